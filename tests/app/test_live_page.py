@@ -19,18 +19,21 @@ from wfsobs.app.live_order import LiveOrder
 from wfsobs.app.live_work import record_saves
 from wfsobs.app.numerals import number
 from wfsobs.app.pages.live import LivePage
-from wfsobs.app.pages.live_table import ranking
+from wfsobs.app.pages.live_figures import EventMarks
+from wfsobs.app.pages.live_table import events_html, peaks_html, ranking
 from wfsobs.app.pages.pages import EXPLORE, LIVE
 from wfsobs.app.service import Service
 from wfsobs.app.session import opens_on_live
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
+from wfsobs.app.views.plots import new_figure
 from wfsobs.live.board import NEXT
+from wfsobs.live.finding import Finding, PeakFinding
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.recording import Recorder
 from wfsobs.live.ring import Ring
 from wfsobs.live.simulated import SimulatedLoop
-from wfsobs.live.view import SHARED, SharedView
+from wfsobs.live.view import SHARED, LiveEvent, SharedView
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -287,3 +290,29 @@ def test_a_recording_is_saved_as_a_record_that_is_read(kind: str, short: Scenari
         if kind == "NPZ":  # an AOT has no truth
             np.testing.assert_array_equal(record.truth("vibration"), rows[:, 9:11])
     ring.release()
+
+
+def finding(*frequencies: float) -> Finding:
+    return Finding(tuple(PeakFinding(f, 0.02, 0.004, 0.02) for f in frequencies), (0.02, 0.02), {})
+
+
+def test_the_table_of_peaks_says_how_far_each_has_moved() -> None:
+    def moves(before: Finding | None, now: Finding) -> list[str]:
+        rows = re.findall(r"<tr data.*?</tr>|<tr><th.*?</tr>", peaks_html(now, before, 1e3, "nm").partition("<tbody>")[2], re.S)
+        return [re.findall(r"<td>(.*?)</td>", row)[1] for row in rows if "<td>" in row]
+
+    assert moves(None, finding(17.25, 47.5)) == ["–", "–"]
+    assert moves(finding(17.25, 50.5), finding(17.20, 47.5, 73.0)) == ["−0.05", "−3.00", "new"]
+
+
+def test_alarms_stand_out_in_the_list_of_events() -> None:
+    html = events_html([LiveEvent(1000, "wind 20 m/s"), LiveEvent(2000, "ALARM noise up: 3 < 4")], 1e-3)
+    assert "<li>2.00 s: <strong>ALARM noise up: 3 &lt; 4</strong></li><li>1.00 s: wind 20 m/s</li>" in html
+
+
+def test_words_of_events_in_the_traces_do_not_cover_each_other() -> None:
+    fig = new_figure()
+    events = [LiveEvent(frame, f"event {frame}") for frame in (1600, 1000, 1200, 1300, 5000)]
+    EventMarks(fig).draw(events, 1e-3, 0.25)
+    (source,) = {renderer.data_source for renderer in fig.renderers}
+    assert source.data == {"x": [1.0, 1.2, 1.3, 1.6, 5.0], "line": ["event 1000", "", "event 1300", "event 1600", "event 5000"]}

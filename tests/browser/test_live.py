@@ -118,8 +118,10 @@ def test_traces_of_all_observers_follow_the_loop(open_page: Any, server: Any) ->
 
 
 def test_a_page_that_opens_on_live_runs_nothing_until_another_page_needs_it(open_page: Any, server: Any) -> None:
-    page = open_page(url=server.url + QUICK + "&view.mode=tilt", wait=False)
+    page = open_page(url=server.url + QUICK + "&view.mode=tilt&view.live.speed=0.3", wait=False)
     begin(page)
+    expect(page.get_by_text(re.compile("^Running at 0.3 × real time"))).to_be_visible()
+    expect(page.get_by_role("combobox", name="Speed")).to_have_text("0.3 ×")
     wind = page.get_by_role("textbox", name="Wind speed V₀ [m/s]")
     wind.fill("20")
     wind.press("Enter")

@@ -56,8 +56,8 @@ def test_a_ramp_is_stairs_of_what_the_simulation_has_then_and_comes_again():
         assert peaks[t].damping * peaks[t].frequency == pytest.approx(before.damping * before.frequency)  # the width
     assert min(np.diff(sorted({t for t, _ in said if t < TIME}))) >= STAIR and all(c["is_new"] for _, c in said)
     lines = {t: c["line"] for t, c in said}
-    assert lines[2 + 2.0] == f"wind {v * 5 / 3:.3g} m/s" and lines[12.0] == f"peak 14 at {before.frequency + 4:.2f} Hz, " + (
-        f"{2e3 * max(before.rms):.1f} nm"
+    assert lines[2 + 2.0] == f"wind {v * 5 / 3:.3g} m/s" and (
+        lines[12.0] == f"peak from {before.frequency:.2f} to {before.frequency + 4:.2f} Hz, {2e3 * max(before.rms):.1f} nm"
     )
 
 

@@ -14,6 +14,8 @@ from wfsobs.live.ring import LiveFrame
 from wfsobs.live.view import LiveView
 from wfsobs.typing import Array
 
+ALARM = "ALARM"
+"""How the line of an alarm begins."""
 MISSING = 0.01
 """Part of the frames of a second that may be missing."""
 RISE, SPREADS = 1.5, 6.0
@@ -84,7 +86,7 @@ class Alarms:
         self._peaks = [*self._peaks[-2:], distinct_peaks(finding)]
         *earlier, now = self._peaks
         for row in drift(earlier[-1], now, earlier[0] if len(earlier) > 1 else ()) if earlier else []:
-            self._say(f"ALARM {row}")
+            self._say(f"{ALARM} {row}")
 
     def _miss(self, sensor: str, due: Array) -> None:
         """Judge what has come of the measurements that were due, (n, n_modes)."""
@@ -109,7 +111,7 @@ class Alarms:
     def _set(self, what: str, is_active: bool, line: str) -> None:
         if is_active and what not in self._active:
             self._active.add(what)
-            self._say(f"ALARM {line}")
+            self._say(f"{ALARM} {line}")
         elif not is_active and what in self._active:
             self._active.discard(what)
             self._say(f"over: {what}")
@@ -150,7 +152,7 @@ def drift(before: Sequence[PeakFinding], now: Sequence[PeakFinding], earlier: Se
     A line that moves in the midst of a minute is two peaks in that minute: one is new. In the next one the other is gone, and has
     moved to it if the minute before the two, `earlier`, had the one and not the other.
     """
-    lines, same = [], _pairs(before, now)
+    lines, same = [], paired_peaks(before, now)
     for peak in now:
         if (one := same.get(peak)) is None:
             lines.append(f"new peak at {peak.frequency:.2f} Hz, {1e3 * peak.rms:.1f} nm")
@@ -166,7 +168,7 @@ def drift(before: Sequence[PeakFinding], now: Sequence[PeakFinding], earlier: Se
     return lines
 
 
-def _pairs(before: Sequence[PeakFinding], now: Sequence[PeakFinding]) -> dict[PeakFinding, PeakFinding]:
+def paired_peaks(before: Sequence[PeakFinding], now: Sequence[PeakFinding]) -> dict[PeakFinding, PeakFinding]:
     """Return peak -> the one before that it is: in its place, or else of its size and within REACH; the nearest ones first."""
     near = [
         (not _is_near(one, peak, CLOSE), abs(one.frequency - peak.frequency), peak, one)

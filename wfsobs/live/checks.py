@@ -71,6 +71,18 @@ def learns_beforehand(observer: Observer, scenario: Scenario) -> bool:
     return Training in observer.parts(observer_settings(observer, scenario))
 
 
+def speed_of(text: str) -> float:
+    """Read a speed. Raises SettingError.
+
+    >>> speed_of("0.25")
+    0.25
+    """
+    try:
+        return check_speed(float(text))
+    except ValueError:
+        raise SettingError(f"speed = {text[:80]}: takes a number from {SLOWEST:g} to {FASTEST:g}") from None
+
+
 def check_speed(speed: float) -> float:
     """Return a speed. Raises SettingError."""
     if not SLOWEST <= speed <= FASTEST:

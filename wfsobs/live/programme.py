@@ -150,7 +150,8 @@ def _act(scenario: Scenario, t: float) -> Act:
         f, rms = peak.frequency + float(shift(own, at)), [float(strength(own, at)) * one for one in peak.rms]
         # it keeps its width in Hz
         changes[f"vibration.peaks.{i}"] = {"frequency": f, "damping": peak.damping * peak.frequency / f, "rms": rms}
-        words[f"peak {i}"] = f"peak {i} at {f:.2f} Hz, {1e3 * max(rms):.1f} nm"
+        move = f"peak at {f:.2f} Hz" if f == peak.frequency else f"peak from {peak.frequency:.2f} to {f:.2f} Hz"
+        words[f"peak {i}"] = f"{move}, {1e3 * max(rms):.1f} nm"
     count, active = before.sensors.lgs_count, [event for event in scenario.events if during(event, at)]
     left = max(count - sum(event.lasers for event in active if event.kind == LASER), 0)
     shares = {sensor: _share(active, sensor) for sensor in ("lgs", "ngs")}

@@ -48,7 +48,7 @@ class Shadow:
                 return
 
             def take(finding: Finding) -> None:
-                loop.workshop.finding = finding
+                loop.workshop.keep(finding)
                 self._alarms.compare(finding)
 
             loop.workshop.do(identify_frames, record, loop.scenario.to_dict(), then=take)

@@ -29,13 +29,14 @@ class Workshop:
 
     Attributes
     ----------
-    finding : Finding or None
-        The last identification.
+    finding, finding_before : Finding or None
+        The last identification, and the one before.
     """
 
     def __init__(self, processes: LiveProcesses, sampling: Sampling, say: Callable[[str], None]):
         self._processes, self._sampling, self._say = processes, sampling, say
         self.finding: Finding | None = None
+        self.finding_before: Finding | None = None
         self._bounds: tuple[Scenario | None, Bounds] = (None, {})
 
     def do(self, function: Callable[..., Any], *arguments: Any, then: Callable[[Any], None]) -> None:
@@ -76,7 +77,7 @@ class Workshop:
         whose = f" for {names[0]}" if len(names) == 1 else ""
 
         def take(finding: Finding) -> None:
-            self.finding = finding
+            self.keep(finding)
             peaks = ", ".join(f"{p.frequency:.1f} Hz" for p in finding.peaks)
             self._say(f"identified{whose}: {len(finding.peaks)} peaks" + (f" at {peaks}" if peaks else ""))
             if names:
@@ -84,6 +85,10 @@ class Workshop:
 
         self._say(f"identifying the last {record.n_steps * record.dt:.0f} s{whose}")
         self.do(identify_frames, record, scenario.to_dict(), then=take)
+
+    def keep(self, finding: Finding) -> None:
+        """Have an identification as the last one."""
+        self.finding_before, self.finding = self.finding, finding
 
     def _deliver(self, design: StepObserver | StepController) -> None:
         if isinstance(design, StepController):

@@ -33,6 +33,8 @@ from wfsobs.live.source import SIMULATION
 from wfsobs.live.view import LiveView
 from wfsobs.settings.errors import SettingError
 
+APART = ":host { gap: 10px; }"
+"""Style of boxes one below the other."""
 LOOK_BACK = 120.0
 """What a recording has of the time before it [s]."""
 INTRO = (
@@ -52,7 +54,7 @@ class LivePage(PageActions):
         self.inputs = (c.running, c.controllers, c.speed)
         self.buttons = c.buttons
         self.intro, self.status = text(INTRO), live_text()
-        self.room = pn.Column(**WIDE, visible=False)
+        self.room = pn.Column(**WIDE, visible=False, stylesheets=[APART])
         self.pulse = Pulse(width=0, height=0, margin=0)
         self.visible = False
         self.picture: LiveRoom | None = None
@@ -99,7 +101,7 @@ class LivePage(PageActions):
             ),
             self.room,
             **WIDE,
-            stylesheets=[":host { gap: 10px; }"],
+            stylesheets=[APART],
         )
 
     def show(self, visible: bool) -> None:

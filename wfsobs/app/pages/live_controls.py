@@ -15,11 +15,12 @@ from wfsobs.app.pages.live_waterfall import MEASUREMENT
 from wfsobs.app.pages.parts import WIDE, line
 from wfsobs.app.style import asset, look
 from wfsobs.live.board import NEXT, SLOTS
-from wfsobs.live.checks import ADAPTIVE
+from wfsobs.live.checks import ADAPTIVE, speed_of
 from wfsobs.live.control_crew import SEATS, USUAL
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.source import SIMULATION, STREAM, LiveSource
 from wfsobs.observers.base import TARGETS
+from wfsobs.settings.group import SettingError
 
 PATIENCE = 10.0
 """Time after which a picture that the browser has not answered is given up [s]."""
@@ -131,11 +132,17 @@ class LiveControls:
 
     def tell(self, loop: LiveLoop) -> None:
         """Show what runs."""
-        self.running.value, self.speed.value = loop.board.active(), loop.speed
+        self.running.value = loop.board.active()
+        self._choose_speed(loop.speed)
         shown = self.lines.value
         self.lines.value = [*shown, *(name for name in ADAPTIVE if name in self.running.value and name not in shown)]
         self.controllers.value = [name for name in SEATS if name in loop.controllers]
         self._allow(loop.source)
+
+    def _choose_speed(self, speed: float) -> None:
+        """Choose a speed, also one that is not among the usual ones."""
+        self.speed.options = dict(sorted({**SPEEDS, f"{speed:g} ×": speed}.items(), key=lambda one: one[1]))
+        self.speed.value = speed
 
     @property
     def names_to_design(self) -> list[str] | None:
@@ -183,8 +190,9 @@ class LiveControls:
             names, known = fields[name].split(",") if fields.get(name) else [], set(field.options.values())
             field.value = [one for one in names if one in known] if name in fields else list(usual)
             refused += [f"{name} = {one[:80]}: there is none of that name" for one in names if one not in known]
-        speeds = {f"{speed:g}": speed for speed in SPEEDS.values()}
-        if (speed := fields.get(SPEED, "1")) not in speeds:
-            refused.append(f"{SPEED} = {speed[:80]}: takes one of {', '.join(speeds)}")
-        self.speed.value = speeds.get(speed, 1.0)
+        try:
+            self._choose_speed(speed_of(fields.get(SPEED, "1")))
+        except SettingError as error:
+            refused.append(str(error))
+            self._choose_speed(1.0)
         return refused

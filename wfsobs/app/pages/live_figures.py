@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 from bokeh.core.validation import silence
@@ -34,6 +35,10 @@ MEMORY = 5.0
 """Time over which spectra are averaged: those of earlier times fade exponentially [s]."""
 DECADES = 7
 """Of the axis of spectra."""
+ROOM = 28
+"""Characters of an event that the height of a figure takes."""
+CLOSE = 0.05
+"""Part of the window within which the words of two events would cover each other."""
 COARSE = 20
 """Bins of the histogram of latencies that are drawn as one."""
 NAMES = (TRUTH, *BOUNDS, *SLOTS)
@@ -58,17 +63,49 @@ class LiveFigure:
             self.lines.restyle(dark, [name for name in NAMES if name not in data])
 
 
+class EventMarks:
+    """When something happened: lines over the traces, with words up from the bottom where there is room beside each other."""
+
+    def __init__(self, fig: figure):
+        self._source = ColumnDataSource({"x": [], "line": []})
+        fig.extra_y_ranges = {"height": Range1d(start=0.0, end=1.0)}
+        at: dict[str, Any] = {"source": self._source, "level": "annotation"}
+        fig.vspan(x="x", line_color="#B84A00", line_dash=[2, 2], **at)
+        words = {"angle": np.pi / 2, "text_font_size": "11px", "text_color": "#B84A00", "x_offset": 12, "y_range_name": "height"}
+        fig.text("x", 0.02, text="line", **at, **words)
+
+    def draw(self, events: Sequence[LiveEvent], dt: float, close: float) -> None:
+        """Send them; of those within `close` [s] the first has words."""
+        times, lines, written = [], [], -np.inf
+        for event in sorted(events):
+            times.append(event.frame * dt)
+            lines.append(short_line(event.line) if times[-1] - written > close else "")
+            written = times[-1] if lines[-1] else written
+        if (marks := {"x": times, "line": lines}) != self._source.data:
+            self._source.data = marks
+
+
+def short_line(line: str) -> str:
+    """Return what of an event there is room for in a figure: numbers that follow a colon are in the list of events.
+
+    >>> short_line("ALARM error of kf-lgs up: 29.7 nm, it was 19.6 nm"), short_line("over: error of kf-lgs")
+    ('ALARM error of kf-lgs up', 'over: error of kf-lgs')
+    >>> short_line("peak from 47.50 to 50.50 Hz, 30.0 nm")
+    'peak from 47.50 to 50.50 Hz'
+    """
+    if len(line) <= ROOM:
+        return line
+    head = next((line[:at] for at in (line.rfind(": "), line.rfind(", ")) if 0 < at <= ROOM), "")
+    return head or line[: ROOM - 1] + "…"
+
+
 class RollingTraces(LiveFigure):
     """The last seconds of errors, or of estimates and truth."""
 
     def __init__(self, painter: Painter) -> None:
         super().__init__(new_figure(x_range=Range1d(start=0.0, end=1.0), y_range=Range1d(start=-1.0, end=1.0)), painter)
         self.figure.xaxis.axis_label = "time of the loop [s]"
-        self._marks = ColumnDataSource({"x": [], "line": []})
-        self.figure.vspan(x="x", source=self._marks, line_color="#B84A00", line_dash=[2, 2])
-        self.figure.text(
-            "x", 0, text="line", source=self._marks, angle=np.pi / 2, text_font_size="11px", text_color="#B84A00", x_offset=12
-        )
+        self._marks = EventMarks(self.figure)
 
     @staticmethod
     def run_in(display: Display) -> float:
@@ -110,10 +147,7 @@ class RollingTraces(LiveFigure):
         self.painter.update(self.figure.y_range, start=0.0 if display.running else -top, end=top)
         what = "running rms of error of" if display.running else "error of" if display.error else ""
         self.figure.yaxis.axis_label = f"{what} {display.mode_label} [{display.unit_label}]".strip()
-        marked = [event for event in events if first <= event.frame <= last]
-        marks = {"x": [event.frame * view.dt for event in marked], "line": [event.line[:40] for event in marked]}
-        if marks != self._marks.data:
-            self._marks.data = marks
+        self._marks.draw([event for event in events if first <= event.frame <= last], view.dt, CLOSE * n * view.dt)
 
 
 class RollingSpectra(LiveFigure):

@@ -42,6 +42,7 @@ class Detector:
         for axis in self.figure.axis:
             ticker = BasicTicker(desired_num_ticks=3)
             axis.update(major_label_text_font_size="10px", minor_tick_line_color=None, ticker=ticker)
+        self.figure.xaxis.update(axis_label="mas", axis_label_text_font_size="10px", axis_label_standoff=2)
         call(self.figure, f"Star: {self.label}")
         self._trail, self._spot = ColumnDataSource({"x": [], "y": []}), ColumnDataSource({"x": [], "y": []})
         self._line = self.figure.line("x", "y", source=self._trail, line_alpha=0.5).glyph

@@ -14,13 +14,16 @@ from wfsobs.app.render import Row, table
 from wfsobs.app.style import look, swatch
 from wfsobs.closed_loop.run import strehl
 from wfsobs.evaluation.rows import row_label
+from wfsobs.live.alarms import ALARM, paired_peaks
 from wfsobs.live.board import NEXT, SCORED
-from wfsobs.live.finding import Bounds, Finding
+from wfsobs.live.finding import Bounds, Finding, PeakFinding
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.view import LiveEvent, LiveView
 from wfsobs.typing import Array
 
 SHOWN_EVENTS = 8
+FAR_BEHIND = 2.0
+"""Beyond this the observers do not catch up by themselves [s]."""
 QUANTITIES = {"Turbulence": "turbulence", "Vibration": "vibration", "Next measurement": NEXT}
 
 
@@ -92,13 +95,27 @@ def control_html(loop: LiveLoop, seconds: float, display: Display) -> str:
     return str(table("Controllers of the live loop", columns, [("", rows)]))
 
 
-def peaks_html(finding: Finding | None, scale: float, unit: str) -> str:
-    """Write the peaks of the last identification."""
+def peaks_html(finding: Finding | None, before: Finding | None, scale: float, unit: str) -> str:
+    """Write the peaks of the last identification, and how far each is from where the one before had it."""
     if finding is None:
         return ""
-    columns = {"Peak [Hz]": "", "± [Hz]": "standard deviation", "Damping": "", f"RMS [{unit}]": "of the mode that has most of it"}
+    columns = {
+        "Peak [Hz]": "",
+        "± [Hz]": "standard deviation",
+        "Moved by [Hz]": "since the identification before",
+        "Damping": "",
+        f"RMS [{unit}]": "of the mode that has most of it",
+    }
+    same = {} if before is None else paired_peaks(before.peaks, finding.peaks)
+
+    def moved(peak: PeakFinding) -> str:
+        if before is None:
+            return NOTHING
+        return f"{peak.frequency - same[peak].frequency:+.2f}".replace("-", "−") if peak in same else "new"
+
     rows = [
-        Row(number(p.frequency, 4), [_number(p.frequency_std), _number(p.damping), number(scale * p.rms)]) for p in finding.peaks
+        Row(number(p.frequency, 4), [_number(p.frequency_std), moved(p), _number(p.damping), number(scale * p.rms)])
+        for p in finding.peaks
     ]
     return str(table("Peaks of the last minute", columns, [("", rows)]))
 
@@ -113,18 +130,25 @@ def status_line(loop: LiveLoop, view: LiveView) -> str:
         return "The observers are being designed"
     state = "Running" if loop.is_playing else "Paused"
     behind = max(loop.newest - loop.count, 0) * loop.sampling.dt / loop.speed  # the two are read one after the other
+    advice = ": more than this machine does, switch some off or run slower" if behind > FAR_BEHIND else ""
     parts = [
         f"{state} at {loop.speed:g} × real time",
         f"{view.dt * (view.first + view.n):.1f} s",
         f"{loop.delivery.frames} frames",
         f"{loop.delivery.losses} lost",
         f"{loop.delivery.late_share:.2%} later than 1 ms",
-        f"observers {behind:.2f} s behind",
+        f"observers {behind:.2f} s behind{advice}",
     ]
     return " · ".join([*parts, "recording"] if loop.recorder.is_on else parts)
 
 
 def events_html(events: Iterable[LiveEvent], dt: float) -> str:
     """List the latest events, the newest first."""
-    lines = [f"<li>{event.frame * dt:.2f} s: {escape(event.line)}</li>" for event in list(events)[-SHOWN_EVENTS:][::-1]]
+    latest = list(events)[-SHOWN_EVENTS:][::-1]
+    lines = [f"<li>{event.frame * dt:.2f} s: {_told(event.line)}</li>" for event in latest]
     return f'<ul class="text" aria-label="Events">{"".join(lines)}</ul>' if lines else ""
+
+
+def _told(line: str) -> str:
+    """Write an event; an alarm stands out."""
+    return f"<strong>{escape(line)}</strong>" if line.startswith(ALARM) else escape(line)
