@@ -21,7 +21,7 @@ class LoopInProcess:
         order = Order(scenario.to_dict(), ("kf-multi",), sampling, 0, False, "", "", "", None, self.news)
         self.crew, self.count = made_crew(order, self.board), 0
         self.recorder = Recorder(self.ring, sampling, self.say, is_simulated)
-        self.workshop = SimpleNamespace(do=lambda function, *given, then: then(function(*given)), finding=None)
+        self.workshop = SimpleNamespace(do=lambda function, *given, then: then(function(*given)), keep=lambda finding: None)
 
     def say(self, line):
         raise NotImplementedError

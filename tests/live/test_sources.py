@@ -4,13 +4,14 @@ import itertools
 import json
 import queue
 import threading
+from time import monotonic
 
 import numpy as np
 import pytest
 import zmq
 
 import wfsobs
-from wfsobs.live.attached import StreamFrames, StreamSource
+from wfsobs.live.attached import SPELL, StreamFrames, StreamSource
 from wfsobs.live.checks import observers_on
 from wfsobs.live.paced import Desk
 from wfsobs.live.recording import open_loop_record
@@ -62,7 +63,7 @@ def stream(tmp_path):
     ring.release()
 
 
-def test_a_stream_is_followed_through_whatever_happens_to_it(stream):
+def test_a_stream_is_followed_through_whatever_happens_to_it(stream, monkeypatch):
     path, image, ring, inbox, news, frames = stream
 
     def send(*values):
@@ -88,10 +89,17 @@ def test_a_stream_is_followed_through_whatever_happens_to_it(stream):
     assert ring.count == 4 and np.isnan(ring.read_frames(1, 3).z).all() and ring.read(3).z[0] == pytest.approx(7e-3)
     send(np.nan, 0, np.inf, 0)
     send(np.nan, 0, 1, 0)
+    send(1, 0, 1, 0)
+    send(np.nan, 0, 1, 0)  # an element that fails again and again is one story
     assert np.isnan(ring.read(4).z).all() and lines() == [(4, "numbers that are not finite")]
+    now = monotonic()
+    monkeypatch.setattr("wfsobs.live.attached.monotonic", lambda: now + SPELL + 1.0)
+    send(np.nan, 0, 1, 0)
+    assert lines() == [(8, "numbers that are not finite")]
+    monkeypatch.undo()
     frames._stand_still()
     frames._stand_still()
-    assert lines() == [(6, "no frame for 0.1 s")]
+    assert lines() == [(9, "no frame for 0.1 s")]
     path.unlink()
     frames._stand_still()
     frames._look()
@@ -101,7 +109,7 @@ def test_a_stream_is_followed_through_whatever_happens_to_it(stream):
     frames._look()
     image.write(np.arange(4.0))
     frames.take()
-    assert ring.count == 7 and lines() == [(6, "frames again")]
+    assert ring.count == 10 and lines() == [(9, "frames again")]
     np.testing.assert_array_equal(image._values, np.arange(4.0))  # nothing is written to it
 
 

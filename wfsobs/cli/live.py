@@ -22,7 +22,7 @@ from wfsobs.cli.options import (
 from wfsobs.cli.show import progress_bar, show_table
 from wfsobs.files import check_writable
 from wfsobs.live.attached import StreamSource
-from wfsobs.live.checks import check_slot, observers_on
+from wfsobs.live.checks import can_control, check_slot, observers_on
 from wfsobs.live.control_crew import USUAL
 from wfsobs.live.follow import follow
 from wfsobs.live.programme import acts_of
@@ -119,7 +119,8 @@ def live(
     if headless:
         _run_headless(source, scenario, names, speed, seconds, record_file, log_file, as_json)
         return
-    beside = () if no_controllers else controllers or USUAL
+    usual = tuple(name for name in USUAL if can_control(name, source))
+    beside = () if no_controllers else controllers or usual
     for name in (*names, *beside):
         check_slot(name)
     try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import inf
 from multiprocessing.context import SpawnContext
 from time import monotonic, sleep
 
@@ -25,6 +26,8 @@ from wfsobs.typing import Array
 
 TICK = 0.05
 """Longest wait for a frame before a look at the commands [s]."""
+SPELL = 10.0
+"""Time after which something that had ceased is told anew [s]."""
 RETRY = 0.5
 """Pause before a stream that cannot be read is looked for again [s]."""
 
@@ -94,7 +97,8 @@ class StreamFrames:
         self._stream: SharedImage | Subscription | None = None
         self._pairs: PairedFrames | None = None
         self._count, self._alive, self._steps = 0, monotonic(), 0
-        self._is_playing = self._is_stuck = self._is_garbage = False
+        self._is_playing = self._is_stuck = False
+        self._spells: dict[str, float] = {}
 
     def run(self) -> None:
         """Follow the stream until the process is ended, or all frames have been sent."""
@@ -113,7 +117,7 @@ class StreamFrames:
         assert self._stream is not None
         found = self._stream.read()
         if found is None:
-            self._say("a frame is being written without an end")
+            self._say_once("a frame is being written without an end")
             sleep(TICK)
             return
         count, values = found
@@ -131,10 +135,8 @@ class StreamFrames:
             for k in range(missing, 0, -1):
                 self._send(count - k, self._nothing, is_missing=True)
         z = values[self._elements] * self._source.unit
-        is_garbage = not np.isfinite(z).all()
-        if is_garbage and not self._is_garbage:
-            self._say("numbers that are not finite")
-        self._is_garbage = is_garbage
+        if not np.isfinite(z).all():
+            self._say_once("numbers that are not finite")
         self._send(count, np.where(np.isfinite(z), z, np.nan))
 
     def _send(self, count: int, z: Array, is_missing: bool = False) -> None:
@@ -209,6 +211,13 @@ class StreamFrames:
             self._say(f"no frame for {STUCK:g} s")
         if not self._stream.is_current:
             self._stream = None
+
+    def _say_once(self, line: str) -> None:
+        """Say what may be so at every other frame: the first time, and again after SPELL without it."""
+        now = monotonic()
+        if now - self._spells.get(line, -inf) > SPELL:
+            self._say(line)
+        self._spells[line] = now
 
     def _say(self, line: str) -> None:
         self._desk.say(self._ring.count, f"{self._source.path}: {line}")

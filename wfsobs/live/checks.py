@@ -66,6 +66,11 @@ def can_run(observer: str, source: LiveSource, scenario: Scenario) -> bool:
     )
 
 
+def can_control(controller: str, source: LiveSource) -> bool:
+    """Return whether a source has what a controller needs."""
+    return source.sampling.ratio is not None or not CONTROLLERS[controller].ngs
+
+
 def learns_beforehand(observer: Observer, scenario: Scenario) -> bool:
     """Return whether an observer is made from a training record."""
     return Training in observer.parts(observer_settings(observer, scenario))

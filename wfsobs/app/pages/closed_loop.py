@@ -23,6 +23,7 @@ from wfsobs.app.pages.loop_figures import LoopSpectrum, Nyquist, Response, Trace
 from wfsobs.app.pages.loop_table import loop_html, margins_html
 from wfsobs.app.pages.parts import (
     EDITED,
+    HALVES,
     SMALL_LABEL,
     TALL,
     WIDE,
@@ -45,10 +46,6 @@ REFERENCES = ("integrator", "lqg-kf-lgs")
 FIRST_S, ZOOM_S = 2.0, 0.5
 """Length of the two traces at first [s], in the middle of the record."""
 
-GRID = """
-:host { display: grid !important; grid-template-columns: minmax(0, 1fr) minmax(0, 1fr); gap: 10px; }
-@media (max-width: 1000px) { :host { grid-template-columns: minmax(0, 1fr); } }
-"""
 INTRO = (
     "Every controller runs on the disturbance and the noise of the results shown, with the delay and the "
     "limits of the mirror set under Controllers. The Strehl ratio counts the simulated modes alone."
@@ -102,13 +99,13 @@ class ClosedLoopPage(PageActions):
             ),
             self.room,
             **WIDE,
-            stylesheets=[GRID],
+            stylesheets=[HALVES],
         )
         stability = pn.Column(
             self.stability,
             pn.Column(text(ABOUT), self.margins, **WIDE),
             **WIDE,
-            stylesheets=[GRID],
+            stylesheets=[HALVES],
         )
         parts = (self._switch(), figures, box("Controllers", self.table), box("Stability", stability))
         self._rooms = [pn.Column(part, **WIDE) for part in parts]  # a grid by its own style is shown even where it is not visible

@@ -12,7 +12,7 @@ import panel_material_ui as pmui
 from wfsobs.app.causes import Causes
 from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL
 from wfsobs.app.history import History
-from wfsobs.app.pages.parts import EDITED, SMALL_LABEL, TALL, WIDE, box, group, zoom_buttons
+from wfsobs.app.pages.parts import EDITED, SMALL_LABEL, TALL, WIDE, box, grid, group, zoom_buttons
 from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset
@@ -32,10 +32,7 @@ from wfsobs.app.views.verdict import VerdictLine
 from wfsobs.evaluation.theory import Theory
 from wfsobs.observers.base import TARGETS, VIBRATION
 
-GRID = """
-:host { display: grid !important; grid-template-columns: minmax(0, 3fr) minmax(0, 2fr); gap: 10px; }
-@media (max-width: 1000px) { :host { grid-template-columns: minmax(0, 1fr); } }
-"""
+GRID = grid("minmax(0, 3fr) minmax(0, 2fr)")
 GAP = ":host { gap: 10px; }"
 ZOOMS: Mapping[str, float | None] = MappingProxyType({"Whole record": None, "2 s": 2.0, "0.2 s": 0.2})
 MARKS = macro("marks", PEAKS, MODEL)

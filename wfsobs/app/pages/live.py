@@ -25,7 +25,7 @@ from wfsobs.app.pages.live_text import live_text
 from wfsobs.app.pages.parts import WIDE, PageActions, box, text
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
-from wfsobs.live.checks import can_run
+from wfsobs.live.checks import can_control, can_run
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.replay import Replay
 from wfsobs.live.simulated import SimulatedLoop
@@ -132,7 +132,8 @@ class LivePage(PageActions):
         elif source.name == SIMULATION:
             source = SimulatedLoop(scenario)
         names = tuple(name for name in c.running.value if can_run(name, source, scenario))
-        return LiveOrder(source, scenario, names, c.speed.value, tuple(c.controllers.value), options=options)
+        controllers = tuple(name for name in c.controllers.value if can_control(name, source))
+        return LiveOrder(source, scenario, names, c.speed.value, controllers, options=options)
 
     @property
     def task(self) -> CopiedTask:

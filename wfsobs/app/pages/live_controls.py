@@ -112,7 +112,7 @@ class LiveControls:
         select = {"size": "small", "margin": 0}
         self.speed = pmui.Select(label="Speed", options=SPEEDS, value=1.0, width=100, **select)
         self.window = pmui.Select(label="Window", options=WINDOWS, value=5.0, width=100, **select)
-        self.target = pmui.Select(label="Errors of", options=QUANTITIES, value=TARGETS[0], width=180, **select)
+        self.target = pmui.Select(label="Errors of", options=QUANTITIES, value=TARGETS[0], width=210, **select)
         self.lasers = pmui.Checkbox(label="Lasers", value=True, **select)
         self.ngs = pmui.Checkbox(label="NGS", value=True, **select)
         self.losses = pmui.Select(label="Lost", options=LOSSES, value=0.0, width=150, **select)

@@ -14,6 +14,7 @@ from bokeh.plotting import figure
 
 from wfsobs.app.display import Display
 from wfsobs.app.pages.live_paint import Painter
+from wfsobs.app.pages.live_waterfall import bridged
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.lines import FigureLines
 from wfsobs.app.views.plots import new_figure
@@ -23,6 +24,7 @@ from wfsobs.evaluation.error_spectra import cumulative_rms
 from wfsobs.evaluation.recovery import trailing_rms
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.latencies import EDGES
+from wfsobs.live.alarms import ALARM
 from wfsobs.live.board import SLOTS, Board
 from wfsobs.live.finding import Bounds
 from wfsobs.live.view import LiveEvent, LiveView
@@ -35,7 +37,7 @@ MEMORY = 5.0
 """Time over which spectra are averaged: those of earlier times fade exponentially [s]."""
 DECADES = 7
 """Of the axis of spectra."""
-ROOM = 28
+ROOM = 30
 """Characters of an event that the height of a figure takes."""
 CLOSE = 0.05
 """Part of the window within which the words of two events would cover each other."""
@@ -86,17 +88,20 @@ class EventMarks:
 
 
 def short_line(line: str) -> str:
-    """Return what of an event there is room for in a figure: numbers that follow a colon are in the list of events.
+    """Return what of an event there is room for in a figure; all of it is in the list of events.
 
     >>> short_line("ALARM error of kf-lgs up: 29.7 nm, it was 19.6 nm"), short_line("over: error of kf-lgs")
     ('ALARM error of kf-lgs up', 'over: error of kf-lgs')
     >>> short_line("peak from 47.50 to 50.50 Hz, 30.0 nm")
     'peak from 47.50 to 50.50 Hz'
+    >>> short_line("/dev/shm/aol1_modevalOL.im.shm: no frame for 0.1 s")
+    'no frame for 0.1 s'
     """
     if len(line) <= ROOM:
         return line
-    head = next((line[:at] for at in (line.rfind(": "), line.rfind(", ")) if 0 < at <= ROOM), "")
-    return head or line[: ROOM - 1] + "…"
+    head, _, tail = line.rpartition(": ")
+    parts = [head if line.startswith(ALARM) else tail, line.rpartition(", ")[0]]
+    return next((part for part in parts if 0 < len(part) <= ROOM), line[: ROOM - 1] + "…")
 
 
 class RollingTraces(LiveFigure):
@@ -206,9 +211,9 @@ def shown_signal(view: LiveView, name: str, target: str, display: Display) -> Ar
 
 
 def _last_spectrum(view: LiveView, name: str, target: str, display: Display, n: int) -> tuple[Array, Array] | None:
-    """Return frequencies [Hz] and the spectrum of the last n frames [um^2/Hz]; None where some are missing."""
-    x = shown_signal(view, name, target, display)[-n:, display.column]
-    if np.isnan(x).any():
+    """Return frequencies [Hz] and the spectrum of the last n frames [um^2/Hz]; None where too many are missing."""
+    x = bridged(shown_signal(view, name, target, display)[-n:, display.column])
+    if x is None:
         return None
     frequency, density = welch_psd(x[:, None], view.dt, 1.0 / (n * view.dt))
     return frequency, density[:, 0]

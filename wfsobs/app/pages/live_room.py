@@ -15,7 +15,7 @@ from wfsobs.app.pages.live_stars import Stars
 from wfsobs.app.pages.live_table import control_html, events_html, live_html, peaks_html
 from wfsobs.app.pages.live_text import live_text
 from wfsobs.app.pages.live_waterfall import MEASUREMENT, Waterfall
-from wfsobs.app.pages.parts import WIDE, box, figure_with_caption, group, legend, line
+from wfsobs.app.pages.parts import HALVES, WIDE, box, figure_with_caption, group, legend, line
 from wfsobs.app.store import Store
 from wfsobs.app.style import look
 from wfsobs.app.views.frames import Frames
@@ -33,10 +33,6 @@ from wfsobs.observers.base import TARGETS
 
 SLOW = 1.0
 """Between two tables [s]."""
-GRID = """
-:host { display: grid !important; grid-template-columns: minmax(0, 1fr) minmax(0, 1fr); gap: 10px; }
-@media (max-width: 1000px) { :host { grid-template-columns: minmax(0, 1fr); } }
-"""
 
 
 class LiveRoom:
@@ -72,7 +68,7 @@ class LiveRoom:
             pmui.Checkbox.from_param(self.display.param.editing, size="small", margin=0),
         )
         return [
-            box("Now", switches, c.lines, self.legend, pn.Column(*figures, **WIDE, stylesheets=[GRID])),
+            box("Now", switches, c.lines, self.legend, pn.Column(*figures, **WIDE, stylesheets=[HALVES])),
             box("Observers", self.table, self.peaks),
             box("Controllers on the same disturbance", c.controllers, self.control_table, self.stars.row),
             box("Events", self.news),

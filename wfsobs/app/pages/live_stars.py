@@ -11,7 +11,7 @@ from bokeh.plotting import figure
 
 from wfsobs.app.display import per_micrometre
 from wfsobs.app.pages.live_paint import Painter
-from wfsobs.app.pages.parts import WIDE
+from wfsobs.app.pages.parts import WIDE, grid
 from wfsobs.app.style import asset, look
 from wfsobs.app.views.plots import call, new_figure
 from wfsobs.app.work import TRUTH
@@ -25,13 +25,19 @@ TRAIL, POINTS = 0.2, 60
 """Length of the trail of the star [s], and its points."""
 SIDE = 150
 """Of a detector at least [px]."""
-GRID = ":host { display: grid !important; grid-template-columns: repeat(auto-fill, minmax(180px, 1fr)); gap: 10px; }"
+GRID = grid(CELLS := "repeat(auto-fill, minmax(180px, 1fr))", CELLS)
 FWHM = 1.03
 """Full width at half maximum of an Airy pattern, in wavelengths over the diameter."""
 
 
 class Detector:
-    """One detector: the core of the star, and where it has been in the last instants."""
+    """One detector: the core of the star, and where it has been in the last instants.
+
+    Attributes
+    ----------
+    view : pn.Column
+        The figure under its caption.
+    """
 
     def __init__(self, name: str, painter: Painter):
         self.painter = painter
@@ -48,11 +54,8 @@ class Detector:
         self._line = self.figure.line("x", "y", source=self._trail, line_alpha=0.5).glyph
         self._core = self.figure.circle("x", "y", radius=1.0, source=self._spot, fill_alpha=0.6).glyph
         self._style: tuple[float, float, str] | None = None
-
-    def view(self) -> pn.Column:
-        """Return the detector under its caption."""
         caption = pn.pane.HTML(f'<div class="caption">{self.label}</div>', margin=0, stylesheets=[asset("style.css")])
-        return pn.Column(caption, pn.pane.Bokeh(self.figure, sizing_mode=self.figure.sizing_mode, margin=0), **WIDE)
+        self.view = pn.Column(caption, pn.pane.Bokeh(self.figure, sizing_mode=self.figure.sizing_mode, margin=0), **WIDE)
 
     def draw(self, points: Array, reach: float, radius: float, dark: bool) -> None:
         """Send the last instants (n, 2), the newest last; reach : of the axes;  radius : of the core, all in mas."""
@@ -87,7 +90,7 @@ class Stars:
             signals |= {name: left.residual(name) for name in names if CONTROLLERS[name].law is not None}
         if list(signals) != list(self._detectors):
             self._detectors = {name: self._detectors.get(name) or Detector(name, self._painter) for name in signals}
-            self.row[:] = [detector.view() for detector in self._detectors.values()]
+            self.row[:] = [detector.view for detector in self._detectors.values()]
         reach = 1.1 * float(np.nanmax(np.abs(scale * signals[TRUTH][:, :2]), initial=1e-3))
         if not self._reach / 1.6 < reach < self._reach:
             self._reach = 1.25 * reach

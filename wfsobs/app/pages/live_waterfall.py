@@ -111,15 +111,27 @@ def second_spectrum(x: Array, dt: float) -> Array:
 
     Each is the mean over its band of the spectrum taken as constant around every frequency. NaN where too much is missing.
     """
-    known = ~np.isnan(x)
-    if known.mean() < 1.0 - MOST_MISSING:
+    whole = bridged(x)
+    if whole is None:
         return np.full(ROWS, np.nan)
-    if not known.all():
-        at = np.arange(len(x))
-        x = np.interp(at, at[known], x[known])
-    frequency, density = welch_psd(x[:, None], dt, 1.0 / LENGTH)
+    frequency, density = welch_psd(whole[:, None], dt, 1.0 / LENGTH)
     half = 0.5 * frequency[1]
     edges = np.geomspace(LOWEST, 0.5 / dt, ROWS + 1)
     power = np.concatenate([[0.0], np.cumsum(density[:, 0] * 2.0 * half)])
     below = np.interp(edges, np.concatenate([[-half], frequency + half]), power)
     return np.diff(below) / np.diff(edges)
+
+
+def bridged(x: Array) -> Array | None:
+    """Return a signal (n,) with straight lines over what is missing; None where too much is.
+
+    >>> bridged(np.array([1.0, 2.0, np.nan, 4.0, 5.0]))
+    array([1., 2., 3., 4., 5.])
+    """
+    known = ~np.isnan(x)
+    if known.all():
+        return x
+    if known.mean() < 1.0 - MOST_MISSING:
+        return None
+    at = np.arange(len(x))
+    return np.interp(at, at[known], x[known])

@@ -119,6 +119,19 @@ def figure_with_caption(title: str, fig: figure, *, tall: bool = False) -> pn.Co
     return pn.Column(caption, pn.pane.Bokeh(fig, sizing_mode=fig.sizing_mode, margin=0), **(TALL if tall else WIDE))
 
 
+def grid(columns: str, narrow: str = "minmax(0, 1fr)") -> str:
+    """Return the style of a Column as a grid of these columns, others on a narrow window; its button to scroll takes no cell."""
+    return f"""
+:host {{ display: grid !important; grid-template-columns: {columns}; gap: 10px; }}
+@media (max-width: 1000px) {{ :host {{ grid-template-columns: {narrow}; }} }}
+.scroll-button {{ display: none; }}
+"""
+
+
+HALVES = grid("minmax(0, 1fr) minmax(0, 1fr)")
+"""Two figures beside each other."""
+
+
 def group(display: Display, name: str, options: Any) -> pmui.RadioButtonGroup:
     """Make the buttons of one switch of the display."""
     widget = pmui.RadioButtonGroup.from_param(
