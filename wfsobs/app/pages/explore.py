@@ -30,9 +30,16 @@ from wfsobs.app.views.table import Table
 from wfsobs.app.views.traces import Traces
 from wfsobs.app.views.verdict import VerdictLine
 from wfsobs.evaluation.theory import Theory
-from wfsobs.observers.base import TARGETS, VIBRATION
+from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION
 
 GRID = grid("minmax(0, 3fr) minmax(0, 2fr)")
+ABOUT: Mapping[str, str] = MappingProxyType(
+    {
+        TURBULENCE: "what the air does to the light; observers estimate it from guide stars, and the smaller the error the better",
+        VIBRATION: "what the shaking of the telescope adds, told apart from the air in the same measurements",
+    }
+)
+"""Target -> what it is, for who comes first to the page."""
 GAP = ":host { gap: 10px; }"
 ZOOMS: Mapping[str, float | None] = MappingProxyType({"Whole record": None, "2 s": 2.0, "0.2 s": 0.2})
 MARKS = macro("marks", PEAKS, MODEL)
@@ -115,7 +122,8 @@ class Explore:
             )
         )
         figures = pn.Column(traces, self.rooms[target], **WIDE, stylesheets=[GRID])
-        return box(target.capitalize(), self.verdicts[target].pane, cards, figures, self.stretches[target].pane)
+        parts = self.verdicts[target].pane, cards, figures, self.stretches[target].pane
+        return box(target.capitalize(), *parts, about=ABOUT[target])
 
     def _room(self, target: str, caption: pn.pane.HTML, pane: pn.pane.Bokeh) -> pn.Column:
         """Lay out a figure; those of the first target stand there at once, the others have their room."""

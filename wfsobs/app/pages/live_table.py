@@ -143,8 +143,8 @@ def status_line(loop: LiveLoop, view: LiveView) -> str:
 
 
 def events_html(events: Iterable[LiveEvent], dt: float) -> str:
-    """List the latest events, the newest first."""
-    latest = list(events)[-SHOWN_EVENTS:][::-1]
+    """List the latest events, by time, the last one first."""
+    latest = sorted(list(events)[-SHOWN_EVENTS:], key=lambda event: event.frame)[::-1]  # some are told late
     lines = [f"<li>{event.frame * dt:.2f} s: {_told(event.line)}</li>" for event in latest]
     return f'<ul class="text" aria-label="Events">{"".join(lines)}</ul>' if lines else ""
 

@@ -59,9 +59,10 @@ class PageActions:
 WIDE: Mapping[str, Any] = MappingProxyType({"sizing_mode": "stretch_width", "margin": 0})
 
 
-def heading(title: str) -> pn.pane.HTML:
-    """Make the title of a box."""
-    return pn.pane.HTML(f'<h2 class="title">{escape(title)}</h2>', margin=0, stylesheets=[asset("style.css")])
+def heading(title: str, about: str = "") -> pn.pane.HTML:
+    """Make the title of a box; about : beside it, what is in the box."""
+    words = f'<span class="about">{escape(about)}</span>' if about else ""
+    return pn.pane.HTML(f'<h2 class="title">{escape(title)}</h2>{words}', margin=0, stylesheets=[asset("style.css")])
 
 
 def html(content: str = "") -> pn.pane.HTML:
@@ -84,9 +85,9 @@ def zoom_buttons(zoom: Callable[[float | None], None], stretches: Mapping[str, f
     return buttons
 
 
-def box(title: str, *content: Any) -> pn.Column:
-    """Lay out a part of a page under its title."""
-    return pn.Column(heading(title), *content, **WIDE, stylesheets=[asset("box.css")])
+def box(title: str, *content: Any, about: str = "") -> pn.Column:
+    """Lay out a part of a page under its title; about : what is in it, in a few words."""
+    return pn.Column(heading(title, about), *content, **WIDE, stylesheets=[asset("box.css")])
 
 
 def line(*parts: Any) -> pn.FlexBox:
