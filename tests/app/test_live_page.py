@@ -19,7 +19,7 @@ from wfsobs.app.live_order import LiveOrder
 from wfsobs.app.live_work import record_saves
 from wfsobs.app.numerals import number
 from wfsobs.app.pages.live import LivePage
-from wfsobs.app.pages.live_figures import EventMarks
+from wfsobs.app.pages.live_figures import LiveMarks
 from wfsobs.app.pages.live_table import events_html, peaks_html, ranking
 from wfsobs.app.pages.pages import EXPLORE, LIVE
 from wfsobs.app.service import Service
@@ -313,6 +313,6 @@ def test_alarms_stand_out_in_the_list_of_events() -> None:
 def test_words_of_events_in_the_traces_do_not_cover_each_other() -> None:
     fig = new_figure()
     events = [LiveEvent(frame, f"event {frame}") for frame in (1600, 1000, 1200, 1300, 5000)]
-    EventMarks(fig).draw(events, 1e-3, 0.25)
+    LiveMarks(fig).draw(events, 1e-3, 0.25)
     (source,) = {renderer.data_source for renderer in fig.renderers}
     assert source.data == {"x": [1.0, 1.2, 1.3, 1.6, 5.0], "line": ["event 1000", "", "event 1300", "event 1600", "event 5000"]}

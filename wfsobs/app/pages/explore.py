@@ -12,7 +12,7 @@ import panel_material_ui as pmui
 from wfsobs.app.causes import Causes
 from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL
 from wfsobs.app.history import History
-from wfsobs.app.pages.parts import EDITED, SMALL_LABEL, TALL, WIDE, box, grid, group, zoom_buttons
+from wfsobs.app.pages.parts import EDITED, SMALL_LABEL, TALL, WIDE, box, grid_style, group, zoom_buttons
 from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset
@@ -32,10 +32,10 @@ from wfsobs.app.views.verdict import VerdictLine
 from wfsobs.evaluation.theory import Theory
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION
 
-GRID = grid("minmax(0, 3fr) minmax(0, 2fr)")
+GRID = grid_style("minmax(0, 3fr) minmax(0, 2fr)")
 ABOUT: Mapping[str, str] = MappingProxyType(
     {
-        TURBULENCE: "what the air does to the light; observers estimate it from guide stars, and the smaller the error the better",
+        TURBULENCE: "what the air does to the light; observers estimate it from guide stars: the smaller the error, the better",
         VIBRATION: "what the shaking of the telescope adds, told apart from the air in the same measurements",
     }
 )

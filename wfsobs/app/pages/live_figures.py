@@ -14,7 +14,7 @@ from bokeh.plotting import figure
 
 from wfsobs.app.display import Display
 from wfsobs.app.pages.live_paint import Painter
-from wfsobs.app.pages.live_waterfall import bridged
+from wfsobs.app.pages.live_waterfall import bridge_missing
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.lines import FigureLines
 from wfsobs.app.views.plots import new_figure
@@ -65,7 +65,7 @@ class LiveFigure:
             self.lines.restyle(dark, [name for name in NAMES if name not in data])
 
 
-class EventMarks:
+class LiveMarks:
     """When something happened: lines over the traces, with words up from the bottom where there is room beside each other."""
 
     def __init__(self, fig: figure):
@@ -83,7 +83,8 @@ class EventMarks:
             times.append(event.frame * dt)
             lines.append(short_line(event.line) if times[-1] - written > close else "")
             written = times[-1] if lines[-1] else written
-        if (marks := {"x": times, "line": lines}) != self._source.data:
+        marks: dict[str, Any] = {"x": times, "line": lines}
+        if marks != self._source.data:
             self._source.data = marks
 
 
@@ -110,7 +111,7 @@ class RollingTraces(LiveFigure):
     def __init__(self, painter: Painter) -> None:
         super().__init__(new_figure(x_range=Range1d(start=0.0, end=1.0), y_range=Range1d(start=-1.0, end=1.0)), painter)
         self.figure.xaxis.axis_label = "time of the loop [s]"
-        self._marks = EventMarks(self.figure)
+        self._marks = LiveMarks(self.figure)
 
     @staticmethod
     def run_in(display: Display) -> float:
@@ -212,7 +213,7 @@ def shown_signal(view: LiveView, name: str, target: str, display: Display) -> Ar
 
 def _last_spectrum(view: LiveView, name: str, target: str, display: Display, n: int) -> tuple[Array, Array] | None:
     """Return frequencies [Hz] and the spectrum of the last n frames [um^2/Hz]; None where too many are missing."""
-    x = bridged(shown_signal(view, name, target, display)[-n:, display.column])
+    x = bridge_missing(shown_signal(view, name, target, display)[-n:, display.column])
     if x is None:
         return None
     frequency, density = welch_psd(x[:, None], view.dt, 1.0 / (n * view.dt))

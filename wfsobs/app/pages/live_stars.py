@@ -11,7 +11,7 @@ from bokeh.plotting import figure
 
 from wfsobs.app.display import per_micrometre
 from wfsobs.app.pages.live_paint import Painter
-from wfsobs.app.pages.parts import WIDE, grid
+from wfsobs.app.pages.parts import WIDE, grid_style
 from wfsobs.app.style import asset, look
 from wfsobs.app.views.plots import call, new_figure
 from wfsobs.app.work import TRUTH
@@ -25,7 +25,7 @@ TRAIL, POINTS = 0.2, 60
 """Length of the trail of the star [s], and its points."""
 SIDE = 150
 """Of a detector at least [px]."""
-GRID = grid(CELLS := "repeat(auto-fill, minmax(150px, 1fr))", CELLS)
+GRID = grid_style(CELLS := "repeat(auto-fill, minmax(150px, 1fr))", CELLS)
 FWHM = 1.03
 """Full width at half maximum of an Airy pattern, in wavelengths over the diameter."""
 

@@ -145,10 +145,10 @@ def status_line(loop: LiveLoop, view: LiveView) -> str:
 def events_html(events: Iterable[LiveEvent], dt: float) -> str:
     """List the latest events, by time, the last one first."""
     latest = sorted(list(events)[-SHOWN_EVENTS:], key=lambda event: event.frame)[::-1]  # some are told late
-    lines = [f"<li>{event.frame * dt:.2f} s: {_told(event.line)}</li>" for event in latest]
+    lines = [f"<li>{event.frame * dt:.2f} s: {_event_html(event.line)}</li>" for event in latest]
     return f'<ul class="text" aria-label="Events">{"".join(lines)}</ul>' if lines else ""
 
 
-def _told(line: str) -> str:
+def _event_html(line: str) -> str:
     """Write an event; an alarm stands out."""
     return f"<strong>{escape(line)}</strong>" if line.startswith(ALARM) else escape(line)

@@ -111,7 +111,7 @@ def second_spectrum(x: Array, dt: float) -> Array:
 
     Each is the mean over its band of the spectrum taken as constant around every frequency. NaN where too much is missing.
     """
-    whole = bridged(x)
+    whole = bridge_missing(x)
     if whole is None:
         return np.full(ROWS, np.nan)
     frequency, density = welch_psd(whole[:, None], dt, 1.0 / LENGTH)
@@ -122,10 +122,10 @@ def second_spectrum(x: Array, dt: float) -> Array:
     return np.diff(below) / np.diff(edges)
 
 
-def bridged(x: Array) -> Array | None:
+def bridge_missing(x: Array) -> Array | None:
     """Return a signal (n,) with straight lines over what is missing; None where too much is.
 
-    >>> bridged(np.array([1.0, 2.0, np.nan, 4.0, 5.0]))
+    >>> bridge_missing(np.array([1.0, 2.0, np.nan, 4.0, 5.0]))
     array([1., 2., 3., 4., 5.])
     """
     known = ~np.isnan(x)

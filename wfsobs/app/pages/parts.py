@@ -120,7 +120,7 @@ def figure_with_caption(title: str, fig: figure, *, tall: bool = False) -> pn.Co
     return pn.Column(caption, pn.pane.Bokeh(fig, sizing_mode=fig.sizing_mode, margin=0), **(TALL if tall else WIDE))
 
 
-def grid(columns: str, narrow: str = "minmax(0, 1fr)") -> str:
+def grid_style(columns: str, narrow: str = "minmax(0, 1fr)") -> str:
     """Return the style of a Column as a grid of these columns, others on a narrow window; its button to scroll takes no cell."""
     return f"""
 :host {{ display: grid !important; grid-template-columns: {columns}; gap: 10px; }}
@@ -129,7 +129,7 @@ def grid(columns: str, narrow: str = "minmax(0, 1fr)") -> str:
 """
 
 
-HALVES = grid("minmax(0, 1fr) minmax(0, 1fr)")
+HALVES = grid_style("minmax(0, 1fr) minmax(0, 1fr)")
 """Two figures beside each other."""
 
 
