@@ -25,7 +25,7 @@ TRAIL, POINTS = 0.2, 60
 """Length of the trail of the star [s], and its points."""
 SIDE = 150
 """Of a detector at least [px]."""
-GRID = grid_style(CELLS := "repeat(auto-fill, minmax(150px, 1fr))", CELLS)
+GRID = grid_style(CELLS := "repeat(auto-fill, minmax(180px, 1fr))", CELLS)
 FWHM = 1.03
 """Full width at half maximum of an Airy pattern, in wavelengths over the diameter."""
 
