@@ -158,13 +158,22 @@ class TestTraces:
 class TestSpectra:
     def test_signal_and_error(self, dashboard: Dashboard) -> None:
         shown, view = dashboard.store.run.result, dashboard.explore.spectra.spectra["vibration"]
-        spectrum = shown.spectra["gpr-offline", "vibration"]
+        spectrum = shown.spectra["gpr-online", "vibration"]
         dashboard.display.show = "signal"
-        assert np.allclose(view.sources["gpr-offline"].data["y"], 1e6 * spectrum.signal[1:, 0])
+        assert np.allclose(view.sources["gpr-online"].data["y"], 1e6 * spectrum.signal[1:, 0])
         truth = np.asarray(view.sources[TRUTH].data["y"])
         dashboard.display.show = "error"
-        assert np.allclose(view.sources["gpr-offline"].data["y"], 1e6 * spectrum.error[1:, 0])
+        assert np.allclose(view.sources["gpr-online"].data["y"], 1e6 * spectrum.error[1:, 0])
         assert np.array_equal(view.sources[TRUTH].data["y"], truth), "the error of answering zero"
+
+    def test_what_is_hidden_is_sent_once_it_is_shown(self, dashboard: Dashboard) -> None:
+        display, view = dashboard.display, dashboard.explore.spectra.spectra["vibration"]
+        spectrum = dashboard.store.run.result.spectra["gpr-offline", "vibration"]
+        assert "gpr-offline" in display.hidden_lines["vibration"] and len(view.sources["gpr-offline"].data["y"]) == 0
+        assert np.isnan(trace(dashboard, "vibration")["gpr-offline"]).all()
+        display.hidden_lines = {**display.hidden_lines, "vibration": []}
+        assert np.allclose(view.sources["gpr-offline"].data["y"], 1e6 * spectrum.error[1:, 0])
+        assert np.isfinite(trace(dashboard, "vibration")["gpr-offline"]).any()
 
     def test_unit(self, dashboard: Dashboard) -> None:
         dashboard.display.unit = "um"

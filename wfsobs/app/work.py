@@ -76,7 +76,7 @@ class _Work:
         self.growing: dict[Key, Array] = {}  # written to by the observers' threads
         self.spectra: dict[Key, SignalAndError] = {}
         self.start_time = self.report_time = self.delivery_time = perf_counter()
-        self.news = False  # since the last delivery
+        self.news = False  # since the last delivery, of observers that run
         self.fraction = 0.0
         self.stage = 0
         self.lock, self.telling = threading.Lock(), threading.Lock()
@@ -103,7 +103,7 @@ class _Work:
                     self.failures.append(item)
                 else:
                     self._add(record, item)
-                self.news = True
+                self.news = self.news or item.observer not in known.known_observers
                 left = self._left()
                 due = (stage := _stage(left)) > self.stage and (left or self.bounds is None)
                 self.stage = stage

@@ -14,6 +14,9 @@ import param
 class Real(param.Number):
     """A finite number; integers become floats, booleans and NaN are refused."""
 
+    __get__ = param.Parameter.__get__
+    """Without param's look for a function that makes the number, which takes most of the time of reading settings."""
+
     def __set__(self, obj: Any, val: Any) -> None:
         super().__set__(obj, _as_float(val))
 
@@ -25,6 +28,8 @@ class Real(param.Number):
 
 class Whole(param.Integer):
     """A whole number; booleans are refused."""
+
+    __get__ = param.Parameter.__get__
 
     def _validate_value(self, val: Any, allow_None: bool) -> None:
         if isinstance(val, bool):

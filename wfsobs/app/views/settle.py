@@ -12,7 +12,7 @@ SETTLE_MS = 60
 """A zoom is answered when the window has not moved for this long."""
 
 
-AFTERWARDS_MS = 250
+AFTERWARDS_MS = 500
 """What a change has beside its picture is told this much later: until then the processors are the run's and the browser's."""
 
 

@@ -80,14 +80,13 @@ class _Spectrum:
         diameter, error = results.scenario.telescope.diameter, shows_error(results, self.target, display)
         drawn: list[Array] = []
         for name, source in self.sources.items():
-            spectrum = spectra.get((name, self.target))
-            if spectrum is None:
+            spectrum = spectra.get((name, self.target)) if self.lines[name].visible else None
+            if spectrum is None:  # what is hidden is sent when it is shown
                 send(source, {"x": [], "y": []})
                 continue
             y = _curve(spectrum, error and name != TRUTH, display, diameter)
             send(source, {"x": spectrum.frequency[1:], "y": y})
-            if self.lines[name].visible:
-                drawn.append(y)
+            drawn.append(y)
         self._fit(drawn + self._draw_compared(display, error), display.cumulative)
         of = " of error" if error else ""
         what, unit = (

@@ -142,9 +142,10 @@ class _Trace:
         """Send the samples first ... last - 1 of every line."""
         scale = per_micrometre(display.unit, results.scenario.telescope.diameter)
         data: dict[str, Any] = {"x": envelope_times(first, last, BINS, results.result.record.dt)}
-        for name in self.names:
-            values = _line(results, name, self.target, display, first, last)
-            data[name] = (scale * envelope(values, BINS)).astype(np.float32)
+        nothing = np.full(len(data["x"]), np.nan, np.float32)
+        for name, line in self.lines.items():  # what is hidden is sent when it is shown
+            values = _line(results, name, self.target, display, first, last) if line.visible else None
+            data[name] = nothing if values is None else (scale * envelope(values, BINS)).astype(np.float32)
         send(self.source, data)
         warm_up = results.scenario.run.warm_up
         self.warm_up.right = warm_up
