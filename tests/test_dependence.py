@@ -18,10 +18,11 @@ from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.estimates import Estimate
 from wfsobs.priors_from.scenario import prior_and_settings
+from wfsobs.priors_from.selection import usual_observers
 from wfsobs.record import Record
 from wfsobs.result import Failure
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.idle import idle_settings, used_settings
+from wfsobs.scenario.idle import idle_settings, used_settings, why_idle_at
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.errors import SettingError
 from wfsobs.settings.parameters import Reals
@@ -171,6 +172,28 @@ def test_what_is_known_is_what_a_whole_run_gives() -> None:
     assert digest(record_bounds(told_otherwise, record)) == digest(record_bounds(BASE, record))
 
 
+@pytest.mark.parametrize("preset", ["ut4", "higher-orders"])
+def test_no_setting_of_a_preset_changes_an_estimate_that_is_known(preset: str) -> None:
+    """Of the observers that a change may reach, those that do not run again have what a run of their own gives, bit by bit."""
+    base = PRESETS[preset]().replace({**QUICK, "run.duration": 0.4})
+    memo, idle = Memo(), idle_settings(base)
+    record = simulate_once(base, memo)
+    names = [name for name in usual_observers(base, record) if not OBSERVERS[name].slow]
+    kept = list(each_estimate(record, base, observers=names, memo=RecordMemo(memo, record)))
+    changes = {path: s for path, s in changes_of(base).items() if record_settings(s) == record_settings(base)}
+    told = 0
+    for path, changed in changes.items():
+        if why_idle_at(path, idle):
+            continue  # test_record_priors_and_bounds_stay
+        now, reached = simulate_once(changed, memo), observers_reached(base, changed)
+        assert reached is not None, path
+        known = RecordMemo(memo, now)
+        found = estimates(now, changed, sorted(reached.intersection(names)), known)
+        recalled, told = sorted(known.known_observers), told + len(known.known_observers)
+        assert {key: value for key, value in found.items() if key[0] in recalled} == estimates(now, changed, recalled), path
+    assert kept and told
+
+
 CASES = {
     "multipeak.line_width": set(),
     "multipeak.turbulence_order": {"kf-multi", "multirate-multi", "gp-lgs", "gp-both"},
@@ -235,6 +258,13 @@ class TestReuse:
         ran = {e.observer for e in found if not any(e is old for old in kept)}
         assert ran == {name for name in ON_PAPER if "ngs" in OBSERVERS[name].sensors}
         assert known.known_observers == set(ON_PAPER) - ran
+
+    def test_a_noise_that_is_stated_as_it_is_runs_no_filter_of_the_ngs(self, before: tuple[Memo, Record, list[Any]]) -> None:
+        memo, record, _kept = before
+        assert BASE.kalman.ngs_noise == BASE.sensors.ngs_noise, "so that it is the same number, by another way"
+        changed, known = BASE.replace({"kalman.measurement_noise": "manual"}), RecordMemo(memo, record)
+        list(each_estimate(record, changed, observers=["kf-ngs", "kf-lgs"], memo=known))
+        assert known.known_observers == {"kf-ngs"}
 
     def test_what_follows_from_an_estimate_is_of_the_truth_too(self, before: tuple[Memo, Record, list[Any]]) -> None:
         memo, record, kept = before

@@ -45,7 +45,8 @@ def test_a_record_comes_back_as_it_was(record, tmp_path):
 
 
 def test_the_least_record(tmp_path):
-    save_arrays(tmp_path / "r.npz", {"y_lgs": np.zeros((9, 1)), "u": np.zeros((9, 1), dtype=">f4"), "dt": np.float32(0.002)})
+    y = np.arange(9.0)[:, None]
+    save_arrays(tmp_path / "r.npz", {"y_lgs": y, "u": np.zeros((9, 1), dtype=">f4"), "dt": np.float32(0.002)})
     record = load_record(tmp_path / "r.npz")
     assert (record.n_steps, record.n_modes, record.y_ngs, record.ratio, record.training) == (9, 1, None, None, None)
     assert record.u.dtype == np.float64
@@ -79,6 +80,9 @@ WRONG = [
     (lambda a: changed(a, "y_ngs", 7, 0.0), "y_ngs has a frame at step 7; with ratio = 5"),
     (lambda a: changed(a, "y_lgs", 3, -np.inf), "y_lgs is -inf at step 3, mode 0; it takes finite numbers"),
     (lambda a: changed(a, "y_lgs", slice(None), np.nan), "y_lgs holds no measurement of one of its modes"),
+    (lambda a: a | {"y_lgs": np.zeros((40, 2))}, "y_lgs is 0 at every step in mode 0: a measurement has noise"),
+    (lambda a: changed(a, "y_lgs", slice(None), 0.1), "y_lgs is the same number at every step in mode 0"),
+    (lambda a: a | {"y_ngs": 0.0 * a["y_ngs"]}, "y_ngs is 0 at every step in mode 0"),
     (lambda a: a | {"training_y": changed(a, "u", 2, np.nan)["u"], "training_u": a["u"]}, "training_y is nan at step 2, mode 0"),
     (lambda a: changed(a, "u", 4, np.inf), "u is inf at step 4, mode 0"),
     (lambda a: a | {"training_y": a["u"]}, "training_y and training_u must come together"),

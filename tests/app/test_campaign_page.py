@@ -94,7 +94,7 @@ def test_a_campaign_is_followed_and_opened(dashboard: Dashboard, loop: Any, plan
     y = page.slice.sources["kf-lgs"].data["y"]
     rms = {c.cell: c.rms for c in compare(read_results(tmp_path)) if (c.target, c.mode, c.name) == ("vibration", "tip", "kf-lgs")}
     assert y == pytest.approx([(rms[0] * rms[1]) ** 0.5, (rms[2] * rms[3]) ** 0.5]), "geometric mean over the other condition"
-    page.filters["sensors.exposure_ratio"].value = 0
+    page.filters["sensors.exposure_ratio"].value = "5"
     assert page.slice.sources["kf-lgs"].data["y"] == pytest.approx([rms[0], rms[2]])
     page.map._handle_msg({"load": 3})
     opened = plan.cells[3].scenario().replace({"run.seed": 7})
@@ -102,6 +102,25 @@ def test_a_campaign_is_followed_and_opened(dashboard: Dashboard, loop: Any, plan
     for nothing in (-1, 4):
         page.load(nothing)
     assert dashboard.store.scenario == opened
+
+
+def test_a_reload_returns_to_the_fields(dashboard: Dashboard, loop: Any) -> None:
+    said = dashboard.view_state.open(
+        "view.page=campaign&view.campaign.target=vibration&view.campaign.only.sensors.exposure_ratio=7"
+    )
+    page = open_campaign(dashboard, loop)
+    assert said == [] and "only.sensors.exposure_ratio = 7: takes one of , 5, 10" in page.failure.object
+    assert page.target.value == "vibration" and page.filters["sensors.exposure_ratio"].value == ""
+    page.across.value, page.down.value = "sensors.exposure_ratio", ""
+    page.filters["turbulence.wind_speed"].value = "20"
+    page.lines.value = ["persistence", "bound"]
+    query, square = dashboard.view_state.query, squares(page)
+    assert "view.campaign.only.turbulence.wind_speed=20" in query and "view.campaign.lines=persistence,bound" in query
+    assert dashboard.view_state.open("view.page=campaign") == [], "a fresh page"
+    assert page.target.value == "turbulence" and squares(page) != square and dashboard.view_state.query == "view.page=campaign"
+    assert dashboard.view_state.open(query) == []
+    assert (page.across.value, page.down.value, page.lines.value) == ("sensors.exposure_ratio", "", ["persistence", "bound"])
+    assert squares(page) == square and dashboard.view_state.query == query
 
 
 def test_without_a_campaign_there_is_no_such_page(loop: Any, short: Scenario, enter: Callable[..., Session]) -> None:

@@ -46,6 +46,16 @@ def previewed(dashboard: Dashboard, loop: Any, content: bytes, name: str = "nigh
     loop.until(lambda: not dashboard.upload.picker.message.startswith(("Reading", "Waiting")))
 
 
+def test_what_was_refused_before_is_not_said_once_a_record_is_used(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
+    dashboard.upload.handle({"action": "scenario", "name": "broken.toml", "text": "[run"})
+    loop.until(lambda: dashboard.actions.toolbar.notes)
+    assert dashboard.actions.toolbar.notes[0].startswith("broken.toml: ")
+    previewed(dashboard, loop, b"time_s,a\n0,1\n", "none.csv")
+    previewed(dashboard, loop, file_of(short))
+    dashboard.upload.confirm()
+    assert dashboard.actions.toolbar.notes == [] and dashboard.upload.picker.message == ""
+
+
 def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
     content = file_of(short)
     before = dashboard.store.run.result

@@ -29,6 +29,9 @@ CASES: dict[str, tuple[dict[str, Any], set[str]]] = {
     "delay": ({"control.delay": 3.0}, set(CONTROLLERS)),
     "stroke": ({"control.stroke": 0.3}, set(CONTROLLERS)),
     "an observer's own": ({"adaptive.window": 3.0}, set()),
+    "what only the Strehl ratio is of": ({"control.wavelength": 1.6}, set()),
+    "windows, which are of z in the loop": ({"gpr_online.inputs": "z"}, set()),
+    "a width below that of every line": ({"multipeak.line_width": 0.011}, set()),
 }
 
 

@@ -80,6 +80,7 @@ class Actions:
         self._view: ViewState | None = None
         self.open_history: Callable[[], None] = lambda: None
         store.param.watch(once(self._refresh, AFTERWARDS_MS), ["scenario", "preset", "source", "wanted_record"])
+        store.param.watch(lambda _event: self.toolbar.param.update(notes=[]), "source")  # of files before the one that is used
         store.run.param.watch(lambda event: self.toolbar.param.update(ready=event.new is not None), "result")
         self._refresh()
 
@@ -159,8 +160,7 @@ class Actions:
 
     def save_scenario(self) -> None:
         """Send the settings as TOML."""
-        text = to_file(self.store.scenario, self.store.preset)
-        self.toolbar.save(FILE, "application/toml", text.encode())
+        self.toolbar.save(FILE, "application/toml", to_file(self.store.scenario, self.store.preset).encode())
 
     def save_data(self, name: str, kind: str, make: Callable[[RunResults], bytes]) -> None:
         """Make a file of the results shown, beside the page, and send it."""

@@ -141,7 +141,8 @@ def truth(record: Record) -> Array:
 def _name(controller: Controller, designs: Sequence[LawDesign], record: Record, plan: Design) -> str:
     """Return the name of an outcome: what it depends on; empty where a law or a prior has no value to compare."""
     used, settings = used_settings(plan.scenario), own_settings(controller, plan.scenario)
-    own, laws = [used.get(name) for name in controller.groups], [(d.law, d.stable, d.note) for d in designs]
+    own = [used.get(name) for name in controller.groups] if controller.counts is None else controller.counts(settings)
+    laws = [(d.law, d.stable, d.note) for d in designs]
     try:
         _, prior = controller_arguments(controller, record, settings, plan.priors[controller.id])
         return digest("outcome", controller.id, laws, own, record_digest(record), prior, plan.plant, plan.start)

@@ -75,6 +75,8 @@ class Controller:
         Line in figures.
     step_predict : callable or None
         (prior, plant, settings, sampling) -> its prediction, one frame at a time; None without one.
+    counts : callable or None
+        Settings -> what of them its commands depend on beside its laws, as plain values; None for all that have an effect.
 
     Raises
     ------
@@ -96,6 +98,7 @@ class Controller:
     seconds: Callable[[Any, int, int], float] | None = None
     look: Look = PLAIN
     step_predict: StepPredict | None = None
+    counts: Callable[[Any], Any] | None = None
 
     def __post_init__(self) -> None:
         if self.predict is not None and not asks_for(Bands, self.prior):

@@ -10,7 +10,7 @@ from wfsobs.control.integrator import best_gain, integrator_law
 from wfsobs.control.law import Law
 from wfsobs.control.lqg import lqg_kf_lgs, lqg_kf_multi, lqg_multirate, lqg_multirate_multi, lqg_multirate_optimal
 from wfsobs.control.mirror import Plant
-from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead, step_gpr_offline_ahead, step_gpr_online_ahead
+from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead, of_z, step_gpr_offline_ahead, step_gpr_online_ahead
 from wfsobs.observers.base import Look
 from wfsobs.observers.kalman.multirate import matched_noise
 from wfsobs.prior import (
@@ -28,6 +28,7 @@ from wfsobs.prior import (
     Training,
 )
 from wfsobs.registry import Registry
+from wfsobs.settings.tree import Plain
 
 
 def integrator(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
@@ -53,6 +54,18 @@ def _matched_noise(settings: Any) -> tuple[Part, ...]:
     return matched_noise(settings.multirate)
 
 
+def _nothing_more(_settings: Any) -> None:
+    """Return what counts of the settings beside the laws that were made of them."""
+
+
+def _offline_used(settings: Any) -> Plain:
+    return of_z(settings.gpr_offline).effective_values()
+
+
+def _online_used(settings: Any) -> Plain:
+    return of_z(settings.gpr_online).effective_values()
+
+
 def _online_seconds(settings: Any, n_steps: int, n_modes: int) -> float:
     """One sample at a time takes a step of 0.1 ms + 0.7 ns m^2."""
     return n_steps * n_modes * (1e-4 + 0.7e-9 * settings.gpr_online.training_size**2)
@@ -72,6 +85,7 @@ CONTROLLERS = Registry(
             help="u[k] = leak u[k-1] - g y[k]",
             settings=("control",),
             asks=_gain,
+            counts=_nothing_more,
             look=Look("Integrator", "#003DE6", "#7AA2FF"),
         ),
         Controller(
@@ -89,6 +103,7 @@ CONTROLLERS = Registry(
             help="minus what the Kalman filter of every peak predicts",
             prior=(Lines, LgsStars),
             settings=("multipeak",),
+            counts=_nothing_more,
             look=Look("LQG multi-peak", "#00707F", "#4DD0E1", (14, 3)),
         ),
         Controller(
@@ -100,6 +115,7 @@ CONTROLLERS = Registry(
             asks=_matched_noise,
             settings=("multirate",),
             ngs=True,
+            counts=_nothing_more,
             look=Look("LQG multi-rate", "#E31FFF", "#F08BFF", (10, 2, 2, 2)),
         ),
         Controller(
@@ -111,6 +127,7 @@ CONTROLLERS = Registry(
             asks=_matched_noise,
             settings=("multirate",),
             ngs=True,
+            counts=_nothing_more,
             look=Look("LQG optimal", "#7A1FA2", "#C9A0FF", (3, 2)),
         ),
         Controller(
@@ -122,6 +139,7 @@ CONTROLLERS = Registry(
             asks=_matched_noise,
             settings=("multirate", "multipeak"),
             ngs=True,
+            counts=_nothing_more,
             look=Look("LQG opt. peaks", "#B40000", "#FF7A70", (8, 3)),
         ),
         Controller(
@@ -135,6 +153,7 @@ CONTROLLERS = Registry(
             settings=("control", "gpr_offline"),
             asks=_gain,
             weight=20.0,
+            counts=_offline_used,
             look=Look("Int. + offline", "#0A960A", "#4FD64F", (12, 2, 2, 2, 2, 2)),
         ),
         Controller(
@@ -149,6 +168,7 @@ CONTROLLERS = Registry(
             asks=_gain_and_scale,
             weight=200.0,
             seconds=_online_seconds,
+            counts=_online_used,
             look=Look("Int. + online", "#004B00", "#A6E3A6", (10, 2, 2, 2)),
         ),
     ),

@@ -52,7 +52,7 @@ def measurement_noise(scenario: Scenario, mode: int) -> tuple[float, float]:
     k = scenario.kalman
     if k.measurement_noise == "manual":
         return k.lgs_noise, k.ngs_noise
-    return max(lgs_noise_rms(scenario, mode), MIN_NOISE), max(noise_rms(scenario, "ngs")[mode], MIN_NOISE)
+    return max(lgs_noise_rms(scenario, mode), MIN_NOISE), max(float(noise_rms(scenario, "ngs")[mode]), MIN_NOISE)
 
 
 def lines_turbulence(

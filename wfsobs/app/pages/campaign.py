@@ -16,6 +16,7 @@ from wfsobs.app.copies import CAMPAIGN, EXPLORED, CopiedTask
 from wfsobs.app.display import Display
 from wfsobs.app.jobs.job import FAILED
 from wfsobs.app.pages.campaign_views import CampaignView, Slice, axis_name, standings_html, value_names, winners_grid
+from wfsobs.app.pages.link import LinkedFields, LinkedLater
 from wfsobs.app.pages.parts import WIDE, PageActions, box, html, legend, line, text
 from wfsobs.app.pages.sweep_settings import line_of
 from wfsobs.app.pages.sweep_views import SweepMap
@@ -29,7 +30,7 @@ from wfsobs.settings.errors import SettingError
 
 PERIOD = 5000
 """Time between two looks at a campaign that is not finished [ms]."""
-NONE = ""
+NONE = ALL = ""
 FIRST_LINES = 5
 """Observers whose lines are shown first: the best ones."""
 SHADES = (
@@ -54,6 +55,7 @@ class CampaignPage(PageActions):
         self.slice: Slice | None = None
         self.axes: dict[str, PlanAxis] = {}
         self.filters: dict[str, Any] = {}
+        self.link = self._fields = LinkedLater()
         self.visible, self._targets = False, list[str]()
         self.work.param.watch(self._take, ["state", "result"])
         self.work.param.watch(self._say, ["state", "progress", "place", "message"])
@@ -150,8 +152,8 @@ class CampaignPage(PageActions):
         self.filters = {
             path: pmui.Select(
                 label=f"Only {axis_name(axis, base)}",
-                options={"all": -1, **{name: i for i, name in enumerate(value_names(axis))}},
-                value=-1,
+                options={"all": ALL, **{name: name for name in value_names(axis)}},
+                value=ALL,
                 **style,
             )
             for path, axis in self.axes.items()
@@ -163,7 +165,11 @@ class CampaignPage(PageActions):
         self.lines = pmui.MultiChoice(
             label="Lines", options={name_label(name): name for name in (*known, *bounds)}, value=[*best, *bounds], **WIDE
         )
-        for field in (self.target, self.across, self.down, self.lines, *self.filters.values()):
+        only = {f"only.{path}": field for path, field in self.filters.items()}
+        linked = {"target": self.target, "across": self.across, "down": self.down, **only, "lines": self.lines}
+        if refused := self._fields.make(LinkedFields(**linked)):
+            self._refuse(f"Not used from the link: {', '.join(refused)}")
+        for field in linked.values():
             field.param.watch(lambda _: self.draw(), "value")
         fields = [line(self.target, self.across, self.down), line(*self.filters.values())] if self.axes else [line(self.target)]
         self.room[:] = [box("Conditions", *fields), box("Observers", self.table)]
@@ -181,8 +187,9 @@ class CampaignPage(PageActions):
         modes = [mode for known, mode in state.errors if known == target]
         cells = np.arange(len(state.plan.cells))
         for path, field in self.filters.items():
-            if field.value >= 0:
-                cells = cells[self.axes[path].of_cell[cells] == field.value]
+            if field.value != ALL:
+                axis = self.axes[path]
+                cells = cells[axis.of_cell[cells] == value_names(axis).index(field.value)]
         if not modes or not len(cells):
             return None
         mode = self.display.mode if self.display.mode in modes else modes[0]
