@@ -156,7 +156,7 @@ class RecordMemo:
         self.memo, self.record = memo, record_digest(record)
         self.known_observers: set[str] = set()
         self._of = record
-        self._names: dict[tuple[str, str], str] = {}
+        self._names: dict[str, str] = {}
         self._signals: dict[frozenset[str], str] = {}
 
     def name(self, observer: Observer, prior: Prior, own: Plain | None) -> str:
@@ -173,20 +173,20 @@ class RecordMemo:
         if any(e is None for e in found):
             return name, []
         self.known_observers.add(observer.id)
-        self._names |= {(observer.id, target): name for target in observer.targets}
+        self._names[observer.id] = name
         return name, found
 
     def note(self, name: str, estimate: Estimate) -> None:
         """Note an estimate of this name."""
-        self._names[estimate.observer, estimate.target] = name
+        self._names[estimate.observer] = name
         self.memo.put(f"{name} {estimate.target}", estimate)
 
     def derive(self, estimate: Estimate, what: str, make: Callable[[], T]) -> T:
-        """Return what follows from an estimate and the record alone; made where it is not known.
+        """Return what follows from an estimate of an observer, or from all together, and the record; made where it is not known.
 
         what : says what it is, and on what else it depends
         """
-        of = self._names.get((estimate.observer, estimate.target))
+        of = self._names.get(estimate.observer)
         if of is None:
             return make()
         return self.memo.keep(f"{what} of {of} {estimate.target} in {self.record}", make)

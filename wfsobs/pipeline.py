@@ -10,7 +10,7 @@ import numpy as np
 
 from wfsobs.dependence import RecordMemo
 from wfsobs.evaluation.record_bounds import Bound, bound_scores, record_bounds
-from wfsobs.evaluation.scores import Derive, make_anew, score
+from wfsobs.evaluation.scores import SCORED, Derive, make_anew, score
 from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.estimates import Estimate
@@ -179,7 +179,7 @@ def collect(
     known = record.turbulence is not None or record.vibration is not None
     scores = score(record, ordered, warm_up=warm_up, mode_names=names, derive=derive)
     if known:
-        scores.sort(key=lambda s: (order[s.observer], s.target))
+        scores.sort(key=lambda s: (order[s.observer], SCORED.index(s.target)))
     scores += bound_scores(least, record, scores, warm_up)
     failed = tuple(sorted(failures, key=lambda f: order[f.observer]))
     return Result(scenario, record, tuple(ordered), tuple(scores), failed, source)

@@ -201,7 +201,9 @@ class Record(Signals):
         )
 
     def truth(self, target: str) -> Array | None:
-        """Return the true signal of `target` ("turbulence" or "vibration"), or None."""
+        """Return the true signal of `target` ("turbulence", "vibration", or "total", their sum), or None."""
+        if target == "total":
+            return None if self.turbulence is None or self.vibration is None else self.turbulence + self.vibration
         return {"turbulence": self.turbulence, "vibration": self.vibration}[target]
 
 

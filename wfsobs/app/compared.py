@@ -13,7 +13,7 @@ from wfsobs.app.numerals import NOTHING, change, number
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.work import TRUTH, Key, RunResults, SignalAndError
-from wfsobs.evaluation.rows import row_label
+from wfsobs.evaluation.rows import row_label, target_title
 from wfsobs.evaluation.scores import Score
 from wfsobs.observers.base import TARGETS
 from wfsobs.result import Result
@@ -92,5 +92,5 @@ def comparison_of(runs: Sequence[ComparedRun], result: Result) -> dict[str, Any]
     return {
         "runs": [[run.letter, run.name] for run in runs],
         "columns": ["Observer", "shown [nm]", *(f"{run.letter} [nm]" for run in runs)],
-        "groups": [[f"{target.capitalize()}, {mode}", rows] for (target, mode), rows in groups.items()],
+        "groups": [[f"{target_title(target)}, {mode}", rows] for (target, mode), rows in groups.items()],
     }

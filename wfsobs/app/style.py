@@ -21,7 +21,8 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.budget import CONE, LAG, LINES, MISMATCH, NOISE
 from wfsobs.evaluation.scores import BOUND, BOUND_ASTERISM, BOUND_BOTH, BOUND_BOTH_MODES, BOUND_MODES, BOUND_STARS
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import PLAIN, Look
+from wfsobs.observers.base import PLAIN, TARGETS, Look
+from wfsobs.observers.estimates import TOTAL
 
 LOOKS: Mapping[str, Look] = MappingProxyType(
     {
@@ -113,11 +114,12 @@ def labels() -> dict[str, str]:
 
 
 def observers_of(target: str, with_hidden: bool = False) -> list[str]:
-    """List the observers that estimate a target, in the order of the registry.
+    """List the observers that estimate a target, or both for TOTAL, in the order of the registry.
 
     with_hidden : also those that stand in tables only
     """
-    return [o.id for o in OBSERVERS.values() if target in o.targets and (with_hidden or o.look.in_figures)]
+    wanted = set(TARGETS if target == TOTAL else (target,))
+    return [o.id for o in OBSERVERS.values() if wanted <= set(o.targets) and (with_hidden or o.look.in_figures)]
 
 
 def asset(name: str) -> str:

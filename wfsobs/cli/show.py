@@ -17,6 +17,7 @@ from wfsobs.cli.tables import score_table
 from wfsobs.evaluation.budget import Budget, budget_row, error_budget
 from wfsobs.evaluation.rows import TIME, Row
 from wfsobs.evaluation.verdict import explain_harm, verdict
+from wfsobs.observers.base import TARGETS
 from wfsobs.progress import Watch
 from wfsobs.result import Result
 
@@ -45,7 +46,7 @@ def show_table(table: Table) -> None:
 
 def show_verdicts(result: Result, budgets: Sequence[Budget] = ()) -> None:
     """Print what the table of a simulated record says, a paragraph per target and mode; budgets : those that are known."""
-    of = dict.fromkeys((s.target, s.mode) for s in result.scores)
+    of = dict.fromkeys((s.target, s.mode) for s in result.scores if s.target in TARGETS)
     known = [*explain_harm(result), *budgets]
     given = result.scenario, result.record, result.estimates, result.scores
     found = (verdict(*given, *key, simulation=result.scenario, budgets=known) for key in of)

@@ -8,7 +8,7 @@ from statistics import median
 from rich.table import Table
 
 from wfsobs.evaluation.rows import TIME, Row, interval_text, is_non_causal, own_interval, row_label, scored_interval
-from wfsobs.evaluation.scores import RESIDUAL
+from wfsobs.evaluation.scores import PREDICTION, RESIDUAL, SCORED
 
 
 def score_table(rows: Sequence[Row]) -> Table:
@@ -75,11 +75,12 @@ def _number(same: Sequence[Row], key: str, scale: float, digits: int) -> str:
 
 
 def _order(rows: Sequence[Row]):
-    """Turbulence before vibration, modes as they come, best observer first, those that stand apart last."""
+    """Turbulence, vibration, then both together; modes as they come, best observer first, those that stand apart last."""
     modes = list(dict.fromkeys(r["mode"] for r in rows))
+    targets = (*SCORED, PREDICTION, RESIDUAL)
 
     def key(group: tuple[str, str, str]) -> tuple:
         same = [r for r in rows if (r["target"], r["mode"], r["observer"]) == group]
-        return group[0], modes.index(group[1]), any(r["apart"] for r in same), median(r["rms_um"] for r in same)
+        return targets.index(group[0]), modes.index(group[1]), any(r["apart"] for r in same), median(r["rms_um"] for r in same)
 
     return key

@@ -27,7 +27,7 @@ from wfsobs.evaluation.rows import NO_ESTIMATE
 from wfsobs.evaluation.scores import BOUND, Score
 from wfsobs.evaluation.sources import CONE, LINES, NOISE, SIGNAL, Source, split_record
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import Observer
+from wfsobs.observers.base import TARGETS, Observer
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
@@ -133,7 +133,7 @@ def error_budget(
     out: list[Budget] = []
     for i, name in enumerate(chosen):
         watch.step(i / len(chosen))
-        own = [s for s in result.scores if s.observer == name and mode in (None, s.mode)]
+        own = [s for s in result.scores if s.observer == name and s.target in TARGETS and mode in (None, s.mode)]
         if name != NO_ESTIMATE and own:
             values = {e.target: e.values for e in result.estimates if e.observer == name}
             bounds = {(s.target, s.mode): s.rms**2 for s in result.scores if s.observer == BOUND}

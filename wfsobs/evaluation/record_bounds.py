@@ -17,9 +17,17 @@ from wfsobs.evaluation.bound_both import PeriodicError, least_errors_of_both
 from wfsobs.evaluation.bound_modes import least_errors_of_modes
 from wfsobs.evaluation.bound_stars import least_errors_of_stars
 from wfsobs.evaluation.memory import keep_freed_memory
-from wfsobs.evaluation.scores import BOUND, BOUND_ASTERISM, BOUND_BOTH, BOUND_BOTH_MODES, BOUND_MODES, BOUND_STARS, Score
+from wfsobs.evaluation.scores import (
+    BOUND,
+    BOUND_ASTERISM,
+    BOUND_BOTH,
+    BOUND_BOTH_MODES,
+    BOUND_MODES,
+    BOUND_STARS,
+    SCORED,
+    Score,
+)
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import TARGETS
 from wfsobs.priors_from.selection import has_prior
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
@@ -80,7 +88,7 @@ def record_bounds(scenario: Scenario, record: Record, observers: Collection[str]
         Bound(row, target, it.name, i, errors[target])
         for i, it in enumerate(scenario.modes[: record.n_modes])
         for row, errors in found[i].items()
-        for target in TARGETS
+        for target in SCORED
     ]
 
 

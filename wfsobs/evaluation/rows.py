@@ -18,6 +18,7 @@ from wfsobs.evaluation.scores import (
 )
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import SPECTRA
+from wfsobs.observers.estimates import TOTAL
 from wfsobs.prior import TRUE, PriorSource
 
 Row = dict[str, Any]
@@ -35,6 +36,11 @@ NOT_OBSERVERS = {
     BOUND_ASTERISM: "Bound, every LGS in all modes, and NGS",
 }
 """Labels of rows in a table of observers that are not observers."""
+
+
+def target_title(target: str) -> str:
+    """Return a target as the beginning of a heading."""
+    return "Turbulence and vibration together" if target == TOTAL else target.capitalize()
 
 
 NO_ESTIMATE = "zero"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import blake2b
 
@@ -13,11 +13,14 @@ from wfsobs.evaluation.calibration import Calibration, calibration
 from wfsobs.evaluation.lag import lag
 from wfsobs.evaluation.samples import common_samples, samples_after, stretch_of
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.estimates import NEXT_Z, Estimate
+from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimate
 from wfsobs.record import Record
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.signal.welch import rms
 from wfsobs.typing import Array
+
+SCORED = (*TARGETS, TOTAL)
+"""What errors are of where there is a truth: what observers estimate, and the sum of both, which a mirror would follow."""
 
 PREDICTION, RESIDUAL = NEXT_Z, "residual y"
 """Targets where there is no truth: the next measurement, and the residual of the loop."""
@@ -41,7 +44,7 @@ class Score:
     Attributes
     ----------
     observer, target, mode : str
-        What was scored.
+        What was scored; target "total" is the sum of turbulence and vibration.
     rms : float
         RMS error [um].
     truth_rms : float
@@ -115,7 +118,7 @@ def score(
     Returns
     -------
     list of Score
-        One per estimate and mode.
+        One per estimate and mode, and one of the sum of both estimates of an observer.
     """
     names = [m.name for m in modes_up_to(HIGHEST_ORDER)][: record.n_modes] if mode_names is None else list(mode_names)
     known = record.turbulence is not None or record.vibration is not None
@@ -131,9 +134,9 @@ def supervised_scores(
 
     None for a target without truth or where no sample is left.
     """
-    out = []
-    for target in TARGETS:
-        truth, of = record.truth(target), [e for e in estimates if e.target == target]
+    out, every = [], [*estimates, *_totals(estimates)]
+    for target in SCORED:
+        truth, of = record.truth(target), [e for e in every if e.target == target]
         if truth is None:
             continue
         for mode, name in enumerate(mode_names):
@@ -144,8 +147,30 @@ def supervised_scores(
             for e, (samples, apart) in zip(of, scored, strict=True):
                 if samples.any():
                     make = partial(_score_mode, e, true, mode, name, record.dt, samples, apart)
-                    out.append(derive(e, f"score {mode} {name} {words[id(samples)]} {apart}", make))
+                    out.append(derive(e, f"score {target} {mode} {name} {words[id(samples)]} {apart}", make))
     return out
+
+
+def _totals(estimates: Sequence[Estimate]) -> list[Estimate]:
+    """Return the estimate of the sum of turbulence and vibration of every observer that estimates both."""
+    return [
+        replace(
+            parts[0],
+            target=TOTAL,
+            values=np.sum([e.values for e in parts], axis=0),
+            seconds_per_step=max(e.seconds_per_step for e in parts),
+            sd=parts[0].sd_of_sum.get(TOTAL),
+        )
+        for parts in _of_both(estimates).values()
+    ]
+
+
+def _of_both(estimates: Sequence[Estimate]) -> dict[str, list[Estimate]]:
+    """Return the estimates of every observer that has both targets."""
+    whole: dict[str, list[Estimate]] = {}
+    for estimate in estimates:
+        whole.setdefault(estimate.observer, []).append(estimate)
+    return {observer: parts for observer, parts in whole.items() if {e.target for e in parts} == set(TARGETS)}
 
 
 def _score_mode(e: Estimate, true: Array, mode: int, name: str, dt: float, samples: Array, apart: bool) -> Score:
@@ -175,10 +200,7 @@ def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: 
     - RESIDUAL: rms of y_lgs, the residual of the recorded loop.
     """
     out: list[Score] = []
-    whole: dict[str, list[Estimate]] = {}
-    for estimate in estimates:
-        whole.setdefault(estimate.observer, []).append(estimate)
-    both = {observer: parts for observer, parts in whole.items() if {e.target for e in parts} == set(TARGETS)}
+    both = _of_both(estimates)
     counts = samples_after(record, warm_up + record.dt)
     for mode, name in enumerate(mode_names):
         z, left = record.z[:, mode], record.y_lgs[:, mode]

@@ -17,6 +17,7 @@ from wfsobs.evaluation.rows import NO_ESTIMATE, can_be_best
 from wfsobs.evaluation.scores import BOUNDS, Score
 from wfsobs.evaluation.verdict_words import best_sentence, harm_sentences
 from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import Estimate
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record
@@ -180,7 +181,8 @@ def explain_harm(result: Result, mode: str | None = None, watch: Watch = QUIET) 
 
     result : of a record that was simulated from its scenario; mode : by default all. Raises Cancelled.
     """
-    harmful = {s.observer for s in result.scores if mode in (None, s.mode) and s.rms >= s.truth_rms}
+    of = [s for s in result.scores if s.target in TARGETS and mode in (None, s.mode)]
+    harmful = {s.observer for s in of if s.rms >= s.truth_rms}
     chosen = [o.id for o in OBSERVERS.values() if o.id in harmful and o.linear and o.seconds is None]
     try:
         return error_budget(result, observers=chosen, mode=mode, watch=watch)

@@ -24,6 +24,7 @@ from wfsobs.app.store import Store
 from wfsobs.campaign.axes import PlanAxis, plan_axes
 from wfsobs.campaign.follow import CampaignState
 from wfsobs.campaign.report import name_label
+from wfsobs.evaluation.rows import target_title
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
@@ -144,7 +145,7 @@ class CampaignPage(PageActions):
         names = {axis_name(axis, base): path for path, axis in self.axes.items()}
         style = {"size": "small", "margin": 0, "width": 260}
         paths = [*self.axes]
-        self.target = pmui.Select(label="Errors of", options={t.capitalize(): t for t in targets}, value=targets[0], **style)
+        self.target = pmui.Select(label="Errors of", options={target_title(t): t for t in targets}, value=targets[0], **style)
         self.across = pmui.Select(label="Across", options=names, value=paths[0] if paths else None, **style)
         self.down = pmui.Select(
             label="Down", options={"no second condition": NONE, **names}, value=paths[1] if len(paths) > 1 else NONE, **style

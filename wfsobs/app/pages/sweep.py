@@ -26,7 +26,8 @@ from wfsobs.app.sweep_work import SweepTask
 from wfsobs.app.views.sweep_lines import SweepLines
 from wfsobs.campaign.sweep import MOST_SEEDS, Sweep, plan_sweep
 from wfsobs.campaign.sweep_results import SweepResults
-from wfsobs.observers.base import TARGETS
+from wfsobs.evaluation.rows import target_title
+from wfsobs.evaluation.scores import SCORED
 from wfsobs.priors_from.selection import quick_observers
 from wfsobs.settings.errors import SettingError
 
@@ -67,12 +68,12 @@ class SweepPage(PageActions):
             over=over, values=values, second=second, second_values=more, seeds=self.seeds, observers=self.observers
         )
         self.estimate = html()
-        self.maps = {target: SweepMap(self.load, grid={}, **WIDE) for target in TARGETS}
+        self.maps = {target: SweepMap(self.load, grid={}, **WIDE) for target in SCORED}
         self.lines: dict[str, SweepLines] = {}
-        self.panes = {target: pn.Column(**WIDE) for target in TARGETS}
-        self.legends = {target: html() for target in TARGETS}
+        self.panes = {target: pn.Column(**WIDE) for target in SCORED}
+        self.legends = {target: html() for target in SCORED}
         self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
-        self.boxes = [box(target.capitalize(), self.legends[target], self.panes[target], self.maps[target]) for target in TARGETS]
+        self.boxes = [box(target_title(target), self.legends[target], self.panes[target], self.maps[target]) for target in SCORED]
         self.shades = text(f"{legend_of_shades()} Click a cell to load its scenario in Explore.")
         self.visible, self._draw_time = False, 0.0
         for part in (*self.boxes, self.shades):
@@ -220,7 +221,7 @@ class SweepPage(PageActions):
         self._draw_time = monotonic()
         single = len(results.sweep.axes) == 1
         with pn.io.hold():
-            for target in TARGETS:
+            for target in SCORED:
                 self.maps[target].grid = map_grid(results, target, self.display)
                 if single:
                     self._draw_lines(results, target)

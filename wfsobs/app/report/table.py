@@ -10,7 +10,7 @@ from wfsobs.app.display import IN_MOST, OVER_SEEDS, score_columns
 from wfsobs.app.numerals import NOTHING
 from wfsobs.app.report.data import State
 from wfsobs.evaluation.evidence import rank_observers
-from wfsobs.evaluation.rows import TIME, Row, can_be_best, is_non_causal, own_interval, row_label, scored_interval
+from wfsobs.evaluation.rows import TIME, Row, can_be_best, is_non_causal, own_interval, row_label, scored_interval, target_title
 from wfsobs.evaluation.scores import RESIDUAL
 
 
@@ -43,7 +43,7 @@ def _body(rows: list[Row], dt: float, seeds: Mapping[str, Any]) -> dict[str, Any
     return {
         "target": target,
         "mode": mode,
-        "title": ", ".join((target.capitalize(), mode, *filter(None, [scored_interval(rows)]))),
+        "title": ", ".join((target_title(target), mode, *filter(None, [scored_interval(rows)]))),
         "rows": [
             {
                 **row,

@@ -28,10 +28,10 @@ from wfsobs.evaluation.rows import (
     row_needs,
     score_rows,
     scored_interval,
+    target_title,
 )
-from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS, LOOP, RESIDUAL, Score
+from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS, LOOP, RESIDUAL, SCORED, Score
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import TARGETS
 from wfsobs.priors_from.selection import is_usual
 from wfsobs.result import Failure
 
@@ -69,7 +69,7 @@ class Table:
 
     def html(self) -> str:
         """Write the table."""
-        groups = self._truthless() or [self._target(target) for target in TARGETS]
+        groups = self._truthless() or [self._target(target) for target in SCORED]
         shown = self.run.result
         left_out = lines_of_failures(shown.result.failures) if shown else []
         return f"{table('RMS errors', self._columns(), groups)}{macro('texts', 'failure', left_out)}"
@@ -130,7 +130,7 @@ class Table:
         order = list(scores.items())
         if self.display.best_first:
             order.sort(key=lambda item: (item[1].apart, item[1].rms) if item[1] else (True, math.inf))
-        title = f"{target.capitalize()}, {self.display.mode}{_stretch([s for s in scores.values() if s])}"
+        title = f"{target_title(target)}, {self.display.mode}{_stretch([s for s in scores.values() if s])}"
         return title, [self._row(name, target, score, marks.get(name, Markup())) for name, score in order]
 
     def _marks(self, target: str, scores: Mapping[str, Score | None]) -> dict[str, Markup]:
