@@ -14,8 +14,7 @@ from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.bound_both import bound_rms_of_both, least_errors_of_both
 from wfsobs.evaluation.record_bounds import record_bounds
 from wfsobs.evaluation.rows import can_be_best
-from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, COMMON_BOUNDS
-from wfsobs.observers.base import TARGETS
+from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, COMMON_BOUNDS, SCORED
 from wfsobs.observers.kalman.multirate_optimal import optimal_cycle
 from wfsobs.priors_from.scenario import kalman_model
 from wfsobs.priors_from.turbulence import measurement_noise
@@ -243,6 +242,6 @@ def test_what_is_remembered_is_of_these_settings() -> None:
         found = {(it.row, it.target, it.column): it.error.rms for it in record_bounds(other, simulate(other))}
         for mode in range(2):
             both, alone = bound_rms_of_both(other, mode), bound_rms(other, mode)
-            for target in TARGETS:
+            for target in SCORED:
                 assert found[BOUND_BOTH, target, mode] == both[target], changed
                 assert found[BOUND, target, mode] == alone[target], changed

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from wfsobs.evaluation.error_spectra import cumulative_rms, scored_samples
 from wfsobs.evaluation.lag import lag
 from wfsobs.evaluation.scores import supervised_scores, unsupervised_scores
-from wfsobs.observers.estimates import Estimate
+from wfsobs.observers.estimates import TOTAL, Estimate
 from wfsobs.record import Record
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.welch import rms, welch_psd
@@ -51,6 +51,30 @@ def test_scores_of_a_known_error(seed: int, log_scale: float, warm_up: float, un
         assert (s.observer, s.target, s.seconds_per_step) == ("x", "vibration", 2e-6)
         assert (s.start, s.stop, s.apart) == (pytest.approx(1e-3 * known[0]), pytest.approx(1e-3 * (known[-1] + 1)), False)
         assert s.lag == pytest.approx(0.0, abs=1e-4)  # white noise at 0.3: the peak of the correlation is at zero
+
+
+def test_both_together_are_scored_against_the_sum_of_both_truths() -> None:
+    """Errors of opposite sign cancel in the sum; the samples are those that both have, the deviation that of the sum."""
+    rng = np.random.default_rng(1)
+    turbulence, vibration, slow, fast = rng.standard_normal((4, 1000, 2))
+    common = rng.standard_normal((1000, 2))
+    first, second = turbulence + common + 0.1 * slow, vibration - common + 0.2 * fast
+    first[:50], second[:80] = np.nan, np.nan
+    sd = {TOTAL: np.full((1000, 2), 0.3)}
+    estimates = [
+        Estimate("both", "turbulence", first, 1e-6, sd=np.ones((1000, 2)), sd_of_sum=sd),
+        Estimate("both", "vibration", second, 2e-6, sd=np.ones((1000, 2)), sd_of_sum=sd),
+        Estimate("one", "vibration", vibration, 1e-6),
+    ]
+    known = record(turbulence, vibration)
+    found = [s for s in supervised_scores(known, estimates, 0.0, NAMES) if s.target == TOTAL]
+    assert [(s.observer, s.mode, s.seconds_per_step, s.start) for s in found] == [("both", name, 2e-6, 0.08) for name in NAMES]
+    for mode, s in enumerate(found):
+        left, truth = (0.1 * slow + 0.2 * fast)[80:, mode], (turbulence + vibration)[80:, mode]
+        assert s.rms == pytest.approx(np.sqrt(np.mean(left**2)), rel=1e-12)  # rounding of sums
+        assert s.truth_rms == pytest.approx(np.sqrt(np.mean(truth**2)), rel=1e-12)
+        assert s.calibration is not None and s.calibration.sd == pytest.approx(0.3, rel=1e-12)
+    assert not [s for s in supervised_scores(record(vibration=vibration), estimates, 0.0, NAMES) if s.target == TOTAL]
 
 
 def test_no_truth_no_score_and_zero_truth_no_ratio() -> None:
