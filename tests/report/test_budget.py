@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import UTC, datetime
+from itertools import takewhile
 from typing import Any
 
 import pytest
@@ -83,7 +84,8 @@ def test_errors_have_the_interval_over_seeds_and_the_best_is_significant(short: 
     it = parse(page(report, MADE))
     table = next(t for t in it.tables if "RMS error [nm]" in t[0])
     start = next(i for i, row in enumerate(table) if row[0].startswith("Vibration, tilt"))
-    cells = {row[0].strip(): row[1].split() for row in table[start + 1 :]}
+    rows = takewhile(lambda row: len(row) > 1, table[start + 1 :])  # up to the next heading
+    cells = {row[0].strip(): row[1].split() for row in rows}
     leaders = evidence.leaders("vibration", "tilt")
     for name in names:
         interval = evidence.interval((name, "vibration", "tilt"))

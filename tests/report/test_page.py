@@ -23,7 +23,7 @@ from wfsobs.app.report.grid import Grid
 from wfsobs.app.report.packing import pack, unpack
 from wfsobs.app.report.page import page
 from wfsobs.app.report.text import FILE, LONGEST, command_of
-from wfsobs.evaluation.rows import TIME, is_non_causal, row_label, scored_interval
+from wfsobs.evaluation.rows import TIME, is_non_causal, row_label, scored_interval, target_title
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.pipeline import observe, run
 from wfsobs.result import Result
@@ -91,7 +91,7 @@ def test_the_numbers_are_those_of_the_run(report: Report, text: str, parse: Any)
             lag = "–" if row["lag_s"] is None else f"{1e3 * row['lag_s']:z.2f}".replace("-", "−")
             spread = "" if row["interval_um"] is None else f" {' – '.join(number(1e3 * x) for x in row['interval_um'])} "
             assert (spread == "") == (row["observer"] != BOUND)
-            want[f"{row['target'].capitalize()}, {row['mode']}", name] = [
+            want[f"{target_title(row['target'])}, {row['mode']}", name] = [
                 spread + number(1e3 * row["rms_um"]),
                 number(1e3 * row["truth_rms_um"]),
                 number(row["normalised_rms"]),
