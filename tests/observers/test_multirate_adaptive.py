@@ -90,7 +90,7 @@ def test_the_density_of_a_fit_is_that_of_its_spectrum_at_every_stage() -> None:
             np.testing.assert_allclose(fit.density(fit.x, f)[0], fit.spectrum.psd(f) + known.psd(f), rtol=1e-9)
 
     check()
-    fit.background()
+    fit.adapt()
     check()
     assert fit.add(fit.maxima(5.0, 20))
     check()

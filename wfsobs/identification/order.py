@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
+from wfsobs.spectral import background
+from wfsobs.spectral.background import with_first_guess
 from wfsobs.spectral.model import Spectrum
 from wfsobs.spectral.periodogram import Cells
 from wfsobs.spectral.whittle import fit_spectrum, spectrum_negative_log_likelihood
@@ -16,12 +16,8 @@ WORTH = 6.0
 """Minimum gain of log-likelihood by the third corner: noise gains as much with a probability of 0.05 % (chi squared of 12)."""
 STARTS = (1.5, 6.0)
 """Third corners, over the first two, at which a fit starts."""
-BACKGROUND, DAMPING = 8.0, 0.8
-"""The minimum gain for a background, which has two parameters: 0.03 % (chi squared of 16); and its damping."""
 APART = 5.0
 """Minimum corner of a background over that of turbulence."""
-REACHES = (0.02, 0.08)
-"""Corners of a background, over the rate, at which a fit starts: 20 and 80 Hz at 1 kHz."""
 
 
 def choose_order(spectrum: Spectrum, cells: Cells, third: bool = False) -> Spectrum:
@@ -42,21 +38,14 @@ def choose_order(spectrum: Spectrum, cells: Cells, third: bool = False) -> Spect
 
 
 def with_background(spectrum: Spectrum, cells: Cells) -> Spectrum:
-    """Return a fitted spectrum with a background if that is worth it, else without.
-
-    A background is an AR(2) so damped that it is flat up to its corner, far above that of turbulence. The aliasing of a
-    Shack-Hartmann sensor is like that.
-    """
+    """Return a fitted spectrum with a background if that is worth it, else without."""
     if spectrum.background:
         without, wide = _smooth(replace(spectrum, background=None), cells), spectrum
     else:
-        dt, shapes = spectrum.dt, []
-        for reach in REACHES:
-            rms = spectrum.noise * np.sqrt(reach)  # half of the density of the noise, about
-            shapes.append(_smooth(replace(spectrum, background=Ar2(2.0 * np.pi * reach / dt, DAMPING, rms, dt)), cells))
+        shapes = [_smooth(with_first_guess(spectrum, reach), cells) for reach in background.REACHES]
         without, wide = spectrum, min(shapes, key=lambda s: spectrum_negative_log_likelihood(s, cells))
     gain = spectrum_negative_log_likelihood(without, cells) - spectrum_negative_log_likelihood(wide, cells)
-    return wide if gain > BACKGROUND and _beyond_turbulence(wide) else without
+    return wide if gain > background.WORTH and _beyond_turbulence(wide) else without
 
 
 def _beyond_turbulence(spectrum: Spectrum) -> bool:

@@ -49,9 +49,14 @@ class Spectrum:
     background: Ar2 | None = None
 
     @property
+    def continuum(self) -> tuple[Ar2 | Ar3, ...]:
+        """Turbulence and background, where present."""
+        return tuple(p for p in (self.turbulence, self.background) if p is not None)
+
+    @property
     def processes(self) -> tuple[Ar2 | Ar3, ...]:
         """Turbulence and background, where present, and the resonances."""
-        return tuple(p for p in (self.turbulence, self.background) if p is not None) + self.resonances
+        return self.continuum + self.resonances
 
     def psd(self, f: Array) -> Array:
         """Return the one-sided power spectral density [um^2/Hz] at f [Hz]."""

@@ -1,9 +1,9 @@
 """Fast fit of the spectrum of one mode, for repeated use on windows of a few seconds: milliseconds.
 
-A short form of `identify`, without its tests and errors: the background of the window before, adapted to this one; the highest
-maxima of the whitened periodogram as resonances, all at once; a few Newton steps of Whittle's likelihood for all parameters; and
-the same once more for the remainder. A false weak peak costs the filter less than a missed one, so the threshold is lower than
-in `search`.
+A short form of `identify`, without its tests and errors: noise and turbulence of the window before, adapted to this one; the
+highest maxima of the whitened periodogram as resonances, all at once; a few Newton steps of Whittle's likelihood for all
+parameters; and the same once more for the remainder. A false weak peak costs the filter less than a missed one, so the threshold
+is lower than in `search`. Where coloured noise would raise the likelihood, the window is fitted with a background as well.
 
 For windows that grow, the resonances of the window before are a first guess too (`follow_spectrum`): they are tracked, not made
 anew. Turbulence is then of third order, since long windows show peaks that what it has too much beyond its corner would hide.
@@ -17,6 +17,8 @@ import numpy as np
 
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
+from wfsobs.spectral import background
+from wfsobs.spectral.background import with_first_guess
 from wfsobs.spectral.missing import MissingSamples
 from wfsobs.spectral.model import Spectrum
 from wfsobs.spectral.periodogram import periodogram, periodogram_frequencies
@@ -41,9 +43,14 @@ THIRD = 4.0
 """Third corner of turbulence, over the first two, at which the first fit of long windows starts."""
 STARTS = 2
 """Corners of turbulence in the first guess: higher ones converge to the same."""
+SUSPECT = 3.2
+"""Standard deviations by which an octave differs from its fit, from which on a background is fitted, too: of one that is as the
+fit says, some of ten octaves does in 1.4 % of windows."""
 
 
-def quick_spectrum(z: Array, dt: float, most: int, lowest: float = LOWEST, before: Spectrum | None = None) -> Spectrum:
+def quick_spectrum(
+    z: Array, dt: float, most: int, lowest: float = LOWEST, before: Spectrum | None = None, *, complete: bool = True
+) -> Spectrum:
     """Fit noise, turbulence and up to `most` peaks to a window.
 
     Parameters
@@ -58,6 +65,8 @@ def quick_spectrum(z: Array, dt: float, most: int, lowest: float = LOWEST, befor
         Minimum frequency of a peak [Hz].
     before : Spectrum, optional
         Spectrum of a similar window, the first guess.
+    complete : bool
+        False where samples are replaced: noise that they have not is like colour, and no background is looked for.
 
     Returns
     -------
@@ -66,11 +75,24 @@ def quick_spectrum(z: Array, dt: float, most: int, lowest: float = LOWEST, befor
     """
     if np.ptp(z) == 0:
         return Spectrum(float(np.finfo(float).tiny), dt)
-    fit = WindowFit(z - z.mean(), dt, _background_of(z - z.mean(), dt, before))
-    if most > 0 or before is None or before.turbulence is None:
-        fit.background()
-    _add_peaks(fit, most, lowest)
-    return fit.spectrum
+    z = z - z.mean()
+    start = _smooth_of(z, dt, before)
+
+    def fitted(smooth: Spectrum) -> WindowFit:
+        fit = WindowFit(z, dt, smooth)
+        if most > 0 or before is None or before.turbulence is None:
+            fit.adapt()
+        _add_peaks(fit, most, lowest)
+        return fit
+
+    known = fitted(start)
+    if known.coloured:
+        if known.worth_of_background() < background.WORTH:
+            known = fitted(replace(start, background=None))
+    elif complete and most > 0 and start.turbulence is not None and known.worst_octave() > SUSPECT:
+        others = [fitted(with_first_guess(start, reach)) for reach in background.REACHES]
+        known = min([known, *others], key=lambda fit: fit.misfit() + background.WORTH * fit.coloured)
+    return known.spectrum
 
 
 def quick_spectrum_of_samples(z: Array, dt: float, most: int, lowest: float, before: Spectrum | None) -> tuple[Spectrum, Array]:
@@ -92,10 +114,10 @@ def quick_spectrum_of_samples(z: Array, dt: float, most: int, lowest: float, bef
     if np.ptp(filled) == 0:
         return quick_spectrum(filled, dt, most, lowest), filled
     known = before if before is not None and before.processes else None
-    fit = known or quick_spectrum(filled, dt, most, lowest)
+    fit = known or quick_spectrum(filled, dt, most, lowest, complete=False)
     for _ in range(1 if known else samples.rounds(LEFT)):
         filled = samples.fill(z - level, fit.psd(f)) + level
-        fit = quick_spectrum(filled, dt, most, lowest, fit)
+        fit = quick_spectrum(filled, dt, most, lowest, fit, complete=False)
         fit = replace(fit, noise=fit.noise / measured)
     return fit, filled
 
@@ -133,22 +155,22 @@ def follow_spectrum(
     """
     z = z - z.mean()
     tracked = () if before is None else before.resonances
-    start = _background_of(z, dt, before)
+    start = _smooth_of(z, dt, before)
     turbulence = start.turbulence
     if isinstance(turbulence, Ar2):
         turbulence = Ar3(turbulence.omega, turbulence.damping, THIRD * turbulence.omega, turbulence.rms, dt)
     fit = WindowFit(z, dt, Spectrum(start.noise, dt, turbulence, tracked), extra, TRACKED, COARSER if long else COARSE, BLUR)
     if not tracked:
-        fit.background()
+        fit.adapt()
     _add_peaks(fit, most, lowest, 1 if tracked and long else 2)
     return fit.spectrum
 
 
-def _background_of(z: Array, dt: float, before: Spectrum | None) -> Spectrum:
-    """Return a first guess of noise and turbulence, without resonances."""
+def _smooth_of(z: Array, dt: float, before: Spectrum | None) -> Spectrum:
+    """Return a first guess of noise, turbulence and background, without resonances."""
     if before is None or before.turbulence is None:
         return first_guess(periodogram_frequencies(len(z), dt), periodogram(z, dt), dt, STARTS)
-    return Spectrum(before.noise, dt, before.turbulence)
+    return replace(before, resonances=())
 
 
 def _add_peaks(fit: WindowFit, most: int, lowest: float, passes: int = 2) -> None:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import log, pi, sqrt
+from math import log, pi
 
 import numpy as np
 from scipy.special import logit
 
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
+from wfsobs.spectral.background import DAMPING
 from wfsobs.spectral.densities import densities
 from wfsobs.spectral.model import FAST, SLOW, Spectrum
 from wfsobs.spectral.periodogram import FINE, NEAR, Cells, periodogram, periodogram_frequencies
+from wfsobs.spectral.process_numbers import behind_pole, numbers_of, one_pole
 from wfsobs.typing import Array
 
 FEWEST = 15.0
@@ -45,9 +47,10 @@ REACH = 1.0
 class WindowFit:
     """A fit: periodogram I at f, a finer one, and the parameters of the spectrum.
 
-    x: log noise, then three per process, turbulence first where there is any (`densities`). Turbulence of third order is that of
-    second order behind one more pole, whose corner is a fourth. narrowest : as NARROWEST; cells : as FINE and NEAR; blur : what
-    the window adds to the half width of a peak, in bins: x has it as it is shown, `spectrum` without.
+    x: log noise, then three per process (`densities`): turbulence first and then the background, where there is any. Turbulence
+    of third order is that of second order behind one more pole, whose corner stands before the resonances. narrowest : as
+    NARROWEST; cells : as FINE and NEAR; blur : what the window adds to the half width of a peak, in bins: x has it as it is
+    shown, `spectrum` without.
     """
 
     def __init__(
@@ -66,10 +69,12 @@ class WindowFit:
         self.f, self.I = self.fine_f[PAD - 1 :: PAD], self.fine[PAD - 1 :: PAD]
         self.df = self.f[0]
         self.blur = 2.0 * pi * blur * self.df
-        processes = [] if start.turbulence is None else [start.turbulence]
-        self.third = isinstance(start.turbulence, Ar3)
-        self.first = 1 + 3 * len(processes) + self.third
-        self.x = np.concatenate([[log(start.noise)], *map(_numbers, [*processes, *map(self._show, start.resonances)])])
+        smooth = [numbers_of(p) for p in (start.turbulence, start.background) if p is not None]
+        self.third, self.coloured = isinstance(start.turbulence, Ar3), start.background is not None
+        self.first = 1 + 3 * len(smooth) + self.third
+        corner = smooth[0][3:] if self.third else []
+        resonances = [numbers_of(self._show(p)) for p in start.resonances]
+        self.x = np.concatenate([[log(start.noise)], *(numbers[:3] for numbers in smooth), corner, *resonances])
         self._last: tuple[Array, Array, tuple[Array, Array]] = (self.f[:0], self.x[:0], (self.f[:0], self.f[:0]))
         self._average()
 
@@ -86,9 +91,10 @@ class WindowFit:
             for w, d, rms in self._of_second_order(self.x)
         ]
         turbulence: Ar2 | Ar3 | None = found.pop(0) if self.first > 1 else None
+        background = found.pop(0) if self.coloured else None
         if self.third and isinstance(turbulence, Ar2):
-            turbulence = _behind_pole(turbulence, float(np.exp(self.x[4])))
-        return Spectrum(float(np.exp(self.x[0])), self.dt, turbulence, tuple(map(self._sharpen, found)))
+            turbulence = behind_pole(turbulence, float(np.exp(self.x[self.first - 1])))
+        return Spectrum(float(np.exp(self.x[0])), self.dt, turbulence, tuple(map(self._sharpen, found)), background)
 
     def _show(self, p: Ar2) -> Ar2:
         """Return a resonance as wide as this window shows it."""
@@ -110,25 +116,46 @@ class WindowFit:
         S, slopes = densities(self._of_second_order(x), self.dt, f)
         by_corner = np.zeros((0, len(f)))
         if self.third:
-            falling, slope = one_pole(x[4], self.dt, f)
+            falling, slope = one_pole(x[self.first - 1], self.dt, f)
             S[0] *= falling
             by_corner = (S[0] * slope)[None]
         total = noise + S.sum(axis=0)
         if self.extra is not None:
             total += self.extra_density if f is self.cells.frequency else self.extra.psd(f)
         slopes *= (S / total)[:, None]
-        by_numbers = slopes.reshape(-1, len(f))
-        found = total, np.vstack([2.0 * noise / total, by_numbers[:3], by_corner / total, by_numbers[3:]])
+        if self.coloured:
+            slopes[1, 1] = 0.0  # the background keeps its damping
+        by_numbers, n_smooth = slopes.reshape(-1, len(f)), self.first - self.third - 1
+        found = total, np.vstack([2.0 * noise / total, by_numbers[:n_smooth], by_corner / total, by_numbers[n_smooth:]])
         self._last = f, x, found
         return found
 
-    def background(self) -> None:
-        """Adapt noise and turbulence to this window, whatever its peaks."""
+    def adapt(self) -> None:
+        """Adapt noise, turbulence and background to this window, whatever its peaks."""
         whole = self.cells.mean
-        for _ in range(2):
+        for _ in range(2 + self.coloured):
             self.cells.mean = np.minimum(whole, CLIPPED * self.density(self.x, self.cells.frequency)[0])
             self.improve()
+            if self.coloured and self.x[4] < self.x[1]:  # the two have changed places
+                self.x[1:7] = *self.x[4:7], self.x[1], logit(DAMPING), self.x[3]
         self.cells.mean = whole
+
+    def misfit(self) -> float:
+        """Compute the negative log-likelihood, and for every resonance what it has to gain."""
+        S, _ = self.density(self.x, self.f)
+        return float(np.sum(np.log(S) + self.I / S)) + WORTH * len(self.resonances)
+
+    def worth_of_background(self) -> float:
+        """Compute what the background gains of log-likelihood, all else as it is."""
+        return float(self._gains(slice(6, 7))[0])
+
+    def worst_octave(self) -> float:
+        """Compute by how many standard deviations the periodogram differs from the fit in the octave where it does most."""
+        f, count = self.cells.frequency, self.cells.count
+        excess = count * (self.cells.mean / self.density(self.x, f)[0] - 1.0)
+        octave = np.floor(np.log2(f / f[0])).astype(int)
+        bins = np.bincount(octave, count)
+        return float(np.max(np.abs(np.bincount(octave, excess)[bins > 0]) / np.sqrt(bins[bins > 0])))
 
     def maxima(self, lowest: float, most: int) -> list[tuple[float, float]]:
         """Return frequency and density of up to `most` unexplained maxima of the whitened periodogram, the highest first."""
@@ -156,7 +183,7 @@ class WindowFit:
         for frequency, density in peaks:
             half = START * self.df
             new = Ar2(2.0 * pi * frequency, min(half / frequency, WIDEST), float(np.sqrt(0.5 * pi * half * density)), self.dt)
-            self.x = np.concatenate([self.x, _numbers(new)])
+            self.x = np.concatenate([self.x, numbers_of(new)])
         if peaks:
             self._average()
         return len(peaks) > 0
@@ -200,7 +227,7 @@ class WindowFit:
             x[2] = np.clip(x[2], logit(0.1), logit(0.99))
         if self.third:
             x[1] = np.clip(x[1], log(SLOW / self.dt), log(FAST / self.dt))
-            x[4] = np.clip(x[4], x[1], log(2.0 * FAST / self.dt))
+            x[self.first - 1] = np.clip(x[self.first - 1], x[1], log(2.0 * FAST / self.dt))
         x[self.first :: 3] = np.clip(x[self.first :: 3], log(4.0 * pi * self.df), log(0.95 * pi / self.dt))
         least = np.minimum(2.0 * pi * self.narrowest * self.df / np.exp(x[self.first :: 3]), WIDEST)
         x[self.first + 1 :: 3] = np.clip(x[self.first + 1 :: 3], logit(least), logit(WIDEST))
@@ -208,40 +235,12 @@ class WindowFit:
 
     def prune(self) -> None:
         """Remove resonances that gain too little likelihood."""
-        count, mean = self.cells.count, self.cells.mean
-        S, slopes = self.density(self.x, self.cells.frequency)
-        share = 0.5 * slopes[self.first + 2 :: 3]  # of each in S
-        without = S * np.maximum(1.0 - share, 1e-6)
-        gain = (np.log(without) + mean / without - np.log(S) - mean / S) @ count
+        gain = self._gains(slice(self.first + 2, None, 3))
         self.x = np.concatenate([self.x[: self.first], self.resonances[gain > WORTH].ravel()])
 
-
-def _numbers(p: Ar2 | Ar3) -> Array:
-    numbers = np.array([log(p.omega), logit(min(p.damping, 0.99)), log(max(p.rms, 1e-12))])
-    if isinstance(p, Ar3):
-        alone = Ar2(p.omega, min(p.damping, 0.99), 1.0, p.dt)
-        numbers = np.append(numbers, log(p.corner))
-        numbers[2] = 0.5 * log(max(_slow_density(p) / _slow_density(alone), 1e-24))
-    return numbers
-
-
-def _behind_pole(p: Ar2, corner: float) -> Ar3:
-    """Return the process of third order with the poles of p and one more, and the density of p at low frequencies."""
-    one = Ar3(p.omega, p.damping, max(corner, p.omega), 1.0, p.dt)
-    return replace(one, rms=sqrt(_slow_density(p) / _slow_density(one)))
-
-
-def _slow_density(p: Ar2 | Ar3) -> float:
-    return float(p.psd(np.zeros(1))[0])
-
-
-def one_pole(number: float, dt: float, f: Array) -> tuple[Array, Array]:
-    """Return the power that passes a pole, 1 at low frequencies, and the derivative of its logarithm by `number`.
-
-    number : log of the corner [rad/s];  f : frequencies [Hz]
-    """
-    decay = float(np.exp(number)) * dt
-    a, turned = np.exp(-decay), 4.0 * np.sin(np.pi * f * dt) ** 2
-    distance = (1.0 - a) ** 2 + a * turned
-    by_a = -2.0 / (1.0 - a) - (turned - 2.0 * (1.0 - a)) / distance
-    return (1.0 - a) ** 2 / distance, -decay * a * by_a
+    def _gains(self, strengths: slice) -> Array:
+        """Compute what processes gain of log-likelihood, all else as it is; strengths : where the logs of their rms are in x."""
+        count, mean = self.cells.count, self.cells.mean
+        S, slopes = self.density(self.x, self.cells.frequency)
+        without = S * np.maximum(1.0 - 0.5 * slopes[strengths], 1e-6)  # half of the slope is the share of each in S
+        return (np.log(without) + mean / without - np.log(S) - mean / S) @ count

@@ -106,7 +106,7 @@ def whitener_of(fit: Spectrum | None) -> FilterStep:
     if fit is None or fit.turbulence is None:
         noise = 1.0 if fit is None else max(fit.noise, MIN_NOISE)
         return np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((1, 1)), np.array([[1.0 / noise]])
-    model, noise = disturbance_model([fit.turbulence], []), max(fit.noise, MIN_NOISE)
+    model, noise = disturbance_model(fit.continuum, []), max(fit.noise, MIN_NOISE)
     s, C = steady_state(model.A, model.C, model.Q, np.array(noise**2)), model.C[None]
     scale = np.sqrt(float((C @ s.P @ C.T)[0, 0]) + noise**2)
     return model.A - s.K @ C, s.K, -C / scale, np.array([[1.0 / scale]])
@@ -120,4 +120,4 @@ def weight_covariance(lines: Spectrum, depth: int) -> Array:
 
 
 def _model(lines: Spectrum) -> DisturbanceModel:
-    return disturbance_model([] if lines.turbulence is None else [lines.turbulence], lines.resonances)
+    return disturbance_model(lines.continuum, lines.resonances)

@@ -107,15 +107,20 @@ def mode_of(spectrum: Spectrum) -> ModeFilter | None:
     """Return the steady-state filter of a spectrum, None where nothing moves. Raises ValueError where there is none."""
     if not spectrum.processes:
         return None
-    model = disturbance_model([] if spectrum.turbulence is None else [spectrum.turbulence], spectrum.resonances)
+    model = disturbance_model(spectrum.continuum, spectrum.resonances)
     return steady_mode(model, max(spectrum.noise, MIN_NOISE))
 
 
 def pack_spectrum(spectrum: Spectrum | None, rows: int) -> Array:
-    """Return a spectrum as numbers, (rows, 4): noise; then omega, damping, rms of turbulence and resonances; NaN where none."""
+    """Return a spectrum as numbers, (rows, 4), NaN where there are none.
+
+    Noise with omega, damping and rms of the background; then these three, and a third corner, of turbulence and resonances.
+    """
     out = np.full((rows, 4), np.nan)
     if spectrum is not None:
-        out[0, 0] = spectrum.noise
+        out[0, 0], background = spectrum.noise, spectrum.background
+        if background is not None:
+            out[0, 1:] = background.omega, background.damping, background.rms
         for row, process in zip(out[1:], (spectrum.turbulence, *spectrum.resonances), strict=False):
             if process is not None:
                 row[:3] = process.omega, process.damping, process.rms
@@ -129,7 +134,8 @@ def unpack_spectrum(table: Array, dt: float) -> Spectrum | None:
         return None
     processes = [None if np.isnan(row[0]) else _process(row, dt) for row in table[1:]]
     resonances = tuple(p for p in processes[1:] if isinstance(p, Ar2))
-    return Spectrum(float(table[0, 0]), dt, processes[0], resonances)
+    background = None if np.isnan(table[0, 1]) else Ar2(*table[0, 1:].tolist(), dt)
+    return Spectrum(float(table[0, 0]), dt, processes[0], resonances, background)
 
 
 def _process(row: Array, dt: float) -> Ar2 | Ar3:
