@@ -13,7 +13,7 @@ from wfsobs.evaluation.rows import NOT_OBSERVERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
 
-PHYSICS_VERSION = 5
+PHYSICS_VERSION = 6
 """Number of the simulation and its numerics: rises with every change that moves results (tests/campaign/test_physics.py)."""
 
 
