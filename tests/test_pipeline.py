@@ -12,7 +12,7 @@ from tests.records import ON_PAPER
 from wfsobs import PRESETS, Record, Scenario, SettingError, observe, run, simulate
 from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.bound_both import bound_rms_of_both
-from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, BOUNDS, COMMON_BOUNDS, LOOP, PREDICTION, RESIDUAL
+from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, BOUNDS, COMMON_BOUNDS, LOOP, PREDICTION, RESIDUAL, SCORED
 from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
@@ -42,8 +42,15 @@ def test_results_come_in_the_order_of_the_registry() -> None:
     assert not result.failures
     pairs = [(e.observer, e.target) for e in result.estimates]
     assert pairs == [(name, target) for name in ON_PAPER for target in sorted(OBSERVERS[name].targets)]
-    rows = [(*pair, mode) for pair in pairs for mode in ("tip", "tilt")]
-    rows += [(bound, target, mode) for mode in ("tip", "tilt") for bound in COMMON_BOUNDS for target in TARGETS]
+    of = {name: OBSERVERS[name].targets for name in ON_PAPER}
+    rows = [
+        (name, target, mode)
+        for name in ON_PAPER
+        for target in SCORED
+        for mode in ("tip", "tilt")
+        if target in of[name] or (target == "total" and len(of[name]) == 2)
+    ]
+    rows += [(bound, target, mode) for mode in ("tip", "tilt") for bound in COMMON_BOUNDS for target in SCORED]
     assert [(s.observer, s.target, s.mode) for s in result.scores] == rows
     found = result.estimate("kf-lgs", "vibration")
     assert found is not None and found.values.shape == result.record.y_lgs.shape and found.seconds_per_step > 0
@@ -64,10 +71,10 @@ def test_scores_are_those_of_the_estimates() -> None:
             # rms is over all phases of a frame
             assert s.phases is None or s.rms == pytest.approx(np.sqrt(np.mean(np.square(s.phases))), rel=1e-12)
             continue
-        e, truth = result.estimate(s.observer, s.target), result.record.truth(s.target)
-        assert e is not None and truth is not None
-        mode = ("tip", "tilt").index(s.mode)
-        error = (e.values - truth)[300 : 799 if s.target == "vibration" else 800, mode]
+        truth, mode = result.record.truth(s.target), ("tip", "tilt").index(s.mode)
+        of = [e for e in result.estimates if e.observer == s.observer and s.target in (e.target, "total")]
+        assert truth is not None and len(of) == 1 + (s.target == "total")
+        error = (sum(e.values for e in of) - truth)[300 : 799 if s.target == "vibration" else 800, mode]
         assert s.rms == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-12)
 
 

@@ -121,7 +121,7 @@ def test_representations_are_one_line(result: wfsobs.Result) -> None:
     for made in (*(make() for make in wfsobs.PRESETS.values()), result, result.record, *result.estimates, loop, found):
         assert "\n" not in repr(made) and len(repr(made)) < 200
     assert "length 2 s, rate 1000 Hz, modes 2" in repr(result.record)
-    assert repr(result).startswith("Result(2 observers, 16 scores, Record(")
+    assert repr(result).startswith("Result(2 observers, 24 scores, Record(")
 
 
 def test_a_notebook_shows_tables(result: wfsobs.Result) -> None:

@@ -77,7 +77,7 @@ def test_the_first_seconds_train_and_the_rest_is_scored(night: Record) -> None:
     for name, got in values(result).items():
         assert np.isnan(got[:800]).all(), name
         np.testing.assert_array_equal(got[800:], whole[name][800:])
-    assert len(result.scores) == 10 and {s.start for s in result.scores} == {0.8}
+    assert len(result.scores) == 12 and {s.start for s in result.scores} == {0.8}
     assert night.vibration is not None
     for s in result.scores:
         if s.observer == "ridge":

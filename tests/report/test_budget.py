@@ -30,7 +30,11 @@ def test_every_linear_observer_has_its_terms_in_the_page(result: Result, short: 
     table = next(t for t in it.tables if t[0][:2] == ["Observer", "Parts"])
     assert table[0][3:] == list(TERMS.values())
     titles = [row[0] for row in table[1:] if len(row) == 1]
-    assert titles == [f"{target}, {mode}" for target in ("Turbulence", "Vibration") for mode in ("tip", "tilt")]
+    assert titles == [
+        f"{target}, {mode}"
+        for target in ("Turbulence", "Vibration", "Turbulence and vibration together")
+        for mode in ("tip", "tilt")
+    ]
     shown: dict[tuple[str, str], list[str]] = {}
     for row in table[1:]:
         if len(row) == 1:

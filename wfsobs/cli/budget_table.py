@@ -9,6 +9,7 @@ from rich.table import Table
 
 from wfsobs.evaluation.budget import TERMS, Budget
 from wfsobs.evaluation.rows import row_label
+from wfsobs.evaluation.scores import SCORED
 
 
 def budget_table(budgets: Sequence[Budget]) -> Table:
@@ -19,7 +20,7 @@ def budget_table(budgets: Sequence[Budget]) -> Table:
     for name in ("error, nm", "nm^2", *TERMS.values(), "bound, nm^2"):
         out.add_column(name, justify="right")
     last = None
-    for it in sorted((b for b in budgets if b.terms), key=lambda b: (b.target, _mode_order(budgets, b), b.total)):
+    for it in sorted((b for b in budgets if b.terms), key=lambda b: (SCORED.index(b.target), _mode_order(budgets, b), b.total)):
         if last not in (None, (it.target, it.mode)):
             out.add_section()
         last = (it.target, it.mode)

@@ -26,8 +26,9 @@ from wfsobs.evaluation.responses import observer_responses
 from wfsobs.evaluation.rows import NO_ESTIMATE
 from wfsobs.evaluation.scores import BOUND, Score
 from wfsobs.evaluation.sources import CONE, LINES, NOISE, SIGNAL, Source, split_record
+from wfsobs.evaluation.totals import with_total
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import TARGETS, Observer
+from wfsobs.observers.base import Observer
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
@@ -133,9 +134,9 @@ def error_budget(
     out: list[Budget] = []
     for i, name in enumerate(chosen):
         watch.step(i / len(chosen))
-        own = [s for s in result.scores if s.observer == name and s.target in TARGETS and mode in (None, s.mode)]
+        own = [s for s in result.scores if s.observer == name and mode in (None, s.mode)]
         if name != NO_ESTIMATE and own:
-            values = {e.target: e.values for e in result.estimates if e.observer == name}
+            values = with_total({e.target: e.values for e in result.estimates if e.observer == name})
             bounds = {(s.target, s.mode): s.rms**2 for s in result.scores if s.observer == BOUND}
             if reason := _without_budget(OBSERVERS[name], observers is not None):
                 found = [Budget(s.observer, s.target, s.mode, s.rms**2, reason=reason) for s in own]
@@ -169,7 +170,9 @@ def _of_observer(
     lines = [[line[0] for line in vibration_lines(scenario, i)] for i in range(record.n_modes)]
     given = [_lines_of(observer, before, i, of) for i, of in enumerate(lines)]
     sources = split_record(scenario, record, lines, given)
-    responses, rest = observer_responses(observer, scenario, record, sources, watch)
+    split, rest = observer_responses(observer, scenario, record, sources, watch)
+    responses, rest = {name: with_total(of) for name, of in split.items()}, with_total(rest)
+    truths = {name: with_total(part.truth) for name, part in sources.items()}
     columns = {mode.name: i for i, mode in enumerate(scenario.modes)}
     complete = {name: Source(_fill(part.measurement), part.truth) for name, part in sources.items()}
     reference: dict[int, dict[str, Array]] = {}
@@ -179,10 +182,9 @@ def _of_observer(
         if i not in reference:
             watch.check()
             sensors = observer.sensors
-            reference[i] = follow_signal(
-                before, i, given[i], sensors, complete[SIGNAL].measurement, scenario.sensors.exposure_ratio
-            )
-        truth = {name: part.truth[s.target][:, i] for name, part in sources.items()}
+            ratio = scenario.sensors.exposure_ratio
+            reference[i] = with_total(follow_signal(before, i, given[i], sensors, complete[SIGNAL].measurement, ratio))
+        truth = {name: of[s.target][:, i] for name, of in truths.items()}
         parts = {name: responses[name][s.target][:, i] - truth[name] for name in sources}
         lag = reference[i][s.target] - truth[SIGNAL]
         parts |= {LAG: lag, MISMATCH: parts.pop(SIGNAL) - lag + rest[s.target][:, i]}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from hashlib import blake2b
 
@@ -12,6 +12,7 @@ import numpy as np
 from wfsobs.evaluation.calibration import Calibration, calibration
 from wfsobs.evaluation.lag import lag
 from wfsobs.evaluation.samples import common_samples, samples_after, stretch_of
+from wfsobs.evaluation.totals import of_both, totals
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimate
 from wfsobs.record import Record
@@ -134,7 +135,7 @@ def supervised_scores(
 
     None for a target without truth or where no sample is left.
     """
-    out, every = [], [*estimates, *_totals(estimates)]
+    out, every = [], [*estimates, *totals(estimates)]
     for target in SCORED:
         truth, of = record.truth(target), [e for e in every if e.target == target]
         if truth is None:
@@ -149,28 +150,6 @@ def supervised_scores(
                     make = partial(_score_mode, e, true, mode, name, record.dt, samples, apart)
                     out.append(derive(e, f"score {target} {mode} {name} {words[id(samples)]} {apart}", make))
     return out
-
-
-def _totals(estimates: Sequence[Estimate]) -> list[Estimate]:
-    """Return the estimate of the sum of turbulence and vibration of every observer that estimates both."""
-    return [
-        replace(
-            parts[0],
-            target=TOTAL,
-            values=np.sum([e.values for e in parts], axis=0),
-            seconds_per_step=max(e.seconds_per_step for e in parts),
-            sd=parts[0].sd_of_sum.get(TOTAL),
-        )
-        for parts in _of_both(estimates).values()
-    ]
-
-
-def _of_both(estimates: Sequence[Estimate]) -> dict[str, list[Estimate]]:
-    """Return the estimates of every observer that has both targets."""
-    whole: dict[str, list[Estimate]] = {}
-    for estimate in estimates:
-        whole.setdefault(estimate.observer, []).append(estimate)
-    return {observer: parts for observer, parts in whole.items() if {e.target for e in parts} == set(TARGETS)}
 
 
 def _score_mode(e: Estimate, true: Array, mode: int, name: str, dt: float, samples: Array, apart: bool) -> Score:
@@ -200,7 +179,7 @@ def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: 
     - RESIDUAL: rms of y_lgs, the residual of the recorded loop.
     """
     out: list[Score] = []
-    both = _of_both(estimates)
+    both = of_both(estimates)
     counts = samples_after(record, warm_up + record.dt)
     for mode, name in enumerate(mode_names):
         z, left = record.z[:, mode], record.y_lgs[:, mode]

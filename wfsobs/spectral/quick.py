@@ -86,12 +86,12 @@ def quick_spectrum(
         return fit
 
     known = fitted(start)
-    if known.coloured:
+    if known.has_background:
         if known.worth_of_background() < background.WORTH:
             known = fitted(replace(start, background=None))
     elif complete and most > 0 and start.turbulence is not None and known.worst_octave() > SUSPECT:
         others = [fitted(with_first_guess(start, reach)) for reach in background.REACHES]
-        known = min([known, *others], key=lambda fit: fit.misfit() + background.WORTH * fit.coloured)
+        known = min([known, *others], key=lambda fit: fit.misfit() + background.WORTH * fit.has_background)
     return known.spectrum
 
 

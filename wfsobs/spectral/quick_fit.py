@@ -70,7 +70,7 @@ class WindowFit:
         self.df = self.f[0]
         self.blur = 2.0 * pi * blur * self.df
         smooth = [numbers_of(p) for p in (start.turbulence, start.background) if p is not None]
-        self.third, self.coloured = isinstance(start.turbulence, Ar3), start.background is not None
+        self.third, self.has_background = isinstance(start.turbulence, Ar3), start.background is not None
         self.first = 1 + 3 * len(smooth) + self.third
         corner = smooth[0][3:] if self.third else []
         resonances = [numbers_of(self._show(p)) for p in start.resonances]
@@ -91,7 +91,7 @@ class WindowFit:
             for w, d, rms in self._of_second_order(self.x)
         ]
         turbulence: Ar2 | Ar3 | None = found.pop(0) if self.first > 1 else None
-        background = found.pop(0) if self.coloured else None
+        background = found.pop(0) if self.has_background else None
         if self.third and isinstance(turbulence, Ar2):
             turbulence = behind_pole(turbulence, float(np.exp(self.x[self.first - 1])))
         return Spectrum(float(np.exp(self.x[0])), self.dt, turbulence, tuple(map(self._sharpen, found)), background)
@@ -123,7 +123,7 @@ class WindowFit:
         if self.extra is not None:
             total += self.extra_density if f is self.cells.frequency else self.extra.psd(f)
         slopes *= (S / total)[:, None]
-        if self.coloured:
+        if self.has_background:
             slopes[1, 1] = 0.0  # the background keeps its damping
         by_numbers, n_smooth = slopes.reshape(-1, len(f)), self.first - self.third - 1
         found = total, np.vstack([2.0 * noise / total, by_numbers[:n_smooth], by_corner / total, by_numbers[n_smooth:]])
@@ -133,10 +133,10 @@ class WindowFit:
     def adapt(self) -> None:
         """Adapt noise, turbulence and background to this window, whatever its peaks."""
         whole = self.cells.mean
-        for _ in range(2 + self.coloured):
+        for _ in range(2 + self.has_background):
             self.cells.mean = np.minimum(whole, CLIPPED * self.density(self.x, self.cells.frequency)[0])
             self.improve()
-            if self.coloured and self.x[4] < self.x[1]:  # the two have changed places
+            if self.has_background and self.x[4] < self.x[1]:  # the two have changed places
                 self.x[1:7] = *self.x[4:7], self.x[1], logit(DAMPING), self.x[3]
         self.cells.mean = whole
 

@@ -10,7 +10,7 @@ from wfsobs.app.numerals import number
 from wfsobs.app.report.data import State
 from wfsobs.app.style import BOUND_MARKS, TERM_COLOURS
 from wfsobs.evaluation.budget import TERMS
-from wfsobs.evaluation.rows import Row, row_label
+from wfsobs.evaluation.rows import Row, row_label, target_title
 
 LEAST = 0.05
 """Share of a bar that is drawn [%]."""
@@ -45,7 +45,7 @@ def _group(state: State, target: str, mode: str, rows: list[Row]) -> dict[str, A
     return {
         "target": target,
         "mode": mode,
-        "title": f"{target.capitalize()}, {mode}",
+        "title": f"{target_title(target)}, {mode}",
         "marks": marks,
         "rows": [_row(row, low, span) for row in sorted(rows, key=lambda row: row["total_um2"])],
     }

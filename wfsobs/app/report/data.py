@@ -25,6 +25,7 @@ from wfsobs.evaluation.budget import budget_row, error_budget
 from wfsobs.evaluation.error_spectra import cumulative_rms, spectra
 from wfsobs.evaluation.evidence import Evidence
 from wfsobs.evaluation.rows import Row, score_rows
+from wfsobs.evaluation.scores import SCORED
 from wfsobs.observers.base import TARGETS
 from wfsobs.priors_from.selection import usual_observers
 from wfsobs.record import RecordError
@@ -141,7 +142,7 @@ def budget_rows(result: Result) -> list[Row]:
         found = [it for it in error_budget(result) if it.terms]
     except ValueError:
         return []
-    found.sort(key=lambda it: (TARGETS.index(it.target), [m.name for m in result.scenario.modes].index(it.mode)))
+    found.sort(key=lambda it: (SCORED.index(it.target), [m.name for m in result.scenario.modes].index(it.mode)))
     return [{"observer": it.observer, "target": it.target, "mode": it.mode, **budget_row(it)} for it in found]
 
 
