@@ -16,8 +16,8 @@ from wfsobs.app.report.packing import pack, unpack
 from wfsobs.app.report.page import page
 from wfsobs.evaluation.budget import TERMS, error_budget
 from wfsobs.evaluation.evidence import gather_evidence
-from wfsobs.evaluation.rows import row_label
-from wfsobs.evaluation.scores import BOUND
+from wfsobs.evaluation.rows import row_label, target_title
+from wfsobs.evaluation.scores import BOUND, SCORED
 from wfsobs.pipeline import run
 from wfsobs.result import Result
 from wfsobs.scenario import Scenario
@@ -30,11 +30,7 @@ def test_every_linear_observer_has_its_terms_in_the_page(result: Result, short: 
     table = next(t for t in it.tables if t[0][:2] == ["Observer", "Parts"])
     assert table[0][3:] == list(TERMS.values())
     titles = [row[0] for row in table[1:] if len(row) == 1]
-    assert titles == [
-        f"{target}, {mode}"
-        for target in ("Turbulence", "Vibration", "Turbulence and vibration together")
-        for mode in ("tip", "tilt")
-    ]
+    assert titles == [f"{target_title(target)}, {mode}" for target in SCORED for mode in ("tip", "tilt")]
     shown: dict[tuple[str, str], list[str]] = {}
     for row in table[1:]:
         if len(row) == 1:
@@ -44,7 +40,7 @@ def test_every_linear_observer_has_its_terms_in_the_page(result: Result, short: 
     budgets = [b for b in error_budget(result) if b.terms]
     assert len(shown) == len(budgets) > 30
     for b in budgets:
-        total, *terms = shown[f"{b.target.capitalize()}, {b.mode}", row_label(b.observer)]
+        total, *terms = shown[f"{target_title(b.target)}, {b.mode}", row_label(b.observer)]
         assert total == number(1e6 * b.total)
         for value, said in zip((b.terms[name] for name in TERMS), terms, strict=True):
             # What rounding leaves is 0.
