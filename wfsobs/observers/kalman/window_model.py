@@ -134,7 +134,8 @@ def unpack_spectrum(table: Array, dt: float) -> Spectrum | None:
         return None
     processes = [None if np.isnan(row[0]) else _process(row, dt) for row in table[1:]]
     resonances = tuple(p for p in processes[1:] if isinstance(p, Ar2))
-    background = None if np.isnan(table[0, 1]) else Ar2(*table[0, 1:].tolist(), dt)
+    omega, damping, rms = table[0, 1:].tolist()
+    background = None if np.isnan(omega) else Ar2(omega, damping, rms, dt)
     return Spectrum(float(table[0, 0]), dt, processes[0], resonances, background)
 
 
