@@ -5,13 +5,28 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from playwright.sync_api import expect
+import pytest
+from playwright.sync_api import Page, expect
 
 from wfsobs.scenario.presets import PRESETS
 
 
-def test_a_setting_is_found_and_gets_the_focus(open_page: Any) -> None:
-    page = open_page()
+@pytest.fixture(scope="module")
+def wide(open_shared: Any) -> Page:
+    """A page for the tests below, in this order."""
+    return open_shared()
+
+
+@pytest.fixture(scope="module")
+def phone(open_shared: Any) -> Page:
+    """As `wide`, with the drawer open."""
+    page = open_shared(390, 844)
+    page.get_by_role("button", name="Open drawer").click()
+    return page
+
+
+def test_a_setting_is_found_and_gets_the_focus(wide: Page) -> None:
+    page = wide
     box = page.get_by_role("combobox", name="Find a setting")
     box.focus()
     page.keyboard.type("process noise")
@@ -34,16 +49,8 @@ def test_a_setting_is_found_and_gets_the_focus(open_page: Any) -> None:
     expect(page.get_by_text("No setting of that name")).to_be_hidden()
 
 
-def test_run_and_status_stay_in_sight(open_page: Any) -> None:
-    page = open_page(1200, 700)
-    page.get_by_role("button", name="Close drawer").click()
-    page.get_by_role("heading", name="RMS errors").scroll_into_view_if_needed()
-    expect(page.get_by_role("button", name="Run", exact=True).first).to_be_in_viewport()
-    expect(page.get_by_role("status").filter(has_text="Done in").first).to_be_in_viewport()
-
-
-def test_a_word_says_what_it_means(open_page: Any) -> None:
-    page = open_page()
+def test_a_word_says_what_it_means(wide: Page) -> None:
+    page = wide
     for word, meaning in (
         ("bound", "Smallest RMS error"),
         ("Lag [ms]", "cross-correlation"),
@@ -59,8 +66,8 @@ def test_a_word_says_what_it_means(open_page: Any) -> None:
         expect(definition).to_be_hidden()
 
 
-def test_help_and_tour_by_keyboard(open_page: Any) -> None:
-    page = open_page()
+def test_help_and_tour_by_keyboard(wide: Page) -> None:
+    page = wide
     page.keyboard.press("?")
     sheet = page.get_by_role("dialog", name="Help")
     expect(sheet.get_by_text("Undo and redo a change of the settings")).to_be_visible()
@@ -80,26 +87,6 @@ def test_help_and_tour_by_keyboard(open_page: Any) -> None:
     expect(sheet).to_be_hidden()
 
 
-def test_a_heading_says_what_differs(open_page: Any) -> None:
-    page = open_page(390, 844)
-    page.get_by_role("button", name="Open drawer").click()
-    page.get_by_role("textbox", name="m/s").fill("20")
-    page.get_by_role("textbox", name="m/s").press("Enter")
-    expect(page.get_by_role("button", name=re.compile("Turbulence · 1 changed"))).to_be_visible()
-
-
-def test_a_preset_is_chosen_from_the_gallery(open_page: Any) -> None:
-    page = open_page(390, 844)
-    page.get_by_role("button", name="Open drawer").click()
-    page.get_by_role("button", name="Gallery").click()
-    sheet = page.get_by_role("dialog", name="Gallery of presets")
-    expect(sheet.get_by_role("button")).to_have_count(len(PRESETS))
-    expect(sheet.locator("svg")).to_have_count(len(PRESETS))
-    sheet.get_by_role("button", name=re.compile("Strong turbulence")).click()
-    expect(sheet).to_be_hidden()
-    expect(page.get_by_role("combobox", name="Preset")).to_have_text("Strong turbulence")
-
-
 PAINTED = """async () => {
   const view = Bokeh.index.query_one((it) => it.model.type === "Figure")
   const {paint, _after_layout} = view, done = []
@@ -117,6 +104,33 @@ PAINTED = """async () => {
 """Whether a figure that finds that its axes need more room is painted after they have got it."""
 
 
-def test_a_figure_is_painted_where_its_axes_are(open_page: Any) -> None:
-    page = open_page()
+def test_a_figure_is_painted_where_its_axes_are(wide: Page) -> None:
+    page = wide
     assert page.evaluate(PAINTED) is True
+
+
+def test_run_and_status_stay_in_sight(wide: Page) -> None:
+    page = wide
+    page.set_viewport_size({"width": 1200, "height": 700})
+    page.get_by_role("button", name="Close drawer").click()
+    page.get_by_role("heading", name="RMS errors").scroll_into_view_if_needed()
+    expect(page.get_by_role("button", name="Run", exact=True).first).to_be_in_viewport()
+    expect(page.get_by_role("status").filter(has_text="Done in").first).to_be_in_viewport()
+
+
+def test_a_heading_says_what_differs(phone: Page) -> None:
+    page = phone
+    page.get_by_role("textbox", name="m/s").fill("20")
+    page.get_by_role("textbox", name="m/s").press("Enter")
+    expect(page.get_by_role("button", name=re.compile("Turbulence · 1 changed"))).to_be_visible()
+
+
+def test_a_preset_is_chosen_from_the_gallery(phone: Page) -> None:
+    page = phone
+    page.get_by_role("button", name="Gallery").click()
+    sheet = page.get_by_role("dialog", name="Gallery of presets")
+    expect(sheet.get_by_role("button")).to_have_count(len(PRESETS))
+    expect(sheet.locator("svg")).to_have_count(len(PRESETS))
+    sheet.get_by_role("button", name=re.compile("Strong turbulence")).click()
+    expect(sheet).to_be_hidden()
+    expect(page.get_by_role("combobox", name="Preset")).to_have_text("Strong turbulence")

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from typing import Any
 
-from playwright.sync_api import expect
+import pytest
+from playwright.sync_api import Page, expect
 
 from tests.browser.conftest import DONE, SETTINGS, finished
 
@@ -28,23 +30,110 @@ def test_a_loop_that_is_changed_while_it_runs(open_page: Any, server: Any) -> No
     expect(page.get_by_text(re.compile("^Paused at 1 × real time"))).to_be_visible(timeout=LONG)
     page.get_by_role("button", name="Play", exact=True).click()
     expect(page.get_by_text(re.compile("^Running at 1 × real time"))).to_be_visible(timeout=LONG)
-    page.get_by_role("button", name="Stop", exact=True).click()
-    expect(page.get_by_text("Stopped", exact=True)).to_be_visible(timeout=LONG)
+    stop(page)
     expect(page.get_by_role("button", name="Start", exact=True)).to_be_enabled()
 
 
-QUICK = "?run.duration=1&run.warm_up=0.2&gpr_online.training_size=40&gpr_offline.training_size=40&view.page=live"
+QUICK = (
+    "?run.duration=1&run.warm_up=0.2&gpr_online.training_size=40&gpr_offline.training_size=40&view.page=live"
+    "&view.live.observers=kf-multi,multirate-multi,gpr-online&view.live.controllers=integrator"
+)
+"""Few beside the page: those whose lines are shown first."""
 
 
-def begin(page: Any) -> None:
+def begin(page: Page) -> None:
     page.wait_for_function(SETTINGS, polling=100)
     page.get_by_role("button", name="Start", exact=True).click()
     expect(page.get_by_role("figure", name="Waterfall")).to_be_visible(timeout=LONG)
 
 
-def test_a_peak_that_is_moved_in_the_live_spectrum(open_page: Any, server: Any) -> None:
-    page = open_page(url=server.url + QUICK, wait=False)
+def stop(page: Page) -> None:
+    """Stop the loop: it would go on for a while without its page, and the next one would wait for its place."""
+    page.get_by_role("button", name="Stop", exact=True).click()
+    expect(page.get_by_text("Stopped", exact=True)).to_be_visible(timeout=LONG)
+
+
+def test_a_page_that_opens_on_live_runs_nothing_until_another_page_needs_it(open_page: Any, server: Any) -> None:
+    page = open_page(url=server.url + QUICK + "&view.mode=tilt&view.live.speed=0.3", wait=False)
     begin(page)
+    expect(page.get_by_text(re.compile("^Running at 0.3 × real time"))).to_be_visible()
+    expect(page.get_by_role("combobox", name="Speed")).to_have_text("0.3 ×")
+    wind = page.get_by_role("textbox", name="Wind speed V₀ [m/s]")
+    wind.fill("20")
+    wind.press("Enter")
+    expect(page.get_by_role("list", name="Events")).to_contain_text("Wind speed V₀ 15 → 20 m/s", timeout=LONG)
+    assert not page.evaluate(DONE)
+    expect(page.get_by_role("button", name="Tilt", exact=True)).to_have_attribute("aria-pressed", "true")
+    page.get_by_role("button", name="Explore", exact=True).click()
+    finished(page)
+    expect(page.get_by_role("button", name="Tilt", exact=True)).to_have_attribute("aria-pressed", "true")
+    page.get_by_role("button", name="Live", exact=True).click()
+    stop(page)
+
+
+@pytest.fixture(scope="module")
+def running(open_shared: Any, server: Any) -> Iterator[Page]:
+    """A page with a loop that runs, for all tests below."""
+    page = open_shared(url=server.url + QUICK, wait=False)
+    begin(page)
+    yield page
+    stop(page)
+
+
+WATCH = """() => {
+  window.shown = []
+  const find = (node) => {
+    for (const it of node.querySelectorAll("*")) {
+      if (it.getAttribute("role") === "status" && /real time/.test(it.textContent)) return it.textContent
+      const inner = it.shadowRoot && find(it.shadowRoot)
+      if (inner) return inner
+    }
+  }
+  window.read = () => Number(/· ([0-9.]+) s ·/.exec(find(document))[1])
+  window.watch = setInterval(() => { const now = window.read(); if (now !== window.shown.at(-1)) window.shown.push(now) }, 20)
+}"""
+SLEEP = "() => { const end = performance.now() + 6000; while (performance.now() < end); return window.read() }"
+
+
+def test_a_page_that_sleeps_and_wakes_shows_now(running: Page) -> None:
+    """What came while it slept is not made up for, picture by picture: one may have been on its way, the next is of now."""
+    page = running
+    page.evaluate(WATCH)
+    page.wait_for_function("window.shown.length > 2", timeout=LONG)
+    asleep = page.evaluate(SLEEP)
+    page.wait_for_function(f"window.read() > {asleep} + 5", timeout=LONG)
+    page.evaluate("() => clearInterval(window.watch)")
+    late = [t for t in page.evaluate("window.shown") if asleep + 0.5 < t < asleep + 4.5]
+    assert len(late) <= 1, late
+
+
+TRACE = """() => {
+  const all = Bokeh.documents.flatMap((it) => [...it._all_models.values()])
+  const lines = (it) => it.renderers.filter((line) => line.glyph?.type === "Line" && line.visible)
+  const isTraces = (it) => it.type === "Figure" && it.below.some((axis) => axis.axis_label === "time of the loop [s]")
+  const figure = all.filter(isTraces).find((it) => lines(it).length)
+  const largest = (y) => Math.max(...[...y].filter(Number.isFinite).map(Math.abs))
+  const told = ({x, y}) => ({first: x[0], last: x[x.length - 1], most: largest(y), same: x.length === y.length})
+  return figure && {end: figure.x_range.end, top: figure.y_range.end, lines: lines(figure).map((it) => told(it.data_source.data))}
+}"""
+
+
+def test_traces_of_all_observers_follow_the_loop(running: Page) -> None:
+    """What comes with a picture reaches the right line: all end where the axis ends, and the largest fills it to 1 / 1.1."""
+    page = running
+    end = 1.0
+    for _ in range(4):
+        seen = page.wait_for_function(f"end => {{ const it = ({TRACE})(); return it?.end > end && it }}", arg=end).json_value()
+        end = seen["end"]
+        assert len(seen["lines"]) == 3 and all(line["same"] for line in seen["lines"])
+        for line in seen["lines"]:
+            # a bin of the envelope is a 300th of the window of at most ten seconds; times come in single precision
+            assert abs(line["last"] - seen["end"]) < 0.05 and line["first"] < line["last"]
+        assert abs(max(line["most"] for line in seen["lines"]) / seen["top"] - 1 / 1.1) < 1e-3
+
+
+def test_a_peak_that_is_moved_in_the_live_spectrum(running: Page) -> None:
+    page = running
     page.get_by_role("combobox", name="Errors of").click()
     page.get_by_role("option", name="Vibration", exact=True).click()
     page.get_by_role("checkbox", name="Edit on the figure").check()
@@ -62,87 +151,15 @@ def test_a_peak_that_is_moved_in_the_live_spectrum(open_page: Any, server: Any) 
     expect(page.get_by_role("figure", name="Star: Integrator")).to_be_visible()
 
 
-WATCH = """() => {
-  window.shown = []
-  const find = (node) => {
-    for (const it of node.querySelectorAll("*")) {
-      if (it.getAttribute("role") === "status" && /real time/.test(it.textContent)) return it.textContent
-      const inner = it.shadowRoot && find(it.shadowRoot)
-      if (inner) return inner
-    }
-  }
-  window.read = () => Number(/· ([0-9.]+) s ·/.exec(find(document))[1])
-  setInterval(() => { const now = window.read(); if (now !== window.shown.at(-1)) window.shown.push(now) }, 20)
-}"""
-SLEEP = "() => { const end = performance.now() + 6000; while (performance.now() < end); return window.read() }"
-
-
-def test_a_page_that_sleeps_and_wakes_shows_now(open_page: Any, server: Any) -> None:
-    """What came while it slept is not made up for, picture by picture: one may have been on its way, the next is of now."""
-    page = open_page(url=server.url + QUICK, wait=False)
-    begin(page)
-    page.evaluate(WATCH)
-    page.wait_for_function("window.shown.length > 2", timeout=LONG)
-    asleep = page.evaluate(SLEEP)
-    page.wait_for_function(f"window.read() > {asleep} + 5", timeout=LONG)
-    late = [t for t in page.evaluate("window.shown") if asleep + 0.5 < t < asleep + 4.5]
-    assert len(late) <= 1, late
-
-
-TRACE = """() => {
-  const all = Bokeh.documents.flatMap((it) => [...it._all_models.values()])
-  const lines = (it) => it.renderers.filter((line) => line.glyph?.type === "Line" && line.visible)
-  const isTraces = (it) => it.type === "Figure" && it.below.some((axis) => axis.axis_label === "time of the loop [s]")
-  const figure = all.filter(isTraces).find((it) => lines(it).length)
-  const largest = (y) => Math.max(...[...y].filter(Number.isFinite).map(Math.abs))
-  const told = ({x, y}) => ({first: x[0], last: x[x.length - 1], most: largest(y), same: x.length === y.length})
-  return {end: figure.x_range.end, top: figure.y_range.end, lines: lines(figure).map((it) => told(it.data_source.data))}
-}"""
-
-
-def test_traces_of_all_observers_follow_the_loop(open_page: Any, server: Any) -> None:
-    """What comes with a picture reaches the right line: all end where the axis ends, and the largest fills it to 1 / 1.1."""
-    page = open_page(url=server.url + QUICK, wait=False)
-    begin(page)
-    ends = []
-    for _ in range(4):
-        page.wait_for_timeout(1500)
-        seen = page.evaluate(TRACE)
-        ends.append(seen["end"])
-        assert len(seen["lines"]) == 3 and all(line["same"] for line in seen["lines"])
-        for line in seen["lines"]:
-            # a bin of the envelope is a 300th of the window of at most ten seconds; times come in single precision
-            assert abs(line["last"] - seen["end"]) < 0.05 and line["first"] < line["last"]
-        assert abs(max(line["most"] for line in seen["lines"]) / seen["top"] - 1 / 1.1) < 1e-3
-    assert sorted(set(ends)) == ends
-
-
-def test_a_page_that_opens_on_live_runs_nothing_until_another_page_needs_it(open_page: Any, server: Any) -> None:
-    page = open_page(url=server.url + QUICK + "&view.mode=tilt&view.live.speed=0.3", wait=False)
-    begin(page)
-    expect(page.get_by_text(re.compile("^Running at 0.3 × real time"))).to_be_visible()
-    expect(page.get_by_role("combobox", name="Speed")).to_have_text("0.3 ×")
-    wind = page.get_by_role("textbox", name="Wind speed V₀ [m/s]")
-    wind.fill("20")
-    wind.press("Enter")
-    expect(page.get_by_role("list", name="Events")).to_contain_text("Wind speed V₀ 15 → 20 m/s", timeout=LONG)
-    assert not page.evaluate(DONE)
-    expect(page.get_by_role("button", name="Tilt", exact=True)).to_have_attribute("aria-pressed", "true")
-    page.get_by_role("button", name="Explore", exact=True).click()
-    finished(page)
-    expect(page.get_by_role("button", name="Tilt", exact=True)).to_have_attribute("aria-pressed", "true")
-
-
 MARKS = """() => Bokeh.documents.flatMap((it) => [...it._all_models.values()])
   .filter((it) => it.type === "ColumnDataSource" && "line" in it.data).flatMap((it) => [...it.data.line])"""
 
 
-def test_one_observer_is_identified_anew_while_the_loop_runs(open_page: Any, server: Any) -> None:
+def test_one_observer_is_identified_anew_while_the_loop_runs(running: Page) -> None:
     """And then designed anew for the settings of the drawer; the others keep their designs."""
-    page = open_page(url=server.url + QUICK, wait=False)
-    begin(page)
+    page = running
     page.get_by_role("combobox", name="Speed").click()
-    page.get_by_role("option", name="0.2 ×", exact=True).click()  # fifteen observers leave the identification no processor else
+    page.get_by_role("option", name="0.2 ×", exact=True).click()  # the observers leave the identification no processor else
     page.get_by_role("combobox", name="New design of").click()
     page.get_by_role("option", name="Multi-rate, all peaks", exact=True).click()
     page.get_by_role("button", name="Identify", exact=True).last.click()  # the first one leads to the page of that name

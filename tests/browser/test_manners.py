@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
+import pytest
 from playwright.sync_api import Locator, Page, expect
 
 QUICK = "?run.duration=2&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.5"
@@ -30,24 +31,10 @@ def remembered(page: Page, theme: str) -> None:
     page.wait_for_function("theme => localStorage.getItem('wfsobs-theme') === theme", arg=theme)
 
 
-def test_nothing_moves_under_the_pointer(open_page: Any, server: Any) -> None:
-    page = open_page(url=server.url + QUICK)
-    load, source = page.get_by_role("button", name="Load data"), page.get_by_role("combobox", name="Source").first
-    run, box = page.get_by_role("button", name="Run", exact=True).first, page.get_by_role("textbox", name="m/s")
-    page.wait_for_function("() => document.fonts.status === 'loaded'")
-    before = [place(it) for it in (load, run, box, source)]
-    page.evaluate("() => { navigator.clipboard.writeText = () => Promise.resolve() }")
-    page.get_by_role("button", name="Share", exact=True).click()
-    page.get_by_role("menuitem", name="Copy link", exact=True).click()
-    expect(page.get_by_text("Copied the link.")).to_be_visible()
-    assert place(load) == before[0]
-    box.fill("22")
-    box.press("Enter")
-    page.locator('input[data-cell="0.frequency"]').fill("7")
-    page.locator('input[data-cell="0.frequency"]').press("Enter")
-    expect(page.get_by_text(re.compile(r"\d changed: .*Peaks"))).to_be_visible()
-    assert [place(it) for it in (load, run, box, source)] == before
-    expect(page.get_by_text("Copied the link.")).to_have_count(0)
+@pytest.fixture(scope="module")
+def wide(open_shared: Any, server: Any) -> Page:
+    """A page for the tests below, in this order."""
+    return open_shared(url=server.url + QUICK)
 
 
 TOLD_TWICE = """async () => {
@@ -68,17 +55,39 @@ TOLD_TWICE = """async () => {
 second has come. What a component itself sets is another matter."""
 
 
-def test_what_is_told_twice_stays_at_the_second(open_page: Any, server: Any) -> None:
-    page = open_page(url=server.url + QUICK)
-    assert page.evaluate(TOLD_TWICE) == ["the newer", "the newer", "a third"]
+def test_what_is_told_twice_stays_at_the_second(wide: Page) -> None:
+    assert wide.evaluate(TOLD_TWICE) == ["the newer", "the newer", "a third"]
 
 
-def test_a_comma_gets_a_hint(open_page: Any, server: Any) -> None:
-    page = open_page(url=server.url + QUICK)
-    box = page.get_by_role("textbox", name="m/s")
+def test_a_comma_gets_a_hint(wide: Page) -> None:
+    box = wide.get_by_role("textbox", name="m/s")
     box.fill("15,5")
     box.press("Enter")
-    expect(page.get_by_role("alert").filter(has_text="use a point: 15.5").first).to_be_visible()
+    hint = wide.get_by_role("alert").filter(has_text="use a point: 15.5")
+    expect(hint.first).to_be_visible()
+    box.fill("15")
+    box.press("Enter")
+    expect(hint).to_have_count(0)
+
+
+def test_nothing_moves_under_the_pointer(wide: Page) -> None:
+    page = wide
+    load, source = page.get_by_role("button", name="Load data"), page.get_by_role("combobox", name="Source").first
+    run, box = page.get_by_role("button", name="Run", exact=True).first, page.get_by_role("textbox", name="m/s")
+    page.wait_for_function("() => document.fonts.status === 'loaded'")
+    before = [place(it) for it in (load, run, box, source)]
+    page.evaluate("() => { navigator.clipboard.writeText = () => Promise.resolve() }")
+    page.get_by_role("button", name="Share", exact=True).click()
+    page.get_by_role("menuitem", name="Copy link", exact=True).click()
+    expect(page.get_by_text("Copied the link.")).to_be_visible()
+    assert place(load) == before[0]
+    box.fill("22")
+    box.press("Enter")
+    page.locator('input[data-cell="0.frequency"]').fill("7")
+    page.locator('input[data-cell="0.frequency"]').press("Enter")
+    expect(page.get_by_text(re.compile(r"\d changed: .*Peaks"))).to_be_visible()
+    assert [place(it) for it in (load, run, box, source)] == before
+    expect(page.get_by_text("Copied the link.")).to_have_count(0)
 
 
 def test_the_theme_of_the_system_unless_another_is_chosen(open_page: Any, server: Any) -> None:

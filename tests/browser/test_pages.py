@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import pytest
 from playwright.sync_api import Page, expect
 
 from wfsobs.app.style import observers_of
@@ -43,8 +44,26 @@ def no_wider_than(page: Page, width: int) -> None:
     page.wait_for_function("width => document.documentElement.scrollWidth <= width", arg=width)
 
 
-def test_the_figures_of_the_paper(open_page: Any, tmp_path: Path) -> None:
-    page = open_page()
+@pytest.fixture(scope="module")
+def wide(open_shared: Any) -> Page:
+    """A page for the tests below, in this order."""
+    return open_shared()
+
+
+def test_best_first(wide: Page) -> None:
+    page = wide
+    expect(page.get_by_role("columnheader", name=re.compile("Stated"))).to_be_visible()
+    table = page.get_by_role("region", name="RMS errors")
+    assert table.evaluate("it => it.scrollWidth <= it.clientWidth"), "all columns at 1400 pixels, the drawer open"
+    rows = page.locator('tr[data-target="turbulence"]:not([data-observer^=bound])')
+    expect(rows.first).to_contain_text(re.compile("smallest|best|tied"))  # the first of one record
+    page.wait_for_function(f"() => ({ERRORS})().every((error, i, all) => i === 0 || all[i - 1] <= error)")
+    page.get_by_role("checkbox", name="Best first").click()
+    expect(rows.first).to_have_attribute("data-observer", "kf-lgs", timeout=SLOW)
+
+
+def test_the_figures_of_the_paper(wide: Page, tmp_path: Path) -> None:
+    page = wide
     before = [name for name, _ in page.evaluate(LINES)]
     assert 0 < len(before) < ALL_LINES, "lines of cards that are not shown, and figures of other pages, are not made yet"
     turn(page, "Paper figures")
@@ -62,8 +81,17 @@ def test_the_figures_of_the_paper(open_page: Any, tmp_path: Path) -> None:
     expect(page.get_by_role("heading", name="Figure 5 of the paper")).to_be_hidden()
 
 
-def test_the_model(open_page: Any) -> None:
-    page = open_page()
+def test_cumulative_rms(wide: Page) -> None:
+    page = wide
+    assert "cumulative" not in page.evaluate(LABELS)
+    turn(page, "Cumulative rms")
+    page.wait_for_function(f"({LABELS})().includes('cumulative rms of error, tip [nm]')")
+    turn(page, "Signal")
+    page.wait_for_function(f"({LABELS})().includes('cumulative rms, tip [nm]')")
+
+
+def test_the_model(wide: Page) -> None:
+    page = wide
     turn(page, "Model")
     expect(page.get_by_role("heading", name="State space: equations 6 and 7")).to_be_visible(timeout=SLOW)
     expect(page.get_by_text("Poles of one cycle, 5 ms").first).to_be_visible()
@@ -116,24 +144,3 @@ def test_pin_and_compare(open_page: Any) -> None:
     page.get_by_role("button", name="Unpin: compare with no other run").click()
     expect(page.get_by_role("columnheader", name="A [nm]")).to_have_count(0, timeout=SLOW)
     page.wait_for_function(f"({PINNED})().every(n => n === 0)")
-
-
-def test_cumulative_rms(open_page: Any) -> None:
-    page = open_page()
-    assert "cumulative" not in page.evaluate(LABELS)
-    turn(page, "Cumulative rms")
-    page.wait_for_function(f"({LABELS})().includes('cumulative rms of error, tip [nm]')")
-    turn(page, "Signal")
-    page.wait_for_function(f"({LABELS})().includes('cumulative rms, tip [nm]')")
-
-
-def test_best_first(open_page: Any) -> None:
-    page = open_page()
-    expect(page.get_by_role("columnheader", name=re.compile("Stated"))).to_be_visible()
-    table = page.get_by_role("region", name="RMS errors")
-    assert table.evaluate("it => it.scrollWidth <= it.clientWidth"), "all columns at 1400 pixels, the drawer open"
-    rows = page.locator('tr[data-target="turbulence"]:not([data-observer^=bound])')
-    expect(rows.first).to_contain_text(re.compile("smallest|best|tied"))  # the first of one record
-    page.wait_for_function(f"() => ({ERRORS})().every((error, i, all) => i === 0 || all[i - 1] <= error)")
-    page.get_by_role("checkbox", name="Best first").click()
-    expect(rows.first).to_have_attribute("data-observer", "kf-lgs", timeout=SLOW)

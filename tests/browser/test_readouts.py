@@ -5,11 +5,17 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from playwright.sync_api import expect
+import pytest
+from playwright.sync_api import Page, expect
 
 
-def test_values_at_the_pointer_and_by_the_arrow_keys(open_page: Any) -> None:
-    page = open_page()
+@pytest.fixture(scope="module")
+def page(open_shared: Any) -> Page:
+    """A page for the tests below, in this order."""
+    return open_shared()
+
+
+def test_values_at_the_pointer_and_by_the_arrow_keys(page: Page) -> None:
     box = page.locator(".values")
     figure = page.get_by_role("figure", name="Turbulence time trace")
     at = figure.bounding_box()
@@ -28,8 +34,7 @@ def test_values_at_the_pointer_and_by_the_arrow_keys(open_page: Any) -> None:
     expect(box).to_be_hidden()
 
 
-def test_a_brush_over_time_and_over_a_band(open_page: Any) -> None:
-    page = open_page()
+def test_a_brush_over_time_and_over_a_band(page: Page) -> None:
     line = page.locator("p.stretch").filter(has_text="Online GPR")
     expect(line).to_have_count(1)
     expect(line).to_contain_text("4.50 – 6.50 s")

@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Page, expect
+
+from tests.browser.conftest import Contexts, leave
 
 FLAGS = ["--public", "--runs", "1", "--max-duration", "100", "--lifetime", "5"]
 """Runs of a page that is gone stop with its session, and only then the next one begins."""
@@ -30,21 +32,21 @@ def serve(make_server: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterato
 
 
 @pytest.fixture
-def visit(browser: Browser, serve: Any) -> Iterator[Callable[..., Page]]:
-    """A function that opens the page for one more visitor."""
-    opened: list[Any] = []
+def visit(contexts: Contexts, serve: Any) -> Iterator[Callable[..., Page]]:
+    """A function that opens the page for one more visitor: every page has a session of its own."""
+    opened: list[Page] = []
 
     def open_it(query: str = "") -> Page:
-        context = browser.new_context(viewport={"width": 1400, "height": 1000})
-        opened.append(context)
-        page = context.new_page()
+        page = contexts().new_page()
+        page.set_viewport_size({"width": 1400, "height": 1000})
         page.set_default_timeout(120_000)
+        opened.append(page)
         page.goto(serve.url + query)
         return page
 
     yield open_it
-    for context in opened:
-        context.close()
+    for page in opened:
+        leave(page)
 
 
 def status(page: Page, text: str) -> None:

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from playwright.sync_api import expect
+import pytest
+from playwright.sync_api import Page, expect
 
 from wfsobs.scenario.presets import paper
 from wfsobs.simulation.loop import simulate
@@ -17,7 +18,13 @@ from wfsobs.telemetry.records import save_record
 SHORT = "run.duration=2&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40"
 
 
-def test_a_record_is_previewed_used_and_taken_back(open_page: Any, server: Any, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def page(open_shared: Any, server: Any) -> Page:
+    """A page for the tests below, in this order."""
+    return open_shared(url=f"{server.url}?{SHORT}")
+
+
+def test_a_record_is_previewed_used_and_taken_back(page: Page, tmp_path: Path) -> None:
     """A file of more than one part; one that is none first."""
     record = simulate(paper().replace({"run.duration": 7.0}))
     y = record.y_lgs.copy()
@@ -26,7 +33,6 @@ def test_a_record_is_previewed_used_and_taken_back(open_page: Any, server: Any, 
     assert (tmp_path / "night.csv").stat().st_size > 1_000_000
     (tmp_path / "wrong.npz").write_text("hello")
 
-    page = open_page(url=f"{server.url}?{SHORT}")
     picker = page.get_by_label("Record file")
     picker.set_input_files(tmp_path / "wrong.npz")
     expect(page.get_by_text("wrong.npz: not an .npz file").first).to_be_visible()
@@ -41,12 +47,27 @@ def test_a_record_is_previewed_used_and_taken_back(open_page: Any, server: Any, 
     expect(page.get_by_text("Record night.csv")).to_have_count(0)
 
 
-def test_a_dropped_file_whose_columns_are_said_what_they_are(open_page: Any, server: Any) -> None:
+def test_template_and_sample(page: Page, tmp_path: Path) -> None:
+    """The sample is a record that can be loaded at once."""
+    page.get_by_text("File format").click()
+    with page.expect_download() as waiting:
+        page.get_by_role("button", name="Template CSV").click()
+    assert waiting.value.suggested_filename == "wfsobs-template.csv"
+    with page.expect_download(timeout=60_000) as waiting:
+        page.get_by_role("button", name="Sample record").click()
+    waiting.value.save_as(tmp_path / "sample.csv")
+    page.get_by_label("Record file").set_input_files(tmp_path / "sample.csv")
+    expect(page.get_by_text("5000 steps at 1000 Hz, 5 s, 0 missing")).to_be_visible()
+    expect(page.get_by_text("truth: turbulence and vibration")).to_be_visible()
+    page.get_by_role("button", name="Discard").click()
+    expect(page.get_by_text("5000 steps at 1000 Hz, 5 s, 0 missing")).not_to_be_visible()
+
+
+def test_a_dropped_file_whose_columns_are_said_what_they_are(page: Page) -> None:
     """Dropped on the table, far from the button; names that say nothing; every choice by a menu of the form."""
     record = simulate(paper().replace({"run.duration": 3.0}))
     table = np.column_stack([record.y_lgs, record.u]).tolist()
     text = "\n".join(["a,b,c,d", *(",".join(map(repr, row)) for row in table)])
-    page = open_page(url=f"{server.url}?{SHORT}")
     page.evaluate(
         """([name, text]) => {
             const files = new DataTransfer()
@@ -75,20 +96,3 @@ def test_a_dropped_file_whose_columns_are_said_what_they_are(open_page: Any, ser
     use.click()
     expect(page.get_by_text("Record odd.csv: 3000 steps")).to_be_visible()
     expect(page.get_by_text("Recorded loop, residual")).to_be_visible()
-
-
-def test_template_and_sample(open_page: Any, server: Any, tmp_path: Path) -> None:
-    """The sample is a record that can be loaded at once."""
-    page = open_page(url=f"{server.url}?{SHORT}")
-    page.get_by_text("File format").click()
-    with page.expect_download() as waiting:
-        page.get_by_role("button", name="Template CSV").click()
-    assert waiting.value.suggested_filename == "wfsobs-template.csv"
-    with page.expect_download(timeout=60_000) as waiting:
-        page.get_by_role("button", name="Sample record").click()
-    waiting.value.save_as(tmp_path / "sample.csv")
-    page.get_by_label("Record file").set_input_files(tmp_path / "sample.csv")
-    expect(page.get_by_text("5000 steps at 1000 Hz, 5 s, 0 missing")).to_be_visible()
-    expect(page.get_by_text("truth: turbulence and vibration")).to_be_visible()
-    page.get_by_role("button", name="Discard").click()
-    expect(page.get_by_text("5000 steps at 1000 Hz, 5 s, 0 missing")).not_to_be_visible()
