@@ -14,7 +14,7 @@ from time import monotonic
 from visitor import Visitor
 
 SHOWN = re.compile(r"real time · ([0-9.]+) s ·")
-"""What a page says of the time of the newest frame in its picture, to 0.01 s."""
+"""What a page says of the time of the newest frame in its picture, to 0.1 s."""
 
 
 class LivePage(Visitor):

@@ -46,7 +46,7 @@ PICTURES = {
         "?run.duration=2&run.warm_up=0.5", ("Sweep", "Run the sweep"), "text=/Finished · 80 of 80 runs/", (1400, 1130)
     ),
     "pictures/closed-loop": Picture("", ("Closed loop",), 'tr[data-controller="integrator+gpr-online"] td', (1400, 1100)),
-    "pictures/live": Picture("", ("Live", "Start"), r"text=/real time · [3-9]\d\.\d\d s · /", (1400, 1380)),
+    "pictures/live": Picture("", ("Live", "Start"), r"text=/real time · [3-9]\d\.\d s · /", (1400, 1380)),
 }
 
 

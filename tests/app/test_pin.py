@@ -151,7 +151,7 @@ class TestTable:
 
     def test_marks(self, dashboard: Dashboard) -> None:
         html = dashboard.explore.table.pane.object
-        assert html.count(">smallest<") == 2, "one causal observer per target, of one record"
+        assert html.count(">smallest<") == 3, "one causal observer per target and for both together, of one record"
         assert ">best<" not in html
         worse = [
             s

@@ -111,7 +111,7 @@ def test_error_over_a_setting_of_the_drawer(open_page: Any, server: Any) -> None
     page.get_by_role("button", name="Run the sweep").click()
     expect(page.get_by_text("Finished · 6 of 6 runs")).to_be_visible(timeout=90_000)
     expect(page.get_by_role("figure", name="Error over Exposure ratio n, turbulence")).to_be_visible()
-    expect(page.get_by_role("button", name=re.compile(r"^Exposure ratio n 10: .*3 seeds$"))).to_have_count(2)
+    expect(page.get_by_role("button", name=re.compile(r"^Exposure ratio n 10: .*3 seeds$"))).to_have_count(3)
     look_for_faults(page)
 
 

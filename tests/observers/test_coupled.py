@@ -15,14 +15,13 @@ from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.bound_modes import bound_rms_of_modes
 from wfsobs.evaluation.calibration import half_width
 from wfsobs.evaluation.exact_errors import exact_errors
-from wfsobs.evaluation.scores import BOUND, BOUND_MODES
+from wfsobs.evaluation.scores import BOUND, BOUND_MODES, SCORED
 from wfsobs.evaluation.theory import is_predicted
 from wfsobs.evaluation.verdict import verdict
 from wfsobs.execution import run_observer
 from wfsobs.live.checks import observers_on
 from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.coupled import INDEPENDENT, CoupledEstimator, CoupledModel
 from wfsobs.pipeline import observe, run
 from wfsobs.prior import Flow, Lines
@@ -75,7 +74,7 @@ def test_its_bound_is_a_row_of_its_table_and_of_no_other() -> None:
     rows, alone = ({(s.target, s.mode): s.rms for s in result.scores if s.observer == row} for row in (BOUND_MODES, BOUND))
     names = [mode.name for mode in short.modes]
     bound = bound_rms_of_modes(short)
-    found = {(target, name): one[target] for one, name in zip(bound, names, strict=True) for target in TARGETS}
+    found = {(target, name): one[target] for one, name in zip(bound, names, strict=True) for target in SCORED}
     assert rows == {key: min(value, alone[key]) for key, value in found.items()}, "no higher than that of a mode by itself"
     assert not [s for s in run(short, observers=["zero"]).scores if s.observer == BOUND_MODES]
     said = verdict(short, result.record, result.estimates, result.scores, "turbulence", names[0])

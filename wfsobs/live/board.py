@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from wfsobs.latencies import EDGES, Latencies
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
+from wfsobs.observers.estimates import TOTAL
 from wfsobs.typing import Array
 
 NEXT = "next"
 """The next measurement: what an observer of turbulence and vibration expects of it is their sum."""
-SCORED = (*TARGETS, NEXT)
+SCORED = (*TARGETS, NEXT, TOTAL)
 """What errors are counted of."""
 SLOTS = tuple(o.id for o in OBSERVERS.values() if o.step is not None and "y_stars" not in o.needs)
 """Observers that run frame by frame, on what a live source sends: no LGS by itself; each has its place."""
@@ -34,8 +35,8 @@ def crew_of(observer: str) -> int:
 class Counts(NamedTuple):
     """What is counted of one observer; all are counted up in place.
 
-    squares, samples : sums of squared errors [um^2] and their numbers, (3, n_modes) for turbulence, vibration and the next
-        measurement
+    squares, samples : sums of squared errors [um^2] and their numbers, (4, n_modes) for turbulence, vibration, the next
+        measurement, and turbulence and vibration together
     latencies : histogram of its steps
     late, frames, since : steps longer than a frame, steps, first frame, (1,); `since` is -1 while it is off
     """

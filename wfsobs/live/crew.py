@@ -8,7 +8,7 @@ from time import monotonic
 import numpy as np
 
 from wfsobs.latencies import EDGES
-from wfsobs.live.board import SCORED, SLOTS, Board
+from wfsobs.live.board import NEXT, SCORED, SLOTS, Board
 from wfsobs.live.paced import Command
 from wfsobs.live.ring import LiveFrame
 from wfsobs.observers.base import TARGETS
@@ -17,6 +17,8 @@ from wfsobs.observers.step_checks import StepError
 from wfsobs.record import Sampling
 from wfsobs.typing import Array
 
+TRUTHS = (*TARGETS, NEXT)
+"""What errors are against; that of both targets together is the sum of theirs."""
 COUNTED = 64
 """Frames that are counted together at most."""
 
@@ -80,7 +82,7 @@ class Crew:
         self._row = np.full(trace_width(m), np.nan)
         slots = self._row[2:].reshape(n, slot_width(m))
         self._times, self._estimates = slots[:, 0], slots[:, 1:].reshape(n, len(TARGETS), m)  # views of the row
-        self._rows, self._truth, self._waits = np.empty((COUNTED, *slots.shape)), np.empty((COUNTED, len(SCORED), m)), 0
+        self._rows, self._truth, self._waits = np.empty((COUNTED, *slots.shape)), np.empty((COUNTED, len(TRUTHS), m)), 0
         self._next, self._running = np.full((n, m), np.nan), np.empty(0, dtype=np.intp)
         self._active: dict[str, Follower] = {}
         self._waiting: dict[str, StepObserver] = {}
@@ -139,6 +141,7 @@ class Crew:
         np.subtract(estimates, truth[:, None, :2], out=out[:, :, :2])
         expected = np.concatenate((self._next[None, running], estimates.sum(axis=2)))  # of each measurement from the frame before
         np.subtract(expected[:-1], truth[:, 2, None], out=out[:, :, 2])
+        np.add(out[:, :, 0], out[:, :, 1], out=out[:, :, 3])
         self._next[running] = expected[-1]
         for at, follower in enumerate(self._active.values()):
             out[: max(0, n - max(0, follower.observer.frame - self._warm_up)), at] = np.nan

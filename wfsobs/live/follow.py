@@ -14,6 +14,8 @@ from wfsobs.live.ring import LiveFrame
 from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.live.source import LiveSource
 from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import TARGETS
+from wfsobs.observers.estimates import TOTAL
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 
@@ -61,7 +63,8 @@ def follow(
     dict
         "frames" that every observer has taken, "lost", "late_share" (an estimate came more than 1 ms after they were due),
         "late_share_sent" (the source sent them more than 1 ms after that) and "observers": id -> latency "p50_us", "p99_9_us",
-        frames "late" (longer than a frame), "rms_nm" over all targets and modes, "errors_nm" by target and mode,
+        frames "late" (longer than a frame), "rms_nm" over all targets and modes, "errors_nm" by target (both
+        together, too) and mode,
         "next_nm" of the next measurement by mode, which needs no truth.
 
     Raises
@@ -93,7 +96,8 @@ def follow(
 
 def _row(counts: Counts, targets: Sequence[str], modes: Sequence[str]) -> dict[str, Any]:
     """Return what is told of an observer."""
-    errors = {target: dict(zip(modes, map(_nanometres, counts.rms(target)), strict=True)) for target in targets}
+    both = [TOTAL] if set(targets) == set(TARGETS) else []
+    errors = {target: dict(zip(modes, map(_nanometres, counts.rms(target)), strict=True)) for target in (*targets, *both)}
     return {
         "p50_us": counts.latencies.quantile(0.5) * 1e6,
         "p99_9_us": counts.latencies.quantile(0.999) * 1e6,

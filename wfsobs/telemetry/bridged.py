@@ -14,13 +14,12 @@ longer than LONGEST is no gap but what the sensor measures.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from wfsobs.record import Record, RecordError, hold_last
+from wfsobs.record import Record, hold_last
 from wfsobs.typing import Array
 
 WINDOW = 28
@@ -43,21 +42,6 @@ ROUNDING = 1e-12
 
 AT_ONCE = 100_000
 """Windows that are fitted at once, for the memory."""
-
-
-def check_that_they_change(signals: Mapping[str, Array], main: str) -> None:
-    """Raise RecordError where the measurements of a mode are one number, for a sensor has noise, or the main signal has none.
-
-    signals : name -> (n_steps, n_modes), NaN where there is no measurement
-    """
-    for name, signal in signals.items():
-        for mode, values in enumerate(signal.T):
-            known = values[~np.isnan(values)]
-            if known.size == 0 and name == main:
-                raise RecordError(f"{name} holds no measurement of one of its modes")
-            if known.size > 1 and (known == known[0]).all():
-                said = "0" if known[0] == 0 else "the same number"
-                raise RecordError(f"{name} is {said} at every step in mode {mode}: a measurement has noise")
 
 
 def without_bridged(record: Record) -> Record:

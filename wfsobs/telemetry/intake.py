@@ -15,7 +15,7 @@ import numpy as np
 from wfsobs.record import DELAY, Record, RecordError, Training
 from wfsobs.scenario import Scenario
 from wfsobs.telemetry import timestamps as clock
-from wfsobs.telemetry.bridged import check_that_they_change, without_bridged
+from wfsobs.telemetry.bridged import without_bridged
 from wfsobs.telemetry.formats.contents import APART, FAST, NGS, SIGNALS, STARS, TRAINING, Contents
 from wfsobs.typing import Array
 from wfsobs.units import ANGLES, micrometres_per, parse_unit
@@ -72,7 +72,8 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
     if STARS in arrays:
         signals[STARS] = _star_counts(arrays[STARS], n)
     dt, ratio = _apply_timestamps(signals, arrays, declaration)
-    check_that_they_change({name: signals[name] for name in ("y_lgs", NGS) if name in signals}, main="y_lgs")
+    if np.isnan(signals["y_lgs"]).all(axis=0).any():
+        raise RecordError("y_lgs holds no measurement of one of its modes")
     delay = _whole("delay", arrays, declaration.command_delay, DELAY)
     if delay < 1:
         raise RecordError(f"delay takes a whole number from 1, not {delay}")

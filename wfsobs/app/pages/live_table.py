@@ -133,7 +133,7 @@ def status_line(loop: LiveLoop, view: LiveView) -> str:
     advice = ": more than this machine does, switch some off or run slower" if behind > FAR_BEHIND else ""
     parts = [
         f"{state} at {loop.speed:g} × real time",
-        f"{view.dt * (view.first + view.n):.2f} s",
+        f"{view.dt * (view.first + view.n):.1f} s",
         f"{loop.delivery.frames} frames",
         f"{loop.delivery.losses} lost",
         f"{loop.delivery.late_share:.2%} later than 1 ms",

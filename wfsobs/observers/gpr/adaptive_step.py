@@ -61,7 +61,7 @@ class AdaptiveGprEstimator:
         n = sampling.n_modes
         self._samples = np.zeros((n, 2 * self.schedule.longest))  # newest last; moved to the front at the end
         self._recent = np.zeros((n, self.schedule.depth))  # whitened, in a ring
-        self._states = np.zeros((n, 2))  # of the whiteners
+        self._states = np.zeros((n, 4))  # of the whiteners: turbulence, and a background where there is one
         self._mean, self._sd = np.full(n, np.nan), np.full(n, np.nan)
         self.reset()
 
