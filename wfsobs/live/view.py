@@ -15,6 +15,7 @@ from wfsobs.live.delivery import merged_rows
 from wfsobs.live.ring import LiveFrame, Ring
 from wfsobs.live.rows import Rows
 from wfsobs.observers.base import TARGETS
+from wfsobs.observers.estimates import TOTAL
 from wfsobs.typing import Array
 
 SHARED = 0.16
@@ -70,7 +71,9 @@ class LiveView:
         return self._traces[:, 1]
 
     def truth(self, target: str) -> Array:
-        """Return the truth of a target, (n, n_modes) [um]; of the next measurement, the measurements."""
+        """Return the truth of a target or of both together, (n, n_modes) [um]; of the next measurement, the measurements."""
+        if target == TOTAL:
+            return self.frames.turbulence + self.frames.vibration
         return self.frames.z if target == NEXT else getattr(self.frames, target)
 
     def steps(self, observer: str) -> Array:
@@ -78,8 +81,10 @@ class LiveView:
         return self._of(observer)[:, 0]
 
     def estimate(self, observer: str, target: str) -> Array:
-        """Return what an observer has estimated of a target, (n, n_modes) [um]; NaN where nothing."""
+        """Return what an observer has estimated of a target or of both together, (n, n_modes) [um]; NaN where nothing."""
         own, m = self._of(observer), self.n_modes
+        if target == TOTAL:
+            return own[:, 1 : 1 + m] + own[:, 1 + m : 1 + 2 * m]
         if target != NEXT:
             at = 1 + TARGETS.index(target) * m
             return own[:, at : at + m]
