@@ -152,7 +152,8 @@ def test_a_peak_that_is_moved_in_the_live_spectrum(running: Page) -> None:
 
 
 MARKS = """() => Bokeh.documents.flatMap((it) => [...it._all_models.values()])
-  .filter((it) => it.type === "ColumnDataSource" && "line" in it.data).flatMap((it) => [...it.data.line])"""
+  .filter((it) => it.type === "ColumnDataSource" && "line" in it.data).flatMap((it) => [...it.data.x])"""
+"""Times at which the traces have a mark [s]."""
 
 
 def test_one_observer_is_identified_anew_while_the_loop_runs(running: Page) -> None:
@@ -166,7 +167,9 @@ def test_one_observer_is_identified_anew_while_the_loop_runs(running: Page) -> N
     events = page.get_by_role("list", name="Events")
     expect(events).to_contain_text("identified for multirate-multi", timeout=LONG)
     expect(events).to_contain_text("multirate-multi has a new design", timeout=LONG)
-    page.wait_for_function(f"({MARKS})().includes('multirate-multi has a new design')", timeout=LONG)
+    told = re.search(r"([0-9.]+) s: multirate-multi has a new design", events.inner_text())  # to 0.01 s
+    assert told is not None
+    page.wait_for_function(f"({MARKS})().some((x) => Math.abs(x - {told[1]}) < 0.006)", timeout=LONG)
     assert re.findall(r"(\S+) has a new design", events.inner_text()) == ["multirate-multi"]
     page.get_by_role("button", name="Design anew", exact=True).click()
     expect(events).to_have_text(re.compile("(multirate-multi has a new design.*){2}", re.S), timeout=LONG)
