@@ -72,7 +72,7 @@ def test_undo_by_key_and_by_button(open_short: Any) -> None:
     page.get_by_role("button", name="Undo", exact=True).click()
     expect(speed(page)).to_have_value("15")
     page.get_by_role("button", name="Redo", exact=True).click()
-    expect(speed(page)).to_have_value("20")
+    expect(speed(page)).to_have_value("20")  # its address follows a little later, at the latest with the next view
     expect(page.get_by_role("button", name="Redo", exact=True)).to_be_disabled()
     speed(page).press("Control+z")
     page.get_by_role("button", name="Tilt", exact=True).click()

@@ -93,6 +93,7 @@ class Actions:
     def follow_view(self, state: ViewState) -> None:
         """Keep the view in the address."""
         self._view = state
+        state.param.watch(self._refresh, "query")  # first: settings wait for their address, and an entry of the history has both
         state.param.watch(lambda event: self.toolbar.param.update(view=event.new), "query")
 
     def open_view(self, query: str) -> None:
