@@ -25,6 +25,8 @@ from wfsobs.app.sources import LoadedRecord
 from wfsobs.cli import main
 from wfsobs.live.replay import Replay
 from wfsobs.live.simulated import SimulatedLoop
+from wfsobs.observers.base import TARGETS
+from wfsobs.observers.estimates import TOTAL
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
 from wfsobs.simulation.loop import simulate
@@ -104,19 +106,24 @@ def test_no_controllers_are_none(page: LivePage, dashboard: Dashboard, served: A
 
 
 def test_the_link(page: LivePage, dashboard: Dashboard, loop: Any) -> None:
+    page.controls.target.value, page.controls.window.value = TOTAL, 10.0
     expected, toolbar = of(page.task.arguments["order"]), dashboard.actions.toolbar
     query = f"?{toolbar.query}&{toolbar.view}"
     dashboard.actions.open_link("?preset=paper&run.duration=2")
     dashboard.actions.open_view("?view.page=live")
     usual = of(page.task.arguments["order"])
     assert usual[2:] != expected[2:] and usual[4] == 1.0, "a link that says nothing of the loop is that of a fresh page"
+    assert (page.controls.target.value, page.controls.window.value) == (TARGETS[0], 5.0)
     dashboard.actions.open_link(query)
     dashboard.actions.open_view(query)
     assert toolbar.notes == [] and dashboard.pages.current == LIVE
     assert of(page.task.arguments["order"]) == expected
-    dashboard.actions.open_view("?view.page=live&view.live.observers=kf-multi,kf-none&view.live.speed=30")
+    assert (page.controls.target.value, page.controls.window.value) == (TOTAL, 10.0)
+    dashboard.actions.open_view("?view.page=live&view.live.observers=kf-multi,kf-none&view.live.speed=30&view.live.window=3")
     assert page.controls.running.value == ["kf-multi"] and page.controls.speed.value == 1.0
+    assert page.controls.window.value == 5.0
     assert toolbar.notes == [
+        "Not used from the link: view.live.window = 3: takes one of 2, 5, 10",
         "Not used from the link: view.live.observers = kf-none: there is none of that name",
         "Not used from the link: view.live.speed = 30: takes a number from 0.1 to 20",
     ]

@@ -132,6 +132,27 @@ def test_traces_of_all_observers_follow_the_loop(running: Page) -> None:
         assert abs(max(line["most"] for line in seen["lines"]) / seen["top"] - 1 / 1.1) < 1e-3
 
 
+def test_errors_of_both_targets_together(running: Page) -> None:
+    """Of observers of both, and of every bound; without handles, which are those of one target."""
+    page = running
+    page.get_by_role("combobox", name="Errors of").click()
+    page.get_by_role("option", name="Turbulence and vibration together", exact=True).click()
+    page.wait_for_function("location.search.includes('view.live.errors=total')")
+    table = page.get_by_role("region", name="Live")
+
+    def of(name: str) -> str:
+        return table.get_by_role("row").filter(has_text=name).get_by_role("cell").first.inner_text()
+
+    expect(table.get_by_role("row").filter(has_text="Bound, LGS and NGS")).to_be_visible(timeout=LONG)
+    filters, bounds = [float(of(name)) for name in ("Multi-peak", "Multi-rate, all peaks")], float(of("Bound, LGS and NGS"))
+    # of the bound of endless records; five seconds of the disturbance scatter by a few per cent
+    assert 0.8 * bounds < filters[1] < 1.5 * bounds < 1.5 * filters[0]
+    assert of("Online GPR") == "–"
+    page.get_by_role("combobox", name="Errors of").click()
+    page.get_by_role("option", name="Turbulence", exact=True).click()
+    page.wait_for_function("!location.search.includes('view.live.errors')")
+
+
 def test_a_peak_that_is_moved_in_the_live_spectrum(running: Page) -> None:
     page = running
     page.get_by_role("combobox", name="Errors of").click()

@@ -93,8 +93,8 @@ class Actions:
     def follow_view(self, state: ViewState) -> None:
         """Keep the view in the address."""
         self._view = state
-        state.param.watch(self._refresh, "query")  # first: settings wait for their address, and an entry of the history has both
-        state.param.watch(lambda event: self.toolbar.param.update(view=event.new), "query")
+        # settings that wait for their address come first: an entry of the browser's history has both
+        state.param.watch(lambda event: (self._refresh(), self.toolbar.param.update(view=event.new)), "query")
 
     def open_view(self, query: str) -> None:
         """Bring the page to the view of an address, and name what cannot be taken."""
@@ -230,8 +230,7 @@ class Actions:
 
     def _take_back(self, text: object) -> None:
         """Unsay what has been read, unless something else has been said meanwhile."""
-        if self.toolbar.message == text:
-            self.toolbar.message = ""
+        self.toolbar.message = "" if self.toolbar.message == text else self.toolbar.message
 
     def _refresh(self, *_: object) -> None:
         scenario, preset, source = self.store.scenario, self.store.preset, self.store.source

@@ -51,7 +51,7 @@ class LivePage(PageActions):
         self.store, self.display = store, display
         self.work = LiveTask(store.session)
         self.controls = c = LiveControls()
-        self.inputs = (c.running, c.controllers, c.speed)
+        self.inputs = (c.running, c.controllers, c.speed, c.target, c.window)
         self.buttons = c.buttons
         self.intro, self.status = text(INTRO), live_text()
         self.room = pn.Column(**WIDE, visible=False, stylesheets=[APART])
@@ -146,7 +146,7 @@ class LivePage(PageActions):
 
     def open_link(self, fields: Mapping[str, str]) -> list[str]:
         """Choose what a link has; return a line for each field refused. A loop that runs is left alone."""
-        return self.controls.open_link(fields) if self.loop is None else []
+        return self.controls.open_link(fields, runs=self.loop is not None)
 
     def follow_link(self, act: Callable[..., object]) -> None:
         """Call a function after every change of what a link has."""

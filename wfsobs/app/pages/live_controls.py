@@ -33,7 +33,7 @@ FIRST = ("kf-lgs", "kf-multi", "multirate", "multirate-multi", "gpr-online")
 """Observers that run first: as many as two cores keep up with beside the page."""
 MAIN = ("kf-multi", "multirate-multi", "gpr-online")
 """Observers whose lines are shown first."""
-OBSERVERS, CONTROLLERS, SPEED = "observers", "controllers", "speed"
+OBSERVERS, CONTROLLERS, SPEED, ERRORS, WINDOW = "observers", "controllers", "speed", "errors", "window"
 """Fields of a link."""
 APART: dict[str, Any] = {**WIDE, "margin": (10, 0, 4, 0)}
 """As wide as the page, its label clear of the row above."""
@@ -181,11 +181,27 @@ class LiveControls:
         """Return what of the loop differs from what is usual, as a link has it."""
         chosen = {OBSERVERS: (self.running.value, FIRST), CONTROLLERS: (self.controllers.value, USUAL)}
         fields = {name: ",".join(now) for name, (now, usual) in chosen.items() if tuple(now) != tuple(usual)}
-        return fields | ({} if self.speed.value == 1.0 else {SPEED: f"{self.speed.value:g}"})
+        fields |= {} if self.speed.value == 1.0 else {SPEED: f"{self.speed.value:g}"}
+        return fields | {name: _text(field.value) for name, field, usual in self._choices if field.value != usual}
 
-    def open_link(self, fields: Mapping[str, str]) -> list[str]:
-        """Choose what a link has, or what is usual; return a line for each field refused."""
-        refused = [f"{name}: there is no such part of a view" for name in fields if name not in (OBSERVERS, CONTROLLERS, SPEED)]
+    @property
+    def _choices(self) -> list[tuple[str, Any, Any]]:
+        """Fields that take one of a list: name in a link, field, what is usual."""
+        errors = [] if self.target.disabled else [(ERRORS, self.target, TARGETS[0])]
+        return [*errors, (WINDOW, self.window, 5.0)]
+
+    def open_link(self, fields: Mapping[str, str], *, runs: bool) -> list[str]:
+        """Choose what a link has, or what is usual; return a line for each field refused. runs : a loop, which is left alone."""
+        known_fields = (OBSERVERS, CONTROLLERS, SPEED, ERRORS, WINDOW)
+        refused = [f"{name}: there is no such part of a view" for name in fields if name not in known_fields]
+        for name, select, usual in self._choices:
+            of = {_text(value): value for value in select.options.values()}
+            select.value = of.get(text := fields.get(name, _text(usual)), usual)
+            refused += [] if text in of else [f"{name} = {text[:80]}: takes one of {', '.join(of)}"]
+        return refused if runs else [*refused, *self._open_loop(fields)]
+
+    def _open_loop(self, fields: Mapping[str, str]) -> list[str]:
+        refused = []
         for name, field, usual in ((OBSERVERS, self.running, FIRST), (CONTROLLERS, self.controllers, USUAL)):
             names, known = fields[name].split(",") if fields.get(name) else [], set(field.options.values())
             field.value = [one for one in names if one in known] if name in fields else list(usual)
@@ -196,3 +212,7 @@ class LiveControls:
             refused.append(str(error))
             self._choose_speed(1.0)
         return refused
+
+
+def _text(value: str | float) -> str:
+    return value if isinstance(value, str) else f"{value:g}"

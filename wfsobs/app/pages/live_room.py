@@ -117,7 +117,7 @@ class LiveRoom:
 
     def _legend(self, loop: LiveLoop, target: str) -> str:
         """Write what the lines of the figures are."""
-        wanted = TARGETS if target == NEXT else (target,)
+        wanted = (target,) if target in TARGETS else TARGETS
         active = [name for name in loop.board.active() if name in self.controls.lines.value]
         names = [name for name in active if set(wanted) <= set(OBSERVERS[name].targets)]
         truth = [] if self.display.error else [TRUTH]
@@ -130,6 +130,6 @@ class LiveRoom:
             if not self.display.editing:
                 return
             store, session = self.store, self.store.session
-            self.editor = SpectrumEditor(target, self.spectra.figure, store, self.display, Frames(session), Theory())
+            self.editor = SpectrumEditor(TARGETS[0], self.spectra.figure, store, self.display, Frames(session), Theory())
             self._spectra_room.append(self.editor.layer)
-        self.editor.turn_to(target if loop.source.name == SIMULATION and target != NEXT else None)
+        self.editor.turn_to(target if loop.source.name == SIMULATION and target in TARGETS else None)

@@ -13,18 +13,21 @@ from wfsobs.app.numerals import NOTHING, number
 from wfsobs.app.render import Row, table
 from wfsobs.app.style import look, swatch
 from wfsobs.closed_loop.run import strehl
-from wfsobs.evaluation.rows import row_label
+from wfsobs.evaluation.rows import row_label, target_title
 from wfsobs.live.alarms import ALARM, paired_peaks
 from wfsobs.live.board import NEXT, SCORED
 from wfsobs.live.finding import Bounds, Finding, PeakFinding
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.view import LiveEvent, LiveView
+from wfsobs.observers.base import TARGETS
+from wfsobs.observers.estimates import TOTAL
 from wfsobs.typing import Array
 
 SHOWN_EVENTS = 8
 FAR_BEHIND = 2.0
 """Beyond this the observers do not catch up by themselves [s]."""
-QUANTITIES = {"Turbulence": "turbulence", "Vibration": "vibration", "Next measurement": NEXT}
+QUANTITIES = {"Next measurement" if target == NEXT else target_title(target): target for target in (*TARGETS, TOTAL, NEXT)}
+"""What errors are shown of."""
 
 
 def ranking(view: LiveView, names: Iterable[str], target: str, column: int) -> list[tuple[str, float]]:
