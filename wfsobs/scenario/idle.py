@@ -6,6 +6,7 @@ Rules within a group are declared by the group (`Group.used_when`); here are tho
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 from wfsobs.scenario.scenario import Scenario
 from wfsobs.settings.group import Group
@@ -62,9 +63,9 @@ def used_settings(scenario: Scenario) -> Plain:
     tree = scenario.effective_values()
     for path, _ in _across(scenario):
         *above, name = path.split(".")
-        node = tree
+        node: Any = tree
         for key in above:
-            node = node.get(key, {})
+            node = node[int(key)] if isinstance(node, list) else node.get(key, {})
         node.pop(name, None)
     return tree
 
@@ -94,6 +95,8 @@ def _across(scenario: Scenario) -> Iterator[tuple[str, str]]:
             yield "turbulence.outer_scale", "Used only with frozen flow, and for radial orders above 1"
     else:
         yield "sensors.lgs_low_frequency_rms", "Used only where Source of turbulence is not frozen-flow"
+        if len(scenario.turbulence.layers) == 1:
+            yield "turbulence.layers.0.fraction", "Used only where there are several layers: they share the turbulence"
         if s.lgs_radius == 0:
             yield "sensors.lgs_angle", "Used only where LGS asterism, radius is above 0"
     if scenario.turbulence.source == "none":
