@@ -10,6 +10,7 @@ import pytest
 
 from tests.observers.test_adaptive import DT, MODEL, NOISE, PEAK, TURBULENCE, made, rms, with_window
 from wfsobs.execution import run_observer
+from wfsobs.observers.estimates import TOTAL
 from wfsobs.observers.kalman import window_model
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.record import Record
@@ -71,16 +72,18 @@ def test_the_spectrum_of_a_window_with_gaps_is_near_the_true_one(
 
 
 def exact(z: Array, mean: float) -> Array:
-    """Estimates and variances (n, 2, 2) of the paper's recursion with the covariance that goes along, from rest, steady."""
+    """Estimates and variances (n, 2, 3) of the paper's recursion with the covariance that goes along, from rest, steady: of
+    turbulence, vibration and both together."""
     model = disturbance_model([TURBULENCE], [PEAK])
     rows = model.output_rows(("turbulence", "vibration"))
+    rows = np.vstack([rows, rows[0] + rows[1]])
     x, P, out = np.zeros(len(model.A)), steady_filter(model, NOISE)[1].posterior, []
     for value in z - mean:
         x, P = model.A @ x, model.A @ P @ model.A.T + model.Q
         if not np.isnan(value):
             L = P @ model.C / (model.C @ P @ model.C + NOISE**2)
             x, P = x + L * (value - model.C @ x), P - np.outer(L, model.C @ P)
-        out.append([rows @ x + [mean, 0.0], np.diag(rows @ P @ rows.T)])
+        out.append([rows @ x + [mean, 0.0, mean], np.diag(rows @ P @ rows.T)])
     return np.array(out)
 
 
@@ -115,6 +118,8 @@ def test_near_gaps_it_is_the_exact_filter_of_given_models(monkeypatch: pytest.Mo
             assert rms(off) < (0.03 if now in (1249, 1499, 1749) else 0.01), (now, target)
             stated = got.sd[target][2 + now : 2 + stop, 0]
             np.testing.assert_allclose(np.sqrt(stated**2 - 0.02**2), sd, rtol=0.01)
+        # what may be missed in the one is in the other
+        np.testing.assert_allclose(got.sd[TOTAL][2 + now : 2 + stop, 0], np.sqrt(expected[:, 1, 2]), rtol=0.01)
 
 
 def test_a_window_with_gaps_that_does_not_move_is_estimated_as_it_is() -> None:

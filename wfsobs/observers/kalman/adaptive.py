@@ -17,7 +17,7 @@ import numpy as np
 from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
 from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.kalman.adaptive_step import AdaptiveEstimator
-from wfsobs.observers.kalman.spread import target_sd
+from wfsobs.observers.kalman.spread import by_name, learnt_sd
 from wfsobs.observers.kalman.window_model import NOT_YET, WindowModel, identify_window, lengths, mode_of
 from wfsobs.observers.kalman.with_gaps import run_frames
 from wfsobs.prior import Prior
@@ -91,25 +91,24 @@ def kf_adaptive(measurements: Measurements, _prior: Prior, settings: Adaptive, w
     if np.isnan(measurements.z).any():
         return run_frames(AdaptiveEstimator(settings, measurements.sampling), measurements, watch)
     z = measurements.z[measurements.delay :]  # what the mirror did before the record is not known
-    columns = []
+    columns, spreads = [], []
     for mode in range(measurements.n_modes):  # one after the other: steps as short as these leave a second thread no room
 
         def tell(fraction: float, mode: int = mode) -> None:
             watch.step((mode + fraction) / measurements.n_modes)
 
-        before = np.full((2, measurements.delay, len(TARGETS)), np.nan)
-        columns.append(np.concatenate([before, adapt(z[:, mode], measurements.dt, settings, tell)], axis=1))
-    values, sd = np.stack(columns, axis=-1)
-    return Estimates(*({target: x[:, i] for i, target in enumerate(TARGETS)} for x in (values, sd)))
+        for found, x in zip((columns, spreads), adapt(z[:, mode], measurements.dt, settings, tell), strict=True):
+            found.append(np.pad(x, ((measurements.delay, 0), (0, 0)), constant_values=np.nan))
+    return Estimates(*(by_name(np.stack(found, axis=-1)) for found in (columns, spreads)))
 
 
-def adapt(z: Array, dt: float, settings: Adaptive, tell: Callable[[float], None]) -> Array:
-    """Turbulence and vibration of one mode's z (n,) [um], and their standard deviations, (2, n, 2) [um].
+def adapt(z: Array, dt: float, settings: Adaptive, tell: Callable[[float], None]) -> tuple[Array, Array]:
+    """Turbulence and vibration of one mode's z (n,), (n, 2), and standard deviations of these and of both together, (n, 3) [um].
 
     A window whose model or filter cannot be found leaves the filter before it in charge. tell : told the fraction done
     """
     n, window, interval = len(z), *lengths(settings, dt)
-    out, sd = np.full((2, n, len(TARGETS)), np.nan)
+    out, sd = (np.full((n, len(TARGETS) + more), np.nan) for more in (0, 1))
     found = NOT_YET
     for start in range(0, n - window + 1, interval):
         tell(start / n)
@@ -120,8 +119,8 @@ def adapt(z: Array, dt: float, settings: Adaptive, tell: Callable[[float], None]
             estimate = found.filter.run((z[start:stop] - mean)[:, None, None])
             out[now:stop] = estimate[window - 1 :, :, 0] + [mean, 0.0]
             if found.mode is not None:
-                sd[now:stop] = np.hypot(target_sd(found.mode.model.output_rows(TARGETS), found.mode.posterior), found.hidden_rms)
-    return np.array([out, sd])
+                sd[now:stop] = learnt_sd(found.mode.model.output_rows(TARGETS), found.mode.posterior, found.hidden_rms)
+    return out, sd
 
 
 def filter_of(spectrum: Spectrum) -> PeriodicFilter:

@@ -9,7 +9,7 @@ import numpy as np
 
 from wfsobs.observers.base import TARGETS, TURBULENCE
 from wfsobs.observers.kalman.gap_bank import STEADY
-from wfsobs.observers.kalman.step import KalmanEstimator
+from wfsobs.observers.kalman.step import KalmanEstimator, total_sd
 from wfsobs.observers.kalman.window_model import (
     NOT_YET,
     WindowModel,
@@ -118,9 +118,9 @@ class AdaptiveEstimator:
         return out, sd
 
     def estimate(self) -> tuple[Array, Array]:
-        """Return the estimates of the last frame, (2, n_modes), and their standard deviations, (2, n_modes)."""
+        """Return the estimates of the last frame, (2, n_modes), and deviations of these and of both together, (3, n_modes)."""
         values, sd = np.array([self.predict(0, target) for target in TARGETS]).swapaxes(0, 1)
-        return values, sd
+        return values, np.vstack([sd, [total_sd(kalman) for kalman in self.filters]])
 
     def settle(self) -> None:
         """Have nothing left to do."""

@@ -28,7 +28,7 @@ from wfsobs.observers.kalman.both_window import (
 from wfsobs.observers.kalman.multirate_adaptive_step import BothEstimator
 from wfsobs.observers.kalman.multirate_optimal import Cycle, optimal_filter
 from wfsobs.observers.kalman.single import NGS
-from wfsobs.observers.kalman.spread import target_sd
+from wfsobs.observers.kalman.spread import by_name, learnt_sd
 from wfsobs.observers.kalman.with_gaps import run_frames
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
@@ -57,14 +57,13 @@ def multirate_adaptive(measurements: Measurements, _prior: Prior, settings: Adap
             watch.step((mode + fraction) / measurements.n_modes)
 
         columns.append(_adapt(v[:, :, mode], measurements.dt, lengths, settings, tell))
-    values, sd = np.stack(columns, axis=-1)
-    return Estimates(*({target: x[:, i] for i, target in enumerate(TARGETS)} for x in (values, sd)))
+    return Estimates(*(by_name(np.stack(found, axis=-1)) for found in zip(*columns, strict=True)))
 
 
-def _adapt(v: Array, dt: float, lengths: Lengths, settings: Adaptive, tell: Callable[[float], None]) -> Array:
-    """Turbulence and vibration of one mode's v (n, 2), and their standard deviations, (2, n, 2) [um]."""
+def _adapt(v: Array, dt: float, lengths: Lengths, settings: Adaptive, tell: Callable[[float], None]) -> tuple[Array, Array]:
+    """Turbulence and vibration of one mode of v, both (n, 2), and deviations of these and of both together, (n, 3) [um]."""
     n, ratio = len(v), lengths.ratio
-    out = np.full((2, n, len(TARGETS)), np.nan)
+    out, sd = (np.full((n, len(TARGETS) + more), np.nan) for more in (0, 1))
     start, end, changed, found = lengths.first, lengths.first + lengths.window, 0, BothModel()
     while end <= n:
         tell(end / n)
@@ -76,20 +75,22 @@ def _adapt(v: Array, dt: float, lengths: Lengths, settings: Adaptive, tell: Call
                 if not is_still(run.surprise[stop - lengths.interval - end : stop - end]):
                     changed, due = stop - lengths.interval, stop
                     break
-            out[:, end - 1 : due] = run.estimates[:, : due - end + 1]
+            out[end - 1 : due], sd[end - 1 : due] = run.estimates[: due - end + 1], run.sd[: due - end + 1]
         end = due
         start = window_start(end, changed, lengths)
-    return out
+    return out, sd
 
 
 class WindowRun(NamedTuple):
     """A filter from the last step of its window on.
 
-    estimates : of that step and the n behind it, and their standard deviations, (2, n + 1, 2) [um]
+    estimates : of that step and the n behind it, (n + 1, 2) [um]
+    sd        : standard deviations of these and of both together, (n + 1, 3) [um]
     surprise  : squared innovations of those n over their variances, (n,)
     """
 
     estimates: Array
+    sd: Array
     surprise: Array
 
 
@@ -106,8 +107,8 @@ def run_window(cycle: Cycle, v: Array, size: int, hidden_rms: float) -> WindowRu
     innovations = v[size:, 0] - means[0] - found[:-1, 2]
     phase = np.arange(size - 1, len(v)) % frames
     variance = np.array([C[0] @ s.P @ C[0] + R[0, 0] for s in states])[phase[1:]]
-    sd = np.hypot(target_sd(cycle.rows, [s.posterior for s in states]), hidden_rms)[phase]
-    return WindowRun(np.array([found[:, :2] + [means[1], 0.0], sd]), innovations**2 / variance)
+    sd = learnt_sd(cycle.rows, [s.posterior for s in states], hidden_rms)[phase]
+    return WindowRun(found[:, :2] + [means[1], 0.0], sd, innovations**2 / variance)
 
 
 def step_multirate_adaptive(_prior: Prior, settings: Adaptive, sampling: Sampling, _horizon: float) -> BothEstimator:

@@ -21,7 +21,7 @@ from wfsobs.observers.kalman.both_window import (
     window_start,
 )
 from wfsobs.observers.kalman.gap_bank import STEADY
-from wfsobs.observers.kalman.step import KalmanEstimator
+from wfsobs.observers.kalman.step import KalmanEstimator, total_sd
 from wfsobs.observers.kalman.window_model import pack_spectrum, unpack_spectrum
 from wfsobs.observers.step_checks import StepError
 from wfsobs.record import Sampling
@@ -177,9 +177,9 @@ class BothEstimator:
         return out, sd
 
     def estimate(self) -> tuple[Array, Array]:
-        """Return the estimates of the last frame, (2, n_modes), and their standard deviations, (2, n_modes)."""
+        """Return the estimates of the last frame, (2, n_modes), and deviations of these and of both together, (3, n_modes)."""
         values, sd = np.array([self.predict(0, target) for target in TARGETS]).swapaxes(0, 1)
-        return values, sd
+        return values, np.vstack([sd, [total_sd(window.kalman) for window in self.windows]])
 
     def settle(self) -> None:
         """Have nothing left to do."""

@@ -19,11 +19,23 @@ from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.signal.stepping import Gain
 from wfsobs.typing import Array
 
+HIDDEN_FROM = np.array([1.0, 1.0, 0.0])
+"""Of what `learnt_sd` returns."""
+
 
 def target_sd(rows: Array, posteriors: Sequence[Array]) -> Array:
     """Return the standard deviation of rows (p, n) of the state, the first states of a filter, (steps that repeat, p)."""
     n = rows.shape[1]
     return np.sqrt([np.maximum(np.sum((rows @ P[:n, :n]) * rows, axis=1), 0.0) for P in posteriors])
+
+
+def learnt_sd(rows: Array, posteriors: Sequence[Array], hidden_rms: float) -> Array:
+    """Return the standard deviations of targets and of TOTAL by a model that was learnt, (steps that repeat, 3) [um].
+
+    rows       : of the targets
+    hidden_rms : rms of vibration that may be in none of its lines, taken for turbulence, not missing in both together [um]
+    """
+    return np.hypot(target_sd(np.vstack([rows, rows.sum(axis=0)]), posteriors), hidden_rms * HIDDEN_FROM)
 
 
 def over_record(sd: Array, n_steps: int, first: int = 0) -> Array:
@@ -50,7 +62,7 @@ def by_target(columns: Sequence[Array], sd: Sequence[Array] = (), first: int = 0
 
 
 def by_name(x: Array) -> dict[str, Array]:
-    """Return the columns of x (n, 2 or 4, n_modes) by what they are: targets, and of standard deviations TOTAL and NEXT_Z."""
+    """Return the columns of x (n, 2 to 4, n_modes) by what they are: targets, and of standard deviations TOTAL and NEXT_Z."""
     return {name: x[:, i] for i, name in zip(range(x.shape[1]), (*TARGETS, TOTAL, NEXT_Z), strict=False)}
 
 
