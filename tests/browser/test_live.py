@@ -20,7 +20,7 @@ def test_a_loop_that_is_changed_while_it_runs(open_page: Any, server: Any) -> No
     page.get_by_role("button", name="Start", exact=True).click()
     expect(page.get_by_text(re.compile(r"^Running at 1 × real time · [1-9]"))).to_be_visible(timeout=LONG)
     table = page.get_by_role("region", name="Live")
-    expect(table.get_by_text("Multi-rate, all peaks", exact=True)).to_be_visible(timeout=LONG)
+    expect(table.get_by_text("Multi-rate multi-peak", exact=True)).to_be_visible(timeout=LONG)
     expect(page.get_by_role("figure", name="Spectra")).to_be_visible()
     wind = page.get_by_role("textbox", name="Wind speed V₀ [m/s]")
     wind.fill("20")
@@ -144,7 +144,7 @@ def test_errors_of_both_targets_together(running: Page) -> None:
         return table.get_by_role("row").filter(has_text=name).get_by_role("cell").first.inner_text()
 
     expect(table.get_by_role("row").filter(has_text="Bound, LGS and NGS")).to_be_visible(timeout=LONG)
-    filters, bounds = [float(of(name)) for name in ("Multi-peak", "Multi-rate, all peaks")], float(of("Bound, LGS and NGS"))
+    filters, bounds = [float(of(name)) for name in ("Multi-peak", "Multi-rate multi-peak")], float(of("Bound, LGS and NGS"))
     # of the bound of endless records; five seconds of the disturbance scatter by a few per cent
     assert 0.8 * bounds < filters[1] < 1.5 * bounds < 1.5 * filters[0]
     assert of("Online GPR") == "–"
@@ -183,7 +183,7 @@ def test_one_observer_is_identified_anew_while_the_loop_runs(running: Page) -> N
     page.get_by_role("combobox", name="Speed").click()
     page.get_by_role("option", name="0.2 ×", exact=True).click()  # the observers leave the identification no processor else
     page.get_by_role("combobox", name="New design of").click()
-    page.get_by_role("option", name="Multi-rate, all peaks", exact=True).click()
+    page.get_by_role("option", name="Multi-rate multi-peak", exact=True).click()
     page.get_by_role("button", name="Identify", exact=True).last.click()  # the first one leads to the page of that name
     events = page.get_by_role("list", name="Events")
     expect(events).to_contain_text("identified for multirate-multi", timeout=LONG)

@@ -16,7 +16,6 @@ import wfsobs
 from tests.records import ON_PAPER
 from wfsobs.evaluation.calibration import calibration, crps, half_width
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.estimates import TOTAL
 from wfsobs.observers.gpr.kernels import SquaredExponential
 from wfsobs.observers.gpr.online import predict_sliding
 from wfsobs.observers.gpr.trained import HELD, train
@@ -135,9 +134,8 @@ def test_every_observer_with_a_model_states_something(name: str) -> None:
             # zero where its model has no vibration: what was identified in a short window
             assert (estimate.sd[known] >= 0).all() and ("adaptive" in name or (estimate.sd[known] > 0).all())
     for score in found.scores:
-        if score.observer == name:  # what a window may hide is known of the vibration, not of what takes its place
-            states = with_model and not ("adaptive" in name and score.target == TOTAL)
-            assert (score.calibration is not None) == states
+        if score.observer == name:
+            assert (score.calibration is not None) == with_model, score.target
 
 
 def test_without_a_truth_the_next_measurement_is_stated() -> None:

@@ -89,7 +89,7 @@ def theme() -> dict[str, Any]:
     """Return the page's colours in light and dark mode; units are written as they are, not in capitals."""
     return {
         "light": {"palette": {"primary": {"main": PRIMARY}}, "components": _COMPONENTS},
-        "dark": {"palette": {"primary": {"main": "#6FB7D6"}}, "components": _COMPONENTS},
+        "dark": {"palette": {"primary": {"main": "#6FB7D6", "dark": "#8CC9E2"}}, "components": _COMPONENTS},
     }
 
 

@@ -128,7 +128,7 @@ CONTROLLERS = Registry(
             settings=("multirate",),
             ngs=True,
             counts=_nothing_more,
-            look=Look("LQG optimal", "#7A1FA2", "#C9A0FF", (3, 2)),
+            look=Look("LQG opt. multi-rate", "#7A1FA2", "#C9A0FF", (3, 2)),
         ),
         Controller(
             "lqg-multirate-multi",
@@ -140,7 +140,7 @@ CONTROLLERS = Registry(
             settings=("multirate", "multipeak"),
             ngs=True,
             counts=_nothing_more,
-            look=Look("LQG opt. peaks", "#B40000", "#FF7A70", (8, 3)),
+            look=Look("LQG multi-rate multi-peak", "#B40000", "#FF7A70", (8, 3)),
         ),
         Controller(
             "integrator+gpr-offline",

@@ -108,8 +108,9 @@ def least_errors(spectra: TrueSpectra, ahead: int = 0, n_steps: int = 1) -> dict
     dict of str to LeastError
         Target -> error; TOTAL is that of both together.
     """
-    past, known = min(n_steps, MOST_PAST), spectra.without_lines
+    known = spectra.without_lines
     whitener, parts = known.whitener, spectra.parts
+    past = min(n_steps, MOST_PAST, whitener.n // 2)  # a correlation of half a transform, and no more, is what it is
     names = [*parts, TOTAL][: 2 * len(parts) - 1]
     best = [known.estimate(*(parts if name == TOTAL else [name]), ahead=ahead) for name in names]
     lines = np.outer([name != "turbulence" for name in names], spectra.line_covariance(past + 1 + ahead))

@@ -112,10 +112,10 @@ class LiveControls:
         select = {"size": "small", "margin": 0}
         self.speed = pmui.Select(label="Speed", options=SPEEDS, value=1.0, width=100, **select)
         self.window = pmui.Select(label="Window", options=WINDOWS, value=5.0, width=100, **select)
-        self.target = pmui.Select(label="Errors of", options=QUANTITIES, value=TARGETS[0], width=210, **select)
+        self.target = pmui.Select(label="Errors of", options=QUANTITIES, value=TARGETS[0], width=300, **select)
         self.lasers = pmui.Checkbox(label="Lasers", value=True, **select)
         self.ngs = pmui.Checkbox(label="NGS", value=True, **select)
-        self.losses = pmui.Select(label="Lost", options=LOSSES, value=0.0, width=150, **select)
+        self.losses = pmui.Select(label="Lost", options=LOSSES, value=0.0, width=160, **select)
         self.running = pmui.MultiChoice(
             label="Observers", options={look(name).label: name for name in SLOTS}, value=list(FIRST), **APART
         )
@@ -127,7 +127,7 @@ class LiveControls:
             field.param.watch(self._offer, "value")
         self._offer()
         waterfall = {"the measurement": MEASUREMENT} | {f"error of {label}": name for label, name in self.running.options.items()}
-        self.waterfall = pmui.Select(label="Waterfall of", options=waterfall, value=MEASUREMENT, width=230, **select)
+        self.waterfall = pmui.Select(label="Waterfall of", options=waterfall, value=MEASUREMENT, width=260, **select)
         self.lines = pmui.MultiChoice(label="Lines", options=self.running.options, value=list(MAIN), **APART)
 
     def tell(self, loop: LiveLoop) -> None:

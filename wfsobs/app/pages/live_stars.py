@@ -41,7 +41,7 @@ class Detector:
 
     def __init__(self, name: str, painter: Painter):
         self.painter = painter
-        self.name, self.label = name, "As it comes" if name == TRUTH else look(name).label
+        self.name, self.label = name, look("none" if name == TRUTH else name).label
         ranges = {"x_range": Range1d(start=-1.0, end=1.0), "y_range": Range1d(start=-1.0, end=1.0)}
         self.figure: figure = new_figure(**ranges)
         self.figure.update(height=None, aspect_ratio=1.0, min_width=SIDE, min_border_left=36, toolbar_location=None)
@@ -77,7 +77,7 @@ class Stars:
 
     def __init__(self, painter: Painter) -> None:
         self._painter = painter
-        self.row = pn.Column(**WIDE, stylesheets=[GRID])
+        self.row = pn.Column(**{**WIDE, "margin": (12, 0, 0, 0)}, stylesheets=[GRID])
         self._detectors: dict[str, Detector] = {}
         self._reach = 1.0
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from html import escape
 from math import inf, isnan
 
 import numpy as np
+from markupsafe import Markup
 
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.numerals import NOTHING, number
@@ -19,6 +21,7 @@ from wfsobs.live.board import NEXT, SCORED
 from wfsobs.live.finding import Bounds, Finding, PeakFinding
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.view import LiveEvent, LiveView
+from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import TOTAL
 from wfsobs.typing import Array
@@ -26,6 +29,8 @@ from wfsobs.typing import Array
 SHOWN_EVENTS = 8
 FAR_BEHIND = 2.0
 """Beyond this the observers do not catch up by themselves [s]."""
+WHAT_RUNS = re.compile(r"^\S+(?= (?:on|off|has a new design)$)|(?<=error of )\S+(?= up|$)|(?<=identified for )\S+(?=:)")
+"""The id of an observer or a controller in an event."""
 QUANTITIES = {"Next measurement" if target == NEXT else target_title(target): target for target in (*TARGETS, TOTAL, NEXT)}
 """What errors are shown of."""
 
@@ -54,15 +59,19 @@ def live_html(loop: LiveLoop, view: LiveView, target: str, display: Display, sca
         _row(loop, name, rms, target, display, scale, least)
         for name, rms in ranking(view, loop.board.active(), target, display.column)
     ]
-    rows += [Row(row_label(name), [number(scale * rms), *[NOTHING] * 5], {"name": name}) for name, rms in of.items()]
+    rows += [
+        Row(swatch(name, display.dark) + row_label(name), [number(scale * rms), *[NOTHING] * 5], {"name": name})
+        for name, rms in of.items()
+    ]
     return str(table("Live", columns, [("", rows)]))
 
 
 def _row(loop: LiveLoop, name: str, rms: float, target: str, display: Display, scale: float, least: float) -> Row:
     counts = loop.board[name]
     whole = float(counts.rms(target)[display.column]) if target in SCORED else float("nan")
+    lacks = [one for one in ((target,) if target in TARGETS else TARGETS) if one not in OBSERVERS[name].targets]
     cells = [
-        _number(scale * rms),
+        Markup('<span title="it has no {}">{}</span>').format(lacks[0], NOTHING) if lacks else _number(scale * rms),
         _number(scale * whole),
         _number(rms / least),
         *(_number(1e6 * counts.latencies.quantile(share)) for share in (0.5, 0.999)),
@@ -139,7 +148,7 @@ def status_line(loop: LiveLoop, view: LiveView) -> str:
         f"{view.dt * (view.first + view.n):.1f} s",
         f"{loop.delivery.frames} frames",
         f"{loop.delivery.losses} lost",
-        f"{loop.delivery.late_share:.2%} later than 1 ms",
+        f"{100.0 * loop.delivery.late_share:.2f} % later than 1 ms",
         f"observers {behind:.2f} s behind{advice}",
     ]
     return " · ".join([*parts, "recording"] if loop.recorder.is_on else parts)
@@ -153,5 +162,6 @@ def events_html(events: Iterable[LiveEvent], dt: float) -> str:
 
 
 def _event_html(line: str) -> str:
-    """Write an event; an alarm stands out."""
+    """Write an event; an alarm stands out, and what runs has the name that it has everywhere on the page."""
+    line = WHAT_RUNS.sub(lambda found: look(found[0]).label, line)
     return f"<strong>{escape(line)}</strong>" if line.startswith(ALARM) else escape(line)

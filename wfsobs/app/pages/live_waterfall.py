@@ -101,7 +101,7 @@ class Waterfall:
         )
         # An image is drawn between its corners, in equal steps of the axis: of a logarithmic one, of the logarithm.
         self._source.data = {"image": [image], "x": [left], "y": [LOWEST], "dw": [end - left], "dh": [top - LOWEST]}
-        self.figure.x_range.update(start=left, end=end)
+        self.figure.x_range.update(start=max(left, 0.0), end=end)  # before the loop there was nothing
         self.figure.y_range.update(start=LOWEST, end=top)
         self.figure.yaxis.axis_label = f"frequency [Hz], {display.mode_label}"
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
 import panel_material_ui as pmui
 import param
 
@@ -12,6 +16,9 @@ from wfsobs.app.store import Store
 NONE = ""
 """No setting."""
 
+LONG: Mapping[str, Any] = MappingProxyType({"sizing_mode": "stretch_width", "max_width": 440, "margin": 0})
+"""As wide as the longest words, or as a phone."""
+
 
 class AxisFields:
     """The fields; a setting that is chosen brings its usual values."""
@@ -19,9 +26,7 @@ class AxisFields:
     def __init__(self, store: Store, labels: tuple[str, str], options: dict[str, str], path: str, values: str):
         """Make the fields. labels : of the setting and of its values; options : name -> path of those to choose from."""
         self.store = store
-        self.select = pmui.Select(
-            label=labels[0], options=options, value=path, size="small", width=290, margin=0, searchable=True
-        )
+        self.select = pmui.Select(label=labels[0], options=options, value=path, size="small", searchable=True, **LONG)
         self.values = pmui.TextInput(label=labels[1], value=values, size="small", width=150, margin=0)
         self.select.param.watch(self._suggest, "value")
 

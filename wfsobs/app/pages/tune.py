@@ -52,7 +52,7 @@ class TunePage(PageActions):
         self.store, self.run, self.display = store, store.run, display
         self.work = BackgroundTask(store.session)
         self.starter = Starter(self.work, "Start tuning", "Progress of the tuning", self._so_far)
-        self.observer = pmui.Select(label="Observer", options=choices(), value=START, size="small", width=190, margin=0)
+        self.observer = pmui.Select(label="Observer", options=choices(), value=START, size="small", width=250, margin=0)
         self.target = pmui.Select(label="Error of", options=[], size="small", width=130, margin=0)
         self.evaluations = pmui.TextInput(label="Evaluations", value=str(EVALUATIONS), size="small", width=110, margin=0)
         self.inputs = (self.observer, self.target, self.evaluations)
