@@ -33,6 +33,7 @@ from wfsobs.app.session import session_page
 from wfsobs.app.warm import warm_up
 from wfsobs.app.work import one_blas_thread
 from wfsobs.campaign.follow import CampaignFolder
+from wfsobs.live.paced import prefer
 
 CACHE_MB = 256
 MESSAGE_BYTES = 6_000_000
@@ -94,6 +95,10 @@ def options(*, public: bool | None = None, runs: int | None = None, **values: An
     return Options(limits=limits, runs=runs or 0, **values)
 
 
+PAINTS = -5
+"""Niceness of the thread that draws the pages of a live loop: behind what keeps time, before the rest of the machine."""
+
+
 def serve(options: Options, live: LiveOrder | None = None) -> None:
     """Serve the dashboard at http://address:port/prefix until told to stop by SIGINT or SIGTERM. Raises OSError, SettingError.
 
@@ -120,6 +125,8 @@ def serve(options: Options, live: LiveOrder | None = None) -> None:
     )
     server.start()
     service.keep_page()
+    if live is not None:
+        prefer(PAINTS)
     loop.start()
     server.stop(wait=False)
     ended = service.close(SAVE_TIME if live is not None and live.record_file else 1.5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import signal
@@ -162,8 +163,7 @@ def enter_process(niceness: int = 0, *, turn: int = 0) -> None:
     niceness : of one that may wait;  turn : as in `go_first`, of one that keeps time
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if niceness:
-        os.nice(niceness)
+    prefer(niceness)
     if turn:
         go_first(turn)
     parent = parent_process()
@@ -174,6 +174,15 @@ def enter_process(niceness: int = 0, *, turn: int = 0) -> None:
         os._exit(1)
 
     Thread(target=end, daemon=True).start()
+
+
+def prefer(niceness: int) -> None:
+    """Give the calling thread, and what it starts, a niceness, where the system lets it: below 0 it runs before others that wait.
+
+    Only root, and who has CAP_SYS_NICE, may lower it.
+    """
+    with contextlib.suppress(AttributeError, OSError):  # another system, or no right to it
+        os.setpriority(os.PRIO_PROCESS, 0, niceness)
 
 
 def go_first(turn: int) -> bool:
