@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -22,7 +23,7 @@ from wfsobs.campaign.compare import compare
 from wfsobs.campaign.follow import CampaignFolder
 from wfsobs.campaign.plan import Campaign, parse_plan
 from wfsobs.campaign.state import open_folder
-from wfsobs.campaign.store import read_results, write_batch
+from wfsobs.campaign.store import batch_files, read_results, write_batch
 from wfsobs.campaign.work import run_rows
 from wfsobs.scenario import Scenario
 
@@ -102,6 +103,35 @@ def test_a_campaign_is_followed_and_opened(dashboard: Dashboard, loop: Any, plan
     for nothing in (-1, 4):
         page.load(nothing)
     assert dashboard.store.scenario == opened
+
+
+def cells_of(page: CampaignPage, name: str) -> dict[str, str]:
+    headings = re.findall(r"<th scope=col>(?:<button[^>]*>)?([^<]*)", page.table.object)
+    row = re.search(rf'<tr data-name="{name}">.*</tr>', page.table.object)
+    assert row is not None
+    return dict(zip(headings[1:], re.findall(r"<td>(.*?)</td>", row[0]), strict=True))
+
+
+def test_what_is_tied_was_tested(dashboard: Dashboard, loop: Any) -> None:
+    page = open_campaign(dashboard, loop)
+    page.filters["turbulence.wind_speed"].value, page.filters["sensors.exposure_ratio"].value = "20", "5"
+    one_seed = cells_of(page, "persistence"), cells_of(page, "kf-lgs")
+    assert {cells["Rank"] for cells in one_seed} == {"–"}, "a single seed is no test"
+    assert {cells["Wins"] for cells in one_seed} == {"1 (0)", "0 (0)"} and squares(page)[2]["state"] == "open"
+
+
+def test_a_scenario_alone_is_tested_over_its_seeds(dashboard: Dashboard, loop: Any, plan: Campaign, tmp_path: Path) -> None:
+    for path in batch_files(tmp_path):
+        path.unlink()
+    rms = {("kf-lgs", 7): 10.0, ("kf-lgs", 8): 12.0, ("persistence", 7): 20.0, ("persistence", 8): 22.1}
+    rows = [row for seed in plan.seeds for row in run_rows(plan.cells[3], seed, plan.observers, ()) if row["target"]]
+    write_batch(tmp_path, [{**row, "rms_nm": rms.get((row["name"], row["seed"]), row["rms_nm"])} for row in rows], PLACE)
+    page = open_campaign(dashboard, loop)
+    for only in ("", "20"):  # two scenarios have that wind, one of which has results
+        page.filters["turbulence.wind_speed"].value = only
+        # differences of 10 and 10.1 nm: t = 201, of 1 degree of freedom 12.7 is significant
+        assert (cells_of(page, "kf-lgs")["Rank"], cells_of(page, "persistence")["Rank"]) == ("best", "")
+        assert cells_of(page, "kf-lgs")["Wins"] == "1 (1)" and squares(page)[3]["state"] == "decided"
 
 
 def test_a_reload_returns_to_the_fields(dashboard: Dashboard, loop: Any) -> None:

@@ -36,7 +36,8 @@ FIRST_LINES = 5
 """Observers whose lines are shown first: the best ones."""
 SHADES = (
     "A full colour: the next is at least 30 % worse. Striped: another does not differ significantly, by a paired t-test over the "
-    "seeds of a scenario, or over the scenarios where a square has several. Click a square to open its scenario in Explore."
+    "seeds of a scenario, or over the scenarios where a square has several, or there are too few results to test. "
+    "Click a square to open its scenario in Explore."
 )
 
 

@@ -56,14 +56,14 @@ def value_names(axis: PlanAxis) -> list[str]:
 def standings_html(view: CampaignView, display: Display) -> str:
     """Write the table of all observers over the scenarios shown, best first."""
     errors, cells, scale = view.errors, view.cells, view.scale(display)
-    several = len(cells) > 1
+    several = len(errors.known_cells(cells)) > 1
     columns = {
         "Observer": "",
         f"Error [{display.unit_label}]": "rms over the seeds; over scenarios the geometric mean",
         "error / bound": "geometric mean over the scenarios; the smallest bound of each",
         "95 %": "of error / bound, over the scenarios",
         "Above the best [%]": f"paired over the {'scenarios' if several else 'seeds'}, with its interval of 95 %",
-        "Rank": "best: all others differ significantly; tied: no significant difference from the leader",
+        "Rank": f"best: all others differ significantly; tied: no significant difference from the best; {NOTHING}: not tested",
         "Wins": "scenarios with the smallest error, and how many of them are significant",
         "Records": "",
         "Failed": "runs without an estimate",
@@ -74,7 +74,7 @@ def standings_html(view: CampaignView, display: Display) -> str:
     for s in standings:
         i = errors.names.index(s.name)
         won = [v for cell in cells.tolist() if (v := errors.winners.get(cell)) is not None and v.best.name == s.name]
-        decided = sum(not v.ties for v in won)
+        decided = sum(v.is_decided for v in won)
         failed = view.state.failures.get(s.name)
         cells_of = [
             number(scale * s.rms),
@@ -91,11 +91,13 @@ def standings_html(view: CampaignView, display: Display) -> str:
 
 
 def _rank(s: CampaignPlace, standings: Sequence[CampaignPlace]) -> str:
-    tied = any(other.is_tie for other in standings)
-    alone = s.is_best and sum(not np.isnan(other.above) for other in standings) == 0
-    if s.is_best:
-        return "" if alone else "tied" if tied else "best"
-    return "tied" if s.is_tie else ""
+    rivals = [other for other in standings if other.is_rival]
+    of = rivals if s.is_best else [s]
+    if any(one.is_tie for one in of):
+        return "tied"
+    if any(one.is_untested for one in of):
+        return NOTHING
+    return "best" if s.is_best and rivals else ""
 
 
 def _number(x: float) -> str:
@@ -149,13 +151,15 @@ def _square(view: CampaignView, cells: list[int], where: str, display: Display, 
         said = f"{where}: {'no result yet' if cells else 'no such scenario'}"
         first = cells[0] if cells else -1
         return {"index": first, "state": WAITING, "text": "", "title": said, "ground": ground, "stripe": ground, "ink": ""}
-    best, decided = verdict.best, not verdict.ties and np.isfinite(verdict.margin)
+    best, decided = verdict.best, verdict.is_decided
     text = number(best.rms * view.scale(display))
     said = f"{where}: {name_label(best.name)} {text} {display.unit_label}"
     if np.isfinite(verdict.margin):
         said += f", {number(100 * verdict.margin, 2)} % before the next"
     if verdict.ties:
         said += f"; tied with {', '.join(map(name_label, verdict.ties))}"
+    elif not decided and np.isfinite(verdict.margin):
+        said += "; too few results to tell"
     if len(cells) > 1:
         said += f"; {len(cells)} scenarios, opens the first"
     else:
