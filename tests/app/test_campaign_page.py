@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.jobs.job import DONE
 from wfsobs.app.numerals import number
 from wfsobs.app.pages.campaign import CampaignPage
 from wfsobs.app.pages.pages import CAMPAIGN, EXPLORE
@@ -103,6 +104,44 @@ def test_a_campaign_is_followed_and_opened(dashboard: Dashboard, loop: Any, plan
     for nothing in (-1, 4):
         page.load(nothing)
     assert dashboard.store.scenario == opened
+
+
+def test_a_campaign_that_was_stopped_is_said_to_be(
+    dashboard: Dashboard, loop: Any, plan: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def add(cell: int, written: float) -> None:
+        write_batch(tmp_path, run_rows(plan.cells[cell], 8, plan.observers, ()), {**PLACE, "written": written})
+
+    def look_at(now: float) -> None:
+        monkeypatch.setattr("wfsobs.campaign.follow.time", lambda: now)
+        for at in (page, *others):
+            at.tick()
+            loop.until(lambda at=at: at.work.state == DONE)
+
+    started, others = (tmp_path / "plan.json").stat().st_mtime, []
+    for path in batch_files(tmp_path):
+        path.unlink()
+    add(0, started + 6.0)
+    add(1, started + 14.0)
+    monkeypatch.setattr("wfsobs.campaign.follow.time", lambda: started + 14.0)
+    page = open_campaign(dashboard, loop)
+    usual = "Tiny: 2 of 8 runs, 4 scenarios, 40 rows"
+    assert page.status.text == f"{usual}, about 48 s left", "six runs of 8 s"
+    look_at(started + 37.0)
+    assert page.status.text == f"{usual}, about 48 s left", "23 s are less than three times 8 s"
+    look_at(started + 54.0)
+    stopped = f"{usual}; no new batch for 40 s: stopped, or slower than before"
+    assert page.status.text == stopped
+    other = CampaignPage(dashboard.store, dashboard.display, lambda: None)  # as a reload makes it
+    others.append(other)
+    look_at(started + 54.0)
+    assert other.status.text == page.status.text == stopped
+    look_at(started + 354.0)
+    assert "no new batch for 6 min" in page.status.text
+    add(2, started + 354.0)
+    add(3, started + 360.0)
+    look_at(started + 361.0)
+    assert page.status.text == "Tiny: 4 of 8 runs, 4 scenarios, 80 rows, about 24 s left", "four runs of 6 s"
 
 
 def cells_of(page: CampaignPage, name: str) -> dict[str, str]:

@@ -126,10 +126,13 @@ class CampaignPage(PageActions):
         if state is None:
             self.status.param.update(text=self.work.line("Reading"), progress=self.work.progress)
             return
-        plan, left = state.plan, state.seconds_left
+        plan, left, silence = state.plan, state.seconds_left, state.silence
         said = f"{plan.name}: {state.n_done} of {plan.n_runs} runs, {len(plan.cells)} scenarios, {state.n_rows} rows"
         if state.n_done == plan.n_runs:
             said += ", finished"
+        elif silence:
+            ended = "ended, stopped" if plan.stop else "stopped"  # it may need no more seeds
+            said += f"; no new batch for {_span(silence)}: {ended}, or slower than before"
         elif np.isfinite(left):
             said += f", about {_span(left)} left"
         self.status.param.update(text=said, progress=state.n_done / plan.n_runs)
@@ -227,7 +230,9 @@ class CampaignPage(PageActions):
 def _span(seconds: float) -> str:
     """Write a time for people.
 
-    >>> _span(40), _span(600), _span(9000)
-    ('40 s', '10 min', '2.5 h')
+    >>> _span(40), _span(600), _span(9000), _span(1e6)
+    ('40 s', '10 min', '2.5 h', '12 days')
     """
-    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+    if seconds < 5400:
+        return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h" if seconds < 48 * 3600 else f"{seconds / 86400:.0f} days"
