@@ -98,6 +98,9 @@ def test_a_campaign_is_followed_and_opened(dashboard: Dashboard, loop: Any, plan
     assert y == pytest.approx([(rms[0] * rms[1]) ** 0.5, (rms[2] * rms[3]) ** 0.5]), "geometric mean over the other condition"
     page.filters["sensors.exposure_ratio"].value = "5"
     assert page.slice.sources["kf-lgs"].data["y"] == pytest.approx([rms[0], rms[2]])
+    of_states = [[(s["state"], s["title"].rpartition(": ")[2]) for s in row] for row in page.map.grid["cells"]]
+    assert of_states[0] == [("left-out", "left out by the fields Only …")] * 2, "not as if they were to be run yet"
+    assert {state for state, _ in of_states[1]} <= {"open", "decided"}
     page.map._handle_msg({"load": 3})
     opened = plan.cells[3].scenario().replace({"run.seed": 7})
     assert dashboard.store.scenario == opened and dashboard.pages.current == EXPLORE

@@ -12,7 +12,7 @@ from bokeh.plotting import figure
 
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.numerals import NOTHING, number
-from wfsobs.app.pages.sweep_views import DECIDED, FULL_MARGIN, GROUNDS, OPEN, WAITING, axis_title, ink_on, mix
+from wfsobs.app.pages.sweep_views import DECIDED, FULL_MARGIN, GROUNDS, LEFT_OUT, OPEN, WAITING, axis_title, ink_on, mix
 from wfsobs.app.render import Row, table
 from wfsobs.app.report.text import value_of
 from wfsobs.app.style import look, swatch
@@ -119,14 +119,17 @@ def winners_grid(view: CampaignView, x: PlanAxis, y: PlanAxis | None, display: D
     """Describe the map of winners."""
     columns, rows = value_names(x), value_names(y) if y else [""]
     across, down = axis_name(x, view.base), axis_name(y, view.base) if y else ""  # once: it looks through all settings
-    of = np.full((len(columns), len(rows)), None, dtype=object)
-    for cell in view.cells.tolist():
+    of = np.full((len(columns), len(rows)), None, dtype=object)  # None: the plan has no such scenario
+    shown = np.isin(np.arange(len(x.of_cell)), view.cells)
+    for cell in range(len(x.of_cell)):
         i, j = int(x.of_cell[cell]), int(y.of_cell[cell]) if y else 0
-        of[i, j] = [*(of[i, j] or []), cell]
+        of[i, j] = of[i, j] or []
+        if shown[cell]:
+            of[i, j].append(cell)
     key: dict[str, str] = {}
     cells = [
         [
-            _square(view, of[i, j] or [], f"{across} {columns[i]}" + (f", {down} {rows[j]}" if y else ""), display, key)
+            _square(view, of[i, j], f"{across} {columns[i]}" + (f", {down} {rows[j]}" if y else ""), display, key)
             for i in range(len(columns))
         ]
         for j in reversed(range(len(rows)))
@@ -142,15 +145,20 @@ def winners_grid(view: CampaignView, x: PlanAxis, y: PlanAxis | None, display: D
     }
 
 
-def _square(view: CampaignView, cells: list[int], where: str, display: Display, key: dict[str, str]) -> dict[str, Any]:
+def _square(view: CampaignView, cells: list[int] | None, where: str, display: Display, key: dict[str, str]) -> dict[str, Any]:
     """Describe one square: the scenario that it opens, its colour and what it says."""
     ground = GROUNDS[display.dark]
     errors = view.errors
-    verdict = errors.winners.get(cells[0]) if len(cells) == 1 else errors.verdict(cells) if cells else None
-    if verdict is None:
-        said = f"{where}: {'no result yet' if cells else 'no such scenario'}"
-        first = cells[0] if cells else -1
-        return {"index": first, "state": WAITING, "text": "", "title": said, "ground": ground, "stripe": ground, "ink": ""}
+    verdict = None if not cells else errors.winners.get(cells[0]) if len(cells) == 1 else errors.verdict(cells)
+    if not cells or verdict is None:
+        said = "no such scenario" if cells is None else "no result yet" if cells else "left out by the fields Only …"
+        square = {
+            "index": cells[0] if cells else -1,
+            "state": WAITING if cells else LEFT_OUT,
+            "text": "",
+            "title": f"{where}: {said}",
+        }
+        return {**square, "ground": ground, "stripe": ground, "ink": ""}
     best, decided = verdict.best, verdict.is_decided
     text = number(best.rms * view.scale(display))
     said = f"{where}: {name_label(best.name)} {text} {display.unit_label}"
