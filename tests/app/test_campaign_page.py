@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from wfsobs.app.copies import CAMPAIGN as COPIED
+from wfsobs.app.copies import CopiedTask, to_command, to_python
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.jobs.job import DONE
 from wfsobs.app.numerals import number
@@ -203,33 +205,92 @@ def test_without_a_campaign_there_is_no_such_page(loop: Any, short: Scenario, en
     assert dashboard.view_state.open("view.page=campaign")[0].startswith("view.page = campaign: takes one of explore, ")
 
 
+def in_a_shell(command: str) -> subprocess.CompletedProcess[str]:
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+    return subprocess.run(command, shell=True, capture_output=True, text=True, env={**os.environ, "PATH": path})
+
+
+@pytest.mark.parametrize(
+    ("target", "mode", "only", "cells"),
+    [
+        ("turbulence", "tip", {}, (0, 1, 2, 3)),
+        ("vibration", "tilt", {"turbulence.wind_speed": "20"}, (2, 3)),
+        ("turbulence", "tilt", {"turbulence.wind_speed": "5", "sensors.exposure_ratio": "10"}, (1,)),
+    ],
+)
 def test_what_is_copied_has_the_numbers_of_the_page(
-    dashboard: Dashboard, loop: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    dashboard: Dashboard,
+    loop: Any,
+    plan: Campaign,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    target: str,
+    mode: str,
+    only: dict[str, str],
+    cells: tuple[int, ...],
 ) -> None:
+    add_batch(plan, tmp_path, 8)
     page = open_campaign(dashboard, loop)
+    assert "--target turbulence --mode tip" in dashboard.actions.toolbar.command, "once there are results, before a field is used"
+    page.target.value = target
+    for path, value in only.items():
+        page.filters[path].value = value
+    dashboard.display.mode = mode
     monkeypatch.chdir(tmp_path.parent)
-    state = page.work.campaign
-    assert state is not None
-    bin_folder = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
-    done = subprocess.run(
-        f"{dashboard.actions.toolbar.command} --csv",
-        shell=True,
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PATH": bin_folder},
-    )
+    done = in_a_shell(f"{dashboard.actions.toolbar.command} --csv")
     assert done.returncode == 0, done.stderr
-    squares: dict[tuple[str, str, str, int], list[float]] = {}
-    for row in csv.DictReader(done.stdout.splitlines()):
-        if row["rms_nm"]:
-            key = row["target"], row["mode"], row["name"], int(row["cell"])
-            squares.setdefault(key, []).append(float(row["rms_nm"]) ** 2)
-    made: dict[str, Any] = {}
-    exec(dashboard.actions.toolbar.python, made)
-    for (target, mode), errors in state.errors.items():
-        assert np.array_equal(made["state"].errors[target, mode].rms, errors.rms, equal_nan=True)
-        for cell, name in np.ndindex(errors.rms.shape):
-            found = squares.get((target, mode, errors.names[name], cell))
-            # the rms over the seeds; of a single float32 the last digit may differ
-            assert (found is None) == bool(np.isnan(errors.rms[cell, name]))
-            assert found is None or np.sqrt(np.mean(found)) == pytest.approx(errors.rms[cell, name], rel=1e-6)
+    rows = {row["name"]: row for row in csv.DictReader(done.stdout.splitlines())}
+    assert [*rows] == re.findall(r'<tr data-name="([^"]*)"', page.table.object), "the same rows in the same order"
+    squares: dict[str, list[float]] = {}
+    for one in compare(read_results(tmp_path)):
+        if (one.target, one.mode) == (target, mode) and one.cell in cells:
+            squares.setdefault(one.name, []).append(one.rms)
+    assert {*squares} == {*rows}
+    for name, row in rows.items():
+        assert (row["target"], row["mode"]) == (target, mode)
+        # the errors of single scenarios by other code, and their geometric mean; rounding of logarithms
+        assert float(row["rms_nm"]) == pytest.approx(np.prod(squares[name]) ** (1 / len(cells)), rel=1e-12)
+        shown = cells_of(page, name)
+        assert shown["Error [nm]"] == number(float(row["rms_nm"])) and shown["Records"] == row["records"] == str(2 * len(cells))
+        assert shown["error / bound"] == number(float(row["over_bound"]))
+        assert shown["Wins"] == (f"{row['wins']} ({row['decided_wins']})" if row["wins"] else "–")
+        assert shown["Rank"] == row["rank"].replace("not tested", "–")
+    capsys.readouterr()
+    exec(dashboard.actions.toolbar.python, {})
+    printed = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert [(words[0], words[1]) for words in printed] == [(name, row["rms_nm"]) for name, row in rows.items()]
+    said = f"Tiny: 8 of 8 runs, {len(cells)} of 4 scenarios"
+    assert said in in_a_shell(dashboard.actions.toolbar.command).stdout
+
+
+def test_a_copy_without_results_has_all_of_them(
+    plan: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path.parent)
+    task = CopiedTask(COPIED, {"folder": tmp_path.name, "target": [], "mode": [], "only": []})
+    assert to_command(Scenario(), "paper", task=task) == f"wfsobs campaign table {tmp_path.name} --together"
+    exec(to_python(Scenario(), "paper", task=task), {})
+    known = {(one.target, one.mode, one.name) for one in compare(read_results(tmp_path))}
+    assert len(capsys.readouterr().out.splitlines()) == len(known) > 8
+
+
+def test_the_fields_stay_where_nothing_has_their_values(
+    loop: Any, short: Scenario, enter: Callable[..., Session], tmp_path: Path
+) -> None:
+    (tmp_path / "nights.csv").write_text("wind,r0\n5,0.1\n20,0.2\n", encoding="utf-8")
+    named = 'columns = { wind = "turbulence.wind_speed", r0 = "turbulence.r0" }'
+    plan = parse_plan(f'{PLAN.partition("[grid]")[0]}[conditions]\nfile = "nights.csv"\n{named}', tmp_path)
+    open_folder(plan, tmp_path)
+    add_batch(plan, tmp_path, 7)
+    session = enter()
+    session.service.campaign = CampaignFolder(tmp_path)
+    dashboard = Dashboard(loop.queue.put, session, short)
+    loop.closing.append(dashboard)
+    dashboard.page()
+    page = open_campaign(dashboard, loop)
+    page.filters["turbulence.wind_speed"].value, page.filters["turbulence.r0"].value = "5", "0.2"
+    assert page.room.visible and page.room[0].visible and "No scenario has all of these values" in page.table.object
+    assert [part.visible for part in page.room[2:]] == [False, False]
+    page.filters["turbulence.r0"].value = "0.1"
+    assert "Persistence" in page.table.object and all(part.visible for part in page.room)

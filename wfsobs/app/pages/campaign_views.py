@@ -18,9 +18,10 @@ from wfsobs.app.report.text import value_of
 from wfsobs.app.style import look, swatch
 from wfsobs.app.views.plots import add_line, call, new_figure
 from wfsobs.campaign.axes import SCENARIO, PlanAxis
-from wfsobs.campaign.errors import CampaignErrors, CampaignPlace
+from wfsobs.campaign.errors import CampaignErrors
 from wfsobs.campaign.follow import CampaignState
 from wfsobs.campaign.report import name_label
+from wfsobs.campaign.standings import UNTESTED, Standing, standings
 from wfsobs.scenario import Scenario
 from wfsobs.typing import Array
 
@@ -41,6 +42,29 @@ class CampaignView:
         return 1e-3 * per_micrometre(display.unit, self.base.telescope.diameter)
 
 
+def progress_text(state: CampaignState) -> str:
+    """Say how far a campaign is, and when it will be done or that nothing comes any more."""
+    plan, silence, left = state.plan, state.silence, state.seconds_left
+    said = f"{plan.name}: {state.n_done} of {plan.n_runs} runs, {len(plan.cells)} scenarios, {state.n_rows} rows"
+    if state.n_done == plan.n_runs:
+        return f"{said}, finished"
+    if silence:
+        ended = "ended, stopped" if plan.stop else "stopped"  # it may need no more seeds
+        return f"{said}; no new batch for {_span(silence)}: {ended}, or slower than before"
+    return f"{said}, about {_span(left)} left" if np.isfinite(left) else said
+
+
+def _span(seconds: float) -> str:
+    """Write a time for people.
+
+    >>> _span(40), _span(600), _span(9000), _span(1e6)
+    ('40 s', '10 min', '2.5 h', '12 days')
+    """
+    if seconds < 5400:
+        return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h" if seconds < 48 * 3600 else f"{seconds / 86400:.0f} days"
+
+
 def axis_name(axis: PlanAxis, base: Scenario) -> str:
     """Name a condition, with its unit."""
     return "Scenario" if axis.path == SCENARIO else axis_title(base, axis.path)
@@ -55,8 +79,7 @@ def value_names(axis: PlanAxis) -> list[str]:
 
 def standings_html(view: CampaignView, display: Display) -> str:
     """Write the table of all observers over the scenarios shown, best first."""
-    errors, cells, scale = view.errors, view.cells, view.scale(display)
-    several = len(errors.known_cells(cells)) > 1
+    scale, several = view.scale(display), len(view.errors.known_cells(view.cells)) > 1
     columns = {
         "Observer": "",
         f"Error [{display.unit_label}]": "rms over the seeds; over scenarios the geometric mean",
@@ -68,36 +91,20 @@ def standings_html(view: CampaignView, display: Display) -> str:
         "Records": "",
         "Failed": "runs without an estimate",
     }
-    ratio, low, high = errors.over_bound(cells)
-    standings = errors.standings(cells)
     rows = []
-    for s in standings:
-        i = errors.names.index(s.name)
-        won = [v for cell in cells.tolist() if (v := errors.winners.get(cell)) is not None and v.best.name == s.name]
-        decided = sum(v.is_decided for v in won)
-        failed = view.state.failures.get(s.name)
+    for s in standings(view.state, view.target, view.mode, view.cells):
         cells_of = [
-            number(scale * s.rms),
-            _number(ratio[i]),
-            _interval(low[i], high[i]),
+            number(scale * s.rms_nm),
+            _number(s.over_bound),
+            _interval(s.over_bound_low, s.over_bound_high),
             _above(s),
-            _rank(s, standings),
-            f"{len(won)} ({decided})" if errors.eligible[cells, i].any() else NOTHING,
-            str(int(errors.count[cells, i].sum())),
-            NOTHING if failed is None else str(int(failed[cells].sum())),
+            NOTHING if s.rank == UNTESTED else s.rank,
+            NOTHING if s.wins is None else f"{s.wins} ({s.decided_wins})",
+            str(s.records),
+            NOTHING if s.failures is None else str(s.failures),
         ]
         rows.append(Row(swatch(s.name, display.dark) + name_label(s.name), cells_of, {"name": s.name}))
     return str(table("Observers of the campaign", columns, [("", rows)]))
-
-
-def _rank(s: CampaignPlace, standings: Sequence[CampaignPlace]) -> str:
-    rivals = [other for other in standings if other.is_rival]
-    of = rivals if s.is_best else [s]
-    if any(one.is_tie for one in of):
-        return "tied"
-    if any(one.is_untested for one in of):
-        return NOTHING
-    return "best" if s.is_best and rivals else ""
 
 
 def _number(x: float) -> str:
@@ -108,10 +115,10 @@ def _interval(low: float, high: float) -> str:
     return f"{number(float(low))} – {number(float(high))}" if np.isfinite(low) and np.isfinite(high) else NOTHING
 
 
-def _above(s: CampaignPlace) -> str:
+def _above(s: Standing) -> str:
     if np.isnan(s.above):
         return NOTHING
-    around = "" if np.isnan(s.low) else f" ({number(100 * s.low, 2)} to {number(100 * s.high, 2)})"
+    around = "" if np.isnan(s.above_low) else f" ({number(100 * s.above_low, 2)} to {number(100 * s.above_high, 2)})"
     return number(100 * s.above, 2) + around
 
 
