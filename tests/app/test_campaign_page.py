@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -13,7 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from wfsobs.app.copies import CAMPAIGN as COPIED
+from wfsobs.app.copies import CopiedTask, to_command, to_python
 from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.jobs.job import DONE
 from wfsobs.app.numerals import number
 from wfsobs.app.pages.campaign import CampaignPage
 from wfsobs.app.pages.pages import CAMPAIGN, EXPLORE
@@ -22,7 +26,7 @@ from wfsobs.campaign.compare import compare
 from wfsobs.campaign.follow import CampaignFolder
 from wfsobs.campaign.plan import Campaign, parse_plan
 from wfsobs.campaign.state import open_folder
-from wfsobs.campaign.store import read_results, write_batch
+from wfsobs.campaign.store import batch_files, read_results, write_batch
 from wfsobs.campaign.work import run_rows
 from wfsobs.scenario import Scenario
 
@@ -96,12 +100,82 @@ def test_a_campaign_is_followed_and_opened(dashboard: Dashboard, loop: Any, plan
     assert y == pytest.approx([(rms[0] * rms[1]) ** 0.5, (rms[2] * rms[3]) ** 0.5]), "geometric mean over the other condition"
     page.filters["sensors.exposure_ratio"].value = "5"
     assert page.slice.sources["kf-lgs"].data["y"] == pytest.approx([rms[0], rms[2]])
+    of_states = [[(s["state"], s["title"].rpartition(": ")[2]) for s in row] for row in page.map.grid["cells"]]
+    assert of_states[0] == [("left-out", "left out by the fields Only …")] * 2, "not as if they were to be run yet"
+    assert {state for state, _ in of_states[1]} <= {"open", "decided"}
     page.map._handle_msg({"load": 3})
     opened = plan.cells[3].scenario().replace({"run.seed": 7})
     assert dashboard.store.scenario == opened and dashboard.pages.current == EXPLORE
     for nothing in (-1, 4):
         page.load(nothing)
     assert dashboard.store.scenario == opened
+
+
+def test_a_campaign_that_was_stopped_is_said_to_be(
+    dashboard: Dashboard, loop: Any, plan: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def add(cell: int, written: float) -> None:
+        write_batch(tmp_path, run_rows(plan.cells[cell], 8, plan.observers, ()), {**PLACE, "written": written})
+
+    def look_at(now: float) -> None:
+        monkeypatch.setattr("wfsobs.campaign.follow.time", lambda: now)
+        for at in (page, *others):
+            at.tick()
+            loop.until(lambda at=at: at.work.state == DONE)
+
+    started, others = (tmp_path / "plan.json").stat().st_mtime, []
+    for path in batch_files(tmp_path):
+        path.unlink()
+    add(0, started + 6.0)
+    add(1, started + 14.0)
+    monkeypatch.setattr("wfsobs.campaign.follow.time", lambda: started + 14.0)
+    page = open_campaign(dashboard, loop)
+    usual = "Tiny: 2 of 8 runs, 4 scenarios, 40 rows"
+    assert page.status.text == f"{usual}, about 48 s left", "six runs of 8 s"
+    look_at(started + 37.0)
+    assert page.status.text == f"{usual}, about 48 s left", "23 s are less than three times 8 s"
+    look_at(started + 54.0)
+    stopped = f"{usual}; no new batch for 40 s: stopped, or slower than before"
+    assert page.status.text == stopped
+    other = CampaignPage(dashboard.store, dashboard.display, lambda: None)  # as a reload makes it
+    others.append(other)
+    look_at(started + 54.0)
+    assert other.status.text == page.status.text == stopped
+    look_at(started + 354.0)
+    assert "no new batch for 6 min" in page.status.text
+    add(2, started + 354.0)
+    add(3, started + 360.0)
+    look_at(started + 361.0)
+    assert page.status.text == "Tiny: 4 of 8 runs, 4 scenarios, 80 rows, about 24 s left", "four runs of 6 s"
+
+
+def cells_of(page: CampaignPage, name: str) -> dict[str, str]:
+    headings = re.findall(r"<th scope=col>(?:<button[^>]*>)?([^<]*)", page.table.object)
+    row = re.search(rf'<tr data-name="{name}">.*</tr>', page.table.object)
+    assert row is not None
+    return dict(zip(headings[1:], re.findall(r"<td>(.*?)</td>", row[0]), strict=True))
+
+
+def test_what_is_tied_was_tested(dashboard: Dashboard, loop: Any) -> None:
+    page = open_campaign(dashboard, loop)
+    page.filters["turbulence.wind_speed"].value, page.filters["sensors.exposure_ratio"].value = "20", "5"
+    one_seed = cells_of(page, "persistence"), cells_of(page, "kf-lgs")
+    assert {cells["Rank"] for cells in one_seed} == {"–"}, "a single seed is no test"
+    assert {cells["Wins"] for cells in one_seed} == {"1 (0)", "0 (0)"} and squares(page)[2]["state"] == "open"
+
+
+def test_a_scenario_alone_is_tested_over_its_seeds(dashboard: Dashboard, loop: Any, plan: Campaign, tmp_path: Path) -> None:
+    for path in batch_files(tmp_path):
+        path.unlink()
+    rms = {("kf-lgs", 7): 10.0, ("kf-lgs", 8): 12.0, ("persistence", 7): 20.0, ("persistence", 8): 22.1}
+    rows = [row for seed in plan.seeds for row in run_rows(plan.cells[3], seed, plan.observers, ()) if row["target"]]
+    write_batch(tmp_path, [{**row, "rms_nm": rms.get((row["name"], row["seed"]), row["rms_nm"])} for row in rows], PLACE)
+    page = open_campaign(dashboard, loop)
+    for only in ("", "20"):  # two scenarios have that wind, one of which has results
+        page.filters["turbulence.wind_speed"].value = only
+        # differences of 10 and 10.1 nm: t = 201, of 1 degree of freedom 12.7 is significant
+        assert (cells_of(page, "kf-lgs")["Rank"], cells_of(page, "persistence")["Rank"]) == ("best", "")
+        assert cells_of(page, "kf-lgs")["Wins"] == "1 (1)" and squares(page)[3]["state"] == "decided"
 
 
 def test_a_reload_returns_to_the_fields(dashboard: Dashboard, loop: Any) -> None:
@@ -131,33 +205,92 @@ def test_without_a_campaign_there_is_no_such_page(loop: Any, short: Scenario, en
     assert dashboard.view_state.open("view.page=campaign")[0].startswith("view.page = campaign: takes one of explore, ")
 
 
+def in_a_shell(command: str) -> subprocess.CompletedProcess[str]:
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+    return subprocess.run(command, shell=True, capture_output=True, text=True, env={**os.environ, "PATH": path})
+
+
+@pytest.mark.parametrize(
+    ("target", "mode", "only", "cells"),
+    [
+        ("turbulence", "tip", {}, (0, 1, 2, 3)),
+        ("vibration", "tilt", {"turbulence.wind_speed": "20"}, (2, 3)),
+        ("turbulence", "tilt", {"turbulence.wind_speed": "5", "sensors.exposure_ratio": "10"}, (1,)),
+    ],
+)
 def test_what_is_copied_has_the_numbers_of_the_page(
-    dashboard: Dashboard, loop: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    dashboard: Dashboard,
+    loop: Any,
+    plan: Campaign,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    target: str,
+    mode: str,
+    only: dict[str, str],
+    cells: tuple[int, ...],
 ) -> None:
+    add_batch(plan, tmp_path, 8)
     page = open_campaign(dashboard, loop)
+    assert "--target turbulence --mode tip" in dashboard.actions.toolbar.command, "once there are results, before a field is used"
+    page.target.value = target
+    for path, value in only.items():
+        page.filters[path].value = value
+    dashboard.display.mode = mode
     monkeypatch.chdir(tmp_path.parent)
-    state = page.work.campaign
-    assert state is not None
-    bin_folder = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
-    done = subprocess.run(
-        f"{dashboard.actions.toolbar.command} --csv",
-        shell=True,
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PATH": bin_folder},
-    )
+    done = in_a_shell(f"{dashboard.actions.toolbar.command} --csv")
     assert done.returncode == 0, done.stderr
-    squares: dict[tuple[str, str, str, int], list[float]] = {}
-    for row in csv.DictReader(done.stdout.splitlines()):
-        if row["rms_nm"]:
-            key = row["target"], row["mode"], row["name"], int(row["cell"])
-            squares.setdefault(key, []).append(float(row["rms_nm"]) ** 2)
-    made: dict[str, Any] = {}
-    exec(dashboard.actions.toolbar.python, made)
-    for (target, mode), errors in state.errors.items():
-        assert np.array_equal(made["state"].errors[target, mode].rms, errors.rms, equal_nan=True)
-        for cell, name in np.ndindex(errors.rms.shape):
-            found = squares.get((target, mode, errors.names[name], cell))
-            # the rms over the seeds; of a single float32 the last digit may differ
-            assert (found is None) == bool(np.isnan(errors.rms[cell, name]))
-            assert found is None or np.sqrt(np.mean(found)) == pytest.approx(errors.rms[cell, name], rel=1e-6)
+    rows = {row["name"]: row for row in csv.DictReader(done.stdout.splitlines())}
+    assert [*rows] == re.findall(r'<tr data-name="([^"]*)"', page.table.object), "the same rows in the same order"
+    squares: dict[str, list[float]] = {}
+    for one in compare(read_results(tmp_path)):
+        if (one.target, one.mode) == (target, mode) and one.cell in cells:
+            squares.setdefault(one.name, []).append(one.rms)
+    assert {*squares} == {*rows}
+    for name, row in rows.items():
+        assert (row["target"], row["mode"]) == (target, mode)
+        # the errors of single scenarios by other code, and their geometric mean; rounding of logarithms
+        assert float(row["rms_nm"]) == pytest.approx(np.prod(squares[name]) ** (1 / len(cells)), rel=1e-12)
+        shown = cells_of(page, name)
+        assert shown["Error [nm]"] == number(float(row["rms_nm"])) and shown["Records"] == row["records"] == str(2 * len(cells))
+        assert shown["error / bound"] == number(float(row["over_bound"]))
+        assert shown["Wins"] == (f"{row['wins']} ({row['decided_wins']})" if row["wins"] else "–")
+        assert shown["Rank"] == row["rank"].replace("not tested", "–")
+    capsys.readouterr()
+    exec(dashboard.actions.toolbar.python, {})
+    printed = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert [(words[0], words[1]) for words in printed] == [(name, row["rms_nm"]) for name, row in rows.items()]
+    said = f"Tiny: 8 of 8 runs, {len(cells)} of 4 scenarios"
+    assert said in in_a_shell(dashboard.actions.toolbar.command).stdout
+
+
+def test_a_copy_without_results_has_all_of_them(
+    plan: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path.parent)
+    task = CopiedTask(COPIED, {"folder": tmp_path.name, "target": [], "mode": [], "only": []})
+    assert to_command(Scenario(), "paper", task=task) == f"wfsobs campaign table {tmp_path.name} --together"
+    exec(to_python(Scenario(), "paper", task=task), {})
+    known = {(one.target, one.mode, one.name) for one in compare(read_results(tmp_path))}
+    assert len(capsys.readouterr().out.splitlines()) == len(known) > 8
+
+
+def test_the_fields_stay_where_nothing_has_their_values(
+    loop: Any, short: Scenario, enter: Callable[..., Session], tmp_path: Path
+) -> None:
+    (tmp_path / "nights.csv").write_text("wind,r0\n5,0.1\n20,0.2\n", encoding="utf-8")
+    named = 'columns = { wind = "turbulence.wind_speed", r0 = "turbulence.r0" }'
+    plan = parse_plan(f'{PLAN.partition("[grid]")[0]}[conditions]\nfile = "nights.csv"\n{named}', tmp_path)
+    open_folder(plan, tmp_path)
+    add_batch(plan, tmp_path, 7)
+    session = enter()
+    session.service.campaign = CampaignFolder(tmp_path)
+    dashboard = Dashboard(loop.queue.put, session, short)
+    loop.closing.append(dashboard)
+    dashboard.page()
+    page = open_campaign(dashboard, loop)
+    page.filters["turbulence.wind_speed"].value, page.filters["turbulence.r0"].value = "5", "0.2"
+    assert page.room.visible and page.room[0].visible and "No scenario has all of these values" in page.table.object
+    assert [part.visible for part in page.room[2:]] == [False, False]
+    page.filters["turbulence.r0"].value = "0.1"
+    assert "Persistence" in page.table.object and all(part.visible for part in page.room)

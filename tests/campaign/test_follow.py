@@ -89,6 +89,26 @@ def test_scenarios_are_the_blocks_of_many():
     assert ratio[:1] == pytest.approx(2.0) and (low[0], high[0]) == pytest.approx((2.0, 2.0))
 
 
+def test_nothing_is_tied_without_a_test():
+    """Errors of b are 1.0 to 1.2 nm above those of a, of c 3 nm below to 3 nm above; of another scenario a alone is known."""
+    a = np.array([10.0, 11.0, 12.0])
+    values = np.full((3, 3, 3), np.nan)
+    values[0] = a[:, None] + [[0.0, 1.0, -3.0], [0.0, 1.1, 0.2], [0.0, 1.2, 3.0]]
+    errors = CampaignErrors(("a", "b", "c"), values, np.ones((3, 3), dtype=bool))
+    assert str(errors.standings([0, 1, 2])) == str(errors.standings([0])), "what has no results is no scenario of a test"
+    places = [(s.name, s.is_best, s.is_tie, s.is_untested) for s in sorted(errors.standings([0, 1, 2]))]
+    assert places == [("a", True, False, False), ("b", False, False, False), ("c", False, True, False)]
+    assert (errors.verdict([0, 1, 2]).ties, errors.verdict([0, 1, 2]).is_decided) == (("c",), False)
+    values = values[..., :2].copy()
+    assert CampaignErrors(("a", "b"), values, np.ones((3, 2), dtype=bool)).winners[0].is_decided
+    for count in (1, 3):  # seeds of a second scenario, of a alone: then b has one scenario, and before its test over the seeds
+        values[1, :count, 0] = 20.0
+        found = CampaignErrors(("a", "b"), values, np.ones((3, 2), dtype=bool))
+        assert [(s.is_tie, s.is_untested) for s in sorted(found.standings([0, 1]))] == [(False, False), (False, True)]
+        assert found.verdict([0, 1]).ties == () and not found.verdict([0, 1]).is_decided
+        assert not found.winners[1].is_decided, "there is nothing beside it"
+
+
 def test_many_values_are_put_into_bins(tmp_path):
     plan = parse_plan("[grid]\nturbulence.wind_speed = " + str([5 + i / 10 for i in range(100)]), tmp_path)
     (axis,) = plan_axes(plan)

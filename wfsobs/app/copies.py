@@ -44,7 +44,8 @@ EXPLORED = CopiedTask()
 def to_command(scenario: Scenario, preset: str, source: Source | None = None, task: CopiedTask = EXPLORED) -> str:
     """Write the command that prints what a page shows; two where the record has to be simulated first."""
     if task.what == CAMPAIGN:  # its settings are in its folder
-        return shlex.join(["wfsobs", "campaign", "table", as_path(task.arguments["folder"])])
+        words = [word for name in ("target", "mode", "only") for one in task.arguments[name] for word in (f"--{name}", one)]
+        return shlex.join(["wfsobs", "campaign", "table", as_path(task.arguments["folder"]), "--together", *words])
     if task.what == LIVE:
         return live_command(scenario, preset, source, task.arguments["order"])
     given = given_options(scenario, preset, FILE)
@@ -73,7 +74,7 @@ def _as_list(value: Any) -> Sequence[Any]:
 def to_python(scenario: Scenario, preset: str, source: Source | None = None, task: CopiedTask = EXPLORED) -> str:
     """Write a script that computes and prints what a page shows."""
     if task.what == CAMPAIGN:
-        return _campaign_script(task.arguments["folder"])
+        return _campaign_script(**task.arguments)
     if task.what == LIVE:
         return live_script(scenario, preset, source, task.arguments["order"])
     source = None if task.what == SWEEP else source
@@ -91,15 +92,21 @@ def to_python(scenario: Scenario, preset: str, source: Source | None = None, tas
     return "\n".join([*sorted(imports | more_imports, key=import_order), "", *lines, *more_lines, ""])
 
 
-def _campaign_script(folder: str) -> str:
+def _campaign_script(folder: str, target: Sequence[str], mode: Sequence[str], only: Sequence[str]) -> str:
+    """Write the script; target, mode : one each, or none where there are no results yet."""
+    rows, indent = f"standings(state, {', '.join(map(repr, [*target, *mode]))}, cells)", ""
+    if not target:
+        rows, indent = "standings(state, *key, cells)", "    "
     return f"""from pathlib import Path
 
 from wfsobs.campaign.follow import CampaignFolder
+from wfsobs.campaign.selection import cells_where
+from wfsobs.campaign.standings import standings
 
 state = CampaignFolder(Path({folder!r})).read()
-for (target, mode), errors in state.errors.items():
-    for place in errors.standings(range(len(state.plan.cells))):
-        print(target, mode, place.name, place.rms, "nm")
+cells = cells_where(state.plan, {[*only]!r})
+{"" if target else "for key in state.errors:" + chr(10)}{indent}for row in {rows}:
+{indent}    print(row.name, row.rms_nm, "nm", row.over_bound, row.above, row.rank, row.wins, row.records, row.failures)
 """
 
 

@@ -30,8 +30,8 @@ class CampaignPlace(NamedTuple):
         Mean of its rms over that of the best, less 1; NaN where it is not compared.
     low, high : float
         Interval of `above`; NaN where there is none.
-    is_best, is_tie : bool
-        Whether it is the best, and whether it does not differ significantly from the best.
+    is_best, is_tie, is_untested : bool
+        Whether it is the best; whether a test finds no difference from the best; whether it is compared with too little to test.
     """
 
     name: str
@@ -41,14 +41,25 @@ class CampaignPlace(NamedTuple):
     high: float
     is_best: bool
     is_tie: bool
+    is_untested: bool
+
+    @property
+    def is_rival(self) -> bool:
+        """Whether it is compared with the best."""
+        return self.is_tie or self.is_untested or not np.isnan(self.above)
 
 
 class CampaignWinner(NamedTuple):
-    """The best over some scenarios; margin : how much worse the next is, NaN without one; ties : what does not differ."""
+    """The best over some scenarios.
+
+    margin : how much worse the next is, NaN without one;  ties : what does not differ by a test
+    is_decided : whether it differs significantly from all others
+    """
 
     best: CampaignPlace
     margin: float
     ties: tuple[str, ...]
+    is_decided: bool
 
 
 @dataclass(frozen=True)
@@ -94,13 +105,18 @@ class CampaignErrors:
         mean, half = _mean_interval(np.where(np.isfinite(logs), logs, np.nan))
         return np.exp(mean), np.exp(mean - half), np.exp(mean + half)
 
+    def known_cells(self, cells: Sequence[int] | Array) -> Array:
+        """Return those of some scenarios that have results."""
+        cells = np.asarray(cells, dtype=int)
+        return cells[self.count[cells].any(axis=1)]
+
     def standings(self, cells: Sequence[int] | Array) -> list[CampaignPlace]:
-        """Compare all names over some scenarios: over the seeds of a single one, over the scenarios of several.
+        """Compare all names over some scenarios: over the seeds if a single one has results, else over the scenarios.
 
         Seeds of one scenario are no independent evidence about others, so that of several each counts once, by the logarithm of
         its rms. The best is the one with the smallest mean of those with a result in most records or scenarios.
         """
-        cells = np.asarray(cells, dtype=int)
+        cells = self.known_cells(cells)
         if len(cells) == 1:
             samples, mean, eligible = self.values[cells[0]], self.rms[cells[0]], self.eligible[cells[0]]
         else:
@@ -113,20 +129,16 @@ class CampaignErrors:
         ranked = [i for i in np.argsort(mean) if candidates[i] and known[i] == known[candidates].max()]
         above = low = high = np.full(len(mean), np.nan)
         best = ranked[0] if ranked else -1
-        tie = np.zeros(len(mean), dtype=bool)
+        tie = untested = np.zeros(len(mean), dtype=bool)
         if ranked:
             difference, half = _mean_interval(samples - samples[:, [best]])
             rivals = candidates & (np.arange(len(mean)) != best)
-            tie = rivals & ~(np.abs(difference) > half)
+            untested = rivals & np.isnan(half)
+            tie = rivals & (np.abs(difference) <= half)
             parts = [np.where(rivals, part, np.nan) for part in (difference, difference - half, difference + half)]
             above, low, high = (part / mean[best] if len(cells) == 1 else np.expm1(part) for part in parts)
-        return [
-            CampaignPlace(
-                self.names[i], float(mean[i]), float(above[i]), float(low[i]), float(high[i]), bool(i == best), bool(tie[i])
-            )
-            for i in np.argsort(mean)
-            if known[i]
-        ]
+        numbers = [column.tolist() for column in (mean, above, low, high, np.arange(len(mean)) == best, tie, untested)]
+        return [CampaignPlace(self.names[i], *(column[i] for column in numbers)) for i in np.argsort(mean) if known[i]]
 
     def verdict(self, cells: Sequence[int] | Array) -> CampaignWinner | None:
         """Return the best over some scenarios; None where nothing is known."""
@@ -134,9 +146,10 @@ class CampaignErrors:
         best = next((s for s in standings if s.is_best), None)
         if best is None:
             return None
-        rivals = [s for s in standings if not np.isnan(s.above)]
+        rivals = [s for s in standings if s.is_rival]
+        decided = bool(rivals) and not any(s.is_tie or s.is_untested for s in rivals)
         margin = min((s.rms for s in rivals), default=np.nan) / best.rms - 1.0 if best.rms > 0 else np.nan
-        return CampaignWinner(best, float(margin), tuple(s.name for s in standings if s.is_tie))
+        return CampaignWinner(best, float(margin), tuple(s.name for s in standings if s.is_tie), decided)
 
     @cached_property
     def winners(self) -> dict[int, CampaignWinner]:

@@ -11,6 +11,7 @@ from time import time
 import numpy as np
 
 from wfsobs.campaign.errors import CampaignErrors, can_win
+from wfsobs.campaign.pace import Pace, WrittenBatch, measure_pace
 from wfsobs.campaign.plan import Campaign
 from wfsobs.campaign.state import folder_plan
 from wfsobs.campaign.store import PLAN, batch_files, need_pyarrow, read_batch
@@ -18,11 +19,7 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.settings.errors import SettingError
 from wfsobs.typing import Array
 
-COLUMNS = ("cell", "seed", "name", "target", "mode", "rms_nm", "apart", "written")
-LATEST = 20
-"""Batches by which the time left is estimated."""
-STILL = 300.0
-"""Time without a batch after which a campaign is taken for one that does not run [s]."""
+COLUMNS = ("cell", "seed", "name", "target", "mode", "rms_nm", "apart", "written", "host", "process")
 
 
 @dataclass(frozen=True)
@@ -35,8 +32,8 @@ class CampaignState:
         What is run.
     n_done, n_rows : int
         Runs that have a row of everything, and number of rows.
-    seconds_left : float
-        About how long the rest takes at the rate of the latest batches [s]; NaN where nothing runs.
+    pace : Pace
+        How fast batches come.
     errors : mapping
         (target, mode) -> errors.
     failures : Mapping
@@ -46,9 +43,19 @@ class CampaignState:
     plan: Campaign
     n_done: int
     n_rows: int
-    seconds_left: float
+    pace: Pace
     errors: Mapping[tuple[str, str], CampaignErrors]
     failures: Mapping[str, Array]
+
+    @property
+    def seconds_left(self) -> float:
+        """About how long the rest takes at the rate of the latest batches [s]; NaN where nothing comes."""
+        return self.pace.seconds_left(self.plan.n_runs - self.n_done, time())
+
+    @property
+    def silence(self) -> float:
+        """For how long no batch has come, if that is clearly longer than a batch has taken [s]; else 0."""
+        return 0.0 if self.n_done == self.plan.n_runs else self.pace.silence(time())
 
 
 class CampaignFolder:
@@ -72,7 +79,7 @@ class CampaignFolder:
         self._read_paths: set[Path] = set()
         self._codes: dict[str, int] = {}
         self._parts: list[Array] = []
-        self._batch_times: list[tuple[float, int]] = []
+        self._batches: list[WrittenBatch] = []
         self._state: CampaignState | None = None
         self._plan_time = 0
         self._lock = threading.Lock()
@@ -90,8 +97,7 @@ class CampaignFolder:
             for i, path in enumerate(fresh):
                 watch.step(i / len(fresh))
                 self._take(path)
-            still = self._state is not None and np.isfinite(self._state.seconds_left) and self._seconds_left(1, 1) is None
-            if self._state is None or fresh or still:
+            if self._state is None or fresh:
                 self._state = self._build()
             return self._state
 
@@ -112,7 +118,8 @@ class CampaignFolder:
         self._parts.append(part)
         self._read_paths.add(path)
         if len(part):
-            self._batch_times.append((float(table["written"][0].as_py()), len(np.unique(part[["cell", "seed"]]))))
+            written, host, process = (table[column][0].as_py() for column in ("written", "host", "process"))
+            self._batches.append(WrittenBatch(written, (host, process), len(np.unique(part[["cell", "seed"]]))))
 
     def _build(self) -> CampaignState:
         plan, codes = self._plan, self._codes
@@ -137,17 +144,10 @@ class CampaignFolder:
             lost = np.unique(failed[failed["name"] == codes.get(name, -1)][["cell", "seed"]])
             failures[name] = np.bincount(lost["cell"], minlength=shape[0])
         n_done = int(done.sum())
-        left = self._seconds_left(n_done, plan.n_runs)
+        pace = measure_pace(self._batches, 1e-9 * self._plan_time, time())
         for one in errors.values():
             _ = one.winners, one.bound  # here, not on the thread of a page
-        return CampaignState(plan, n_done, len(rows), np.nan if left is None else left, errors, failures)
-
-    def _seconds_left(self, n_done: int, n_runs: int) -> float | None:
-        """Return the time of the rest by the latest batches [s]; None while nothing is written."""
-        latest = sorted(self._batch_times)[-LATEST:]
-        if len(latest) < 2 or time() - latest[-1][0] > STILL or latest[-1][0] <= latest[0][0]:
-            return None
-        return (n_runs - n_done) * (latest[-1][0] - latest[0][0]) / sum(runs for _, runs in latest[1:])
+        return CampaignState(plan, n_done, len(rows), pace, errors, failures)
 
 
 ROW = np.dtype(

@@ -21,7 +21,8 @@ from wfsobs.campaign.run import Progress as State
 from wfsobs.campaign.state import finished_runs, folder_plan
 from wfsobs.campaign.store import add_settings, need_pyarrow, read_results
 from wfsobs.campaign.work import run_rows
-from wfsobs.cli.campaign_results import print_csv, summary_table
+from wfsobs.cli.campaign_results import print_csv, select_rows, summary_table
+from wfsobs.cli.campaign_together import print_together
 from wfsobs.cli.show import show_table
 from wfsobs.evaluation.scores import COMMON_BOUNDS
 from wfsobs.settings.errors import SettingError
@@ -190,12 +191,30 @@ def _shard(text: str | None) -> tuple[int, int]:
 
 @campaign.command("table")
 @click.argument("folder", metavar="DIR")
-@click.option("--csv", "as_csv", is_flag=True, help="Print all rows, sorted by key, without times and hosts.")
+@click.option(
+    "--only",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Only scenarios with this value, such as turbulence.wind_speed=20, or NAME=LOW..HIGH; can be given many times.",
+)
+@click.option("--target", metavar="TARGET", help="Only errors of this target.")
+@click.option("--mode", metavar="MODE", help="Only errors of this mode.")
+@click.option("--together", is_flag=True, help="One row per observer over all scenarios, as the page of the dashboard has it.")
+@click.option(
+    "--csv", "as_csv", is_flag=True, help="Print all rows, sorted by key, without times and hosts; or --together as CSV."
+)
 @click.option("--parquet", metavar="FILE", help="Write all rows with their settings to one Parquet file.")
-def print_table(folder: str, as_csv: bool, parquet: str | None) -> None:
+def print_table(
+    folder: str, only: tuple[str, ...], target: str | None, mode: str | None, together: bool, as_csv: bool, parquet: str | None
+) -> None:
     """Print the results of a campaign: errors over the seeds and paired differences from the best."""
+    if together and parquet:
+        raise SettingError("--parquet: takes all rows, not --together")
     plan = folder_plan(Path(folder))
-    rows = read_results(Path(folder))
+    if together:
+        print_together(Path(folder), only, target, mode, as_csv)
+        return
+    rows = select_rows(plan, read_results(Path(folder)), only, target, mode)
     if parquet:
         import pyarrow.parquet as pq
 

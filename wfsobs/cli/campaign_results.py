@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import csv
 import sys
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from rich.table import Table
 
 from wfsobs.campaign.compare import QUANTILES, compare
 from wfsobs.campaign.plan import Campaign
+from wfsobs.campaign.selection import cells_where
 from wfsobs.campaign.store import RESULTS
 from wfsobs.evaluation.rows import NOT_OBSERVERS
+from wfsobs.settings.errors import SettingError
 
 if TYPE_CHECKING:
     import pyarrow
@@ -21,6 +24,34 @@ SPREAD = f"{', '.join(f'{q * 100:g}' for q in QUANTILES)} % of seeds"
 
 CHUNK = 10_000
 """Rows that are Python objects at a time: these take far more memory than a table."""
+
+
+def select_rows(plan: Campaign, table: pyarrow.Table, only: Sequence[str], target: str | None, mode: str | None) -> pyarrow.Table:
+    """Return the rows of some scenarios, a target and a mode, and of runs without an estimate. Raises SettingError."""
+    import pyarrow.compute as pc
+
+    cells = cells_of(plan, only)
+    for option, wanted in (("target", target), ("mode", mode)):
+        known = sorted(filter(None, table[option].unique().to_pylist()))
+        if check_known(option, wanted, known):
+            table = table.filter((pc.field(option) == wanted) | (pc.field("target") == ""))
+    return table.filter(pc.field("cell").isin(cells)) if only else table
+
+
+def cells_of(plan: Campaign, only: Sequence[str]) -> list[int]:
+    """Return the scenarios of --only. Raises SettingError."""
+    try:
+        return cells_where(plan, only).tolist()
+    except SettingError as error:
+        raise SettingError(f"--only {error}") from None
+
+
+def check_known(option: str, wanted: str | None, known: Iterable[str]) -> bool:
+    """Return whether an option is given. Raises SettingError where it is none of what there are results of."""
+    if wanted is not None and wanted not in known:
+        listed = ", ".join(known)
+        raise SettingError(f"--{option} {wanted}: {f'takes one of {listed}' if listed else 'there are no results yet'}")
+    return wanted is not None
 
 
 def print_csv(plan: Campaign, table: pyarrow.Table) -> None:

@@ -9,13 +9,22 @@ from typing import Any
 import numpy as np
 import panel as pn
 import panel_material_ui as pmui
+import param
 
 from wfsobs.app.campaign_work import CampaignTask
 from wfsobs.app.controls.status import Status
 from wfsobs.app.copies import CAMPAIGN, EXPLORED, CopiedTask
 from wfsobs.app.display import Display
 from wfsobs.app.jobs.job import FAILED
-from wfsobs.app.pages.campaign_views import CampaignView, Slice, axis_name, standings_html, value_names, winners_grid
+from wfsobs.app.pages.campaign_views import (
+    CampaignView,
+    Slice,
+    axis_name,
+    progress_text,
+    standings_html,
+    value_names,
+    winners_grid,
+)
 from wfsobs.app.pages.link import LinkedFields, LinkedLater
 from wfsobs.app.pages.parts import WIDE, PageActions, box, html, legend, line, text
 from wfsobs.app.pages.sweep_settings import line_of
@@ -24,6 +33,7 @@ from wfsobs.app.store import Store
 from wfsobs.campaign.axes import PlanAxis, plan_axes
 from wfsobs.campaign.follow import CampaignState
 from wfsobs.campaign.report import name_label
+from wfsobs.campaign.selection import condition
 from wfsobs.evaluation.rows import target_title
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.scenario import Scenario
@@ -36,8 +46,15 @@ FIRST_LINES = 5
 """Observers whose lines are shown first: the best ones."""
 SHADES = (
     "A full colour: the next is at least 30 % worse. Striped: another does not differ significantly, by a paired t-test over the "
-    "seeds of a scenario, or over the scenarios where a square has several. Click a square to open its scenario in Explore."
+    "seeds of a scenario, or over the scenarios where a square has several, or there are too few results to test. "
+    "Click a square to open its scenario in Explore."
 )
+
+
+class CopiedInput(param.Parameterized):
+    """What the copies of the page are made of, for those who watch its fields: it has them only once there are results."""
+
+    value = param.Parameter(EXPLORED)
 
 
 class CampaignPage(PageActions):
@@ -57,6 +74,8 @@ class CampaignPage(PageActions):
         self.axes: dict[str, PlanAxis] = {}
         self.filters: dict[str, Any] = {}
         self.link = self._fields = LinkedLater()
+        self.copied = CopiedInput()
+        self.inputs = [self.copied]
         self.visible, self._targets = False, list[str]()
         self.work.param.watch(self._take, ["state", "result"])
         self.work.param.watch(self._say, ["state", "progress", "place", "message"])
@@ -77,9 +96,14 @@ class CampaignPage(PageActions):
 
     @property
     def task(self) -> CopiedTask:
-        """To print the table of the campaign, whose folder is named as a loaded record is: without where it lies."""
-        folder = self.work.folder
-        return EXPLORED if folder is None else CopiedTask(CAMPAIGN, {"folder": folder.folder.resolve().name})
+        """To print the table as it is shown; its folder is named as a loaded record is: without where it lies."""
+        folder, state = self.work.folder, self.work.campaign
+        if folder is None:
+            return EXPLORED
+        target = [self.target.value] if state is not None and self._targets else []
+        mode = [self._mode(state, *target)] if state is not None and target else []
+        only = [condition(self.axes[path], i) for path, i in self._chosen().items()]
+        return CopiedTask(CAMPAIGN, {"folder": folder.folder.resolve().name, "target": target, "mode": mode, "only": only})
 
     def tick(self) -> None:
         """Look whether there is something new."""
@@ -125,13 +149,7 @@ class CampaignPage(PageActions):
         if state is None:
             self.status.param.update(text=self.work.line("Reading"), progress=self.work.progress)
             return
-        plan, left = state.plan, state.seconds_left
-        said = f"{plan.name}: {state.n_done} of {plan.n_runs} runs, {len(plan.cells)} scenarios, {state.n_rows} rows"
-        if state.n_done == plan.n_runs:
-            said += ", finished"
-        elif np.isfinite(left):
-            said += f", about {_span(left)} left"
-        self.status.param.update(text=said, progress=state.n_done / plan.n_runs)
+        self.status.param.update(text=progress_text(state), progress=state.n_done / state.plan.n_runs)
 
     def _make(self, state: CampaignState) -> None:
         """Make the fields when the first results are there, and anew where there are errors of something else."""
@@ -185,16 +203,23 @@ class CampaignPage(PageActions):
     def view_of(self, state: CampaignState) -> CampaignView | None:
         """Return what is shown by the fields and the mode of the page; None where there is nothing."""
         target = self.target.value
-        modes = [mode for known, mode in state.errors if known == target]
         cells = np.arange(len(state.plan.cells))
-        for path, field in self.filters.items():
-            if field.value != ALL:
-                axis = self.axes[path]
-                cells = cells[axis.of_cell[cells] == value_names(axis).index(field.value)]
-        if not modes or not len(cells):
+        for path, i in self._chosen().items():
+            cells = cells[self.axes[path].of_cell[cells] == i]
+        if not len(cells):
             return None
-        mode = self.display.mode if self.display.mode in modes else modes[0]
+        mode = self._mode(state, target)
         return CampaignView(state, target, mode, state.errors[target, mode], cells, self.base)
+
+    def _chosen(self) -> dict[str, int]:
+        """Return the conditions that the fields leave one value of: path -> position of the value."""
+        chosen = {path: field.value for path, field in self.filters.items() if field.value != ALL}
+        return {path: value_names(self.axes[path]).index(value) for path, value in chosen.items()}
+
+    def _mode(self, state: CampaignState, target: str) -> str:
+        """Return the mode of the page, or where there is none of it the first."""
+        modes = [mode for known, mode in state.errors if known == target]
+        return self.display.mode if self.display.mode in modes else modes[0]
 
     def draw(self) -> None:
         """Send the picture; only aggregates leave the server."""
@@ -202,9 +227,11 @@ class CampaignPage(PageActions):
         if not self.visible or state is None or not self._targets:
             return
         with pn.io.hold():
-            view = self.view_of(state)
-            self.room.visible = view is not None
-            if view is None:
+            view, self.copied.value = self.view_of(state), self.task
+            for part in self.room.objects[2:]:
+                part.visible = view is not None
+            if view is None:  # the fields stay, to choose something else
+                self.table.object = "<p>No scenario has all of these values.</p>"
                 return
             self.table.object = standings_html(view, self.display)
             if not self.axes:
@@ -221,12 +248,3 @@ class CampaignPage(PageActions):
         self.slice.draw(view, self.lines.value, self.display)
         drawn = [name for name in self.lines.value if name in view.errors.names]
         self.legend.object = legend({name: name_label(name) for name in drawn}, self.display.dark)
-
-
-def _span(seconds: float) -> str:
-    """Write a time for people.
-
-    >>> _span(40), _span(600), _span(9000)
-    ('40 s', '10 min', '2.5 h')
-    """
-    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

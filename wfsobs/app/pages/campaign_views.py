@@ -12,15 +12,16 @@ from bokeh.plotting import figure
 
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.numerals import NOTHING, number
-from wfsobs.app.pages.sweep_views import DECIDED, FULL_MARGIN, GROUNDS, OPEN, WAITING, axis_title, ink_on, mix
+from wfsobs.app.pages.sweep_views import DECIDED, FULL_MARGIN, GROUNDS, LEFT_OUT, OPEN, WAITING, axis_title, ink_on, mix
 from wfsobs.app.render import Row, table
 from wfsobs.app.report.text import value_of
 from wfsobs.app.style import look, swatch
 from wfsobs.app.views.plots import add_line, call, new_figure
 from wfsobs.campaign.axes import SCENARIO, PlanAxis
-from wfsobs.campaign.errors import CampaignErrors, CampaignPlace
+from wfsobs.campaign.errors import CampaignErrors
 from wfsobs.campaign.follow import CampaignState
 from wfsobs.campaign.report import name_label
+from wfsobs.campaign.standings import UNTESTED, Standing, standings
 from wfsobs.scenario import Scenario
 from wfsobs.typing import Array
 
@@ -41,6 +42,29 @@ class CampaignView:
         return 1e-3 * per_micrometre(display.unit, self.base.telescope.diameter)
 
 
+def progress_text(state: CampaignState) -> str:
+    """Say how far a campaign is, and when it will be done or that nothing comes any more."""
+    plan, silence, left = state.plan, state.silence, state.seconds_left
+    said = f"{plan.name}: {state.n_done} of {plan.n_runs} runs, {len(plan.cells)} scenarios, {state.n_rows} rows"
+    if state.n_done == plan.n_runs:
+        return f"{said}, finished"
+    if silence:
+        ended = "ended, stopped" if plan.stop else "stopped"  # it may need no more seeds
+        return f"{said}; no new batch for {_span(silence)}: {ended}, or slower than before"
+    return f"{said}, about {_span(left)} left" if np.isfinite(left) else said
+
+
+def _span(seconds: float) -> str:
+    """Write a time for people.
+
+    >>> _span(40), _span(600), _span(9000), _span(1e6)
+    ('40 s', '10 min', '2.5 h', '12 days')
+    """
+    if seconds < 5400:
+        return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h" if seconds < 48 * 3600 else f"{seconds / 86400:.0f} days"
+
+
 def axis_name(axis: PlanAxis, base: Scenario) -> str:
     """Name a condition, with its unit."""
     return "Scenario" if axis.path == SCENARIO else axis_title(base, axis.path)
@@ -55,47 +79,32 @@ def value_names(axis: PlanAxis) -> list[str]:
 
 def standings_html(view: CampaignView, display: Display) -> str:
     """Write the table of all observers over the scenarios shown, best first."""
-    errors, cells, scale = view.errors, view.cells, view.scale(display)
-    several = len(cells) > 1
+    scale, several = view.scale(display), len(view.errors.known_cells(view.cells)) > 1
     columns = {
         "Observer": "",
         f"Error [{display.unit_label}]": "rms over the seeds; over scenarios the geometric mean",
         "error / bound": "geometric mean over the scenarios; the smallest bound of each",
         "95 %": "of error / bound, over the scenarios",
         "Above the best [%]": f"paired over the {'scenarios' if several else 'seeds'}, with its interval of 95 %",
-        "Rank": "best: all others differ significantly; tied: no significant difference from the leader",
+        "Rank": f"best: all others differ significantly; tied: no significant difference from the best; {NOTHING}: not tested",
         "Wins": "scenarios with the smallest error, and how many of them are significant",
         "Records": "",
         "Failed": "runs without an estimate",
     }
-    ratio, low, high = errors.over_bound(cells)
-    standings = errors.standings(cells)
     rows = []
-    for s in standings:
-        i = errors.names.index(s.name)
-        won = [v for cell in cells.tolist() if (v := errors.winners.get(cell)) is not None and v.best.name == s.name]
-        decided = sum(not v.ties for v in won)
-        failed = view.state.failures.get(s.name)
+    for s in standings(view.state, view.target, view.mode, view.cells):
         cells_of = [
-            number(scale * s.rms),
-            _number(ratio[i]),
-            _interval(low[i], high[i]),
+            number(scale * s.rms_nm),
+            _number(s.over_bound),
+            _interval(s.over_bound_low, s.over_bound_high),
             _above(s),
-            _rank(s, standings),
-            f"{len(won)} ({decided})" if errors.eligible[cells, i].any() else NOTHING,
-            str(int(errors.count[cells, i].sum())),
-            NOTHING if failed is None else str(int(failed[cells].sum())),
+            NOTHING if s.rank == UNTESTED else s.rank,
+            NOTHING if s.wins is None else f"{s.wins} ({s.decided_wins})",
+            str(s.records),
+            NOTHING if s.failures is None else str(s.failures),
         ]
         rows.append(Row(swatch(s.name, display.dark) + name_label(s.name), cells_of, {"name": s.name}))
     return str(table("Observers of the campaign", columns, [("", rows)]))
-
-
-def _rank(s: CampaignPlace, standings: Sequence[CampaignPlace]) -> str:
-    tied = any(other.is_tie for other in standings)
-    alone = s.is_best and sum(not np.isnan(other.above) for other in standings) == 0
-    if s.is_best:
-        return "" if alone else "tied" if tied else "best"
-    return "tied" if s.is_tie else ""
 
 
 def _number(x: float) -> str:
@@ -106,10 +115,10 @@ def _interval(low: float, high: float) -> str:
     return f"{number(float(low))} – {number(float(high))}" if np.isfinite(low) and np.isfinite(high) else NOTHING
 
 
-def _above(s: CampaignPlace) -> str:
+def _above(s: Standing) -> str:
     if np.isnan(s.above):
         return NOTHING
-    around = "" if np.isnan(s.low) else f" ({number(100 * s.low, 2)} to {number(100 * s.high, 2)})"
+    around = "" if np.isnan(s.above_low) else f" ({number(100 * s.above_low, 2)} to {number(100 * s.above_high, 2)})"
     return number(100 * s.above, 2) + around
 
 
@@ -117,14 +126,17 @@ def winners_grid(view: CampaignView, x: PlanAxis, y: PlanAxis | None, display: D
     """Describe the map of winners."""
     columns, rows = value_names(x), value_names(y) if y else [""]
     across, down = axis_name(x, view.base), axis_name(y, view.base) if y else ""  # once: it looks through all settings
-    of = np.full((len(columns), len(rows)), None, dtype=object)
-    for cell in view.cells.tolist():
+    of = np.full((len(columns), len(rows)), None, dtype=object)  # None: the plan has no such scenario
+    shown = np.isin(np.arange(len(x.of_cell)), view.cells)
+    for cell in range(len(x.of_cell)):
         i, j = int(x.of_cell[cell]), int(y.of_cell[cell]) if y else 0
-        of[i, j] = [*(of[i, j] or []), cell]
+        of[i, j] = of[i, j] or []
+        if shown[cell]:
+            of[i, j].append(cell)
     key: dict[str, str] = {}
     cells = [
         [
-            _square(view, of[i, j] or [], f"{across} {columns[i]}" + (f", {down} {rows[j]}" if y else ""), display, key)
+            _square(view, of[i, j], f"{across} {columns[i]}" + (f", {down} {rows[j]}" if y else ""), display, key)
             for i in range(len(columns))
         ]
         for j in reversed(range(len(rows)))
@@ -140,22 +152,29 @@ def winners_grid(view: CampaignView, x: PlanAxis, y: PlanAxis | None, display: D
     }
 
 
-def _square(view: CampaignView, cells: list[int], where: str, display: Display, key: dict[str, str]) -> dict[str, Any]:
+def _square(view: CampaignView, cells: list[int] | None, where: str, display: Display, key: dict[str, str]) -> dict[str, Any]:
     """Describe one square: the scenario that it opens, its colour and what it says."""
     ground = GROUNDS[display.dark]
     errors = view.errors
-    verdict = errors.winners.get(cells[0]) if len(cells) == 1 else errors.verdict(cells) if cells else None
-    if verdict is None:
-        said = f"{where}: {'no result yet' if cells else 'no such scenario'}"
-        first = cells[0] if cells else -1
-        return {"index": first, "state": WAITING, "text": "", "title": said, "ground": ground, "stripe": ground, "ink": ""}
-    best, decided = verdict.best, not verdict.ties and np.isfinite(verdict.margin)
+    verdict = None if not cells else errors.winners.get(cells[0]) if len(cells) == 1 else errors.verdict(cells)
+    if not cells or verdict is None:
+        said = "no such scenario" if cells is None else "no result yet" if cells else "left out by the fields Only …"
+        square = {
+            "index": cells[0] if cells else -1,
+            "state": WAITING if cells else LEFT_OUT,
+            "text": "",
+            "title": f"{where}: {said}",
+        }
+        return {**square, "ground": ground, "stripe": ground, "ink": ""}
+    best, decided = verdict.best, verdict.is_decided
     text = number(best.rms * view.scale(display))
     said = f"{where}: {name_label(best.name)} {text} {display.unit_label}"
     if np.isfinite(verdict.margin):
         said += f", {number(100 * verdict.margin, 2)} % before the next"
     if verdict.ties:
         said += f"; tied with {', '.join(map(name_label, verdict.ties))}"
+    elif not decided and np.isfinite(verdict.margin):
+        said += "; too few results to tell"
     if len(cells) > 1:
         said += f"; {len(cells)} scenarios, opens the first"
     else:

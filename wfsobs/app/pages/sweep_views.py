@@ -31,7 +31,7 @@ MOST_ROWS = 3000
 """Of the table in a report."""
 
 REPORT_COLUMNS = ("target", "mode", "observer", "seeds", "mean rms [nm]", "95 % [nm]", "")
-OPEN, DECIDED, WAITING, FAILED = "open", "decided", "waiting", "failed"
+OPEN, DECIDED, WAITING, FAILED, LEFT_OUT = "open", "decided", "waiting", "failed", "left-out"
 
 
 class SweepMap(JSComponent):

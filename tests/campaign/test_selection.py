@@ -1,0 +1,140 @@
+"""Some scenarios of a campaign: by values and ranges on the command line, refused in one line; bins are copied exactly."""
+
+import csv
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from wfsobs.campaign.axes import plan_axes
+from wfsobs.campaign.plan import parse_plan
+from wfsobs.campaign.selection import cells_where, condition
+from wfsobs.campaign.state import open_folder
+from wfsobs.campaign.store import read_results, write_batch
+from wfsobs.campaign.work import run_rows
+from wfsobs.cli import main
+from wfsobs.settings.errors import SettingError
+
+PLAN = """
+name = "Tiny"
+seeds = 1
+observers = ["kf-lgs", "persistence"]
+[settings]
+run.duration = 0.3
+run.warm_up = 0.1
+[[scenario]]
+name = "the one"
+[[scenario]]
+name = "other"
+settings = { sensors.lgs_noise = 0.05 }
+[grid]
+turbulence.wind_speed = [20, 5.5]
+"""
+"""Scenarios 0 to 3: the one at 20 and 5.5, other at 20 and 5.5."""
+
+
+@pytest.fixture
+def plan(tmp_path):
+    return parse_plan(PLAN, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("only", "cells"),
+    [
+        ([], [0, 1, 2, 3]),
+        (["turbulence.wind_speed=20"], [0, 2]),
+        (["turbulence.wind_speed=20.0"], [0, 2]),
+        (["turbulence.wind_speed=5..10"], [1, 3]),
+        (["turbulence.wind_speed=5.5..20"], [0, 1, 2, 3]),
+        (["turbulence.wind_speed=5.5", "turbulence.wind_speed=20"], [0, 1, 2, 3]),
+        (["scenario=the one", "turbulence.wind_speed=5.5"], [1]),
+    ],
+)
+def test_scenarios_are_chosen(plan, only, cells):
+    assert cells_where(plan, only).tolist() == cells
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("wind=5", "wind=5: takes NAME=VALUE with one of scenario, turbulence.wind_speed"),
+        ("scenario", "scenario: takes NAME=VALUE with one of scenario, turbulence.wind_speed"),
+        ("scenario=third", "scenario=third: takes one of the one, other"),
+        (
+            "turbulence.wind_speed=6..9",
+            "turbulence.wind_speed=6..9: takes one of 5.5, 20, or a range LOW..HIGH that has some",
+        ),
+    ],
+)
+def test_what_is_unknown_is_refused(plan, text, said):
+    with pytest.raises(SettingError) as refused:
+        cells_where(plan, [text])
+    assert str(refused.value) == said
+
+
+def test_every_value_of_a_field_is_found_again(tmp_path):
+    text = """
+[grid]
+kalman.process_noise = ["matched", "manual"]
+[conditions]
+file = "nights.csv"
+columns = { wind = "turbulence.wind_speed", r0 = "turbulence.r0" }
+"""
+    rows = [f"{5 + 0.1234567890123 * i},{(0.1, 0.1500001, 0.15)[i // 20]}" for i in range(60)]
+    (tmp_path / "nights.csv").write_text("\n".join(["wind,r0", *rows]), encoding="utf-8")
+    plan = parse_plan(text, tmp_path)
+    axes = plan_axes(plan)
+    assert [axis.is_binned for axis in axes] == [True, False, False]
+    for axis in axes:
+        for i in range(len(axis.values)):
+            assert cells_where(plan, [condition(axis, i)]).tolist() == np.flatnonzero(axis.of_cell == i).tolist()
+    with pytest.raises(SettingError, match="no scenario has all of these"):  # the strongest winds and the smallest r0
+        cells_where(plan, [condition(axes[0], 15), condition(axes[1], 0)])
+
+
+@pytest.fixture
+def folder(plan, tmp_path):
+    open_folder(plan, tmp_path)
+    rows = [row for cell in plan.cells for row in run_rows(cell, 1, plan.observers, ())]
+    write_batch(tmp_path, rows, {"host": "here", "process": 1, "written": 1.0})
+    return tmp_path
+
+
+def table(*arguments):
+    return CliRunner().invoke(main, ["campaign", "table", *map(str, arguments)])
+
+
+def test_rows_are_those_of_some_scenarios_a_target_and_a_mode(folder):
+    found = table(folder, "--only", "turbulence.wind_speed=20", "--target", "vibration", "--mode", "tilt", "--csv")
+    rows = [(int(r["cell"]), r["name"], float(r["rms_nm"])) for r in csv.DictReader(found.stdout.splitlines())]
+    wanted = [
+        (r["cell"], r["name"], r["rms_nm"])
+        for r in read_results(folder).to_pylist()
+        if r["cell"] in (0, 2) and (r["target"], r["mode"]) == ("vibration", "tilt")
+    ]
+    assert rows == wanted and {cell for cell, *_ in rows} == {0, 2}
+    short = table(folder, "--only", "scenario=other", "--mode", "tip").stdout
+    assert "other" in short and "the one" not in short and "tilt" not in short
+
+
+@pytest.mark.parametrize("together", [[], ["--together"]])
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [
+        ("--target", "noise", "--target noise: takes one of total, turbulence, vibration"),
+        ("--mode", "focus", "--mode focus: takes one of tilt, tip"),
+        ("--only", "wind=5", "--only wind=5: takes NAME=VALUE with one of scenario, turbulence.wind_speed"),
+    ],
+)
+def test_options_say_what_they_take(folder, together, option, value, said):
+    found = table(folder, *together, option, value)
+    assert found.exit_code != 0 and said in found.stderr and len(found.stderr.strip().splitlines()) == 1
+
+
+def test_together_has_a_row_per_name(folder):
+    found = table(folder, "--together", "--target", "turbulence", "--mode", "tip")
+    assert found.exit_code == 0 and "4 of 4 runs, 4 of 4 scenarios" in found.stdout
+    assert found.stdout.count("kf-lgs") == found.stdout.count("persistence") == 1
+    rows = list(csv.DictReader(table(folder, "--together", "--csv").stdout.splitlines()))
+    assert {(r["target"], r["mode"]) for r in rows} >= {("turbulence", "tip"), ("vibration", "tilt")}
+    assert table(folder, "--together", "--parquet", folder / "all.parquet").exit_code != 0
