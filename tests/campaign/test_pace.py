@@ -33,7 +33,7 @@ def test_a_batch_takes_what_its_process_took():
     every = [one for process in range(4) for one in batches(60.0 + 0.3 * process, 120.0 + 0.3 * process, process=process)]
     pace = measure_pace(every, UNSTARTED, 121.0)
     assert pace.silence(181.0) == 0.0 and pace.silence(121.0 + 3 * 60.0) > 0.0
-    first = measure_pace([one for one in every if one.written < 61.0], 0.0, 61.0)
+    first = measure_pace([one for one in every if one.time < 61.0], 0.0, 61.0)
     assert first.patience == 180.0, "the first one took the time since the start"
     assert measure_pace(batches(60.0), UNSTARTED, 61.0).patience == UNKNOWN
 

@@ -11,7 +11,7 @@ from time import time
 import numpy as np
 
 from wfsobs.campaign.errors import CampaignErrors, can_win
-from wfsobs.campaign.pace import Pace, WrittenBatch, measure_pace
+from wfsobs.campaign.pace import BatchPace, WrittenBatch, measure_pace
 from wfsobs.campaign.plan import Campaign
 from wfsobs.campaign.state import folder_plan
 from wfsobs.campaign.store import PLAN, batch_files, need_pyarrow, read_batch
@@ -32,7 +32,7 @@ class CampaignState:
         What is run.
     n_done, n_rows : int
         Runs that have a row of everything, and number of rows.
-    pace : Pace
+    pace : BatchPace
         How fast batches come.
     errors : mapping
         (target, mode) -> errors.
@@ -43,7 +43,7 @@ class CampaignState:
     plan: Campaign
     n_done: int
     n_rows: int
-    pace: Pace
+    pace: BatchPace
     errors: Mapping[tuple[str, str], CampaignErrors]
     failures: Mapping[str, Array]
 

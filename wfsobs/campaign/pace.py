@@ -21,13 +21,13 @@ UNKNOWN = 300.0
 class WrittenBatch(NamedTuple):
     """A batch: when it was written [s since 1970], host and process that did so, and its number of runs."""
 
-    written: float
+    time: float
     worker: tuple[str, int]
     n_runs: int
 
 
 @dataclass(frozen=True)
-class Pace:
+class BatchPace:
     """What is known of the pace.
 
     Attributes
@@ -53,7 +53,7 @@ class Pace:
         return np.nan if self.silence(now) else n_runs * self.seconds_per_run
 
 
-def measure_pace(batches: Iterable[WrittenBatch], started: float, now: float) -> Pace:
+def measure_pace(batches: Iterable[WrittenBatch], start: float, now: float) -> BatchPace:
     """Measure the pace by the times at which batches were written.
 
     What a batch takes is the time since the one before of the same process, of the first one that since the start. After a
@@ -63,7 +63,7 @@ def measure_pace(batches: Iterable[WrittenBatch], started: float, now: float) ->
     ----------
     batches : iterable of WrittenBatch
         All that are known.
-    started : float
+    start : float
         When the campaign was started the last time [s since 1970]; left out where it is later than now, by another clock.
     now : float
         The time [s since 1970].
@@ -71,18 +71,18 @@ def measure_pace(batches: Iterable[WrittenBatch], started: float, now: float) ->
     longest, last, before = 0.0, np.nan, dict[tuple[str, int], float]()
     stretch: list[WrittenBatch] = []
     for batch in sorted(batches):
-        if batch.written - last > _patience(longest):
+        if batch.time - last > _patience(longest):
             stretch, before = [], {}
         if batch.worker in before:
-            longest = max(longest, batch.written - before[batch.worker])
-        elif not last >= started and started <= batch.written:
-            longest = max(longest, batch.written - started)
+            longest = max(longest, batch.time - before[batch.worker])
+        elif not last >= start and start <= batch.time:
+            longest = max(longest, batch.time - start)
         stretch.append(batch)
-        before[batch.worker] = last = batch.written
+        before[batch.worker] = last = batch.time
     latest, per_run = stretch[-LATEST:], np.nan
-    if len(latest) > 1 and latest[-1].written > latest[0].written:
-        per_run = (latest[-1].written - latest[0].written) / sum(batch.n_runs for batch in latest[1:])
-    return Pace(max(last, started) if last < started <= now else last, _patience(longest), per_run)
+    if len(latest) > 1 and latest[-1].time > latest[0].time:
+        per_run = (latest[-1].time - latest[0].time) / sum(batch.n_runs for batch in latest[1:])
+    return BatchPace(max(last, start) if last < start <= now else last, _patience(longest), per_run)
 
 
 def _patience(longest: float) -> float:

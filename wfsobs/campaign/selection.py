@@ -39,13 +39,13 @@ def cells_where(plan: Campaign, only: Iterable[str]) -> Array:
     axes = {axis.path: axis for axis in plan_axes(plan)}
     chosen: dict[str, Array] = {}
     for text in only:
-        path, equals, wanted = text.partition("=")
+        path, equals, named = text.partition("=")
         if not equals or path not in axes:
             names = f"NAME=VALUE with one of {', '.join(axes)}" if axes else "nothing: there is a single scenario"
             raise SettingError(f"{text}: takes {names}")
-        found = _has_value(_values(plan, path), wanted)
+        found = _has_value(_values(plan, path), named)
         if not found.any():
-            raise SettingError(f"{text}: takes {_allowed(_values(plan, path))}")
+            raise SettingError(f"{text}: takes {_list_values(_values(plan, path))}")
         chosen[path] = chosen.get(path, False) | found
     cells = np.flatnonzero(np.logical_and.reduce([np.ones(len(plan.cells), dtype=bool), *chosen.values()]))
     if not len(cells):
@@ -69,16 +69,16 @@ def _text(value: Any) -> str:
     return NOT_SET if value is None else format_value(value)
 
 
-def _has_value(values: list[Any], wanted: str) -> Array:
+def _has_value(values: list[Any], name: str) -> Array:
     """Return which values a text names, bool (n,)."""
-    low, _, high = wanted.partition(RANGE)
-    span = _number(low), _number(high if RANGE in wanted else low)
+    low, _, high = name.partition(RANGE)
+    span = _number(low), _number(high if RANGE in name else low)
     if None in span:
-        return np.array([_text(value) == wanted for value in values])
-    return np.array([(_is_number(value) and span[0] <= value <= span[1]) or _text(value) == wanted for value in values])
+        return np.array([_text(value) == name for value in values])
+    return np.array([(_is_number(value) and span[0] <= value <= span[1]) or _text(value) == name for value in values])
 
 
-def _allowed(values: list[Any]) -> str:
+def _list_values(values: list[Any]) -> str:
     """Say what values there are."""
     texts = list(dict.fromkeys(map(_text, values)))
     numbers = sorted({value for value in values if _is_number(value)})

@@ -13,7 +13,7 @@ BEST, TIED, UNTESTED = "best", "tied", "not tested"
 
 
 @dataclass(frozen=True)
-class Standing:
+class TogetherRow:
     """One row of the table.
 
     Attributes
@@ -54,7 +54,7 @@ class Standing:
     failures: int | None
 
 
-def standings(state: CampaignState, target: str, mode: str, cells: Sequence[int] | Array) -> list[Standing]:
+def standings(state: CampaignState, target: str, mode: str, cells: Sequence[int] | Array) -> list[TogetherRow]:
     """Return the table over some scenarios, the smallest error first.
 
     state : of `wfsobs.campaign.follow.CampaignFolder`;  cells : of `wfsobs.campaign.selection.cells_where`
@@ -68,7 +68,7 @@ def standings(state: CampaignState, target: str, mode: str, cells: Sequence[int]
         won = [v for cell in cells if (v := errors.winners.get(int(cell))) is not None and v.best.name == s.name]
         can_win, failed = errors.eligible[cells, i].any(), state.failures.get(s.name)
         out.append(
-            Standing(
+            TogetherRow(
                 target,
                 mode,
                 s.name,

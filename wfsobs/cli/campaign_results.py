@@ -46,12 +46,12 @@ def cells_of(plan: Campaign, only: Sequence[str]) -> list[int]:
         raise SettingError(f"--only {error}") from None
 
 
-def check_known(option: str, wanted: str | None, known: Iterable[str]) -> bool:
+def check_known(option: str, text: str | None, names: Iterable[str]) -> bool:
     """Return whether an option is given. Raises SettingError where it is none of what there are results of."""
-    if wanted is not None and wanted not in known:
-        listed = ", ".join(known)
-        raise SettingError(f"--{option} {wanted}: {f'takes one of {listed}' if listed else 'there are no results yet'}")
-    return wanted is not None
+    if text is not None and text not in names:
+        listed = ", ".join(names)
+        raise SettingError(f"--{option} {text}: {f'takes one of {listed}' if listed else 'there are no results yet'}")
+    return text is not None
 
 
 def print_csv(plan: Campaign, table: pyarrow.Table) -> None:

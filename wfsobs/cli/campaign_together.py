@@ -12,7 +12,7 @@ from pathlib import Path
 from rich.table import Table
 
 from wfsobs.campaign.follow import CampaignFolder
-from wfsobs.campaign.standings import Standing, standings
+from wfsobs.campaign.standings import TogetherRow, standings
 from wfsobs.cli.campaign_results import cells_of, check_known
 from wfsobs.cli.show import show_table
 from wfsobs.evaluation.rows import NOT_OBSERVERS
@@ -31,14 +31,14 @@ def print_together(folder: Path, only: Sequence[str], target: str | None, mode: 
     rows = [row for key in keys for row in standings(state, *key, cells)]
     if as_csv:
         out = csv.writer(sys.stdout, lineterminator="\n")
-        out.writerow([field.name for field in fields(Standing)])
+        out.writerow([field.name for field in fields(TogetherRow)])
         out.writerows([["" if _is_missing(value) else value for value in astuple(row)] for row in rows])
         return
     title = f"{state.plan.name}: {state.n_done} of {state.plan.n_runs} runs, {len(cells)} of {len(state.plan.cells)} scenarios"
     show_table(_table(rows, title))
 
 
-def _table(rows: Sequence[Standing], title: str) -> Table:
+def _table(rows: Sequence[TogetherRow], title: str) -> Table:
     out = Table(title=title, caption="wins: scenarios with the smallest error, and how many of them are significant")
     for name in (*TEXTS, *NUMBERS):
         out.add_column(name, justify="right" if name in NUMBERS else "left")
@@ -61,7 +61,7 @@ def _table(rows: Sequence[Standing], title: str) -> Table:
     return out
 
 
-def _above(row: Standing) -> str:
+def _above(row: TogetherRow) -> str:
     if math.isnan(row.above):
         return ""
     around = "" if math.isnan(row.above_low) else f" ({100 * row.above_low:.1f} to {100 * row.above_high:.1f})"

@@ -74,8 +74,8 @@ class CampaignPage(PageActions):
         self.axes: dict[str, PlanAxis] = {}
         self.filters: dict[str, Any] = {}
         self.link = self._fields = LinkedLater()
-        self.copied = CopiedInput()
-        self.inputs = [self.copied]
+        self.copy_input = CopiedInput()
+        self.inputs = [self.copy_input]
         self.visible, self._targets = False, list[str]()
         self.work.param.watch(self._take, ["state", "result"])
         self.work.param.watch(self._say, ["state", "progress", "place", "message"])
@@ -102,7 +102,7 @@ class CampaignPage(PageActions):
             return EXPLORED
         target = [self.target.value] if state is not None and self._targets else []
         mode = [self._mode(state, *target)] if state is not None and target else []
-        only = [condition(self.axes[path], i) for path, i in self._chosen().items()]
+        only = [condition(self.axes[path], i) for path, i in self._choices().items()]
         return CopiedTask(CAMPAIGN, {"folder": folder.folder.resolve().name, "target": target, "mode": mode, "only": only})
 
     def tick(self) -> None:
@@ -161,7 +161,7 @@ class CampaignPage(PageActions):
         self.base: Scenario = base
         self.axes = {axis.path: axis for axis in plan_axes(state.plan)}
         names = {axis_name(axis, base): path for path, axis in self.axes.items()}
-        style = {"size": "small", "margin": 0, "width": 260}
+        style = {"size": "small", "margin": 0, "width": 300}
         paths = [*self.axes]
         self.target = pmui.Select(label="Errors of", options={target_title(t): t for t in targets}, value=targets[0], **style)
         self.across = pmui.Select(label="Across", options=names, value=paths[0] if paths else None, **style)
@@ -204,14 +204,14 @@ class CampaignPage(PageActions):
         """Return what is shown by the fields and the mode of the page; None where there is nothing."""
         target = self.target.value
         cells = np.arange(len(state.plan.cells))
-        for path, i in self._chosen().items():
+        for path, i in self._choices().items():
             cells = cells[self.axes[path].of_cell[cells] == i]
         if not len(cells):
             return None
         mode = self._mode(state, target)
         return CampaignView(state, target, mode, state.errors[target, mode], cells, self.base)
 
-    def _chosen(self) -> dict[str, int]:
+    def _choices(self) -> dict[str, int]:
         """Return the conditions that the fields leave one value of: path -> position of the value."""
         chosen = {path: field.value for path, field in self.filters.items() if field.value != ALL}
         return {path: value_names(self.axes[path]).index(value) for path, value in chosen.items()}
@@ -227,7 +227,7 @@ class CampaignPage(PageActions):
         if not self.visible or state is None or not self._targets:
             return
         with pn.io.hold():
-            view, self.copied.value = self.view_of(state), self.task
+            view, self.copy_input.value = self.view_of(state), self.task
             for part in self.room.objects[2:]:
                 part.visible = view is not None
             if view is None:  # the fields stay, to choose something else

@@ -21,7 +21,7 @@ from wfsobs.campaign.axes import SCENARIO, PlanAxis
 from wfsobs.campaign.errors import CampaignErrors
 from wfsobs.campaign.follow import CampaignState
 from wfsobs.campaign.report import name_label
-from wfsobs.campaign.standings import UNTESTED, Standing, standings
+from wfsobs.campaign.standings import UNTESTED, TogetherRow, standings
 from wfsobs.scenario import Scenario
 from wfsobs.typing import Array
 
@@ -115,7 +115,7 @@ def _interval(low: float, high: float) -> str:
     return f"{number(float(low))} – {number(float(high))}" if np.isfinite(low) and np.isfinite(high) else NOTHING
 
 
-def _above(s: Standing) -> str:
+def _above(s: TogetherRow) -> str:
     if np.isnan(s.above):
         return NOTHING
     around = "" if np.isnan(s.above_low) else f" ({number(100 * s.above_low, 2)} to {number(100 * s.above_high, 2)})"
