@@ -123,7 +123,7 @@ class Strip:
         """Write the interval of the mean error over several seeds; empty where there is none."""
         evidence = self.seeds.evidence if self.seeds else None
         interval = evidence.interval((name, self.target, self.display.mode)) if evidence else None
-        return " – ".join(number(self._in_unit(x, results)) for x in interval) if interval else ""
+        return f"mean {' – '.join(number(self._in_unit(x, results)) for x in interval)}" if interval else ""
 
     def _score_fields(self, name: str, score: Score, results: RunResults, base: str) -> dict[str, Any]:
         relative = f"{score.normalised_rms:.2f} × {base}" if score.normalised_rms is not None else ""
