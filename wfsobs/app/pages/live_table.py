@@ -29,7 +29,9 @@ from wfsobs.typing import Array
 SHOWN_EVENTS = 8
 FAR_BEHIND = 2.0
 """Beyond this the observers do not catch up by themselves [s]."""
-WHAT_RUNS = re.compile(r"^\S+(?= (?:on|off|has a new design)$)|(?<=error of )\S+(?= up|$)|(?<=identified for )\S+(?=:)")
+WHAT_RUNS = re.compile(
+    r"^\S+(?= (?:on|off|has a new design)$)|(?<=error of )\S+(?= up|$)|(?<=identified for )\S+(?=:)|(?<= s for )\S+$"
+)
 """The id of an observer or a controller in an event."""
 QUANTITIES = {"Next measurement" if target == NEXT else target_title(target): target for target in (*TARGETS, TOTAL, NEXT)}
 """What errors are shown of."""
