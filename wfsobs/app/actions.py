@@ -91,9 +91,8 @@ class Actions:
         pages.param.watch(self._turn, "current")
 
     def follow_view(self, state: ViewState) -> None:
-        """Keep the view in the address."""
+        """Keep the view in the address, behind settings that wait for theirs: an entry of the browser's history has both."""
         self._view = state
-        # settings that wait for their address come first: an entry of the browser's history has both
         state.param.watch(lambda event: (self._refresh(), self.toolbar.param.update(view=event.new)), "query")
 
     def open_view(self, query: str) -> None:
@@ -230,7 +229,8 @@ class Actions:
 
     def _take_back(self, text: object) -> None:
         """Unsay what has been read, unless something else has been said meanwhile."""
-        self.toolbar.message = "" if self.toolbar.message == text else self.toolbar.message
+        if self.toolbar.message == text:
+            self.toolbar.message = ""
 
     def _refresh(self, *_: object) -> None:
         scenario, preset, source = self.store.scenario, self.store.preset, self.store.source

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wfsobs.observers.base import TARGETS, TURBULENCE
+from wfsobs.observers.base import TURBULENCE
 from wfsobs.observers.kalman.gap_bank import STEADY
-from wfsobs.observers.kalman.step import KalmanEstimator, total_sd
+from wfsobs.observers.kalman.spread import learnt_estimate
+from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.observers.kalman.window_model import (
     NOT_YET,
     WindowModel,
@@ -119,8 +120,10 @@ class AdaptiveEstimator:
 
     def estimate(self) -> tuple[Array, Array]:
         """Return the estimates of the last frame, (2, n_modes), and deviations of these and of both together, (3, n_modes)."""
-        values, sd = np.array([self.predict(0, target) for target in TARGETS]).swapaxes(0, 1)
-        return values, np.vstack([sd, [total_sd(kalman) for kalman in self.filters]])
+        known = zip(self.filters, self.means, self.models, strict=True)
+        of_modes = [learnt_estimate(kalman, mean, found.hidden_rms) for kalman, mean, found in known]
+        values, sd = (np.stack(parts, axis=1) for parts in zip(*of_modes, strict=True))
+        return values, sd
 
     def settle(self) -> None:
         """Have nothing left to do."""

@@ -21,7 +21,8 @@ from wfsobs.observers.kalman.both_window import (
     window_start,
 )
 from wfsobs.observers.kalman.gap_bank import STEADY
-from wfsobs.observers.kalman.step import KalmanEstimator, total_sd
+from wfsobs.observers.kalman.spread import learnt_estimate
+from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.observers.kalman.window_model import pack_spectrum, unpack_spectrum
 from wfsobs.observers.step_checks import StepError
 from wfsobs.record import Sampling
@@ -178,8 +179,10 @@ class BothEstimator:
 
     def estimate(self) -> tuple[Array, Array]:
         """Return the estimates of the last frame, (2, n_modes), and deviations of these and of both together, (3, n_modes)."""
-        values, sd = np.array([self.predict(0, target) for target in TARGETS]).swapaxes(0, 1)
-        return values, np.vstack([sd, [total_sd(window.kalman) for window in self.windows]])
+        means = [np.nan if window.kalman is None else window.means[1] for window in self.windows]
+        of_modes = [learnt_estimate(w.kalman, mean, w.model.hidden_rms) for w, mean in zip(self.windows, means, strict=True)]
+        values, sd = (np.stack(parts, axis=1) for parts in zip(*of_modes, strict=True))
+        return values, sd
 
     def settle(self) -> None:
         """Have nothing left to do."""

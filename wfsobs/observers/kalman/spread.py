@@ -13,14 +13,11 @@ from scipy.linalg import block_diag
 
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimates
-from wfsobs.observers.kalman.step import matrix_power
+from wfsobs.observers.kalman.step import KalmanEstimator, matrix_power
 from wfsobs.signal.filter_covariance import lyapunov
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.signal.stepping import Gain
 from wfsobs.typing import Array
-
-HIDDEN_FROM = np.array([1.0, 1.0, 0.0])
-"""Of what `learnt_sd` returns."""
 
 
 def target_sd(rows: Array, posteriors: Sequence[Array]) -> Array:
@@ -35,7 +32,25 @@ def learnt_sd(rows: Array, posteriors: Sequence[Array], hidden_rms: float) -> Ar
     rows       : of the targets
     hidden_rms : rms of vibration that may be in none of its lines, taken for turbulence, not missing in both together [um]
     """
-    return np.hypot(target_sd(np.vstack([rows, rows.sum(axis=0)]), posteriors), hidden_rms * HIDDEN_FROM)
+    return with_hidden(target_sd(np.vstack([rows, rows.sum(axis=0)]), posteriors), hidden_rms)
+
+
+def with_hidden(sd: Array, hidden_rms: float) -> Array:
+    """Return standard deviations of the targets and TOTAL, (..., 3) [um], with what is hidden, as in `learnt_sd`."""
+    return np.hypot(sd, hidden_rms * np.array([1.0, 1.0, 0.0]))
+
+
+def learnt_estimate(kalman: KalmanEstimator | None, mean: float, hidden_rms: float) -> tuple[Array, Array]:
+    """Return the estimates (2,) of the last frame by the filter of one mode, and deviations of these and TOTAL, (3,) [um].
+
+    mean : of its window, which is turbulence, and all that is known without a filter [um]; NaN where there is no window yet
+    hidden_rms : as in `learnt_sd`
+    """
+    of_window = np.array([mean, 0.0 * mean])
+    if kalman is None:
+        return of_window, np.full(3, np.nan)
+    values, sd = kalman.estimate()
+    return values[:, 0] + of_window, with_hidden(sd[:3, 0], hidden_rms)
 
 
 def over_record(sd: Array, n_steps: int, first: int = 0) -> Array:

@@ -179,11 +179,6 @@ class KalmanEstimator(LinearEstimator):
                 rest[...] = others
 
 
-def total_sd(filter_: KalmanEstimator | None) -> float:
-    """Return the standard deviation of turbulence and vibration together by the filter of a single mode; NaN without one [um]."""
-    return float("nan") if filter_ is None else float(filter_.estimate()[1][len(TARGETS), 0])
-
-
 def carry_state(new: DisturbanceModel, old: DisturbanceModel, x: Array) -> Array:
     """Return the state of another model in which the disturbance is what it is in the state x (n,) of the old one.
 
