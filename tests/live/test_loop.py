@@ -5,13 +5,17 @@ import queue
 import signal
 import subprocess
 import sys
+import threading
 import time
+from contextlib import suppress
+from multiprocessing import Pipe
 from multiprocessing.shared_memory import SharedMemory
 
 import numpy as np
 import pytest
 
 import wfsobs
+from wfsobs.live import simulated
 from wfsobs.live.blocks import Block
 from wfsobs.live.board import Board
 from wfsobs.live.crew import trace_width
@@ -21,47 +25,95 @@ from wfsobs.live.observing import POLL, REST, Order, Pause, made_crew
 from wfsobs.live.paced import Pace
 from wfsobs.live.ring import LiveFrame, Ring
 from wfsobs.live.rows import Rows
-from wfsobs.live.simulated import FADE, SimulatedFrames, SimulatedLoop
+from wfsobs.live.simulated import FADE, GLANCE, SimulatedFrames, SimulatedLoop
 from wfsobs.live.view import read_view
 from wfsobs.scenario.presets import paper
 from wfsobs.settings.group import SettingError
 
 
-def blocks(value, n, count, first=False):
-    """Make blocks of n frames of one number each, with an NGS measurement in every fifth."""
+def put(ready, generation, value, n, count, first=False):
+    """Have rows ready of `count` blocks of n frames of one number each, in pieces, with an NGS measurement in every fifth."""
     ngs = np.full((n, 2), np.nan)
     ngs[::5] = value
-    out = [Block(np.full((n, 2), value), ngs.copy(), np.full((n, 2), value), np.full((n, 2), value)) for _ in range(count)]
-    if first:
-        out[0].ngs[0] = np.nan
-    return out
+    for number in range(count):
+        block = Block(np.full((n, 2), value), ngs.copy(), np.full((n, 2), value), np.full((n, 2), value))
+        if first and number == 0:
+            block.ngs[0] = np.nan
+        for rows in block.pieces(317 * 64):  # 64 bytes a row: neither a part of a block nor whole NGS frames
+            ready.put((generation, rows))
 
 
 def test_new_settings_fade_in_without_a_seam():
-    """Weights of old and new have squares that add up to one, whatever was still in the queue; NGS frames come when due."""
-    ready = queue.Queue()
-    for block in blocks(1.0, 2000, 3):
-        ready.put((0, block))
+    """Weights of old and new have squares that add up to one, whatever was still in the queue; NGS frames come when due.
+
+    What was ready of the old settings, and of some that were changed at once, does not come back.
+    """
+    ready, n = queue.Queue(), 9000
+    put(ready, 0, 1.0, 2000, 3)
     frames = SimulatedFrames(paper(), ready)
     rows = [frames.next_row(k) for k in range(503)]
     assert "peak" in frames.take({"settings": paper().to_dict(), "is_new": 1, "line": "a peak"}, 503)
+    frames.take({"settings": paper().to_dict(), "is_new": 1}, 503)
     rows += [frames.next_row(k) for k in range(503, 603)]
-    for block in blocks(100.0, 2000, 2, first=True):
-        ready.put((1, block))
-    rows = np.array([*rows, *(frames.next_row(k) for k in range(603, 2500))])
+    put(ready, 1, 7.0, 2000, 1, first=True)
+    put(ready, 2, 100.0, 2000, 6, first=True)
+    rows = np.array([*rows, *(frames.next_row(k) for k in range(603, n))])
     z, ngs = rows[:, 0], rows[:, 2]
-    start, steps = 605, round(FADE * 1000)  # looked for in frames with an NGS measurement, so that those stay in step
+    # Looked for in frames with an NGS measurement, so that those stay in step, a few pieces in each: seven of 7.0 come before.
+    start, steps = 605 + 5 * (7 // GLANCE), round(FADE * 1000)
     phase = 0.5 * np.pi * np.arange(steps) / steps
     assert np.all(z[:start] == 1.0) and np.all(z[start + steps :] == 100.0)
     assert z[start : start + steps] == pytest.approx(np.cos(phase) + 100.0 * np.sin(phase), rel=1e-12)
-    assert np.array_equal(~np.isnan(ngs), np.arange(2500) % 5 == 0)
+    assert np.array_equal(~np.isnan(ngs), np.arange(n) % 5 == 0)
     assert np.array_equal(ngs[::5], z[::5]) and np.array_equal(rows[:, 6], z)
+
+
+class Shelf(queue.Queue):
+    """A queue that is closed for a maker of blocks by an error."""
+
+    closed = False
+
+    def put(self, item, timeout):
+        if self.closed:
+            raise EOFError
+        super().put(item, timeout=timeout)
+
+
+def test_first_block_of_new_settings_is_whole(monkeypatch):
+    """It must last until that of still newer ones is made; of what follows it, and of settings in between, nothing need come."""
+    monkeypatch.setattr("wfsobs.live.simulated.enter_process", lambda niceness: None)
+    scenario, ready = paper(), Shelf(90)  # two blocks have 80 pieces
+    inbox, outbox = Pipe(duplex=False)
+
+    def make():
+        with suppress(EOFError):
+            simulated._make(scenario.to_dict(), inbox, ready)
+
+    maker = threading.Thread(target=make)
+    maker.start()
+    while not ready.full():
+        time.sleep(0.01)
+    for speed in (11.0, 12.0, 13.0):
+        outbox.send({"settings": scenario.replace({"turbulence.wind_speed": speed}).to_dict()})
+    taken = [ready.get(timeout=60.0)]
+    while taken[-1][0] < 3:
+        taken.append(ready.get(timeout=60.0))
+    outbox.send({"settings": scenario.to_dict()})
+    while taken[-1][0] < 4:
+        taken.append(ready.get(timeout=60.0))
+    ready.closed = True
+    maker.join(60.0)
+    assert not maker.is_alive()
+    order = [generation for generation, _ in taken]
+    lengths = {g: sum(len(rows) for generation, rows in taken if generation == g) for g in set(order)}
+    assert order == sorted(order) and list(lengths) == [0, 3, 4]
+    # Of the blocks of 20 s two are ready, and of the third what there was room for, of new settings one at least.
+    assert 40_000 <= lengths[0] < 60_000 and 20_000 <= lengths[3] < 100_000
 
 
 def test_lost_frames_hold_the_command():
     ready = queue.Queue()
-    for block in blocks(1.0, 2000, 2):
-        ready.put((0, block))
+    put(ready, 0, 1.0, 2000, 2)
     frames = SimulatedFrames(paper(), ready)
     before = [frames.next_row(k) for k in range(50)][-1]
     frames.take({"losses": {"lgs": 1.0, "ngs": 0.0}}, 50)

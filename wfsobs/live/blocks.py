@@ -40,9 +40,11 @@ class Block:
     turbulence: Array
     vibration: Array
 
-    def rows(self) -> Array:
-        """Return a row per frame: z, ngs, turbulence, vibration, (n, 4 n_modes) [um]."""
-        return np.hstack([self.z, self.ngs, self.turbulence, self.vibration])
+    def pieces(self, size: int) -> list[Array]:
+        """Return a row per frame, z, ngs, turbulence, vibration, (n, 4 n_modes) [um], in pieces of `size` bytes at most."""
+        rows = np.hstack([self.z, self.ngs, self.turbulence, self.vibration])
+        n = max(1, size // rows[0].nbytes)
+        return [rows[at : at + n] for at in range(0, len(rows), n)]
 
 
 def endless_blocks(scenario: Scenario, rng: np.random.Generator, length: float = LENGTH) -> Iterator[Block]:

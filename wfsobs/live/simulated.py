@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from wfsobs.live.blocks import Block, endless_blocks
+from wfsobs.live.blocks import LENGTH, endless_blocks
 from wfsobs.live.paced import SOURCE, Command, Desk, Staff, enter_process, may_go_first, send_frames
 from wfsobs.live.source import SIMULATION
 from wfsobs.record import Sampling
@@ -22,8 +23,15 @@ from wfsobs.typing import Array
 
 AHEAD = 2
 """Blocks that are ready beside the one that is sent."""
+PIECE = 1 << 15
+"""Bytes of a piece of a block. A pipe holds one, so that its frames wait for no other process."""
+GLANCE = 4
+"""Pieces that are taken in one frame at most, each in a tenth of a millisecond."""
 FADE = 0.5
 """Time in which frames of changed settings fade in [s]."""
+
+Piece = tuple[int, Array]
+"""Generation of the settings, and rows of a block."""
 
 
 @dataclass(frozen=True)
@@ -47,42 +55,77 @@ class SimulatedLoop:
 
     def staff(self, context: SpawnContext, desk: Desk) -> Staff:
         """Return its processes."""
-        ready = context.Queue(AHEAD)
+        scenario = self.scenario
+        block = 8 * 4 * len(scenario.modes) * round(0.5 * LENGTH / scenario.dt)
+        ready = context.Queue(AHEAD * -(-block // PIECE))
         inbox, outbox = context.Pipe(duplex=False)
-        settings = self.scenario.to_dict()
+        settings = scenario.to_dict()
         maker = context.Process(target=_make, args=(settings, inbox, ready), daemon=True)
         sender = context.Process(target=_send, args=(settings, ready, desk), daemon=True)
         return Staff(sender, [maker], [outbox], ready)
 
 
-def _make(settings: dict[str, Any], inbox: Connection, ready: Queue[tuple[int, Block]]) -> None:
+def _make(settings: dict[str, Any], inbox: Connection, ready: Queue[Piece]) -> None:
     """Make blocks ahead of time; when the settings change, those of the new ones.
 
     It gives way to the other processes of the loop where those cannot go first.
     """
     enter_process(niceness=0 if may_go_first() else 10)
-    scenario, generation = Scenario.from_dict(settings), 0
+    scenario, generation, is_first = Scenario.from_dict(settings), 0, True
     rng = np.random.default_rng(scenario.run.seed)
     blocks = endless_blocks(scenario, rng)
     while True:
-        block, is_put = next(blocks), False
-        while not is_put:
-            while inbox.poll():  # only the newest settings are simulated
-                changed, is_put = inbox.recv()["settings"], True
-                generation, blocks = generation + 1, endless_blocks(Scenario.from_dict(changed), rng)
-            if is_put:
+        changed = None
+        for rows in next(blocks).pieces(PIECE):
+            is_put = False
+            while not is_put and (is_first or not inbox.poll()):  # a first block is whole, so that it lasts until the next one
+                with suppress(Full):
+                    ready.put((generation, rows), timeout=0.1)
+                    is_put = True
+            if not is_put:
                 break
-            try:
-                ready.put((generation, block), timeout=0.1)
-                is_put = True
-            except Full:
-                pass
+        is_first = False
+        while inbox.poll():  # only the newest settings are simulated
+            changed, generation, is_first = inbox.recv()["settings"], generation + 1, True
+        if changed is not None:
+            blocks = endless_blocks(Scenario.from_dict(changed), rng)
 
 
-def _send(settings: dict[str, Any], ready: Queue[tuple[int, Block]], desk: Desk) -> None:
+def _send(settings: dict[str, Any], ready: Queue[Piece], desk: Desk) -> None:
     enter_process(turn=SOURCE)
     scenario = Scenario.from_dict(settings)
     send_frames(desk, SimulatedFrames(scenario, ready), scenario.dt)
+
+
+class RowQueue:
+    """Rows of one generation, as they come in pieces."""
+
+    def __init__(self, rows: Array):
+        self._pieces, self._at = deque([rows]), 0
+
+    @property
+    def left(self) -> int:
+        """Number of rows that are here."""
+        return sum(map(len, self._pieces)) - self._at
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no row is here."""
+        return not self._pieces
+
+    def add(self, rows: Array) -> None:
+        """Append rows."""
+        self._pieces.append(rows)
+
+    def next_row(self) -> Array:
+        """Return the next row, of those that are here."""
+        first = self._pieces[0]
+        row = first[self._at]
+        self._at += 1
+        if self._at == len(first):
+            self._pieces.popleft()
+            self._at = 0
+        return row
 
 
 class SimulatedFrames:
@@ -93,30 +136,26 @@ class SimulatedFrames:
     scenario : Scenario
         Settings at the start.
     ready : queue
-        (generation, block): blocks of the same settings are of one generation, the first is 0.
+        (generation, rows): rows of the same settings are of one generation, the first is 0.
     """
 
-    def __init__(self, scenario: Scenario, ready: Queue[tuple[int, Block]]):
+    def __init__(self, scenario: Scenario, ready: Queue[Piece]):
         self._ready, self._ratio, self._dt = ready, scenario.sensors.exposure_ratio, scenario.dt
         self._loop, self._losses = Integrator(scenario), Losses(len(scenario.modes))
-        self._generation = self._target = 0
-        self._stock: deque[Array] = deque()
-        self._old, self._new = self._take_block(), None
-        self._at = self._new_at = 0
+        self._target, (self._generation, rows) = 0, ready.get()
+        self._old, self._new = RowQueue(rows), None
         self._weight = np.empty(0)
+        self._new_at = 0
 
     def next_row(self, number: int) -> Array:
         """Return the next frame: of the present settings, or fading into those of changed ones."""
         if self._target > self._generation and self._new is None and number % self._ratio == 0:
             self._look_for_new()
         if self._new is not None and self._new_at == len(self._weight):
-            self._old, self._at, self._new = self._new, self._new_at, None
-        if self._at == len(self._old):
-            self._old, self._at = self._take_block(), 0
-        row = self._old[self._at]
-        self._at += 1
+            self._old, self._new = self._new, None
+        row = self._next_of(self._old)
         if self._new is not None:
-            row = self._mix(row, self._new[self._new_at])
+            row = self._mix(row, self._next_of(self._new))
             self._new_at += 1
         m = len(row) // 4
         z, ngs = self._losses.apply(row[:m], row[m : 2 * m])
@@ -137,24 +176,25 @@ class SimulatedFrames:
         return np.sqrt(1.0 - weight**2) * row + weight * new if self._new_at else row
 
     def _look_for_new(self) -> None:
-        """Begin to fade once a block of the newest settings has come; those before it may still be needed."""
-        try:
-            generation, block = self._ready.get_nowait()
-        except Empty:
-            return
-        if generation < self._target:
-            self._stock.append(block.rows())
-            return
-        left = len(self._old) - self._at + sum(map(len, self._stock))
-        steps = min(round(FADE / self._dt), left) // self._ratio * self._ratio
-        self._weight = np.sin(0.5 * np.pi * np.arange(steps) / max(steps, 1))
-        self._new, self._new_at, self._generation = block.rows(), 0, generation
+        """Begin to fade once rows of the newest settings have come; those of the present ones may be needed until then."""
+        for _ in range(GLANCE):
+            try:
+                generation, rows = self._ready.get_nowait()
+            except Empty:
+                return
+            if generation == self._generation:
+                self._old.add(rows)
+            elif generation == self._target:
+                steps = min(round(FADE / self._dt), self._old.left) // self._ratio * self._ratio
+                self._weight = np.sin(0.5 * np.pi * np.arange(steps) / max(steps, 1))
+                self._new, self._new_at, self._generation = RowQueue(rows), 0, generation
+                return
 
-    def _take_block(self) -> Array:
-        if self._stock:
-            return self._stock.popleft()
-        self._generation, block = self._ready.get()
-        return block.rows()
+    def _next_of(self, queue: RowQueue) -> Array:
+        if queue.is_empty:
+            self._generation, rows = self._ready.get()
+            queue.add(rows)
+        return queue.next_row()
 
 
 class Losses:
