@@ -80,6 +80,23 @@ function layOutOnceAFrame() {
 }
 layOutOnceAFrame()
 
+// Each part of a figure has an element of its own, and writes the style sheet of its place with every picture: the browser finds its
+// styles anew before the next part asks for some, a hundred times a second on a page that is live. What is the same is not written
+// again; lines are on the canvas, and their elements, which nothing is in, need no place.
+function placePartsOnce() {
+  const sheet = Bokeh.require("core/dom").InlineStyleSheet.prototype
+  if (sheet.writesOnChange) return
+  const write = sheet._update
+  sheet.writesOnChange = true
+  sheet._update = function (css) {
+    if (css !== this.el.textContent) write.call(this, css)
+  }
+  Bokeh.Models.get("GlyphRenderer").prototype.default_view.prototype.update_position = function () {
+    this.position.replace(":host { display: none; }")
+  }
+}
+placePartsOnce()
+
 // A React component gives what the server sets back to its model a moment later. By then the server may have set something newer,
 // which the older would undo, on the page and in the server. What comes back is left out; it is what the model had been given.
 const ECHO_MS = 2000

@@ -59,7 +59,7 @@ class LiveFigure:
     def put(self, data: Mapping[str, tuple[Array, Array]], dark: bool) -> None:
         """Show these lines, x and y by name, and no others."""
         for name, (x, y) in data.items():
-            self.painter.data(self.sources[name], {"x": x, "y": y})
+            self.painter.data(self.figure, self.sources[name], {"x": x, "y": y})
         if (style := (dark, set(data))) != self._style:
             self._style = style
             self.lines.restyle(dark, [name for name in NAMES if name not in data])
@@ -149,8 +149,8 @@ class RollingTraces(LiveFigure):
             ends = times[[0, -1]]
             data |= {name: (ends, np.full(2, scale * of[target][display.column])) for name, of in bounds.items() if target in of}
         self.put(data, display.dark)
-        self.painter.update(self.figure.x_range, start=first * view.dt, end=last * view.dt)
-        self.painter.update(self.figure.y_range, start=0.0 if display.running else -top, end=top)
+        self.painter.update(self.figure, self.figure.x_range, start=first * view.dt, end=last * view.dt)
+        self.painter.update(self.figure, self.figure.y_range, start=0.0 if display.running else -top, end=top)
         what = "running rms of error of" if display.running else "error of" if display.error else ""
         self.figure.yaxis.axis_label = f"{what} {display.mode_label} [{display.unit_label}]".strip()
         self._marks.draw([event for event in events if first <= event.frame <= last], view.dt, CLOSE * n * view.dt)

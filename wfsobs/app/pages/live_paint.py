@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from bokeh.model import Model
 from bokeh.models import ColumnDataSource
+from bokeh.plotting import figure
 
 from wfsobs.app.pages.live_controls import Pulse
 from wfsobs.typing import Array
@@ -24,19 +25,19 @@ class Painter:
         self._steps: list[list[Any]] = []
         self._numbers: list[Array] = []
 
-    def data(self, source: ColumnDataSource, columns: Mapping[str, Array]) -> None:
-        """Have a source hold these numbers, columns of one length, in single precision."""
+    def data(self, fig: figure, source: ColumnDataSource, columns: Mapping[str, Array]) -> None:
+        """Have a source of a figure hold these numbers, columns of one length, in single precision."""
         numbers = {name: np.asarray(x, dtype=np.float32) for name, x in columns.items()}
         if not self._reaches(source):
             source.data = {**numbers}
             return
-        self._steps.append([source.id, list(numbers), len(next(iter(numbers.values()))), []])
+        self._steps.append([fig.id, source.id, list(numbers), len(next(iter(numbers.values()))), []])
         self._numbers += numbers.values()
 
-    def update(self, model: Model, **values: float) -> None:
-        """Set properties that are numbers."""
+    def update(self, fig: figure, model: Model, **values: float) -> None:
+        """Set properties of a part of a figure that are numbers."""
         if self._reaches(model):
-            self._steps.append([model.id, [], 0, [list(pair) for pair in values.items()]])
+            self._steps.append([fig.id, model.id, [], 0, [list(pair) for pair in values.items()]])
         else:
             model.update(**values)
 

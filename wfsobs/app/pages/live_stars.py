@@ -61,7 +61,7 @@ class Detector:
         """Send the last instants (n, 2), the newest last; reach : of the axes;  radius : of the core, all in mas."""
         points = points[~np.isnan(points).any(axis=1)]
         for source, shown in ((self._trail, points), (self._spot, points[-1:])):
-            self.painter.data(source, {"x": shown[:, 0], "y": shown[:, 1]})
+            self.painter.data(self.figure, source, {"x": shown[:, 0], "y": shown[:, 1]})
         colour = look(self.name).colour(dark)
         if (style := (reach, radius, colour)) == self._style:
             return
