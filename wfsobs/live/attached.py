@@ -151,6 +151,8 @@ class StreamFrames:
             self._write(*row)
 
     def _write(self, z: Array, ngs: Array) -> None:
+        if self._ring.count == self._desk.n_frames:  # of a gap, what is beyond the last frame that was asked for
+            return
         n = self._desk.n_modes
         self._row[0], self._row[1 : 1 + n], self._row[1 + n : 1 + 2 * n] = self._alive, z, ngs
         self._ring.write(self._row)

@@ -21,15 +21,19 @@ SCORED = (*TARGETS, NEXT, TOTAL)
 """What errors are counted of."""
 SLOTS = tuple(o.id for o in OBSERVERS.values() if o.step is not None and "y_stars" not in o.needs)
 """Observers that run frame by frame, on what a live source sends: no LGS by itself; each has its place."""
-CREWS = ("linear", "others")
-"""Linear observers follow in one process, those that learn or take long in another, so that the linear ones are on time."""
+ADAPTIVE = ("kf-adaptive", "multirate-adaptive", "gpr-adaptive")
+"""Observers that identify a window now and then, which takes a tenth of a second."""
+LONG_STEPS = (*ADAPTIVE, "gpr-offline")
+"""Observers some of whose steps are longer than a frame at 1 kHz."""
+CREWS = ("linear", "learning", "long")
+"""Processes of observers: linear ones, those that learn from every frame, LONG_STEPS. None need wait for what takes longer."""
 
 Integers = NDArray[np.int64]
 
 
 def crew_of(observer: str) -> int:
     """Return the place in CREWS of the process in which an observer follows."""
-    return CREWS.index("linear" if OBSERVERS[observer].linear else "others")
+    return CREWS.index("long" if observer in LONG_STEPS else "linear" if OBSERVERS[observer].linear else "learning")
 
 
 class Counts(NamedTuple):

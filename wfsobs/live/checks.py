@@ -6,7 +6,7 @@ from typing import Any
 
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.step import StepController
-from wfsobs.live.board import SLOTS
+from wfsobs.live.board import ADAPTIVE, LONG_STEPS, SLOTS
 from wfsobs.live.control_crew import SEATS
 from wfsobs.live.source import STREAM, LiveSource
 from wfsobs.observers import OBSERVERS
@@ -22,10 +22,6 @@ from wfsobs.stepping import design
 
 SLOWEST, FASTEST = 0.1, 20.0
 """Limits of the speed."""
-ADAPTIVE = ("kf-adaptive", "multirate-adaptive")
-"""Observers that are run if named, or where there are events; some of their steps are longer than a frame."""
-LONG_STEPS = (*ADAPTIVE, "gpr-offline")
-"""Observers that are run if named alone, where there are no events."""
 
 
 def make_design(name: str, settings: dict[str, Any], sampling: Sampling) -> StepObserver | StepController:

@@ -13,7 +13,7 @@ from typing import Any
 
 from wfsobs.live.board import Board
 from wfsobs.live.crew import Crew, trace_width
-from wfsobs.live.paced import FAST_CREW, SLOW_CREW, Command, enter_process, go_first
+from wfsobs.live.paced import SOURCE, Command, enter_process, go_first
 from wfsobs.live.ring import Ring
 from wfsobs.live.rows import Rows
 from wfsobs.live.source import end_process
@@ -133,7 +133,7 @@ class CrewProcess:
 
 def observe_frames(order: Order) -> None:
     """Follow a ring until the process is ended."""
-    enter_process(turn=SLOW_CREW if order.place else FAST_CREW)
+    enter_process(turn=SOURCE - 1 - order.place)
     sampling = order.sampling
     ring, board = Ring(sampling.n_modes, order.ring_name), Board(sampling.n_modes, order.board_name)
     traces = Rows(trace_width(sampling.n_modes), TRACE_CAPACITY, order.traces_name)

@@ -28,8 +28,8 @@ LOOK = 0.01
 STALL = 1.0
 """Delay beyond which the frames in between are given up, and the clock starts anew [s]."""
 
-SOURCE, FAST_CREW, SLOW_CREW = 3, 2, 1
-"""Turns of the processes that keep time: what takes least goes first, and delays the others least."""
+SOURCE = 4
+"""Turn of the source: what takes least goes first, and delays the others least; those of the crews follow, the last is 1."""
 
 Command = Mapping[str, Any]
 """What a process of a live loop is told: one word and what belongs to it."""

@@ -14,8 +14,8 @@ from wfsobs.app.pages.live_table import QUANTITIES
 from wfsobs.app.pages.live_waterfall import MEASUREMENT
 from wfsobs.app.pages.parts import WIDE, line
 from wfsobs.app.style import asset, look
-from wfsobs.live.board import NEXT, SLOTS
-from wfsobs.live.checks import ADAPTIVE, speed_of
+from wfsobs.live.board import ADAPTIVE, NEXT, SLOTS
+from wfsobs.live.checks import speed_of
 from wfsobs.live.control_crew import SEATS, USUAL
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.source import SIMULATION, STREAM, LiveSource
