@@ -303,6 +303,7 @@ def test_the_table_of_peaks_says_how_far_each_has_moved() -> None:
 
     assert moves(None, finding(17.25, 47.5)) == ["–", "–"]
     assert moves(finding(17.25, 50.5), finding(17.20, 47.5, 73.0)) == ["−0.05", "−3.00", "new"]
+    assert moves(finding(17.25, 50.5), finding(17.246, 50.506, 73.0)) == ["0", "+0.01", "new"]
 
 
 def test_alarms_stand_out_in_the_list_of_events() -> None:

@@ -125,13 +125,17 @@ def peaks_html(finding: Finding | None, before: Finding | None, scale: float, un
     def moved(peak: PeakFinding) -> str:
         if before is None:
             return NOTHING
-        return f"{peak.frequency - same[peak].frequency:+.2f}".replace("-", "−") if peak in same else "new"
+        if peak not in same:
+            return "new"
+        by = round(peak.frequency - same[peak].frequency, 2)
+        return f"{by:+.2f}".replace("-", "−") if by else "0"
 
     rows = [
         Row(number(p.frequency, 4), [_number(p.frequency_std), moved(p), _number(p.damping), number(scale * p.rms)])
         for p in finding.peaks
     ]
-    return str(table("Peaks of the last minute", columns, [("", rows)]))
+    title = "Peaks of the last minute"
+    return f'<div class="caption apart">{title}</div>{table(title, columns, [("", rows)])}'
 
 
 def _number(x: float) -> str:
