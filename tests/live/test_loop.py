@@ -7,9 +7,11 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from contextlib import suppress
 from multiprocessing import Pipe
 from multiprocessing.shared_memory import SharedMemory
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +22,7 @@ from wfsobs.live.blocks import Block
 from wfsobs.live.board import Board
 from wfsobs.live.crew import trace_width
 from wfsobs.live.delivery import Delivery, merged_rows
-from wfsobs.live.loop import LiveLoop
+from wfsobs.live.loop import TICK, LiveLoop, _keep
 from wfsobs.live.observing import POLL, REST, Order, Pause, made_crew
 from wfsobs.live.paced import Pace
 from wfsobs.live.ring import LiveFrame, Ring
@@ -361,7 +363,7 @@ def test_nothing_is_left_of_a_loop_whose_owner_is_killed():
     code = (
         "import time\n"
         "from wfsobs import PRESETS\n"
-        "from wfsobs.live.loop import LiveLoop\n"
+        "from wfsobs.live.loop import TICK, LiveLoop, _keep\n"
         "from wfsobs.live.simulated import SimulatedLoop\n"
         "s = PRESETS['paper']()\n"
         "loop = LiveLoop(SimulatedLoop(s), s, ['zero'])\n"
@@ -411,3 +413,19 @@ def test_a_process_goes_first_where_the_system_lets_it():
     for line in lines:
         told, is_so = line.split()
         assert told == is_so
+
+
+def test_a_fast_loop_is_looked_after_as_often_in_its_own_time():
+    """So that no event of its scenario is passed over; a slow one no less often than one in real time."""
+
+    class Paced:
+        def __init__(self, speed):
+            self.speed = speed
+
+        def tend(self):
+            pass
+
+    for speed, expected in ((20.0, TICK / 20.0), (0.1, TICK)):
+        loop, waits = Paced(speed), []
+        _keep(weakref.ref(loop), SimpleNamespace(wait=lambda pause, waits=waits: waits.append(pause) or len(waits) > 3))
+        assert waits == [TICK, *[expected] * 3]
