@@ -94,9 +94,7 @@ def to_python(scenario: Scenario, preset: str, source: Source | None = None, tas
 
 def _campaign_script(folder: str, target: Sequence[str], mode: Sequence[str], only: Sequence[str]) -> str:
     """Write the script; target, mode : one each, or none where there are no results yet."""
-    rows, indent = f"standings(state, {', '.join(map(repr, [*target, *mode]))}, cells)", ""
-    if not target:
-        rows, indent = "standings(state, *key, cells)", "    "
+    keys = f"[({target[0]!r}, {mode[0]!r})]" if target else "state.errors"
     return f"""from pathlib import Path
 
 from wfsobs.campaign.follow import CampaignFolder
@@ -105,8 +103,9 @@ from wfsobs.campaign.standings import standings
 
 state = CampaignFolder(Path({folder!r})).read()
 cells = cells_where(state.plan, {[*only]!r})
-{"" if target else "for key in state.errors:" + chr(10)}{indent}for row in {rows}:
-{indent}    print(row.name, row.rms_nm, "nm", row.over_bound, row.above, row.rank, row.wins, row.records, row.failures)
+for target, mode in {keys}:
+    for row in standings(state, target, mode, cells):
+        print(row.name, row.rms_nm, "nm", row.over_bound, row.above, row.rank, row.wins, row.records, row.failures)
 """
 
 
