@@ -35,7 +35,7 @@ from usage import cpu_seconds, family, memory_mb
 
 from wfsobs import PRESETS
 from wfsobs.live.checks import observers_on
-from wfsobs.live.paced import SOURCE, go_first
+from wfsobs.live.paced import SOURCE, go_first, prefer
 from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.observers import OBSERVERS
 
@@ -44,6 +44,8 @@ PAGE_BEHIND, PICTURES = 0.5, 5.0
 """[s], per second"""
 WEIGHED = 10.0
 """Time between two looks at the memory [s]: each holds up the process that it is of, and on some kernels a processor."""
+VISITS = -10
+"""Niceness of the pages without a browser."""
 SETTLED = 20
 """Pictures of every page before the measurement begins."""
 
@@ -62,7 +64,8 @@ def run_empty(late, frames, end, first=None) -> None:
 
 
 def visit(base: str, pages: int, pictures) -> None:
-    """Open pages, and keep them open."""
+    """Open pages, and keep them open; as those of another machine they do not wait for a processor of this one."""
+    prefer(VISITS)
     asyncio.run(watch_pages(base, pages, pictures))
 
 

@@ -77,18 +77,23 @@ def _make(settings: dict[str, Any], inbox: Connection, ready: Queue[Piece]) -> N
     while True:
         changed = None
         for rows in next(blocks).pieces(PIECE):
-            is_put = False
-            while not is_put and (is_first or not inbox.poll()):  # a first block is whole, so that it lasts until the next one
-                with suppress(Full):
-                    ready.put((generation, rows), timeout=0.1)
-                    is_put = True
-            if not is_put:
+            # a first block is whole, so that it lasts until the next one
+            if not _put(ready, (generation, rows), None if is_first else inbox):
                 break
         is_first = False
         while inbox.poll():  # only the newest settings are simulated
             changed, generation, is_first = inbox.recv()["settings"], generation + 1, True
         if changed is not None:
             blocks = endless_blocks(Scenario.from_dict(changed), rng)
+
+
+def _put(ready: Queue[Piece], piece: Piece, inbox: Connection | None) -> bool:
+    """Have a piece ready as soon as there is room for it; return whether there was before something was in the inbox."""
+    while inbox is None or not inbox.poll():
+        with suppress(Full):
+            ready.put(piece, timeout=0.1)
+            return True
+    return False
 
 
 def _send(settings: dict[str, Any], ready: Queue[Piece], desk: Desk) -> None:
