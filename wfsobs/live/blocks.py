@@ -40,11 +40,10 @@ class Block:
     turbulence: Array
     vibration: Array
 
-    def pieces(self, size: int) -> list[Array]:
-        """Return a row per frame, z, ngs, turbulence, vibration, (n, 4 n_modes) [um], in pieces of `size` bytes at most."""
+    def pieces(self, length: int) -> list[Array]:
+        """Return a row per frame, z, ngs, turbulence, vibration, (n, 4 n_modes) [um], in pieces of so many frames."""
         rows = np.hstack([self.z, self.ngs, self.turbulence, self.vibration])
-        n = max(1, size // rows[0].nbytes)
-        return [rows[at : at + n] for at in range(0, len(rows), n)]
+        return [rows[at : at + length] for at in range(0, len(rows), length)]
 
 
 def endless_blocks(scenario: Scenario, rng: np.random.Generator, length: float = LENGTH) -> Iterator[Block]:

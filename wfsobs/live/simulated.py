@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from wfsobs.live.blocks import LENGTH, endless_blocks
+from wfsobs.live.blocks import endless_blocks
 from wfsobs.live.paced import SOURCE, Command, Desk, Staff, enter_process, may_go_first, send_frames
 from wfsobs.live.source import SIMULATION
 from wfsobs.record import Sampling
@@ -21,10 +21,10 @@ from wfsobs.scenario import Scenario
 from wfsobs.stepping import sampling_of
 from wfsobs.typing import Array
 
-AHEAD = 2
-"""Blocks that are ready beside the one that is sent."""
+AHEAD = 40.0
+"""Time whose frames are ready beside those that are sent [s]."""
 PIECE = 1 << 15
-"""Bytes of a piece of a block. A pipe holds one, so that its frames wait for no other process."""
+"""Bytes of a piece of a block at most. A pipe holds one, so that its frames wait for no other process."""
 GLANCE = 4
 """Pieces that are taken in one frame at most, each in a tenth of a millisecond."""
 FADE = 0.5
@@ -55,14 +55,18 @@ class SimulatedLoop:
 
     def staff(self, context: SpawnContext, desk: Desk) -> Staff:
         """Return its processes."""
-        scenario = self.scenario
-        block = 8 * 4 * len(scenario.modes) * round(0.5 * LENGTH / scenario.dt)
-        ready = context.Queue(AHEAD * -(-block // PIECE))
+        ready = context.Queue(round(AHEAD / self.scenario.dt) // piece_length(self.scenario) + 1)
         inbox, outbox = context.Pipe(duplex=False)
-        settings = scenario.to_dict()
+        settings = self.scenario.to_dict()
         maker = context.Process(target=_make, args=(settings, inbox, ready), daemon=True)
         sender = context.Process(target=_send, args=(settings, ready, desk), daemon=True)
         return Staff(sender, [maker], [outbox], ready)
+
+
+def piece_length(scenario: Scenario) -> int:
+    """Return the frames of a piece, whole exposures of the NGS: whatever follows on it is in step with them."""
+    ratio = scenario.sensors.exposure_ratio
+    return max(1, PIECE // (8 * 4 * len(scenario.modes) * ratio)) * ratio
 
 
 def _make(settings: dict[str, Any], inbox: Connection, ready: Queue[Piece]) -> None:
@@ -76,7 +80,7 @@ def _make(settings: dict[str, Any], inbox: Connection, ready: Queue[Piece]) -> N
     blocks = endless_blocks(scenario, rng)
     while True:
         changed = None
-        for rows in next(blocks).pieces(PIECE):
+        for rows in next(blocks).pieces(piece_length(scenario)):
             # a first block is whole, so that it lasts until the next one
             if not _put(ready, (generation, rows), None if is_first else inbox):
                 break
