@@ -151,11 +151,12 @@ def _solve(ahead: NDArray[np.float32], rest: Array, length: int) -> Array:
     size = fft.next_fast_len(2 * length, real=True)
     common = fft.rfft(ahead[1 : 2 * length + 1].T, size)
     # Of the innovations in the present cycle, those after the step are not known.
-    first = ahead[:length] * (np.arange(ratio)[:, None, None] < np.arange(ratio))
+    first = ahead[:length].T * (np.arange(ratio)[:, None, None] < np.arange(ratio)[:, None])  # (age, step, frame)
 
     def apply(x: NDArray[np.float32]) -> NDArray[np.float32]:
         reversed_x = fft.rfft(x, size).conj()
-        out = x + (x @ first) @ first.transpose(0, 2, 1)
+        # Not by BLAS: as fast here, and one of its products once told of an invalid value where there was none.
+        out = x + np.einsum("asp,apf->asf", np.einsum("asf,apf->asp", x, first), first)
         total = np.zeros_like(reversed_x)
         for hankel in common:
             known = fft.irfft(hankel * reversed_x, size)[..., :length]
