@@ -10,7 +10,7 @@ from wfsobs.live.board import ADAPTIVE, LONG_STEPS, SLOTS
 from wfsobs.live.control_crew import SEATS
 from wfsobs.live.source import STREAM, LiveSource
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import Observer
+from wfsobs.observers.base import TARGETS, Observer
 from wfsobs.observers.step import StepObserver
 from wfsobs.prior import Training
 from wfsobs.priors_from.scenario import observer_settings
@@ -60,6 +60,11 @@ def can_run(observer: str, source: LiveSource, scenario: Scenario) -> bool:
         and has_prior(it, scenario, source.sampling.n_modes)
         and (source.name != STREAM or not learns_beforehand(it, scenario))
     )
+
+
+def has_error(observer: str, source: LiveSource) -> bool:
+    """Return whether errors of an observer are known: without truth those of the next measurement, the sum of both targets."""
+    return source.has_truth or set(TARGETS) <= set(OBSERVERS[observer].targets)
 
 
 def can_control(controller: str, source: LiveSource) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from time import monotonic
 from typing import Any
 
@@ -15,7 +15,7 @@ from wfsobs.app.pages.live_waterfall import MEASUREMENT
 from wfsobs.app.pages.parts import WIDE, line
 from wfsobs.app.style import asset, look
 from wfsobs.live.board import ADAPTIVE, NEXT, SLOTS
-from wfsobs.live.checks import speed_of
+from wfsobs.live.checks import has_error, speed_of
 from wfsobs.live.control_crew import SEATS, USUAL
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.source import SIMULATION, STREAM, LiveSource
@@ -134,8 +134,7 @@ class LiveControls:
         """Show what runs."""
         self.running.value = loop.board.active()
         self._choose_speed(loop.speed)
-        shown = self.lines.value
-        self.lines.value = [*shown, *(name for name in ADAPTIVE if name in self.running.value and name not in shown)]
+        self.lines.value = choose_lines(self.lines.value, [name for name in self.running.value if has_error(name, loop.source)])
         self.controllers.value = [name for name in SEATS if name in loop.controllers]
         self._allow(loop.source)
 
@@ -212,6 +211,18 @@ class LiveControls:
             refused.append(str(error))
             self._choose_speed(1.0)
         return refused
+
+
+def choose_lines(wanted: Sequence[str], running: Sequence[str]) -> list[str]:
+    """Return whose lines are shown: those wanted that run, others for those that do not, and the adaptive ones.
+
+    >>> choose_lines(["kf-multi", "gpr-online"], ["kf-lgs", "gpr-online", "kf-adaptive"])
+    ['gpr-online', 'kf-lgs', 'kf-adaptive']
+    """
+    kept = [name for name in wanted if name in running]
+    spare = [name for name in dict.fromkeys((*FIRST, *running)) if name in running and name not in (*kept, *ADAPTIVE)]
+    adaptive = [name for name in ADAPTIVE if name in running and name not in kept]
+    return [*kept, *spare[: len(wanted) - len(kept)], *adaptive]
 
 
 def _text(value: str | float) -> str:
