@@ -213,16 +213,16 @@ class LiveControls:
         return refused
 
 
-def choose_lines(wanted: Sequence[str], running: Sequence[str]) -> list[str]:
-    """Return whose lines are shown: those wanted that run, others for those that do not, and the adaptive ones.
+def choose_lines(choice: Sequence[str], running: Sequence[str]) -> list[str]:
+    """Return whose lines are shown: those of the choice that run, others for those that do not, and the adaptive ones.
 
     >>> choose_lines(["kf-multi", "gpr-online"], ["kf-lgs", "gpr-online", "kf-adaptive"])
     ['gpr-online', 'kf-lgs', 'kf-adaptive']
     """
-    kept = [name for name in wanted if name in running]
+    kept = [name for name in choice if name in running]
     spare = [name for name in dict.fromkeys((*FIRST, *running)) if name in running and name not in (*kept, *ADAPTIVE)]
     adaptive = [name for name in ADAPTIVE if name in running and name not in kept]
-    return [*kept, *spare[: len(wanted) - len(kept)], *adaptive]
+    return [*kept, *spare[: len(choice) - len(kept)], *adaptive]
 
 
 def _text(value: str | float) -> str:
