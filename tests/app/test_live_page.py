@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import threading
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -30,9 +31,11 @@ from wfsobs.app.views.plots import new_figure
 from wfsobs.live.board import NEXT
 from wfsobs.live.finding import Finding, PeakFinding
 from wfsobs.live.loop import LiveLoop
+from wfsobs.live.peaks import Change
 from wfsobs.live.recording import Recorder
 from wfsobs.live.ring import Ring
 from wfsobs.live.simulated import SimulatedLoop
+from wfsobs.live.spectrum_of_minute import MinuteSpectrum
 from wfsobs.live.view import SHARED, LiveEvent, SharedView
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
@@ -292,18 +295,27 @@ def test_a_recording_is_saved_as_a_record_that_is_read(kind: str, short: Scenari
     ring.release()
 
 
-def finding(*frequencies: float) -> Finding:
-    return Finding(tuple(PeakFinding(f, 0.02, 0.004, 0.02) for f in frequencies), (0.02, 0.02), {})
+def finding(*frequencies: float, level: float = 1e-6) -> Finding:
+    """Return a minute with peaks at these frequencies, found there and in its spectrum."""
+    density = np.full((29_999, 2), level)
+    density[[round(60 * f) - 1 for f in frequencies]] += 0.02**2 * 60.0
+    peaks = tuple(PeakFinding(f, 0.02, 0.0, 0.02) for f in frequencies)
+    return Finding(peaks, (0.02, 0.02), {}, MinuteSpectrum(1.0 / 60.0, density))
 
 
 def test_the_table_of_peaks_says_how_far_each_has_moved() -> None:
-    def moves(before: Finding | None, now: Finding) -> list[str]:
-        rows = re.findall(r"<tr data.*?</tr>|<tr><th.*?</tr>", peaks_html(now, before, 1e3, "nm").partition("<tbody>")[2], re.S)
+    def moves(*minutes: Finding) -> list[str]:
+        html = peaks_html(Change(minutes), 1e3, "nm")
+        rows = re.findall(r"<tr data.*?</tr>|<tr><th.*?</tr>", html.partition("<tbody>")[2], re.S)
         return [re.findall(r"<td>(.*?)</td>", row)[1] for row in rows if "<td>" in row]
 
-    assert moves(None, finding(17.25, 47.5)) == ["–", "–"]
+    assert peaks_html(None, 1e3, "nm") == ""
+    assert moves(finding(17.25, 47.5)) == ["–", "–"]
     assert moves(finding(17.25, 50.5), finding(17.20, 47.5, 73.0)) == ["−0.05", "−3.00", "new"]
-    assert moves(finding(17.25, 50.5), finding(17.246, 50.506, 73.0)) == ["0", "+0.01", "new"]
+    before = finding(17.25, 50.5, 73.0)
+    assert moves(before, finding(17.246, 50.506, 73.0)) == ["0", "+0.01", "0"]
+    # as strong as before, and not found then
+    assert moves(replace(before, peaks=before.peaks[:2]), finding(17.246, 50.506, 73.0)) == ["0", "+0.01", "–"]
 
 
 def test_alarms_stand_out_in_the_list_of_events() -> None:

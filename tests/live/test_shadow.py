@@ -3,6 +3,8 @@
 Stream, source, observers, alarms and identification are those of `wfsobs live --in STREAM`, in this process and without a clock.
 """
 
+from concurrent.futures import Future
+
 import numpy as np
 import pytest
 
@@ -87,3 +89,21 @@ def test_a_night_with_a_peak_noise_and_lost_frames(loop):
     assert 1.0 < share < 14.0  # of 1000 frames a part, or all, lose a tenth; 4 standard deviations above
     assert when("ALARM error of kf-multi up")[-1] > 32 and when("over: error of kf-multi")[-1] > 33
     assert "kf-multi" in loop.board.active()
+
+
+def test_what_takes_longer_than_a_minute_to_identify_is_waited_for(loop, monkeypatch):
+    monkeypatch.setattr("wfsobs.live.shadow.MINUTE", 1.0)
+    loop.shadow, begun = Shadow(loop.say, loop), []
+
+    def begin(*_, then):
+        begun.append(Future())
+        return begun[-1]
+
+    loop.workshop.do = begin
+    for _ in range(3500):
+        loop.send(np.zeros(2), False)
+    assert len(begun) == 1
+    begun[0].set_result(None)
+    for _ in range(1500):
+        loop.send(np.zeros(2), False)
+    assert len(begun) == 2

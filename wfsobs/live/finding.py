@@ -10,6 +10,7 @@ from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.bound_both import bound_rms_of_both
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH
 from wfsobs.identification import identify
+from wfsobs.live.spectrum_of_minute import MinuteSpectrum, spectrum_of
 from wfsobs.priors_from.identification import told_by
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
@@ -36,11 +37,13 @@ class Finding:
     peaks    : of all modes together
     noise    : of the measurement, per mode [um]
     settings : of the scenario with the models that were found
+    spectrum : of the measurement; None where too much of it is missing
     """
 
     peaks: tuple[PeakFinding, ...]
     noise: tuple[float, ...]
     settings: dict[str, Any]
+    spectrum: MinuteSpectrum | None = None
 
 
 def identify_frames(record: Record, settings: dict[str, Any]) -> Finding:
@@ -51,7 +54,8 @@ def identify_frames(record: Record, settings: dict[str, Any]) -> Finding:
         for p in result.peaks
     ]
     told = told_by(result, Scenario.from_dict(settings))
-    return Finding(tuple(peaks), tuple(mode.noise.value for mode in result.modes), told.to_dict())
+    noise = tuple(mode.noise.value for mode in result.modes)
+    return Finding(tuple(peaks), noise, told.to_dict(), spectrum_of(record.z, record.dt))
 
 
 def bounds_of(settings: dict[str, Any]) -> dict[str, dict[str, list[float]]]:

@@ -6,6 +6,7 @@ Frames are judged as they come, and the errors of observers as each process of t
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import Future
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
@@ -29,6 +30,7 @@ class Shadow:
         """Say : receives one line; processes : of its loop."""
         self._alarms, self._processes = Alarms(say), processes
         self._next_second, self._next_minute = SECOND, MINUTE
+        self._identification: Future[Finding] | None = None
 
     def __call__(self, loop: LiveLoop) -> None:
         """Judge what has come since the last call."""
@@ -42,16 +44,21 @@ class Shadow:
                 self._alarms.judge(view, both)
         if now >= self._next_minute:
             self._next_minute = now + MINUTE
-            try:
-                record = loop.recorder.look_back(MINUTE, loop.scenario)
-            except SettingError:  # nothing has come
-                return
+            if self._identification is None or self._identification.done():  # many peaks may take more than a minute
+                self._identification = self._identify(loop)
 
-            def take(finding: Finding) -> None:
-                loop.workshop.keep(finding)
-                self._alarms.compare(finding)
+    def _identify(self, loop: LiveLoop) -> Future[Finding] | None:
+        """Have the last minute identified and compared; return what is found in time, None where nothing has come."""
+        try:
+            record = loop.recorder.look_back(MINUTE, loop.scenario)
+        except SettingError:
+            return None
 
-            loop.workshop.do(identify_frames, record, loop.scenario.to_dict(), then=take)
+        def take(finding: Finding) -> None:
+            loop.workshop.keep(finding)
+            self._alarms.compare(finding)
+
+        return loop.workshop.do(identify_frames, record, loop.scenario.to_dict(), then=take)
 
 
 def append_line(path: str, seconds: float, line: str) -> None:

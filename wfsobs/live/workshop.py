@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from typing import Any
+from typing import Any, TypeVar
 
 from wfsobs.control.step import StepController
 from wfsobs.live.checks import check_slot, make_design
 from wfsobs.live.finding import Bounds, Finding, bounds_of, identify_frames
+from wfsobs.live.peaks import Change
 from wfsobs.live.processes import LiveProcesses
 from wfsobs.observers.step import StepObserver
 from wfsobs.record import Record, Sampling
 from wfsobs.scenario import Scenario
+
+T = TypeVar("T")
 
 
 class Workshop:
@@ -29,20 +32,20 @@ class Workshop:
 
     Attributes
     ----------
-    finding, finding_before : Finding or None
-        The last identification, and the one before.
+    change : Change or None
+        What the last identification has found, beside the one before.
     """
 
     def __init__(self, processes: LiveProcesses, sampling: Sampling, say: Callable[[str], None]):
         self._processes, self._sampling, self._say = processes, sampling, say
-        self.finding: Finding | None = None
-        self.finding_before: Finding | None = None
+        self.change: Change | None = None
+        self._findings: list[Finding] = []
         self._bounds: tuple[Scenario | None, Bounds] = (None, {})
 
-    def do(self, function: Callable[..., Any], *arguments: Any, then: Callable[[Any], None]) -> None:
-        """Have something computed, and then do something with the result; an error becomes a line."""
+    def do(self, function: Callable[..., T], *arguments: Any, then: Callable[[T], None]) -> Future[T]:
+        """Have something computed, and then do something with the result; an error becomes a line. Return the result to come."""
 
-        def end(future: Future[Any]) -> None:
+        def end(future: Future[T]) -> None:
             if future.cancelled() or self._processes.is_over.is_set():
                 return
             if (error := future.exception()) is not None:
@@ -50,7 +53,9 @@ class Workshop:
             else:
                 then(future.result())
 
-        self._processes.workshop.submit(function, *arguments).add_done_callback(end)
+        future = self._processes.workshop.submit(function, *arguments)
+        future.add_done_callback(end)
+        return future
 
     def bounds(self, scenario: Scenario) -> Bounds:
         """Return the bounds of the present settings, as `bounds_of` does; nothing until they are known."""
@@ -88,7 +93,8 @@ class Workshop:
 
     def keep(self, finding: Finding) -> None:
         """Have an identification as the last one."""
-        self.finding_before, self.finding = self.finding, finding
+        self._findings = [*self._findings[-1:], finding]
+        self.change = Change(self._findings)
 
     def _deliver(self, design: StepObserver | StepController) -> None:
         if isinstance(design, StepController):

@@ -14,7 +14,6 @@ from bokeh.plotting import figure
 
 from wfsobs.app.display import Display
 from wfsobs.app.pages.live_paint import Painter
-from wfsobs.app.pages.live_waterfall import bridge_missing
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.lines import FigureLines
 from wfsobs.app.views.plots import new_figure
@@ -27,6 +26,7 @@ from wfsobs.latencies import EDGES
 from wfsobs.live.alarms import ALARM
 from wfsobs.live.board import SLOTS, Board
 from wfsobs.live.finding import Bounds
+from wfsobs.live.spectrum_of_minute import bridge_missing
 from wfsobs.live.view import LiveEvent, LiveView
 from wfsobs.signal.welch import welch_psd
 from wfsobs.typing import Array

@@ -112,8 +112,7 @@ class LiveRoom:
         self.table.object = view.once(key, lambda: live_html(loop, view, target, d, scale, self._bounds))
         self.control_table.object = view.once(("controls", seconds, *of), lambda: control_html(loop, seconds, d))
         self.news.object = events_html(loop.events, loop.sampling.dt)
-        shop = loop.workshop
-        self.peaks.object = peaks_html(shop.finding, shop.finding_before, scale, self.display.unit_label)
+        self.peaks.object = peaks_html(loop.workshop.change, scale, self.display.unit_label)
 
     def _legend(self, loop: LiveLoop, target: str) -> str:
         """Write what the lines of the figures are."""

@@ -16,10 +16,11 @@ from wfsobs.app.render import Row, table
 from wfsobs.app.style import look, swatch
 from wfsobs.closed_loop.run import strehl
 from wfsobs.evaluation.rows import row_label, target_title
-from wfsobs.live.alarms import ALARM, paired_peaks
+from wfsobs.live.alarms import ALARM
 from wfsobs.live.board import NEXT, SCORED
-from wfsobs.live.finding import Bounds, Finding, PeakFinding
+from wfsobs.live.finding import Bounds, PeakFinding
 from wfsobs.live.loop import LiveLoop
+from wfsobs.live.peaks import Change, moves_of
 from wfsobs.live.view import LiveEvent, LiveView
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
@@ -109,30 +110,28 @@ def control_html(loop: LiveLoop, seconds: float, display: Display) -> str:
     return str(table("Controllers of the live loop", columns, [("", rows)]))
 
 
-def peaks_html(finding: Finding | None, before: Finding | None, scale: float, unit: str) -> str:
+def peaks_html(change: Change | None, scale: float, unit: str) -> str:
     """Write the peaks of the last identification, and how far each is from where the one before had it."""
-    if finding is None:
+    if change is None:
         return ""
     columns = {
         "Peak [Hz]": "",
         "± [Hz]": "standard deviation",
-        "Moved by [Hz]": "since the identification before",
+        "Moved by [Hz]": "since the identification before; nothing where that did not find it",
         "Damping": "",
         f"RMS [{unit}]": "of the mode that has most of it",
     }
-    same = {} if before is None else paired_peaks(before.peaks, finding.peaks)
+    was = {**change.same, **moves_of(change)}
 
     def moved(peak: PeakFinding) -> str:
-        if before is None:
-            return NOTHING
-        if peak not in same:
-            return "new"
-        by = round(peak.frequency - same[peak].frequency, 2)
+        if peak not in was:
+            return "new" if peak in change.new else NOTHING
+        by = round(peak.frequency - was[peak].frequency, 2)
         return f"{by:+.2f}".replace("-", "−") if by else "0"
 
     rows = [
         Row(number(p.frequency, 4), [_number(p.frequency_std), moved(p), _number(p.damping), number(scale * p.rms)])
-        for p in finding.peaks
+        for p in change.found
     ]
     title = "Peaks of the last minute"
     return f'<div class="caption apart">{title}</div>{table(title, columns, [("", rows)])}'

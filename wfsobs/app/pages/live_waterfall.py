@@ -10,6 +10,7 @@ from bokeh.palettes import Viridis256
 
 from wfsobs.app.display import Display
 from wfsobs.app.views.plots import new_figure
+from wfsobs.live.spectrum_of_minute import bridge_missing
 from wfsobs.live.view import LiveView
 from wfsobs.signal.welch import welch_psd
 from wfsobs.typing import Array
@@ -23,8 +24,6 @@ LOWEST = 1.0
 """Frequency at which it begins [Hz]."""
 FLOOR, DECADES = 0.05, 2.0
 """The darkest colour is that below which this part of the spectra is; the colours span so many decades at least."""
-MOST_MISSING = 0.2
-"""Part of a second that may be missing; it is bridged by straight lines."""
 
 
 class Waterfall:
@@ -120,18 +119,3 @@ def second_spectrum(x: Array, dt: float) -> Array:
     power = np.concatenate([[0.0], np.cumsum(density[:, 0] * 2.0 * half)])
     below = np.interp(edges, np.concatenate([[-half], frequency + half]), power)
     return np.diff(below) / np.diff(edges)
-
-
-def bridge_missing(x: Array) -> Array | None:
-    """Return a signal (n,) with straight lines over what is missing; None where too much is.
-
-    >>> bridge_missing(np.array([1.0, 2.0, np.nan, 4.0, 5.0]))
-    array([1., 2., 3., 4., 5.])
-    """
-    known = ~np.isnan(x)
-    if known.all():
-        return x
-    if known.mean() < 1.0 - MOST_MISSING:
-        return None
-    at = np.arange(len(x))
-    return np.interp(at, at[known], x[known])
