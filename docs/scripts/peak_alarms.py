@@ -18,7 +18,7 @@ import numpy as np
 
 import wfsobs
 from wfsobs.live.finding import Finding, identify_frames
-from wfsobs.live.peaks import CLOSE, changes
+from wfsobs.live.peaks import CLOSE, peak_changes
 from wfsobs.record import Record
 
 LINES = (0.0, 0.003, 0.005, 0.010, 0.030)
@@ -54,7 +54,7 @@ def main(preset: str = "paper", minutes: str = "20") -> None:
     with ProcessPoolExecutor() as pool:
         for rms in LINES:
             findings = list(pool.map(partial(find, preset), [(k, rms) for k in range(n)]))
-            rows = [(k, row) for k in range(1, n) for row in changes(findings[max(k - 3, 0) : k + 1])]
+            rows = [(k, row) for k in range(1, n) for row in peak_changes(findings[max(k - 3, 0) : k + 1])]
             told = [(k, row) for k, row in rows if rms and any(is_of(row, line_of(j, rms)[0]) for j in (k - 1, k))]
             come = len({k for k, row in told if k % 2 and ("new" in row or "moved" in row)})
             gone = len({k for k, row in told if not k % 2 and ("gone" in row or "moved" in row)})

@@ -7,7 +7,7 @@ import pytest
 
 from wfsobs.live.alarms import Alarms
 from wfsobs.live.finding import Finding, PeakFinding
-from wfsobs.live.peaks import Change, changes, distinct_peaks, has_risen
+from wfsobs.live.peaks import Change, distinct_peaks, has_risen, peak_changes
 from wfsobs.live.spectrum_of_minute import MinuteSpectrum, spectrum_of
 
 STEP, NOISE, DT = 1.0 / 60.0, 0.02, 1e-3
@@ -144,13 +144,13 @@ def test_a_line_in_pieces_is_one_peak_and_a_faint_one_is_none():
     own = np.array([0.006, 0.001, 0.01]) ** 2 + (np.array([50.43, 50.51, 50.49]) - middle) ** 2
     assert found[1].frequency_std == pytest.approx(np.sqrt(power @ own / power.sum()), rel=1e-12)
     other = (17.2, 3e-3)
-    assert changes([minute(other, (50.5, 3e-2)), whole]) == []  # a minute does not resolve the difference
-    assert changes([minute(other, (47.5, 3e-2)), whole]) == ["peak moved from 47.50 to 50.51 Hz"]
+    assert peak_changes([minute(other, (50.5, 3e-2)), whole]) == []  # a minute does not resolve the difference
+    assert peak_changes([minute(other, (47.5, 3e-2)), whole]) == ["peak moved from 47.50 to 50.51 Hz"]
 
 
 def test_what_is_known_of_the_first_minute():
     change = Change([minute((10, 0.02))])
-    assert [peak.frequency for peak in change.found] == [10] and not change.same and not change.new and not change.gone
+    assert [peak.frequency for peak in change.peaks] == [10] and not change.same and not change.new and not change.losses
 
 
 def test_the_power_of_a_line_and_the_level_around_it():

@@ -9,7 +9,7 @@ import numpy as np
 
 from wfsobs.live.board import NEXT
 from wfsobs.live.finding import Finding
-from wfsobs.live.peaks import changes
+from wfsobs.live.peaks import peak_changes
 from wfsobs.live.ring import LiveFrame
 from wfsobs.live.view import LiveView
 from wfsobs.typing import Array
@@ -72,7 +72,7 @@ class Alarms:
     def compare(self, finding: Finding) -> None:
         """Judge an identification against those before."""
         self._findings = [*self._findings[-3:], finding]
-        for row in changes(self._findings):
+        for row in peak_changes(self._findings):
             self._say(f"{ALARM} {row}")
 
     def _miss(self, sensor: str, due: Array) -> None:

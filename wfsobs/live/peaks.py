@@ -45,13 +45,13 @@ class Change:
 
     Attributes
     ----------
-    found : tuple of PeakFinding
+    peaks : tuple of PeakFinding
         Those of the last minute.
     same : dict
         Those of them that were known -> as they were.
-    drifted : dict
+    drifts : dict
         Those of the same that have been elsewhere -> as they were.
-    new, gone : list of PeakFinding
+    new, losses : list of PeakFinding
         Those that were not known and have risen; those known that are not found and have fallen.
     """
 
@@ -60,15 +60,15 @@ class Change:
         known: list[PeakFinding] = []
         for minute in findings[-2::-1]:
             known += [peak for peak in distinct_peaks(minute) if not any(is_close(peak, one) for one in known)]
-        self.found = distinct_peaks(now)
-        self.same = paired_peaks(known, self.found)
-        self.drifted = {peak: one for peak, one in self.same.items() if _has_drifted(peak, one, before, now)}
-        self.new = [peak for peak in self.found if peak not in self.same and has_risen(peak, before, now)]
+        self.peaks = distinct_peaks(now)
+        self.same = paired_peaks(known, self.peaks)
+        self.drifts = {peak: one for peak, one in self.same.items() if _has_drifted(peak, one, before, now)}
+        self.new = [peak for peak in self.peaks if peak not in self.same and has_risen(peak, before, now)]
         was = self.same.values()
-        self.gone = [peak for peak in known if peak not in was and has_risen(peak, now, before)]
+        self.losses = [peak for peak in known if peak not in was and has_risen(peak, now, before)]
 
 
-def changes(findings: Sequence[Finding]) -> list[str]:
+def peak_changes(findings: Sequence[Finding]) -> list[str]:
     """Say which peaks are new, have moved or are gone in the last of up to four minutes, one after the other.
 
     A line that moves in the midst of a minute is two peaks in that minute: one is new. In the next one the other is gone, and has
@@ -77,12 +77,12 @@ def changes(findings: Sequence[Finding]) -> list[str]:
     last, before = Change(findings[-3:]), Change(findings[-4:-1]) if len(findings) > 1 else None
     moves = moves_of(last, before)
     lines = []
-    for peak in last.found:
-        if (origin := moves.get(peak, last.drifted.get(peak))) is not None:
+    for peak in last.peaks:
+        if (origin := moves.get(peak, last.drifts.get(peak))) is not None:
             lines.append(f"peak moved from {origin.frequency:.2f} to {peak.frequency:.2f} Hz")
         elif peak in last.new:
             lines.append(f"new peak at {peak.frequency:.2f} Hz, {1e3 * peak.rms:.1f} nm")
-    lost = [peak for peak in last.gone if peak not in moves.values()]
+    lost = [peak for peak in last.losses if peak not in moves.values()]
     return [*lines, *(f"peak at {peak.frequency:.2f} Hz is gone" for peak in lost)]
 
 
@@ -92,7 +92,7 @@ def moves_of(last: Change, before: Change | None = None) -> dict[PeakFinding, Pe
     A peak that was new the minute `before` is a place to have moved to as well.
     """
     just_new = [] if before is None else [peak for peak, one in last.same.items() if one in before.new]
-    pairs = [(abs(one.frequency - peak.frequency), peak, one) for peak in (*last.new, *just_new) for one in last.gone]
+    pairs = [(abs(one.frequency - peak.frequency), peak, one) for peak in (*last.new, *just_new) for one in last.losses]
     moves: dict[PeakFinding, PeakFinding] = {}
     for _, peak, one in sorted(pairs, key=lambda pair: pair[0]):
         was = one if before is None else before.same.get(one, one)

@@ -131,7 +131,7 @@ def peaks_html(change: Change | None, scale: float, unit: str) -> str:
 
     rows = [
         Row(number(p.frequency, 4), [_number(p.frequency_std), moved(p), _number(p.damping), number(scale * p.rms)])
-        for p in change.found
+        for p in change.peaks
     ]
     title = "Peaks of the last minute"
     return f'<div class="caption apart">{title}</div>{table(title, columns, [("", rows)])}'
