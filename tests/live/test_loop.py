@@ -113,7 +113,7 @@ def test_first_block_of_new_settings_is_whole(monkeypatch):
     assert not maker.is_alive()
     order = [generation for generation, _ in taken]
     lengths = {g: sum(len(rows) for generation, rows in taken if generation == g) for g in set(order)}
-    assert order == sorted(order) and list(lengths) == [0, 3, 4]
+    assert order == sorted(order) and {0, 3, 4} <= set(order)  # and some of those in between, if the three did not come at once
     assert all(
         len(rows) % 5 == 0 for _, rows in taken
     )  # else the NGS frames of what follows on a part of a block were out of step
