@@ -63,6 +63,8 @@ class OneMode:
         Measured share of every bin, see `missing`.
     rejections : list
         Candidates that no peak explains.
+    removals : list
+        Frequencies of resonances that were removed for their uncertainty [Hz].
     """
 
     def __init__(self, z: Array, dt: float, rng: np.random.Generator | None = None):
@@ -76,6 +78,7 @@ class OneMode:
         self.spectrum = first_guess(self.f, self.I, dt)
         self.strong = np.zeros(len(self.f), bool)
         self.rejections: list[Candidate] = []
+        self.removals: list[float] = []
         self._fill()
 
     def _fill(self) -> None:
@@ -201,7 +204,13 @@ class OneMode:
         self._subtract_lines()
 
     def _split(self, p: Ar2) -> None:
-        """Replace one resonance that is several bins wide by two, where they are worth it: neighbours look like one."""
+        """Replace one resonance that is several bins wide by two, where they are worth it: neighbours look like one.
+
+        Not where one was removed before: it would come back, and be removed again.
+        """
+        frequency = p.omega / (2 * pi)
+        if any(abs(one - frequency) <= 2.0 * p.damping * frequency for one in self.removals):
+            return
         shape = split_resonance(self.spectrum, self.f, self.I, p)
         if shape is not None:
             self.spectrum = shape
@@ -218,6 +227,7 @@ class OneMode:
             return False
         p = self.spectrum.resonances[worst]
         self.spectrum = replace(self.spectrum, resonances=tuple(q for q in self.spectrum.resonances if q is not p))
+        self.removals.append(p.omega / (2 * pi))
         self.rejections.append(Candidate(p.omega / (2 * pi), max(round(p.damping * p.omega / pi / self.f[0]), WIDEST_LINE), 0.0))
         self.refit()
         return True
