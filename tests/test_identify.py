@@ -226,7 +226,7 @@ def test_a_resonance_as_uncertain_as_this_is_taken_off() -> None:
 
 @pytest.mark.parametrize(("removals", "count"), [([], 2), ([30.3], 1), ([45.0], 2)])
 def test_a_resonance_that_was_taken_off_does_not_come_back_by_a_split(removals: list[float], count: int) -> None:
-    """Else it would be taken off and come back until the last sweep, as in one of ten records of `ut4-floor`."""
+    """Else it would be taken off and come back until the last sweep, as in three of ten minutes of `ut4` and `ut4-floor`."""
     rng = np.random.default_rng(11)
     two = [Ar2(2 * pi * f, 0.01, 0.02, DT) for f in (30.0, 32.0)]
     z = sum((one.sample(60_000, rng) for one in two), 0.014 * rng.standard_normal(60_000))
