@@ -5,10 +5,14 @@ import inspect
 import re
 import subprocess
 import sys
+import tomllib
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import pytest
+from packaging.requirements import Requirement
+from packaging.version import Version
 
 import wfsobs
 from wfsobs.cli.group import COMMANDS, main
@@ -166,3 +170,26 @@ def test_a_report_is_written(tmp_path: Path) -> None:
     wfsobs.export(tmp_path / "report.html", wfsobs.PRESETS["paper"]().replace(QUICK), on_result=done.append)
     assert len(done) == 1
     assert (tmp_path / "report.html").read_text(encoding="utf-8").startswith("<!doctype html>")
+
+
+def requirements() -> dict[str, Requirement]:
+    """What the package, its extras and its build need, by name."""
+    config = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
+    project, extras = config["project"], config["project"]["optional-dependencies"]
+    lines = [
+        *config["build-system"]["requires"],
+        *project["dependencies"],
+        *(line for extra in extras.values() for line in extra),
+    ]
+    return {it.name: it for it in map(Requirement, lines) if it.name != "wfsobs"}
+
+
+def test_every_range_of_versions_has_a_ceiling() -> None:
+    assert [str(it) for it in requirements().values() if not any(part.operator == "<" for part in it.specifier)] == []
+
+
+@pytest.mark.parametrize("name", ["panel", "panel-material-ui", "bokeh"])
+def test_a_package_whose_private_names_are_used_stays_at_its_minor_version(name: str) -> None:
+    now = Version(version(name))
+    assert now in requirements()[name].specifier
+    assert f"{now.major}.{now.minor + 1}.0" not in requirements()[name].specifier

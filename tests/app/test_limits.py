@@ -7,11 +7,13 @@ from dataclasses import fields
 from typing import Any
 
 import pytest
+from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tornado.httputil import HTTPHeaders, HTTPServerRequest, RequestStartLine
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.handlers import full_html
+from wfsobs.app.handlers import SecurityHeaders, full_html
 from wfsobs.app.limits import NONE, PUBLIC, Limits
 from wfsobs.app.serve import Options, options, origins
 from wfsobs.app.service import Full, Service
@@ -206,3 +208,21 @@ def test_pages_come_from_where_the_server_is_reached() -> None:
         "ao.example.org",
         "localhost:5006",
     ]
+
+
+@pytest.mark.parametrize(
+    ("embedders", "ancestors"), [((), "'none'"), (("https://a.org", "http://b:80"), "https://a.org http://b:80")]
+)
+def test_only_the_pages_named_may_show_this_one_in_a_frame(embedders: tuple[str, ...], ancestors: str) -> None:
+    transform = SecurityHeaders(embedders, HTTPServerRequest(start_line=RequestStartLine("GET", "/", "HTTP/1.1")))
+    _, headers, _ = transform.transform_first_chunk(200, HTTPHeaders(), b"", True)
+    assert headers["Content-Security-Policy"] == f"frame-ancestors {ancestors}"
+
+
+@pytest.mark.parametrize(
+    "origin", ["example.org", "https://a.org; script-src *", "https://a.org\nX: y", "*", "https://a.org/page"]
+)
+def test_an_origin_that_is_none_is_refused(origin: str) -> None:
+    said = CliRunner().invoke(serve, ["--embed", origin])
+    assert said.exit_code == 2
+    assert "is no origin; it takes https://HOST[:PORT] or http://HOST[:PORT]" in said.output

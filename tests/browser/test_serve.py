@@ -5,6 +5,8 @@ from __future__ import annotations
 import signal
 import threading
 import time
+import urllib.error
+import urllib.request
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -63,6 +65,17 @@ def test_serve(open_page: Any, serve: Any) -> None:
     page = open_page(url=serve.url)
     expect(page).to_have_title("wfsobs")
     assert serve.errors(0) == []
+
+
+@pytest.mark.parametrize("path", ["", "liveness", "static/js/bokeh.min.js", "none"])
+def test_every_answer_has_the_headers_that_protect_a_page(serve: Any, path: str) -> None:
+    try:
+        headers = urllib.request.urlopen(serve.url + path).headers
+    except urllib.error.HTTPError as error:
+        headers = error.headers
+    assert headers.get_all("X-Content-Type-Options") == ["nosniff"]
+    assert headers.get_all("Referrer-Policy") == ["same-origin"]
+    assert headers.get_all("Content-Security-Policy") == ["frame-ancestors 'none'"]
 
 
 def test_two_visitors_wait_in_line(visit: Callable[..., Page]) -> None:

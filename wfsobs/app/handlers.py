@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from html import escape
 
 from bokeh.server.session import ServerSession
 from panel.io.server import DocHandler
-from tornado.web import RequestHandler
+from tornado.httputil import HTTPHeaders, HTTPServerRequest
+from tornado.web import OutputTransform, RequestHandler
 
 from wfsobs.app.live_work import live_counts
 from wfsobs.app.ready import NextPage
@@ -43,6 +45,23 @@ class PageHandler(DocHandler):
         self.request.headers.pop("Bokeh-Session-Id", None)
         if len(self.request.query) > LONGEST:  # the page says that it was not used; here it would be sent to and fro
             arguments.clear()
+
+
+class SecurityHeaders(OutputTransform):
+    """Headers of every answer: no guessing of types, no address for other sites, no frame but in the pages named."""
+
+    def __init__(self, embedders: Sequence[str], request: HTTPServerRequest):
+        super().__init__(request)
+        self._ancestors = " ".join(embedders) or "'none'"
+
+    def transform_first_chunk(
+        self, status_code: int, headers: HTTPHeaders, chunk: bytes, finishing: bool
+    ) -> tuple[int, HTTPHeaders, bytes]:
+        """Add them; called by Tornado."""
+        headers["X-Content-Type-Options"] = "nosniff"
+        headers["Referrer-Policy"] = "same-origin"
+        headers["Content-Security-Policy"] = f"frame-ancestors {self._ancestors}"
+        return status_code, headers, chunk
 
 
 class Liveness(RequestHandler):

@@ -22,7 +22,7 @@ from bokeh.util.token import generate_secret_key
 from panel.io.server import DocHandler, get_server
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.handlers import Liveness, PageHandler, full_html
+from wfsobs.app.handlers import Liveness, PageHandler, SecurityHeaders, full_html
 from wfsobs.app.limits import NONE, PUBLIC, Limits
 from wfsobs.app.live_order import LiveOrder
 from wfsobs.app.live_work import share_loop
@@ -57,6 +57,7 @@ class Options:
     """How to serve.
 
     origins    : HOST or HOST:PORT that browsers reach the server by, where it is not the address: behind a proxy
+    embedders  : origins whose pages may show the dashboard in a frame
     prefix     : path of the page, where a proxy serves other things beside it
     runs       : jobs at once, of every kind; 0 for as many as there are processors
     lifetime   : of the settings of a page that is not connected any more, or has never been [s]
@@ -70,6 +71,7 @@ class Options:
     address: str = "localhost"
     open_browser: bool = False
     origins: Sequence[str] = ()
+    embedders: Sequence[str] = ()
     prefix: str = ""
     limits: Limits = NONE
     runs: int = 0
@@ -200,6 +202,7 @@ def make_server(options: Options, service: Service) -> Server:
         check_unused_sessions_milliseconds=round(250 * options.lifetime),
         extra_patterns=[("/liveness", Liveness, {"service": service})],
     )
+    server._tornado.add_transform(partial(SecurityHeaders, options.embedders))  # type: ignore[arg-type]  # called like a class
     router = server._tornado.wildcard_router
     router.rules = [rule for rule in router.rules if not issubclass(rule.target, UNUSED)]
     for rule in router.rules:

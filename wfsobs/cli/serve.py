@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import click
 
 from wfsobs.settings.errors import SettingError
+
+ORIGIN = re.compile(r"https?://(\*\.)?[\w.-]+(:\d+|:\*)?|https?://\[[\da-f:]+\](:\d+)?", re.ASCII | re.IGNORECASE)
+
+
+def _check_embedders(_context: click.Context, _option: click.Parameter, origins: tuple[str, ...]) -> tuple[str, ...]:
+    """Return origins that can stand in a header."""
+    for origin in origins:
+        if not ORIGIN.fullmatch(origin):
+            raise click.BadParameter(f"{origin!r} is no origin; it takes https://HOST[:PORT] or http://HOST[:PORT]")
+    return origins
 
 
 @click.command()
@@ -21,6 +32,14 @@ from wfsobs.settings.errors import SettingError
     multiple=True,
     metavar="HOST[:PORT]",
     help="Host name of the page behind a proxy; can be given many times.",
+)
+@click.option(
+    "--embed",
+    "embedders",
+    multiple=True,
+    metavar="ORIGIN",
+    callback=_check_embedders,
+    help="Origin (https://HOST[:PORT]) whose pages may show this one in a frame; can be given many times. By default none.",
 )
 @click.option("--prefix", default="", metavar="PATH", help="Path of the page behind a proxy.")
 @click.option(
