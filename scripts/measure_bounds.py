@@ -17,6 +17,7 @@ import numpy as np
 
 from wfsobs.app.work import one_blas_thread
 from wfsobs.evaluation.record_bounds import JOINT, joint_observers, record_bounds
+from wfsobs.evaluation.rows import JOINT_BOUNDS
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -36,7 +37,7 @@ def one(name: str, observer: str) -> None:
     scenario = PRESETS[name]()
     first, first_busy = times(scenario, observer)
     again, again_busy = times(scenario.replace({"sensors.lgs_noise": 1.01 * scenario.sensors.lgs_noise}), observer)
-    label = JOINT[observer][0] if observer else "of every mode"
+    label = JOINT_BOUNDS[observer] if observer else "of every mode"
     print(f"{name:20}{label:20}{first:8.2f}{again:8.2f}{first_busy:12.2f}{again_busy:12.2f}", flush=True)
 
 

@@ -167,6 +167,31 @@ def test_the_right_model_has_no_mismatch() -> None:
         assert min(it.terms["noise"], it.terms["lag"]) > 0.05 * it.total
 
 
+BOTH_RIGHT = {
+    "two processes": PRESETS["paper"](),
+    "other beams": PRESETS["ut4"]().replace({"multipeak.turbulence_order": 3, "sensors.kind": "zernike"}),
+}
+
+
+@pytest.mark.parametrize("name", BOTH_RIGHT)
+def test_a_filter_of_both_sensors_whose_model_is_right_has_no_mismatch(name: str) -> None:
+    """With the slow error of the LGS, which both sensors together tell from the turbulence."""
+    for it in budgets(BOTH_RIGHT[name].replace({"run.duration": 4.0}), "multirate-multi"):
+        # The same filter twice: what is left is the precision of the Riccati equation.
+        assert abs(it.terms["mismatch"]) < 1e-6 * it.total, it
+        assert it.terms["noise"] + it.terms["lag"] > 0.5 * it.total
+
+
+def test_the_bound_beside_a_budget_is_that_of_what_the_observer_measures() -> None:
+    scenario = PRESETS["paper"]().replace({"run.duration": 2.0})
+    result = run(scenario, observers=["kf-lgs", "kf-ngs", "multirate-optimal"])
+    least = {(s.observer, s.target, s.mode): s.rms**2 for s in result.scores if s.observer in BOUNDS}
+    own = {"kf-lgs": "bound", "multirate-optimal": "bound-both"}
+    for it in error_budget(result):
+        # No bound of the NGS alone is computed.
+        assert it.bound == (least[own[it.observer], it.target, it.mode] if it.observer in own else None)
+
+
 def test_the_sources_are_the_record() -> None:
     scenario = PRESETS["lost-frames"]().replace({"run.duration": 14.0})
     record = simulate(scenario)

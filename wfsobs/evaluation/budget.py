@@ -23,8 +23,8 @@ import numpy as np
 from wfsobs.evaluation.known_lines import given_lines
 from wfsobs.evaluation.reference_filter import follow_signal
 from wfsobs.evaluation.responses import observer_responses
-from wfsobs.evaluation.rows import NO_ESTIMATE
-from wfsobs.evaluation.scores import BOUND, Score
+from wfsobs.evaluation.rows import NO_ESTIMATE, own_bound
+from wfsobs.evaluation.scores import Score
 from wfsobs.evaluation.sources import CONE, LINES, NOISE, SIGNAL, Source, split_record
 from wfsobs.evaluation.totals import with_total
 from wfsobs.observers import OBSERVERS
@@ -70,7 +70,8 @@ class Budget:
     terms : dict of str to float
         Term -> its part of the total, in the order of TERMS [um^2]; empty where there is no budget.
     bound : float or None
-        Minimum mean square error of any causal observer of the LGS [um^2], a mark beside the terms; None where it is not known.
+        Minimum mean square error of any causal observer of the same measurements [um^2], a mark beside the terms; None where
+        it is not known.
     method : str
         LINEAR or AVERAGED.
     reason : str
@@ -137,7 +138,7 @@ def error_budget(
         own = [s for s in result.scores if s.observer == name and mode in (None, s.mode)]
         if name != NO_ESTIMATE and own:
             values = with_total({e.target: e.values for e in result.estimates if e.observer == name})
-            bounds = {(s.target, s.mode): s.rms**2 for s in result.scores if s.observer == BOUND}
+            bounds = {(s.target, s.mode): s.rms**2 for s in result.scores if s.observer == own_bound(name)}
             if reason := _without_budget(OBSERVERS[name], observers is not None):
                 found = [Budget(s.observer, s.target, s.mode, s.rms**2, reason=reason) for s in own]
             else:

@@ -17,12 +17,10 @@ from wfsobs.evaluation.bound_both import PeriodicError, least_errors_of_both
 from wfsobs.evaluation.bound_modes import least_errors_of_modes
 from wfsobs.evaluation.bound_stars import least_errors_of_stars
 from wfsobs.evaluation.memory import keep_freed_memory
+from wfsobs.evaluation.rows import JOINT_BOUNDS
 from wfsobs.evaluation.scores import (
     BOUND,
-    BOUND_ASTERISM,
     BOUND_BOTH,
-    BOUND_BOTH_MODES,
-    BOUND_MODES,
     BOUND_STARS,
     SCORED,
     Score,
@@ -38,14 +36,14 @@ from wfsobs.simulation.true_spectra import has_known_spectra, true_spectra
 
 Errors = dict[str, LeastError] | dict[str, PeriodicError]
 
-JOINT: Mapping[str, tuple[str, str, Callable[[Scenario], list[dict[str, PeriodicError]]]]] = MappingProxyType(
+JOINT: Mapping[str, tuple[str, Callable[[Scenario], list[dict[str, PeriodicError]]]]] = MappingProxyType(
     {
-        "kf-coupled": (BOUND_MODES, BOUND, least_errors_of_modes),
-        "multirate-coupled": (BOUND_BOTH_MODES, BOUND_BOTH, least_errors_of_modes_of_both),
-        "kf-asterism": (BOUND_ASTERISM, BOUND_STARS, least_errors_of_asterism),
+        "kf-coupled": (BOUND, least_errors_of_modes),
+        "multirate-coupled": (BOUND_BOTH, least_errors_of_modes_of_both),
+        "kf-asterism": (BOUND_STARS, least_errors_of_asterism),
     }
 )
-"""Observer of all modes together -> row of its bound, that of each mode by itself, and how to compute it."""
+"""Observer of JOINT_BOUNDS -> the bound of each mode by itself, and how to compute its own."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +79,7 @@ def record_bounds(scenario: Scenario, record: Record, observers: Collection[str]
     plain = scenario.replace({"run.seed": 0})
     found = [dict(of_mode) for of_mode in _least_of_modes(plain, record.n_modes, record.n_steps)]
     for observer in joint_observers(scenario, observers):
-        row, alone, _ = JOINT[observer]
+        row, alone = JOINT_BOUNDS[observer], JOINT[observer][0]
         for of_mode, errors in zip(found, _least_together(plain, observer), strict=True):
             of_mode[row] = {target: _lesser(error, of_mode.get(alone, {}).get(target)) for target, error in errors.items()}
     return [
@@ -100,7 +98,7 @@ def joint_observers(scenario: Scenario, observers: Collection[str]) -> list[str]
 @lru_cache(maxsize=4)
 def _least_together(scenario: Scenario, observer: str) -> list[dict[str, PeriodicError]]:
     keep_freed_memory()
-    return JOINT[observer][2](scenario)
+    return JOINT[observer][1](scenario)
 
 
 def _lesser(together: PeriodicError, alone: LeastError | PeriodicError | None) -> PeriodicError:

@@ -37,14 +37,28 @@ NOT_OBSERVERS = {
 }
 """Labels of rows in a table of observers that are not observers."""
 
+NO_ESTIMATE = "zero"
+"""The observer that stands for having none; it is never the best, nor worse than itself."""
+
+JOINT_BOUNDS = {"kf-coupled": BOUND_MODES, "multirate-coupled": BOUND_BOTH_MODES, "kf-asterism": BOUND_ASTERISM}
+"""Observers of all modes together, and the bound of what they measure."""
+
+
+def own_bound(observer: str) -> str | None:
+    """Return the bound of the measurements of an observer; None where there is none: it looks ahead, or has the NGS alone.
+
+    >>> own_bound("kf-lgs"), own_bound("multirate-multi"), own_bound("kf-ngs")
+    ('bound', 'bound-both', None)
+    """
+    if observer in NOT_OBSERVERS or observer == NO_ESTIMATE or not OBSERVERS[observer].causal:
+        return None
+    of_sensors = {("lgs",): BOUND, ("lgs", "ngs"): BOUND_BOTH}
+    return JOINT_BOUNDS.get(observer) or of_sensors.get(OBSERVERS[observer].sensors)
+
 
 def target_title(target: str) -> str:
     """Return a target as the beginning of a heading."""
     return "Turbulence and vibration together" if target == TOTAL else target.capitalize()
-
-
-NO_ESTIMATE = "zero"
-"""The observer that stands for having none; it is never the best, nor worse than itself."""
 
 
 def score_rows(scores: Iterable[Score], seed: int | None, *, source: PriorSource = TRUE) -> list[Row]:

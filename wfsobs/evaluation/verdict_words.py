@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wfsobs.evaluation.budget import CONE, LAG, LINES, MISMATCH, NOISE
-from wfsobs.evaluation.rows import row_label
+from wfsobs.evaluation.rows import JOINT_BOUNDS, row_label
 from wfsobs.evaluation.scores import BOUND_ASTERISM, BOUND_BOTH, BOUND_BOTH_MODES, BOUND_MODES
 from wfsobs.observers import OBSERVERS
 from wfsobs.prior import Bands, Lines, Model, Part, Training, asks_for
@@ -24,13 +24,13 @@ TOLD: tuple[tuple[Part, str], ...] = (
 )
 """What is said of an observer by the first part of its prior that is found here."""
 
-OF_BOTH = "LGS and NGS"
-OF_MODES = {
-    "kf-coupled": (BOUND_MODES, "the LGS in all modes"),
-    "multirate-coupled": (BOUND_BOTH_MODES, "LGS and NGS in all modes"),
-    "kf-asterism": (BOUND_ASTERISM, "every LGS in all modes, and NGS"),
+OF_BOUND = {
+    BOUND_BOTH: "LGS and NGS",
+    BOUND_MODES: "the LGS in all modes",
+    BOUND_BOTH_MODES: "LGS and NGS in all modes",
+    BOUND_ASTERISM: "every LGS in all modes, and NGS",
 }
-"""Observers of all modes together: the row of their own bound, and what has it."""
+"""Bounds that an error is compared with, and whose they are."""
 
 CAUSES = {
     NOISE: "noise of the sensors",
@@ -63,8 +63,8 @@ def best_sentence(it: Verdict, scale: float, unit: str) -> str:
 
 def _to_bound(it: Verdict) -> str:
     """Say how far the best error is from the least possible. It is a mean over records, so that one may lie below."""
-    own, words = OF_MODES.get(it.best.observer, (BOUND_BOTH, OF_BOTH))
-    bound = it.bounds.get(own, 0.0)
+    own = JOINT_BOUNDS.get(it.best.observer, BOUND_BOTH)
+    bound, words = it.bounds.get(own, 0.0), OF_BOUND[own]
     if not bound:
         return ""
     percent = round(100.0 * (it.best.rms / bound - 1.0))
