@@ -193,6 +193,16 @@ def test_lag_of_a_sine_is_the_parabola_through_a_cosine(delay: float) -> None:
     assert found == pytest.approx(np.tan(w * delay) / (2 * np.tan(w / 2)) * 1e-3, abs=1e-3 * 1e-3)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_lag_of_a_line_in_an_estimate_is_the_one_nearest_to_zero(seed: int) -> None:
+    """The filter follows a line of 47.5 Hz, 3 ms late, and has some of one of 10 Hz upside down, which makes the correlation a
+    period of 21 ms away the higher one."""
+    rng, dt, t = np.random.default_rng(seed), 1e-3, np.arange(9003) * 1e-3
+    slow, line = (np.cos(2 * np.pi * (f * t + rng.random())) for f in (10.0, 47.5))
+    # 0.3 cos(2 pi 10 Hz tau) beside cos(2 pi 47.5 Hz (tau - 3 ms)) has its slope, 19 / s, at a curvature of 297^2 / s^2: 0.2 ms.
+    assert lag((slow + line)[3:], line[:-3] - 0.3 * slow[3:], dt) == pytest.approx(3e-3, abs=3e-4)
+
+
 def test_lag_does_not_see_scale_offset_or_noise() -> None:
     truth, value = shifted(3.0)
     noisy = 7.0 + 0.01 * value + 0.003 * truth.std() * np.random.default_rng(1).standard_normal(truth.size)

@@ -37,7 +37,10 @@ TERMS: Mapping[str, str] = MappingProxyType(
         NEEDS: (
             "What an observer must be given beside measurements: a model, vibration lines, frequency bands or training data."
         ),
-        LAG: "Delay of the estimate: where its cross-correlation with the truth has its maximum. Negative if the estimate leads.",
+        LAG: (
+            "Delay of the estimate: where its cross-correlation with the truth has its maximum. Negative if the estimate leads. "
+            "Of an oscillation it is known but for whole periods: the one nearest to zero."
+        ),
         REAL_TIME: "Computing time per step over the period of the loop. Below 1 the observer is fast enough for it.",
         STATED: (
             "Standard deviation that the observer's own model gives its estimates. Equal to the RMS error where that model is "

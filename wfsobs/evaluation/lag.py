@@ -17,7 +17,8 @@ def lag(truth: Array, value: Array, dt: float) -> float | None:
 
     The middle of the truth is compared with equally long pieces of the estimate, each with its own mean and variance:
     a plain cross-correlation has fewer terms at larger lags, which biases the broad maximum of a slow signal towards
-    zero. Of maxima within 2 % of the highest, the periods of a pure tone, it is the one nearest to zero.
+    zero. The phase of an oscillation tells its delay but for whole periods: of maxima that reach half of the highest, which
+    may be highest by chance, it is the one nearest to zero.
     """
     reach = min(round(MAX_LAG / dt), (truth.size - 1) // 4)
     middle = truth[reach : truth.size - reach]
@@ -31,7 +32,7 @@ def lag(truth: Array, value: Array, dt: float) -> float | None:
     power = np.maximum(power, 1e-12 * power.max())
     alike = np.correlate(moving, middle - middle.mean(), "valid") / np.sqrt(power)
     inner = alike[1:-1]
-    tops = 1 + np.flatnonzero((inner >= alike[:-2]) & (inner >= alike[2:]) & (inner >= 0.98 * alike.max()))
+    tops = 1 + np.flatnonzero((inner >= alike[:-2]) & (inner >= alike[2:]) & (inner >= 0.5 * alike.max()))
     if tops.size == 0:
         return float((np.argmax(alike) - reach) * dt)
     peak = tops[np.argmin(np.abs(tops - reach))]
