@@ -49,3 +49,12 @@ def read_truth(measured: Measurements, _prior: Prior, _settings: Any, _watch: Wa
 
 
 READS_TRUTH = Observer("reads-truth", "Reads the truth", (VIBRATION,), read_truth)
+
+
+def sleep(measured: Measurements, _prior: Prior, _settings: Any, _watch: Watch) -> dict[str, np.ndarray]:
+    print("asleep", flush=True)
+    time.sleep(600.0)
+    return {VIBRATION: np.zeros_like(measured.z)}
+
+
+SLEEPS = Observer("sleeps", "Sleeps", (VIBRATION,), sleep)

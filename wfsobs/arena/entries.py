@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -16,6 +18,7 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
 from wfsobs.settings.errors import SettingError
+from wfsobs.testing.common import error_line
 
 REGISTERED, CHALLENGER, MODULE, FOLDER = "registered", "challenger", "module", "folder"
 
@@ -100,11 +103,13 @@ def load_object(entry: ArenaEntry) -> Any:
 
 
 def _from_module(name: str) -> Any:
+    if (here := os.getcwd()) not in sys.path:  # as `python -m` has it; processes that are started take over the list
+        sys.path.insert(0, here)
     module, _, attribute = name.partition(":")
     try:
         algorithm = getattr(import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise SettingError(f"--entry {name}: cannot be imported: {error}") from None
+    except Exception as error:
+        raise SettingError(f"--entry {name}: cannot be imported: {error_line(error)}") from None
     kinds = (OBSERVERS.kind, CONTROLLERS.kind)
     if not isinstance(algorithm, kinds):
         raise SettingError(f"--entry {name}: takes an Observer or a Controller, not a {type(algorithm).__name__}")

@@ -8,11 +8,11 @@ from __future__ import annotations
 import io
 import os
 import signal
-import sys
 from collections.abc import Mapping
 from contextlib import suppress
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection
+from threading import Thread
 from time import perf_counter
 from types import TracebackType
 from typing import Any, NamedTuple, Self
@@ -22,6 +22,10 @@ import numpy as np
 from wfsobs.arena.entries import ArenaEntry, load_object
 from wfsobs.observers.base import Observer
 from wfsobs.observers.estimates import NEXT_Z, TOTAL
+from wfsobs.progress import Watch
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.testing import QUICK, CheckError, check_controller, check_observer
+from wfsobs.testing.common import error_line
 from wfsobs.typing import Array
 
 READY_TIME = 120.0
@@ -71,7 +75,7 @@ class EntryProcess:
         self._end()
 
     def check(self, seconds: float) -> None:
-        """Check the rules for all entries in the process. Raises EntryError."""
+        """Check the rules for all entries in the process. Raises EntryError, also where a run takes more than this time [s]."""
         self._ask(CHECK, seconds)
 
     def run(self, seconds: float, *arguments: Any) -> Answer:
@@ -84,22 +88,22 @@ class EntryProcess:
         try:
             self._connection.send(message)
             return _read(self._receive(seconds))
-        except EOFError:
-            raise EntryError(f"its process ended, with exit status {self._end()}") from None
-        except BrokenPipeError:
+        except (EOFError, ConnectionError):
             raise EntryError(f"its process ended, with exit status {self._end()}") from None
 
     def _receive(self, seconds: float) -> bytes:
-        if not self._connection.poll(seconds):
-            self._end()
-            raise EntryError(f"too slow: no answer after {seconds:g} s")
-        return self._connection.recv_bytes()
+        """Return the next answer; with an empty message begins another run of the checks, and its time."""
+        while self._connection.poll(seconds):
+            if data := self._connection.recv_bytes():
+                return data
+        self._end()
+        raise EntryError(f"too slow: no answer after {seconds:g} s")
 
     def _start(self) -> None:
         os.environ["OPENBLAS_NUM_THREADS"] = "1"  # inherited, and read when it imports numpy
         context = get_context("spawn")
         self._connection, theirs = context.Pipe()
-        process = context.Process(target=serve, args=(theirs, self.entry, self.memory, os.getcwd()))
+        process = context.Process(target=serve, args=(theirs, self.entry, self.memory))
         process.start()
         self._process = process
         theirs.close()
@@ -118,14 +122,17 @@ class EntryProcess:
         return process.exitcode
 
 
-def serve(connection: Connection, entry: ArenaEntry, memory: float, folder: str) -> None:
+def serve(connection: Connection, entry: ArenaEntry, memory: float) -> None:
     """Answer what is asked until the connection ends; the main function of the process."""
-    import wfsobs.testing  # noqa: F401  the limit is for what comes after
-
     if hasattr(os, "setpgid"):
         os.setpgid(0, 0)
-    sys.path.insert(0, folder)
+    Thread(target=_end_with_parent, daemon=True).start()
     _limit_memory(memory)
+
+    def begin_run() -> bool:
+        connection.send_bytes(b"")
+        return False
+
     algorithm: Any = None
     message: Any = None
     while True:
@@ -134,7 +141,7 @@ def serve(connection: Connection, entry: ArenaEntry, memory: float, folder: str)
                 algorithm = load_object(entry)
                 answer = {}
             elif message == CHECK:
-                check(algorithm)
+                check(algorithm, Watch(is_cancelled=begin_run))
                 answer = {}
             else:
                 start = perf_counter()
@@ -143,7 +150,7 @@ def serve(connection: Connection, entry: ArenaEntry, memory: float, folder: str)
         except MemoryError:
             answer = {"reason": np.array(f"too large: needs more than {memory:g} GB of memory")}
         except Exception as error:
-            answer = {"reason": np.array(reason(error))}
+            answer = {"reason": np.array(error_line(error))}
         file = io.BytesIO()
         np.savez(file, **answer)  # pyright: ignore[reportArgumentType]
         connection.send_bytes(file.getvalue())
@@ -153,24 +160,14 @@ def serve(connection: Connection, entry: ArenaEntry, memory: float, folder: str)
             return
 
 
-def reason(error: Exception) -> str:
-    """Return the reason of an error in one line; an error of the code has its type."""
-    text = " ".join(str(error).split())
-    return text if isinstance(error, (ValueError, AssertionError)) and text else f"{type(error).__name__}: {text}"
-
-
-def check(algorithm: Any) -> None:
+def check(algorithm: Any, watch: Watch) -> None:
     """Check the rules for observers or controllers. Raises CheckError, ValueError."""
-    from wfsobs.testing import QUICK, CheckError, check_controller, check_observer
-
     if not isinstance(algorithm, Observer):
-        check_controller(algorithm)
+        check_controller(algorithm, watch=watch)
         return
     if not algorithm.causal:
         raise CheckError(f"{algorithm.id}: looks ahead, as it says itself")
-    from wfsobs.scenario.presets import PRESETS
-
-    check_observer(algorithm, PRESETS["paper"]().replace({**QUICK, "vibration.synthesis": "gaussian"}))
+    check_observer(algorithm, PRESETS["paper"]().replace({**QUICK, "vibration.synthesis": "gaussian"}), watch=watch)
 
 
 def solve(algorithm: Any, *arguments: Any) -> dict[str, Array]:
@@ -200,6 +197,15 @@ def _kill_group(leader: int) -> None:
     if hasattr(os, "killpg"):
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(leader, signal.SIGKILL)
+
+
+def _end_with_parent() -> None:
+    """End the process and what it has started once the arena has ended, however that came."""
+    parent = parent_process()
+    assert parent is not None
+    parent.join()
+    _kill_group(os.getpid())
+    os._exit(1)
 
 
 def _limit_memory(gigabytes: float) -> None:

@@ -76,7 +76,7 @@ def run(
     for track in values["tracks"]:
         show_table(_table(track))
     for one in values["refused"]:
-        click.echo(f"refused: {one['reason']}")
+        click.echo(f"{one['entry']}: refused: {one['reason']}")
     click.echo(f"wfsobs: {folder / 'index.html'}: written", err=True)
 
 

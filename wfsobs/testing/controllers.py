@@ -17,13 +17,23 @@ from wfsobs.control.law import Law
 from wfsobs.control.mirror import Plant
 from wfsobs.prior import Prior
 from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
+from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
-from wfsobs.testing.common import QUICK, SAME, CheckError, change_from, in_a_fresh_process
+from wfsobs.testing.common import (
+    QUICK,
+    SAME,
+    CheckError,
+    changed_after,
+    check_numbers,
+    in_a_fresh_process,
+    reported,
+    steps_to_check,
+)
 from wfsobs.testing.reach import SEED, given_away, walk_references
-from wfsobs.testing.steps import run_loop
+from wfsobs.testing.steps import STEPS, run_loop
 from wfsobs.typing import Array
 
 LOST = 7
@@ -39,7 +49,44 @@ class ControllerInputs(NamedTuple):
     settings: Settings
 
 
-def check_controller(controller: Controller, scenario: Scenario | None = None, alone: bool = True) -> None:
+class Subject(NamedTuple):
+    """A controller that is checked, and what is asked before each of its runs whether to stop."""
+
+    controller: Controller
+    watch: Watch
+
+    def laws(self, given: ControllerInputs) -> tuple[Law, ...]:
+        """Return its laws, which are stable. Raises CheckError."""
+        id_ = self.controller.id
+        with reported(id_, self.watch):
+            laws = _laws(self.controller, given)
+            for law in laws:
+                if not isinstance(law, Law):
+                    raise CheckError(f"{id_}: law takes a wfsobs.control.law.Law, not a {type(law).__name__}")
+                if not law.stable:
+                    raise CheckError(f"{id_}: a pole of its closed loop is not within the unit circle")
+        return laws
+
+    def commands(self, given: ControllerInputs, then: str = "") -> Array:
+        """Return its commands, numbers of the right shape; then : when they were none. Raises CheckError."""
+        id_ = self.controller.id
+        with reported(id_, self.watch):
+            u = _commands(self.controller, given)
+            check_numbers(id_, "its command", u, given.measurements.y_lgs.shape)
+            if not np.isfinite(u).all():
+                raise CheckError(f"{id_}: a command is NaN or infinite{then}")
+        return u
+
+    def compare(self, got: Array, base: Array, what: str, stop: int | None = None, *, exact: bool = False) -> None:
+        """Raise CheckError where two results differ before a step by more than rounding."""
+        bound = 0.0 if exact else SAME * float(np.std(base))
+        if not np.allclose(got[:stop], base[:stop], rtol=0.0, atol=bound):
+            raise CheckError(f"{self.controller.id}: {what}")
+
+
+def check_controller(
+    controller: Controller, scenario: Scenario | None = None, alone: bool = True, *, watch: Watch = QUIET
+) -> None:
     """Run a controller on a short simulated record and check what holds for all of them.
 
     It reaches neither truth nor scenario nor seed. Its laws are stable. Its commands are numbers of the shape of the measurements
@@ -55,33 +102,37 @@ def check_controller(controller: Controller, scenario: Scenario | None = None, a
         What is simulated, 1.5 s of the preset paper unless given; its seed is replaced by one that can be recognised.
     alone
         Whether to start the fresh process; a script that does needs the guard `if __name__ == "__main__"`.
+    watch
+        Is asked before every run of the controller whether to stop.
 
     Raises
     ------
     CheckError
-        With the rule that it does not keep.
+        With the rule that it does not keep, or the error that it raises.
     ValueError
-        Where the controller has no law for the scenario.
+        Where the scenario has no prior for the controller.
+    Cancelled
+        Where `watch` asks to stop.
     """
     s = (scenario or PRESETS["paper"]().replace(QUICK)).replace({"run.seed": SEED})
     record = simulate(s)
     given = _inputs(controller, record, s)
-    laws = _check_laws(controller, given)
-    if found := given_away(record, controller, laws, *given):
+    subject = Subject(controller, watch)
+    if found := given_away(record, controller, subject.laws(given), *given):
         raise CheckError(f"{controller.id}: uses more than it is given: it reaches {', '.join(sorted(found))}")
-    base = _commands(controller, given)
-    _check_shape(controller, base, given.measurements)
+    base = subject.commands(given)
     again = _inputs(controller, record, s)
     twice = "run twice on the same measurements it gives two results: it keeps something between runs, or draws random numbers"
-    _compare(controller, _commands(controller, again), base, twice, exact=True)
+    subject.compare(subject.commands(again), base, twice, exact=True)
     _check_untouched(controller, given, _inputs(controller, record, s))
-    _check_causal(controller, given, base)
-    _check_gaps(controller, given)
-    _check_steps(controller, given)
+    _check_causal(subject, given, base)
+    _check_gaps(subject, given)
+    _check_steps(subject, given)
     if alone:
-        there = in_a_fresh_process(controller.id, _commands, controller, again)
+        there = in_a_fresh_process(controller.id, watch, _commands, controller, again)
+        check_numbers(controller.id, "its command", there, base.shape)
         what = "in a fresh process, with measurements and prior alone, it commands something else: it uses more than it is given"
-        _compare(controller, there, base, what)
+        subject.compare(there, base, what)
 
 
 def _inputs(controller: Controller, record: Record, scenario: Scenario) -> ControllerInputs:
@@ -95,28 +146,7 @@ def _laws(controller: Controller, inputs: ControllerInputs) -> tuple[Law, ...]:
 
 
 def _commands(controller: Controller, inputs: ControllerInputs) -> Array:
-    laws = _laws(controller, inputs)
-    try:
-        return controller.commands(laws, *inputs)[0]
-    except ValueError as error:
-        raise CheckError(f"{controller.id}: cannot run: {error}") from error
-
-
-def _check_laws(controller: Controller, inputs: ControllerInputs) -> tuple[Law, ...]:
-    laws = _laws(controller, inputs)
-    for law in laws:
-        if not isinstance(law, Law):
-            raise CheckError(f"{controller.id}: law takes a wfsobs.control.law.Law, not a {type(law).__name__}")
-        if not law.stable:
-            raise CheckError(f"{controller.id}: a pole of its closed loop is not within the unit circle")
-    return laws
-
-
-def _check_shape(controller: Controller, u: Any, measurements: Measurements) -> None:
-    if not isinstance(u, np.ndarray) or u.dtype != float or u.shape != measurements.y_lgs.shape:
-        raise CheckError(f"{controller.id}: its commands take numbers of shape {measurements.y_lgs.shape}, (n_steps, n_modes)")
-    if not np.isfinite(u).all():
-        raise CheckError(f"{controller.id}: a command is NaN or infinite")
+    return controller.commands(_laws(controller, inputs), *inputs)[0]
 
 
 def _check_untouched(controller: Controller, inputs: ControllerInputs, fresh: ControllerInputs) -> None:
@@ -134,48 +164,36 @@ def _settings(own: Any) -> dict[str, Any]:
     return {name: group.to_dict() for name, group in vars(own).items()}
 
 
-def _check_causal(controller: Controller, inputs: ControllerInputs, base: Array) -> None:
+def _check_causal(subject: Subject, inputs: ControllerInputs, base: Array) -> None:
     """Check that u[k] uses y[0..k] and u[0..k-1] alone."""
-    measured, n = inputs.measurements, inputs.measurements.n_steps
-    for k in (n // 2, n // 2 + 3, n - 5):
-        rng = np.random.default_rng(k)
-        later = replace(
-            measured,
-            y_lgs=change_from(measured.y_lgs, k + 1, rng),
-            u=change_from(measured.u, k, rng),
-            y_ngs=None if measured.y_ngs is None else change_from(measured.y_ngs, k + 1, rng),
-        )
+    measured = inputs.measurements
+    for k in steps_to_check(measured.n_steps):
         what = f"looks ahead: measurements after step {k} change its command of that step or an earlier one"
-        _compare(controller, _commands(controller, inputs._replace(measurements=later)), base, what, stop=k + 1)
+        later = inputs._replace(measurements=changed_after(measured, k, commands_from=0))
+        subject.compare(subject.commands(later), base, what, stop=k + 1)
 
 
-def _check_gaps(controller: Controller, inputs: ControllerInputs) -> None:
-    y, start = inputs.measurements.y_lgs.copy(), inputs.measurements.n_steps // 2
+def _check_gaps(subject: Subject, inputs: ControllerInputs) -> None:
+    gap = _with_gap(inputs.measurements)
+    u = subject.commands(inputs._replace(measurements=gap), " after missing samples")
+    if subject.controller.law is not None and not np.ptp(u[gap.n_steps // 2 + LOST :], axis=0).any():
+        raise CheckError(f"{subject.controller.id}: does not recover after missing samples")
+
+
+def _with_gap(measured: Measurements) -> Measurements:
+    """Return measurements without LOST samples in the middle."""
+    y, start = measured.y_lgs.copy(), measured.n_steps // 2
     y[start : start + LOST] = np.nan
-    u = _commands(controller, inputs._replace(measurements=replace(inputs.measurements, y_lgs=y)))
-    if not np.isfinite(u).all():
-        raise CheckError(f"{controller.id}: a command is NaN or infinite after missing samples")
-    if controller.law is not None and not np.ptp(u[start + LOST :], axis=0).any():
-        raise CheckError(f"{controller.id}: does not recover after missing samples")
+    return replace(measured, y_lgs=y)
 
 
-def _check_steps(controller: Controller, inputs: ControllerInputs) -> None:
+def _check_steps(subject: Subject, inputs: ControllerInputs) -> None:
     """Check that frame by frame it commands what it commands over a record, unless it cannot run frame by frame."""
+    controller = subject.controller
     if controller.predict is not None and controller.step_predict is None:
         return
-    y, start = inputs.measurements.y_lgs.copy(), inputs.measurements.n_steps // 2
-    y[start : start + LOST] = np.nan
-    measured = replace(inputs.measurements, y_lgs=y)
-    got = run_loop(controller.design(inputs.prior, inputs.plant, inputs.settings, measured.sampling), measured)
-    _compare(
-        controller,
-        got,
-        _commands(controller, inputs._replace(measurements=measured)),
-        "frame by frame it commands something else",
-    )
-
-
-def _compare(controller: Controller, got: Array, base: Array, what: str, stop: int | None = None, exact: bool = False) -> None:
-    bound = 0.0 if exact else SAME * float(np.std(base))
-    if not np.allclose(got[:stop], base[:stop], rtol=0.0, atol=bound):
-        raise CheckError(f"{controller.id}: {what}")
+    measured = _with_gap(inputs.measurements)
+    with reported(controller.id, subject.watch, STEPS):
+        got = run_loop(controller.design(inputs.prior, inputs.plant, inputs.settings, measured.sampling), measured)
+    base = subject.commands(inputs._replace(measurements=measured))
+    subject.compare(got, base, "frame by frame it commands something else")

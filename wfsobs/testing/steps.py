@@ -12,11 +12,14 @@ from wfsobs.control.step import StepController
 from wfsobs.observers.base import Observer
 from wfsobs.observers.step import StepObserver
 from wfsobs.prior import Prior
+from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, hold_last
-from wfsobs.testing.common import SAME, CheckError
+from wfsobs.testing.common import SAME, CheckError, reported
 from wfsobs.typing import Array
 
 Estimates = dict[str, Array]
+
+STEPS = "cannot run frame by frame"
 
 
 def run_steps(observer: StepObserver, measurements: Measurements, steps: Iterable[int] | None = None) -> Estimates:
@@ -71,7 +74,7 @@ def step_difference(observer: Observer, measurements: Measurements, prior: Prior
     return worst
 
 
-def check_steps(observer: Observer, measurements: Measurements, prior: Prior, settings: Any) -> None:
+def check_steps(observer: Observer, measurements: Measurements, prior: Prior, settings: Any, watch: Watch = QUIET) -> None:
     """Check an observer that can run frame by frame.
 
     After every frame its estimate is that of its run over the record, gaps included. It goes on from a saved state as if there
@@ -87,22 +90,23 @@ def check_steps(observer: Observer, measurements: Measurements, prior: Prior, se
     y, half = measurements.y_lgs.copy(), measurements.n_steps // 2
     y[half : half + 7] = np.nan
     measurements = replace(measurements, y_lgs=y)
-    if not step_difference(observer, measurements, prior, settings) <= SAME:
+    with reported(observer.id, watch, STEPS):
+        difference = step_difference(observer, measurements, prior, settings)
+    if not difference <= SAME:
         raise CheckError(f"{observer.id}: frame by frame its estimate is not that of its run over the record")
-    ours, other = (observer.design(prior, settings, measurements.sampling) for _ in range(2))
-    base = run_steps(ours, measurements)
-    run_steps(other, measurements, range(half))
-    ours.reset()
-    ours.load_state_dict(other.state_dict())
-    _compare(
-        observer,
-        run_steps(ours, measurements, range(half, measurements.n_steps)),
-        base,
-        half,
-        "from a saved state it goes on elsewhere",
-    )
-    ours.reset()
-    _compare(observer, run_steps(ours, measurements), base, 0, "after a reset it is not what it was at the start")
+    with reported(observer.id, watch, STEPS):
+        ours, other = (observer.design(prior, settings, measurements.sampling) for _ in range(2))
+        base = run_steps(ours, measurements)
+    with reported(observer.id, watch, STEPS):
+        run_steps(other, measurements, range(half))
+        ours.reset()
+        ours.load_state_dict(other.state_dict())
+        got = run_steps(ours, measurements, range(half, measurements.n_steps))
+    _compare(observer, got, base, half, "from a saved state it goes on elsewhere")
+    with reported(observer.id, watch, STEPS):
+        ours.reset()
+        got = run_steps(ours, measurements)
+    _compare(observer, got, base, 0, "after a reset it is not what it was at the start")
 
 
 def _compare(observer: Observer, got: Estimates, base: Estimates, start: int, what: str) -> None:
