@@ -36,7 +36,7 @@ class CheckError(AssertionError):
 
 
 @contextmanager
-def reported(name: str, watch: Watch, what: str = "cannot run") -> Iterator[None]:
+def report_errors(name: str, watch: Watch, what: str = "cannot run") -> Iterator[None]:
     """Raise CheckError for whatever is raised inside; ask first whether to stop."""
     watch.check()
     try:
@@ -62,9 +62,9 @@ def check_numbers(name: str, what: str, values: Any, shape: tuple[int, ...]) -> 
         raise CheckError(f"{name}: {what} takes the shape {shape}, (n_steps, n_modes), not {values.shape}")
 
 
-def arrays_of(measured: Measurements) -> dict[str, Array]:
+def arrays_of(measurements: Measurements) -> dict[str, Array]:
     """Return every array of measurements by name."""
-    return {name: x for name, x in vars(measured).items() if isinstance(x, np.ndarray)}
+    return {name: x for name, x in vars(measurements).items() if isinstance(x, np.ndarray)}
 
 
 RESIDUES = 7
@@ -85,11 +85,13 @@ def steps_to_check(n: int) -> list[int]:
     return [min(int(rng.integers(10)), last), min(int(rng.integers(10, 100)), last), *spread]
 
 
-def changed_after(measured: Measurements, step: int, *, commands_from: int = 1) -> Measurements:
+def changed_after(measurements: Measurements, step: int, *, commands_from: int = 1) -> Measurements:
     """Return measurements with other numbers in every array after a step; commands_from : of u, steps from there on."""
     rng = np.random.default_rng(step)
     first = {"u": step + commands_from}
-    return replace(measured, **{name: _change_from(x, first.get(name, step + 1), rng) for name, x in arrays_of(measured).items()})
+    return replace(
+        measurements, **{name: _change_from(x, first.get(name, step + 1), rng) for name, x in arrays_of(measurements).items()}
+    )
 
 
 def _change_from(x: Array, start: int, rng: np.random.Generator) -> Array:
@@ -108,7 +110,7 @@ def in_a_fresh_process(name: str, watch: Watch, run: Callable[..., R], *argument
     Raises CheckError where they cannot be sent, or it fails there.
     """
     with (
-        reported(name, watch, "cannot run in a fresh process"),
+        report_errors(name, watch, "cannot run in a fresh process"),
         ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool,
     ):
         return pool.submit(run, *arguments).result()

@@ -29,7 +29,7 @@ from wfsobs.testing.common import (
     changed_after,
     check_numbers,
     in_a_fresh_process,
-    reported,
+    report_errors,
     steps_to_check,
 )
 from wfsobs.testing.reach import SEED, given_away, walk_references
@@ -49,17 +49,17 @@ class ControllerInputs(NamedTuple):
     settings: Settings
 
 
-class Subject(NamedTuple):
+class ControllerRuns(NamedTuple):
     """A controller that is checked, and what is asked before each of its runs whether to stop."""
 
     controller: Controller
     watch: Watch
 
-    def laws(self, given: ControllerInputs) -> tuple[Law, ...]:
+    def laws(self, inputs: ControllerInputs) -> tuple[Law, ...]:
         """Return its laws, which are stable. Raises CheckError."""
         id_ = self.controller.id
-        with reported(id_, self.watch):
-            laws = _laws(self.controller, given)
+        with report_errors(id_, self.watch):
+            laws = _laws(self.controller, inputs)
             for law in laws:
                 if not isinstance(law, Law):
                     raise CheckError(f"{id_}: law takes a wfsobs.control.law.Law, not a {type(law).__name__}")
@@ -67,12 +67,12 @@ class Subject(NamedTuple):
                     raise CheckError(f"{id_}: a pole of its closed loop is not within the unit circle")
         return laws
 
-    def commands(self, given: ControllerInputs, then: str = "") -> Array:
+    def commands(self, inputs: ControllerInputs, then: str = "") -> Array:
         """Return its commands, numbers of the right shape; then : when they were none. Raises CheckError."""
         id_ = self.controller.id
-        with reported(id_, self.watch):
-            u = _commands(self.controller, given)
-            check_numbers(id_, "its command", u, given.measurements.y_lgs.shape)
+        with report_errors(id_, self.watch):
+            u = _commands(self.controller, inputs)
+            check_numbers(id_, "its command", u, inputs.measurements.y_lgs.shape)
             if not np.isfinite(u).all():
                 raise CheckError(f"{id_}: a command is NaN or infinite{then}")
         return u
@@ -117,22 +117,22 @@ def check_controller(
     s = (scenario or PRESETS["paper"]().replace(QUICK)).replace({"run.seed": SEED})
     record = simulate(s)
     given = _inputs(controller, record, s)
-    subject = Subject(controller, watch)
-    if found := given_away(record, controller, subject.laws(given), *given):
+    runs = ControllerRuns(controller, watch)
+    if found := given_away(record, controller, runs.laws(given), *given):
         raise CheckError(f"{controller.id}: uses more than it is given: it reaches {', '.join(sorted(found))}")
-    base = subject.commands(given)
+    base = runs.commands(given)
     again = _inputs(controller, record, s)
     twice = "run twice on the same measurements it gives two results: it keeps something between runs, or draws random numbers"
-    subject.compare(subject.commands(again), base, twice, exact=True)
+    runs.compare(runs.commands(again), base, twice, exact=True)
     _check_untouched(controller, given, _inputs(controller, record, s))
-    _check_causal(subject, given, base)
-    _check_gaps(subject, given)
-    _check_steps(subject, given)
+    _check_causal(runs, given, base)
+    _check_gaps(runs, given)
+    _check_steps(runs, given)
     if alone:
         there = in_a_fresh_process(controller.id, watch, _commands, controller, again)
         check_numbers(controller.id, "its command", there, base.shape)
         what = "in a fresh process, with measurements and prior alone, it commands something else: it uses more than it is given"
-        subject.compare(there, base, what)
+        runs.compare(there, base, what)
 
 
 def _inputs(controller: Controller, record: Record, scenario: Scenario) -> ControllerInputs:
@@ -164,36 +164,36 @@ def _settings(own: Any) -> dict[str, Any]:
     return {name: group.to_dict() for name, group in vars(own).items()}
 
 
-def _check_causal(subject: Subject, inputs: ControllerInputs, base: Array) -> None:
+def _check_causal(runs: ControllerRuns, inputs: ControllerInputs, base: Array) -> None:
     """Check that u[k] uses y[0..k] and u[0..k-1] alone."""
     measured = inputs.measurements
     for k in steps_to_check(measured.n_steps):
         what = f"looks ahead: measurements after step {k} change its command of that step or an earlier one"
         later = inputs._replace(measurements=changed_after(measured, k, commands_from=0))
-        subject.compare(subject.commands(later), base, what, stop=k + 1)
+        runs.compare(runs.commands(later), base, what, stop=k + 1)
 
 
-def _check_gaps(subject: Subject, inputs: ControllerInputs) -> None:
+def _check_gaps(runs: ControllerRuns, inputs: ControllerInputs) -> None:
     gap = _with_gap(inputs.measurements)
-    u = subject.commands(inputs._replace(measurements=gap), " after missing samples")
-    if subject.controller.law is not None and not np.ptp(u[gap.n_steps // 2 + LOST :], axis=0).any():
-        raise CheckError(f"{subject.controller.id}: does not recover after missing samples")
+    u = runs.commands(inputs._replace(measurements=gap), " after missing samples")
+    if runs.controller.law is not None and not np.ptp(u[gap.n_steps // 2 + LOST :], axis=0).any():
+        raise CheckError(f"{runs.controller.id}: does not recover after missing samples")
 
 
-def _with_gap(measured: Measurements) -> Measurements:
+def _with_gap(measurements: Measurements) -> Measurements:
     """Return measurements without LOST samples in the middle."""
-    y, start = measured.y_lgs.copy(), measured.n_steps // 2
+    y, start = measurements.y_lgs.copy(), measurements.n_steps // 2
     y[start : start + LOST] = np.nan
-    return replace(measured, y_lgs=y)
+    return replace(measurements, y_lgs=y)
 
 
-def _check_steps(subject: Subject, inputs: ControllerInputs) -> None:
+def _check_steps(runs: ControllerRuns, inputs: ControllerInputs) -> None:
     """Check that frame by frame it commands what it commands over a record, unless it cannot run frame by frame."""
-    controller = subject.controller
+    controller = runs.controller
     if controller.predict is not None and controller.step_predict is None:
         return
     measured = _with_gap(inputs.measurements)
-    with reported(controller.id, subject.watch, STEPS):
+    with report_errors(controller.id, runs.watch, STEPS):
         got = run_loop(controller.design(inputs.prior, inputs.plant, inputs.settings, measured.sampling), measured)
-    base = subject.commands(inputs._replace(measurements=measured))
-    subject.compare(got, base, "frame by frame it commands something else")
+    base = runs.commands(inputs._replace(measurements=measured))
+    runs.compare(got, base, "frame by frame it commands something else")

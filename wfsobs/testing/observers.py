@@ -28,23 +28,23 @@ from wfsobs.testing.common import (
     changed_after,
     check_numbers,
     in_a_fresh_process,
-    reported,
+    report_errors,
     steps_to_check,
 )
 from wfsobs.testing.steps import Estimates, check_steps
 
 
-class Subject(NamedTuple):
+class ObserverRuns(NamedTuple):
     """An observer that is checked, and what is asked before each of its runs whether to stop."""
 
     observer: Observer
     watch: Watch
 
-    def estimate(self, *given: Any) -> Estimates:
+    def estimate(self, *arguments: Any) -> Estimates:
         """Return what it estimates, in arrays of the right shape. Raises CheckError."""
-        with reported(self.observer.id, self.watch):
-            found = self.observer.estimate(*given)
-            _check_shapes(self.observer, found, given[0])
+        with report_errors(self.observer.id, self.watch):
+            found = self.observer.estimate(*arguments)
+            _check_shapes(self.observer, found, arguments[0])
         return found
 
     def compare(self, got: Estimates, base: Estimates, what: str, stop: int | None = None, *, exact: bool = False) -> None:
@@ -87,30 +87,30 @@ def check_observer(observer: Observer, scenario: Scenario | None = None, alone: 
     record = simulate(s)
     if missing := observer.missing(record):
         raise CheckError(f"{observer.id}: needs {', '.join(missing)}, which no record has")
-    subject = Subject(observer, watch)
+    runs = ObserverRuns(observer, watch)
     given = arguments(observer, record, s)
-    base = subject.estimate(*given)
+    base = runs.estimate(*given)
     if empty := [target for target in observer.targets if np.isnan(base[target]).all()]:
         raise CheckError(f"{observer.id}: {empty[0]} has no estimate in any step")
     again = arguments(observer, record, s)
-    subject.compare(subject.estimate(*again), base, "run twice on the same measurements it gives two results", exact=True)
+    runs.compare(runs.estimate(*again), base, "run twice on the same measurements it gives two results", exact=True)
     _check_untouched(observer, given[0], observer.measurements(record))
     if observer.causal:
-        _check_causal(subject, given, base)
-    _check_gaps(subject, given)
+        _check_causal(runs, given, base)
+    _check_gaps(runs, given)
     check_steps(observer, *given, watch=watch)
     if alone:
         there = in_a_fresh_process(observer.id, watch, _run, observer, *again)
         _check_shapes(observer, there, given[0])
         what = "in a fresh process, with measurements and prior alone, it gives another result: it uses more than it is given"
-        subject.compare(there, base, what)
+        runs.compare(there, base, what)
 
 
-def _check_shapes(observer: Observer, found: Estimates, measurements: Measurements) -> None:
+def _check_shapes(observer: Observer, estimates: Estimates, measurements: Measurements) -> None:
     for target in observer.targets:
         if target not in TARGETS:
             raise CheckError(f"{observer.id}: target {target!r} is none of {', '.join(TARGETS)}")
-        values = found.get(target)
+        values = estimates.get(target)
         if values is None:
             raise CheckError(f"{observer.id}: returns no {target}")
         check_numbers(observer.id, target, values, measurements.y_lgs.shape)
@@ -125,22 +125,22 @@ def _check_untouched(observer: Observer, measurements: Measurements, fresh: Meas
             raise CheckError(f"{observer.id}: changes its measurements ({name})")
 
 
-def _check_causal(subject: Subject, arguments: tuple[Measurements, Prior, Any], base: Estimates) -> None:
+def _check_causal(runs: ObserverRuns, arguments: tuple[Measurements, Prior, Any], base: Estimates) -> None:
     """phi_hat[k] may use y[0..k] and u[0..k], see `wfsobs.observers.base`."""
     measured, *rest = arguments
     for k in steps_to_check(measured.n_steps):
         what = f"looks ahead: measurements after step {k} change its estimate of that step or an earlier one"
-        subject.compare(subject.estimate(changed_after(measured, k), *rest), base, what, stop=k + 1)
+        runs.compare(runs.estimate(changed_after(measured, k), *rest), base, what, stop=k + 1)
 
 
-def _check_gaps(subject: Subject, arguments: tuple[Measurements, Prior, Any]) -> None:
+def _check_gaps(runs: ObserverRuns, arguments: tuple[Measurements, Prior, Any]) -> None:
     measured, *rest = arguments
     y, start = measured.y_lgs.copy(), measured.n_steps // 2
     y[start : start + 7] = np.nan
-    found = subject.estimate(replace(measured, y_lgs=y), *rest)
-    for target in subject.observer.targets:
+    found = runs.estimate(replace(measured, y_lgs=y), *rest)
+    for target in runs.observer.targets:
         if np.isnan(found[target][start + 1 :]).all():
-            raise CheckError(f"{subject.observer.id}: {target} does not recover after missing samples")
+            raise CheckError(f"{runs.observer.id}: {target} does not recover after missing samples")
 
 
 def _run(observer: Observer, *arguments: Any) -> Estimates:

@@ -14,7 +14,7 @@ from wfsobs.observers.step import StepObserver
 from wfsobs.prior import Prior
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, hold_last
-from wfsobs.testing.common import SAME, CheckError, reported
+from wfsobs.testing.common import SAME, CheckError, report_errors
 from wfsobs.typing import Array
 
 Estimates = dict[str, Array]
@@ -90,20 +90,20 @@ def check_steps(observer: Observer, measurements: Measurements, prior: Prior, se
     y, half = measurements.y_lgs.copy(), measurements.n_steps // 2
     y[half : half + 7] = np.nan
     measurements = replace(measurements, y_lgs=y)
-    with reported(observer.id, watch, STEPS):
+    with report_errors(observer.id, watch, STEPS):
         difference = step_difference(observer, measurements, prior, settings)
     if not difference <= SAME:
         raise CheckError(f"{observer.id}: frame by frame its estimate is not that of its run over the record")
-    with reported(observer.id, watch, STEPS):
+    with report_errors(observer.id, watch, STEPS):
         ours, other = (observer.design(prior, settings, measurements.sampling) for _ in range(2))
         base = run_steps(ours, measurements)
-    with reported(observer.id, watch, STEPS):
+    with report_errors(observer.id, watch, STEPS):
         run_steps(other, measurements, range(half))
         ours.reset()
         ours.load_state_dict(other.state_dict())
         got = run_steps(ours, measurements, range(half, measurements.n_steps))
     _compare(observer, got, base, half, "from a saved state it goes on elsewhere")
-    with reported(observer.id, watch, STEPS):
+    with report_errors(observer.id, watch, STEPS):
         ours.reset()
         got = run_steps(ours, measurements)
     _compare(observer, got, base, 0, "after a reset it is not what it was at the start")
