@@ -16,16 +16,31 @@ def write_whole(path: str | Path, write: Callable[[IO[bytes]], object]) -> None:
     Parameters
     ----------
     path : str or Path
-        File to write.
+        File to write; of a link, the file that it leads to. A device or a pipe is written to as it is.
     write : callable
         Receives the open file.
 
     Raises
     ------
     OSError
-        The file cannot be written; a file that was at `path` before is unchanged.
+        The file cannot be written; it names `path`. A file that was there before is unchanged.
     """
-    path = Path(path)
+    try:
+        if _is_device(path):
+            with open(path, "wb") as file:
+                write(file)
+        else:
+            _write_and_rename(Path(os.path.realpath(path)), write)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
+
+
+def _is_device(path: str | Path) -> bool:
+    """Return whether a path is that of a device or a pipe."""
+    return os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path)
+
+
+def _write_and_rename(path: Path, write: Callable[[IO[bytes]], object]) -> None:
     with NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
         try:
             write(file)
@@ -39,10 +54,12 @@ def write_whole(path: str | Path, write: Callable[[IO[bytes]], object]) -> None:
 
 def check_writable(path: str | Path) -> None:
     """Raise OSError where `write_whole` could not write to `path`."""
-    path = Path(path)
+    path = Path(os.path.realpath(path) if os.path.islink(path) and not _is_device(path) else path)
     folder = path.parent
     number, where = (
-        (errno.EISDIR, path)
+        (0, path)
+        if _is_device(path)
+        else (errno.EISDIR, path)
         if path.is_dir()
         else (errno.ENOENT, folder)
         if not folder.exists()

@@ -24,6 +24,7 @@ from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import rows as loop_rows
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.evaluation.rows import Row, score_rows
+from wfsobs.files import check_writable
 from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import as_stated
 from wfsobs.pipeline import observe as observe_record
@@ -73,6 +74,8 @@ def run(
     """Simulate the loop, run every observer and print the RMS table."""
     if save and seeds > 1:
         raise SettingError("--save: saves one record; leave --seeds at 1")
+    if save:
+        check_writable(save)
     if (budget or budget_of) and (seeds > 1 or over_time):
         raise SettingError("--budget: is of one record, without --over-time; leave --seeds at 1")
     if unknown := set(budget_of) - set(OBSERVERS):

@@ -50,6 +50,8 @@ def observe(
 ) -> None:
     """Run the observers on a record: .npz, .csv, .fits or AOT (preset paper unless told)."""
     scenario = configfile.scenario_from(preset, config, assignments)
+    if out:
+        check_writable(out)
     if prior is not None:
         scenario = told_by(configfile.load_scenario(prior), scenario)
         for path, value in map(configfile.parse_assignment, assignments):

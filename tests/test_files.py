@@ -1,0 +1,73 @@
+"""Files are written whole or not at all, and errors name what the user named."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+from typing import IO, NoReturn
+
+import pytest
+from click.testing import CliRunner
+
+from wfsobs.cli import main
+from wfsobs.files import check_writable, write_whole
+
+
+def full(_file: IO[bytes]) -> NoReturn:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_full_disk_names_the_file_and_leaves_the_old_one(tmp_path: Path) -> None:
+    path = tmp_path / "kept.txt"
+    path.write_bytes(b"old")
+    with pytest.raises(OSError, match=r"No space left on device: '.*/kept\.txt'$") as caught:
+        write_whole(path, full)
+    assert caught.value.filename == str(path) and caught.value.errno == errno.ENOSPC
+    assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["kept.txt"]
+
+
+def test_an_error_without_a_number_names_the_file(tmp_path: Path) -> None:
+    def write(_file: IO[bytes]) -> NoReturn:
+        raise OSError("Not enough space on disk")
+
+    with pytest.raises(OSError, match=r"Not enough space on disk: '.*/a\.fits'$"):
+        write_whole(tmp_path / "a.fits", write)
+
+
+@pytest.mark.parametrize("name", ["nowhere/a.npz", "folder/a.npz"])
+def test_errors_name_the_users_file_not_the_temporary_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder" / "a.npz").mkdir(parents=True)
+    with pytest.raises(OSError, match=f": '{name}'$"):
+        write_whole(name, lambda file: file.write(b"new"))
+    assert os.listdir("folder") == ["a.npz"]
+
+
+def test_a_link_stays_one(tmp_path: Path) -> None:
+    (tmp_path / "far").mkdir()
+    link, target = tmp_path / "link.txt", tmp_path / "far" / "target.txt"
+    link.symlink_to("far/target.txt")
+    for content in (b"first", b"second"):  # of a link that leads to nothing yet, and of one to a file
+        check_writable(link)
+        write_whole(link, lambda file, content=content: file.write(content))
+        assert link.is_symlink() and target.read_bytes() == content
+    assert os.listdir(tmp_path / "far") == ["target.txt"]
+
+
+def test_a_pipe_is_written_to() -> None:
+    receive, send = os.pipe()
+    check_writable(f"/dev/fd/{send}")
+    write_whole(f"/dev/fd/{send}", lambda file: file.write(b"through"))
+    os.close(send)
+    with os.fdopen(receive, "rb") as file:
+        assert file.read() == b"through"
+
+
+@pytest.mark.parametrize("link", [False, True])
+def test_a_file_that_cannot_be_written_is_named_before_anything_is_computed(tmp_path: Path, link: bool) -> None:
+    path = tmp_path / "nowhere" / "a.npz"
+    if link:
+        (tmp_path / "a.npz").symlink_to(path)
+    result = CliRunner().invoke(main, ["run", "--save", str(tmp_path / "a.npz" if link else path)])
+    assert (result.exit_code, result.output) == (2, f"wfsobs: {path.parent}: No such file or directory\n")
