@@ -1,4 +1,4 @@
-"""A histogram of latencies, whose quantiles take no more room however long a loop runs."""
+"""A histogram of latencies, or of other numbers that span decades: its quantiles take no more room however long a loop runs."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class Latencies:
         """Begin anew."""
         self.counts[:] = 0
 
-    def add(self, latency: float) -> None:
-        """Count one latency [s]."""
-        self.counts[np.searchsorted(EDGES, latency)] += 1
+    def add(self, latency: float | NDArray[np.float64]) -> None:
+        """Count a latency, or several [s]."""
+        np.add.at(self.counts, np.searchsorted(EDGES, latency), 1)
 
     def quantile(self, share: float) -> float:
         """Return a quantile, rounded up to the next edge [s]; NaN without a latency."""

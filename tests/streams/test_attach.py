@@ -13,14 +13,19 @@ from threading import Thread
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import wfsobs
 from tests.streams.conftest import ENOUGH, started, wait_until
 from wfsobs.cli import main
+from wfsobs.observers.step import StepObserver
 from wfsobs.stepping import design
-from wfsobs.streams.attach import Attachment, Wiring
+from wfsobs.streams.attach import Attachment
+from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.shared_image import SharedImage
-from wfsobs.streams.watchdog import Safety
+from wfsobs.streams.watchdog import BEYOND, Fallback, Safety
+from wfsobs.streams.wiring import NgsWiring, Wiring
 
 SINGLE = 2e-7
 """Rounding of float32 over the size of a number, three times over: measurement, estimate, comparison."""
@@ -126,7 +131,7 @@ def test_a_modal_filter_goes_on_without_a_block_that_does_not_come(tmp_path: Pat
     assert ours.returncode == 0, err
     assert loop.returncode == 0 and n // 2 < int(told) <= n
     summary = json.loads(out)
-    assert 0 < summary["frames"] + summary["missing"] <= n and summary["torn"] == 0
+    assert 0 < summary["frames"] + summary["missing"] <= n
 
 
 def test_an_answer_that_a_newer_frame_has_overtaken_is_not_sent(tmp_path: Path) -> None:
@@ -171,7 +176,7 @@ class Streams:
             SharedImage(folder / "in.im.shm"),
             SharedImage(folder / "out.im.shm"),
             design(name, wfsobs.PRESETS["paper"]()),
-            Wiring((0, 1), 1.0, 1.0, np.full(2, 0.03), **settings),
+            Wiring((0, 1), 1.0, 1.0, np.full(2, 0.03), np.full(2, 0.5), **settings),
             said.append,
         )
 
@@ -208,7 +213,7 @@ def test_missing_and_unreadable_measurements_are_missing(tmp_path: Path) -> None
     gone[50:53], gone[100, 0], gone[120] = np.nan, np.nan, np.nan
     sent = gone.copy()
     sent[120] = [np.inf, -np.inf]
-    streams = Streams(tmp_path, said)
+    streams = Streams(tmp_path, said, safety=Safety(largest=5.0))
     got = []
     with streams.running():
         for k, row in enumerate(sent):
@@ -250,14 +255,140 @@ def test_garbage_gives_no_stale_and_no_wild_output(tmp_path: Path) -> None:
     with streams.running():
         for row in z[:50]:
             streams.answer(row)
-        wild = [streams.answer(np.array([1e12, -1e12])) for _ in range(5)]
-        assert not np.any(wild)
+        wild = [streams.answer(np.array([1e12, -1e12])) for _ in range(BEYOND)]
+        assert np.abs(wild).max() < 2.0 * np.abs(z).max() and not np.any(wild[-1])
         torn = streams.sink.count
         streams.source._writing[0] = 1
         streams.source._count[0] += np.uint64(1)
         assert not streams.next(torn).any()
         streams.source._writing[0] = 0
-    assert said[0] == "the estimate exceeds 5 um: output falls back to zero" and streams.attachment.tally.torn == 1
+    assert said[0].startswith("the estimate left its band") and streams.attachment.tally.torn == 1
+
+
+class Frames:
+    """A stream in memory: frames that the test gives, or those that have been written."""
+
+    path, first, is_current, write_time = "memory", 0, True, 0
+
+    def __init__(self, n: int, dtype: str = "float64"):
+        self.count, self.values = 0, np.zeros(n, dtype)
+
+    @property
+    def n(self) -> int:
+        return self.values.size
+
+    def read(self, patience: float = 0.0) -> tuple[int, np.ndarray] | None:
+        return self.count, self.values.astype(float)
+
+    def write(self, values: np.ndarray, elements: np.ndarray | slice = slice(None)) -> None:
+        self.values[elements] = values
+        self.count += 1
+
+
+class Way:
+    """The whole way of a frame, without a thread: `send` gives what goes out."""
+
+    def __init__(self, observer: StepObserver, safety: Safety, dtype: str = "float64", ngs: bool = False):
+        observer.reset()
+        self.said: list[str] = []
+        self.source, self.sink, self.ngs = Frames(2), Frames(2, dtype), Frames(2)
+        wiring = Wiring((0, 1), 1.0, 1.0, np.full(2, 0.02), np.full(2, 0.5), safety, 0, ENOUGH)
+        second = NgsStream(self.ngs, NgsWiring((0, 1), 1.0, 5, 0, ENOUGH), self.said.append) if ngs else None  # pyright: ignore[reportArgumentType]
+        self.attachment = Attachment(self.source, self.sink, observer, wiring, self.said.append, second)  # pyright: ignore[reportArgumentType]
+
+    def send(self, z: np.ndarray, lost: int = 0) -> np.ndarray:
+        self.source.count += lost
+        self.source.write(z)
+        self.attachment._take(0.0)
+        return self.sink.values.copy()
+
+
+OBSERVED = {name: design(name, wfsobs.PRESETS["paper"]()) for name in ("kf-lgs", "multirate-multi")}
+QUIET = wfsobs.simulate(wfsobs.PRESETS["paper"]().replace({"run.duration": 3.0}))
+ANY = st.floats(allow_nan=True, allow_infinity=True, width=64)
+
+
+@pytest.mark.parametrize("fallback", ["zero", "hold"])
+@pytest.mark.parametrize("size", [2.0, 20.0, 1e30])
+def test_one_frame_that_cannot_be_changes_nothing_that_goes_out(fallback: Fallback, size: float) -> None:
+    """It is missing: what goes out is what the observer gives without it, to the last digit."""
+    way = Way(OBSERVED["kf-lgs"], Safety(fallback))
+    z = QUIET.z[:1200].copy()
+    z[1000] += size
+    got = [way.send(row) for row in z]
+    z[1000] = np.nan
+    np.testing.assert_array_equal(got, stepped(z, "kf-lgs", 1))
+    summary = way.attachment.summary()
+    assert summary["out_of_band"] == 1 and summary["fallbacks"] == 0 and not way.said
+
+
+@pytest.mark.parametrize("fallback", ["zero", "hold"])
+def test_a_level_that_moves_for_good_is_followed(fallback: Fallback) -> None:
+    """Four measurements are refused, then the output falls back to what was before, and comes back at the new level."""
+    way = Way(OBSERVED["kf-lgs"], Safety(fallback, calm=300))
+    z = QUIET.z[:2500].copy()
+    z[1000:] += 2.0
+    got = np.array([way.send(row) for row in z])
+    before = got[999] if fallback == "hold" else np.zeros(2)
+    np.testing.assert_array_equal(got[1004:1304], np.tile(before, (300, 1)))
+    assert BEYOND - 1 <= way.attachment.summary()["out_of_band"] < 3 * BEYOND  # it swings in
+    assert way.said[1:] == ["output on again after 300 good frames"]
+    assert np.abs(got[-500:] - z[-500:]).max() < 0.3  # the vibration and the noise of a frame
+
+
+def test_measurements_that_are_never_there_are_frames_that_are_missing() -> None:
+    way = Way(OBSERVED["kf-lgs"], Safety("zero"))
+    got = np.array([way.send(row) for row in [*QUIET.z[:500], *np.full((11, 2), np.nan)]])
+    assert got[509].any() and not got[510].any()
+    assert way.said == ["11 frames in a row are missing: output falls back to zero"]
+
+
+def test_a_frame_after_a_gap_is_held_against_what_is_expected_there() -> None:
+    way = Way(OBSERVED["kf-lgs"], Safety())
+    for row in QUIET.z[:1000]:
+        way.send(row)
+    way.send(QUIET.z[1003] + 2.0, lost=3)
+    assert way.attachment.summary()["out_of_band"] == 1
+
+
+def test_one_frame_of_the_ngs_that_cannot_be_is_missing() -> None:
+    out = []
+    for bad in (np.nan, 20.0, 1e300):
+        way, got = Way(OBSERVED["multirate-multi"], Safety(calm=1), ngs=True), []
+        for k in range(1, 2000):
+            if k % 5 == 0:
+                way.ngs.write(QUIET.z_ngs[k] if k != 1500 else np.full(2, bad))
+            got.append(way.send(QUIET.z[k]))
+        out.append(got)
+        assert way.attachment.summary()["fallbacks"] == 1  # the NGS frames have found their place
+    np.testing.assert_array_equal(out[0], out[1])
+    np.testing.assert_array_equal(out[0], out[2])
+
+
+@given(
+    frames=st.lists(st.tuples(st.tuples(ANY, ANY), st.integers(0, 12), st.integers(0, 7)), min_size=1, max_size=12),
+    fallback=st.sampled_from(["zero", "hold"]),
+    largest=st.sampled_from([None, 0.3, 40.0]),
+    ngs=st.booleans(),
+)
+@settings(max_examples=150, deadline=None)
+def test_nothing_above_the_limit_goes_out_whatever_comes_in(frames, fallback: Fallback, largest: float | None, ngs: bool) -> None:
+    """Any doubles in both streams, gaps of any length, as often as wanted in a row, between frames as they should be."""
+    way = Way(OBSERVED["multirate-multi" if ngs else "kf-lgs"], Safety(fallback, largest, calm=3), "float32", ngs)
+    limit, sent = 5.0 if largest is None else largest, []
+    for k in range(105):
+        if k % 5 == 0:
+            way.ngs.write(QUIET.z_ngs[k or 5])
+        sent.append(way.send(QUIET.z[k]))
+    for k, (values, lost, times) in enumerate(frames):
+        for i in range(times):
+            way.ngs.write(np.array(values[::-1]))
+            sent.append(way.send(np.array(values), lost if i == 0 else 0))
+        sent += [way.send(QUIET.z[(105 + 7 * k + i) % 2900]) for i in range(4)]
+    assert (np.abs(sent) <= np.float32(limit)).all()
+    assert (np.abs(way.attachment._watchdog.safe) <= limit).all()
+    json.dumps(way.attachment.summary(), allow_nan=False)
+    way.attachment._line()
 
 
 def test_shadow_writes_nothing(tmp_path: Path) -> None:
@@ -296,6 +427,7 @@ def test_a_semaphore_that_another_process_waits_for_is_left_to_it(tmp_path: Path
         (["--shadow", "--observer", "gpr-online"], "its windows hold commands"),
         (["--shadow", "--delay", "1.5", "--observer", "ridge"], "learns from a record beforehand"),
         (["--shadow", "--semaphore", "10"], "it has 0 to 9"),
+        (["--shadow", "--limit", "nan"], "--limit nan: takes a number above 0"),
     ],
 )
 def test_what_cannot_be_attached_is_said_in_one_line(tmp_path: Path, options: list[str], reason: str) -> None:

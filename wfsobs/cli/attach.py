@@ -13,7 +13,7 @@ import numpy as np
 from wfsobs.cli.options import ngs_options, ngs_wiring, scenario_options, stream_elements
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.step import StepError, StepObserver
-from wfsobs.prior import Model, Training
+from wfsobs.prior import LgsError, Lines, Model, Training
 from wfsobs.priors_from.identification import told_by
 from wfsobs.priors_from.scenario import observer_settings
 from wfsobs.record import Sampling
@@ -25,7 +25,7 @@ from wfsobs.streams.layout import StreamError
 from wfsobs.streams.network import Publication, Subscription, is_address
 from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.shared_image import SharedImage, stream_path
-from wfsobs.streams.watchdog import Fallback, Safety
+from wfsobs.streams.watchdog import LIMIT, Fallback, Safety
 from wfsobs.streams.wiring import STUCK, Wiring
 from wfsobs.units import UNITS, micrometres_per
 
@@ -62,7 +62,12 @@ from wfsobs.units import UNITS, micrometres_per
 @click.option(
     "--fallback", type=click.Choice(["zero", "hold"]), default="zero", show_default=True, help="Output in place of an estimate."
 )
-@click.option("--limit", type=click.FloatRange(0, min_open=True), metavar="X", help="Magnitude that no estimate may exceed.")
+@click.option(
+    "--limit",
+    type=click.FloatRange(0, 1e12, min_open=True),
+    metavar="X",
+    help=f"Magnitude that no estimate may exceed; unless told {LIMIT:g} times the rms of a measurement by the prior.",
+)
 @click.option(
     "--stuck", type=click.FloatRange(1e-3, 60), default=STUCK, show_default=True, metavar="S", help="Time without a frame."
 )
@@ -99,6 +104,8 @@ def attach(
     """Run an observer on the streams of a running loop, in shared memory or by ZeroMQ (docs/streams.md)."""
     if bool(sink) == shadow:
         raise SettingError("attach: takes --out STREAM, or --shadow to write nothing")
+    if limit is not None and np.isnan(limit):
+        raise SettingError("--limit nan: takes a number above 0")
     scenario = configfile.scenario_from(preset, config, assignments)
     if prior is not None:
         scenario = told_by(configfile.load_scenario(prior), scenario)
@@ -109,11 +116,10 @@ def attach(
     try:
         given = _open_source(source)
         taken = None if sink is None else _open_sink(sink, given, ngs)
-        observer, noise = _design(name, scenario, len(elements), delay - 1, ngs is not None)
+        observer, noise, spread = _design(name, scenario, len(elements), delay - 1, ngs is not None)
         warm_up = max(round(scenario.run.warm_up / scenario.dt), 1)
-        largest = np.inf if limit is None else limit * per_unit
-        limits = Safety(fallback, largest, calm=warm_up)
-        wiring = Wiring(elements, per_unit, delay, noise, limits, warm_up, stuck, semaphore)
+        limits = Safety(fallback, None if limit is None else limit * per_unit, calm=warm_up)
+        wiring = Wiring(elements, per_unit, delay, noise, spread, limits, warm_up, stuck, semaphore)
         second = None
         if ngs is not None:
             ngs_is = ngs_wiring(scenario, len(elements), ngs_modes, unit, ngs_lag, stuck)
@@ -154,8 +160,10 @@ def _open_sink(name: str, source: SharedImage | Subscription, ngs: str | None) -
     return SharedImage.create(path, source.header.shape, dtype=dtype, layout=source.header.layout)
 
 
-def _design(name: str, scenario: Scenario, n_modes: int, horizon: float, has_ngs: bool) -> tuple[StepObserver, np.ndarray]:
-    """Return the observer, and the rms noise of a measurement that its prior has, (n_modes,) [um]."""
+def _design(
+    name: str, scenario: Scenario, n_modes: int, horizon: float, has_ngs: bool
+) -> tuple[StepObserver, np.ndarray, np.ndarray]:
+    """Return the observer, and by its prior the rms of the noise of a measurement and of all of it, (n_modes,) [um]."""
     if name not in OBSERVERS:
         raise SettingError(f"observer {name!r}: no such observer; there are {', '.join(OBSERVERS)}")
     declared = OBSERVERS[name]
@@ -171,8 +179,11 @@ def _design(name: str, scenario: Scenario, n_modes: int, horizon: float, has_ngs
     observer = design(name, scenario, sampling=sampling, horizon=horizon)
     if observer.estimator.needs_command:
         raise StepError(f"{name}: its windows hold commands, which the stream has not; set its inputs to z")
-    model = prior_in(name, scenario, (Model,), scenario, sampling, None).model
-    return observer, np.array([mode.lgs_noise for mode in model])
+    known = prior_in(name, scenario, (Model, Lines, LgsError), scenario, sampling, None)
+    noise = np.array([mode.lgs_noise for mode in known.model])
+    disturbance = [(*lines.turbulence, *lines.lines, *lines.continuum) for lines in known.lines]
+    parts = [[one.rms for one in (*of_mode, error.process)] for of_mode, error in zip(disturbance, known.lgs_error, strict=True)]
+    return observer, noise, np.array([np.linalg.norm([sd, *rms]) for sd, rms in zip(noise, parts, strict=True)])
 
 
 @contextmanager

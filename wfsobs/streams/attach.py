@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from wfsobs.observers.base import TARGETS
 from wfsobs.observers.step import StepObserver
 from wfsobs.streams.going_back import GoingBack
 from wfsobs.streams.layout import StreamError
@@ -16,14 +17,12 @@ from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.semaphores import Semaphore
 from wfsobs.streams.stream import SinkStream, SourceStream
 from wfsobs.streams.tally import Tally
-from wfsobs.streams.watchdog import Watchdog
+from wfsobs.streams.watchdog import Gate, Watchdog
 from wfsobs.streams.wiring import Wiring, check_elements
 from wfsobs.typing import Array
 
 TICK = 0.05
 """Longest wait for a frame before a look at the clock and at the wish to stop [s]."""
-RATE_ERROR = 0.05
-"""Part of the rate by which a loop may be off the design."""
 LONGEST_GAP = 1000
 """Missing frames that an observer is taken through; after more of them it starts anew."""
 
@@ -65,14 +64,14 @@ class Attachment:
             if stream is not None:
                 check_elements(stream, wiring.elements)
         self._source, self._sink, self._observer, self._wiring, self._say = source, sink, observer, wiring, say
-        self._elements, n = np.array(wiring.elements), len(wiring.elements)
-        self._watchdog = Watchdog(n, wiring.safety, say, wiring.warm_up)
+        self._elements = np.array(wiring.elements)
+        self._watchdog = Watchdog(wiring.largest, wiring.safety, say, wiring.warm_up)
+        self._gate, self._ngs_gate = Gate(wiring.spread, wiring.largest), Gate(wiring.spread, wiring.largest)
         self._semaphore: Semaphore | None = None
         self._semaphore_number: int | None = None
-        self._expectation, self._band = np.full(n, np.nan), np.full(n, np.nan)
-        self._missing = np.full(n, np.nan)
+        self._missing = np.full(len(wiring.elements), np.nan)
         self._count, self._alive = source.first, 0.0
-        self._is_stuck = self._is_off_rate = self._is_overtaken = False
+        self._is_stuck = self._is_overtaken = False
         self._ngs, self._frames = ngs, GoingBack(observer)
         self.tally = Tally(observer.sampling.dt)
 
@@ -105,7 +104,8 @@ class Attachment:
                 now = monotonic()
                 if now >= spoken:
                     report(self._line())
-                    self._check_rate()
+                    if off_rate := self.tally.find_rate_error():
+                        self._say(f"{self._source.path}: {off_rate}")
                     spoken += 1.0
         finally:
             gc.unfreeze()
@@ -128,13 +128,6 @@ class Attachment:
             self._source.release(self._semaphore_number)
             self._semaphore_number = None
 
-    def _check_rate(self) -> None:
-        """Say once that the loop runs at another rate than the observer is designed for."""
-        rate, designed = self.tally.rate, 1.0 / self._observer.sampling.dt
-        if rate is not None and not self._is_off_rate and abs(rate / designed - 1.0) > RATE_ERROR:
-            self._is_off_rate = True
-            self._say(f"{self._source.path}: {rate:.0f} frames per second, the observer is designed for {designed:g}")
-
     def _take(self, arrival: float) -> None:
         """Take the newest frame, and send what is expected of a later one."""
         found = self._source.read()
@@ -151,15 +144,18 @@ class Attachment:
         self._count = count
         for _ in range(lost):
             self._frames.update(self._missing)
-        z = values[self._elements] * self._wiring.unit
+        if lost:
+            self._expect()
+        with np.errstate(over="ignore", invalid="ignore"):
+            measured = values[self._elements] * self._wiring.unit
         found_ngs = self._look_for_ngs()
-        error = z - self._expectation if not lost else self._missing
-        estimate = self._step(np.where(np.isfinite(z), z, np.nan), *found_ngs)
-        output = self._watchdog.output(estimate, error, self._band, lost)
+        z, error = self._gate.accept(measured), measured - self._gate.mean
+        beyond = max(self._gate.beyond.max(), self._ngs_gate.beyond.max())
+        output = self._watchdog.output(self._step(z, *found_ngs), z, beyond, lost)
         self._is_overtaken = self._source.count != count and not self._is_overtaken
         if not self._is_overtaken:  # else the next answer follows at once, and who waits for it must not get this one
             self._send(output)
-        self.tally.add(arrival, monotonic(), lost, z, error)
+        self.tally.add(arrival, monotonic(), lost, measured, error, not np.array_equal(z, measured, equal_nan=True))
         self._observer.settle()
         self._frames.keep()
         self._expect()
@@ -177,9 +173,9 @@ class Attachment:
         found = self._ngs.look(self._count, write_time)
         phase = self._ngs.phase
         if phase is not None and self._frames.align((self._count - phase) % self._ngs.ratio):
-            self._expectation = np.full_like(self._expectation, np.nan)
+            self._restart_gates()
             self._watchdog.fall_back("the NGS frames have found their place")
-        return (None, 0) if found is None else (found[1], found[0])
+        return (None, 0) if found is None else (self._ngs_gate.accept(found[1]), found[0])
 
     def _step(self, z: Array, ngs: Array | None, late: int) -> Array:
         self._frames.update(z, ngs, late)
@@ -188,16 +184,21 @@ class Attachment:
         )
 
     def _expect(self) -> None:
-        """Keep what the next measurement should be, and how sure that is: the deviations of the parts added up."""
-        parts = [self._observer.predict(0, target) for target in self._observer.targets] if self._predicts_next else []
-        if parts:
-            self._expectation = sum((mean for mean, _ in parts), np.zeros_like(self._missing))
-            self._band = sum((sd for _, sd in parts), self._wiring.noise)
+        """Keep what the next measurement should be, and how sure that is: the deviations of the parts added up.
 
-    @property
-    def _predicts_next(self) -> bool:
-        own = self._observer.estimator.horizon
-        return own is None or own == 0
+        Observers of both sensors predict no errors of the LGS, so that they state no deviation of its measurement.
+        """
+        observer = self._observer
+        if observer.estimator.horizon or len(observer.targets) < len(TARGETS):
+            return
+        parts = [observer.predict(0, target) for target in observer.targets]
+        self._gate.mean = self._ngs_gate.mean = sum((mean for mean, _ in parts), np.zeros_like(self._missing))
+        if self._ngs is None:
+            self._gate.sd = sum((sd for _, sd in parts), self._wiring.noise)
+
+    def _restart_gates(self) -> None:
+        self._gate.restart()
+        self._ngs_gate.restart()
 
     def _stand_still(self) -> None:
         """No frame has come: send the safe output once, and look for a new stream at the same place."""
@@ -228,7 +229,7 @@ class Attachment:
             self._ngs.restart()
         self._observer.reset()
         self._frames.forget()
-        self._expectation = np.full_like(self._expectation, np.nan)
+        self._restart_gates()
         self._count = count
         self._say(reason)
         self._watchdog.fall_back(reason)

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from wfsobs.streams.layout import StreamError
 from wfsobs.streams.stream import AnyStream
-from wfsobs.streams.watchdog import Safety
+from wfsobs.streams.watchdog import LIMIT, Safety
 from wfsobs.typing import Array
 
 STUCK = 0.1
@@ -22,6 +24,7 @@ class Wiring:
     unit     : micrometres per unit of the streams
     ahead    : frames from the newest measurement to the one that is to be met
     noise    : rms of the noise of a measurement, (n_modes,) [um]
+    spread   : rms of a measurement by the prior, (n_modes,) [um]
     stuck    : time without a frame after which the stream is stuck [s]
     semaphore : number of the semaphore that is waited for, where no other process does; None looks at the counter
     """
@@ -30,10 +33,17 @@ class Wiring:
     unit: float
     ahead: float
     noise: Array
+    spread: Array
     safety: Safety = field(default_factory=Safety)
     warm_up: int = 0
     stuck: float = STUCK
     semaphore: int | None = None
+
+    @property
+    def largest(self) -> Array:
+        """Magnitude that no estimate may have, (n_modes,) [um]."""
+        told = self.safety.largest
+        return LIMIT * self.spread if told is None else np.full(self.spread.size, told)
 
 
 @dataclass(frozen=True)
