@@ -91,6 +91,25 @@ def test_a_design_goes_on_in_another_process(name: str) -> None:
                 np.testing.assert_array_equal(here.predict(0, target), there.predict(0, target))
 
 
+@pytest.mark.parametrize("name", [name for name in STEPS if name in ON_PAPER])
+def test_predictions_that_are_kept_stay_what_they_were(name: str) -> None:
+    """Every one is an array of its own, unless the caller gives some: then it is written there."""
+    record, scenario = with_gaps("paper")
+    observer = wfsobs.design(name, scenario, sampling=record.sampling)
+    given, target = (np.empty(2), np.empty(2)), observer.targets[-1]
+    kept, copies = [], []
+    for k in range(60):
+        observer.update(record.z[k], u=np.nan_to_num(record.u[k]))
+        kept.append(observer.predict(0, target))
+        copies.append(np.array(kept[-1]))
+        assert observer.predict(0, target, out=given) is given
+        np.testing.assert_array_equal(given, copies[-1])
+        given[0][:] = given[1][:] = kept[-1][1][:] = 7.0  # what a caller does to its arrays is nothing to the observer
+        np.testing.assert_array_equal(observer.predict(0, target), copies[-1])
+        kept[-1][1][:] = copies[-1][1]
+    np.testing.assert_array_equal(kept, copies)
+
+
 def test_every_causal_observer_has_steps() -> None:
     assert [name for name, observer in OBSERVERS.items() if observer.step is None] == ["butterworth-ol"]
 

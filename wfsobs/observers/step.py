@@ -49,7 +49,10 @@ class Estimator(Stateful, Protocol):
         ...
 
     def predict(self, frames: float, target: str) -> tuple[Array, Array]:
-        """Return (mean, sd) of the target that many frames ahead, each (n_modes,) [um]. Raises StepError."""
+        """Return (mean, sd) of the target that many frames ahead, each (n_modes,) [um], good until the next frame or prediction.
+
+        Raises StepError.
+        """
         ...
 
     def settle(self) -> None:
@@ -152,7 +155,9 @@ class StepObserver:
         self.estimator.advance(z, slow, u)
         self.frame += 1
 
-    def predict(self, frames: float = 0, target: str | None = None) -> tuple[Array, Array]:
+    def predict(
+        self, frames: float = 0, target: str | None = None, *, out: tuple[Array, Array] | None = None
+    ) -> tuple[Array, Array]:
         """Predict a target.
 
         Parameters
@@ -161,12 +166,14 @@ class StepObserver:
             Frames ahead of the last one, 0 or more; with a fraction where the observer has a model in continuous time.
         target : str, optional
             "turbulence" or "vibration"; can be left out where the observer estimates one.
+        out : (Array, Array), optional
+            Arrays that mean and sd are written to, (n_modes,) each, for a loop that allocates nothing; by default new ones.
 
         Returns
         -------
         mean, sd : Array
             Prediction, and its standard deviation by the observer's own model once that is in its steady state, each
-            (n_modes,) [um]. NaN where there is none. They are overwritten by the next call for the same frames and target.
+            (n_modes,) [um]. NaN where there is none.
 
         Raises
         ------
@@ -177,7 +184,11 @@ class StepObserver:
             target = self._only_target()
         if (frames, target) not in self._allowed_requests:
             self._check_request(frames, target)
-        return self.estimator.predict(frames, target) if self.frame else (self._nothing, self._nothing)
+        mean, sd = self.estimator.predict(frames, target) if self.frame else (self._nothing, self._nothing)
+        if out is None:
+            return mean.copy(), sd.copy()
+        out[0][...], out[1][...] = mean, sd
+        return out
 
     def settle(self) -> None:
         """Do what does not need to be done before the estimate is out; the next `update` does it otherwise.
