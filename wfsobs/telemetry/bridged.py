@@ -4,7 +4,7 @@ Where a frame was lost, telemetry often has the last value once more, a line bet
 takes these for measurements trusts them, and starts wrong after the gap. A frame is taken for missing where
 
 - the measurement, or the pseudo-open-loop of it, is the same in all modes for the third time, or
-- the last WINDOW frames follow a polynomial as no measured ones do: the squares left over are below SHARE of their usual mean.
+- the last WINDOW frames follow a polynomial as no measured ones do: the squares left over are below SHARE of their median so far.
   DEGREE is such that a line of 50 Hz at 1 kHz, which a prediction goes on with, leaves 1e-5 of its power.
 
 No later frame decides, and nothing is found before USUAL / 10 frames with noise. Windows overlap, so that one in 10^9 of white
@@ -29,10 +29,10 @@ DEGREE = 8
 """Of the polynomial."""
 
 SHARE = 0.05
-"""Of the usual mean square of what the polynomial leaves over."""
+"""Of the usual square of what the polynomial leaves over."""
 
 USUAL = 2000
-"""Frames that the usual mean square is the mean of; a tenth of them have to be there first."""
+"""Frames that the usual square is the median of, taken anew at every tenth of them, the first of which has to be there first."""
 
 LONGEST = 10.0
 """Gap that is taken for one, at most [s]."""
@@ -46,7 +46,9 @@ AT_ONCE = 100_000
 
 def without_bridged(record: Record) -> Record:
     """Return a record that tells no missing frames with those missing that were filled in; its origin says how many."""
-    bridged = find_bridged(record.y_lgs, hold_last(record.z), record.dt)
+    seen = slice(record.delay, None)  # z before has no commands
+    bridged = np.zeros(record.n_steps, dtype=bool)
+    bridged[seen] = find_bridged(record.y_lgs[seen], hold_last(record.z)[seen], record.dt)
     if not bridged.any():
         return record
     said = f"{bridged.sum()} LGS frames without noise of their own taken for missing"
@@ -81,6 +83,7 @@ def find_bridged(y: Array, z: Array, dt: float) -> Array:
 def _lacking(again: Array, left_over: Array, rounding: Array, longest: float) -> Array:
     """Return which frames repeat, or lack the noise that those before them have, (n,); none before there is some noise."""
     usual, seen, lasting, apart = np.zeros(left_over.shape[1]), 0, 0, 0
+    last = np.zeros((USUAL, left_over.shape[1]))  # of those that are measured, in any order
     out = np.zeros(len(left_over), dtype=bool)
     for k, squares in enumerate(left_over):
         apart = 0 if again[k] else apart + 1  # a window that has frames that repeat says nothing of the others
@@ -91,8 +94,10 @@ def _lacking(again: Array, left_over: Array, rounding: Array, longest: float) ->
         if lasting > longest:
             seen = 0
         if not out[k] and k >= WINDOW:
+            last[seen % USUAL] = squares
             seen += 1
-            usual = usual + (squares - usual) / min(seen, USUAL)
+            if seen % (USUAL // 10) == 0:
+                usual = np.median(last[:seen], axis=0)
     return out
 
 
