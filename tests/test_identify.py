@@ -385,7 +385,7 @@ NOISE = 0.01 * np.random.default_rng(9).standard_normal((6000, 1))
         (np.sin(2 * pi * 20.3 * T) + np.where((T > 2) & (T < 3), 0.0, NOISE), "not stationary"),  # held samples
         (np.round(NOISE / 0.02) * 0.02, "is white"),  # counts
         (NOISE + 3.0 * T, "NOT white"),  # drift
-        (NOISE + 5.0 * (np.arange(6000)[:, None] % 997 == 500), "further than 6 standard deviations"),  # outliers
+        (NOISE + 5.0 * (np.arange(6000)[:, None] % 997 == 500), "is white at 1% ("),  # outliers
         (NOISE * (1.0 + (T > 3)), "not stationary"),
     ],
 )

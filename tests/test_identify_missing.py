@@ -7,12 +7,13 @@ from math import pi
 import numpy as np
 import pytest
 from scipy.linalg import circulant
-from scipy.stats import binom
+from scipy.stats import binom, norm
 
 from wfsobs.identification import identify
+from wfsobs.identification.report import whiteness_lines
 from wfsobs.record import Record, RecordError
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.spectral.missing import MissingSamples
+from wfsobs.spectral.missing import FAR, MOST_OUTLYING, MissingSamples, find_outlying
 from wfsobs.spectral.model import Spectrum
 from wfsobs.spectral.periodogram import Cells, periodogram_frequencies
 from wfsobs.spectral.whittle import spectrum_information
@@ -125,3 +126,44 @@ def test_intervals_hold_where_a_third_is_lost() -> None:
 def test_what_lacks_too_much_is_refused() -> None:
     with pytest.raises(RecordError, match=r"tip: \d+ of \d+ samples are measured, identification needs 1000, and 50%"):
         identify(record(0.6, np.random.default_rng(1), 6000))
+
+
+@pytest.mark.parametrize(("share", "size"), [(0.0, 0.0), (1.0 / 6000, 250.0), (0.01, 40.0), (0.01, 10.0), (0.01, 1e200)])
+def test_outlying_samples_are_those_that_were_put_in(share: float, size: float) -> None:
+    """Beside lost frames, at the ends, next to one another; another one, by Gaussian chance, in one of 40 such tests."""
+    found = put = lost = 0
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        z = record(0.01, rng, 6000).y_lgs[:, 0]
+        hit = (rng.random(6000) < share) & ~np.isnan(z)
+        hit[[0, 1, -1]] |= share > 0.0
+        z[hit] += 0.014 * size * rng.choice([-1, 1], hit.sum())
+        out = find_outlying(z)
+        found, put, lost = found + out.sum(), put + hit.sum(), lost + (hit & ~out).sum()
+    assert found - (put - lost) <= 1
+    # the deviation of a prediction is at most 1.3 of the noise, its median over a part 5 % off
+    assert lost <= binom.isf(1e-3, put, norm.cdf(1.05 * FAR - size / 1.3)) if put else found <= 1
+
+
+def test_what_is_no_outlier() -> None:
+    """A louder half, few values, a drift, a jump of the level; and what a tenth of the samples would have to be."""
+    rng = np.random.default_rng(3)
+    white, k = rng.standard_normal(6000), np.arange(6000)
+    for z in (white * np.where(k < 3000, 1.0, 10.0), np.round(0.4 * white), 0.01 * k + white, 5.0 * (k > 3000) + white):
+        assert not find_outlying(z).any()
+    assert not find_outlying(white + 100.0 * (rng.random(6000) < 1.3 * MOST_OUTLYING)).any()
+
+
+def test_outlying_samples_are_counted_told_and_missing() -> None:
+    """The model is that of the record without them; noise was four times as much with one in a hundred."""
+    rng = np.random.default_rng(8)
+    z = record(0.0, rng, 6000).y_lgs
+    hit = rng.random(6000) < 0.01
+    spoilt = z + 40.0 * 0.014 * rng.choice([-1, 1], (6000, 1)) * hit[:, None]
+    clean, found = (identify(Record(y, np.zeros_like(y), DT)) for y in (z, spoilt))
+    put = hit[2:][: found.n_steps].sum()
+    assert (clean.modes[0].outlying, found.modes[0].outlying) == (0, put)
+    assert f"; outlying samples taken for missing: {put}" in whiteness_lines(found)[0]
+    # a hundredth of the samples less: a tenth of a standard deviation, times 5
+    assert abs(found.modes[0].noise.value - clean.modes[0].noise.value) < 0.5 * clean.modes[0].noise.std
+    assert len(found.modes[0].peaks) == len(clean.modes[0].peaks) == 1

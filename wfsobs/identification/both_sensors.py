@@ -17,6 +17,7 @@ from wfsobs.identification.process import IdentifiedProcess, Number, read_proces
 from wfsobs.record import Record, hold_last, pseudo_open_loop
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
+from wfsobs.spectral.missing import find_outlying
 from wfsobs.spectral.periodogram import fast_length
 from wfsobs.typing import Array
 
@@ -40,11 +41,14 @@ class SensorDifference:
         Slow error of the combined LGS.
     process : Ar2 or None
         The same, as an observer receives it.
+    outlying : int
+        Frames far from what those around them predict, taken for missing.
     """
 
     noise: Number
     error: IdentifiedProcess | None = None
     process: Ar2 | None = None
+    outlying: int = 0
 
 
 def sensor_differences(record: Record) -> Array | None:
@@ -83,7 +87,8 @@ def read_difference(difference: Array, dt: float, ratio: int, lgs_noise: Number)
     SensorDifference
         The numbers.
     """
-    mode = OneMode(difference, dt * ratio)
+    outlying = find_outlying(difference)
+    mode = OneMode(np.where(outlying, np.nan, difference), dt * ratio)
     for _ in range(mode.missing.rounds(SETTLED)):
         mode.refit()
     std, spectrum = mode.errors(), mode.spectrum
@@ -91,8 +96,8 @@ def read_difference(difference: Array, dt: float, ratio: int, lgs_noise: Number)
     rms = sqrt(max(whole - of_lgs, LEAST * whole))
     noise = with_reliable_std(Number(rms, hypot(whole * float(std[0]), lgs_noise.value * lgs_noise.std / ratio) / rms))
     if not isinstance(slow := spectrum.turbulence, Ar2):
-        return SensorDifference(noise)
-    return SensorDifference(noise, read_process(slow, std[spectrum.starts[0] :]), slow.at(dt))
+        return SensorDifference(noise, outlying=int(outlying.sum()))
+    return SensorDifference(noise, read_process(slow, std[spectrum.starts[0] :]), slow.at(dt), int(outlying.sum()))
 
 
 def without_error(turbulence: tuple[Ar2 | Ar3, ...], error: Ar2 | None) -> tuple[Ar2 | Ar3, ...]:

@@ -18,6 +18,7 @@ from wfsobs.record import Record, RecordError, hold_last, pseudo_open_loop
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.filter_covariance import RiccatiError
+from wfsobs.spectral.missing import find_outlying
 from wfsobs.spectral.periodogram import fast_length, periodogram
 from wfsobs.spectral.search import LOWEST, PAD, Candidate, SearchResult, search_peaks
 from wfsobs.typing import Array
@@ -44,6 +45,7 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
     """Identify the model of every mode of a record, from its pseudo-open-loop measurement z.
 
     White noise, turbulence and vibration peaks, each number with its standard deviation; missing samples are accounted for.
+    Samples far from what those around them predict are counted, and then missing.
     With enough NGS frames the noise of the NGS and the slow error of the LGS as well.
 
     Parameters
@@ -91,6 +93,8 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
             )
         if not np.nanstd(column) > RESTING * np.nanmax(np.abs(column)):
             raise RecordError(f"{name}: z is constant, there is nothing to identify")
+    outlying = np.column_stack([find_outlying(column) for column in z.T])
+    z = np.where(outlying, np.nan, z)
     modes = []
     for column in z.T:
         watch.check()
@@ -100,7 +104,10 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
     found = tuple(
         read_mode(name, mode, lowest, check_whiteness(mode, count)) for name, mode, count in zip(names, modes, left, strict=False)
     )
-    if (differences := sensor_differences(record)) is not None and record.ratio is not None:
+    found = tuple(replace(mode, outlying=int(count)) for mode, count in zip(found, outlying.sum(axis=0), strict=True))
+    y_lgs = record.y_lgs.copy()
+    y_lgs[record.delay :][: len(z)][outlying] = np.nan
+    if (differences := sensor_differences(replace(record, y_lgs=y_lgs))) is not None and record.ratio is not None:
         found = tuple(
             replace(mode, difference=read_difference(column, record.dt, record.ratio, mode.noise))
             for mode, column in zip(found, differences.T, strict=True)

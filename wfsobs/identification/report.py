@@ -36,6 +36,7 @@ def identification_dict(result: Identification) -> dict[str, Any]:
             {
                 "mode": m.name,
                 **numbers(noise=m.noise),
+                "outlying": m.outlying,
                 "turbulence": None if m.turbulence is None else of(m.turbulence),
                 "background": None if m.background is None else of(m.background),
                 "ngs_noise": None if m.difference is None else numbers(rms=m.difference.noise),
@@ -79,6 +80,8 @@ def whiteness_lines(result: Identification) -> list[str]:
         w = m.whiteness
         tests = f"cumulative spectrum p = {w.periodogram:.2g}, innovations p = {w.innovations:.2g}"
         rest = f"; {w.left} candidates that no peak explains" if w.left else ""
+        outlying = {"samples": m.outlying, "NGS frames": m.difference.outlying if m.difference else 0}
+        rest += "".join(f"; outlying {what} taken for missing: {count}" for what, count in outlying.items() if count)
         why = "".join(f"; {remark}" for remark in w.remarks)
         out.append(f"{m.name}: residual is {'white' if w.white else 'NOT white'} at {LEVEL:.0%} ({tests}{rest}){why}")
     return out

@@ -61,6 +61,8 @@ class IdentifiedMode:
         Tests of the residual.
     difference : SensorDifference or None
         What the NGS tells beside z, of a record with enough NGS frames.
+    outlying : int
+        Samples of z far from what those around them predict, taken for missing.
     """
 
     name: str
@@ -73,6 +75,7 @@ class IdentifiedMode:
     prior: Lines
     whiteness: Whiteness
     difference: SensorDifference | None = None
+    outlying: int = 0
 
     @property
     def lgs_error(self) -> Ar2 | None:

@@ -1,4 +1,4 @@
-"""Missing samples of one mode: their expected values for a given spectrum, and the share of every bin lost with them.
+"""Missing samples of one mode: their expected values for a given spectrum, and the share of bins lost with them. Outlying ones.
 
 A filled record is not a measurement: it has no noise in its gaps. With C the covariance of the complete record (circulant, of
 eigenvalues S), the filled record is the conditional mean of the complete one given the measured samples; the expected periodogram
@@ -13,7 +13,9 @@ from itertools import pairwise
 from math import ceil, log
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.fft import irfft, rfft
+from scipy.ndimage import median_filter
 from scipy.sparse.linalg import LinearOperator, cg
 
 from wfsobs.spectral.periodogram import periodogram
@@ -27,6 +29,14 @@ CLOSE, MOST = 1e-4, 300
 """Approximate error of a filled sample, over the noise, at which conjugate gradients stop; maximum number of steps."""
 LEAST = 1e-3
 """Minimum measured share of a bin."""
+HALF = 8
+"""Samples to either side from which a sample is predicted."""
+FAR = 5.0
+"""Standard deviations beyond which a sample is outlying: one in 2e6 of Gaussian noise."""
+PART = 500
+"""Samples over which a standard deviation is taken, by a median; of a part and its neighbours the largest holds."""
+MOST_OUTLYING = 0.1
+"""Maximum share of outlying samples: beyond it they are what the sensor measures."""
 
 
 class MissingSamples:
@@ -95,3 +105,54 @@ class MissingSamples:
     def _at_all_frequencies(self, S: Array) -> Array:
         """Return a density at all frequencies of rfft, zero included."""
         return np.concatenate([S[:1], S, S[-1:]])[: self.n // 2 + 1]
+
+
+def find_outlying(z: Array) -> Array:
+    """Return which samples of z (n,) are far from what their neighbours on both sides predict, bool (n,); NaN is missing.
+
+    First those far from a running median, then, until it is the same ones, those far from the best linear prediction from the
+    samples that are neither missing nor outlying: so an outlier does not make its neighbours look like others.
+    """
+    gone, k = np.isnan(z), np.arange(len(z))
+    x = np.interp(k, k[~gone], z[~gone] - np.median(z[~gone]))
+    out = _is_far(x - median_filter(x, 5), gone, 0.0)
+    for _ in range(20):
+        before, absent = out, gone | out
+        out = _is_far(_prediction_errors(x, absent), absent, 0.05) & ~gone
+        if (out == before).all():
+            break
+    return out if out.mean() <= MOST_OUTLYING else np.zeros_like(out)
+
+
+def _is_far(errors: Array, absent: Array, least: float) -> Array:
+    """Return which errors are more than FAR of their standard deviations around there, at least `least`."""
+    size = np.abs(errors)
+    parts = np.array_split(np.where(absent, np.nan, size), max(len(size) // PART, 1))
+    scale = np.array([np.nanmedian(part) if np.isfinite(part).any() else 0.0 for part in parts]) / 0.6745
+    scale = sliding_window_view(np.pad(scale, 1), 3).max(axis=1)
+    return size > FAR * np.repeat(np.maximum(scale, least), [len(part) for part in parts])
+
+
+def _prediction_errors(x: Array, absent: Array) -> Array:
+    """Return x (n,) minus its prediction from what is not absent of the HALF samples on either side, over its deviation.
+
+    The covariance is that of the windows without absent samples; zeros where there are too few, or nothing but zeros.
+    """
+    count = 2 * HALF
+    windows = sliding_window_view(np.pad(np.where(absent, 0.0, x), HALF), count + 1)
+    known = ~sliding_window_view(np.pad(absent, HALF, constant_values=True), count + 1)
+    whole = known.all(axis=1)
+    learnt = windows[whole]
+    size = np.abs(learnt).max(initial=0.0)
+    if len(learnt) < 10 * count or size == 0.0:
+        return np.zeros_like(x)
+    M = (learnt / size).T @ (learnt / size) / len(learnt)
+    M = 0.5 * (M + M[::-1, ::-1]) + 1e-10 * np.trace(M) * np.eye(count + 1)
+    beside = np.arange(count + 1) != HALF
+    C, c = M[beside][:, beside], M[beside, HALF]
+    weights = np.tile(np.linalg.solve(C, c), (len(x), 1))
+    for some in np.array_split(np.flatnonzero(~whole), 1 + (~whole).sum() // 5000):  # for the memory
+        there = known[some][:, beside]
+        each = np.where(there[:, :, None] & there[:, None], C, np.eye(count))
+        weights[some] = np.linalg.solve(each, np.where(there, c, 0.0)[..., None])[..., 0]
+    return (x - (windows[:, beside] * weights).sum(axis=1)) / (size * np.sqrt(M[HALF, HALF] - weights @ c))
