@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import inf
 from typing import TYPE_CHECKING, Any
 
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.missing import fill_missing
 from wfsobs.observers.step_checks import StepError
-from wfsobs.prior import Part, Prior, Training
+from wfsobs.prior import LgsStars, Part, Prior, Spectra, Training
 from wfsobs.priors_from.controllers import own_settings, plant_of
 from wfsobs.priors_from.identification import told_by
-from wfsobs.priors_from.scenario import as_sampled, observer_settings, prior_of
+from wfsobs.priors_from.scenario import SHARED, as_sampled, observer_settings, prior_of
 from wfsobs.record import Record, Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
@@ -59,9 +60,9 @@ def design(
     SettingError
         The name is unknown.
     StepError
-        It cannot run frame by frame, or not for this horizon.
+        It cannot run frame by frame, or not for this horizon; the prior lacks a part that it needs, or has fewer modes.
     ValueError
-        The prior lacks what it needs; one line with the reason.
+        There is no such design for the prior; one line with the reason.
 
     Examples
     --------
@@ -80,6 +81,7 @@ def design(
         raise SettingError(f"design {name!r}: no such observer or controller; there are {known}")
     settings = scenario or (prior if isinstance(prior, Scenario) else Scenario())
     sampling = sampling or _sampling(prior, settings)
+    _check_sampling(name, sampling)
     settings = as_sampled(settings, sampling)
     told = prior if isinstance(prior, Prior) else settings
     if not isinstance(prior, Prior) and (scenario is not None or not isinstance(prior, Scenario)):
@@ -110,7 +112,20 @@ def prior_in(
     prior = _of_modes(prior, name, sampling.n_modes)
     if Training in parts and prior.training is None:
         prior = replace(prior, training=_training(scenario, train))
+    where = {**SHARED, Spectra: "spectra"}  # the parts whose absence has no reason of its own
+    del where[LgsStars]  # known where the number of LGS changes
+    for field in (where[part] for part in parts if part in where):
+        if not getattr(prior, field) and not (field == "noise" and prior.model):  # a model may have the noise
+            raise StepError(f"{name}: the prior has no {field}")
+    if prior.training is not None and prior.training.y_lgs.shape[1] < sampling.n_modes:
+        raise StepError(f"{name}: the training data have {prior.training.y_lgs.shape[1]} modes, the loop has {sampling.n_modes}")
     return prior
+
+
+def _check_sampling(name: str, sampling: Sampling) -> None:
+    n_modes, dt, ratio, delay = sampling
+    if not (n_modes >= 1 and 0.0 < dt < inf and (ratio is None or ratio >= 1) and delay >= 1):
+        raise StepError(f"{name}: {sampling}: takes 1 mode at least, dt above 0, and a ratio and a delay of 1 at least")
 
 
 def _sampling(prior: Prior | Identification | Scenario, scenario: Scenario) -> Sampling:
@@ -129,7 +144,7 @@ def sampling_of(scenario: Scenario) -> Sampling:
 
 def _of_modes(prior: Prior, name: str, n: int) -> Prior:
     """Return the prior of the first n modes. Raises StepError where it has fewer."""
-    parts = {part: getattr(prior, part) for part in ("model", "noise", "lgs_error", "lines", "beams", "spectra")}
+    parts = {part: getattr(prior, part) for part in ("model", "noise", "lgs_error", "stars", "lines", "beams", "spectra")}
     for part, given in parts.items():
         if given and len(given) < n:
             raise StepError(f"{name}: the prior has {part} of {len(given)} modes, the loop has {n}")

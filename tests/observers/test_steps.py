@@ -14,6 +14,7 @@ import pytest
 import wfsobs
 from tests.records import ON_PAPER, short
 from wfsobs import PRESETS
+from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead
 from wfsobs.observers import OBSERVERS
@@ -23,7 +24,8 @@ from wfsobs.observers.kalman.step import matrix_power
 from wfsobs.observers.missing import fill_missing
 from wfsobs.observers.step_checks import StepError
 from wfsobs.prior import Bands, Lines, Model, Prior, Training
-from wfsobs.priors_from.scenario import arguments, kalman_model, prior_of
+from wfsobs.priors_from.controllers import own_settings
+from wfsobs.priors_from.scenario import arguments, kalman_model, observer_settings, prior_of
 from wfsobs.priors_from.selection import has_prior
 from wfsobs.priors_from.turbulence import measurement_noise
 from wfsobs.progress import QUIET
@@ -189,12 +191,23 @@ def test_wrong_input_is_one_line_and_takes_no_frame() -> None:
         observer.update([0.0, np.inf])
     with refused("one is due in every 5th"):
         observer.update([0.0, 0.0], [0.0, 0.0])
+    for z in ("ab", ["1", "2"], [1j, 0.0], np.array([1.0 + 0j, 0.0]), [[1.0], [1.0, 2.0]], {}, np.array([0, 0], "datetime64[s]")):
+        with refused("^multirate: z takes real numbers, not .+$"):
+            observer.update(z)  # type: ignore[arg-type]
+    with refused("^multirate: ngs takes real numbers, not text$"):
+        observer.update([0.0, 0.0], "ab")
+    with refused("^multirate: stars takes a whole number, 0 or more, not 'x'$"):
+        observer.update([0.0, 0.0], stars="x")  # type: ignore[arg-type]
     assert observer.frame == 0
+    for z in ([0.0, np.nan], np.float32([1.0, 2.0]), [1, 2], [True, False], [None, 1.0]):
+        observer.update(z)
+    observer.reset()
     observer.update([0.0, np.nan])
     with refused("it estimates turbulence"):
         observer.predict(0, "vibration")
-    with refused("takes 0 or more"):
-        observer.predict(-1)
+    for frames in (-1, np.nan, "x", None):
+        with refused("takes 0 or more"):
+            observer.predict(frames, "turbulence")
     with refused("predict takes a target"):
         wfsobs.design("kf-lgs", PRESETS["paper"]()).predict(0)
     with refused("cannot run frame by frame"):
@@ -203,6 +216,54 @@ def test_wrong_input_is_one_line_and_takes_no_frame() -> None:
         observer.load_state_dict(wfsobs.design("kf-lgs", PRESETS["paper"]()).state_dict())
     with refused("not from kf-lgs"):
         observer.take_over(wfsobs.design("kf-lgs", PRESETS["paper"]()))
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_a_state_without_numbers_is_refused_and_leaves_the_old_one(name: str) -> None:
+    scenario = next(made for make in PRESETS.values() if has_prior(OBSERVERS[name], made := make()))
+    observer = wfsobs.design(name, scenario.replace({"run.duration": 2.0}))
+    state = observer.state_dict()
+    observer.load_state_dict(state)  # NaN where nothing is known yet
+    filled = {name: np.full(np.shape(x), np.nan) for name, x in state.items()}
+    own = {name for name in state if name.rpartition(".")[2] in ("x", "states", "covariance", "last", "past")}
+    for wrong in (
+        filled,
+        *({**state, one: filled[one]} for one in own),
+        {**state, "frame": "x"},
+        {**state, "frame": np.array(1j)},
+        {**state, "frame": -1},
+        {**state, "frame": 1.5},
+        "x",
+        None,
+    ):
+        with refused(f"^{name}: load_state_dict: .*$"):
+            observer.load_state_dict(wrong)  # type: ignore[arg-type]
+    for one, x in observer.state_dict().items():
+        np.testing.assert_array_equal(x, state[one])
+
+
+def refusal(*arguments: Any, **named: Any) -> str:
+    """Return why there is no design, empty where there is one."""
+    try:
+        wfsobs.design(*arguments, **named)
+    except StepError as error:
+        return str(error)
+    return ""
+
+
+@pytest.mark.parametrize("name", [*(n for n in STEPS if has_prior(OBSERVERS[n], PRESETS["paper"]())), *CONTROLLERS])
+def test_a_prior_that_lacks_something_is_one_line(name: str) -> None:
+    scenario = PRESETS["paper"]().replace({"run.duration": 2.0})
+    known = wfsobs.design(name, scenario).sampling
+    if name in OBSERVERS:
+        parts = OBSERVERS[name].parts(observer_settings(OBSERVERS[name], scenario))
+    else:
+        parts = CONTROLLERS[name].parts(own_settings(CONTROLLERS[name], scenario))
+    assert refusal(name, Prior(), scenario=scenario).startswith(f"{name}: the prior has no ") == bool(parts)
+    of_modes = {part for part in parts if not issubclass(part, Bands)}
+    assert ("modes, the loop has 5" in refusal(name, scenario, sampling=known._replace(n_modes=5))) == bool(of_modes)
+    for wrong in ({"n_modes": 0}, {"dt": 0.0}, {"dt": np.nan}, {"ratio": 0}, {"delay": 0}):
+        assert "takes 1 mode at least" in refusal(name, scenario, sampling=known._replace(**wrong))
 
 
 @pytest.mark.parametrize(("name", "ahead"), [("gpr-offline", gpr_offline_ahead), ("gpr-online", gpr_online_ahead)])

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from wfsobs.control.mirror import Plant
 from wfsobs.control.step_laws import StepLaw, VibrationAhead, push_row
 from wfsobs.observers.missing import Bridge
-from wfsobs.observers.step_checks import StepError, check_frame, check_not_due, check_state
+from wfsobs.observers.step_checks import StepError, check_frame, check_not_due, check_stars, check_state
 from wfsobs.record import Sampling
 from wfsobs.signal.stepping import Stateful, load_parts, save_parts
 from wfsobs.typing import Array
@@ -114,6 +114,7 @@ class StepController:
 
     def _take(self, x: ArrayLike, ngs: ArrayLike | None, stars: int | None, name: str, is_open: bool) -> Array:
         x, is_whole = check_frame(self.id, x, name, self.sampling.n_modes, self.frame)
+        check_stars(self.id, stars)
         due = self.uses_ngs and self.frame > 0 and self.frame % self._ratio == 0
         slow = self._check_ngs(ngs, due) if self.uses_ngs else None
         seen = self.correction

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from wfsobs.observers.missing import Bridge
-from wfsobs.observers.step_checks import StepError, check_each, check_frame, check_not_due, check_state
+from wfsobs.observers.step_checks import StepError, check_each, check_frame, check_not_due, check_stars, check_state
 from wfsobs.signal.stepping import Stateful, load_parts, save_parts
 from wfsobs.typing import Array
 
@@ -136,6 +136,7 @@ class StepObserver:
             The frame is then not taken.
         """
         z, is_whole = self._check(z, "z")
+        check_stars(self.id, stars)
         due = self._needs_ngs and self.frame > 0 and self.frame % self._ratio == 0
         slow = self._check_ngs(ngs, due) if self._needs_ngs else None
         if self.estimator.needs_command:
@@ -246,7 +247,7 @@ class StepObserver:
     def _check_request(self, frames: float, target: str) -> None:
         if target not in self.targets:
             raise StepError(f"{self.id}: target {target!r}: it estimates {' and '.join(self.targets)}")
-        if not 0 <= frames < inf:
+        if not isinstance(frames, (int, float, np.number)) or not 0 <= frames < inf:
             raise StepError(f"{self.id}: frames = {frames!r}: takes 0 or more")
         own = self.estimator.horizon
         if own is not None and frames != own:
