@@ -9,14 +9,22 @@ After frame k `predict(0)` is row k of the observer's run over the record.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from math import inf
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from wfsobs.observers.missing import Bridge
-from wfsobs.observers.step_checks import StepError, check_each, check_frame, check_not_due, check_stars, check_state
+from wfsobs.observers.step_checks import (
+    StepError,
+    check_each,
+    check_frame,
+    check_not_due,
+    check_request,
+    check_stars,
+    check_state,
+    only_target,
+)
 from wfsobs.signal.stepping import Stateful, load_parts, save_parts
 from wfsobs.typing import Array
 
@@ -182,9 +190,10 @@ class StepObserver:
             Another target, or frames that the observer does not predict.
         """
         if target is None:
-            target = self._only_target()
+            target = only_target(self.id, self.targets)
         if (frames, target) not in self._allowed_requests:
-            self._check_request(frames, target)
+            check_request(self.id, frames, target, self.targets, self.estimator.horizon)
+            self._allowed_requests.add((frames, target))
         mean, sd = self.estimator.predict(frames, target) if self.frame else (self._nothing, self._nothing)
         if out is None:
             return mean.copy(), sd.copy()
@@ -243,20 +252,3 @@ class StepObserver:
             return self._nothing if ngs is None else self._check(ngs, "ngs")[0]
         check_not_due(self.id, ngs, self._ratio, self.frame)
         return None
-
-    def _check_request(self, frames: float, target: str) -> None:
-        if target not in self.targets:
-            raise StepError(f"{self.id}: target {target!r}: it estimates {' and '.join(self.targets)}")
-        if not isinstance(frames, (int, float, np.number)) or not 0 <= frames < inf:
-            raise StepError(f"{self.id}: frames = {frames!r}: takes 0 or more")
-        own = self.estimator.horizon
-        if own is not None and frames != own:
-            raise StepError(
-                f"{self.id}: designed for {own:g} frames ahead; design it with horizon = {frames:g} for predict({frames:g})"
-            )
-        self._allowed_requests.add((frames, target))
-
-    def _only_target(self) -> str:
-        if len(self.targets) != 1:
-            raise StepError(f"{self.id}: predict takes a target: {' or '.join(self.targets)}")
-        return next(iter(self.targets))

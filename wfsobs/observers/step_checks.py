@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import inf, isnan
 from textwrap import shorten
 
@@ -83,6 +83,25 @@ def check_state(id: str, state: Mapping[str, ArrayLike], own: Mapping[str, Array
     if given["frame"] < 0:
         raise StepError(f"{id}: load_state_dict: frame = {given['frame']:g}: takes 0 or more")
     return given
+
+
+def only_target(id: str, targets: Sequence[str]) -> str:
+    """Return the target of an observer that estimates one. Raises StepError."""
+    if len(targets) != 1:
+        raise StepError(f"{id}: predict takes a target: {' or '.join(targets)}")
+    return targets[0]
+
+
+def check_request(id: str, frames: float, target: str, targets: Sequence[str], horizon: float | None) -> None:
+    """Raise StepError for a prediction that an observer of these targets, and trained for this horizon, does not make."""
+    if target not in targets:
+        raise StepError(f"{id}: target {target!r}: it estimates {' and '.join(targets)}")
+    if not isinstance(frames, (int, float, np.number)) or not 0 <= frames < inf:
+        raise StepError(f"{id}: frames = {frames!r}: takes 0 or more")
+    if horizon is not None and frames != horizon:
+        raise StepError(
+            f"{id}: designed for {horizon:g} frames ahead; design it with horizon = {frames:g} for predict({frames:g})"
+        )
 
 
 def whole_frames(frames: float, what: str) -> int:
