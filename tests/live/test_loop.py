@@ -287,7 +287,7 @@ def test_a_live_loop_from_start_to_stop():
         assert (loop.delivery.frames, loop.delivery.losses) == (sent, 0) and 0 <= loop.delivery.late_share <= 1
         names = [loop._processes.feed.ring.name, *(rows.name for rows in loop._processes.traces()), loop.board.name]
         assert len(names) == 4, "those that learn have a process of their own"
-        record, pids = loop.recorder.stop(scenario), loop.pids
+        record, pids = loop.recorder.stop(scenario), loop._processes.pids
         assert record.n_steps == sent == loop.newest
         for score in wfsobs.observe(record, scenario, observers=["kf-multi", "gp-both"]).scores:
             if score.observer in ("kf-multi", "gp-both"):
@@ -375,7 +375,8 @@ def test_nothing_is_left_of_a_loop_whose_owner_is_killed():
         "from wfsobs.live.simulated import SimulatedLoop\n"
         "s = PRESETS['paper']()\n"
         "loop = LiveLoop(SimulatedLoop(s), s, ['zero'])\n"
-        "print(*loop.pids, loop._processes.feed.ring.name, loop._processes.traces()[0].name, loop.board.name, flush=True)\n"
+        "p = loop._processes\n"
+        "print(*p.pids, p.feed.ring.name, p.traces()[0].name, loop.board.name, flush=True)\n"
         "time.sleep(100)\n"
     )
     owner = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)

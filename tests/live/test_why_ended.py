@@ -6,8 +6,10 @@ from typing import Any
 
 import pytest
 
-from wfsobs.live.follow import _drain, why_ended
+from wfsobs.live.follow import _drain
+from wfsobs.live.loop import LiveLoop
 from wfsobs.live.view import LiveEvent
+from wfsobs.settings.group import SettingError
 
 
 @pytest.mark.parametrize(
@@ -20,12 +22,15 @@ from wfsobs.live.view import LiveEvent
 )
 def test_the_reason_is_that_of_an_observer_whatever_a_source_says_afterwards(lines, reason):
     loop: Any = SimpleNamespace(events=deque(LiveEvent(0, line) for line in lines))
-    assert why_ended(loop) == reason
+    loop._processes = SimpleNamespace(failure=str, observers_are_alive=False)
+    loop.tend = lambda: None
+    assert LiveLoop.failure(loop) == reason
 
 
 def test_what_happens_is_said_once_each_also_what_comes_last():
     said: list[str] = []
     events = deque([LiveEvent(0, "no frame for 0.1 s"), LiveEvent(7, "frames again")])
-    loop: Any = SimpleNamespace(events=events, observers_are_alive=False, count=0)
-    _drain(loop, 10, None, lambda _: None, said.append)
+    loop: Any = SimpleNamespace(events=events, failure=lambda: "it was killed", count=0)
+    with pytest.raises(SettingError, match=r"^it was killed$"):
+        _drain(loop, 10, None, lambda _: None, said.append)
     assert said == ["no frame for 0.1 s", "frames again"] and not events

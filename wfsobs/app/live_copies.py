@@ -23,7 +23,7 @@ LOOP = """loop = LiveLoop(source, scenario, {observers!r}, speed={speed!r})
 for controller in {controllers!r}:
     loop.control(controller, True)
 loop.play()
-while loop.observers_are_alive and loop.count < n:
+while not loop.failure() and loop.count < n:
     time.sleep(0.1)
 for observer in loop.board.active():
     for target in OBSERVERS[observer].targets:

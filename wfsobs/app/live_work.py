@@ -13,7 +13,6 @@ from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.live_order import LiveOrder
 from wfsobs.app.logs import event
 from wfsobs.app.service import Service
-from wfsobs.live.follow import why_ended
 from wfsobs.live.loop import LiveLoop
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError
@@ -34,22 +33,24 @@ def compute(order: LiveOrder, service: Service, watch: Watch, tell: Tell) -> Non
         tell(latest=loop)
         while True:
             watch.check()
-            if not loop.observers_are_alive:
-                loop.tend()
-                raise SettingError(why_ended(loop))
+            if reason := loop.failure():
+                raise SettingError(reason)
             sleep(LOOK)
     finally:
-        order.end(loop)
-        loop.stop()
+        try:
+            order.end(loop)
+        finally:
+            loop.stop()
 
 
-def share_loop(order: LiveOrder, service: Service) -> None:
-    """Run a loop that all sessions watch, until the server ends."""
+def share_loop(order: LiveOrder, service: Service, fail: Callable[[], None]) -> None:
+    """Run a loop that all sessions watch, until the server ends; `fail` is called once it cannot go on."""
 
     def hear(news: Mapping[str, Any]) -> None:
         service.live_loop = news.get("latest", service.live_loop)
         if message := news.get("message"):
             event("live-failed", logging.ERROR, reason=message)
+            fail()
 
     service.live = order
     service.queue.submit(live_job(order, service), "server", hear)

@@ -20,6 +20,7 @@ from bokeh.server.views.autoload_js_handler import AutoloadJsHandler
 from bokeh.server.views.metadata_handler import MetadataHandler
 from bokeh.util.token import generate_secret_key
 from panel.io.server import DocHandler, get_server
+from tornado.ioloop import IOLoop
 
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.handlers import Liveness, PageHandler, SecurityHeaders, full_html
@@ -104,7 +105,7 @@ PAINTS = -5
 def serve(options: Options, live: LiveOrder | None = None) -> None:
     """Serve the dashboard at http://address:port/prefix until told to stop by SIGINT or SIGTERM. Raises OSError, SettingError.
 
-    live : a loop that runs until then, and that every page opens with
+    live : a loop that runs until then, and that every page opens with; where it cannot go on the server ends with exit status 2
     """
     to_stream(options.log_level, options.log_requests)
     prepare()
@@ -112,10 +113,16 @@ def serve(options: Options, live: LiveOrder | None = None) -> None:
     if options.campaign:
         service.campaign = CampaignFolder(Path(options.campaign))
     warm_up(service)
+    loop, status = IOLoop.current(), 0
+
+    def fail() -> None:
+        nonlocal status
+        status = 2
+        loop.add_callback(loop.stop)
+
     if live is not None:
-        share_loop(live, service)
+        share_loop(live, service, fail)
     server = make_server(options, service)
-    loop = server.io_loop
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: loop.add_callback_from_signal(loop.stop))
     event(
@@ -137,7 +144,9 @@ def serve(options: Options, live: LiveOrder | None = None) -> None:
     if not ended:  # a computation that does not listen must not keep the process
         logging.shutdown()
         sys.stdout.flush()
-        os._exit(0)
+        os._exit(status)
+    if status:
+        sys.exit(status)
 
 
 def make_service(limits: Limits, runs: int = 0, cache_mb: int = CACHE_MB) -> Service:

@@ -193,23 +193,25 @@ def _run_headless(
     n_frames = max(1, round(seconds / source.sampling.dt * speed))
     if isinstance(source, Replay):
         n_frames = min(n_frames, source.record.n_steps)
-    with progress_bar("frames") as update:
-        result = follow(
-            scenario,
-            n_frames,
-            observers,
-            source=source,
-            speed=speed,
-            keep=kept.append if record_file else None,
-            report=update,
-            say=_say if isinstance(source, StreamSource) else lambda _: None,
-            log_file=log_file or "",
-        )
-    if record_file and kept:
-        frames = LiveFrame(*(np.array(part) for part in zip(*kept, strict=True)))
-        is_simulated = isinstance(source, SimulatedLoop)
-        record = record_of(frames, scenario) if is_simulated else open_loop_record(frames, source.sampling)
-        save_record(record_file, record, configfile.to_toml(scenario.before_events))
+    try:
+        with progress_bar("frames") as update:
+            result = follow(
+                scenario,
+                n_frames,
+                observers,
+                source=source,
+                speed=speed,
+                keep=kept.append if record_file else None,
+                report=update,
+                say=_say if isinstance(source, StreamSource) else lambda _: None,
+                log_file=log_file or "",
+            )
+    finally:  # what has been sent is there, whatever has ended it
+        if record_file and kept:
+            frames = LiveFrame(*(np.array(part) for part in zip(*kept, strict=True)))
+            is_simulated = isinstance(source, SimulatedLoop)
+            record = record_of(frames, scenario) if is_simulated else open_loop_record(frames, source.sampling)
+            save_record(record_file, record, configfile.to_toml(scenario.before_events))
     if as_json:
         click.echo(json.dumps(result, allow_nan=False))
         return
@@ -217,6 +219,9 @@ def _run_headless(
     for name in ("Observer", "rms, nm", "step p50, us", "p99.9, us", "longer than a frame"):
         table.add_column(name, justify="left" if name == "Observer" else "right")
     for name, row in result["observers"].items():
-        rms = "-" if row["rms_nm"] is None else f"{row['rms_nm']:.2f}"
-        table.add_row(name, rms, f"{row['p50_us']:.0f}", f"{row['p99_9_us']:.0f}", str(row["late"]))
+        cells = (
+            "-" if x is None else f"{x:.{digits}f}"
+            for x, digits in ((row["rms_nm"], 2), (row["p50_us"], 0), (row["p99_9_us"], 0))
+        )
+        table.add_row(name, *cells, str(row["late"]))
     show_table(table)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from multiprocessing.shared_memory import SharedMemory
 from typing import NamedTuple
 
@@ -137,4 +138,5 @@ class Board:
         self.squares = self.samples = self.histograms = self.late = self.frames = self._since = np.empty(0, dtype=np.int64)
         self._memory.close()
         if self._owner:
-            self._memory.unlink()
+            with suppress(FileNotFoundError):  # as in `Rows.release`
+                self._memory.unlink()

@@ -16,7 +16,7 @@ from wfsobs.live.delivery import merged_rows
 from wfsobs.live.paced import Command, enter_process
 from wfsobs.live.ring import CAPACITY, Ring
 from wfsobs.live.rows import Rows
-from wfsobs.live.source import end_process
+from wfsobs.live.source import end_process, send_command
 from wfsobs.live.view import rms_of_known
 from wfsobs.record import Sampling
 from wfsobs.typing import Array
@@ -104,23 +104,23 @@ class ControlProcess:
         The frames.
     news : queue
         Of (number of the frame, one line).
+
+    Attributes
+    ----------
+    process : BaseProcess
+        It.
     """
 
     def __init__(self, context: SpawnContext, sampling: Sampling, warm_up: float, ring: Ring, news: Queue[tuple[int, str]]):
         self._rows, self._dt = Rows(row_width(sampling.n_modes), ROOM), sampling.dt
         inbox, self._outbox = context.Pipe(duplex=False)
         order = ControlOrder(sampling, warm_up, ring.name, self._rows.name, inbox, news)
-        self._process = context.Process(target=control_frames, args=(order,), daemon=True)
-        self._process.start()
-
-    @property
-    def pids(self) -> list[int]:
-        """Its process id."""
-        return [] if self._process.pid is None else [self._process.pid]
+        self.process = context.Process(target=control_frames, args=(order,), name="the controllers", daemon=True)
+        self.process.start()
 
     def tell(self, command: Command) -> None:
         """Give it a command."""
-        self._outbox.send(command)
+        send_command(self._outbox, command)
 
     def view(self, seconds: float) -> ControlView:
         """Return the last so many seconds that the controllers have taken."""
@@ -130,7 +130,7 @@ class ControlProcess:
 
     def stop(self) -> None:
         """End it and give the memory back."""
-        end_process(self._process)
+        end_process(self.process)
         self._rows.release()
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import isnan
+from math import isfinite
 from time import sleep
 from typing import Any
 
-from wfsobs.live.board import NEXT, SLOTS, Counts
+from wfsobs.live.board import NEXT, Counts
 from wfsobs.live.checks import observers_on
-from wfsobs.live.loop import TICK, LiveLoop
+from wfsobs.live.loop import LiveLoop
 from wfsobs.live.ring import LiveFrame
 from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.live.source import LiveSource
@@ -65,12 +65,12 @@ def follow(
         "late_share_sent" (the source sent them more than 1 ms after that) and "observers": id -> latency "p50_us", "p99_9_us",
         frames "late" (longer than a frame), "rms_nm" over all targets and modes, "errors_nm" by target (both
         together, too) and mode,
-        "next_nm" of the next measurement by mode, which needs no truth.
+        "next_nm" of the next measurement by mode, which needs no truth; None for a number that is not known.
 
     Raises
     ------
     SettingError
-        An observer is unknown or does not run frame by frame, or an event cannot be played.
+        An observer is unknown or does not run frame by frame, an event cannot be played, or a process was killed.
     """
     source = source or SimulatedLoop(scenario)
     chosen = list(dict.fromkeys(observers or observers_on(source, scenario)))
@@ -99,8 +99,8 @@ def _row(counts: Counts, targets: Sequence[str], modes: Sequence[str]) -> dict[s
     both = [TOTAL] if set(targets) == set(TARGETS) else []
     errors = {target: dict(zip(modes, map(_nanometres, counts.rms(target)), strict=True)) for target in (*targets, *both)}
     return {
-        "p50_us": counts.latencies.quantile(0.5) * 1e6,
-        "p99_9_us": counts.latencies.quantile(0.999) * 1e6,
+        "p50_us": _times(1e6, counts.latencies.quantile(0.5)),
+        "p99_9_us": _times(1e6, counts.latencies.quantile(0.999)),
         "late": int(counts.late[0]),
         "rms_nm": _nanometres(counts.total_rms(targets)),
         "errors_nm": errors,
@@ -109,23 +109,19 @@ def _row(counts: Counts, targets: Sequence[str], modes: Sequence[str]) -> dict[s
 
 
 def _nanometres(x: float) -> float | None:
-    return None if isnan(x) else float(x) * 1e3
+    return _times(1e3, x)
+
+
+def _times(factor: float, x: float) -> float | None:
+    return factor * float(x) if isfinite(x) else None
 
 
 def _await_observers(loop: LiveLoop) -> None:
     """Wait until the observers are designed. Raises SettingError with the reason where one cannot be."""
     while not loop.is_ready:
-        if not loop.observers_are_alive:
-            sleep(2.0 * TICK)  # the line may still be on its way
-            raise SettingError(why_ended(loop))
+        if reason := loop.failure():
+            raise SettingError(reason)
         sleep(PAUSE)
-
-
-def why_ended(loop: LiveLoop) -> str:
-    """Return the line of the observer that could not be designed, or else the last one."""
-    lines = [event.line for event in loop.events]
-    of_observers = [line for line in lines if line.split(":")[0] in SLOTS]
-    return next(iter((*of_observers, *lines[-1:])), "the processes of the loop have ended")
 
 
 def _drain(
@@ -135,12 +131,12 @@ def _drain(
     report: Callable[[float], None],
     say: Callable[[str], None],
 ) -> None:
-    """Keep every frame and say what happens, until all have been taken or no more come."""
+    """Keep every frame and say what happens, until all have been taken or no more come. Raises SettingError."""
     kept = reported = 0
-    is_over = False
+    is_over, reason = False, ""
     while not is_over:
-        may_go_on = loop.observers_are_alive and (loop.feed.is_alive or loop.count < loop.newest)
-        is_over = loop.count >= n_frames or not may_go_on
+        reason = loop.failure()
+        is_over = bool(reason) or loop.count >= n_frames or not (loop.feed.is_alive or loop.count < loop.newest)
         if not is_over:
             sleep(PAUSE)
         while loop.events:
@@ -152,3 +148,5 @@ def _drain(
         if loop.count // 1000 > reported:
             reported = loop.count // 1000
             report(loop.count / n_frames)
+    if reason and loop.count < n_frames:
+        raise SettingError(reason)

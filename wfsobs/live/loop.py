@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from threading import Event, Thread
+from threading import Event, Lock, Thread
 from typing import Any
 from weakref import ReferenceType, finalize, ref
 
+from wfsobs.live.board import SLOTS
 from wfsobs.live.checks import check_slot, check_speed
 from wfsobs.live.control_process import ControlView
 from wfsobs.live.processes import LiveProcesses
@@ -62,7 +63,7 @@ class LiveLoop:
         self.events: deque[LiveEvent] = deque(maxlen=MOST_EVENTS)
         self.controllers: set[str] = set()
         self._shadow: Shadow | None = None
-        self._log_file, self.readings = "", SharedView()
+        self._log_file, self.readings, self._tending = "", SharedView(), Lock()
         self._processes = LiveProcesses(source, told.before_events, tuple(dict.fromkeys(observers)), self._speed, n_frames)
         self.feed, self.board, self.delivery = self._processes.feed, self._processes.board, self._processes.delivery
         self.programme = Programme(told, self.feed.tell)
@@ -82,11 +83,6 @@ class LiveLoop:
         return self._processes.are_ready
 
     @property
-    def observers_are_alive(self) -> bool:
-        """Whether the observers take what comes."""
-        return self._processes.observers_are_alive
-
-    @property
     def speed(self) -> float:
         """Speed; 1 is real time."""
         return self._speed
@@ -100,11 +96,6 @@ class LiveLoop:
     def newest(self) -> int:
         """Frames that the source has sent."""
         return self.feed.ring.count
-
-    @property
-    def pids(self) -> list[int]:
-        """Ids of the processes of source and observers."""
-        return self._processes.pids
 
     @property
     def scenario(self) -> Scenario:
@@ -222,16 +213,26 @@ class LiveLoop:
 
     def tend(self) -> None:
         """Look after the processes; called a few times a second."""
-        if self._is_wanted and self.is_ready and not self._has_begun:
-            self._has_begun = True
-            self.feed.tell({"play": True})
-        self.programme.play(self.newest * self.sampling.dt)
-        for number, line in self._processes.news():
-            self.say(line, number)
-        self.delivery.collect()
-        self.recorder.collect()
-        if self._shadow is not None:
-            self._shadow(self)
+        with self._tending:
+            if self._is_wanted and self.is_ready and not self._has_begun:
+                self._has_begun = True
+                self.feed.tell({"play": True})
+            self.programme.play(self.newest * self.sampling.dt)
+            for number, line in self._processes.news():
+                self.say(line, number)
+            self.delivery.collect()
+            self.recorder.collect()
+            if self._shadow is not None:
+                self._shadow(self)
+
+    def failure(self) -> str:
+        """Return why the loop cannot go on, in one line; "" while it can: a process was killed, an observer has no design."""
+        if (line := self._processes.failure()) or self._processes.observers_are_alive:
+            return line
+        self.tend()
+        lines = [event.line for event in self.events]
+        of_observers = [line for line in lines if line.split(":")[0] in SLOTS]
+        return next(iter((*of_observers, *lines[-1:])), "the processes of the loop have ended")
 
     def stop(self) -> None:
         """End the processes and give the memory back."""

@@ -11,12 +11,12 @@ from multiprocessing.queues import Queue
 from time import monotonic, sleep
 from typing import Any
 
-from wfsobs.live.board import Board
+from wfsobs.live.board import CREWS, Board
 from wfsobs.live.crew import Crew, trace_width
 from wfsobs.live.paced import SOURCE, Command, enter_process, go_first
 from wfsobs.live.ring import Ring
 from wfsobs.live.rows import Rows
-from wfsobs.live.source import end_process
+from wfsobs.live.source import end_process, send_command
 from wfsobs.record import Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.stepping import design
@@ -90,6 +90,8 @@ class CrewProcess:
     ----------
     traces : Rows
         Its estimates.
+    process : BaseProcess
+        It.
     """
 
     def __init__(self, context: SpawnContext, site: Site, observers: tuple[str, ...], place: int, joins_late: bool):
@@ -98,8 +100,8 @@ class CrewProcess:
         inbox, self._outbox = context.Pipe(duplex=False)
         names = site.ring.name, self.traces.name, site.board.name
         order = Order(site.settings, observers, site.sampling, place, joins_late, *names, inbox, site.news)
-        self._process = context.Process(target=observe_frames, args=(order,), daemon=True)
-        self._process.start()
+        self.process = context.Process(target=observe_frames, args=(order,), name=f"the observers ({CREWS[place]})", daemon=True)
+        self.process.start()
 
     @property
     def is_ready(self) -> bool:
@@ -114,20 +116,15 @@ class CrewProcess:
     @property
     def is_alive(self) -> bool:
         """Whether it takes what comes."""
-        return self._process.is_alive()
-
-    @property
-    def pids(self) -> list[int]:
-        """Its process id."""
-        return [] if self._process.pid is None else [self._process.pid]
+        return self.process.is_alive()
 
     def tell(self, command: Command) -> None:
         """Give it a command."""
-        self._outbox.send(command)
+        send_command(self._outbox, command)
 
     def stop(self) -> None:
         """End it and give the memory back."""
-        end_process(self._process)
+        end_process(self.process)
         self.traces.release()
 
 

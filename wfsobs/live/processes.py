@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
+from multiprocessing.process import BaseProcess
+from signal import Signals
 from threading import Event, RLock
 
 from wfsobs.live.board import CREWS, Board, crew_of
 from wfsobs.live.control_process import ControlProcess
 from wfsobs.live.delivery import Delivery
 from wfsobs.live.observing import CrewProcess, Site
-from wfsobs.live.paced import Command, enter_process
+from wfsobs.live.paced import Command
 from wfsobs.live.ring import LiveFrame
-from wfsobs.live.rows import Rows
-from wfsobs.live.source import LiveSource, SourceProcess, end_process, take_all
+from wfsobs.live.rows import Rows, Tracker
+from wfsobs.live.source import LiveSource, SourceProcess, take_all
 from wfsobs.live.view import LiveView, last_frames, read_view
+from wfsobs.live.workshop import SideProcess
 from wfsobs.scenario import Scenario
 
 
@@ -44,8 +46,8 @@ class LiveProcesses:
         What is counted of the frames.
     controllers : ControlProcess or None
         Begun with the first controller.
-    workshop : ProcessPoolExecutor
-        A process at low priority, which is made when it is first used.
+    workshop : SideProcess
+        For what is made beside them.
     is_over : threading.Event
         Whether all has ended.
     """
@@ -53,7 +55,7 @@ class LiveProcesses:
     def __init__(
         self, source: LiveSource, scenario: Scenario, observers: tuple[str, ...], speed: float, n_frames: int | None = None
     ):
-        self._context = get_context("spawn")
+        self._context, self._tracker = get_context("spawn"), Tracker()
         self.feed, self.is_over, self._lock = SourceProcess(source, speed, n_frames), Event(), RLock()
         self.board, self._news = Board(source.sampling.n_modes), self._context.Queue()
         self._site = Site(scenario.to_dict(), source.sampling, self.feed.ring, self.board, self._news)
@@ -65,7 +67,7 @@ class LiveProcesses:
             if own or not place:
                 self._start_crew(place, own)
         self.delivery = Delivery(self.feed.ring, self.board, self.traces, self.count)
-        self.workshop = ProcessPoolExecutor(1, self._context, initializer=enter_process, initargs=(10,))
+        self.workshop = SideProcess(self._context)
 
     def _start_crew(self, place: int, observers: tuple[str, ...], *, joins_late: bool = False) -> None:
         self.crews[place] = CrewProcess(self._context, self._site, observers, place, joins_late)
@@ -101,10 +103,23 @@ class LiveProcesses:
         return not self.is_over.is_set() and all(crew.is_alive for crew in list(self.crews.values()))
 
     @property
+    def processes(self) -> list[BaseProcess]:
+        """All that have begun."""
+        beside = (None if self.controllers is None else self.controllers.process, self.workshop.process)
+        crews = (crew.process for crew in list(self.crews.values()))
+        return [*self.feed.processes, *crews, *(process for process in beside if process is not None)]
+
+    @property
     def pids(self) -> list[int]:
-        """Ids of the processes of source and observers."""
-        others = [] if self.controllers is None else self.controllers.pids
-        return [*self.feed.pids, *(pid for crew in list(self.crews.values()) for pid in crew.pids), *others]
+        """Their ids."""
+        return [process.pid for process in self.processes if process.pid is not None]
+
+    def failure(self) -> str:
+        """Return one line that names the processes that have ended otherwise than by themselves; "" without one."""
+        lines = [f"the process of {p.name} ({p.pid}) was ended by {_cause(p.exitcode)}" for p in self.processes if p.exitcode]
+        if self._tracker.is_gone:
+            lines.append("the resource tracker of Python was killed")
+        return f"live: {'; '.join(lines)}" if lines else ""
 
     def tell_observers(self, command: Command) -> None:
         """Give a command to the crew of the observer that it is about, which begins with its first one."""
@@ -135,11 +150,14 @@ class LiveProcesses:
         with self._lock:
             self.is_over.set()
         self.delivery.collect()
+        self._tracker.release()
         for crew in (*self.crews.values(), *([self.controllers] if self.controllers else ())):
             crew.stop()
-        workers = [*(self.workshop._processes or {}).values()]
-        self.workshop.shutdown(wait=False, cancel_futures=True)
-        for worker in workers:
-            end_process(worker)
+        self.workshop.stop()
         self.feed.stop()
         self.board.release()
+
+
+def _cause(status: int) -> str:
+    """Return what has ended a process of this exit status."""
+    return f"an error, exit status {status}" if status > 0 else f"signal {-status} ({Signals(-status).name})"

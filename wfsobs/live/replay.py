@@ -38,7 +38,8 @@ class Replay:
 
     def staff(self, context: SpawnContext, desk: Desk) -> Staff:
         """Return its process."""
-        return Staff(context.Process(target=_send, args=(frame_rows(self.record), self.record.dt, desk), daemon=True), [], [])
+        rows = frame_rows(self.record)
+        return Staff(context.Process(target=_send, args=(rows, self.record.dt, desk), name="the source", daemon=True), [], [])
 
 
 def frame_rows(record: Record) -> Array:

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import select
+import warnings
+from contextlib import suppress
+from multiprocessing import resource_tracker
 from multiprocessing.shared_memory import SharedMemory
 
 import numpy as np
@@ -84,4 +89,35 @@ class Rows:
         self._head, self._rows = self._head.copy(), np.broadcast_to(np.nan, self._rows.shape)
         self._memory.close()
         if self._owner:
-            self._memory.unlink()
+            with suppress(FileNotFoundError):  # a resource tracker has done so: that of this process was killed
+                self._memory.unlink()
+
+
+class Tracker:
+    """The process of Python that gives shared memory back where its owner was killed."""
+
+    def __init__(self) -> None:
+        pipe = resource_tracker.getfd() if os.name == "posix" else None
+        self._pipe = None if pipe is None else os.dup(pipe)
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether it has been killed: nobody reads from its pipe."""
+        if self._pipe is None:
+            return False
+        (look := select.poll()).register(self._pipe, 0)
+        return bool(look.poll(0))
+
+    def release(self) -> None:
+        """Have another one in place of one that is gone; what it says of memory that it has never heard of is not shown."""
+        is_gone, pipe, self._pipe = self.is_gone, self._pipe, None
+        if pipe is not None:
+            os.close(pipe)
+        if is_gone:
+            shown = os.dup(2)
+            with open(os.devnull, "w") as nothing, warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                os.dup2(nothing.fileno(), 2)
+                resource_tracker.ensure_running()
+                os.dup2(shown, 2)
+            os.close(shown)

@@ -58,8 +58,8 @@ class SimulatedLoop:
         ready = context.Queue(round(AHEAD / self.scenario.dt) // piece_length(self.scenario) + 1)
         inbox, outbox = context.Pipe(duplex=False)
         settings = self.scenario.to_dict()
-        maker = context.Process(target=_make, args=(settings, inbox, ready), daemon=True)
-        sender = context.Process(target=_send, args=(settings, ready, desk), daemon=True)
+        maker = context.Process(target=_make, args=(settings, inbox, ready), name="the simulation", daemon=True)
+        sender = context.Process(target=_send, args=(settings, ready, desk), name="the source", daemon=True)
         return Staff(sender, [maker], [outbox], ready)
 
 

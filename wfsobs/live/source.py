@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext
 from multiprocessing.process import BaseProcess
 from multiprocessing.queues import Queue
@@ -57,6 +59,8 @@ class SourceProcess:
     ----------
     ring : Ring
         Its frames.
+    processes : list of BaseProcess
+        That which writes the ring is the last one.
     """
 
     def __init__(self, source: LiveSource, speed: float = 1.0, n_frames: int | None = None):
@@ -67,17 +71,14 @@ class SourceProcess:
         inbox, self._outbox = context.Pipe(duplex=False)
         desk = Desk(self.ring.name, n_modes, inbox, self._news, speed, n_frames)
         self._staff = source.staff(context, desk)
-        self._processes = [*self._staff.others, self._staff.sender]
-        for process in self._processes:
+        self.processes = [*self._staff.others, self._staff.sender]
+        for process in self.processes:
             process.start()
 
     def tell(self, command: Command) -> None:
         """Give a command to the process that sends; new settings to the others as well."""
         for pipe in (*self._staff.outboxes, self._outbox) if command.get("is_new") else (self._outbox,):
-            try:
-                pipe.send(command)
-            except OSError:  # it has ended
-                return
+            send_command(pipe, command)
 
     def news(self) -> list[tuple[int, str]]:
         """Return what it has said since the last call: number of the frame, one line."""
@@ -86,18 +87,19 @@ class SourceProcess:
     @property
     def is_alive(self) -> bool:
         """Whether frames may follow."""
-        return self._processes[-1].is_alive() and not self.ring.is_closed
-
-    @property
-    def pids(self) -> list[int]:
-        """Process ids."""
-        return [p.pid for p in self._processes if p.pid is not None]
+        return self.processes[-1].is_alive() and not self.ring.is_closed
 
     def stop(self) -> None:
         """End the processes and give the memory back."""
-        for process in self._processes:
+        for process in self.processes:
             end_process(process)
         self.ring.release()
+
+
+def send_command(outbox: Connection, command: Command) -> None:
+    """Send a command to a process; to one that has ended, nothing."""
+    with suppress(OSError):
+        outbox.send(command)
 
 
 def take_all(queue: Queue[tuple[int, str]]) -> list[tuple[int, str]]:
