@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import ttest_1samp, ttest_rel
+from scipy.stats import binom, ttest_1samp, ttest_rel
 
-from wfsobs.evaluation.evidence import differ_in_pairs, gather_evidence
+from wfsobs.evaluation.evidence import Evidence, columns_differ, gather_evidence, holm
+from wfsobs.evaluation.rows import can_be_best
 from wfsobs.evaluation.scores import Score
 from wfsobs.evaluation.verdict import verdict
+from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import run
 from wfsobs.scenario.presets import PRESETS
 
@@ -24,7 +26,40 @@ def test_a_difference_is_that_of_a_paired_t_test() -> None:
     for shift in np.linspace(0.0, 2.0, 9):
         one = rng.normal(10.0, 3.0, 8)
         other = one + rng.normal(shift, 1.0, 8)
-        assert differ_in_pairs(one, other) == (ttest_rel(one, other).pvalue < 0.05)
+        expected = ttest_rel(one, other).pvalue < 0.05
+        assert columns_differ(np.column_stack([one, other])).tolist() == [[False, expected], [expected, False]]
+
+
+def test_many_tests_are_those_of_a_table_done_by_hand() -> None:
+    """Holm: 0.001 <= 0.05 / 4, 0.012 <= 0.05 / 3, 0.03 > 0.05 / 2: that and all above are not significant."""
+    assert holm(np.array([0.03, 0.001, 0.04, 0.012])).tolist() == [False, True, False, True]
+
+
+@pytest.mark.parametrize(("names", "seeds"), [(8, 8), (12, 3), (20, 20)])
+def test_of_equals_any_is_called_worse_in_at_most_five_per_cent(names: int, seeds: int) -> None:
+    """Without a correction for their number: 43 to 60 % of cases."""
+    rng, n = np.random.default_rng(names), 600
+    ids = [name for name in OBSERVERS if can_be_best(name, False) and name != "zero"][: min(names, 8)]
+    worse = unequal = 0
+    for _ in range(n):
+        shared = rng.normal(10.0, 1.0, (seeds, 1))
+        errors = shared + rng.normal(0.0, 0.5, (seeds, names))
+        worse += bool(columns_differ(errors).any())
+        of = {(name, "vibration", "tip"): errors[:, i] for i, name in enumerate(ids)}
+        unequal += len(Evidence(of, dict.fromkeys(of, errors[:, 0]), seeds).leaders("vibration", "tip")) < len(ids)
+    most = binom.ppf(0.9999, n, 0.05) / n
+    assert worse / n <= most and unequal / n <= most
+
+
+def test_one_of_many_that_is_worse_is_found() -> None:
+    rng = np.random.default_rng(2)
+    errors = rng.normal(10.0, 1.0, (8, 1)) + rng.normal(0.0, 0.2, (8, 10)) + 2.0 * (np.arange(10) == 4)
+    of = {
+        (name, "turbulence", "tip"): errors[:, i] for i, name in enumerate([n for n in OBSERVERS if can_be_best(n, False)][:10])
+    }
+    worst = list(of)[4][0]
+    found = Evidence(of, dict.fromkeys(of, errors[:, 0]), 8).leaders("turbulence", "tip")
+    assert worst not in found and len(found) == 9
 
 
 def test_the_interval_is_that_of_the_mean() -> None:

@@ -10,9 +10,11 @@ import pytest
 from scipy.signal import lfilter
 
 from wfsobs.evaluation.budget import error_budget
+from wfsobs.evaluation.evidence import LEVEL, means_differ
 from wfsobs.evaluation.rows import can_be_best, row_label
+from wfsobs.evaluation.samples import BATCHES, batch_means
 from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS
-from wfsobs.evaluation.verdict import BATCHES, LEVEL, differs, explain_harm, verdict
+from wfsobs.evaluation.verdict import explain_harm, verdict
 from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import run
 from wfsobs.result import Result
@@ -61,13 +63,22 @@ def test_the_best_is_the_least_error_of_the_table_and_the_sentence_has_its_numbe
             first = found.sentences()[0]
             assert first.startswith(f"{target.capitalize()}, {mode}: {row_label(found.best.observer)} ")
             # Three digits, so that half of the last is at most 0.5 %.
-            said = re.search(r"(?:best|error), ([\d.]+) nm", first)
+            said = re.search(r"(?:best|error), ([\d.]+) ± ([\d.]+) nm", first)
             assert said and float(said[1]) == pytest.approx(found.best.rms * 1e3, rel=5e-3)
+            score = next(s for s in of if s.observer == found.best.observer)
+            assert found.best.interval == score.interval and score.interval is not None
+            low, high = score.interval
+            assert low < score.rms < high and float(said[2]) == pytest.approx(500.0 * (high - low), abs=0.051)
             bound = next(s.rms for s in of if s.observer == BOUND_BOTH)
-            percent = re.search(r"(\d+) % (above|below) the bound of LGS and NGS", first)
-            signed = 0.0 if percent is None else float(percent[1]) * (1 if percent[2] == "above" else -1)
-            assert signed == pytest.approx(100.0 * (found.best.rms / bound - 1.0), abs=0.51)
-            assert ("tied" in first) == bool(found.ties) and all(row_label(name) in first for name in found.ties)
+            percent = re.search(r"(\d+) % (above|below) the theoretical limit using LGS and NGS", first)
+            if low <= bound <= high:
+                assert "at the theoretical limit using LGS and NGS" in first
+            else:
+                assert percent and percent[2] == ("above" if bound < low else "below")
+                assert float(percent[1]) == pytest.approx(100.0 * abs(found.best.rms / bound - 1.0), abs=0.51)
+            assert ("statistically equal to" in first) == bool(found.ties) and all(
+                row_label(name) in first for name in found.ties
+            )
 
 
 def test_who_does_harm_is_named_with_where_its_error_lies(result: Result) -> None:
@@ -102,15 +113,15 @@ def test_a_filter_of_one_line_does_harm_at_the_others_and_not_where_there_are_no
         by_name[name] = found
     (harm,) = by_name["paper"].harms
     assert harm.observer == "kf-lgs" and harm.worse and harm.at_others > 0.6 > 0.3 > harm.at_known
-    assert "LGS KF is worse than no estimate: it is given a model with one line" in by_name["paper"].sentences()[1]
+    assert "LGS KF is worse than assuming no vibration: its model has one of 12 peaks" in by_name["paper"].sentences()[1]
     # With one line both filters have the same model.
     assert not by_name["one line"].harms and by_name["one line"].ties
 
 
 NAMES = {
-    "noise": "noise of the sensors",
+    "noise": "sensor noise",
     "lag": "lag",
-    "lines": "not model",
+    "lines": "unmodelled peaks",
     "mismatch": "model mismatch",
     "cone": "cone effect and aliasing",
 }
@@ -140,12 +151,12 @@ def test_who_does_harm_is_named_with_the_largest_term_of_its_error_budget(name: 
         assert harm.cause == max(of, key=of.__getitem__)
         # Rounding: the terms add up to the square of the error in the table.
         assert harm.share == pytest.approx(of[harm.cause] / errors[harm.observer] ** 2, rel=1e-6)
-        (said,) = (s for s in sentences if row_label(harm.observer) in s.partition(" than no estimate")[0])
+        (said,) = (s for s in sentences if row_label(harm.observer) in s.partition(" than assuming")[0])
         assert said.endswith(f"{NAMES[harm.cause]}.")
         together = [
-            h.share for h in found.harms if h.cause == harm.cause and row_label(h.observer) in said.partition(" than no")[0]
+            h.share for h in found.harms if h.cause == harm.cause and row_label(h.observer) in said.partition(" than assuming")[0]
         ]
-        percent = re.search(r"(?:(\d+) %|all) of (?:its|their) error is", said)
+        percent = re.search(r"(?:(\d+) %|all) of (?:its|their) error comes from", said)
         assert percent and float(percent[1] or 100.0) == pytest.approx(100.0 * np.mean(together), abs=0.51)
     if name in CAUSED:
         assert {harm.cause for harm in found.harms if harm.observer.startswith(("kf", "multirate"))} == {name}
@@ -165,6 +176,11 @@ def test_without_truth_there_is_no_verdict_and_without_a_simulation_no_lines() -
     assert verdict(result.scenario, replace(result.record, turbulence=None, vibration=None), *given[2:]) is None
 
 
+def differs(*errors: Array) -> bool:
+    """Whether any of some errors of one record differ significantly."""
+    return bool(means_differ(batch_means(np.array(errors).T ** 2), in_order=True).any())
+
+
 def errors_of(rng: np.random.Generator, scale: float) -> tuple[Array, Array]:
     """Two records of 10 s of equally distributed errors, correlated over 20 ms and with each other; the other scaled."""
     shared, one, other = lfilter([np.sqrt(1.0 - 0.95**2)], [1.0, -0.95], rng.standard_normal((3, 10_000)))
@@ -180,6 +196,14 @@ def test_a_difference_is_called_significant_as_often_as_the_level_says_and_a_lar
     assert abs(even - LEVEL) < 4.0 * np.sqrt(LEVEL * (1.0 - LEVEL) / 400)
     assert np.mean([differs(*errors_of(rng, 1.2)) for _ in range(50)]) > 0.9
     assert not differs(np.zeros(BATCHES), np.zeros(BATCHES))
+
+
+def test_of_eight_equal_errors_of_one_record_any_is_called_different_as_rarely() -> None:
+    rng, found = np.random.default_rng(5), 0
+    for _ in range(200):
+        shared, *own = lfilter([np.sqrt(1.0 - 0.95**2)], [1.0, -0.95], rng.standard_normal((9, 10_000)))
+        found += differs(*(0.8 * shared + 0.6 * one for one in own))
+    assert found / 200 < LEVEL + 4.0 * np.sqrt(LEVEL * (1.0 - LEVEL) / 200)
 
 
 @pytest.mark.parametrize("seconds", [0.3, 1.0])

@@ -112,7 +112,7 @@ def test_the_verdict_says_the_largest_term_of_those_that_do_harm_when_it_is_know
         loop.until(lambda: store.run.state == DONE and bool(causes.budgets))
         terms = {b.observer: b.terms for b in causes.budgets if (b.target, b.mode) == ("vibration", mode)}
         assert max(terms["kf-lgs"], key=terms["kf-lgs"].__getitem__) == "lines"
-        assert "error is lines that they do not model." in line.html()
+        assert "error comes from unmodelled peaks." in line.html()
         assert line.pane.object == line.html()
     store.run_on(LoadedRecord(simulate(store.scenario), "mine", "key"), store.scenario)
     assert not causes.budgets

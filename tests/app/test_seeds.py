@@ -129,8 +129,8 @@ def test_a_change_of_settings_cancels_them_and_one_seed_is_none(store: Store, lo
     seeds.count = 1
     loop.finish(store)
     assert seeds.n_known == 1 and seeds.evidence is None and store.session.service.queue.length == 0
-    seeds.count = 2
-    loop.until(lambda: seeds.n_known == 2)
+    seeds.count = 3
+    loop.until(lambda: seeds.n_known == 3)
     assert seeds.evidence is not None
 
 

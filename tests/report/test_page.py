@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from wfsobs import __version__
+from wfsobs.app.display import AT_LIMIT
 from wfsobs.app.numerals import number
 from wfsobs.app.report.data import Report, state_of
 from wfsobs.app.report.grid import Grid
@@ -25,6 +26,7 @@ from wfsobs.app.report.page import page
 from wfsobs.app.report.text import FILE, LONGEST, command_of
 from wfsobs.evaluation.rows import TIME, is_non_causal, row_label, scored_interval, target_title
 from wfsobs.evaluation.scores import BOUND
+from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import observe, run
 from wfsobs.result import Result
 from wfsobs.scenario import Scenario
@@ -86,11 +88,19 @@ def test_the_numbers_are_those_of_the_run(report: Report, text: str, parse: Any)
             if cells:
                 got[title, first] = cells
         want = {}
+        own = {("lgs",): "bound", ("lgs", "ngs"): "bound-both"}
+        rows = {(row["observer"], row["target"], row["mode"]): row for row in state.rows}
+        known = {key: row["interval_um"] for key, row in rows.items() if key[0] in OBSERVERS and key[0] != "zero"}
+        least = {
+            key: rows[own[OBSERVERS[key[0]].sensors], *key[1:]]["rms_um"] for key in known if OBSERVERS[key[0]].sensors in own
+        }
+        limits = {k for k, x in least.items() if OBSERVERS[k[0]].causal and known[k][0] <= x <= known[k][1]}
         for row in state.rows:
             name = row_label(row["observer"]) + (" looks ahead" if is_non_causal(row["observer"]) else "")
+            name += f" {AT_LIMIT}" if (row["observer"], row["target"], row["mode"]) in limits else ""
             lag = "–" if row["lag_s"] is None else f"{1e3 * row['lag_s']:z.2f}".replace("-", "−")
-            spread = "" if row["interval_um"] is None else f" {' – '.join(number(1e3 * x) for x in row['interval_um'])} "
-            assert (spread == "") == (row["observer"] != BOUND)
+            ends = " – ".join(number(1e3 * x) for x in row["interval_um"] or ())
+            spread = f" {ends} " if row["observer"] == BOUND else ""
             want[f"{target_title(row['target'])}, {row['mode']}", name] = [
                 spread + number(1e3 * row["rms_um"]),
                 number(1e3 * row["truth_rms_um"]),

@@ -16,7 +16,7 @@ from wfsobs.app.store import Store
 from wfsobs.app.work import RunResults
 from wfsobs.cost import run_seconds
 from wfsobs.dependence import Memo, RecordMemo, simulate_once
-from wfsobs.evaluation.evidence import Evidence, gather_evidence
+from wfsobs.evaluation.evidence import FEWEST, Evidence, gather_evidence
 from wfsobs.evaluation.scores import Score
 from wfsobs.pipeline import observe
 from wfsobs.progress import Watch
@@ -65,7 +65,7 @@ class SeedRuns(param.Parameterized):
     """One seed after the other, once a run is done; what has been found of a scenario goes with it."""
 
     count = param.Integer(SEEDS, bounds=(1, MOST), label="Seeds", doc="Seeds whose records are compared; 1 is the one shown.")
-    evidence: Evidence | None = param.Parameter(None, doc="What the seeds done so far say; None for one alone.")  # type: ignore
+    evidence: Evidence | None = param.Parameter(None, doc="What the seeds done so far say; None for too few.")  # type: ignore
 
     def __init__(self, store: Store):
         super().__init__()
@@ -107,7 +107,7 @@ class SeedRuns(param.Parameterized):
     def _go_on(self, *_: object) -> None:
         """Say what is known, and have the next seed run; what is there already does not wait for a turn each."""
         self._take_known()
-        self.evidence = gather_evidence(self._scores[: self.count]) if self.n_known > 1 else None
+        self.evidence = gather_evidence(self._scores[: self.count]) if self.n_known >= FEWEST else None
         if not self.possible or len(self._scores) >= self.count:
             self.task.close()
         else:

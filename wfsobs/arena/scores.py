@@ -6,18 +6,20 @@ mean. Its logarithm is a smooth function of mean squares, and its variance follo
     d log r = (a[i] / mean(a) - b[i] / mean(b)) / 2,
 
 a and b the mean squares of error and reference (the delta method). The scenarios are fixed: intervals are over seeds. Two entries
-are compared on the same records, so that what the records have in common cancels.
+are compared on the same records, so that what the records have in common cancels, and all pairs are tested together (`holm`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
 
 from wfsobs.campaign.compare import LEVEL
+from wfsobs.evaluation.evidence import all_pairs, pairs_differ, t_probability
 from wfsobs.typing import Array
 
 
@@ -59,34 +61,42 @@ def geometric_mean(ratios: Sequence[float]) -> float:
         return float(np.exp(np.mean(np.log(ratios))))
 
 
-def log_ratio(a: Sequence[Array], b: Sequence[Array], level: float = LEVEL) -> tuple[float, float | None]:
-    """Return the mean over scenarios of log(rms a / rms b), and the half-width of its interval.
+class LogRatio(NamedTuple):
+    """Mean of log(rms a / rms b), its standard error, and degrees of freedom; NaN where there are too few samples."""
+
+    mean: float
+    error: float
+    freedom: float
+
+    def half_width(self, level: float = LEVEL) -> float | None:
+        """Return the half-width of the interval by Student's t; None with fewer than two samples of a scenario."""
+        return None if np.isnan(self.error) else float(stdtrit(self.freedom, (1 + level) / 2) * self.error)
+
+
+def log_ratio(a: Sequence[Array], b: Sequence[Array]) -> LogRatio:
+    """Compare two mean squares over scenarios.
 
     Parameters
     ----------
     a, b : sequence of Array
         Mean squares on the same samples, one array (n_samples,) per scenario.
-    level : float
-        Level of the interval.
 
     Returns
     -------
-    float
-        Mean.
-    float or None
-        Half-width by Student's t, degrees of freedom by Welch and Satterthwaite; None with fewer than two samples of a scenario.
+    LogRatio
+        Degrees of freedom by Welch and Satterthwaite.
     """
     with np.errstate(divide="ignore"):
         mean = float(np.mean([0.5 * (np.log(np.mean(x)) - np.log(np.mean(y))) for x, y in zip(a, b, strict=True)]))
     if min(len(x) for x in a) < 2 or not np.isfinite(mean):
-        return mean, None
+        return LogRatio(mean, np.nan, np.nan)
     influence = [0.5 * (x / np.mean(x) - y / np.mean(y)) for x, y in zip(a, b, strict=True)]
     parts = np.array([np.sum(i**2) / (len(i) * (len(i) - 1)) for i in influence]) / len(influence) ** 2
     total = float(parts.sum())
     if total == 0.0:
-        return mean, 0.0
+        return LogRatio(mean, 0.0, 1.0)
     freedom = total**2 / float(sum(p**2 / (len(i) - 1) for p, i in zip(parts, influence, strict=True)))
-    return mean, float(stdtrit(freedom, (1 + level) / 2) * np.sqrt(total))
+    return LogRatio(mean, float(np.sqrt(total)), freedom)
 
 
 def rank_entries(squares: Mapping[str, Sequence[Array]], reference: Sequence[Array]) -> list[Standing]:
@@ -104,21 +114,16 @@ def rank_entries(squares: Mapping[str, Sequence[Array]], reference: Sequence[Arr
     list of Standing
         The smallest score first.
     """
-    better = {name: sum(_is_better(other, own) for other in squares.values()) for name, own in squares.items()}
-    ranks = {name: 1 + count for name, count in better.items()}
+    entries = list(squares.values())
+    ratios = [tuple(float(np.sqrt(np.mean(a) / np.mean(b))) for a, b in zip(own, reference, strict=True)) for own in entries]
+    scores = np.array([geometric_mean(one) for one in ratios])
+    pairs = [log_ratio(entries[i], entries[j]) for i, j in zip(*all_pairs(len(entries)), strict=True)]
+    p = np.nan_to_num(t_probability(*np.array(pairs).reshape(-1, 3).T), nan=1.0)  # with too few samples nothing is decided
+    ranks = (1 + (pairs_differ(p) & (scores[:, None] < scores)).sum(axis=0)).tolist()
     out = []
-    for name, own in squares.items():
-        ratios = tuple(float(np.sqrt(np.mean(a) / np.mean(b))) for a, b in zip(own, reference, strict=True))
-        mean, half = log_ratio(own, reference)
-        interval = None if half is None else (float(np.exp(mean - half)), float(np.exp(mean + half)))
-        tied = list(ranks.values()).count(ranks[name]) > 1
-        out.append(Standing(name, geometric_mean(ratios), interval, ranks[name], tied, ratios))
+    for name, own, rank, score, of_cases in zip(squares, entries, ranks, scores.tolist(), ratios, strict=True):
+        against = log_ratio(own, reference)
+        half = against.half_width()
+        interval = None if half is None else (float(np.exp(against.mean - half)), float(np.exp(against.mean + half)))
+        out.append(Standing(name, score, interval, rank, ranks.count(rank) > 1, of_cases))
     return sorted(out, key=lambda s: s.score)
-
-
-def _is_better(a: Sequence[Array], b: Sequence[Array]) -> bool:
-    """Return whether a is significantly better than b; with one sample of a scenario nothing is."""
-    if a is b:
-        return False
-    mean, half = log_ratio(a, b)
-    return half is not None and mean < 0.0 and -mean > half

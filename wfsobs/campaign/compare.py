@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.special import stdtrit
 
+from wfsobs.evaluation.evidence import columns_differ
 from wfsobs.evaluation.rows import can_be_best
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.typing import Array
@@ -43,9 +44,11 @@ class Comparison:
         Mean of its rms less that of the best over the records that both have [nm]; None for the best and for rows that cannot be
         the best.
     half_width : float or None
-        Of the interval of the difference at the level [nm]; None with fewer than two records.
+        Of the interval of this one difference at the level [nm]; None with fewer than two records.
     is_best : bool
         Whether it has the smallest error of those that can be the best and did not fail more often than others.
+    is_tie : bool
+        Whether the difference from the best is not significant, with all pairs of what can be the best tested together (`holm`).
     quantiles : tuple of float
         Of the rms of single records [nm], of QUANTILES; empty without a result.
     """
@@ -61,12 +64,8 @@ class Comparison:
     difference: float | None = None
     half_width: float | None = None
     is_best: bool = False
+    is_tie: bool = False
     quantiles: tuple[float, ...] = ()
-
-    @property
-    def is_tie(self) -> bool:
-        """Whether the difference from the best is not significant."""
-        return self.difference is not None and (self.half_width is None or abs(self.difference) <= self.half_width)
 
 
 def paired_difference(a: Array, b: Array, level: float = LEVEL) -> tuple[float, float | None]:
@@ -195,12 +194,19 @@ def _compare_one(group: Samples, level: float) -> list[Comparison]:
         rms = np.sqrt((np.where(known, values, 0.0) ** 2).sum(axis=0) / count)
     ranked = [i for i in np.argsort(rms) if eligible[i] and count[i] == count[eligible].max(initial=0)]
     out = []
+    rivals = np.flatnonzero(eligible)
+    differs = (
+        dict(zip(rivals, columns_differ(values[:, rivals], 1.0 - level)[rivals == ranked[0]][0], strict=True)) if ranked else {}
+    )
     for i in np.argsort(rms):
-        difference, half = None, None
+        difference, half, is_tie = None, None, False
         if ranked and eligible[i] and i != ranked[0]:
             difference, half = paired_difference(values[:, i], values[:, ranked[0]], level)
+            is_tie = not differs[i]
         failures, is_best = len(values) - int(count[i]), bool(ranked) and bool(i == ranked[0])
         where = group.cell, group.scenario, group.target, group.mode
         spread = tuple(np.quantile(values[known[:, i], i], QUANTILES).tolist()) if count[i] else ()
-        out.append(Comparison(*where, names[i], int(count[i]), failures, float(rms[i]), difference, half, is_best, spread))
+        out.append(
+            Comparison(*where, names[i], int(count[i]), failures, float(rms[i]), difference, half, is_best, is_tie, spread)
+        )
     return out

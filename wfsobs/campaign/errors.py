@@ -11,6 +11,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from wfsobs.campaign.compare import LEVEL
+from wfsobs.evaluation.evidence import columns_differ
 from wfsobs.evaluation.rows import NOT_OBSERVERS, can_be_best
 from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS
 from wfsobs.observers import OBSERVERS
@@ -31,7 +32,8 @@ class CampaignPlace(NamedTuple):
     low, high : float
         Interval of `above`; NaN where there is none.
     is_best, is_tie, is_untested : bool
-        Whether it is the best; whether a test finds no difference from the best; whether it is compared with too little to test.
+        Whether it is the best; whether a test of all pairs together finds no difference from the best; whether it is compared
+        with too little to test.
     """
 
     name: str
@@ -129,12 +131,14 @@ class CampaignErrors:
         ranked = [i for i in np.argsort(mean) if candidates[i] and known[i] == known[candidates].max()]
         above = low = high = np.full(len(mean), np.nan)
         best = ranked[0] if ranked else -1
-        tie = untested = np.zeros(len(mean), dtype=bool)
+        tie, untested = np.zeros((2, len(mean)), dtype=bool)
         if ranked:
             difference, half = _mean_interval(samples - samples[:, [best]])
             rivals = candidates & (np.arange(len(mean)) != best)
             untested = rivals & np.isnan(half)
-            tie = rivals & (np.abs(difference) <= half)
+            compared = np.flatnonzero(candidates)
+            tie[compared] = ~columns_differ(samples[:, compared])[compared == best][0]
+            tie &= rivals & ~untested
             parts = [np.where(rivals, part, np.nan) for part in (difference, difference - half, difference + half)]
             above, low, high = (part / mean[best] if len(cells) == 1 else np.expm1(part) for part in parts)
         numbers = [column.tolist() for column in (mean, above, low, high, np.arange(len(mean)) == best, tie, untested)]

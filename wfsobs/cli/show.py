@@ -15,6 +15,7 @@ from wfsobs.cli.budget_table import budget_table
 from wfsobs.cli.recovery_tables import OverTime
 from wfsobs.cli.tables import score_table
 from wfsobs.evaluation.budget import Budget, budget_row, error_budget
+from wfsobs.evaluation.evidence import Evidence
 from wfsobs.evaluation.rows import TIME, Row
 from wfsobs.evaluation.verdict import explain_harm, verdict
 from wfsobs.observers.base import TARGETS
@@ -41,15 +42,18 @@ def show_over_time(history: OverTime, as_json: bool) -> None:
 def show_table(table: Table) -> None:
     """Print a table as wide as the terminal, or where there is none as wide as a page."""
     console = Console()
-    (console if console.is_terminal else Console(width=180)).print(table)
+    (console if console.is_terminal else Console(width=195)).print(table)
 
 
-def show_verdicts(result: Result, budgets: Sequence[Budget] = ()) -> None:
-    """Print what the table of a simulated record says, a paragraph per target and mode; budgets : those that are known."""
+def show_verdicts(result: Result, budgets: Sequence[Budget] = (), evidence: Evidence | None = None) -> None:
+    """Print what the table of a simulated record says, a paragraph per target and mode.
+
+    budgets : those that are known;  evidence : what further seeds say
+    """
     of = dict.fromkeys((s.target, s.mode) for s in result.scores if s.target in TARGETS)
     known = [*explain_harm(result), *budgets]
     given = result.scenario, result.record, result.estimates, result.scores
-    found = (verdict(*given, *key, simulation=result.scenario, budgets=known) for key in of)
+    found = (verdict(*given, *key, simulation=result.scenario, budgets=known, evidence=evidence) for key in of)
     for it in found:
         if it is not None:
             click.echo("\n" + "\n".join(f"{'  ' * bool(i)}{line}" for i, line in enumerate(it.sentences())))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import click
 
@@ -23,6 +24,7 @@ from wfsobs.cli.show import (
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import rows as loop_rows
 from wfsobs.closed_loop.run import closed_loop
+from wfsobs.evaluation.evidence import FEWEST, gather_evidence
 from wfsobs.evaluation.rows import Row, score_rows
 from wfsobs.files import check_writable
 from wfsobs.observers import OBSERVERS
@@ -31,6 +33,7 @@ from wfsobs.pipeline import observe as observe_record
 from wfsobs.prior import GIVEN
 from wfsobs.priors_from.training import trained_until, with_training
 from wfsobs.progress import Watch
+from wfsobs.result import Result
 from wfsobs.scenario import configfile
 from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.loop import simulate
@@ -84,7 +87,7 @@ def run(
     if vibration_psd is not None:
         table = load_psd(vibration_psd, psd_unit, scenario.telescope.diameter)
         scenario = scenario.replace({"vibration.source": "psd", "vibration.psd": table})
-    all_rows: list[Row] = []
+    results: list[Result] = []
     history = OverTime(scenario, over_time) if over_time else None
     with progress_bar() as update:
         for i in range(seeds):
@@ -94,16 +97,18 @@ def run(
                 save_record(save, record, configfile.to_toml(one))
             result = observe_record(record, one, watch=Watch(progress=lambda f, i=i: update((i + f) / seeds)), is_simulated=True)
             warn(result)
-            all_rows += score_rows(result.scores, one.run.seed)
             if history:
                 history.add(result, one.run.seed)
+            # Of the others the scores are enough.
+            results.append(replace(result, record=results[0].record, estimates=()) if results else result)
     if history:
         show_over_time(history, as_json)
         return
-    budgets = find_budgets(result, budget_of or None) if budget or budget_of else []
+    budgets = find_budgets(results[0], budget_of or None) if budget or budget_of else []
+    all_rows = [row for it in results for row in score_rows(it.scores, it.scenario.run.seed)]
     show(add_budgets(all_rows, budgets), as_json)
-    if seeds == 1 and not as_json:
-        show_verdicts(result, budgets)
+    if not as_json and seeds not in range(2, FEWEST):
+        show_verdicts(results[0], budgets, gather_evidence([it.scores for it in results]))
         show_budgets(budgets)
 
 

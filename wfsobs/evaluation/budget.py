@@ -204,7 +204,7 @@ def _terms(parts: dict[str, Array], error: Array, score: Score, dt: float) -> di
 
 def _lines_of(observer: Observer, scenario: Scenario, column: int, lines: Sequence[float]) -> Sequence[float]:
     """Return the lines that an observer models; one that is given none and learns from the measurements can find them all."""
-    return lines if not observer.prior and not observer.linear else given_lines(scenario, observer.id, column, lines)
+    return lines if not observer.prior and not observer.linear else given_lines(scenario, observer.id, column)
 
 
 def _method(observer: Observer) -> str:

@@ -1,15 +1,21 @@
-"""What several seeds of a scenario say that one record cannot: intervals of errors, and differences that are significant."""
+"""What several seeds of a scenario say that one record cannot: intervals of errors, and differences that are significant.
+
+Of many observers the best is found by comparing all with each other. Pairs are tested together (`holm`), so that of equals any is
+called different in at most LEVEL of cases.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from math import sqrt
 
 import numpy as np
-from scipy.stats import t as student
+from numpy.typing import NDArray
+from scipy.special import stdtr, stdtrit
 
 from wfsobs.evaluation.rows import NO_ESTIMATE, can_be_best
+from wfsobs.evaluation.samples import scatter_of_mean
 from wfsobs.evaluation.scores import BOUNDS, Score
 from wfsobs.observers import OBSERVERS
 from wfsobs.typing import Array
@@ -29,7 +35,7 @@ Key = tuple[str, str, str]
 
 @dataclass(frozen=True)
 class Evidence:
-    """Errors over several seeds of a scenario.
+    """Errors over several seeds of a scenario, or over the pieces of one record.
 
     Attributes
     ----------
@@ -37,11 +43,14 @@ class Evidence:
         (observer, target, mode) -> rms error, and rms of the truth, of every seed, (n_seeds,) [um].
     n_seeds : int
         Number of seeds.
+    record : mapping
+        (observer, target, mode) -> score of the first of them.
     """
 
     errors: Mapping[Key, Array]
     truths: Mapping[Key, Array]
     n_seeds: int
+    record: Mapping[Key, Score] = field(default_factory=dict)
 
     def mean(self, key: Key) -> float | None:
         """Return the mean over the seeds of an rms error [um]; None where it is not known of all."""
@@ -49,11 +58,20 @@ class Evidence:
 
     def interval(self, key: Key) -> tuple[float, float] | None:
         """Return the interval that has the mean over all records in 95 % of cases [um]; None where it is not known."""
-        if key not in self.errors or self.n_seeds < FEWEST:
+        if key not in self.errors:
             return None
-        values = self.errors[key]
-        reach = float(student.ppf(1.0 - LEVEL / 2.0, values.size - 1) * values.std(ddof=1) / sqrt(values.size))
-        return max(float(values.mean()) - reach, 0.0), float(values.mean()) + reach
+        return self.record[key].interval if self.n_seeds == 1 and self.record else seeds_interval(self.errors[key])
+
+    def over_seeds(self, score: Score) -> Score:
+        """Return a score with mean error, its interval and the mean truth of all seeds; as it was where these are not known."""
+        key = score.observer, score.target, score.mode
+        truth = next((float(of.mean()) for other, of in self.truths.items() if other[1:] == key[1:]), 0.0)
+        if score.apart or not truth > 0 or (key[0] not in BOUNDS and key not in self.errors):
+            return score
+        error, interval = (
+            (score.rms, score.interval) if key[0] in BOUNDS else (float(self.errors[key].mean()), self.interval(key))
+        )
+        return replace(score, rms=error, truth_rms=truth, normalised_rms=error / truth, interval=interval)
 
     def ranking(self, target: str, mode: str) -> list[str]:
         """Return the observers that can be best, the smallest mean error first."""
@@ -63,10 +81,54 @@ class Evidence:
     def leaders(self, target: str, mode: str) -> tuple[str, ...]:
         """Return the observer with the smallest mean error, and all whose errors do not differ significantly from its own."""
         ranked = self.ranking(target, mode)
-        if not ranked or self.n_seeds < FEWEST:
+        if not ranked or 1 < self.n_seeds < FEWEST:
             return ()
-        first = self.errors[ranked[0], target, mode]
-        return (ranked[0], *(name for name in ranked[1:] if not differ_in_pairs(first, self.errors[name, target, mode])))
+        mean = np.array([self.errors[name, target, mode].mean() for name in ranked])
+        worse = self._differ(ranked, target, mode)[0, :-1] & (mean > mean[0] * (1.0 + SAME))
+        return tuple(name for name, is_worse in zip(ranked, worse, strict=True) if not is_worse)
+
+    def harmful(self, target: str, mode: str) -> dict[str, bool]:
+        """Return the observers whose mean error is not below that of no estimate, the worst first, and if significantly above."""
+        ranked = self.ranking(target, mode)
+        if not ranked:
+            return {}
+        apart = dict(zip(ranked, self._differ(ranked, target, mode)[-1, :-1].tolist(), strict=True))
+        known = {name: (name, target, mode) for name in reversed(ranked)}
+        return {name: apart[name] for name, key in known.items() if self.errors[key].mean() >= self.truths[key].mean()}
+
+    def _differ(self, names: Sequence[str], target: str, mode: str) -> NDArray[np.bool_]:
+        """Return which of some observers, and no estimate after them, differ significantly."""
+        keys = [(name, target, mode) for name in names]
+        if self.n_seeds > 1:
+            return means_differ(np.array([*(self.errors[key] for key in keys), self.truths[keys[0]]]).T)
+        pieces = [np.array(self.record[key].pieces).reshape(-1, 2) for key in keys]
+        if min(map(len, pieces)) < 3:
+            return np.zeros((len(keys) + 1,) * 2, dtype=bool)
+        return means_differ(np.column_stack([*(of[:, 0] for of in pieces), pieces[0][:, 1]]), in_order=True)
+
+
+def means_differ(values: Array, in_order: bool = False) -> NDArray[np.bool_]:
+    """Return which columns of positive values (n, k) differ significantly in their means, bool (k, k): `pairs_differ`.
+
+    The logarithm of the ratio of two means has the variance of the mean of their influences, value / mean (the delta method).
+
+    values : rows are seeds, or with `in_order` pieces of one record, which may be correlated. Of few independent ones the scatter
+        is underestimated: it is widened so that errors that are slow are not called different more often than others.
+    """
+    one, other = all_pairs(values.shape[1])
+    mean = np.maximum(values.mean(axis=0), np.finfo(float).tiny)
+    influence = values[:, other] / mean[other] - values[:, one] / mean[one]
+    _, error, freedom = scatter_of_mean(influence, independent=not in_order)
+    widened = (1.0 + 1.0 / freedom) ** 2 if in_order else 1.0
+    return pairs_differ(t_probability(np.log(mean[other] / mean[one]), widened * error, freedom))
+
+
+def seeds_interval(errors: Array) -> tuple[float, float] | None:
+    """Return the interval that has the mean of values (n_seeds,) over all records, by Student's t; None of too few."""
+    if errors.size < FEWEST:
+        return None
+    reach = float(stdtrit(errors.size - 1, 1.0 - LEVEL / 2.0) * errors.std(ddof=1) / sqrt(errors.size))
+    return max(float(errors.mean()) - reach, 0.0), float(errors.mean()) + reach
 
 
 def rank_observers(errors: Mapping[str, float]) -> list[str]:
@@ -88,17 +150,60 @@ def gather_evidence(seeds: Sequence[Iterable[Score]]) -> Evidence:
         {key: np.array([of[key].rms for of in known]) for key in keys},
         {key: np.array([of[key].truth_rms for of in known]) for key in keys},
         len(known),
+        {key: known[0][key] for key in keys},
     )
 
 
-def differ_in_pairs(one: Array, other: Array) -> bool:
-    """Whether two sets of values (n,), pair by pair of the same records, differ significantly: a paired t-test.
+def columns_differ(values: Array, level: float = LEVEL) -> Array:
+    """Return which columns of values (n, k) differ significantly in their means, bool (k, k).
 
-    >>> differ_in_pairs(np.array([10.0, 12.0, 11.0]), np.array([10.5, 12.4, 11.5]))
-    True
-    >>> differ_in_pairs(np.array([10.0, 12.0, 11.0]), np.array([11.0, 11.0, 11.5]))
-    False
+    Rows are of the same records: paired t-tests of all pairs of columns, and `holm`. NaN where a column has no result.
+
+    >>> columns_differ(np.array([[10.0, 10.5, 11.0], [12.0, 12.4, 11.0], [11.0, 11.5, 11.5]])).astype(int)
+    array([[0, 1, 0],
+           [1, 0, 0],
+           [0, 0, 0]])
     """
-    difference = other - one
-    scatter = float(difference.std(ddof=1)) / sqrt(difference.size)
-    return bool(abs(difference.mean()) > student.ppf(1.0 - LEVEL / 2.0, difference.size - 1) * scatter)
+    one, other = all_pairs(values.shape[1])
+    difference = values[:, other] - values[:, one]
+    known = ~np.isnan(difference)
+    n = known.sum(axis=0)
+    enough = n > 1
+    mean = np.divide(np.where(known, difference, 0.0).sum(axis=0), n, out=np.zeros(n.size), where=enough)
+    squares = np.where(known, difference - mean, 0.0) ** 2
+    variance = np.divide(squares.sum(axis=0), n * (n - 1.0), out=np.zeros(n.size), where=enough)
+    return pairs_differ(t_probability(mean, np.sqrt(variance), np.maximum(n - 1.0, 1.0)), level)
+
+
+def all_pairs(k: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the first and the second of every pair of k things."""
+    return np.triu_indices(k, 1)
+
+
+def t_probability(mean: Array, error: Array, freedom: Array) -> Array:
+    """Return the probability of as large a mean, by chance, of what is zero; error : its standard deviation, estimated."""
+    t = np.divide(np.abs(mean), error, out=np.where(mean != 0, np.inf, 0.0), where=error > 0)
+    return 2.0 * stdtr(freedom, -t)
+
+
+def pairs_differ(p: Array, level: float = LEVEL) -> Array:
+    """Return which of k things differ, bool (k, k), by the probabilities of `all_pairs` and Holm's correction."""
+    k = round(0.5 + sqrt(0.25 + 2.0 * p.size))
+    out = np.zeros((k, k), dtype=bool)
+    out[all_pairs(k)] = holm(p, level)
+    return out | out.T
+
+
+def holm(p: Array, level: float = LEVEL) -> Array:
+    """Return which of many tests are significant: any of those without an effect is in at most `level` of cases.
+
+    S. Holm, Scand. J. Statist. 6 (1979) 65.
+
+    >>> holm(np.array([0.03, 0.01, 0.02]))
+    array([ True,  True,  True])
+    >>> holm(np.array([0.04, 0.01, 0.03]))
+    array([False,  True, False])
+    """
+    order, out = np.argsort(p, kind="stable"), np.zeros(p.size, dtype=bool)
+    out[order] = np.logical_and.accumulate(p[order] <= level / np.arange(p.size, 0, -1))
+    return out

@@ -1,4 +1,4 @@
-"""Which lines of the vibration an observer is given."""
+"""What an observer knows before it measures, and which lines of the vibration."""
 
 from __future__ import annotations
 
@@ -7,23 +7,39 @@ from collections.abc import Sequence
 import numpy as np
 
 from wfsobs.observers import OBSERVERS
-from wfsobs.prior import Bands, Lines, Model, asks_for
+from wfsobs.prior import Bands, Lines, Model, Part, Training, asks_for
 from wfsobs.priors_from.scenario import modelled_peak
 from wfsobs.scenario import Scenario
+from wfsobs.simulation.disturbance import vibration_lines
 from wfsobs.typing import Array
 
 HALF_WIDTH = 1.5
 """What counts as at a line [Hz] to either side, three bins of a spectrum with 0.5 Hz."""
 
 
-def given_lines(scenario: Scenario, observer: str, column: int, lines: Sequence[float]) -> Sequence[float]:
-    """Return the lines [Hz] that an observer is given in one mode, of a vibration with these lines."""
-    prior = OBSERVERS[observer].prior
-    if Lines in prior or not lines:
-        return lines
-    if asks_for(Model, prior):
+PEAKS, ONE_PEAK, TRAINED, BANDS, NOTHING = "peaks", "one peak", "training data", "bands", "nothing"
+"""Kinds of prior knowledge: the frequencies of peaks, a model with one, training data, frequency bands, and none."""
+
+_KINDS: tuple[tuple[Part, str], ...] = ((Lines, PEAKS), (Model, ONE_PEAK), (Training, TRAINED), (Bands, BANDS))
+
+
+def prior_knowledge(observer: str) -> str:
+    """Return which kind of prior knowledge an observer has.
+
+    >>> prior_knowledge("kf-multi"), prior_knowledge("kf-lgs"), prior_knowledge("kf-adaptive")
+    ('peaks', 'one peak', 'nothing')
+    """
+    return next((kind for part, kind in _KINDS if asks_for(part, OBSERVERS[observer].prior)), NOTHING)
+
+
+def given_lines(scenario: Scenario, observer: str, column: int) -> Sequence[float]:
+    """Return the frequencies [Hz] of what an observer is given in one mode; scenario : what its prior is made from."""
+    kind = prior_knowledge(observer)
+    if kind == PEAKS:
+        return [line[0] for line in vibration_lines(scenario, column)]
+    if kind == ONE_PEAK:
         return [modelled_peak(scenario, column)[0]]
-    return scenario.butterworth.frequencies if asks_for(Bands, prior) else ()
+    return scenario.butterworth.frequencies if asks_for(Bands, OBSERVERS[observer].prior) else ()
 
 
 def is_near(frequency: Array, lines: Sequence[float]) -> Array:

@@ -112,6 +112,26 @@ def row_needs(observer: str, *, source: PriorSource = TRUE) -> str:
     return OBSERVERS[observer].needs_text(source=source)
 
 
+def above_bound(rms: float, interval: Sequence[float] | None, bound: float | None) -> float | None:
+    """Return by which share an error is above the bound of what the observer measures: 0 where its interval has the bound in it.
+
+    None where there is no bound.
+
+    >>> above_bound(9.7, (9.2, 10.2), 10.0), round(above_bound(11.0, (10.5, 11.5), 10.0), 6), above_bound(9.7, None, None)
+    (0.0, 0.1, None)
+    """
+    if not bound:
+        return None
+    return 0.0 if interval is not None and interval[0] <= bound <= interval[1] else rms / bound - 1.0
+
+
+def at_bound(scores: Iterable[Score]) -> set[tuple[str, str, str]]:
+    """Return (observer, target, mode) of scores whose interval has the bound of what the observer measures in it."""
+    of = {(s.observer, s.target, s.mode): s for s in scores}
+    bounds = {key: of.get((own_bound(key[0]) or "", *key[1:])) for key in of}
+    return {key for key, bound in bounds.items() if bound and above_bound(of[key].rms, of[key].interval, bound.rms) == 0.0}
+
+
 def can_be_best(observer: str, apart: bool) -> bool:
     """Return whether a row can be the best: not a bound, nor a row that is not causal or was scored on samples of its own."""
     return observer not in NOT_OBSERVERS and not is_non_causal(observer) and not apart

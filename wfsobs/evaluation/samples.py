@@ -13,6 +13,10 @@ SHARE = 0.5
 """Minimum share of the samples after the warm-up that observers in a table have in common; those that leave fewer stand apart."""
 
 
+BATCHES = 20
+"""Pieces of a record whose means tell how far that of the whole scatters."""
+
+
 def common_samples(samples: Sequence[Array]) -> list[tuple[Array, bool]]:
     """Select the samples on which estimates are scored.
 
@@ -50,3 +54,28 @@ def samples_after(record: Record, warm_up: float) -> Array:
 def stretch_of(samples: Array, dt: float) -> tuple[float, float]:
     """Return the time [s] of the first sample and of the end of the last."""
     return float(np.argmax(samples) * dt), float((samples.size - np.argmax(samples[::-1])) * dt)
+
+
+def batch_means(values: Array) -> Array:
+    """Return the means of BATCHES pieces of values (n, ...), of fewer where there are fewer values."""
+    return np.array([piece.mean(axis=0) for piece in np.array_split(values, BATCHES) if len(piece)])
+
+
+def scatter_of_mean(values: Array, independent: bool = False) -> tuple[Array, Array, Array]:
+    """Return the means of columns of values (n, k), their standard deviations and degrees of freedom, each (k,).
+
+    Values that are not independent are batch means: slow signals make neighbours alike, which counts as fewer of them, those of a
+    first-order autoregression with their correlation (Law and Kelton, Simulation Modeling and Analysis, ch. 9). Fewer than three
+    of them say nothing, and fewer than two of any: NaN.
+    """
+    n, mean = len(values), values.mean(axis=0)
+    if n < (2 if independent else 3):
+        return mean, np.full_like(mean, np.nan), np.ones_like(mean)
+    deviation = values - mean
+    power = (deviation**2).sum(axis=0)
+    if independent:
+        return mean, np.sqrt(power / (n - 1) / n), np.full_like(mean, n - 1.0)
+    alike = np.divide((deviation[1:] * deviation[:-1]).sum(axis=0), power, out=np.zeros_like(power), where=power > 0)
+    alike = np.maximum(alike + 1.0 / n, 0.0)  # the estimate of a correlation from n values is low by about 1 / n
+    effective = np.maximum(n * (1.0 - alike) / (1.0 + alike), 2.0)
+    return mean, np.sqrt(power / (n - 1) / effective), effective - 1.0

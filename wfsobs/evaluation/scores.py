@@ -6,12 +6,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from hashlib import blake2b
+from typing import Any
 
 import numpy as np
+from scipy.special import stdtrit
 
 from wfsobs.evaluation.calibration import Calibration, calibration
 from wfsobs.evaluation.lag import lag
-from wfsobs.evaluation.samples import common_samples, samples_after, stretch_of
+from wfsobs.evaluation.samples import batch_means, common_samples, samples_after, scatter_of_mean, stretch_of
 from wfsobs.evaluation.totals import of_both, totals
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimate
@@ -61,11 +63,14 @@ class Score:
     apart : bool
         Whether the samples differ from those of the other rows, so that the row cannot be compared with them.
     interval : tuple of float or None
-        Of the bound of the LGS: range of the rms of an optimal observer in 95 % of records [um].
+        Range that has the rms over all records at 95 % confidence, as the scatter within this one tells [um]. Of the bound of the
+        LGS: range of the rms of an optimal observer in 95 % of records.
     phases : tuple of float or None
         Of the bounds of both sensors: the bound in steps with an NGS frame, one step later, ... [um]; `rms` is over all.
     calibration : Calibration or None
         How the standard deviation that the observer states fits its errors; None where it states none.
+    pieces : tuple of (float, float)
+        Mean squares of error and truth in pieces of the scored samples [um^2]; empty for a bound.
     """
 
     observer: str
@@ -82,6 +87,7 @@ class Score:
     interval: tuple[float, float] | None = None
     phases: tuple[float, ...] | None = None
     calibration: Calibration | None = None
+    pieces: tuple[tuple[float, float], ...] = ()
 
 
 Derive = Callable[[Estimate, str, Callable[[], Score]], Score]
@@ -167,7 +173,17 @@ def _score_mode(e: Estimate, true: Array, mode: int, name: str, dt: float, sampl
         *stretch_of(samples, dt),
         apart,
         calibration=None if e.sd is None else calibration(value - t, e.sd[samples, mode]),
+        **_scatter(value - t, t),
     )
+
+
+def _scatter(error: Array, truth: Array) -> dict[str, Any]:
+    """Return the fields `pieces` and `interval` of a score; no interval of an error that is zero."""
+    pieces = batch_means(np.column_stack([error, truth]) ** 2)
+    (mean, _), (deviation, _), (freedom, _) = scatter_of_mean(pieces)
+    reach = 0.5 * stdtrit(freedom, 0.975) * deviation / mean if mean > 0 else np.nan  # of the logarithm of the rms
+    scale = rms(error) * np.exp([-reach, reach])
+    return {"pieces": tuple(map(tuple, pieces.tolist())), "interval": tuple(scale.tolist()) if np.isfinite(reach) else None}
 
 
 def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: float, mode_names: list[str]) -> list[Score]:
@@ -204,6 +220,7 @@ def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: 
                         *stretch_of(samples, record.dt),
                         apart,
                         calibration=None if sd is None else calibration(error[samples], _later(sd[:, mode])[samples]),
+                        **_scatter(error[samples], z[samples]),
                     )
                 )
         samples = next((s for s, apart in scored if not apart and s.any()), measured) & ~np.isnan(left)

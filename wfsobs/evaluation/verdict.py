@@ -1,20 +1,18 @@
-"""What a table of errors says, in one or two sentences per target: who is best, by how much, and who does harm and why."""
+"""What a table of errors says of a target: the best with each kind of prior knowledge, the limit, and who does harm and why."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from math import sqrt
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.stats import t as student
 
 from wfsobs.evaluation.budget import Budget, error_budget
-from wfsobs.evaluation.evidence import LEVEL, Evidence, differ_in_pairs, rank_observers
-from wfsobs.evaluation.known_lines import given_lines, is_near
-from wfsobs.evaluation.rows import NO_ESTIMATE, can_be_best
-from wfsobs.evaluation.scores import BOUNDS, Score
+from wfsobs.evaluation.evidence import Evidence, gather_evidence
+from wfsobs.evaluation.known_lines import given_lines, is_near, prior_knowledge
+from wfsobs.evaluation.rows import JOINT_BOUNDS, above_bound
+from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS, Score
 from wfsobs.evaluation.verdict_words import best_sentence, harm_sentences
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
@@ -29,8 +27,30 @@ from wfsobs.typing import Array
 if TYPE_CHECKING:
     from wfsobs.result import Result
 
-BATCHES = 20
-"""Pieces of the record whose mean squared errors are compared."""
+
+@dataclass(frozen=True)
+class Place:
+    """An observer that can be the best.
+
+    rms, interval : mean of its error over the seeds, or its error on the record, and the interval of that [um]
+    is_tie        : whether the error does not differ significantly from the smallest
+    knowledge     : of `prior_knowledge`
+    n_peaks       : peaks in its model: of those of the vibration where they are known
+    limit         : the least error possible [um], and of which row of BOUNDS; None where it is not known
+    """
+
+    observer: str
+    rms: float
+    interval: tuple[float, float] | None
+    is_tie: bool
+    knowledge: str
+    n_peaks: int
+    limit: tuple[float, str] | None = None
+
+    @property
+    def above_limit(self) -> float | None:
+        """By which share the error is above the limit: 0 where its interval has the limit in it."""
+        return above_bound(self.rms, self.interval, self.limit[0] if self.limit else None)
 
 
 @dataclass(frozen=True)
@@ -42,32 +62,49 @@ class Harm:
     cause, share        : largest term of its error budget, and its part of the whole; empty where the budget is not known
     """
 
-    observer: str
+    place: Place
     worse: bool
     at_known: float
     at_others: float
     cause: str = ""
     share: float = 0.0
 
+    @property
+    def observer(self) -> str:
+        """Whose it is."""
+        return self.place.observer
+
 
 @dataclass(frozen=True)
 class Verdict:
     """What the scores of one target and mode amount to.
 
-    best  : the score with the least error of those that can be compared
-    ties  : observers whose error is larger, but not significantly so on this record
-    bounds : row -> the least error possible [um], of the rows of the table
-    lines : how many lines the vibration has
-    harms : observers that are worse than no estimate, the worst first
-    seeds : over how many records of the scenario, whose mean error is that of `best`
+    places : observers that can be the best, the smallest error first
+    lines  : how many lines the vibration has; 0 where that is not known
+    harms  : observers that are worse than no estimate, the worst first
+    seeds  : over how many records of the scenario
     """
 
-    best: Score
-    ties: tuple[str, ...]
-    bounds: Mapping[str, float]
+    target: str
+    mode: str
+    places: tuple[Place, ...]
     lines: int
     harms: tuple[Harm, ...]
     seeds: int = 1
+
+    @property
+    def best(self) -> Place:
+        """The one with the smallest error."""
+        return self.places[0]
+
+    @property
+    def ties(self) -> tuple[str, ...]:
+        """Observers whose error is larger, but not significantly so."""
+        return tuple(place.observer for place in self.places[1:] if place.is_tie)
+
+    def best_with(self, *knowledge: str) -> Place | None:
+        """Return the best of those with these kinds of prior knowledge (`prior_knowledge`); None where there is none."""
+        return next((place for place in self.places if place.knowledge in knowledge), None)
 
     def sentences(self, scale: float = 1e3, unit: str = "nm") -> list[str]:
         """Return the verdict in words; scale: from micrometres to the unit."""
@@ -93,81 +130,39 @@ def verdict(
     evidence   : errors over several seeds, on which the verdict then rests; where the errors lie is that of the record
     budgets    : error budgets of the record, from which it is said why an observer does harm (`explain_harm`)
     """
-    of = [s for s in scores if (s.target, s.mode) == (target, mode)]
-    rivals = {s.observer: s for s in of if can_be_best(s.observer, s.apart) and s.observer != NO_ESTIMATE}
-    ranked = [rivals[name] for name in rank_observers({name: s.rms for name, s in rivals.items()})]
-    truth = record.truth(target)
-    if not ranked or truth is None or not ranked[0].truth_rms > 0:
+    found, truth = evidence or gather_evidence([scores]), record.truth(target)
+    ranked, leaders = found.ranking(target, mode), found.leaders(target, mode)
+    if not ranked or truth is None or not found.truths[ranked[0], target, mode].mean() > 0:
         return None
     column = [m.name for m in scenario.modes].index(mode)
-    values = {e.observer: e.values[:, column] for e in estimates if e.target == target}
-    errors = {s.observer: _keep_scored(record, values[s.observer] - truth[:, column], s) for s in ranked}
     lines = () if simulation is None else tuple(line[0] for line in vibration_lines(simulation, column))
+    of = {s.observer: s for s in scores if (s.target, s.mode) == (target, mode)}
+    limits = {name: (s.rms, name) for name, s in of.items() if name in BOUNDS}
+    given = {name: given_lines(scenario, name, column) for name in ranked}
+    places = {
+        name: Place(
+            name,
+            float(found.errors[name, target, mode].mean()),
+            found.interval((name, target, mode)),
+            name in leaders,
+            prior_knowledge(name),
+            min(int(is_near(np.array(lines), given[name]).sum()), len(given[name])) if lines else len(given[name]),
+            limits.get(JOINT_BOUNDS.get(name, BOUND_BOTH)),
+        )
+        for name in ranked
+    }
     causes = {b.observer: _largest_term(b) for b in budgets if (b.target, b.mode) == (target, mode) and b.terms}
-    first = ranked[0]
-    found = Verdict(
-        first,
-        tuple(s.observer for s in ranked[1:] if not differs(errors[first.observer], errors[s.observer])),
-        {s.observer: s.rms for s in of if s.observer in BOUNDS},
-        len(lines),
-        tuple(
-            Harm(
-                s.observer,
-                differs(_keep_scored(record, truth[:, column], s), errors[s.observer]),
-                *_shares(errors[s.observer], record.dt, lines, given_lines(scenario, s.observer, column, lines)),
-                *causes.get(s.observer, ("", 0.0)),
-            )
-            for s in reversed(ranked)
-            if s.rms >= s.truth_rms
-        ),
+    values = {e.observer: e.values[:, column] for e in estimates if e.target == target}
+    harms = (
+        Harm(
+            places[name],
+            worse,
+            *_shares(_keep_scored(record, values[name] - truth[:, column], of[name]), record.dt, lines, given[name]),
+            *causes.get(name, ("", 0.0)),
+        )
+        for name, worse in found.harmful(target, mode).items()
     )
-    return found if evidence is None else _over_seeds(found, evidence, {s.observer: s for s in ranked})
-
-
-def _over_seeds(one: Verdict, evidence: Evidence, scores: dict[str, Score]) -> Verdict:
-    """Return a verdict that rests on the errors of several seeds; as it was where they say nothing."""
-    target, mode = one.best.target, one.best.mode
-    leaders = evidence.leaders(target, mode)
-    if not leaders or leaders[0] not in scores:
-        return one
-    keys = {harm: (harm.observer, target, mode) for harm in one.harms if (harm.observer, target, mode) in evidence.errors}
-    errors, truths = evidence.errors, evidence.truths
-    mean = evidence.mean((leaders[0], target, mode))
-    assert mean is not None
-    return replace(
-        one,
-        best=replace(scores[leaders[0]], rms=mean),
-        ties=leaders[1:],
-        harms=tuple(
-            replace(harm, worse=differ_in_pairs(truths[key], errors[key]))
-            for harm, key in keys.items()
-            if errors[key].mean() >= truths[key].mean()
-        ),
-        seeds=evidence.n_seeds,
-    )
-
-
-def differs(one: Array, other: Array) -> bool:
-    """Whether two errors (n,), step by step of one record, differ significantly in their mean squares.
-
-    The difference of the squares is averaged over BATCHES pieces and compared with the scatter of their means by a t-test (batch
-    means: Law and Kelton, Simulation Modeling and Analysis, ch. 9). Slow errors make neighbouring means alike, which counts as
-    fewer of them, those of a first-order autoregression with their correlation. NaN where a step does not count.
-    """
-    difference = other**2 - one**2
-    pieces = np.array_split(difference[~np.isnan(difference)], BATCHES)
-    means = np.array([piece.mean() for piece in pieces if piece.size])
-    deviation = means - means.mean() if means.size else means
-    power = float(deviation @ deviation)
-    if means.size < 3:
-        return False
-    if not power > 0:
-        return bool(means[0] != 0.0)
-    # The estimate of a correlation from n values is low by about 1 / n.
-    alike = max(float(deviation[1:] @ deviation[:-1]) / power + 1.0 / means.size, 0.0)
-    independent = max(means.size * (1.0 - alike) / (1.0 + alike), 2.0)
-    scatter = means.std(ddof=1) / sqrt(independent)
-    return bool(abs(means.mean()) > student.ppf(1.0 - LEVEL / 2.0, independent - 1.0) * scatter)
+    return Verdict(target, mode, tuple(places.values()), len(lines), tuple(harms), found.n_seeds)
 
 
 def _largest_term(budget: Budget) -> tuple[str, float]:

@@ -129,7 +129,8 @@ def state_of(result: Result, states: int = 1, *, is_simulated: bool = True, evid
                 lines |= _frequencies(found[0])
                 for suffix, density in zip(("", "-error") if "error" in signals else ("",), found[1:], strict=False):
                     lines[f"psd{suffix}/{where}"], lines[f"cumulative{suffix}/{where}"] = _spectra(found[0], density[:, i])
-    rows = score_rows(result.scores, scenario.run.seed, source=result.prior_source)
+    scores = [evidence.over_seeds(score) for score in result.scores] if evidence else result.scores
+    rows = score_rows(scores, scenario.run.seed, source=result.prior_source)
     budgets = budget_rows(result) if is_simulated else []
     return State(
         scenario, rows, tuple(_reasons(result)), grid, lines, loop_rows(result), budgets, seeds_of(evidence) if evidence else {}

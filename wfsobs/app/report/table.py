@@ -6,12 +6,23 @@ from collections.abc import Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
-from wfsobs.app.display import IN_MOST, OVER_SEEDS, score_columns
+from wfsobs.app.display import AT_LIMIT, IN_MOST, OVER_SEEDS, score_columns
 from wfsobs.app.numerals import NOTHING
 from wfsobs.app.report.data import State
 from wfsobs.evaluation.evidence import rank_observers
-from wfsobs.evaluation.rows import TIME, Row, can_be_best, is_non_causal, own_interval, row_label, scored_interval, target_title
-from wfsobs.evaluation.scores import RESIDUAL
+from wfsobs.evaluation.rows import (
+    TIME,
+    Row,
+    above_bound,
+    can_be_best,
+    is_non_causal,
+    own_bound,
+    own_interval,
+    row_label,
+    scored_interval,
+    target_title,
+)
+from wfsobs.evaluation.scores import BOUNDS, RESIDUAL
 
 
 def state_table(state: State, name: str) -> dict[str, Any]:
@@ -38,7 +49,12 @@ def _order(rows: list[Row]):
 def _body(rows: list[Row], dt: float, seeds: Mapping[str, Any]) -> dict[str, Any]:
     target, mode = _group(rows[0])
     marks = _marks(rows, seeds.get("leaders", {}).get(f"{target}/{mode}", []))
-    intervals = seeds.get("intervals", {})
+    bounds = {row["observer"]: row["rms_um"] for row in rows if row["observer"] in BOUNDS}
+    limits = {
+        row["observer"]
+        for row in rows
+        if above_bound(row["rms_um"], row["interval_um"], bounds.get(own_bound(row["observer"]) or "")) == 0.0
+    }
     over_seeds = f"{OVER_SEEDS}, {seeds.get('count', 1)} seeds"
     return {
         "target": target,
@@ -51,8 +67,9 @@ def _body(rows: list[Row], dt: float, seeds: Mapping[str, Any]) -> dict[str, Any
                 "looks_ahead": is_non_causal(row["observer"]),
                 "stretch": own_interval(row),
                 "mark": marks.get(row["observer"]),
-                "interval": row["interval_um"] or intervals.get(f"{row['observer']}/{target}/{mode}"),
-                "meaning": IN_MOST if row["interval_um"] else over_seeds,
+                "at_limit": row["observer"] in limits and AT_LIMIT,
+                "interval": row["interval_um"] if seeds or row["observer"] in BOUNDS else None,
+                "meaning": IN_MOST if row["observer"] in BOUNDS else over_seeds,
                 "lag": NOTHING if row["lag_s"] is None else f"{1e3 * row['lag_s']:z.2f}".replace("-", "−"),
                 "time": row[TIME],
                 "factor": None if row[TIME] is None else 1e-6 * row[TIME] / dt,

@@ -117,13 +117,12 @@ class Strip:
                 return self._without_truth(name, results)
             waiting = self.run.state == RUNNING
             return self._card(name, None, "computing …" if waiting else "no result")
-        return self._score_fields(name, score, results, "truth") | {"range": self._range(name, results)}
-
-    def _range(self, name: str, results: RunResults) -> str:
-        """Write the interval of the mean error over several seeds; empty where there is none."""
         evidence = self.seeds.evidence if self.seeds else None
-        interval = evidence.interval((name, self.target, self.display.mode)) if evidence else None
-        return f"mean {' – '.join(number(self._in_unit(x, results)) for x in interval)}" if interval else ""
+        if evidence is None or score.apart:
+            return self._score_fields(name, score, results, "truth")
+        mean = evidence.over_seeds(score)
+        ends = " – ".join(number(self._in_unit(x, results)) for x in mean.interval or ())
+        return self._score_fields(name, mean, results, "truth") | {"range": ends and f"mean {ends}"}
 
     def _score_fields(self, name: str, score: Score, results: RunResults, base: str) -> dict[str, Any]:
         relative = f"{score.normalised_rms:.2f} × {base}" if score.normalised_rms is not None else ""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 import panel as pn
 from markupsafe import Markup
 
 from wfsobs.app.compared import ComparedRun
-from wfsobs.app.display import IN_MOST, OVER_SEEDS, Display, per_micrometre, score_columns
+from wfsobs.app.display import AT_LIMIT, IN_MOST, OVER_SEEDS, Display, per_micrometre, score_columns
 from wfsobs.app.glossary import BOUND as TERM_OF_BOUND
 from wfsobs.app.glossary import term
 from wfsobs.app.jobs.task import BackgroundTask
@@ -21,6 +21,7 @@ from wfsobs.app.work import RunResults
 from wfsobs.evaluation.evidence import rank_observers
 from wfsobs.evaluation.rows import (
     NOT_OBSERVERS,
+    at_bound,
     can_be_best,
     is_non_causal,
     own_interval,
@@ -119,19 +120,24 @@ class Table:
         """List the rows of a target, best first if asked for, those without a score last."""
         shown = self.run.result
         scores = {
-            name: find(shown, name, target, self.display.mode) if shown else None
+            name: self._score(name, target)
             for name in (*observers_of(target, with_hidden=True), *BOUNDS)
             if not shown or name in BOUNDS or is_usual(OBSERVERS[name], shown.result.scenario, shown.result.record)
         }
         for name in set(BOUNDS).difference(COMMON_BOUNDS):  # only where stars differ, or modes are coupled
             if not scores[name]:
                 del scores[name]
-        marks = self._marks(target, scores)
+        marks, limits = self._marks(target, scores), {key[0] for key in at_bound(filter(None, scores.values()))}
         order = list(scores.items())
         if self.display.best_first:
             order.sort(key=lambda item: (item[1].apart, item[1].rms) if item[1] else (True, math.inf))
         title = f"{target_title(target)}, {self.display.mode}{_stretch([s for s in scores.values() if s])}"
-        return title, [self._row(name, target, score, marks.get(name, Markup())) for name, score in order]
+        return title, [self._row(name, target, score, marks.get(name, Markup()), name in limits) for name, score in order]
+
+    def _score(self, name: str, target: str) -> Score | None:
+        """Find a score, with the mean over the seeds where there are several."""
+        score = find(self.run.result, name, target, self.display.mode) if self.run.result else None
+        return self.seeds.evidence.over_seeds(score) if score and self.seeds and self.seeds.evidence else score
 
     def _marks(self, target: str, scores: Mapping[str, Score | None]) -> dict[str, Markup]:
         """Mark the best, which differs significantly from all others over seeds, or those tied; of one record the smallest."""
@@ -141,26 +147,24 @@ class Table:
         rivals = {n: s.rms for n, s in scores.items() if s and can_be_best(n, s.apart)}
         return dict.fromkeys(rank_observers(rivals)[:1], SMALLEST)
 
-    def _over_seeds(self, name: str, target: str, scale: float) -> Markup:
-        """Write the interval of the mean error over several seeds, to stand before that of the record."""
+    def _interval(self, score: Score, scale: float) -> Markup:
+        """Write the interval of a bound, or of the mean error over several seeds, to stand before it."""
         evidence = self.seeds.evidence if self.seeds else None
-        interval = evidence.interval((name, target, self.display.mode)) if evidence else None
-        if evidence is None or interval is None:
+        if score.interval is None or not (evidence or score.observer in BOUNDS):
             return Markup()
-        return macro("interval", *(number(x * scale) for x in interval), f"{OVER_SEEDS}, {evidence.n_seeds} seeds")
+        meaning = IN_MOST if score.observer in BOUNDS or not evidence else f"{OVER_SEEDS}, {evidence.n_seeds} seeds"
+        return macro("interval", *(number(x * scale) for x in score.interval), meaning)
 
-    def _row(self, name: str, target: str, score: Score | None, mark: Markup) -> Row:
-        shown, compared = self.run.result, self._compared_cells(name, target, score)
+    def _row(self, name: str, target: str, score: Score | None, mark: Markup, at_limit: bool) -> Row:
+        shown = self.run.result
+        compared = self._compared_cells(name, target, find(shown, name, target, self.display.mode) if shown else None)
         needs = row_needs(name, source=shown.result.prior_source) if shown else row_needs(name)
         cells = [NOTHING, *compared, *[NOTHING] * 2, needs, *[NOTHING] * 4]
         if shown and score:
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
             cells = [
                 # The number last, so that numbers stand below each other.
-                (_interval(score.interval, scale) or self._over_seeds(name, target, scale))
-                + " "
-                + mark
-                + number(score.rms * scale),
+                self._interval(score, scale) + " " + mark + number(score.rms * scale),
                 *compared,
                 number(score.truth_rms * scale),
                 (ABOVE if (score.normalised_rms or 0.0) > 1.0 else "") + number(score.normalised_rms),
@@ -170,6 +174,7 @@ class Table:
                 _own_sd(score, scale),
             ]
         head = self._head(name) + macro("note", "looks ahead" if is_non_causal(name) else "") + _own(score)
+        head += macro("note", AT_LIMIT if at_limit else "")
         return Row(head, cells, {"observer": name, "target": target})
 
     def _head(self, name: str) -> Markup:
@@ -197,11 +202,6 @@ def _stretch(scores: list[Score]) -> str:
 def _own(score: Score | None) -> Markup:
     """Write the stretch of an observer that was scored on samples of its own, to stand beside its name."""
     return macro("note", own_interval(score_rows([score], None)[0]) if score and score.apart else "")
-
-
-def _interval(interval: Sequence[float] | None, scale: float) -> Markup:
-    """Write the interval of a bound, to stand before it."""
-    return macro("interval", *(number(x * scale) for x in interval), IN_MOST) if interval else Markup()
 
 
 def _own_sd(score: Score, scale: float) -> str:

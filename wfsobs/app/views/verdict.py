@@ -78,7 +78,7 @@ class VerdictLine:
         first, *others = found.sentences(scale, self.display.unit_label)
         first = _say_where(first, (found.best.observer, *found.ties))
         more = "".join(f"<br>{escape(sentence)}" for sentence in others)
-        text = f"<strong>{explain_first(first, 'bound', BOUND)}</strong>{more}".replace(" %", "&nbsp;%")
+        text = f"<strong>{explain_first(first, 'theoretical limit', BOUND)}</strong>{more}".replace(" %", "&nbsp;%")
         self._sentence = of, text
         return _paragraph(text, "verdict")
 
