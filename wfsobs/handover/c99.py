@@ -1,7 +1,8 @@
 """A linear controller as C99 without dependencies: a header, a source, and a test on vectors of the run over a record.
 
-Sparse rows of A and dense C and L are tables of constants; one function runs any of the filters. Memory is static. Near gaps the
-covariance of a Kalman filter goes along, in double precision; it starts from that of the steady state, which is a table as well.
+Sparse rows of A and dense C and L are tables of constants; one function runs any of the filters. The state is a struct of the
+caller's. Near gaps the covariance of a Kalman filter goes along, in double precision; it starts from that of the steady state,
+which is a table as well.
 """
 
 from __future__ import annotations
@@ -25,10 +26,17 @@ TEMPLATES = files("wfsobs.handover") / "templates"
 
 
 class _Tables:
-    """Tables of constants, each written once however often it is used."""
+    """Tables of constants, each written once however often it is used.
+
+    Attributes
+    ----------
+    n_states, n_covariances, most : int
+        Numbers in the states of all filters together and in the covariances that go along; states of the longest filter.
+    """
 
     def __init__(self) -> None:
         self.lines: list[str] = []
+        self.n_states = self.n_covariances = self.most = 0
         self._names: dict[tuple[str, bytes], str] = {}
 
     def numbers(self, kind: str, values: Array) -> str:
@@ -73,24 +81,23 @@ class _Tables:
     def gaps(self, gaps: GapGains | None, name: str) -> str:
         """Return the initialiser of the gains near gaps, with their covariance."""
         if gaps is None:
-            return "{0, 0, 0, 0, 0, 0, 0}"
+            return "{0, 0, 0, 0, 0, 0}"
         steps = ", ".join(map(self.gap_step, gaps.cycle, gaps.posteriors))
         n = len(gaps.weights)
         self.lines.append(f"static const struct gap_step {name}_steps[] = {{{steps}}};")
-        self.lines.append(f"static double {name}_p[{n * n}];")
-        self.lines.append(f"static int {name}_near;")
-        counts = f"{len(gaps.cycle)}, {len(gaps.cycle[0][1])}"
-        return f"{{{counts}, {name}_steps, {self.numbers('double', gaps.weights)}, {gaps.most!r}, {name}_p, &{name}_near}}"
+        counts, first = f"{len(gaps.cycle)}, {len(gaps.cycle[0][1])}", self.n_covariances
+        self.n_covariances += n * n
+        return f"{{{counts}, {name}_steps, {self.numbers('double', gaps.weights)}, {gaps.most!r}, {first}}}"
 
     def filter(self, gains: GainCycle | None, name: str) -> str:
-        """Return the initialiser of a filter with its state."""
+        """Return the initialiser of a filter, its state behind those before it."""
         if gains is None:
             return "{0, 0, 0, 0, 0}"
         steps = ([] if gains.first is None else [gains.first]) + list(gains.steps)
         n = len(steps[0].A)
         self.lines.append(f"static const struct step {name}_steps[] = {{{', '.join(map(self.step, steps))}}};")
-        self.lines.append(f"static real {name}_x[{n}];")
-        return f"{{{n}, {len(steps)}, {int(gains.first is not None)}, {name}_steps, {name}_x}}"
+        first, self.n_states, self.most = self.n_states, self.n_states + n, max(self.most, n)
+        return f"{{{n}, {len(steps)}, {int(gains.first is not None)}, {name}_steps, {first}}}"
 
 
 def source(design: LinearDesign) -> Mapping[str, str]:
@@ -105,13 +112,15 @@ def source(design: LinearDesign) -> Mapping[str, str]:
             tables.numbers("real", mode.row),
         ]
         modes.append("{" + ", ".join(parts) + "}")
-    most = max(len(step.A) for mode in design.modes for g in (mode.gains, mode.lgs, mode.ngs) if g for step in g.steps)
     words = {
         "@CONVENTIONS@": "\n".join(f"   {line}" for line in design.conventions(True)),
         "@TEXT@": "\n".join(design.conventions(True)),
         "@MODES@": str(len(modes)),
         "@RATIO@": str(design.ratio),
-        "@STATES@": str(most),
+        "@X@": str(tables.n_states),
+        "@P@": str(max(tables.n_covariances, 1)),
+        "@STATES@": str(tables.most),
+        "@PRODUCT@": str(tables.most**2 if tables.n_covariances else 1),
         "@TABLES@": "\n".join(tables.lines),
         "@FILTERS@": ",\n    ".join(modes),
     }
