@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from wfsobs.control.mirror import Plant
 from wfsobs.control.step_laws import StepLaw, VibrationAhead, push_row
 from wfsobs.observers.missing import Bridge
-from wfsobs.observers.step_checks import StepError, check_frame, check_not_due, check_stars, check_state
+from wfsobs.observers.step_checks import StepError, check_frame, check_ngs, check_stars, check_state
 from wfsobs.record import Sampling
 from wfsobs.signal.stepping import Stateful, load_parts, save_parts
 from wfsobs.typing import Array
@@ -57,7 +57,7 @@ class StepController:
         self._taps = plant.mirror.taps[1:]
         self._commands = np.zeros((len(self._taps), n))  # commands, newest first
         self._mirror = np.zeros((max(self._ratio, 1), n))  # the mirror in the last measurements, newest first
-        self._nothing, self._none = np.full(n, np.nan), np.zeros(n)
+        self._none = np.zeros(n)
         found = {"lgs": self._lgs, "law": law, "ngs": self._ngs}
         self._parts: dict[str, Stateful] = {name: part for name, part in found.items() if part is not None}
         self._parts |= {} if ahead is None else ahead.parts
@@ -116,7 +116,7 @@ class StepController:
         x, is_whole = check_frame(self.id, x, name, self.sampling.n_modes, self.frame)
         check_stars(self.id, stars)
         due = self.uses_ngs and self.frame > 0 and self.frame % self._ratio == 0
-        slow = self._check_ngs(ngs, due) if self.uses_ngs else None
+        slow = check_ngs(self.id, ngs, due, self.sampling.n_modes, self._ratio, self.frame) if self.uses_ngs else None
         seen = self.correction
         z = x if is_open else x - seen
         if self._lgs is not None:
@@ -195,9 +195,3 @@ class StepController:
             return command
         last = self._commands[0]
         return np.clip(np.clip(command, last - mirror.slew, last + mirror.slew), -mirror.stroke, mirror.stroke)
-
-    def _check_ngs(self, ngs: ArrayLike | None, due: bool) -> Array | None:
-        if due:
-            return self._nothing if ngs is None else check_frame(self.id, ngs, "ngs", self.sampling.n_modes, self.frame)[0]
-        check_not_due(self.id, ngs, self._ratio, self.frame)
-        return None

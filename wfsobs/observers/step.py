@@ -19,7 +19,7 @@ from wfsobs.observers.step_checks import (
     StepError,
     check_each,
     check_frame,
-    check_not_due,
+    check_ngs,
     check_request,
     check_stars,
     check_state,
@@ -146,7 +146,7 @@ class StepObserver:
         z, is_whole = self._check(z, "z")
         check_stars(self.id, stars)
         due = self._needs_ngs and self.frame > 0 and self.frame % self._ratio == 0
-        slow = self._check_ngs(ngs, due) if self._needs_ngs else None
+        slow = check_ngs(self.id, ngs, due, self.sampling.n_modes, self._ratio, self.frame) if self._needs_ngs else None
         if self.estimator.needs_command:
             if u is None:
                 raise StepError(f"{self.id}: its windows hold commands: update(z, u=...) takes that of the frame, too")
@@ -246,9 +246,3 @@ class StepObserver:
 
     def _check(self, x: ArrayLike, name: str) -> tuple[Array, bool]:
         return check_frame(self.id, x, name, self.sampling.n_modes, self.frame)
-
-    def _check_ngs(self, ngs: ArrayLike | None, due: bool) -> Array | None:
-        if due:
-            return self._nothing if ngs is None else self._check(ngs, "ngs")[0]
-        check_not_due(self.id, ngs, self._ratio, self.frame)
-        return None

@@ -59,10 +59,13 @@ def check_each(id: str, each: ArrayLike | None, shape: tuple[int, int], frame: i
     return x
 
 
-def check_not_due(id: str, ngs: ArrayLike | None, ratio: int, frame: int) -> None:
-    """Raise StepError for an NGS frame where none is due."""
+def check_ngs(id: str, ngs: ArrayLike | None, due: bool, n_modes: int, ratio: int, frame: int) -> Array | None:
+    """Return an NGS frame that is due, NaN where it is missing, and None where none is due. Raises StepError."""
+    if due:
+        return np.full(n_modes, np.nan) if ngs is None else check_frame(id, ngs, "ngs", n_modes, frame)[0]
     if ngs is not None and not np.isnan(as_numbers(id, ngs, "ngs")).all():
         raise StepError(f"{id}: an NGS frame in frame {frame}: one is due in every {ratio}th, {ratio}, {2 * ratio}, ...")
+    return None
 
 
 def check_state(id: str, state: Mapping[str, ArrayLike], own: Mapping[str, Array]) -> dict[str, Array]:
