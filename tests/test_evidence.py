@@ -46,7 +46,7 @@ def test_of_equals_any_is_called_worse_in_at_most_five_per_cent(names: int, seed
         errors = shared + rng.normal(0.0, 0.5, (seeds, names))
         worse += bool(columns_differ(errors).any())
         of = {(name, "vibration", "tip"): errors[:, i] for i, name in enumerate(ids)}
-        unequal += len(Evidence(of, dict.fromkeys(of, errors[:, 0]), seeds).leaders("vibration", "tip")) < len(ids)
+        unequal += len(Evidence(of, of, seeds).leaders("vibration", "tip")) < len(ids)
     most = binom.ppf(0.9999, n, 0.05) / n
     assert worse / n <= most and unequal / n <= most
 
@@ -58,7 +58,7 @@ def test_one_of_many_that_is_worse_is_found() -> None:
         (name, "turbulence", "tip"): errors[:, i] for i, name in enumerate([n for n in OBSERVERS if can_be_best(n, False)][:10])
     }
     worst = list(of)[4][0]
-    found = Evidence(of, dict.fromkeys(of, errors[:, 0]), 8).leaders("turbulence", "tip")
+    found = Evidence(of, of, 8).leaders("turbulence", "tip")
     assert worst not in found and len(found) == 9
 
 

@@ -16,10 +16,11 @@ from wfsobs.evaluation.samples import BATCHES, batch_means
 from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS
 from wfsobs.evaluation.verdict import explain_harm, verdict
 from wfsobs.observers import OBSERVERS
-from wfsobs.pipeline import run
+from wfsobs.pipeline import observe, run
 from wfsobs.result import Result
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.disturbance import vibration_lines
+from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
 
 QUICK = ("kf-lgs", "kf-multi", "multirate-optimal", "ridge-30", "butterworth-cl", "persistence", "zero")
@@ -166,6 +167,49 @@ def test_budgets_are_made_of_those_that_do_harm_and_of_a_simulation_alone() -> N
     result = run(SCENARIOS["paper"], observers=("kf-lgs", "kf-multi", "zero"))
     assert {(b.observer, b.mode) for b in explain_harm(result, "tilt")} == {("kf-lgs", "tilt")}
     assert not explain_harm(replace(result, record=replace(result.record, vibration=None)))
+
+
+FOUND = [{"frequency": 14.0, "damping": 0.003, "rms": [0.01, 0.01]}, {"frequency": 47.4, "damping": 0.003, "rms": [0.01, 0.01]}]
+
+
+@pytest.mark.parametrize(
+    ("peaks", "counted", "words"),
+    [
+        ([], 0, "knows 0 of 14 peak frequencies"),
+        ([*FOUND, {"frequency": 40.0, "damping": 0.003, "rms": [0.01, 0.01]}], 2, "knows 2 of 14 peak frequencies"),
+        (PRESETS["paper"]().vibration.peaks, 14, "knows all 14 peak frequencies"),
+    ],
+)
+def test_the_peaks_that_are_counted_are_those_that_the_observers_are_told(peaks: list, counted: int, words: str) -> None:
+    """As after an identification, which found two of the peaks, and one where there is none."""
+    simulation = PRESETS["paper"]().replace({"run.duration": 2.0})
+    told = simulation.replace({"vibration.peaks": peaks})
+    result = observe(simulate(simulation), told, observers=("kf-multi", "zero"))
+    given = (result.scenario, result.record, result.estimates, result.scores, "turbulence", "tip")
+    found = verdict(*given, simulation=simulation)
+    assert found is not None and found.lines == 14
+    assert found.best.n_peaks == counted and words in found.sentences()[0]
+    # Without the simulation nobody knows which of them there are.
+    alone = verdict(*given)
+    assert alone is not None and alone.best.n_peaks == sum(p.rms[0] > 0 for p in told.vibration.peaks)
+
+
+def test_the_best_with_each_kind_of_prior_knowledge_is_the_least_error_of_those_that_have_it(result: Result) -> None:
+    found = verdict(
+        result.scenario, result.record, result.estimates, result.scores, "vibration", "tip", simulation=result.scenario
+    )
+    assert found is not None
+    of = {s.observer: s.rms for s in result.scores if (s.target, s.mode) == ("vibration", "tip")}
+    kinds = {
+        "peaks": {"kf-multi"},
+        "one peak": {"kf-lgs", "multirate-optimal"},
+        "training data": {"ridge-30"},
+        "bands": {"butterworth-cl"},
+    }
+    for kind, names in kinds.items():
+        best = found.best_with(kind)
+        assert best is not None and best.rms == min(of[name] for name in names) and best.observer in names
+    assert found.best_with("nothing") is None
 
 
 def test_without_truth_there_is_no_verdict_and_without_a_simulation_no_lines() -> None:

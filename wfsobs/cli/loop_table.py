@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from statistics import median
+from statistics import mean, median
 
+import numpy as np
 from rich.table import Table
 
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label, linear
-from wfsobs.evaluation.rows import Row
+from wfsobs.evaluation.evidence import seeds_interval
+from wfsobs.evaluation.rows import Row, interval_text
 
 
 def loop_table(rows: Sequence[Row]) -> Table:
-    """Return the residual table, best controller first; over several seeds the medians, with the smallest and the largest."""
+    """Return the residual table, best controller first; residuals are means over seeds with intervals, all else medians."""
     several = len({r["seed"] for r in rows}) > 1
-    out = Table(title="Residual in closed loop after warm-up" + (", median over seeds" if several else ""))
+    out = Table(title="Residual in closed loop after warm-up" + (", mean over seeds" if several else ""))
     for name in ("Mode", "Controller", "Needs"):
         out.add_column(name, no_wrap=True)
-    spread = ("spread, nm",) if several else ()
+    spread = ("95 %, nm",) if several else ()
     for name in ("rms, nm", *spread, "mas", "Strehl", "theory, nm", "gain", "margins", "delay, ms", "at limit, %"):
         out.add_column(name, justify="right", no_wrap=True)
     last = None
@@ -28,7 +30,7 @@ def loop_table(rows: Sequence[Row]) -> Table:
         last = mode
         stable = all(r["stable"] for r in same)
         left = [r["residual_rms_nm"] for r in same if r["residual_rms_nm"] is not None]
-        shown = _number(same, "residual_rms_nm", 2) if left else "unstable" if not stable else "-"
+        shown = f"{mean(left):.2f}" if left else "unstable" if not stable else "-"
         if all(r["stable"] is None for r in same):
             shown = "none"
         out.add_row(
@@ -36,7 +38,7 @@ def loop_table(rows: Sequence[Row]) -> Table:
             label(controller),
             same[0]["needs"],
             shown,
-            *((f"{min(left):.2f} - {max(left):.2f}" if left else "-",) if several else ()),
+            *((interval_text(seeds_interval(np.array(left)), 1.0),) if several else ()),
             _number(same, "residual_rms_mas", 3),
             _number(same, "strehl", 4),
             linear(same, _number(same, "predicted_rms_nm", 2)),
@@ -72,6 +74,6 @@ def _order(rows: Sequence[Row]):
 
     def key(group: tuple[str, str]) -> tuple:
         left = [r["residual_rms_nm"] for r in rows if (r["mode"], r["controller"]) == group]
-        return modes.index(group[0]), median(float("inf") if x is None else x for x in left)
+        return modes.index(group[0]), mean(float("inf") if x is None else x for x in left)
 
     return key

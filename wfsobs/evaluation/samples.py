@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.special import stdtrit
 
 from wfsobs.record import Record
 from wfsobs.typing import Array
@@ -79,3 +80,14 @@ def scatter_of_mean(values: Array, independent: bool = False) -> tuple[Array, Ar
     alike = np.maximum(alike + 1.0 / n, 0.0)  # the estimate of a correlation from n values is low by about 1 / n
     effective = np.maximum(n * (1.0 - alike) / (1.0 + alike), 2.0)
     return mean, np.sqrt(power / (n - 1) / effective), effective - 1.0
+
+
+def rms_interval(rms: float, squares: Array) -> tuple[float, float] | None:
+    """Return the interval of an rms at 95 % confidence, by the scatter of its logarithm in batch means of squares (n, 1).
+
+    None where there is none: of too few, or of an error that is zero.
+    """
+    mean, deviation, freedom = (float(x[0]) for x in scatter_of_mean(squares))
+    reach = 0.5 * float(stdtrit(freedom, 0.975)) * deviation / mean if mean > 0 else np.nan
+    low, high = (rms * np.exp([-reach, reach])).tolist()
+    return (low, high) if np.isfinite(reach) else None

@@ -9,11 +9,10 @@ from hashlib import blake2b
 from typing import Any
 
 import numpy as np
-from scipy.special import stdtrit
 
 from wfsobs.evaluation.calibration import Calibration, calibration
 from wfsobs.evaluation.lag import lag
-from wfsobs.evaluation.samples import batch_means, common_samples, samples_after, scatter_of_mean, stretch_of
+from wfsobs.evaluation.samples import batch_means, common_samples, rms_interval, samples_after, stretch_of
 from wfsobs.evaluation.totals import of_both, totals
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimate
@@ -63,7 +62,7 @@ class Score:
     apart : bool
         Whether the samples differ from those of the other rows, so that the row cannot be compared with them.
     interval : tuple of float or None
-        Range that has the rms over all records at 95 % confidence, as the scatter within this one tells [um]. Of the bound of the
+        Range that has the rms over all records at 95 % confidence, by the scatter within this one [um]. Of the bound of the
         LGS: range of the rms of an optimal observer in 95 % of records.
     phases : tuple of float or None
         Of the bounds of both sensors: the bound in steps with an NGS frame, one step later, ... [um]; `rms` is over all.
@@ -178,12 +177,9 @@ def _score_mode(e: Estimate, true: Array, mode: int, name: str, dt: float, sampl
 
 
 def _scatter(error: Array, truth: Array) -> dict[str, Any]:
-    """Return the fields `pieces` and `interval` of a score; no interval of an error that is zero."""
+    """Return the fields `pieces` and `interval` of a score."""
     pieces = batch_means(np.column_stack([error, truth]) ** 2)
-    (mean, _), (deviation, _), (freedom, _) = scatter_of_mean(pieces)
-    reach = 0.5 * stdtrit(freedom, 0.975) * deviation / mean if mean > 0 else np.nan  # of the logarithm of the rms
-    scale = rms(error) * np.exp([-reach, reach])
-    return {"pieces": tuple(map(tuple, pieces.tolist())), "interval": tuple(scale.tolist()) if np.isfinite(reach) else None}
+    return {"pieces": tuple(map(tuple, pieces.tolist())), "interval": rms_interval(rms(error), pieces[:, :1])}
 
 
 def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: float, mode_names: list[str]) -> list[Score]:

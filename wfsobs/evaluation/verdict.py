@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Place:
+class Contender:
     """An observer that can be the best.
 
     rms, interval : mean of its error over the seeds, or its error on the record, and the interval of that [um]
@@ -62,7 +62,7 @@ class Harm:
     cause, share        : largest term of its error budget, and its part of the whole; empty where the budget is not known
     """
 
-    place: Place
+    place: Contender
     worse: bool
     at_known: float
     at_others: float
@@ -87,13 +87,13 @@ class Verdict:
 
     target: str
     mode: str
-    places: tuple[Place, ...]
+    places: tuple[Contender, ...]
     lines: int
     harms: tuple[Harm, ...]
     seeds: int = 1
 
     @property
-    def best(self) -> Place:
+    def best(self) -> Contender:
         """The one with the smallest error."""
         return self.places[0]
 
@@ -102,7 +102,7 @@ class Verdict:
         """Observers whose error is larger, but not significantly so."""
         return tuple(place.observer for place in self.places[1:] if place.is_tie)
 
-    def best_with(self, *knowledge: str) -> Place | None:
+    def best_with(self, *knowledge: str) -> Contender | None:
         """Return the best of those with these kinds of prior knowledge (`prior_knowledge`); None where there is none."""
         return next((place for place in self.places if place.knowledge in knowledge), None)
 
@@ -140,7 +140,7 @@ def verdict(
     limits = {name: (s.rms, name) for name, s in of.items() if name in BOUNDS}
     given = {name: given_lines(scenario, name, column) for name in ranked}
     places = {
-        name: Place(
+        name: Contender(
             name,
             float(found.errors[name, target, mode].mean()),
             found.interval((name, target, mode)),

@@ -13,7 +13,7 @@ from wfsobs.evaluation.rows import row_label
 from wfsobs.evaluation.scores import BOUND_ASTERISM, BOUND_BOTH, BOUND_BOTH_MODES, BOUND_MODES
 
 if TYPE_CHECKING:
-    from wfsobs.evaluation.verdict import Harm, Place, Verdict
+    from wfsobs.evaluation.verdict import Contender, Harm, Verdict
 
 MOST = 3
 """Observers that are named as equal to the best; the table has all."""
@@ -36,7 +36,7 @@ CAUSES = {
 """Terms of an error budget, as causes."""
 
 
-def knowledge_clause(place: Place, lines: int, several: bool = False) -> str:
+def knowledge_clause(place: Contender, lines: int, several: bool = False) -> str:
     """Write what an observer knows before it measures; lines : of the vibration, 0 where that is not known."""
     they, know, have, model = (
         ("they", "know", "have", "their models have") if several else ("it", "knows", "has", "its model has")
@@ -68,7 +68,7 @@ def best_sentence(it: Verdict, scale: float, unit: str) -> str:
     return f"{it.target.capitalize()}, {it.mode}: {start}{_to_limit(it.best)}; {knowledge_clause(it.best, it.lines)}."
 
 
-def _to_limit(place: Place) -> str:
+def _to_limit(place: Contender) -> str:
     """Say how far an error is from the least possible."""
     above = place.above_limit
     if above is None or place.limit is None:
