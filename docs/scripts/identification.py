@@ -182,7 +182,10 @@ def held(seeds: range, rate: float, duration: float, lost: float) -> tuple[dict[
             near = [p for p in mode.peaks if p.pure == (xi == 0) and abs(p.frequency.value - f) < max(0.3, 4.0 * p.frequency.std)]
             for p in sorted(near, key=lambda p: abs(p.frequency.value - f))[:1]:
                 kind = "resonances" if xi else "lines"
-                pairs += [(f"{kind}, frequency", p.frequency, f), (f"{kind}, rms", p.rms, rms)]
+                pairs += [
+                    (f"{kind}, frequency", p.frequency, f),
+                    (f"{kind}, rms", (p.ensemble_rms or p.rms) if xi else p.rms, rms),
+                ]
                 pairs += [("resonances, damping", p.damping, xi)] if xi else []
         for name, number, true in pairs:
             stated = bool(np.isfinite(number.std))
@@ -228,7 +231,8 @@ def spread(scenario: Scenario, seeds: range) -> dict[str, Any]:
             for p in m.peaks:
                 if abs(p.frequency.value - peak.frequency) <= THRESHOLD * 5 and p.pure == (peak.damping == 0):
                     kind = "line" if p.pure else "resonance"
-                    pairs += [(f"{kind}, frequency", p.frequency, peak.frequency), (f"{kind}, rms", p.rms, peak.rms[0])]
+                    pairs += [(f"{kind}, frequency", p.frequency, peak.frequency)]
+                    pairs += [(f"{kind}, rms", p.rms if p.pure else p.ensemble_rms or p.rms, peak.rms[0])]
                     pairs += [] if p.pure else [("resonance, damping", p.damping, peak.damping)]
         for name, n, value in pairs:
             scores.setdefault(name, []).extend([(n.value - value) / n.std] * bool(np.isfinite(n.std)))

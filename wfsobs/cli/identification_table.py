@@ -11,7 +11,8 @@ from wfsobs.identification.result import Identification
 
 def identification_table(result: Identification) -> Table:
     """Noise, turbulence and peaks of every mode."""
-    out = Table(title=f"Identified from {result.duration:.1f} s, with standard deviations")
+    title = f"Identified from {result.duration:.1f} s, with standard deviations"
+    out = Table(title=title, caption="rms of lines and resonances: within this record")
     for name in ("Mode", "What"):
         out.add_column(name, no_wrap=True)
     for name in ("frequency, Hz", "damping", "rms, nm"):

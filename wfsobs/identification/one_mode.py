@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import pi
 
 import numpy as np
@@ -10,9 +9,9 @@ import numpy as np
 from wfsobs.identification.misfit import margin
 from wfsobs.identification.order import choose_order, with_background
 from wfsobs.identification.resonances import (
-    WIDEST,
+    NEIGHBOURS,
     add_resonance,
-    is_resolved,
+    is_peak,
     misfit_of,
     reach_of,
     split_resonance,
@@ -129,7 +128,7 @@ class OneMode:
     def refit(self, reshape: bool = False, third: bool = False) -> None:
         """Fit all parameters of the spectrum at once.
 
-        A resonance that has become as narrow as a line becomes one; one that has become as wide as turbulence is dropped.
+        A resonance that has become as wide as turbulence is dropped.
 
         reshape : whether the order of the turbulence and the background are chosen anew; third : third order in any case
         """
@@ -137,13 +136,9 @@ class OneMode:
         self.spectrum = fit_spectrum(self.spectrum, cells)
         if reshape:
             self.spectrum = with_background(choose_order(self.spectrum, cells, third), cells)
-        for p in [p for p in self.spectrum.resonances if not is_resolved(p, self.f)]:
-            self.spectrum = replace(self.spectrum, resonances=tuple(q for q in self.spectrum.resonances if q is not p))
-            frequency = p.omega / (2 * pi)
-            if p.damping < WIDEST and 2.0 * self.f[0] < frequency < self.f[-1]:
-                self.lines = [*self.lines, nearest_line(self.left, self.dt, frequency, 0.75 * self.f[0])]
-            self.rejections.append(Candidate(frequency, WIDEST_LINE, 0.0))  # or it would come back
-            self._subtract_lines()
+        for p in [p for p in self.spectrum.resonances if not is_peak(p, self.f)]:
+            self.spectrum = self.spectrum.without(p)
+            self.rejections.append(Candidate(p.omega / (2 * pi), WIDEST_LINE, 0.0))  # or it would come back
         self._fill()
 
     def explain(self, candidate: Candidate) -> bool:
@@ -156,22 +151,26 @@ class OneMode:
         lines, spectrum, reach = self.lines, self.spectrum, reach_of(candidate, self.f[0])
         beside = [line for line in lines if abs(line.frequency - candidate.frequency) < reach]
         trials: list[tuple[list[Sinusoid], Spectrum]] = []
+        if not beside and not any(abs(p.omega / (2 * pi) - candidate.frequency) < reach for p in spectrum.resonances):
+            shape = add_resonance(spectrum, self.f, self.I, candidate)
+            at = shape.resonances[-1].omega / (2 * pi)  # its own skirt may have been the candidate
+            beside = [line for line in lines if abs(line.frequency - at) < NEIGHBOURS * self.f[0]]
+            if not beside:
+                trials.append((lines, shape))
+                if candidate.width <= WIDEST_LINE:
+                    at = strongest_bin(candidate, self.f, self.I / spectrum.psd(self.f))
+                    trials.append(([*lines, nearest_line(self.left, self.dt, at, 0.75 * self.f[0])], spectrum))
         if beside:
             self.lines = rest = [line for line in lines if line not in beside]
             self._subtract_lines()
             centre = float(np.mean([line.frequency for line in beside]))
             wide = Candidate(centre, max(candidate.width, 3), candidate.strength)
             trials.append((rest, add_resonance(spectrum, self.f, self.I, wide)))
-        elif not any(abs(p.omega / (2 * pi) - candidate.frequency) < reach for p in spectrum.resonances):
-            trials.append((lines, add_resonance(spectrum, self.f, self.I, candidate)))
-            if candidate.width <= WIDEST_LINE:
-                at = strongest_bin(candidate, self.f, self.I / spectrum.psd(self.f))
-                trials.append(([*lines, nearest_line(self.left, self.dt, at, 0.75 * self.f[0])], spectrum))
         outcomes = []
         for some, shape in trials:
             self.lines = some
             self._subtract_lines()
-            if len(shape.resonances) > len(spectrum.resonances) and not is_resolved(shape.resonances[-1], self.f):
+            if len(shape.resonances) > len(spectrum.resonances) and not is_peak(shape.resonances[-1], self.f):
                 continue
             peaks_more = len(some) - len(lines) + len(shape.resonances) - len(spectrum.resonances)
             gain = before - misfit_of(shape, self.f[window], self.I[window]) - WORTH * peaks_more
@@ -217,20 +216,29 @@ class OneMode:
             self.refit()
 
     def prune(self) -> bool:
-        """Remove the resonance whose rms is least certain, if that is below SURE of its standard deviations; return whether.
+        """Remove the least certain resonance that the likelihood can do without; return whether.
 
-        A neighbour has its power as well.
+        Those are tried whose rms is below SURE of its standard deviations. That of a narrow one is uncertain since its width is,
+        however high it stands: it is kept. One whose power a neighbour has as well is not worth its parameters.
         """
-        std, starts = self.errors(), self.spectrum.starts[len(self.spectrum.processes) - len(self.spectrum.resonances) :]
-        worst = max(range(len(self.spectrum.resonances)), key=lambda i: std[starts[i] + RMS], default=None)
-        if worst is None or std[starts[worst] + RMS] * SURE < 1.0:
-            return False
-        p = self.spectrum.resonances[worst]
-        self.spectrum = replace(self.spectrum, resonances=tuple(q for q in self.spectrum.resonances if q is not p))
-        self.removals.append(p.omega / (2 * pi))
-        self.rejections.append(Candidate(p.omega / (2 * pi), max(round(p.damping * p.omega / pi / self.f[0]), WIDEST_LINE), 0.0))
-        self.refit()
-        return True
+        std, first = self.errors(), len(self.spectrum.processes) - len(self.spectrum.resonances)
+        unsure = [
+            (float(std[start + RMS]), p)
+            for start, p in zip(self.spectrum.starts[first:-1], self.spectrum.resonances, strict=True)
+            if std[start + RMS] * SURE >= 1.0
+        ]
+        whole, before = self.spectrum, misfit_of(self.spectrum, self.f, self.I)
+        for _, p in sorted(unsure, key=lambda pair: pair[0], reverse=True):
+            rest = whole.without(p)
+            if misfit_of(fit_spectrum(rest, self.cells(everything=True)), self.f, self.I) - before > WORTH:
+                continue
+            frequency = p.omega / (2 * pi)
+            self.spectrum = rest
+            self.removals.append(frequency)
+            self.rejections.append(Candidate(frequency, max(round(2.0 * p.damping * frequency / self.f[0]), WIDEST_LINE), 0.0))
+            self.refit()
+            return True
+        return False
 
     def errors(self) -> Array:
         """Return the standard deviations of the spectrum's parameters, see `standard_deviations`."""

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import hypot, isnan, log, nan, pi, sqrt
 from typing import NamedTuple
 
+import numpy as np
+from scipy.fft import rfft
+
+from wfsobs.identification.one_mode import OneMode
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
-from wfsobs.spectral.model import HIGHEST
-from wfsobs.spectral.whittle import NO_NEARER
+from wfsobs.spectral.lines import Sinusoid, line_in_record, short_taper
+from wfsobs.spectral.missing import LEAST
+from wfsobs.spectral.model import HIGHEST, Spectrum
+from wfsobs.spectral.whittle import NO_NEARER, spectrum_information
 from wfsobs.typing import Array
 
 
@@ -31,7 +37,10 @@ class IdentifiedProcess:
     damping : Number
         Damping ratio; 0 +- 0 for an undamped line.
     rms : Number
-        Rms [um].
+        Rms [um]; of a peak that within the record.
+    ensemble_rms : Number or None
+        Of a peak, rms of the process that it is drawn from, as an observer receives it [um]; without a standard deviation below a
+        half width of one bin, 1 / length, where the record does not tell.
     third_corner : Number or None
         Of turbulence of third order, over `frequency`.
     """
@@ -40,6 +49,7 @@ class IdentifiedProcess:
     damping: Number
     rms: Number
     third_corner: Number | None = None
+    ensemble_rms: Number | None = None
 
     @property
     def pure(self) -> bool:
@@ -56,6 +66,12 @@ class IdentifiedPeak:
     rms: tuple[Number | None, ...]
 
 
+EDGE = 4.0
+"""Minimum distance of a line from zero and from half the rate for a standard deviation, in bins: its image overlaps it."""
+NARROW = 4.0
+"""Half width of a resonance in bins below which it is known by its amplitude in time (`lines`), beyond it by its bins."""
+RESOLVED = 1.0
+"""Minimum half width in bins for a standard deviation of the rms of the process that a resonance is drawn from."""
 POOR = 1.0 / 3.0
 """Maximum standard deviation over the number: beyond it, the likelihood of a positive number is not normal."""
 AGREE = 3.0
@@ -92,6 +108,63 @@ def read_process(p: Ar2 | Ar3, std: Array) -> IdentifiedProcess:
         with_reliable_std(scale_number(Number(1.0, float(std[2])), p.rms)),
         third and with_reliable_std(third),
     )
+
+
+def read_resonance(mode: OneMode, p: Ar2, process: IdentifiedProcess) -> IdentifiedProcess:
+    """Return a resonance, as `read_process` does, with the rms that it has within the record."""
+    half, rest = p.damping * process.frequency.value / mode.f[0], mode.spectrum.without(p)
+    ensemble = process.rms if half >= RESOLVED else Number(p.rms, nan)
+    if half < NARROW:
+        narrow = _narrow(mode, mode.left, process.frequency.value, rest)
+        return replace(narrow, damping=process.damping, ensemble_rms=ensemble)
+    return replace(process, rms=with_reliable_std(Number(*_rms_of_bins(mode, p))), ensemble_rms=ensemble)
+
+
+def read_line(mode: OneMode, line: Sinusoid) -> IdentifiedProcess:
+    """Return an undamped line, or one that is too narrow to be told from it."""
+    if EDGE * mode.f[0] < line.frequency < mode.f[-1] - EDGE * mode.f[0]:
+        found = _narrow(mode, mode.left + line.signal(mode.n, mode.dt), line.frequency, mode.spectrum)
+    else:
+        found = IdentifiedProcess(Number(line.frequency, nan), Number(0.0, 0.0), Number(line.rms, nan))
+    return replace(found, ensemble_rms=Number(line.rms, nan))
+
+
+def _narrow(mode: OneMode, x: Array, near: float, rest: Spectrum) -> IdentifiedProcess:
+    """Return a line of x (n,) by its own likelihood; rest : spectrum of what is beside it."""
+
+    def floor(f: Array) -> Array:
+        S = rest.psd(f)
+        return S / np.maximum(1.0 - np.interp(f, mode.f, mode.missing_power) / S, LEAST)
+
+    frequency, frequency_std, rms, rms_std = line_in_record(x, mode.dt, near, floor)
+    return IdentifiedProcess(
+        with_reliable_std(Number(frequency, frequency_std)), Number(0.0, 0.0), with_reliable_std(Number(rms, rms_std))
+    )
+
+
+def _rms_of_bins(mode: OneMode, p: Ar2) -> tuple[float, float]:
+    """Return the rms [um] of a wide resonance within the record and its standard deviation, from its part of every bin.
+
+    Given the spectrum, what the resonance has of a bin is a complex normal variable. How well its own three numbers are known
+    comes in addition.
+    """
+    spectrum, df = mode.spectrum, float(mode.f[0])
+    start, rest = spectrum.starts[spectrum.processes.index(p)], spectrum.without(p).psd(mode.f)
+    h = short_taper(mode.n, mode.dt, p.omega / (2 * pi))
+    seen = 2.0 * mode.dt / np.sum(h**2) * np.abs(rfft(h * mode.left)[1 : len(mode.f) + 1]) ** 2 + mode.missing_power
+
+    def power_and_variance(move: Array) -> tuple[float, float]:
+        vector = spectrum.vector
+        vector[start : start + 3] += move
+        part = 1.0 - rest / spectrum.with_vector(vector).psd(mode.f)
+        unknown, kept = part * rest, part**2 * seen
+        return float(np.sum(kept + unknown)) * df, float(np.sum((unknown + 2.0 * kept) * unknown / mode.share**2)) * df**2
+
+    covariance = np.linalg.inv(spectrum_information(spectrum, mode.cells(everything=True), range(start, start + 3)))
+    directions = np.linalg.cholesky(covariance).T
+    power, variance = power_and_variance(np.zeros(3))
+    slopes = [0.5 * (power_and_variance(d)[0] - power_and_variance(-d)[0]) for d in directions]
+    return sqrt(power), 0.5 * sqrt((variance + sum(slope**2 for slope in slopes)) / power)
 
 
 def scale_number(n: Number, factor: float) -> Number:

@@ -18,7 +18,8 @@ Row = tuple[str, Number | None, Number | None, Number | None]
 def identification_dict(result: Identification) -> dict[str, Any]:
     """Return the output of `wfsobs identify --json`.
 
-    Every number has its standard deviation as `_std`, null where there is none; rms in um, frequencies in Hz.
+    Every number has its standard deviation as `_std`, null where there is none; rms in um, frequencies in Hz. The rms of a
+    peak is that within the record, `ensemble_rms` that of the process, which filters receive.
     """
 
     def numbers(**values: Number) -> dict[str, float | None]:
@@ -131,7 +132,7 @@ def _std(std: float) -> str:
 
 def _notes(path: str, p: IdentifiedProcess, whose: str) -> dict[str, str]:
     """Return comments on the settings of one process or peak."""
-    numbers = {"frequency": p.frequency, "damping": p.damping, "rms": p.rms, "third_corner": p.third_corner}
+    numbers = {"frequency": p.frequency, "damping": p.damping, "rms": p.ensemble_rms or p.rms, "third_corner": p.third_corner}
     notes = {f"{path}.{name}": f"+- {_std(n.std)}" for name, n in numbers.items() if n is not None and n.std}
     if p.pure:
         notes[f"{path}.damping"] = "a pure line"

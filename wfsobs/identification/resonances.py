@@ -16,8 +16,6 @@ from wfsobs.typing import Array
 
 NEIGHBOURS = 4.0
 """Bins, beside half its width, within which a candidate is not a new peak: two peaks that near are one."""
-RESOLVED = 0.2
-"""Minimum half width at half maximum of a resonance, in bins; what is narrower is a line."""
 WIDEST = 0.5
 """Maximum damping of a resonance."""
 SPLIT = 8.0
@@ -49,10 +47,9 @@ def strongest_bin(candidate: Candidate, f: Array, ratio: Array) -> float:
     return float(f[near][np.argmax(ratio[near])])
 
 
-def is_resolved(p: Ar2, f: Array) -> bool:
-    """Return whether a resonance is wider than a line, narrower than turbulence, and below half the rate."""
-    frequency = p.omega / (2 * pi)
-    return RESOLVED * f[0] < p.damping * frequency and p.damping < WIDEST and 2.0 * f[0] < frequency < f[-1]
+def is_peak(p: Ar2, f: Array) -> bool:
+    """Return whether a resonance is narrower than turbulence, not slower than the record, and below half the rate."""
+    return p.damping < WIDEST and 2.0 * f[0] < p.omega / (2 * pi) < f[-1]
 
 
 def add_resonance(spectrum: Spectrum, f: Array, I: Array, candidate: Candidate) -> Spectrum:  # noqa: E741
@@ -86,12 +83,11 @@ def split_resonance(spectrum: Spectrum, f: Array, I: Array, p: Ar2) -> Spectrum 
     half = p.damping * f0
     if half < 2.0 * NEIGHBOURS * f[0]:
         return None
-    rest = [q for q in spectrum.resonances if q is not p]
     two = [Ar2(2 * pi * (f0 + sign * 0.7 * half), 0.4 * p.damping, p.rms / np.sqrt(2.0), spectrum.dt) for sign in (-1, 1)]
-    start = replace(spectrum, resonances=(*rest, *two))
+    start = replace(spectrum, resonances=(*spectrum.without(p).resonances, *two))
     keep = np.where(window_about(Candidate(f0, int(4.0 * half / f[0]), 0.0), f), 1.0, 0.0)
     cells = Cells(f, I, keep, [q.omega / (2 * pi) for q in (*start.resonances, p)])
     count = len(start.vector)
     shape = fit_spectrum(start, cells, range(count - 6, count))
     gain = spectrum_negative_log_likelihood(spectrum, cells) - spectrum_negative_log_likelihood(shape, cells)
-    return shape if gain > SPLIT and all(is_resolved(q, f) for q in shape.resonances[-2:]) else None
+    return shape if gain > SPLIT and all(is_peak(q, f) for q in shape.resonances[-2:]) else None

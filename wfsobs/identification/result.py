@@ -6,8 +6,6 @@ from dataclasses import dataclass, replace
 from math import nan, pi, sqrt
 from typing import Any
 
-import numpy as np
-
 from wfsobs.identification.both_sensors import SensorDifference, error_of_a_star, without_error
 from wfsobs.identification.continuum import is_continuum
 from wfsobs.identification.one_mode import OneMode
@@ -17,7 +15,9 @@ from wfsobs.identification.process import (
     Number,
     mean,
     merge_peaks,
+    read_line,
     read_process,
+    read_resonance,
     scale_number,
     with_reliable_std,
 )
@@ -31,8 +31,6 @@ from wfsobs.spectral.model import Spectrum
 
 SLOWEST = 10.0
 """Minimum periods of turbulence in a record for a standard deviation of its corner: a slower one is not resolved."""
-EDGE = 4.0
-"""Minimum distance of a line from zero and from half the rate for a standard deviation, in bins: its image overlaps it."""
 LARGEST = 100.0
 """Maximum strength of turbulence [um] in a scenario's settings."""
 
@@ -192,27 +190,20 @@ def read_mode(name: str, mode: OneMode, lowest: float, whiteness: Whiteness) -> 
         turbulence = replace(turbulence, frequency=Number(turbulence.frequency.value, nan))
     smooth = [is_continuum(mode.spectrum, p, lowest) for p in mode.spectrum.resonances]
     broad = [p for p, is_smooth in zip(found, smooth, strict=True) if is_smooth]
-    found = [p for p, is_smooth in zip(found, smooth, strict=True) if not is_smooth]
-    for line in mode.lines:
-        floor = float(mode.spectrum.psd(np.array([line.frequency]))[0]) / float(np.interp(line.frequency, mode.f, mode.share))
-        in_frequency, in_rms = line.standard_deviations(mode.n, mode.dt, floor)
-        if not EDGE * mode.f[0] < line.frequency < mode.f[-1] - EDGE * mode.f[0]:
-            in_frequency = in_rms = nan
-        found.append(
-            IdentifiedProcess(
-                with_reliable_std(Number(line.frequency, in_frequency)),
-                Number(0.0, 0.0),
-                with_reliable_std(Number(line.rms, in_rms)),
-            )
-        )
-    peaks = sorted((p for p in found if p.frequency.value >= lowest), key=lambda p: p.frequency.value)
+    seen = [
+        read_resonance(mode, p, one)
+        for p, one, is_smooth in zip(mode.spectrum.resonances, found, smooth, strict=True)
+        if not is_smooth
+    ]
+    seen += [read_line(mode, line) for line in mode.lines]
+    peaks = sorted((p for p in seen if p.frequency.value >= lowest), key=lambda p: p.frequency.value)
     s = mode.spectrum
     shapes = (p for p, is_smooth in zip(s.resonances, smooth, strict=True) if is_smooth)
     prior = Lines(
         s.noise,
         s.dt,
         tuple(p for p in (s.turbulence, s.background, *shapes) if p is not None),
-        tuple(Line(p.frequency.value, p.damping.value, p.rms.value) for p in peaks),
+        tuple(Line(p.frequency.value, p.damping.value, (p.ensemble_rms or p.rms).value) for p in peaks),
     )
     return IdentifiedMode(name, with_reliable_std(noise), turbulence, background, tuple(peaks), tuple(broad), s, prior, whiteness)
 

@@ -63,6 +63,10 @@ class Spectrum:
         at = _Frequencies(f, self.dt)
         return 2.0 * self.dt * self.noise**2 + sum((at.density(p) for p in self.processes), np.zeros_like(f))
 
+    def without(self, resonance: Ar2) -> Spectrum:
+        """Return the spectrum without one of its resonances."""
+        return replace(self, resonances=tuple(p for p in self.resonances if p is not resonance))
+
     @property
     def vector(self) -> Array:
         """Parameter vector: log noise, then log omega, logit damping, log rms of every process, (numbers,).

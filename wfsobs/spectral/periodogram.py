@@ -77,6 +77,8 @@ class Cells:
 
     Attributes
     ----------
+    bin_width : float
+        1 / length of the record [Hz].
     frequency, mean, count, share : Array
         Frequency [Hz], mean of the periodogram, number of bins and measured share, each (cells,).
     """
@@ -90,7 +92,7 @@ class Cells:
         share: Array | float = 1.0,
         sizes: tuple[int, int] = (FINE, NEAR),
     ):
-        j = np.arange(1.0, len(f) + 1.0)
+        self.bin_width, j = float(f[0]), np.arange(1.0, len(f) + 1.0)
         fine, near = sizes
         size = np.maximum(j / fine, 1.0)
         for centre in resonances:

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.special import logit
 
 from wfsobs.signal import whittle
 from wfsobs.signal.ar2 import Ar2
@@ -22,6 +23,8 @@ TOLERANCE = 1e-2
 """Distance of a fit from its minimum, in standard deviations of its parameters."""
 NOISE, TURBULENCE, BACKGROUND, RESONANCE = 3.0, (2.0, 8.0, 4.0, 3.0), (1.5, 0.0, 4.0), (0.1, 6.0, 4.0)
 """Maximum distance of parameters from their start: a resonance stays near its frequency."""
+NARROWEST = 0.2
+"""Minimum half width of a resonance in bins: bins tell nothing of a smaller one, between two of which it would become a line."""
 NO_NEARER = 1.1
 """Minimum third corner, over the first two, for its standard deviation."""
 
@@ -65,7 +68,7 @@ def fit_spectrum(spectrum: Spectrum, cells: Cells, free: Sequence[int] | None = 
     index = [i for i in (range(len(start)) if free is None else free) if i not in spectrum.fixed_parameters]
     first = () if spectrum.turbulence is None else TURBULENCE[: spectrum.starts[1] - 1]
     second = () if spectrum.background is None else BACKGROUND
-    reach = np.array([NOISE, *first, *second, *RESONANCE * len(spectrum.resonances)])[index]
+    reach = np.array([NOISE, *first, *second, *RESONANCE * len(spectrum.resonances)])
 
     def moved(x: Array) -> Spectrum:
         vector = start.copy()
@@ -78,8 +81,11 @@ def fit_spectrum(spectrum: Spectrum, cells: Cells, free: Sequence[int] | None = 
     def log_slopes(x: Array, S: Array) -> Array:
         return moved(x).slopes(cells.frequency, index) / S
 
-    bounds = np.transpose([start[index] - reach, start[index] + reach])
-    return moved(whittle.whittle_fit(density, log_slopes, start[index], bounds, cells.mean, cells.count, TOLERANCE, STEPS))
+    bounds = np.transpose([start - reach, start + reach])
+    for i, p in zip(spectrum.starts[len(spectrum.continuum) :], spectrum.resonances, strict=False):
+        least = logit(min(NARROWEST * cells.bin_width * 2.0 * np.pi / p.omega, 0.5))
+        bounds[i + 1] = np.maximum(bounds[i + 1], [least, least + 1.0])
+    return moved(whittle.whittle_fit(density, log_slopes, start[index], bounds[index], cells.mean, cells.count, TOLERANCE, STEPS))
 
 
 def standard_deviations(spectrum: Spectrum, cells: Cells, inflation: float) -> Array:

@@ -19,7 +19,7 @@ def identification_html(mode: IdentifiedMode, display: Display, diameter: float)
         "What": "by frequency",
         "Frequency [Hz]": "natural frequency; of turbulence the corner",
         "Damping": "0 for a line",
-        f"Rms [{display.unit_label}]": "standard deviation of it in z",
+        f"Rms [{display.unit_label}]": "standard deviation of it in z; of a peak within this record",
     }
     body = []
     for what, frequency, damping, rms in mode_rows(mode):
