@@ -9,6 +9,7 @@ A tip or tilt of a [m] rms over an aperture D tilts the wavefront by 4 a / D [ra
 from __future__ import annotations
 
 import math
+import re
 
 LENGTHS = {"um": 1.0, "nm": 1e-3, "m": 1e6}
 """Micrometres per unit."""
@@ -16,10 +17,16 @@ LENGTHS = {"um": 1.0, "nm": 1e-3, "m": 1e6}
 ANGLES = {"rad": 1.0, "arcsec": math.radians(1.0 / 3600.0), "mas": math.radians(1.0 / 3.6e6)}
 """Radians per unit."""
 
+SECONDS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+"""Seconds per unit of time."""
+
 UNITS = ("um", "nm", "mas", "arcsec", "rad")
 """Units that a user can give for a file."""
 
 _SYNONYMS = {"µm": "um", "micron": "um", "microns": "um", "\u03bcm": "um", "meter": "m", "arcseconds": "arcsec", "radian": "rad"}
+
+
+_ENDING = re.compile(r"[_ \[(]+(?P<unit>[A-Za-zµμ]+)[\])]?$")
 
 
 def micrometres_per(unit: str, diameter: float) -> float:
@@ -35,3 +42,19 @@ def parse_unit(text: str) -> str | None:
     """
     name = _SYNONYMS.get(text.strip(), text.strip())
     return name if name in LENGTHS or name in ANGLES else None
+
+
+def split_unit(heading: str, beside: str = "") -> tuple[str, str]:
+    """Return the name in a heading without its unit, and the unit, that stated `beside` first; empty where neither is one.
+
+    >>> split_unit("slope x [nm]"), split_unit("t_ms"), split_unit("cmd_x"), split_unit("T", "ns")
+    (('slope x', 'nm'), ('t', 'ms'), ('cmd_x', ''), ('T', 'ns'))
+    """
+    match = _ENDING.search(heading)
+    ending = _parse_any(match["unit"]) if match else ""
+    name = heading[: match.start()] if match and ending else heading
+    return name, _parse_any(beside.strip()) or ending
+
+
+def _parse_any(text: str) -> str:
+    return parse_unit(text) or (text if text in SECONDS else "")

@@ -186,7 +186,7 @@ def renamed(content: bytes) -> bytes:
 
 def test_columns_of_other_names(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
     """Names that say enough are read at once; a choice moves a role; the copy names the columns."""
-    content = renamed(file_of(short))
+    content = renamed(file_of(short, training=None))
     previewed(dashboard, loop, content)
     loop.until(lambda: not dashboard.upload.picker.message)
     form = dashboard.upload.form
@@ -294,6 +294,29 @@ def test_what_is_no_record(dashboard: Dashboard, loop: Any) -> None:
         assert "<b>.exe" not in dashboard.upload.content.text.object
         dashboard.upload.confirm()
         assert dashboard.store.source is None and dashboard.store.run.result is before
+
+
+@pytest.mark.parametrize(
+    "refused",
+    [
+        {"action": "large", "name": "a.npz"},
+        {"action": "part", "name": "a.npz", "index": 0, "count": 1, "data": "%%%"},
+        {"action": "part", "name": "a.npz", "index": 0, "count": 1, "data": ""},
+        {"action": "part", "name": "a.npz", "index": 0, "count": 1, "data": "AAAA"},
+    ],
+)
+def test_nothing_of_the_file_before_stays_after_a_refusal(
+    dashboard: Dashboard, loop: Any, short: Scenario, refused: dict
+) -> None:
+    upload = dashboard.upload
+    previewed(dashboard, loop, file_of(short))
+    assert upload.room.visible and not upload.use.disabled
+    upload.handle(refused)
+    loop.until(lambda: not upload.picker.message.startswith(("Reading", "Waiting")))
+    assert upload.picker.message.startswith("a.npz") or "choose the file again" in upload.picker.message
+    assert not upload.room.visible or ("night.csv" not in upload.content.text.object and upload.use.disabled)
+    upload.confirm()
+    assert dashboard.store.source is None
 
 
 def test_a_record_that_is_too_short_cannot_be_used(dashboard: Dashboard, loop: Any) -> None:

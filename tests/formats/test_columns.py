@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,12 @@ import pytest
 from click.testing import CliRunner
 
 from wfsobs.cli import main
-from wfsobs.record import RecordError
+from wfsobs.record import Record, RecordError
 from wfsobs.telemetry.columns import suggest_clock, suggest_roles
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.preview import ColumnsPreview, preview_any
 from wfsobs.telemetry.records import read_columns, read_record
+from wfsobs.units import SECONDS
 
 RNG = np.random.default_rng(2)
 N = 50
@@ -38,7 +40,7 @@ def test_csv_by_the_roles_that_names_suggest() -> None:
     record = read_record(io.BytesIO(text()), "a.csv", declaration=DeclaredFormat(columns=ROLES))
     np.testing.assert_allclose(record.y_lgs, 1e-3 * Y, rtol=1e-12)
     np.testing.assert_allclose(record.u, 1e-3 * U, rtol=1e-12)
-    assert record.dt == pytest.approx(0.002, rel=1e-9) and record.origin == "unit nm"
+    assert record.dt == pytest.approx(0.002, rel=1e-9) and record.origin == "unit nm, column flux not used"
 
 
 def test_csv_without_a_heading() -> None:
@@ -82,7 +84,7 @@ def test_fits_tables_and_images() -> None:
     [
         (
             {"y_lgs/tipp": "flux"},
-            "a.csv: 'y_lgs/tipp' is no part of a record; a column is one of time, y_lgs/tip, y_lgs/tilt, u/",
+            "a.csv: 'y_lgs/tipp' is no part of a record; a column is one of time, frame, y_lgs/tip, y_lgs/tilt, u/",
         ),
         ({"y_lgs/tip": "wfs z"}, r"a.csv: has no column 'wfs z'; it has t \[ms\], wfs x \[nm\], wfs y \[nm\], cmd x"),
         ({"y_lgs/tip": NAMES[1]}, "a.csv: has no u; a record needs y_lgs, u and dt"),
@@ -92,6 +94,173 @@ def test_fits_tables_and_images() -> None:
 def test_what_cannot_be(roles: dict[str, str], line: str) -> None:
     with pytest.raises(RecordError, match=line):
         read_record(io.BytesIO(text()), "a.csv", declaration=DeclaredFormat(columns=roles))
+
+
+OWN = ("time_s", "y_lgs/tip_nm", "y_lgs/tilt_nm", "u/tip_nm", "u/tilt_nm")
+"""Names of a record."""
+
+
+def table(heading: Sequence[str], *columns: np.ndarray, separator: str = ",", decimal: str = ".") -> bytes:
+    rows = zip(*(c if c.dtype.kind == "U" else [repr(x).replace(".", decimal) for x in c.tolist()] for c in columns), strict=True)
+    return "\n".join(separator.join(cells) for cells in ([*heading] if heading else [], *rows) if cells).encode()
+
+
+def is_as_clean(record: Record, said: str, missing: int = 0) -> None:
+    """Whether a record has all of Y and U [nm] at 500 Hz, and says so much of how it was read."""
+    there = ~np.isnan(record.y_lgs[:, 0])
+    assert record.missing == missing and record.n_steps == N and record.origin == said
+    np.testing.assert_allclose(record.y_lgs[there], 1e-3 * Y[there], rtol=1e-12)
+    np.testing.assert_allclose(record.u[there], 1e-3 * U[there], rtol=1e-12)
+    assert record.dt == 0.002
+
+
+@pytest.mark.parametrize(
+    ("name", "factor"),
+    [
+        ("time_s", 1.0),
+        ("time", 1.0),
+        ("time_ms", 1e3),
+        ("time_us", 1e6),
+        ("time [ns]", 1e9),
+        ("Time (µs)", 1e6),
+        ("time_ns", 1e9),
+    ],
+)
+@pytest.mark.parametrize("start", [0, 1_762_145_600])
+def test_a_time_in_the_unit_of_its_name(name: str, factor: float, start: int) -> None:
+    """Of an epoch as well, where a double resolves 0.2 us: the rate is the roundest within that."""
+    stamps = start * factor + np.round(0.002 * factor * np.arange(N), 6)
+    is_as_clean(read_record(io.BytesIO(table((name, *OWN[1:]), stamps, *Y.T, *U.T)), "a.csv"), "unit nm")
+    fits, file = pytest.importorskip("astropy.io.fits"), io.BytesIO()
+    unit = name.rpartition("_")[2] if "_" in name else "s"
+    if unit in SECONDS and "_" in name:
+        columns = [fits.Column("TIME", "D", unit=unit, array=stamps), fits.Column("Y_LGS", "2D", unit="nm", array=Y)]
+        fits.BinTableHDU.from_columns([*columns, fits.Column("U", "2D", unit="nm", array=U)]).writeto(file)
+        is_as_clean(read_record(io.BytesIO(file.getvalue()), "a.fits"), "unit nm")
+        file = io.BytesIO()
+        np.savez(file, y_lgs=Y, u=U, unit="nm", **{name: stamps})
+        is_as_clean(read_record(file, "a.npz"), "unit nm")
+
+
+@pytest.mark.parametrize("ending", [".csv", ".npz", ".fits"])
+def test_columns_that_nobody_names_keep_their_names(ending: str) -> None:
+    stated, stamps, file = DeclaredFormat(columns={"time": "stamp_ms", "u/tilt": "b", "u/tip": "a"}), 1e3 * TIME, io.BytesIO()
+    if ending == ".csv":
+        file.write(table(("stamp_ms", *OWN[1:3], "a", "b"), stamps, *Y.T, *U.T))
+    elif ending == ".npz":
+        np.savez(file, y_lgs=Y, a=U[:, 0], b=U[:, 1], stamp_ms=stamps, unit="nm", cube=np.zeros((3, 4, 5)), note=np.array("x"))
+    else:
+        fits = pytest.importorskip("astropy.io.fits")
+        columns = [fits.Column("stamp_ms", "D", array=stamps), fits.Column("Y_LGS", "2D", unit="nm", array=Y)]
+        columns += [fits.Column(name, "D", array=u) for name, u in zip("ab", U.T, strict=True)]
+        fits.BinTableHDU.from_columns(columns).writeto(file)
+    file.seek(0)
+    is_as_clean(read_record(file, f"a{ending}", declaration=stated), "unit nm")
+
+
+@pytest.mark.parametrize("name", ["frame", "FrameCounter", "frame_no", "wfs frame counter"])
+@pytest.mark.parametrize("bits", [8, 16, 32])
+@pytest.mark.parametrize("every", [1, 4])
+@pytest.mark.parametrize("lost", [[], [7], [19, 20, 21, 40]])
+def test_a_frame_counter_says_what_is_missing(name: str, bits: int, every: int, lost: list[int]) -> None:
+    """It may start anew at its highest number, and count more than there are rows."""
+    there = np.delete(np.arange(N), lost)
+    count = ((2**bits - 20 * every + every * np.arange(N)) % 2**bits)[there]
+    stated, said = DeclaredFormat(rate=500.0), f"unit nm, frames counted by {name}"
+    record = read_record(io.BytesIO(table((name, *OWN[1:]), count, *Y[there].T, *U[there].T)), "a.csv", declaration=stated)
+    is_as_clean(record, said, len(lost))
+    assert np.isnan(record.y_lgs[lost]).all()
+    assert np.isnan(record.z[[k + 2 for k in lost]]).all(), "whose command was lost"
+    file = io.BytesIO()
+    np.savez(file, y_lgs=Y[there], u=U[there], unit="nm", **{name: count.astype(np.uint32)})
+    is_as_clean(read_record(file, "a.npz", declaration=stated), said, len(lost))
+    rng = np.random.default_rng(1)
+    stamps = TIME[there] + 1e-3 * rng.standard_normal(there.size) * (there % (N - 1) > 0)
+    both = table((OWN[0], name, *OWN[1:]), stamps, count, *Y[there].T, *U[there].T)
+    record = read_record(io.BytesIO(both), "a.csv")
+    is_as_clean(record, record.origin, len(lost))
+    assert "steps rms off the frames counted" in record.origin
+
+
+@pytest.mark.parametrize(
+    ("count", "line"),
+    [
+        (np.where(np.arange(N) < 9, np.arange(N), np.arange(N) - 1), "frame does not count at row 9: from 8 to 8"),
+        (np.where(np.arange(N) < 9, np.arange(N), np.arange(N) - 5), "frame does not count at row 9: from 8 to 4"),
+        (np.where(np.arange(N) < 9, np.arange(N), np.arange(N) + 99), "99 frames are missing, more than the 50 measured"),
+    ],
+)
+def test_a_counter_that_does_not_count(count: np.ndarray, line: str) -> None:
+    with pytest.raises(RecordError, match=line):
+        read_record(io.BytesIO(table(("frame", *OWN[1:]), count, *Y.T, *U.T)), "a.csv", declaration=DeclaredFormat(rate=500.0))
+
+
+def test_what_is_not_used_is_named() -> None:
+    """Names alone make no counter, nor do numbers alone; two counters are none."""
+    stated, count = DeclaredFormat(rate=500.0), np.arange(N)
+    for names, columns, said in (
+        (["frame", "frame_rate"], [0 * count, 0 * count + 500], "columns frame, frame_rate not used"),
+        (["row"], [count], "column row not used"),
+        (["frame", "counter"], [count, count], "columns frame, counter not used"),
+        ([f"c{i}" for i in range(9)], [count] * 9, "columns c0, c1, c2, c3, c4 and 4 more not used"),
+        (["frame time [ms]"], [count], "column frame time [ms] not used"),
+    ):
+        content = table([*OWN[1:], *names], *Y.T, *U.T, *columns)
+        is_as_clean(read_record(io.BytesIO(content), "a.csv", declaration=stated), f"unit nm, {said}")
+    with pytest.raises(RecordError, match=r"has no dt and no time; .* which column is the time\? It has when"):
+        read_record(io.BytesIO(table([*OWN[1:], "when"], *Y.T, *U.T, TIME)), "a.csv")
+
+
+def test_stamps_and_counter_that_do_not_agree() -> None:
+    """A pause of 0.1 s within which no frame was counted."""
+    k = np.arange(400)
+    y = RNG.standard_normal((400, 2))
+    content = table(("time_s", "frame", *OWN[1:]), 0.002 * k + 0.1 * (k > 200), k, *y.T, *y.T)
+    with pytest.raises(RecordError, match="time and frame do not agree"):
+        read_record(io.BytesIO(content), "a.csv")
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t", " ", "   "])
+@pytest.mark.parametrize("decimal", [".", ","])
+@pytest.mark.parametrize("heading", [True, False])
+def test_separators_and_decimal_commas(separator: str, decimal: str, heading: bool) -> None:
+    if separator == decimal:
+        return
+    content = table(OWN if heading else [], TIME, *Y.T, *U.T, separator=separator, decimal=decimal)
+    roles = dict(zip(ROLES, (f"column {i + 1}" for i in range(5)), strict=True))
+    stated = DeclaredFormat() if heading else DeclaredFormat(unit="nm", columns=roles)
+    name = {",": "", ";": ", cells separated by semicolons", "\t": ", cells separated by tabs"}
+    said = name.get(separator, ", cells separated by blanks") + ", decimal commas" * (decimal == ",")
+    is_as_clean(read_record(io.BytesIO(content), "a.txt", declaration=stated), f"unit nm{said}")
+
+
+def test_columns_of_text() -> None:
+    """Left out where it begins with text or comes to it, also with a separator between quotation marks; never what is needed."""
+    good = np.array(["ok", '"seen, then lost"'] * (N // 2))
+    late = np.array(["1"] * (N - 1) + ["saturated"])
+    content = table([*OWN, "comment", "flag"], TIME, *Y.T, *U.T, good, late)
+    is_as_clean(read_record(io.BytesIO(content), "a.csv"), "unit nm, columns comment (text), flag (text) not used")
+    for name in ("flag", "comment"):
+        with pytest.raises(RecordError, match=rf"a.csv: line \d+, {name}: '\w+' is not a number"):
+            read_record(io.BytesIO(content), "a.csv", declaration=DeclaredFormat(columns={"u/tip": name}))
+    with pytest.raises(RecordError, match=r"a.csv: line 51, u/tilt_nm: 'saturated' is not a number"):
+        read_record(io.BytesIO(table(OWN, TIME, *Y.T, U.T[0], late)), "a.csv")
+
+
+def test_a_micro_sign_of_an_old_code_page() -> None:
+    content = table([name.replace("nm", "µm") for name in OWN], TIME, *Y.T, *U.T)
+    record = read_record(io.BytesIO(content.decode().encode("latin-1")), "a.csv")
+    np.testing.assert_allclose(record.y_lgs, Y, rtol=1e-12)
+
+
+def test_tip_comes_first_in_whatever_order_the_columns_are() -> None:
+    order = [0, 2, 1, 4, 3]
+    content = table([OWN[i] for i in order], *(np.column_stack([TIME, Y, U])[:, order].T))
+    is_as_clean(read_record(io.BytesIO(content), "a.csv"), "unit nm")
+    roles = dict(reversed(ROLES.items()))
+    is_as_clean(
+        read_record(io.BytesIO(text()), "a.csv", declaration=DeclaredFormat(columns=roles)), "unit nm, column flux not used"
+    )
 
 
 def test_names_that_suggest_nothing() -> None:

@@ -147,6 +147,41 @@ def test_what_is_no_clock(time: np.ndarray, message: str) -> None:
         taken(time=time, dt=NONE)
 
 
+@pytest.mark.parametrize(("jitter", "late", "lost"), [(0.0, 0, [5]), (0.08, 0, [700, 701]), (0.3, 0, []), (0.1, 40, [])])
+def test_stamps_that_scatter_about_a_stated_rate(jitter: float, late: int, lost: list[int]) -> None:
+    """Normal jitter in steps, and stamps that are late: below a tenth lost frames are told from it; above, that there is none."""
+    rng, n = np.random.default_rng(4), 2000
+    there = np.delete(np.arange(n), lost)
+    time = 0.001 * (there + jitter * rng.standard_normal(there.size))
+    time[rng.integers(0, there.size, late)] += 0.004
+    y = rng.standard_normal((n, 2))
+    for rate, file in ((1000.0, NONE), (1000.05, NONE), (None, 0.001)):
+        record = taken(DeclaredFormat(rate=rate), time=time, dt=file, y_lgs=y[there], u=y[there])
+        assert record.missing == len(lost) and record.n_steps == n and record.dt == pytest.approx(0.001, rel=1e-4)
+        np.testing.assert_array_equal(record.y_lgs[there], y[there])
+        assert ("steps rms off the stated rate" in record.origin) == (jitter > 0.05)
+    if jitter > 0.05:
+        with pytest.raises(RecordError, match=r"rate is not constant: .*; stamps that scatter need a stated rate|goes backwards"):
+            taken(time=time, dt=NONE, y_lgs=y[there], u=y[there])
+
+
+def test_stamps_that_scatter_too_much_to_say_what_is_missing() -> None:
+    rng, there = np.random.default_rng(4), np.delete(np.arange(2000), [700])
+    time = 0.001 * (there + 0.25 * rng.standard_normal(there.size))
+    y = rng.standard_normal((there.size, 2))
+    with pytest.raises(RecordError, match="; it is not known which frames are missing"):
+        taken(DeclaredFormat(rate=1000.0), time=time, dt=NONE, y_lgs=y, u=y)
+
+
+def test_more_modes_than_the_settings_have() -> None:
+    five = RNG.standard_normal((N, 5))
+    with pytest.raises(RecordError, match=r"1 to 2 modes\): 5 modes need telescope.radial_order = 2"):
+        taken(y_lgs=five, u=five)
+    with pytest.raises(RecordError, match=r"1 to 5 modes\): 7 modes need telescope.radial_order = 3"):
+        taken(scenario=Scenario().replace({"telescope.radial_order": 2}), y_lgs=five[:, [0, 1, 2, 3, 4, 0, 1]], u=five)
+    assert taken(scenario=Scenario().replace({"telescope.radial_order": 2}), y_lgs=five, u=five).n_modes == 5
+
+
 # ---------------------------------------------------------------------- another rate
 
 
@@ -218,7 +253,8 @@ def test_wrong_contents(arrays: dict, message: str) -> None:
 CSV = [
     ("y_lgs/tip_um,u/tip_um\n1,2\n3,x\n", "line 3, u/tip_um: 'x' is not a number"),
     ("y_lgs/tip_um,u/tip_um\n1,2\n3\n", "line 3 has 1 cells, the heading 2"),
-    ("y_lgs/tip_um;u/tip_um\n1;2\n", "line 2, y_lgs/tip_um;u/tip_um: '1;2' is not a number"),
+    ("y_lgs/tip_um;u/tip_um\n1,5;2\n3,x;2\n", "line 3, y_lgs/tip_um: '3,x' is not a number"),
+    ("y_lgs/tip_um;u/tip_um\n1;2\n1\n", "line 3 has 1 cells, the heading 2; cells are separated by semicolons"),
     ("frame,seeing\n1,2\n", "has no y_lgs; a record needs y_lgs, u and dt"),
     ("y_lgs/tip_um,y_lgs/tip_um,u/tip_um\n1,2,3\n", "two columns have the same heading"),
     ("y_lgs/tip_um,y_lgs/tip_nm,u/tip_um\n1,2,3\n", "two columns are named y_lgs/tip"),

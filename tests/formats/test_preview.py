@@ -207,9 +207,9 @@ def test_a_huge_table(monkeypatch) -> None:
     assert f"at most {MOST_FILE / 1e6:.0f} MB are taken" in refused(bytes(MOST_FILE + 1), "a.csv")
 
 
-@pytest.mark.parametrize("data", [b"y_lgs/tip_um\xff\n", "y_lgs/tip_um,u/tip_um\n1,2".encode("utf-16"), b"a,b\n\x00,1\n"])
+@pytest.mark.parametrize("data", [b"y_lgs/tip_um\xff\x80\n", "y_lgs/tip_um,u/tip_um\n1,2".encode("utf-16"), b"a,b\n\x00,1\n"])
 def test_a_table_that_is_not_text(data: bytes) -> None:
-    assert "not UTF-8 text" in (line := refused(data, "a.csv")) or "is not text" in line
+    assert "is not text" in refused(data, "a.csv")
 
 
 def fits_of(*hdus) -> bytes:

@@ -74,7 +74,7 @@ def test_a_unit_is_never_guessed(name: str) -> None:
         ("", "holds no table"),
         ("f,tip,tilt\n1,2,3\n", "has no column frequency"),
         ("frequency [kHz],tip [nm^2/Hz],tilt [nm^2/Hz]\n1,2,3\n", "frequency is in 'kHz'; it takes Hz"),
-        ("frequency,tip,tilt\n1,2\n", "line 2: tilt is not a number"),
+        ("frequency,tip,tilt\n1,2\n", "line 2 has 2 cells, the heading 3"),
         ("frequency,tip,tilt\n1,nan,2\n", "tip does not hold one finite number per row"),
     ],
 )

@@ -11,6 +11,7 @@ from wfsobs.pipeline import as_stated
 from wfsobs.progress import Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
+from wfsobs.sensors.modes import HIGHEST_ORDER, order_of
 from wfsobs.telemetry.intake import DeclaredFormat
 
 
@@ -92,10 +93,9 @@ def give_same_record(one: Source | None, other: Source | None) -> bool:
 
 def fit_to_record(record: Record, scenario: Scenario) -> Scenario:
     """Set the rate, ratio, length and modes of a scenario to those of a record. Raises SettingError."""
-    order = next((n for n in range(1, 7) if (n + 1) * (n + 2) // 2 - 1 >= record.n_modes), 6)
     duration = record.n_steps * record.dt
     changes = {
-        "telescope.radial_order": order,
+        "telescope.radial_order": order_of(record.n_modes) or HIGHEST_ORDER,
         "run.duration": duration,
         "run.warm_up": min(scenario.run.warm_up, 0.2 * duration),
     }

@@ -87,7 +87,7 @@ class Upload:
         if action == "simulate":
             self.place.give_back()
         elif action == "large":
-            self._say(too_large(safe_name(str(msg.get("name", "")))))
+            self.discard(too_large(safe_name(str(msg.get("name", "")))))
         elif action == "part":
             self._take(msg)
         elif action == "template":

@@ -8,7 +8,7 @@ from typing import Any
 
 from wfsobs.prior import Lines
 from wfsobs.scenario import Scenario
-from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
+from wfsobs.sensors.modes import order_of
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
 
@@ -28,8 +28,8 @@ WIDTHS = ("bandwidth_offline", "bandwidth_online")
 
 def base_scenario(n_modes: int, dt: float, base: Scenario | None) -> Scenario:
     """Return a scenario for telemetry of so many modes at steps of dt [s], without events, which name peaks by their number."""
-    order = next(order for order in range(1, HIGHEST_ORDER + 1) if len(modes_up_to(order)) >= n_modes)
-    out = (base or Scenario()).before_events.replace({"telescope.radial_order": order, "sensors.lgs_rate": 1.0 / dt})
+    changes = {"telescope.radial_order": order_of(n_modes), "sensors.lgs_rate": 1.0 / dt}
+    out = (base or Scenario()).before_events.replace(changes)
     return out.replace(band_settings(out, 0.5 / dt))
 
 

@@ -28,4 +28,13 @@ def modes_up_to(order: int) -> tuple[Mode, ...]:
     return tuple(Mode(mode_name(j), j, noll(j)[0]) for j in up_to_order(order))
 
 
+def order_of(n_modes: int) -> int | None:
+    """Return the smallest radial order that has so many modes, None where there is none.
+
+    >>> order_of(2), order_of(5), order_of(28)
+    (1, 2, None)
+    """
+    return next((order for order in range(1, HIGHEST_ORDER + 1) if len(modes_up_to(order)) >= n_modes), None)
+
+
 TIP_TILT = modes_up_to(1)

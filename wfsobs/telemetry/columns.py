@@ -9,12 +9,9 @@ import numpy as np
 
 from wfsobs.record import RecordError
 from wfsobs.sensors.modes import TIP_TILT
-from wfsobs.telemetry.formats.contents import CLOCKS, NGS, TIME, Contents, FileColumns, from_columns, pad_fast
+from wfsobs.telemetry.formats.contents import FRAME, NGS, TIME, Contents, FileColumns, from_columns, parse_heading
 from wfsobs.typing import Array
-from wfsobs.units import parse_unit
-
-SECONDS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
-"""Seconds per unit of time."""
+from wfsobs.units import SECONDS, split_unit
 
 SIGNALS = {
     "y_lgs": "measurement",
@@ -24,13 +21,10 @@ SIGNALS = {
     "vibration": "true vibration",
 }
 
-ROLES: dict[str, str] = {TIME: "time"} | {
+ROLES: dict[str, str] = {TIME: "time", FRAME: "frame counter"} | {
     f"{signal}/{mode.name}": f"{label}, {mode.name}" for signal, label in SIGNALS.items() for mode in TIP_TILT
 }
 """What a column can be -> how it is called."""
-
-UNIT = re.compile(r"[_ \[(]+(?P<unit>[A-Za-zµμ]+)[\])]?$")
-"""A unit at the end of a heading, such as `slope [nm]` or `t_ms`."""
 
 WORDS = {
     "turbulence": {"turbulence", "turb", "atmosphere", "atm"},
@@ -44,44 +38,71 @@ WORDS = {
 
 AXES = {"tip": {"tip", "x", "0"}, "tilt": {"tilt", "y", "1"}}
 TIMES = {"time", "t", "timestamp", "stamp", "seconds", "clock"}
+COUNTERS = {"frame", "framecounter", "framecount", "framenumber", "frameno", "frameid", "counter"}
+OTHER_COUNTS = {"rate", "lost", "missing", "skipped"}
+"""Words beside those of a counter, of what it does not count."""
 
 
-def map_columns(file: FileColumns, roles: Mapping[str, str]) -> Contents:
-    """Return the contents of a file whose columns have the roles {role: name in the file}.
+def to_contents(file: FileColumns, roles: Mapping[str, str]) -> Contents:
+    """Return the contents of a file: columns of the roles {role: name in the file}, and what has the name of a part of a record.
+
+    A column that counts the frames is used as what it is where no column has that role.
 
     Raises
     ------
     RecordError
         There is no such role or no such column, or a column has a unit that is none.
     """
-    named = {}
+    found: dict[str, tuple[Array, str]] = {}
     for role, name in roles.items():
         if role not in ROLES:
             raise RecordError(f"{role[:80]!r} is no part of a record; a column is one of {', '.join(ROLES)}")
+        if name in file.texts:
+            raise RecordError(file.texts[name])
         if name not in file.columns:
-            raise RecordError(f"has no column {name[:80]!r}; it has {', '.join([*file.columns][:20])}")
-        unit = heading_unit(name, file.units.get(name, ""))
-        if role in CLOCKS:
-            named[role] = file.columns[name] * SECONDS.get(unit, 1.0)
+            there = (
+                f"it has {', '.join([*file.columns][:20])}" if file.columns else "columns of its format have names of their own"
+            )
+            raise RecordError(f"has no column {name[:80]!r}; {there}")
+        unit = split_unit(name, file.units.get(name, ""))[1]
+        found[role] = file.columns[name], unit if (unit in SECONDS) == (role == TIME) else ""
+    unused = []
+    for name, values in file.columns.items():
+        role, unit = parse_heading(name, file.units.get(name, "")) or ("", "")
+        if name in roles.values() or name.split("[")[0].lower() in file.contents.arrays:
+            continue
+        if not role or role in roles:
+            unused.append(name)
+        elif role in found:
+            raise RecordError(f"two columns are named {role}")
         else:
-            named[f"{role}_{unit}" if parse_unit(unit) else role] = file.columns[name]
-    contents = from_columns(named)
-    pad_fast(contents)
-    contents.arrays |= file.plain
+            found[role] = values, unit
+    contents = from_columns(found)
+    contents.units |= {name: unit for name, unit in file.contents.units.items() if name not in contents.arrays}
+    contents.arrays = file.contents.arrays | contents.arrays
+    contents.guesses = [*file.contents.guesses]
+    n_rows = len(contents.arrays["y_lgs"]) if np.ndim(contents.arrays.get("y_lgs", 0)) else 0
+    counters = [name for name in unused if _has_counter_name(name) and is_counter(file.columns[name], n_rows)]
+    if FRAME not in found and len(counters) == 1:
+        unused.remove(counters[0])
+        contents.arrays[FRAME] = file.columns[counters[0]]
+        contents.guesses.append(f"frames counted by {counters[0]}")
+    contents.leftovers = [*unused, *(f"{name} (text)" for name in file.texts)]
     return contents
 
 
-def heading_unit(name: str, text: str = "") -> str:
-    """Return the unit stated beside a column, otherwise the one that its name ends in; empty where neither is one.
+def is_counter(values: Array, n: int) -> bool:
+    """Return whether values are `n` whole numbers that mostly rise, by few at a time.
 
-    >>> heading_unit("slope x [nm]"), heading_unit("t_ms"), heading_unit("cmd_x")
-    ('nm', 'ms', '')
+    >>> is_counter(np.array([65534.0, 65535.0, 0.0, 1.0, 3.0]), 5), is_counter(np.zeros(9), 9)
+    (True, False)
     """
-    match = UNIT.search(name)
-    for unit in (text.strip(), match["unit"] if match else ""):
-        if unit in SECONDS or parse_unit(unit):
-            return parse_unit(unit) or unit
-    return ""
+    return values.size == n > 2 and bool((values == np.round(values)).all()) and 1 <= np.median(np.diff(values)) <= 1000
+
+
+def _has_counter_name(name: str) -> bool:
+    words = set(re.findall(r"[a-z]+", name.lower()))
+    return bool(words & COUNTERS) and not words & (TIMES | OTHER_COUNTS)
 
 
 def suggest_roles(names: Iterable[str]) -> dict[str, str]:
@@ -108,16 +129,17 @@ def suggest_clock(columns: Mapping[str, Array]) -> str | None:
     """
     for name, values in columns.items():
         steps = np.diff(values)
-        if steps.size and np.all(steps > 0) and 1e-5 <= np.median(steps) * SECONDS.get(heading_unit(name), 1.0) <= 0.1:
+        if steps.size and np.all(steps > 0) and 1e-5 <= np.median(steps) * SECONDS.get(split_unit(name)[1], 1.0) <= 0.1:
             return name
     return None
 
 
 def _role_of(name: str) -> str | None:
-    bare = UNIT.sub("", name) if heading_unit(name) else name
-    words = re.findall(r"[a-z]+|\d+", bare.lower())
+    words = re.findall(r"[a-z]+|\d+", split_unit(name)[0].lower())
     if not words:
         return None
+    if _has_counter_name(name):
+        return FRAME
     axis = next((mode for mode, known in AXES.items() if words[-1] in known), None)
     rest = words[:-1] if axis and len(words) > 1 else words
     if axis is None and words[0] in AXES:  # x, y and numbers in front are names of other things as well

@@ -1,24 +1,29 @@
 """From the named arrays of a file to a `Record`: the only check of shapes, units, signs and clocks.
 
-A record has y_lgs and u (n_steps, n_modes) and dt or time; optionally y_ngs (the same shape, NaN where there is no frame, or
-one row per frame) with ratio or time_ngs, the truth turbulence and vibration, open_loop_y, lgs_stars (n_steps,), y_stars
-(n_steps, n_lgs, n_modes), and for the offline GPR training_y, training_u and training_open_loop_y (n, n_modes).
+A record has y_lgs and u (n_steps, n_modes) and dt or time; optionally frame (n_steps,), a count that skips missing frames, y_ngs
+(n_steps, n_modes), NaN where there is no frame, or one row per frame, with ratio or time_ngs, the truth turbulence and vibration,
+open_loop_y, lgs_stars (n_steps,), y_stars (n_steps, n_lgs, n_modes), and for the offline GPR training_y, training_u and
+training_open_loop_y (n, n_modes).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from wfsobs.record import DELAY, Record, RecordError, Training
 from wfsobs.scenario import Scenario
+from wfsobs.sensors.modes import order_of
 from wfsobs.telemetry import timestamps as clock
 from wfsobs.telemetry.bridged import without_bridged
-from wfsobs.telemetry.formats.contents import APART, FAST, NGS, SIGNALS, STARS, TRAINING, Contents
+from wfsobs.telemetry.formats.contents import APART, FAST, FRAME, NGS, SIGNALS, STARS, TIME, TRAINING, Contents
 from wfsobs.typing import Array
 from wfsobs.units import ANGLES, micrometres_per, parse_unit
+
+MOST_NAMED = 5
+"""Maximum columns that are named as not used."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +62,9 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
     n, n_modes = signals["y_lgs"].shape
     most = len(scenario.modes)
     if not 1 <= n_modes <= most or n < 2:
-        raise RecordError(f"y_lgs has shape {(n, n_modes)}; it takes (n_steps >= 2, 1 to {most} modes)")
+        order = order_of(n_modes) if n_modes > most else None
+        needed = f": {n_modes} modes need telescope.radial_order = {order}" if order else ""
+        raise RecordError(f"y_lgs has shape {(n, n_modes)}; it takes (n_steps >= 2, 1 to {most} modes){needed}")
     for name in signals:
         rows = signals["training_y"].shape[0] if name in TRAINING and "training_y" in signals else n
         rows = signals[name].shape[0] if name == NGS else rows  # may have one row per frame
@@ -71,7 +78,8 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
         signals["training_u"] *= sign
     if STARS in arrays:
         signals[STARS] = _star_counts(arrays[STARS], n)
-    dt, ratio = _apply_timestamps(signals, arrays, declaration)
+    dt, ratio, timing = _apply_timestamps(signals, contents, declaration)
+    origin = ", ".join(filter(None, (origin, *contents.guesses, timing, _name_unused(contents.leftovers))))
     if np.isnan(signals["y_lgs"]).all(axis=0).any():
         raise RecordError("y_lgs holds no measurement of one of its modes")
     delay = _whole("delay", arrays, declaration.command_delay, DELAY)
@@ -143,47 +151,51 @@ def _into_micrometres(
     return ", ".join([*([str(arrays["origin"])] if "origin" in arrays else []), *said]), sign
 
 
+def _name_unused(columns: Sequence[str]) -> str:
+    """Say which columns are no part of the record, in a few words; nothing where there is none."""
+    more = f" and {len(columns) - MOST_NAMED} more" if len(columns) > MOST_NAMED else ""
+    named = ", ".join(name[:40] for name in columns[:MOST_NAMED])
+    return f"column{'s' * (len(columns) > 1)} {named}{more} not used" if columns else ""
+
+
 def _apply_timestamps(
-    signals: dict[str, Array], arrays: Mapping[str, Array], declaration: DeclaredFormat
-) -> tuple[float, int | None]:
-    """Place the rows by their time stamps, and NGS frames beside them; return the fast step [s] and the ratio."""
-    n = signals["y_lgs"].shape[0]
+    signals: dict[str, Array], contents: Contents, declaration: DeclaredFormat
+) -> tuple[float, int | None, str]:
+    """Place the rows by the frame counter or their time stamps, and NGS frames beside them.
+
+    Returns
+    -------
+    dt, ratio, said
+        The fast step [s], the ratio, and what was guessed of the stamps.
+    """
+    arrays, n, said = contents.arrays, signals["y_lgs"].shape[0], ""
     dt = None if "dt" not in arrays else _number("dt", arrays["dt"])
     if declaration.rate is not None:
         if dt is not None and abs(dt * declaration.rate - 1.0) > clock.AGREE:
             raise RecordError(f"its rate is {1.0 / dt:.6g} Hz, but {declaration.rate:.6g} Hz are stated")
         dt = 1.0 / declaration.rate if dt is None else dt
     start = 0.0
-    if "time" in arrays:
-        time = _clock("time", arrays["time"], n)
-        steps, dt = clock.steps_of(time, dt)
+    steps = clock.counted_steps(_clock(FRAME, arrays[FRAME], n)) if FRAME in arrays else None
+    if TIME in arrays:
+        time = _clock(TIME, arrays[TIME], n)
+        steps, dt, said = clock.steps_of(time, dt, steps)
         start = float(time[0])
+    if steps is not None:
         for name, values in signals.items():
             if name not in TRAINING and values.shape[0] == n:
                 signals[name] = clock.place_rows(values, steps)
     if dt is None:
-        raise RecordError("has no dt and no time; a record needs y_lgs, u and dt")
+        there = f": which column is the time? It has {', '.join(contents.leftovers[:20])}" if contents.leftovers else ""
+        raise RecordError(f"has no dt and no time; a record needs y_lgs, u and dt, or a stated rate{there}")
     if NGS not in signals:
-        return dt, None
+        return dt, None, said
     if "time_ngs" in arrays:
         ratio = _stamped_frames(signals, arrays, start, dt)
     else:
         ratio = _whole("ratio", arrays)
-        signals[NGS] = _numbered_frames(signals[NGS], signals["y_lgs"].shape[0], ratio)
-    signals[NGS] = _frames(signals[NGS], ratio)
-    return dt, ratio
-
-
-def _numbered_frames(frames: Array, n: int, ratio: int) -> Array:
-    """Return frames with a row per fast step, from one row per step or per frame."""
-    if frames.shape[0] == n:
-        return frames
-    out = np.full((n, frames.shape[1]), np.nan)
-    due = out[ratio::ratio]
-    if not 0 <= frames.shape[0] - len(due) <= 1:
-        raise RecordError(f"y_ngs has {frames.shape[0]} rows; it takes {n}, or one per frame, {len(due)}")
-    due[:] = frames[: len(due)]
-    return out
+        signals[NGS] = clock.place_frames(signals[NGS], signals["y_lgs"].shape[0], ratio)
+    signals[NGS] = clock.drop_partial_frames(signals[NGS], ratio)
+    return dt, ratio, said
 
 
 def _stamped_frames(signals: dict[str, Array], arrays: Mapping[str, Array], start: float, dt: float) -> int:
@@ -235,16 +247,3 @@ def _whole(name: str, arrays: Mapping[str, Array], declaration: int | None = Non
     if declaration is not None and value != declaration:
         raise RecordError(f"{name} is {value:g}, but {declaration} is stated")
     return int(value)
-
-
-def _frames(y_ngs: Array, ratio: int) -> Array:
-    """Check that frames are at k = n, 2n, ...; drop a frame at k = 0, which saw nothing, and frames without all modes."""
-    steps = np.arange(y_ngs.shape[0])
-    due = (steps % ratio == 0) & (steps >= ratio)
-    wrong = ~due & ~np.isnan(y_ngs).all(axis=1) & (steps > 0)
-    if wrong.any():
-        raise RecordError(
-            f"y_ngs has a frame at step {int(np.argmax(wrong))}; with ratio = {ratio} "
-            f"frames are at steps {ratio}, {2 * ratio}, ... and NaN elsewhere"
-        )
-    return np.where((due & ~np.isnan(y_ngs).any(axis=1))[:, None], y_ngs, np.nan)

@@ -12,7 +12,7 @@ import numpy as np
 from wfsobs.files import write_whole
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.telemetry.columns import map_columns
+from wfsobs.telemetry.columns import to_contents
 from wfsobs.telemetry.formats import format_of
 from wfsobs.telemetry.formats.contents import Contents, FileColumns
 from wfsobs.telemetry.formats.npz import write as write_npz
@@ -127,13 +127,10 @@ def read_record(
 
 
 def read_contents(file: IO[bytes], name: str, roles: Mapping[str, str], most: int = MOST_BYTES) -> Contents:
-    """Read the named arrays of an open file, by the roles of its columns where there are any. Raises RecordError."""
-    return map_columns(read_columns(file, name, most), roles) if roles else format_of(name).read(file, most)
+    """Read the named arrays of an open file, those of its columns that have these roles among them. Raises RecordError."""
+    return to_contents(read_columns(file, name, most), roles)
 
 
 def read_columns(file: IO[bytes], name: str, most: int = MOST_BYTES) -> FileColumns:
-    """Read the columns of an open file under its own names. Raises RecordError."""
-    fmt = format_of(name)
-    if fmt.columns is None:
-        raise RecordError("columns of its format have names of their own")
-    return fmt.columns(file, most)
+    """Read the columns of an open file under its own names; its name gives the format. Raises RecordError."""
+    return format_of(name).read(file, most)

@@ -1,7 +1,7 @@
 """File formats of records: each a small module with `read` and `write`, and one table from name to format.
 
-A format turns a file into named arrays and back (`Contents`); their meaning is checked
-in one place, `wfsobs.telemetry.records`. A new format is one more module and one more line here.
+A format turns a file into columns and named arrays, and back; their meaning is checked
+in one place, `wfsobs.telemetry.intake`. A new format is one more module and one more line here.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import IO
 
 from wfsobs.record import RecordError
 from wfsobs.telemetry.formats import aot, csv, fits, npz
-from wfsobs.telemetry.formats.contents import Contents, FileColumns
+from wfsobs.telemetry.formats.contents import FileColumns
 from wfsobs.typing import Array
 
 
@@ -25,24 +25,21 @@ class Format:
     endings : tuple of str
         Endings of file names.
     read : callable
-        (open file, maximum bytes of numbers) -> Contents.
+        (open file, maximum bytes of numbers) -> FileColumns, under the file's own names.
     write : callable
         (open file, arrays) -> None.
-    columns : callable or None
-        (open file, maximum bytes of numbers) -> FileColumns, under the file's own names; None where they have no choice.
     """
 
     endings: tuple[str, ...]
-    read: Callable[[IO[bytes], int], Contents]
+    read: Callable[[IO[bytes], int], FileColumns]
     write: Callable[[IO[bytes], Mapping[str, Array]], None]
-    columns: Callable[[IO[bytes], int], FileColumns] | None = None
 
 
 FORMATS = (
-    Format((".npz",), npz.read, npz.write, npz.columns),
-    Format((".csv", ".txt"), csv.read, csv.write, csv.columns),
+    Format((".npz",), npz.read, npz.write),
+    Format((".csv", ".txt"), csv.read, csv.write),
     Format((".aot.fits",), aot.read, aot.write),
-    Format((".fits", ".fit", ".fts"), fits.read, fits.write, fits.columns),  # reads AOT as well, which says so inside
+    Format((".fits", ".fit", ".fts"), fits.read, fits.write),  # reads AOT as well, which says so inside
 )
 
 

@@ -16,7 +16,7 @@ from typing import IO, Any
 import numpy as np
 
 from wfsobs.record import DELAY, RecordError
-from wfsobs.telemetry.formats.contents import NUMBERS, Contents, TooLargeError, numbers_and_texts
+from wfsobs.telemetry.formats.contents import NUMBERS, Contents, FileColumns, TooLargeError, numbers_and_texts
 from wfsobs.telemetry.formats.fits import open_fits, read_whole
 from wfsobs.typing import Array
 
@@ -32,7 +32,7 @@ def _aotpy() -> Any:
     return aotpy
 
 
-def read(file: IO[bytes], most: int) -> Contents:
+def read(file: IO[bytes], most: int) -> FileColumns:
     """Read an AOT file. Raises RecordError, TooLargeError.
 
     Images outside the file are refused: nothing but the file is opened.
@@ -48,7 +48,7 @@ def read(file: IO[bytes], most: int) -> Contents:
         reader = aotpy.AOTFITSReader(
             io.BytesIO(read_whole(file)), externals="disallow", exception_level=critical, log_level=critical
         )
-        return _contents(reader.get_system(), aotpy)
+        return FileColumns(contents=_contents(reader.get_system(), aotpy))
     except RecordError:
         raise
     except Exception as error:  # of many kinds, by what a file lacks

@@ -11,7 +11,7 @@ import numpy as np
 from wfsobs.record import RecordError
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.typing import Array
-from wfsobs.units import parse_unit
+from wfsobs.units import SECONDS, parse_unit, split_unit
 
 FAST = ("y_lgs", "u", "turbulence", "vibration", "open_loop_y")
 """Arrays with one row per fast step."""
@@ -24,6 +24,9 @@ SIGNALS = (*FAST, NGS, *TRAINING)
 TIME, TIME_NGS = "time", "time_ngs"
 CLOCKS = (TIME, TIME_NGS)
 """Arrays (n,) [s]."""
+
+FRAME = "frame"
+"""Array (n,), counts the frames and may start anew at a power of two."""
 
 STARS = "lgs_stars"
 """Array (n,) of whole numbers; in .npz alone."""
@@ -52,10 +55,16 @@ class Contents:
         Name (of NAMES) -> array as in the file; numbers and texts have no dimension.
     units : dict of str to str
         Name of a signal -> its unit, where the file gives one for it alone.
+    guesses : list of str
+        What was guessed of the file, a few words each.
+    leftovers : list of str
+        Columns that are no part of the record.
     """
 
     arrays: dict[str, Array] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
+    guesses: list[str] = field(default_factory=list)
+    leftovers: list[str] = field(default_factory=list)
 
     def state_unit(self, name: str, text: str) -> None:
         """Note the unit of a signal. Raises RecordError for an unknown one, or one that differs from that of its other modes."""
@@ -74,15 +83,18 @@ class FileColumns:
     ----------
     columns : dict of str to Array
         Name in the file -> values, (n,).
-    plain : dict of str to Array
-        Numbers and texts of known names (NUMBERS, TEXTS).
     units : dict of str to str
         Name in the file -> unit beside it, as written.
+    texts : dict of str to str
+        Name in the file -> why it holds no numbers.
+    contents : Contents
+        Whole arrays, numbers and texts of the names of a record (NAMES).
     """
 
     columns: dict[str, Array] = field(default_factory=dict)
-    plain: dict[str, Array] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
+    texts: dict[str, str] = field(default_factory=dict)
+    contents: Contents = field(default_factory=Contents)
 
     def add(self, name: str, values: Array, unit: str = "") -> None:
         """Add an array of one or two dimensions; the columns of two are name[0], name[1], ..., the longer axis being time."""
@@ -96,37 +108,46 @@ class FileColumns:
                 self.units[name] = unit
 
 
-def from_columns(columns: Mapping[str, Array]) -> Contents:
-    """Return the contents of columns (n,) named as COLUMN, time_s or time_ngs_s; others are ignored.
+def parse_heading(heading: str, beside: str = "") -> tuple[str, str] | None:
+    """Return the role and the unit of a column named as in a record, None of any other; beside : its unit, if not in its name.
 
-    Modes are in the order of the columns of y_lgs. Raises RecordError where an array lacks one of them.
+    >>> parse_heading("y_lgs/tip_um"), parse_heading("time [ms]"), parse_heading("flux")
+    (('y_lgs/tip', 'um'), ('time', 'ms'), None)
+    """
+    match = COLUMN.fullmatch(heading)
+    if match and match["array"] in SIGNALS:
+        return f"{match['array']}/{match['mode']}", match["unit"] or beside.strip()
+    name, unit = split_unit(heading, beside)
+    return (name.lower(), unit) if name.lower() in CLOCKS else None
+
+
+def from_columns(columns: Mapping[str, tuple[Array, str]]) -> Contents:
+    """Return the contents of columns {role: (values, unit)}, the shorter fast ones with missing samples at their end.
+
+    Modes are tip, tilt and then in the order of the columns of y_lgs. Raises RecordError where an array lacks one of them.
     """
     contents = Contents()
     found: dict[str, dict[str, Array]] = {}
-    for heading, values in columns.items():
-        clock = heading.removesuffix("_s")
-        match = COLUMN.fullmatch(heading)
-        if clock in CLOCKS:
-            contents.arrays[clock] = values
-        elif match and match["array"] in SIGNALS:
-            name = match["array"]
-            if match["mode"] in found.setdefault(name, {}):
-                raise RecordError(f"two columns are named {name}/{match['mode']}")
-            found[name][match["mode"]] = values
-            if match["unit"]:
-                contents.state_unit(name, match["unit"])
-    if "y_lgs" not in found:
-        return contents
-    modes = list(found["y_lgs"])
+    for role, (values, unit) in columns.items():
+        name, _, mode = role.partition("/")
+        if not mode:
+            contents.arrays[name] = values * SECONDS.get(unit, 1.0)
+            continue
+        found.setdefault(name, {})[mode] = values
+        if unit:
+            contents.state_unit(name, unit)
+    first = [mode.name for mode in TIP_TILT]
     for name, by_mode in found.items():
+        modes = sorted(found.get("y_lgs", by_mode), key=lambda mode: first.index(mode) if mode in first else len(first))
         if set(by_mode) != set(modes):
             raise RecordError(f"{name} has the modes {', '.join(by_mode)}; y_lgs has {', '.join(modes)}")
         longest = max(map(len, by_mode.values()))
         contents.arrays[name] = np.column_stack([_pad(by_mode[mode], longest) for mode in modes])
+    _pad_fast(contents)
     return contents
 
 
-def pad_fast(contents: Contents) -> None:
+def _pad_fast(contents: Contents) -> None:
     """Extend all fast signals to the length of the longest: what ends early has missing samples there."""
     fast = [name for name in FAST if name in contents.arrays]
     n = max((len(contents.arrays[name]) for name in (*fast, *((TIME,) if TIME in contents.arrays else ()))), default=0)

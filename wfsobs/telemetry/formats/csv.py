@@ -6,6 +6,8 @@ missing sample; where a column is empty to the end, it ends there.
 
 from __future__ import annotations
 
+import csv
+import re
 from array import array
 from collections.abc import Iterator, Mapping
 from itertools import chain
@@ -20,47 +22,57 @@ from wfsobs.telemetry.formats.contents import (
     Contents,
     FileColumns,
     TooLargeError,
-    from_columns,
     numbers_and_texts,
-    pad_fast,
+    parse_heading,
     to_columns,
 )
 from wfsobs.typing import Array
+
+SEPARATORS: dict[str | None, str] = {"\t": "tabs", ";": "semicolons", ",": "commas", None: "blanks"}
+"""What separates cells: the first of these that makes numbers of the first line, or that is in the heading."""
+
+CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f\x7f-\x9f]")
+"""What is in no text."""
 
 LONGEST_LINE = 65_536
 """Maximum length of a line [bytes]."""
 
 
-def read(file: IO[bytes], most: int) -> Contents:
-    """Read a CSV file. Raises RecordError naming the line, TooLargeError."""
-    table = columns(file, most)
-    contents = from_columns(table.columns)
-    pad_fast(contents)
-    contents.arrays |= table.plain
-    return contents
+def read(file: IO[bytes], most: int) -> FileColumns:
+    """Read every column, whatever its name; without a heading they are column 1, column 2, ...
 
-
-def columns(file: IO[bytes], most: int) -> FileColumns:
-    """Read every column, whatever its name; without a heading they are column 1, column 2, ... Raises as `read`."""
-    plain, heading, rows = _head(file)
+    A column that holds text is left out, unless it has the name of a part of a record. Raises RecordError naming the line,
+    TooLargeError.
+    """
+    out = FileColumns()
+    heading, separator, rows = _head(file, out.contents)
     if len(set(heading)) < len(heading):
         raise RecordError("two columns have the same heading")
-    width = len(heading)
-    cells_of, ends = [array("d") for _ in heading], [0] * width
+    width, commas = len(heading), False
+    cells_of, ends = {i: array("d") for i in range(width)}, [0] * width
     for step, (line, cells) in enumerate(rows):
         if len(cells) != width:
-            raise RecordError(f"line {line} has {len(cells)} cells, the heading {width}; cells are separated by commas")
+            raise RecordError(f"line {line} has {len(cells)} cells, the heading {width}; cells are separated by {separator}")
         if (step + 1) * width * 8 > most:
             raise TooLargeError(most)
-        for i, cell in enumerate(cells):
-            text = cell.strip()
+        for i, column in [*cells_of.items()]:
+            text = cells[i].strip()
             if text:
                 ends[i] = step + 1
             try:
-                cells_of[i].append(float(text or "nan"))
+                column.append(float(text or "nan"))
             except ValueError:
-                raise RecordError(f"line {line}, {heading[i]}: {text[:40]!r} is not a number") from None
-    return FileColumns({name: np.array(c[:end]) for name, c, end in zip(heading, cells_of, ends, strict=True)}, plain)
+                try:
+                    column.append(float(text.replace(",", ".")))
+                    commas = True
+                except ValueError:
+                    out.texts[heading[i]] = f"line {line}, {heading[i]}: {text[:40]!r} is not a number"
+                    if parse_heading(heading[i]):
+                        raise RecordError(out.texts[heading[i]]) from None
+                    del cells_of[i]
+    out.columns = {heading[i]: np.array(column[: ends[i]]) for i, column in cells_of.items()}
+    out.contents.guesses += [f"cells separated by {separator}"] * (separator != "commas") + ["decimal commas"] * commas
+    return out
 
 
 def numbered_lines(file: IO[bytes]) -> Iterator[tuple[int, str]]:
@@ -71,40 +83,47 @@ def numbered_lines(file: IO[bytes]) -> Iterator[tuple[int, str]]:
         if len(line) > LONGEST_LINE:
             raise RecordError(f"line {number} is longer than {LONGEST_LINE} bytes")
         try:
-            text = line.decode("utf-8-sig" if number == 1 else "utf-8").strip()
-        except UnicodeDecodeError:
-            raise RecordError(f"line {number} is not UTF-8 text") from None
-        if "\0" in text:
+            text = line.decode("utf-8-sig" if number == 1 else "utf-8")
+        except UnicodeDecodeError:  # as old programs write a micro sign
+            text = line.decode("latin-1")
+        text = text.strip(" \r\n")
+        if CONTROL.search(text):
             raise RecordError(f"line {number} is not text")
-        if text:
+        if text.strip():
             yield number, text
 
 
-def _head(file: IO[bytes]) -> tuple[dict[str, Array], list[str], Iterator[tuple[int, list[str]]]]:
-    """Return numbers and texts of the comments, the heading, and the rows as (line, cells)."""
-    plain: dict[str, Array] = {}
+def _head(file: IO[bytes], contents: Contents) -> tuple[list[str], str, Iterator[tuple[int, list[str]]]]:
+    """Return the heading, what separates cells, and the rows as (line, cells); numbers and texts of comments go to `contents`."""
     lines = numbered_lines(file)
     for number, text in lines:
         if not text.startswith("#"):
-            heading = [cell.strip().strip('"') for cell in text.split(",")]
-            rows = ((n, t.split(",")) for n, t in lines if not t.startswith("#"))
+            signs = [sign for sign in SEPARATORS if sign is None or sign in text]
+            sign = next((sign for sign in signs if all(map(_is_number, _cells(text, sign)))), signs[0])
+            heading = [cell.strip().strip('"') for cell in _cells(text, sign)]
+            rows = ((n, _cells(t, sign)) for n, t in lines if not t.startswith("#"))
             if not all(map(_is_number, heading)):
-                return plain, heading, rows
-            return plain, [f"column {i + 1}" for i in range(len(heading))], chain([(number, heading)], rows)
+                return heading, SEPARATORS[sign], rows
+            return [f"column {i + 1}" for i in range(len(heading))], SEPARATORS[sign], chain([(number, heading)], rows)
         name, colon, value = text.lstrip("# ").partition(":")
         if colon and name in TEXTS:
-            plain[name] = np.array(value.strip())
+            contents.arrays[name] = np.array(value.strip())
         elif colon and name in NUMBERS:
             try:
-                plain[name] = np.array(float(value))
+                contents.arrays[name] = np.array(float(value))
             except ValueError:
                 raise RecordError(f"line {number}: {name} takes a number, not {value.strip()[:40]!r}") from None
     raise RecordError("holds no table")
 
 
+def _cells(text: str, sign: str | None) -> list[str]:
+    """Return the cells of a line; between quotation marks a separator is none."""
+    return next(csv.reader([text], delimiter=sign)) if sign and '"' in text else text.split(sign)
+
+
 def _is_number(text: str) -> bool:
     try:
-        float(text)
+        float(text.replace(",", "."))
     except ValueError:
         return False
     return True

@@ -21,13 +21,13 @@ from wfsobs.telemetry.formats.contents import (
     NUMBERS,
     SIGNALS,
     TRAINING,
-    Contents,
     FileColumns,
     TooLargeError,
-    from_columns,
     numbers_and_texts,
+    parse_heading,
 )
 from wfsobs.typing import Array
+from wfsobs.units import SECONDS
 
 HDUList = Any
 """Astropy's, which is imported only when needed."""
@@ -43,25 +43,6 @@ DAMAGED = "damaged, or not a FITS file of tables and images"
 MOST_HDUS = 200
 
 
-def columns(file: IO[bytes], most: int) -> FileColumns:
-    """Read every column of the tables and images, whatever its name. Raises RecordError, TooLargeError."""
-    fits = astropy_fits()
-    out = FileColumns()
-    with open_fits(file, most) as hdus:
-        if AOT in hdus[0].header:
-            raise RecordError("columns of an AOT file have names of their own")
-        for number, hdu in enumerate(hdus):
-            out.plain |= {key: value for key, value in _plain(hdu).items() if key != "unit"}  # of one image alone
-            if isinstance(hdu, fits.BinTableHDU):
-                for column in hdu.columns:
-                    if "P" not in column.format and "Q" not in column.format and hdu.data[column.name].dtype.kind in "fiu":
-                        out.add(column.name, _native(hdu.data[column.name], column.name, column.null), column.unit or "")
-            elif hdu.data is not None and hdu.data.dtype.kind in "fiu":
-                name = hdu.name or f"image {number}"
-                out.add(name, _native(hdu.data, name, hdu.header.get("BLANK")), str(hdu.header.get("BUNIT", "")))
-    return out
-
-
 def astropy_fits() -> Any:
     """Return astropy.io.fits. Raises RecordError naming the extra where it is not installed."""
     try:
@@ -71,11 +52,11 @@ def astropy_fits() -> Any:
     return fits
 
 
-def read(file: IO[bytes], most: int) -> Contents:
-    """Read a FITS file, or an AOT file. Raises RecordError, TooLargeError."""
+def read(file: IO[bytes], most: int) -> FileColumns:
+    """Read the tables and images of a FITS file, or an AOT file. Raises RecordError, TooLargeError."""
     with open_fits(file, most) as hdus:
         if AOT not in hdus[0].header:
-            return _contents(hdus)
+            return _columns(hdus)
     from wfsobs.telemetry.formats import aot
 
     return aot.read(file, most)
@@ -130,52 +111,52 @@ def _check_sizes(hdus: HDUList, length: int, most: int) -> None:
             raise RecordError("ends before its data do")
 
 
-def _contents(hdus: HDUList) -> Contents:
+def _columns(hdus: HDUList) -> FileColumns:
     fits = astropy_fits()
-    contents = Contents()
-    flat: dict[str, Array] = {}
-    for hdu in hdus:
-        name = hdu.name.lower()
+    out = FileColumns()
+    for number, hdu in enumerate(hdus):
+        for key, keyword in KEYWORDS.items():
+            if keyword in hdu.header and not (key == "unit" and hdu.is_image and hdu.data is not None):  # of one image alone
+                out.contents.arrays[key] = np.array(hdu.header[keyword])
+        if EXACT in hdu.header:
+            out.contents.arrays["dt"] = np.array(float(hdu.header[EXACT]))
+        data: Any = hdu.data
         if isinstance(hdu, fits.BinTableHDU):
-            _read_table(hdu, contents, flat)
-        elif name in SIGNALS or name in CLOCKS:
-            contents.arrays[name] = _native(hdu.data, name, hdu.header.get("BLANK"))
-            if name in SIGNALS and "BUNIT" in hdu.header:
-                contents.state_unit(name, str(hdu.header["BUNIT"]))
-        contents.arrays |= {key: value for key, value in _plain(hdu).items() if not (key == "unit" and name in SIGNALS)}
-    of_modes = from_columns(flat)
-    contents.arrays |= of_modes.arrays
-    contents.units |= of_modes.units
-    return contents
+            for column in hdu.columns:
+                if "P" in column.format or "Q" in column.format:
+                    _leave(out, column.name, f"{column.name} is a column of rows of unlike lengths")
+                else:
+                    _add(out, column.name, data[column.name], column.null, column.unit or "")
+        elif data is not None:
+            _add(out, hdu.name or f"image {number}", data, hdu.header.get("BLANK"), str(hdu.header.get("BUNIT", "")))
+    return out
 
 
-def _plain(hdu: Any) -> dict[str, Array]:
-    """Return the numbers and texts of a header."""
-    found = {key: np.array(hdu.header[keyword]) for key, keyword in KEYWORDS.items() if keyword in hdu.header}
-    return found | ({"dt": np.array(float(hdu.header[EXACT]))} if EXACT in hdu.header else {})
+def _add(out: FileColumns, name: str, data: Any, blank: int | None, unit: str) -> None:
+    """Add a column or an image; one with the name of a part of a record whole as well, in the unit beside it."""
+    known = name.lower()
+    if np.asarray(data).dtype.kind not in "fiu":
+        _leave(out, name, f"{name} does not hold numbers")
+        return
+    values = _native(data, blank)
+    out.add(name, values, unit)
+    if known in SIGNALS:
+        out.contents.arrays[known] = values[:, None] if values.ndim == 1 else values  # of one mode
+        if unit:
+            out.contents.state_unit(known, unit)
+    elif known in CLOCKS:
+        out.contents.arrays[known] = values * SECONDS.get(unit.strip(), 1.0)
 
 
-def _read_table(hdu: Any, contents: Contents, flat: dict[str, Array]) -> None:
-    for column in hdu.columns:
-        name = column.name.lower()
-        known = name in SIGNALS or name in CLOCKS
-        if "P" in column.format or "Q" in column.format:
-            if known:
-                raise RecordError(f"{name} is a column of rows of unlike lengths")
-            continue
-        if known:
-            values = _native(hdu.data[column.name], name, column.null)
-            contents.arrays[name] = values[:, None] if name in SIGNALS and values.ndim == 1 else values  # of one mode
-            if name in SIGNALS and column.unit:
-                contents.state_unit(name, column.unit)
-        elif "/" in name or name.removesuffix("_s") in CLOCKS:
-            flat[column.name] = _native(hdu.data[column.name], column.name, column.null)
+def _leave(out: FileColumns, name: str, why: str) -> None:
+    """Leave out what holds no numbers, unless it has the name of a part of a record."""
+    if name.lower() in (*SIGNALS, *CLOCKS) or parse_heading(name):
+        raise RecordError(why)
+    out.texts[name] = why
 
 
-def _native(data: Any, name: str, blank: int | None) -> Array:
+def _native(data: Any, blank: int | None) -> Array:
     """Return numbers in native byte order, integers scaled as the header says; the integer `blank` is a missing one."""
-    if data is None or np.asarray(data).dtype.kind not in "fiu":
-        raise RecordError(f"{name} does not hold numbers")
     out = np.array(data, dtype=np.float64)
     if blank is not None and np.asarray(data).dtype.kind in "iu":
         out[np.asarray(data) == blank] = np.nan

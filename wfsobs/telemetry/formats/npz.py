@@ -2,80 +2,84 @@
 
 from __future__ import annotations
 
-import io
+import math
 import zipfile
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import IO
 
 import numpy as np
 from numpy.lib import format as npy
 
 from wfsobs.record import RecordError
-from wfsobs.telemetry.formats.contents import NAMES, NUMBERS, TEXTS, Contents, FileColumns, TooLargeError
+from wfsobs.telemetry.formats.contents import NAMES, NUMBERS, TEXTS, FileColumns, TooLargeError
 from wfsobs.typing import Array
 
 KINDS = "fiuUb"
 """Kinds of array that are read: numbers, text, booleans. No objects, so no pickles."""
 
 DAMAGED = "damaged, or holds more than plain arrays"
+DAMAGES = (ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError, RuntimeError, NotImplementedError, MemoryError)
 HEADER = 10_000
 """Maximum header of an array [bytes]."""
 
 
-def read(file: IO[bytes], most: int) -> Contents:
-    """Read the arrays of known names, and no others. Raises RecordError, and TooLargeError before the memory is used."""
-    return Contents(_arrays(file, most, NAMES))
+def read(file: IO[bytes], most: int) -> FileColumns:
+    """Read the arrays of known names, and those of others that are columns of numbers, as far as there is room.
 
-
-def columns(file: IO[bytes], most: int) -> FileColumns:
-    """Read the columns of every array, whatever its name. Raises as `read`."""
-    out = FileColumns()
-    for name, values in _arrays(file, most).items():
-        if name in (*NUMBERS, *TEXTS):
-            out.plain[name] = values
-        else:
-            out.add(name, values)
-    return out
-
-
-def _arrays(file: IO[bytes], most: int, names: Iterable[str] | None = None) -> dict[str, Array]:
-    """Return the arrays of these names, of all names by default."""
+    Raises RecordError, and TooLargeError before the memory is used.
+    """
     if not zipfile.is_zipfile(file):
         raise RecordError("not an .npz file; a record is an .npz with y_lgs, u and dt")
+    out = FileColumns()
     try:
         with zipfile.ZipFile(file) as archive:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            known = {name: members[name] for name in names or members if name in members}
-            if sum(info.file_size for info in known.values()) > most:
+            known = {name: members[name] for name in NAMES if name in members}
+            room = most - sum(info.file_size for info in known.values())
+            if room < 0:
                 raise TooLargeError(most)
-            return {name: _array(_member(archive, info), name) for name, info in known.items()}
+            for name, info in known.items():
+                out.contents.arrays[name] = _array(archive, info, name)
+                if name not in (*NUMBERS, *TEXTS):
+                    out.add(name, out.contents.arrays[name])
+            for name, info in members.items():
+                if name not in known and info.file_size <= room and _is_table(archive, info):
+                    room -= info.file_size
+                    out.add(name, _array(archive, info, name))
     except RecordError:
         raise
-    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError, RuntimeError, NotImplementedError, MemoryError):
+    except DAMAGES:
         raise RecordError(DAMAGED) from None
+    return out
 
 
-def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
-    """Return the bytes of a member, at most the size in the directory: a read without a size would unpack everything."""
+def _is_table(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bool:
+    """Return whether a member holds numbers in one or two dimensions."""
+    try:
+        with archive.open(info) as stream:
+            shape, _, dtype = _header(stream)
+    except DAMAGES:
+        return False
+    return dtype.kind in "fiu" and len(shape) in (1, 2)
+
+
+def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Return shape, order (True: Fortran's) and type."""
+    read_header = npy.read_array_header_1_0 if npy.read_magic(stream) == (1, 0) else npy.read_array_header_2_0
+    return read_header(stream, max_header_size=HEADER)
+
+
+def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str) -> Array:
+    """Return an array whose header agrees with the size in the directory: a read without a size would unpack everything."""
     with archive.open(info) as stream:
-        return stream.read(info.file_size)
-
-
-def _array(content: bytes, name: str) -> Array:
-    """Return an array whose header agrees with the data after it."""
-    stream = io.BytesIO(content)
-    version = npy.read_magic(stream)
-    read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-    shape, fortran, dtype = read_header(stream, max_header_size=HEADER)
-    if dtype.hasobject or dtype.kind not in KINDS:
-        raise RecordError(DAMAGED if dtype.hasobject else f"{name} holds {dtype}, not numbers")
-    count = 1
-    for length in shape:
-        count *= length
-    if count * dtype.itemsize != len(content) - stream.tell():
-        raise RecordError(f"{name} is not as long as its header says")
-    values = np.frombuffer(content, dtype, count, stream.tell())
+        shape, fortran, dtype = _header(stream)
+        if dtype.hasobject or dtype.kind not in KINDS:
+            raise RecordError(DAMAGED if dtype.hasobject else f"{name} holds {dtype}, not numbers")
+        size = math.prod(shape) * dtype.itemsize
+        if min(shape, default=0) < 0 or size != info.file_size - stream.tell():
+            raise RecordError(f"{name} is damaged: not as long as its header says")
+        values = np.frombuffer(stream.read(size), dtype, math.prod(shape))
     return values.reshape(shape, order="F" if fortran else "C")
 
 

@@ -13,7 +13,7 @@ from typing import IO
 import numpy as np
 
 from wfsobs.record import RecordError
-from wfsobs.telemetry.formats.csv import numbered_lines
+from wfsobs.telemetry.formats import csv
 from wfsobs.telemetry.formats.fits import open_fits
 from wfsobs.typing import Array
 from wfsobs.units import UNITS, micrometres_per, parse_unit
@@ -71,26 +71,16 @@ def read_psd(file: IO[bytes], name: str, unit: str | None = None, diameter: floa
 
 
 def _from_csv(file: IO[bytes]) -> Table:
-    rows = [(n, text.split(",")) for n, text in numbered_lines(file) if not text.startswith("#")]
-    if not rows:
-        raise NoSpectrumError("holds no table")
-    found: dict[str, int] = {}
-    units: dict[str, str] = {}
-    for i, heading in enumerate(rows[0][1]):
-        name, _, rest = heading.strip().strip('"').partition("[")
-        found[name.strip().lower()] = i
-        units[name.strip().lower()] = rest.rstrip("] ")
-    missing = [name for name in COLUMNS if name not in found]
+    table = csv.read(file, MOST)
+    names = {heading.partition("[")[0].strip().lower(): heading for heading in (*table.columns, *table.texts)}
+    missing = [name for name in COLUMNS if name not in names]
     if missing:
         raise NoSpectrumError(f"has no column {missing[0]}; it takes frequency [Hz], tip [nm^2/Hz], tilt [nm^2/Hz]")
-    columns: dict[str, list[float]] = {name: [] for name in COLUMNS}
-    for line, cells in rows[1:]:
-        for name in COLUMNS:
-            try:
-                columns[name].append(float(cells[found[name]]))
-            except (ValueError, IndexError):
-                raise RecordError(f"line {line}: {name} is not a number") from None
-    return {name: np.array(values) for name, values in columns.items()}, {n: u for n, u in units.items() if n in COLUMNS}
+    of_text = [names[name] for name in COLUMNS if names[name] in table.texts]
+    if of_text:
+        raise RecordError(table.texts[of_text[0]])
+    units = {name: names[name].partition("[")[2].rstrip("] ") for name in COLUMNS}
+    return {name: table.columns[names[name]] for name in COLUMNS}, units
 
 
 def _from_fits(file: IO[bytes]) -> Table:
