@@ -11,7 +11,7 @@ import pytest
 from wfsobs.record import Record
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
-from wfsobs.telemetry.command_response import DECIDED, command_response
+from wfsobs.telemetry.command_response import DECIDED, command_response, saturation_lines
 from wfsobs.typing import Array
 
 GAIN, LEAK, NOISE = 0.4, 0.995, 0.05
@@ -84,3 +84,46 @@ def test_commands_of_another_unit_are_said_to_be() -> None:
     assert found is not None and (found.sign, found.delay) == (1, None)
     expected = "delay undecided: at no delay do the commands explain the measurements' jumps, as if the two had different units"
     assert found.lines()[1] == expected
+
+
+def limited_loop(disturbance: Array, rail: float, recorded: bool) -> Record:
+    """An integrator that goes on beyond the rail of the mirror; recorded : whether what the mirror does is in the record."""
+    noise = NOISE * np.random.default_rng(3).standard_normal(disturbance.shape)
+    y, u = np.zeros_like(disturbance), np.zeros_like(disturbance)
+    for k in range(2, len(y)):
+        y[k] = disturbance[k - 1] + noise[k] + np.clip(u[k - 2], -rail, rail)
+        u[k] = LEAK * u[k - 1] - GAIN * y[k]
+    return Record(y, np.clip(u, -rail, rail) if recorded else u, 1e-3)
+
+
+@pytest.mark.parametrize("rate", [0.02, 0.1])
+def test_commands_beyond_a_rail(rate: float) -> None:
+    """Smooth disturbances of 0.4 um; the level is that of the rail, and without one nothing is said."""
+    rng, n = np.random.default_rng(5), 8000
+    kernel = np.exp(-rate * np.arange(600.0))
+    white = rng.standard_normal((n + 600, 2))
+    smooth = np.column_stack([np.convolve(np.convolve(x, kernel, "same"), kernel, "same")[:n] for x in white.T])
+    disturbance = smooth * 0.4 / smooth.std(axis=0)
+    rails = limited_loop(disturbance, 0.6, recorded=False)
+    lines = saturation_lines(rails)
+    assert [line.split(":")[0] for line in lines] == ["tip", "tilt"] and all("do nothing" in line for line in lines)
+    for line in lines:
+        levels = [float(level) for level in re.findall(r"[+-]\d+(?:\.\d+)?", line)]
+        assert sorted(np.sign(levels)) == [-1, 1] and np.abs(levels) == pytest.approx(600.0, rel=0.05), (
+            "to the steps of the search"
+        )
+    assert saturation_lines(limited_loop(disturbance, np.inf, recorded=False)) == []
+    (stays, _) = saturation_lines(limited_loop(disturbance, 0.6, recorded=True))
+    assert re.fullmatch(r"tip: commands stay at their largest value in \d+ frames, as at the limit of a mirror", stays)
+    assert saturation_lines(replace(rails, u=0.0 * rails.u)) == []
+
+
+def test_no_rail_is_seen_in_loops_without(disturbance: Array) -> None:
+    """Outlying samples, missing ones, an offset and commands that are held do not look like one."""
+    noise = NOISE * np.random.default_rng(3).standard_normal(disturbance.shape)
+    clean = closed_loop(disturbance, noise, 1, 2)
+    y, u = clean.y_lgs.copy(), clean.u.copy()
+    y[::97] += 2.0
+    y[5000:5400], u[5000:5400] = np.nan, np.nan
+    for record in (clean, replace(clean, y_lgs=y, u=u), replace(clean, u=clean.u + 200.0)):
+        assert saturation_lines(record) == []

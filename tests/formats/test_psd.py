@@ -83,6 +83,30 @@ def test_wrong_tables(text: str, message: str) -> None:
         read_psd(io.BytesIO(text.encode()), "a.csv", "nm")
 
 
+@pytest.mark.parametrize("first", [0.25, 0.0, 5.0])
+def test_bins_of_a_spectrum_keep_all_their_power(first: float) -> None:
+    """Most of it in the first bin, as windshake has it; the first of 0 Hz is half as wide as the others."""
+    f = first + 0.25 * np.arange(1000)
+    f = f.astype(np.float32).astype(float)  # as a file of single precision has it
+    density = 1e8 / (1.0 + np.arange(1000.0)) ** 2
+    rows = [f"{a!r},{x!r},{x!r}" for a, x in zip(f.tolist(), density.tolist(), strict=True)]
+    text = "\n".join(["frequency,tip [nm^2/Hz],tilt [nm^2/Hz]", *rows])
+    table = read_psd(io.BytesIO(text.encode()), "a.csv")
+    expected = 0.25 * (density.sum() - (0.5 * density[0] if first == 0 else 0.0))
+    assert np.trapezoid(table["tip"], table["frequency"]) == pytest.approx(1e-6 * expected, rel=1e-6), "to single precision"
+    assert table["frequency"][0] == max(first - 0.125, 0.0) and np.all(np.diff(table["frequency"]) > 0)
+    uneven = read_psd(io.BytesIO("\n".join([*text.split("\n")[:20], *text.split("\n")[30:]]).encode()), "a.csv")
+    assert uneven["frequency"][0] == first, "a curve, not bins"
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_decimal_commas(separator: str) -> None:
+    text = (
+        f"frequency{separator}tip [nm^2/Hz]{separator}tilt [nm^2/Hz]\n0,5{separator}1,5{separator}2\n1{separator}2{separator}3\n"
+    )
+    assert read_psd(io.BytesIO(text.encode()), "a.csv")["tip"] == pytest.approx([1.5e-6, 2e-6])
+
+
 def test_the_command_runs_on_it(tmp_path) -> None:
     """The shipped table is such a file; the vibration's rms is that of its bins, joined by straight lines."""
     path = tmp_path / "eris.csv"

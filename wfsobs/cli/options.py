@@ -12,6 +12,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.errors import SettingError
 from wfsobs.streams.wiring import STUCK, NgsWiring
+from wfsobs.telemetry.command_response import saturation_lines
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.records import load_record
 from wfsobs.units import UNITS, micrometres_per
@@ -141,6 +142,8 @@ def load_declared(record_file: str, scenario: Scenario, declaration: DeclaredFor
             "prediction and count in no score of one",
             err=True,
         )
+    for line in saturation_lines(record):
+        click.echo(f"wfsobs: {record_file}: {line}", err=True)
     return record
 
 

@@ -43,6 +43,16 @@ DECIDED = 3.0
 """Standard errors by which the best delay has to be better than any other."""
 
 
+LIMITED = 40.0
+"""Log-likelihood by which commands that are cut at a level have to predict a measurement better than the whole ones."""
+
+ROWS = 10_000
+"""Rows of a record from which that is computed."""
+
+LEVELS = np.array([0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.94, 0.97, 0.985, 0.995])
+"""Quantiles of the commands that are tried as such a level."""
+
+
 @dataclass(frozen=True)
 class CommandResponse:
     """What a record says of sign and delay of its commands.
@@ -134,6 +144,64 @@ def command_response(record: Record) -> CommandResponse | None:
         margin,
         scale,
     )
+
+
+def saturation_lines(record: Record) -> list[str]:
+    """Return a line for each mode whose mirror does not follow commands beyond a level, or whose commands stay at their largest.
+
+    A loop is linear but for that: measurements are predicted from their past and that of the commands, whole and cut at a level.
+    """
+    y, u = (hold_last(x[:MOST_STEPS, : len(TIP_TILT)]) for x in (record.y_lgs, record.u))
+    if len(y) <= 40 * ORDER:
+        return []
+    lines = []
+    for mode, measured, commands in zip(TIP_TILT, y.T, u.T, strict=False):
+        low, high = -np.inf, np.inf
+        for _ in range(2):  # the second time with the other end known
+            high = _highest_followed(measured, np.maximum(commands, low))
+            low = -_highest_followed(-measured, -np.minimum(commands, high))
+            if np.isinf([low, high]).all():
+                break
+        if np.isfinite([low, high]).any():
+            levels = " and ".join(f"{1e3 * level:+.3g}" for level in (low, high) if np.isfinite(level))
+            share = np.mean((commands < low) | (commands > high))
+            lines.append(
+                f"{mode.name}: commands beyond about {levels} nm, {100.0 * share:.2g} % of all, do nothing: the mirror is at its "
+                "limit there, and z, which has the whole of them, is wrong"
+            )
+        elif count := max(_count_at_end(commands), _count_at_end(-commands)):
+            lines.append(f"{mode.name}: commands stay at their largest value in {count} frames, as at the limit of a mirror")
+    return lines
+
+
+def _highest_followed(y: Array, u: Array) -> float:
+    """Return the level above which commands do nothing; infinity where they are not known to."""
+    whole, quantiles = _log_likelihood(y, u), LEVELS
+    for _ in range(3):  # each time nearer to the best
+        levels = np.quantile(u, quantiles)
+        likelihoods = [_log_likelihood(y, np.minimum(u, level)) for level in levels]
+        best = int(np.argmax(likelihoods))
+        if likelihoods[best] - whole < LIMITED:
+            return np.inf
+        quantiles = np.linspace(quantiles[max(best - 1, 0)], quantiles[min(best + 1, len(quantiles) - 1)], 5)
+    return float(levels[best])
+
+
+def _log_likelihood(y: Array, u: Array) -> float:
+    """Return the log-likelihood of the prediction of y from the past of y and u, but for a constant, from ROWS rows at most."""
+    rows = np.arange(ORDER, len(y), -(-len(y) // ROWS))
+    past = [x[rows - i] for x in (y, u) for i in range(1, ORDER + 1)]
+    table = np.column_stack([np.ones(rows.size), *past, y[rows]])
+    triangle = np.asarray(np.linalg.qr(table, mode="r"))
+    return -rows.size * float(np.log(max(abs(triangle[-1, -1]), 1e-300)))
+
+
+def _count_at_end(u: Array) -> int:
+    """Return in how many frames commands are at their largest value, if they come back to it more than to others; otherwise 0."""
+    values, counts = np.unique(u, return_counts=True)
+    at_end = u == values[-1]
+    times = np.count_nonzero(at_end[1:] & ~at_end[:-1])
+    return int(counts[-1]) if times >= 3 and counts[-1] >= 10 * counts[-2] else 0
 
 
 def _responses(y: Array, u: Array) -> tuple[Array, Array, float]:

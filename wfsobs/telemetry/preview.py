@@ -16,7 +16,7 @@ from wfsobs.record import Record, RecordError, hold_last
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import rms, welch_psd
 from wfsobs.telemetry.columns import describe_values, suggest_clock, suggest_roles
-from wfsobs.telemetry.command_response import CommandResponse, command_response
+from wfsobs.telemetry.command_response import CommandResponse, command_response, saturation_lines
 from wfsobs.telemetry.formats.contents import TIME, Contents
 from wfsobs.telemetry.formats.psd import NoSpectrumError, read_psd
 from wfsobs.telemetry.intake import DeclaredFormat, to_record
@@ -50,15 +50,19 @@ class Reading:
         What the data say of sign and delay, of the commands as they are in the file.
     units : dict of str to float
         Units under which the size of z is plausible -> its rms [um]; empty where the file or the user states the unit.
+    limits : list of str
+        What the data say of commands at the limit of the mirror, a line per mode.
     """
 
     sign: int = 1
     response: CommandResponse | None = None
     units: dict[str, float] = field(default_factory=dict)
+    limits: list[str] = field(default_factory=list)
 
     def lines(self) -> list[str]:
         """Return the evidence, a line each."""
         lines = self.response.lines() if self.response else ["sign and delay: too few steps, or commands that do not move"]
+        lines += self.limits
         if self.units:
             ways = " or ".join(f"{unit} ({float(f'{1e3 * rms:.3g}'):g} nm rms of z)" for unit, rms in self.units.items())
             lines.append(f"unit {'undecided' if len(self.units) > 1 else 'proposed'}: the numbers are plausible as {ways}")
@@ -230,10 +234,11 @@ def _read_off(record: Record, contents: Contents, declaration: DeclaredFormat, s
     """Return what the data say of sign, delay and unit; size : rms of z, as read [um]."""
     sign = int(contents.arrays.get("command_sign", declaration.command_sign or 1))
     response = command_response(replace(record, u=sign * record.u))
+    limits = saturation_lines(record)
     if declaration.unit or contents.units or "unit" in contents.arrays:
-        return Reading(sign, response)
+        return Reading(sign, response, limits=limits)
     units = {unit: size * micrometres_per(unit, scenario.telescope.diameter) for unit in UNITS}
-    return Reading(sign, response, {unit: x for unit, x in units.items() if PLAUSIBLE[0] <= x <= PLAUSIBLE[1]})
+    return Reading(sign, response, {unit: x for unit, x in units.items() if PLAUSIBLE[0] <= x <= PLAUSIBLE[1]}, limits)
 
 
 def safe_name(name: str) -> str:

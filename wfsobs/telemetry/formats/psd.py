@@ -2,6 +2,9 @@
 
 CSV: columns frequency, tip and tilt, each with its unit in brackets, such as `tip [nm^2/Hz]`. FITS: a table of those columns
 with TUNITn, or an image of three rows, frequency, tip, tilt, with BUNIT. One-sided densities; frequencies in Hz.
+
+Densities at evenly spaced frequencies are those of bins, as an estimate of a spectrum has them: the first and the last go on by
+half a step. Joined by straight lines they then have the power of all bins.
 """
 
 from __future__ import annotations
@@ -21,6 +24,12 @@ from wfsobs.units import UNITS, micrometres_per, parse_unit
 COLUMNS = ("frequency", "tip", "tilt")
 MOST = 64_000_000
 """Maximum bytes of numbers in a file; a scenario takes 100 000 frequencies."""
+
+FEWEST_BINS = 8
+"""Frequencies by which a table may be one of bins."""
+
+UNEVEN = 0.01
+"""Maximum relative difference of the spaces between bins, which short numbers round."""
 
 SQUARED = re.compile(r"(?P<unit>[A-Za-zµμ]+)\s*(?:\^|\*\*)?2\s*(?:/\s*|\s)Hz(?:\^?-1)?")
 Table = tuple[dict[str, Array], dict[str, str]]
@@ -101,8 +110,9 @@ def _to_table(columns: dict[str, Array], units: dict[str, str], unit: str | None
     if units["frequency"] not in ("", "Hz", "hz"):
         raise RecordError(f"frequency is in {units['frequency']!r}; it takes Hz")
     for name, values in columns.items():
-        if values.ndim != 1 or not np.isfinite(values).all():
+        if values.ndim != 1 or not values.size or not np.isfinite(values).all():
             raise RecordError(f"{name} does not hold one finite number per row")
+    columns = _extend_bins(columns)
     out = {"frequency": columns["frequency"].tolist()}
     for name in COLUMNS[1:]:
         match = SQUARED.fullmatch(units[name].strip())
@@ -116,3 +126,15 @@ def _to_table(columns: dict[str, Array], units: dict[str, str], unit: str | None
             raise RecordError(f"has no unit of {name}: state one of {', '.join(UNITS)} (squared, per Hz)")
         out[name] = (columns[name] * micrometres_per(amplitude, diameter) ** 2).tolist()
     return out
+
+
+def _extend_bins(columns: dict[str, Array]) -> dict[str, Array]:
+    """Return the columns with the outer edges of the first and last bin, where their frequencies are evenly spaced."""
+    f = columns["frequency"]
+    half, steps = 0.5 * (f[-1] - f[0]) / max(f.size - 1, 1), np.diff(f)
+    if f.size < FEWEST_BINS or half <= 0 or np.ptp(steps) > UNEVEN * steps.min():
+        return columns
+    low = max(f[0] - half, 0.0)
+    begins = int(low < f[0])
+    extended = {name: np.pad(values, (begins, 1), "edge") for name, values in columns.items()}
+    return extended | {"frequency": np.concatenate([[low] * begins, f, [f[-1] + half]])}
