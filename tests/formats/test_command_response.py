@@ -108,7 +108,7 @@ def test_commands_beyond_a_rail(rate: float) -> None:
     lines = saturation_lines(rails)
     assert [line.split(":")[0] for line in lines] == ["tip", "tilt"] and all("do nothing" in line for line in lines)
     for line in lines:
-        levels = [float(level) for level in re.findall(r"[+-]\d+(?:\.\d+)?", line)]
+        levels = [float(level) for level in re.findall(r"[+-]\d+(?= nm)", line)]
         assert sorted(np.sign(levels)) == [-1, 1] and np.abs(levels) == pytest.approx(600.0, rel=0.05), (
             "to the steps of the search"
         )

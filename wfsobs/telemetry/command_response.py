@@ -156,19 +156,14 @@ def saturation_lines(record: Record) -> list[str]:
         return []
     lines = []
     for mode, measured, commands in zip(TIP_TILT, y.T, u.T, strict=False):
-        low, high = -np.inf, np.inf
-        for _ in range(2):  # the second time with the other end known
+        high = _highest_followed(measured, commands)
+        low = -_highest_followed(-measured, -np.minimum(commands, high))
+        if np.isfinite(low):  # from above once more, with what is known from below
             high = _highest_followed(measured, np.maximum(commands, low))
-            low = -_highest_followed(-measured, -np.minimum(commands, high))
-            if np.isinf([low, high]).all():
-                break
-        if np.isfinite([low, high]).any():
-            levels = " and ".join(f"{1e3 * level:+.3g}" for level in (low, high) if np.isfinite(level))
-            share = np.mean((commands < low) | (commands > high))
-            lines.append(
-                f"{mode.name}: commands beyond about {levels} nm, {100.0 * share:.2g} % of all, do nothing: the mirror is at its "
-                "limit there, and z, which has the whole of them, is wrong"
-            )
+        if beyond := np.count_nonzero((commands < low) | (commands > high)):
+            levels = " and ".join(f"{1e3 * level:+.3g} nm" for level in (low, high) if np.isfinite(level))
+            known = f"commands beyond about {levels}, {100.0 * beyond / len(y):.2g} % of all, do nothing"
+            lines.append(f"{mode.name}: {known}: the mirror is at its limit there, and z, which has the whole of them, is wrong")
         elif count := max(_count_at_end(commands), _count_at_end(-commands)):
             lines.append(f"{mode.name}: commands stay at their largest value in {count} frames, as at the limit of a mirror")
     return lines
