@@ -232,6 +232,7 @@ def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: 
                     None,
                     0.0,
                     *stretch_of(samples, record.dt),
+                    **_scatter(left[samples], z[samples]),
                 )
             )
     return out
