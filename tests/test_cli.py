@@ -77,6 +77,21 @@ def observed(result):
     return [row for row in json.loads(result.stdout) if row["observer"] not in BOUNDS]
 
 
+def test_observers_are_chosen_by_name_in_every_command_that_runs_them(tmp_path):
+    """The rows are those of these observers and of the bounds."""
+    names = ("--observer", "persistence", "--observer", "zero")
+    record, page = tmp_path / "record.npz", tmp_path / "page.html"
+    for arguments in (("run", *QUICK, "--save", str(record)), ("observe", str(record))):
+        rows = json.loads(call(*arguments, *names, "--json").stdout)
+        assert {row["observer"] for row in rows} - {*BOUNDS} == {"persistence", "zero"}
+    assert call("export", str(page), *QUICK, *names).exit_code == 0
+    text = page.read_text(encoding="utf-8")
+    assert "Persistence" in text and OBSERVERS["butterworth-cl"].label not in text
+    for arguments in (("run",), ("observe", str(record)), ("export", str(page))):
+        result = call(*arguments, "--observer", "nobody")
+        assert (result.exit_code, result.stderr.count("\n")) == (2, 1) and "'nobody': no such observer" in result.stderr
+
+
 def test_a_saved_record_gives_the_same_numbers(tmp_path):
     record, estimates = tmp_path / "r.npz", tmp_path / "e.npz"
     first = call("run", *QUICK, "--json", "--save", str(record))

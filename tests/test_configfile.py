@@ -150,3 +150,14 @@ def test_order_of_precedence(tmp_path):
     assert told == paper().replace({"run.seed": 5, "run.duration": 3.0})
     with pytest.raises(SettingError, match=r"run.warm_up = 30: must be below run.duration = 10 s"):
         configfile.scenario_from(None, None, ("run.warm_up=30",))
+
+
+def test_a_quoted_name_with_dots_is_the_unquoted_one():
+    want = configfile.from_toml("[run]\nduration = 4.0\nseed = 3\n")
+    assert configfile.from_toml('"run.duration" = 4.0\n[run]\nseed = 3\n') == want
+    assert configfile.from_toml('run = {duration = 4.0}\n"run.seed" = 3\n') == want
+    peaks = configfile.parse_toml('x = [{"a.b" = 1, a.c = 2}]\n"" = 3\n')
+    assert peaks == {"x": [{"a": {"b": 1, "c": 2}}], "": 3}
+    for text in ('"run.duration" = 4.0\n[run]\nduration = 5.0\n', '[run]\nduration = 5.0\n["run.duration"]\nx = 1\n'):
+        with pytest.raises(SettingError, match=r"^TOML: run\.duration: is set twice$"):
+            configfile.from_toml(text)

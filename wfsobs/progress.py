@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import count
 
 import numpy as np
@@ -41,9 +41,9 @@ class Watch:
         Receives (target, values so far, with NaN where not yet computed) from observers that compute in blocks.
     """
 
-    progress: Callable[[float], None] = _silent
-    is_cancelled: Callable[[], bool] = _never
-    partial: Callable[[str, NDArray[np.float64]], None] = _keep
+    progress: Callable[[float], None] = field(default=_silent, repr=False)
+    is_cancelled: Callable[[], bool] = field(default=_never, repr=False)
+    partial: Callable[[str, NDArray[np.float64]], None] = field(default=_keep, repr=False)
 
     def check(self) -> None:
         """Raise `Cancelled` if the computation is to stop."""

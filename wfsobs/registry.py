@@ -68,7 +68,7 @@ class Registry(MutableMapping[str, E]):
         Group of entry points.
     built_in : iterable
         Entries of wfsobs.
-    reserved : iterable of str
+    reserved_ids : iterable of str
         Ids that are used for something else.
     """
 

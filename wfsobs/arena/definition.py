@@ -14,6 +14,7 @@ from wfsobs.arena.telemetry import TelemetryCase
 from wfsobs.arena.tracks import TRACKS
 from wfsobs.scenario.configfile import parse_toml, preset
 from wfsobs.settings.errors import SettingError
+from wfsobs.settings.tree import leaves
 from wfsobs.simulation.synthesis import period_steps
 
 FILE = Path(__file__).with_name("arena.toml")
@@ -130,7 +131,7 @@ def _case(entry: Mapping[str, Any], common: Mapping[str, Any], seeds: range, rea
     track, name = entry["track"], entry["name"]
     if track not in TRACKS:
         raise SettingError(f"arena.scenario {name}: track {track!r} is not one of {', '.join(TRACKS)}")
-    changes = {**common, **entry.get("settings", {})}
+    changes = {**dict(leaves(common)), **dict(leaves(entry.get("settings", {})))}
     if quick:
         changes |= {"run.duration": QUICK_DURATION, "run.warm_up": QUICK_WARM_UP, "adaptive.window": 0.5, "events": []}
         changes = {path: value for path, value in changes.items() if not path.startswith("events.")}

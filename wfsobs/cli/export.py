@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from wfsobs.campaign.sweep import MOST_SEEDS
-from wfsobs.cli.options import scenario_options
+from wfsobs.cli.options import observer_option, scenario_options
 from wfsobs.cli.show import progress_bar, warn
 from wfsobs.progress import Watch
 from wfsobs.scenario import configfile
@@ -16,6 +16,7 @@ from wfsobs.settings.errors import SettingError
 @click.command()
 @click.argument("out", metavar="OUT.html")
 @scenario_options
+@observer_option
 @click.option(
     "--vary",
     multiple=True,
@@ -30,7 +31,13 @@ from wfsobs.settings.errors import SettingError
     help="Also run the N - 1 seeds after run.seed, and give intervals of the errors.",
 )
 def export(
-    out: str, preset: str | None, config: str | None, assignments: tuple[str, ...], vary: tuple[str, ...], seeds: int
+    out: str,
+    preset: str | None,
+    config: str | None,
+    assignments: tuple[str, ...],
+    observers: tuple[str, ...],
+    vary: tuple[str, ...],
+    seeds: int,
 ) -> None:
     """Write a report: one HTML file with figures and numbers that opens without a network."""
     base = configfile.scenario_from(preset, config, assignments)
@@ -43,6 +50,7 @@ def export(
         write(
             out,
             base,
+            observers=observers or None,
             vary=variations,
             seeds=seeds,
             preset=configfile.preset_name(preset, config),

@@ -15,6 +15,7 @@ from wfsobs.cli.options import (
     load_declared,
     ngs_options,
     ngs_wiring,
+    observer_option,
     record_options,
     scenario_options,
     stream_elements,
@@ -52,7 +53,7 @@ from wfsobs.units import micrometres_per
 @click.option("--modes", metavar="I,J,...", help="Elements of a frame of the stream, from 0, that are its modes.")
 @ngs_options
 @record_options
-@click.option("--observer", "observers", multiple=True, metavar="NAME", help="Run this observer alone; can be given many times.")
+@observer_option
 @click.option(
     "--controller",
     "controllers",

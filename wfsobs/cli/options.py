@@ -35,6 +35,11 @@ def scenario_options(command: Callable) -> Callable:
     return command
 
 
+observer_option = click.option(
+    "--observer", "observers", multiple=True, metavar="NAME", help="Run this observer alone; can be given many times."
+)
+
+
 def ngs_options(command: Callable) -> Callable:
     """Add --ngs, --ngs-modes and --ngs-lag, the stream of a second sensor."""
     for option in (

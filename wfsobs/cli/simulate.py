@@ -8,7 +8,15 @@ from dataclasses import replace
 import click
 
 from wfsobs.cli.loop_table import loop_table
-from wfsobs.cli.options import declare_format, load_declared, record_options, scenario_options, training, training_options
+from wfsobs.cli.options import (
+    declare_format,
+    load_declared,
+    observer_option,
+    record_options,
+    scenario_options,
+    training,
+    training_options,
+)
 from wfsobs.cli.recovery_tables import OverTime
 from wfsobs.cli.show import (
     add_budgets,
@@ -44,6 +52,7 @@ from wfsobs.units import UNITS
 
 @click.command()
 @scenario_options
+@observer_option
 @click.option(
     "--seeds", type=click.IntRange(1, 100_000), default=1, metavar="N", help="Repeat with seeds run.seed ... run.seed + N - 1."
 )
@@ -65,6 +74,7 @@ def run(
     preset: str | None,
     config: str | None,
     assignments: tuple[str, ...],
+    observers: tuple[str, ...],
     seeds: int,
     as_json: bool,
     save: str | None,
@@ -95,7 +105,8 @@ def run(
             record = simulate(one)
             if save:
                 save_record(save, record, configfile.to_toml(one))
-            result = observe_record(record, one, watch=Watch(progress=lambda f, i=i: update((i + f) / seeds)), is_simulated=True)
+            inner = Watch(progress=lambda f, i=i: update((i + f) / seeds))
+            result = observe_record(record, one, observers=observers or None, watch=inner, is_simulated=True)
             warn(result)
             if history:
                 history.add(result, one.run.seed)

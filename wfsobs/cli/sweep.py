@@ -12,7 +12,7 @@ from rich.table import Table
 
 from wfsobs.campaign.sweep import MOST_SEEDS, parse_axis, plan_sweep
 from wfsobs.campaign.sweep_results import SweepResults, run_sweep
-from wfsobs.cli.options import scenario_options
+from wfsobs.cli.options import observer_option, scenario_options
 from wfsobs.cli.show import progress_bar, show_table
 from wfsobs.evaluation.evidence import FEWEST
 from wfsobs.evaluation.rows import row_label
@@ -39,7 +39,7 @@ from wfsobs.scenario import configfile
     metavar="N",
     help=f"Seeds of every scenario; no difference is significant with fewer than {FEWEST}.",
 )
-@click.option("--observer", "observers", multiple=True, metavar="NAME", help="Run this observer alone; can be given many times.")
+@observer_option
 @click.option("--csv", "csv_file", metavar="FILE", help="Save the errors of all observers.")
 def sweep(
     preset: str | None,

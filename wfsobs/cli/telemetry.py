@@ -7,7 +7,15 @@ import json
 import click
 
 from wfsobs.cli.identification_table import identification_table
-from wfsobs.cli.options import declare_format, load_declared, record_options, scenario_options, training, training_options
+from wfsobs.cli.options import (
+    declare_format,
+    load_declared,
+    observer_option,
+    record_options,
+    scenario_options,
+    training,
+    training_options,
+)
 from wfsobs.cli.show import progress_bar, show, show_table, warn
 from wfsobs.evaluation.rows import score_rows
 from wfsobs.files import check_writable, write_whole
@@ -28,6 +36,7 @@ from wfsobs.telemetry.records import save_arrays
 @scenario_options
 @record_options
 @training_options
+@observer_option
 @click.option("--prior", metavar="FOUND.toml", help="Prior of the observers: the file of `wfsobs identify --out`.")
 @click.option("--out", metavar="ESTIMATES.npz", help="Save every estimate under the key observer/target.")
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
@@ -44,6 +53,7 @@ def observe(
     sha256: str | None,
     train: str | None,
     train_until: float | None,
+    observers: tuple[str, ...],
     prior: str | None,
     out: str | None,
     as_json: bool,
@@ -60,8 +70,9 @@ def observe(
     record = load_declared(record_file, scenario, stated, sha256)
     learnt = training(train, train_until, record, scenario, stated)
     with progress_bar() as update:
+        told = None if prior is None else scenario
         result = observe_record(
-            record, scenario, prior=None if prior is None else scenario, train=learnt, watch=Watch(progress=update)
+            record, scenario, observers=observers or None, prior=told, train=learnt, watch=Watch(progress=update)
         )
     warn(result)
     if out:

@@ -104,7 +104,7 @@ def score(
     *,
     warm_up: float = 0.0,
     mode_names: Sequence[str] | None = None,
-    derive: Derive = make_anew,
+    derive: Derive | None = None,
 ) -> list[Score]:
     """Score estimates: the error where the record has a truth, else that of predicting the next measurement.
 
@@ -129,7 +129,7 @@ def score(
     names = [m.name for m in modes_up_to(HIGHEST_ORDER)][: record.n_modes] if mode_names is None else list(mode_names)
     known = record.turbulence is not None or record.vibration is not None
     if known:
-        return supervised_scores(record, estimates, warm_up, names, derive)
+        return supervised_scores(record, estimates, warm_up, names, derive or make_anew)
     return unsupervised_scores(record, estimates, warm_up, names)
 
 

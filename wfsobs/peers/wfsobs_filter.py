@@ -45,6 +45,8 @@ def make_filter() -> type:
             Micrometres per unit of the modes; SPECULA's modes are in nanometres.
         gain : float
             What the sensor shows of a mode, as measured: measurements are divided by it.
+        target_device_idx, precision : int, optional
+            Those of SPECULA.
         """
 
         def __init__(

@@ -32,7 +32,9 @@ class NotToml(SettingError):
 def parse_toml(text: str) -> dict[str, Any]:
     """Return the tables of a TOML text, from a file, a command line or a link.
 
-    Raises NotToml, and SettingError where values are nested more than DEEPEST deep.
+    A quoted name with dots, "run.duration", is taken as the unquoted one.
+
+    Raises NotToml, and SettingError where values are nested more than DEEPEST deep, or one is set twice.
     """
     too_deep = SettingError(f"tables or lists nested more than {DEEPEST} deep")
     if LONG_NAME.search(text):
@@ -53,7 +55,32 @@ def parse_toml(text: str) -> dict[str, Any]:
         ]
     if level:
         raise too_deep
-    return values
+    return _without_quotes(values)
+
+
+def _without_quotes(node: Any) -> Any:
+    """Return tables and lists in which a quoted name with dots, "run.duration", is what it is without the quotes."""
+    if isinstance(node, list):
+        return [_without_quotes(one) for one in node]
+    if not isinstance(node, dict):
+        return node
+    out: dict[str, Any] = {}
+    for name, value in node.items():
+        inner = _without_quotes(value)
+        for part in reversed(name.split(".")):
+            inner = {part: inner}
+        _merge(out, inner)
+    return out
+
+
+def _merge(into: dict[str, Any], table: dict[str, Any], where: str = "") -> None:
+    for name, value in table.items():
+        if isinstance(value, dict) and isinstance(into.get(name), dict):
+            _merge(into[name], value, f"{where}{name}.")
+        elif name in into:
+            raise SettingError(f"{where}{name}: is set twice")
+        else:
+            into[name] = value
 
 
 def to_toml(scenario: Scenario) -> str:

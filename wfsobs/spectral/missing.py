@@ -44,7 +44,7 @@ class MissingSamples:
 
     Parameters
     ----------
-    gone : Array
+    is_missing : Array
         Which samples are missing, bool (n,).
     dt : float
         Time step [s].

@@ -21,11 +21,12 @@ def export(
     path: str | Path,
     scenario: Scenario,
     *,
+    observers: Sequence[str] | None = None,
     vary: Sequence[Variation] = (),
     preset: str = "paper",
     seeds: int = 1,
     watch: Watch = QUIET,
-    on_result: Callable[[Result], None] = lambda result: None,
+    on_result: Callable[[Result], None] | None = None,
 ) -> None:
     """Run a scenario and write a report: one HTML file with figures and numbers that opens without a network.
 
@@ -35,6 +36,8 @@ def export(
         File to write.
     scenario : Scenario
         Settings of the run.
+    observers : sequence of str, optional
+        Ids of the observers; by default all that the scenario has something for.
     vary : sequence of Variation, optional
         Settings and their values (`wfsobs.scenario.grid.parse_variation`); every combination is run.
     preset : str
@@ -64,8 +67,9 @@ def export(
         for number in range(seeds):
             done, scenario_of_seed = i + number / seeds, one.replace({"run.seed": one.run.seed + number}) if number else one
             inner = Watch(lambda f, done=done: watch.progress((done + f / seeds) / len(chosen)), watch.is_cancelled)
-            of.append(run(scenario_of_seed, watch=inner))
-        on_result(of[0])
+            of.append(run(scenario_of_seed, observers=observers, watch=inner))
+        if on_result is not None:
+            on_result(of[0])
         evidence = gather_evidence([result.scores for result in of]) if seeds > 1 else None
         kept.append(state_of(of[0], len(chosen), evidence=evidence))
     content = page(Report(preset, scenario, tuple(vary), tuple(kept)), datetime.now().astimezone()).encode()

@@ -32,7 +32,7 @@ class FrameEstimator(LinearEstimator):
         Of the slow filters.
     spread : callable
         (mode, target, fast steps since the frame) -> row of the slow filter's state.
-    held : bool
+    holds : bool
         Whether an estimate is held until the next frame, so that any fraction of a frame is defined.
     """
 
