@@ -34,9 +34,7 @@ if TYPE_CHECKING:
 
 
 class Estimator(Stateful, Protocol):
-    """The part of a step observer that differs from observer to observer.
-
-    Measurements reach it complete, or with NaN where the observer takes missing ones.
+    """What differs from observer to observer. Measurements come complete, or with NaN where it takes missing ones.
 
     Attributes
     ----------
@@ -57,10 +55,7 @@ class Estimator(Stateful, Protocol):
         ...
 
     def predict(self, frames: float, target: str) -> tuple[Array, Array]:
-        """Return (mean, sd) of the target that many frames ahead, each (n_modes,) [um], good until the next frame or prediction.
-
-        Raises StepError.
-        """
+        """Return (mean, sd) of the target so many frames ahead, (n_modes,) [um], good until the next call. Raises StepError."""
         ...
 
     def settle(self) -> None:

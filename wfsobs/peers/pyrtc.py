@@ -1,11 +1,12 @@
-"""Observers as predictors of pyRTC: `type: wfsobs` in the `predictor` of a loop.
+"""Observers as predictors of pyRTC: `type: wfsobs` in the `predictor` of a loop. Importing this registers them, where pyRTC is.
 
-pyRTC imports the module that a component names. A loop of `class_name: Loop` and `class_file: .../wfsobs/peers/pyrtc.py` is
-pyRTC's own, with the predictor registered; its base class is pyRTC's and is asked for when it runs, as pyRTC has another licence.
+pyRTC imports the module that a component names; the loop of `class_name: Loop` and `class_file: .../wfsobs/peers/pyrtc.py` is its
+own. Base class and loop are pyRTC's and are looked for when they run, as pyRTC has another licence.
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 from wfsobs.peers.predictor import LoopPredictor
@@ -27,10 +28,13 @@ def register_predictor() -> type[LoopPredictor]:
 
 
 def __getattr__(name: str) -> Any:
-    """Return pyRTC's `Loop`, the predictor registered."""
+    """Return pyRTC's `Loop`."""
     if name != "Loop":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from pyrtc.loop import Loop  # pyright: ignore[reportMissingImports]
 
-    register_predictor()
     return Loop
+
+
+with suppress(ModuleNotFoundError):
+    register_predictor()
