@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from wfsobs.app.style import PRIMARY, look, observers_of
 from wfsobs.app.work import TRUTH
 from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 
 Array = NDArray[np.float64]
@@ -36,6 +37,12 @@ XYZ = np.array([[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721
 
 TOGETHER = {**{target: [TRUTH, *observers_of(target)] for target in TARGETS}, "controllers": list(CONTROLLERS)}
 """Lines that share a figure."""
+
+OFTEN_FIRST = ("kf-lgs", "gpr-online", "multirate-optimal", "multirate-multi", "multirate-adaptive", "gp-both")
+"""The references, and those that are the best of most scenarios."""
+
+CLEARLY_APART = 25.0
+"""A difference in CIE L*a*b* that lines which cross each other show."""
 
 TOLD_APART = 20.0
 """A difference in CIE L*a*b* that thin lines show as well."""
@@ -77,6 +84,27 @@ def test_lines_differ_in_colour_or_dash(together: list[str], sight: str, dark: b
 def test_lines_stand_out(dark: bool, background: str) -> None:
     faint = {name: contrast(look(name).colour(dark), background) for names in TOGETHER.values() for name in names}
     assert {name: c for name, c in faint.items() if c < 2.9} == {}
+
+
+@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("sight", ["common", "deuteranopia"])
+@pytest.mark.parametrize("target", TARGETS)
+def test_lines_that_are_shown_at_first_differ_by_colour_alone(target: str, sight: str, dark: bool) -> None:
+    """Dashes of thin lines on top of each other run together."""
+    seen = {name: lab(SIGHT[sight] @ linear(look(name).colour(dark))) for name in OFTEN_FIRST if name in observers_of(target)}
+    close = [(a, b) for a, b in combinations(seen, 2) if np.linalg.norm(seen[a] - seen[b]) < CLEARLY_APART]
+    assert close == []
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_families_hold_without_green(dark: bool) -> None:
+    """For a deuteranope filters of one sensor are yellow, multi-rate ones blue, Gaussian processes grey."""
+    blueness = {o.id: -lab(SIGHT["deuteranopia"] @ linear(o.look.colour(dark)))[2] for o in OBSERVERS.values()}
+    single, both, processes = (
+        [value for name, value in blueness.items() if name.startswith(family) and name != "kf-ngs"]  # the paper's NGS is blue
+        for family in ("kf-", "multirate", "gp")
+    )
+    assert max(single) < min(processes) - 5.0 and max(processes) < min(both) - 5.0
 
 
 def test_black_and_white_have_the_highest_contrast() -> None:

@@ -171,7 +171,7 @@ def test_a_bad_value_shows_beside_its_setting(controls: Controls, path: str, tex
     assert says in error_of(controls, path)
     assert field.widgets[-1].error_state and field.widgets[-1].value == text, "what was typed stays, to be corrected"
     assert controls.store.run.result is shown and controls.store.scenario is scenario
-    assert status_of(controls.store)[1] == f"Not accepted: {setting_name(path)}" == controls.status.note
+    assert status_of(controls.store)[2] == f"Not accepted: {setting_name(path)}" == controls.status.note
 
 
 def test_what_is_being_typed_stays_when_another_setting_changes(controls: Controls) -> None:
@@ -202,6 +202,15 @@ def test_a_slider_grows_to_hold_a_typed_value(controls: Controls, loop: Any) -> 
     controls.store.change("turbulence.wind_speed", 10)
     assert field.widgets[0].end == 40.0
     loop.finish(controls.store)
+
+
+def test_a_long_number_fits_its_box(controls: Controls) -> None:
+    """A box beside a slider has room for seven characters; what is kept has all digits."""
+    slider, box = field_of(controls, "turbulence.wind_speed").widgets
+    controls.store.change("turbulence.wind_speed", 18.475123456)
+    assert (box.value, slider.value) == ("18.4751", 18.475123456)
+    box.param.trigger("value")
+    assert controls.store.value("turbulence.wind_speed") == 18.475123456
 
 
 def test_choices_and_switches_run(controls: Controls, loop: Any) -> None:
@@ -291,7 +300,7 @@ class TestPeaks:
         """What is kept has all digits."""
         peak = {"frequency": 17.25123, "damping": 0.0123456, "rms": [0.0084123, 0.02]}
         controls.store.replace({PATH: [peak]})
-        assert controls.lists[PATH].table.rows == [["17.25", "0.01235", "0.00841", "0.02"]]
+        assert controls.lists[PATH].table.rows == [["17.2512", "0.01235", "0.00841", "0.02"]]
         assert controls.store.value(PATH)[0].to_dict() == peak
 
     @pytest.mark.parametrize(

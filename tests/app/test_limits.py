@@ -214,7 +214,7 @@ def test_pages_come_from_where_the_server_is_reached() -> None:
     ("embedders", "ancestors"), [((), "'none'"), (("https://a.org", "http://b:80"), "https://a.org http://b:80")]
 )
 def test_only_the_pages_named_may_show_this_one_in_a_frame(embedders: tuple[str, ...], ancestors: str) -> None:
-    transform = SecurityHeaders(embedders, HTTPServerRequest(start_line=RequestStartLine("GET", "/", "HTTP/1.1")))
+    transform = SecurityHeaders(embedders, HTTPServerRequest(start_line=RequestStartLine("GET", "/", "HTTP/1.0")))
     _, headers, _ = transform.transform_first_chunk(200, HTTPHeaders(), b"", True)
     assert headers["Content-Security-Policy"] == f"frame-ancestors {ancestors}"
 

@@ -15,7 +15,7 @@ from wfsobs.app.jobs.job import DONE, RUNNING
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.main_lines import REFERENCES, MainLines, main_observers
 from wfsobs.app.views.traces import first_window
-from wfsobs.evaluation.rows import is_non_causal
+from wfsobs.evaluation.rows import NO_ESTIMATE, is_non_causal
 from wfsobs.evaluation.scores import PREDICTION, Score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
@@ -69,6 +69,21 @@ class TestRule:
 
     def test_all_where_nothing_can_be_compared(self) -> None:
         assert main_observers([], "vibration", "tip") == observers_of("vibration")
+
+    def test_the_best_of_the_verdict_over_seeds_is_among_them(self, scores: tuple[Score, ...]) -> None:
+        leader = others_of(scores, "turbulence")[0]
+        assert leader in main_observers(scores, "turbulence", "tip", (leader,))
+
+    def test_whatever_can_be_best_has_a_line(self) -> None:
+        for target in TARGETS:
+            assert {*observers_of(target)} == {o.id for o in OBSERVERS.values() if target in o.targets} - {NO_ESTIMATE}
+
+    def test_what_runs_has_a_card(self, dashboard: Dashboard) -> None:
+        shown = dashboard.store.run.result
+        for target in TARGETS:
+            ran = [name for name in observers_of(target) if shown.result.estimate(name, target) is not None]
+            assert [card["name"] for card in dashboard.explore.strips[target].cards.items] == ["truth", *ran]
+            assert not {"kf-coupled", "kf-asterism"} & {*ran}, "there is nothing to run them on"
 
 
 class TestChoice:

@@ -241,14 +241,28 @@ def test_the_page_shows_the_place(service: Service, make_store: Any, loop: Any) 
     store.run.session.post = loop.queue.put
     store.run.start(asked[2].job)
     loop.until(lambda: store.run.place == 2)
-    assert status_of(store)[0] == "Waiting: position 2" and store.run.state == RUNNING
+    assert status_of(store)[1] == "Waiting: position 2" and store.run.state == RUNNING
     for one in asked[:2]:
         one.gate.set()
     loop.until(lambda: store.run.place == 0)
     asked[2].job.tell(progress=0.25)
-    loop.until(lambda: status_of(store)[0] == "Running, 25 %")
+    loop.until(lambda: status_of(store)[1] == "Running, 25 %")
     store.run.cancel()
     log.until(lambda: not log.running.total())
+
+
+def test_the_top_of_the_page_names_what_goes_on_beside_the_run(make_store: Any) -> None:
+    store = make_store()
+    store.run.state = DONE
+    before = status_of(store)
+    tasks = [BackgroundTask(store.session, title=name) for name in ("Sweep", "Tuning")]
+    for task in tasks:
+        task.param.update(state=RUNNING, progress=0.25)
+    assert status_of(store)[:2] == (0.25, "Tuning, 25 %")
+    tasks[1].refuse("no")
+    assert status_of(store)[:2] == (0.25, "Sweep, 25 %")
+    tasks[0].cancel()
+    assert status_of(store) == before
 
 
 def test_a_task_shows_one_job_at_a_time(service: Service, loop: Any, caplog: Any) -> None:

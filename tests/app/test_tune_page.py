@@ -13,9 +13,11 @@ import pytest
 from wfsobs.app.controls.names import setting_name
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING
+from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.limits import Limits
 from wfsobs.app.numerals import number
 from wfsobs.app.pages.pages import TUNE
+from wfsobs.app.pages.parts import Starter
 from wfsobs.app.pages.tune import TunePage
 from wfsobs.app.pages.tune_views import unit_for
 from wfsobs.app.sources import LoadedRecord
@@ -132,6 +134,15 @@ def test_progress_cancel_and_errors(page: TunePage, dashboard: Dashboard, loop: 
     assert shown is not None
     estimate = seconds(shown, dashboard.store.scenario, "gpr-online", 1000)
     assert page.work.message == f"The tuning would take about {estimate:.0f} s, at most 0.01 on this server" and estimate > 1.0
+
+
+@pytest.mark.parametrize(("state", "disabled"), [(FAILED, True), (CANCELLED, True), (RUNNING, True), (DONE, False)])
+def test_only_what_is_done_can_be_used(dashboard: Dashboard, state: str, disabled: bool) -> None:
+    """The result may be that of an earlier work."""
+    work = BackgroundTask(dashboard.store.session)
+    starter = Starter(work, "Start", "Progress")
+    work.param.update(state=state, result=1)
+    assert starter.uses[0].disabled == disabled
 
 
 def test_the_least_so_far() -> None:

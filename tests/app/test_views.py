@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -11,9 +12,10 @@ from bokeh.models import CrosshairTool
 
 from tests.records import ON_PAPER
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.display import per_micrometre
+from wfsobs.app.display import RUNNING_RMS, SIGNAL, per_micrometre
 from wfsobs.app.downloads import data_csv
 from wfsobs.app.numerals import number
+from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.style import look
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.traces import BINS
@@ -22,6 +24,8 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import PLAIN
+from wfsobs.scenario import Scenario
+from wfsobs.simulation.loop import simulate
 
 
 def trace(dashboard: Dashboard, target: str) -> dict[str, Any]:
@@ -58,9 +62,7 @@ class TestTraces:
         dashboard.display.show = "signal"
         shown = dashboard.store.run.result
         data = trace(dashboard, "turbulence")
-        filters = {"kf-lgs", "kf-multi", "kf-adaptive", "kf-ngs"}
-        multirate = {"multirate", "multirate-optimal", "multirate-multi", "multirate-adaptive"}
-        assert set(data) == {"x", TRUTH, *filters, *multirate}
+        assert set(data) == {"x", TRUTH, *(o.id for o in OBSERVERS.values() if "turbulence" in o.targets)} - {"zero"}
         expected = 1e3 * envelope(shown.values("kf-lgs", "turbulence")[:, 0], BINS)
         assert np.allclose(data["kf-lgs"], expected, rtol=1e-6)
         assert data["x"][0] >= 0 and data["x"][-1] <= 2.0 and data["x"].size == data[TRUTH].size
@@ -233,7 +235,7 @@ class TestNumbers:
             if (s.observer, s.target, s.mode) == ("gpr-online", "vibration", "tip")
         )
         assert cards["gpr-online"]["value"] == number(1e3 * score.rms) and cards["gpr-online"]["unit"] == "nm"
-        assert cards["gpr-online"]["colour"] == "#004B00"
+        assert cards["gpr-online"]["colour"] == look("gpr-online").light
         assert cards[TRUTH]["value"] == number(1e3 * score.truth_rms)
         assert "zero" not in cards
 
@@ -343,3 +345,15 @@ def test_the_verdict_stays_dimmed_until_the_next_one(dashboard: Dashboard, loop:
     assert line.pane.object == '<p class="verdict before"></p>', "nothing is known of another mode yet"
     loop.finish(dashboard.store)
     assert "Vibration, tilt: " in line.pane.object
+
+
+def test_a_record_without_truth_leaves_no_choice_but_its_signals(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
+    switch = dashboard.explore.show_switch
+    dashboard.display.show = RUNNING_RMS
+    record = replace(simulate(short), turbulence=None, vibration=None)
+    dashboard.store.run_on(LoadedRecord(record, "night.npz", "key"), short)
+    loop.finish(dashboard.store)
+    assert (dashboard.display.show, switch.value, switch.disabled) == (SIGNAL, SIGNAL, True)
+    dashboard.store.run_on(None, short)
+    loop.finish(dashboard.store)
+    assert (dashboard.display.show, switch.value, switch.disabled) == (RUNNING_RMS, RUNNING_RMS, False)

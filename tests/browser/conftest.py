@@ -20,6 +20,10 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
 
+from wfsobs.app.style import observers_of
+from wfsobs.priors_from.selection import usual_observers
+from wfsobs.scenario.presets import PRESETS
+
 ROOT = Path(__file__).parents[2]
 FLAGS = [
     "--no-sandbox",
@@ -39,6 +43,12 @@ CLOSED_MID_UPDATE = (
 )
 """What a page that closes during an update leaves in the log; nothing else is let through. The last two are Bokeh's own: a
 page that closes before its session is there, and a change that is read when its connection has been closed."""
+
+
+def carded(target: str) -> list[str]:
+    """The observers of a target that run on the paper's scenario, each with a card."""
+    usual = usual_observers(PRESETS["paper"]())
+    return [name for name in observers_of(target) if name in usual]
 
 
 expect.set_options(timeout=60_000)  # a busy machine is no fault

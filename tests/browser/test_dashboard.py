@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 
-from wfsobs.app.style import observers_of
+from tests.browser.conftest import carded
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario.presets import PRESETS
 
@@ -122,7 +122,7 @@ def test_first_paint(wide: Page, tmp_path: Path) -> None:
         assert float(value) > 0 and float(truth) > 0
         assert float(relative) == pytest.approx(float(value) / float(truth), rel=0.02)
         assert lag and float(seconds) > 0
-    expect(page.locator(".card")).to_have_count(sum(1 + len(observers_of(target)) for target in TARGETS))
+    expect(page.locator(".card")).to_have_count(sum(1 + len(carded(target)) for target in TARGETS))
     lines = page.locator(".card[aria-pressed=true]").count()
     assert 2 * len(TARGETS) < lines < 20, "the truth and the few observers that matter"
     drawn = f"n => {{ const all = ({POINTS})(); return all.length === n && Math.min(...all) > 300 }}"

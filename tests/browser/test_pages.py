@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 
-from wfsobs.app.style import observers_of
+from tests.browser.conftest import carded
 from wfsobs.observers.base import TARGETS
 
 MODELS = "[...Bokeh.index.roots[0].model.document._all_models.values()]"
@@ -27,7 +27,7 @@ ERRORS = """() => {
 """Of the observers of the turbulence, in the order of the table."""
 SLOW = 60_000
 """What a page may take on a machine that is busy with other things [ms]."""
-IN_EACH = [1 + len(observers_of(target)) for target in TARGETS]
+IN_EACH = [1 + len(carded(target)) for target in TARGETS]
 ALL_LINES = 2 * sum(IN_EACH)
 LINES_OF_FIGURES = 2 * 2 + 2 * 2 + 2 * 4 + 3 * 4
 

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 
-from wfsobs.app.style import observers_of
+from tests.browser.conftest import carded
 
 ALLOWED: Mapping[str, tuple[str, int, str]] = MappingProxyType(
     {
@@ -277,7 +277,7 @@ def test_the_figures_are_not_far(open_page: Any) -> None:
     expect(page.get_by_role("button", name="Skip to figures")).to_be_in_viewport()
     press(page, "Enter")
     assert until(page, "Truth", most=10), "a card of the first strip"
-    stops = len(observers_of("turbulence")) + 4  # a card each, three buttons below them, and the figure
+    stops = len(carded("turbulence")) + 4  # a card each, three buttons below them, and the figure
     assert until(page, "Turbulence time trace", most=stops), "a figure has a name"
     for name in ("Page", "Mode", "Unit", "Show", "Spectrum"):
         expect(page.get_by_role("group", name=name, exact=True)).to_be_visible()

@@ -24,6 +24,12 @@ def test_values_at_the_pointer_and_by_the_arrow_keys(page: Page) -> None:
     expect(box).not_to_contain_text("Adaptive KF")  # hidden
     page.mouse.move(at["x"] + at["width"] / 2, at["y"] - 60)
     expect(box).to_be_hidden()
+    page.mouse.move(at["x"] + at["width"] / 2, at["y"] + at["height"] / 2)
+    expect(box).to_be_visible()
+    page.mouse.wheel(0, 3000)  # away from the figure
+    expect(box).to_be_hidden()
+    page.mouse.move(1, 1)
+    figure.scroll_into_view_if_needed()
     figure.locator(".bk-events").focus()
     page.keyboard.press("ArrowRight")
     expect(page.get_by_role("status").filter(has_text=re.compile(r"(frequency|time)\s*[\d.]+ (Hz|s)"))).to_be_visible()

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import time
+import zlib
 from collections.abc import Callable, Iterator
 from importlib.resources import files
 from itertools import product
@@ -21,6 +22,7 @@ from playwright.sync_api import Browser, Locator, Page, expect
 import wfsobs
 from wfsobs.app.display import UNITS, per_micrometre
 from wfsobs.app.numerals import number
+from wfsobs.app.style import TERM_COLOURS
 from wfsobs.app.work import TRUTH
 from wfsobs.cli import main
 from wfsobs.evaluation.error_spectra import cumulative_rms, spectra
@@ -169,6 +171,7 @@ def test_lines_follow_the_switches(open_report: Any) -> None:
     estimate, truth = result.estimate("kf-lgs", "vibration"), result.record.vibration
     assert estimate is not None and truth is not None
     slide(page, 0, 0)
+    choose(page, "Signal")
 
     def shows(name: str, values: np.ndarray, scale: float) -> dict[str, Any]:
         got = line(page, "trace-vibration", name)
@@ -311,6 +314,40 @@ def test_accessible_and_no_wider_than_the_window(open_report: Any, width: int, s
     page.emulate_media(color_scheme={"light": "dark", "dark": "light"}[scheme])
     follows = f"before => ({LINE})(['trace-vibration', 'kf-lgs']).colour !== before"
     page.wait_for_function(follows, arg=colour[scheme])
+
+
+def test_opens_with_the_verdict_and_the_errors_of_the_main_lines(open_report: Any) -> None:
+    page = open_report()
+    expect(page.locator(".box h2").first).to_have_text("Verdict")
+    best = page.locator("p.verdict").filter(visible=True)
+    expect(best).to_have_text([re.compile("^Turbulence, tip: "), re.compile("^Vibration, tip: ")])
+    choose(page, "Tilt")
+    expect(best).to_have_text([re.compile("^Turbulence, tilt: "), re.compile("^Vibration, tilt: ")])
+    first = line(page, "trace-vibration", "kf-lgs")
+    assert first["label"].startswith("error of tilt") and first["visible"]
+    shown = page.locator("#cards-vibration .card[aria-pressed=true]")
+    few = shown.count()
+    assert few < page.locator("#cards-vibration .card").count()
+    assert not line(page, "trace-vibration", "butterworth-cl")["visible"]
+    page.locator("#cards-vibration").get_by_role("button", name="Show all").click()
+    assert line(page, "trace-vibration", "butterworth-cl")["visible"]
+    page.locator("#cards-vibration").get_by_role("button", name="Show the main ones").click()
+    expect(shown).to_have_count(few)
+
+
+def test_on_paper_bars_have_their_colours_and_nothing_is_cut(open_report: Any) -> None:
+    page = open_report()
+    parts = re.findall(rb"stream\r?\n(.*?)\r?\nendstream", page.pdf(format="A4"), re.S)
+    drawn = b"".join(zlib.decompress(part) for part in parts if part[:1] == b"x")
+    fills = {tuple(map(float, colour)) for colour in re.findall(rb"([\d.]+) ([\d.]+) ([\d.]+) rg", drawn)}
+    for colour in TERM_COLOURS.values():
+        rgb = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+        assert any(np.allclose(fill, rgb, atol=0.002) for fill in fills), colour
+    page.emulate_media(media="print")
+    width = round((210 - 2 * 10) / 25.4 * 96)  # A4 within its margins [px]
+    page.set_viewport_size({"width": width, "height": 1000})
+    wide = "() => [...document.querySelectorAll('.scroll')].filter(it => it.scrollWidth > it.clientWidth).length"
+    page.wait_for_function(f"width => document.documentElement.scrollWidth <= width && ({wide})() === 0", arg=width)
 
 
 def test_the_policy_holds(open_report: Any) -> None:

@@ -97,7 +97,8 @@ def test_a_state_has_the_lines_of_the_result(result: Result) -> None:
 
 
 def test_an_unfinished_observer_is_named(result: Result) -> None:
-    part = replace(result, estimates=tuple(e for e in result.estimates if e.observer != "gpr-online"))
+    done = {name: tuple(it for it in getattr(result, name) if it.observer != "gpr-online") for name in ("estimates", "scores")}
+    part = replace(result, **done)
     assert state_of(part).reasons == ("gpr-online left out: not finished when the report was made",)
 
 

@@ -23,7 +23,7 @@ from wfsobs.app.history import History
 from wfsobs.app.jobs.job import FAILED
 from wfsobs.app.pages.explore import Explore
 from wfsobs.app.pages.pages import LIVE, Pages
-from wfsobs.app.pages.parts import WIDE
+from wfsobs.app.pages.parts import ON_ONE_LINE, WIDE
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import Post, Session
 from wfsobs.app.store import Store
@@ -194,7 +194,15 @@ class Dashboard:
 
     def _top(self) -> pn.FlexBox:
         """Lay out the buttons of the pages, and the switches that all pages share."""
-        return pn.FlexBox(self.pages.switch, *self.modes.view(), *self.units.view(), gap="12px", align_items="center", **WIDE)
+        return pn.FlexBox(
+            self.pages.switch,
+            *self.modes.view(),
+            *self.units.view(),
+            gap="12px",
+            align_items="center",
+            **WIDE,
+            stylesheets=[ON_ONE_LINE],
+        )
 
     def _row_of_actions(self) -> pn.Row:
         return pn.Row(self.actions.toolbar, self.upload.picker, **WIDE, stylesheets=[ACTIONS])

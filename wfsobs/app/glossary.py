@@ -9,7 +9,11 @@ from markupsafe import Markup, escape
 
 from wfsobs.app.render import macro
 
-BOUND, NEEDS, LAG, STREHL, RELATIVE, RMS_ERROR, REAL_TIME, STATED = (
+KF, GPR, LGS, NGS, BOUND, NEEDS, LAG, STREHL, RELATIVE, RMS_ERROR, REAL_TIME, STATED = (
+    "KF",
+    "GPR",
+    "LGS",
+    "NGS",
     "Bound",
     "Needs",
     "Lag",
@@ -22,6 +26,16 @@ BOUND, NEEDS, LAG, STREHL, RELATIVE, RMS_ERROR, REAL_TIME, STATED = (
 
 TERMS: Mapping[str, str] = MappingProxyType(
     {
+        KF: (
+            "Kalman filter: estimates turbulence and vibration step by step from a state-space model of both. A multi-rate one "
+            "uses LGS and NGS, each at its own rate; an adaptive one identifies its model from the measurements."
+        ),
+        GPR: (
+            "Gaussian process regression: predicts the vibration from past measurements, without a model of its peaks. The "
+            "offline one is trained on an earlier record, the online one during the run."
+        ),
+        LGS: "Laser guide star: measured at the rate of the loop, with a slow error of its own in tip and tilt.",
+        NGS: "Natural guide star: measured once in several steps of the loop (exposure ratio n), without that slow error.",
         RMS_ERROR: (
             "Root mean square of estimate minus truth after the warm-up, over the samples that all observers have. "
             "Smaller is better."

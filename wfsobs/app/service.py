@@ -13,6 +13,8 @@ from math import isfinite
 from time import monotonic
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import param
+
 from wfsobs.app.cache import Cache, key_of
 from wfsobs.app.jobs.job import IDLE_TIME, Job, Listener, Tell, Work
 from wfsobs.app.jobs.queue import JobQueue, release_memory
@@ -150,13 +152,16 @@ class Service:
         return self.queue.close(timeout)
 
 
-class Session:
+class Session(param.Parameterized):
     """One visitor: their number, their tasks, and how another thread has something done on theirs.
 
     Before the visitor has come, what is not known already waits for them.
     """
 
+    doing = param.Dict({}, doc="What is at work beside the run: its name -> fraction done, and how it is going in a line.")
+
     def __init__(self, service: Service):
+        super().__init__()
         self.service, self.number = service, 0
         self.post: Post = lambda function: function()
         self.tasks: list[BackgroundTask] = []

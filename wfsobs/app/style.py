@@ -1,7 +1,9 @@
 """Colours, dashes and names: how an observer or a controller looks wherever it appears.
 
-Observers and controllers say it themselves; here are the other lines. The colours are the paper's. In dark mode each has a
-lighter relative; dashes tell apart what comes close in colour.
+Observers and controllers say it themselves; here are the other lines. Filters of one sensor are warm, multi-rate ones violet,
+Gaussian processes blue-green: families that hold without red or green cones. LGS, NGS, multi-rate and Butterworth have the
+paper's colours; its greens of the GPR, one with orange and red for a deuteranope, are bluer here. In dark mode each has a lighter
+relative; dashes tell apart what comes close in colour.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from wfsobs.app.render import macro
 from wfsobs.app.work import TRUTH
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.budget import CONE, LAG, LINES, MISMATCH, NOISE
+from wfsobs.evaluation.rows import NO_ESTIMATE
 from wfsobs.evaluation.scores import BOUND, BOUND_ASTERISM, BOUND_BOTH, BOUND_BOTH_MODES, BOUND_MODES, BOUND_STARS
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import PLAIN, TARGETS, Look
@@ -72,10 +75,17 @@ PRIMARY = "#0B4F6C"
 _COMPONENTS = {
     "MuiAppBar": {"styleOverrides": {"root": {"backgroundColor": f"{PRIMARY} !important", "color": "#fff !important"}}},
     "MuiButton": {"styleOverrides": {"root": {"textTransform": "none"}}},
-    # The drawer of a phone is open when the page comes, until the browser has closed it (frame.js).
-    "MuiDrawer": {"styleOverrides": {"modal": {"@media (max-width: 599.95px)": {"visibility": "var(--wfsobs-drawer, hidden)"}}}},
+    # The drawer over a narrow page is open when the page comes, until the browser has closed it (frame.js).
+    "MuiDrawer": {"styleOverrides": {"modal": {"@media (max-width: 999.95px)": {"visibility": "var(--wfsobs-drawer, hidden)"}}}},
     # Why a setting has no effect is to be read, though its box is grey.
     "MuiFormHelperText": {"styleOverrides": {"root": {"&.Mui-disabled": {"color": "inherit", "opacity": 0.75}}}},
+    # Above the line of its mark: beside it is the box with the number that is being changed.
+    "MuiTooltip": {
+        "styleOverrides": {
+            "tooltipPlacementRight": {"transform": "translateY(calc(-50% - 12px)) !important"},
+            "arrow": {"display": "none"},
+        }
+    },
     "MuiToggleButton": {
         "styleOverrides": {
             # On the grey that is under the pointer the words would be too faint.
@@ -85,11 +95,16 @@ _COMPONENTS = {
 }
 
 
+_BREAKPOINTS = {"values": {"xs": 0, "sm": 1000, "md": 1100, "lg": 1200, "xl": 1536}}
+"""Widths [px]; below `sm` the drawer lies over the page: beside it, at a zoom of 200 %, there is no room for a figure."""
+
+
 def theme() -> dict[str, Any]:
     """Return the page's colours in light and dark mode; units are written as they are, not in capitals."""
+    common = {"components": _COMPONENTS, "breakpoints": _BREAKPOINTS}
     return {
-        "light": {"palette": {"primary": {"main": PRIMARY}}, "components": _COMPONENTS},
-        "dark": {"palette": {"primary": {"main": "#6FB7D6", "dark": "#8CC9E2"}}, "components": _COMPONENTS},
+        "light": {"palette": {"primary": {"main": PRIMARY}}, **common},
+        "dark": {"palette": {"primary": {"main": "#6FB7D6", "dark": "#8CC9E2"}}, **common},
     }
 
 
@@ -113,13 +128,13 @@ def labels() -> dict[str, str]:
     return {name: look(name).label for name in (*LOOKS, *OBSERVERS, *CONTROLLERS)}
 
 
-def observers_of(target: str, with_hidden: bool = False) -> list[str]:
+def observers_of(target: str, with_zero: bool = False) -> list[str]:
     """List the observers that estimate a target, or both for TOTAL, in the order of the registry.
 
-    with_hidden : also those that stand in tables only
+    with_zero : also no estimate at all, a row of tables; its line is the axis
     """
     wanted = set(TARGETS if target == TOTAL else (target,))
-    return [o.id for o in OBSERVERS.values() if wanted <= set(o.targets) and (with_hidden or o.look.in_figures)]
+    return [o.id for o in OBSERVERS.values() if wanted <= set(o.targets) and (with_zero or o.id != NO_ESTIMATE)]
 
 
 def asset(name: str) -> str:

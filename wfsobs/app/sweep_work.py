@@ -32,7 +32,7 @@ class SweepTask(BackgroundTask):
     """
 
     def __init__(self, session: Session):
-        super().__init__(session)
+        super().__init__(session, title="Sweep")
         self._one = BackgroundTask(session)
         self._cell, self._base_key, self._start = 0, "", 0.0
         self._one.param.watch(self._take, ["state", "place"])

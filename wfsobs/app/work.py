@@ -21,6 +21,7 @@ from wfsobs.app.sources import Source
 from wfsobs.dependence import Memo, RecordMemo, digest, simulate_once
 from wfsobs.evaluation.error_spectra import spectra
 from wfsobs.evaluation.record_bounds import Bound, joint_observers, record_bounds
+from wfsobs.evaluation.rows import NO_ESTIMATE
 from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import SLOW, TARGETS
@@ -178,7 +179,7 @@ class _Work:
         key = (estimate.observer, estimate.target)
         self.estimates.append(estimate)
         self.growing.pop(key, None)
-        if not OBSERVERS[estimate.observer].look.in_figures:
+        if estimate.observer == NO_ESTIMATE:
             return  # it stands in the table alone
         truth = record.truth(estimate.target)
         make = partial(self._spectrum, record, estimate.target, estimate.values)

@@ -145,12 +145,12 @@ function tellDrawn(model) {
   look()
 }
 
-// On a phone the drawer lies over the page: its style hides it until it has been closed here, and is opened.
-const PHONE = "(max-width: 599.95px)"
+// In a narrow window the drawer lies over the page: its style hides it until it has been closed here, and is opened.
+const NARROW = "(max-width: 999.95px)"
 function closeDrawer(doc) {
   const page = [...doc._all_models.values()].find((it) => it.data?.attributes && "sidebar_open" in it.data.attributes)
   const allow = () => document.documentElement.style.setProperty("--wfsobs-drawer", "visible")
-  if (!page || !matchMedia(PHONE).matches) return allow()
+  if (!page || !matchMedia(NARROW).matches) return allow()
   page.data.sidebar_open = false
   page.data.properties.sidebar_open.change.connect(allow)
 }

@@ -29,7 +29,7 @@ function offerSweep(model, el) {
     const seen = box && box.height > 0 && box.top >= 0 && box.bottom <= window.innerHeight
     if (button.matches(":popover-open") !== Boolean(seen)) button.togglePopover(Boolean(seen))
     if (!seen) return
-    button.style.top = `${box.top - 8}px`
+    button.style.top = `${box.top < button.offsetHeight ? box.bottom : box.top - button.offsetHeight}px` // not over what is changed
     button.style.left = `${Math.max(box.right - button.offsetWidth, 0)}px`
   }
   const offer = (event) => {

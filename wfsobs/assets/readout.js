@@ -60,7 +60,8 @@ export function render({model, el}) {
     })
   })
   on("pointerdown", () => { at = null; hide() })
-  on("scroll", () => { at = null; hide() })
+  // A box within a component scrolls without an event here: its wheel is heard.
+  for (const type of ["scroll", "wheel"]) on(type, () => { at = null; if (moved) moved.view = null; hide() })
   on("keydown", (event) => {
     const step = {ArrowLeft: -1, ArrowRight: 1}[event.key]
     const view = step && viewOf(event)

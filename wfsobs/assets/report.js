@@ -4,9 +4,9 @@
 const read = (id) => JSON.parse(document.getElementById(id).textContent)
 const data = read("data")
 const states = read("rows")
-const shown = {state: data.start, mode: data.modes[0], unit: "nm", show: "signal", spectrum: "psd", zoom: "whole",
-               over: Object.keys(data.sweeps)[0]}
-const hidden = Object.fromEntries(Object.keys(data.names).map((target) => [target, []]))
+const shown = {state: data.start, mode: data.modes[0], over: Object.keys(data.sweeps)[0]}
+for (const it of document.querySelectorAll(".switches input:checked")) shown[it.name] = it.value
+const hidden = {...data.hidden}
 const night = matchMedia("screen and (prefers-color-scheme: dark)")
 let dark = night.matches
 
@@ -214,20 +214,24 @@ function cards(target) {
   const watchers = {items: [], hidden_lines: [], last_arrival: []}
   const model = {
     items: [], terms: {},  // the report has a section of them
-    hidden_lines: hidden[target], last_arrival: 0,
-    send_msg({hidden: names, number: asked}) {
+    main: "Show the main ones", hidden_lines: hidden[target], last_arrival: 0,
+    send_msg({main, hidden: names = data.hidden[target], number: asked = model.last_arrival}) {
       hidden[target] = names
       Object.assign(model, {hidden_lines: names, last_arrival: asked})
+      if (main) watchers.hidden_lines.forEach((f) => f())
       toggled(target)
     },
     on(name, f) { watchers[name].push(f) },
   }
   render({model, el: document.getElementById(`cards-${target}`)})
   return () => {
-    model.items = data.names[target].map((name) => card(target, name))
+    model.items = data.names[target].filter((name) => name === "truth" || ran(target, name)).map((name) => card(target, name))
     watchers.items.forEach((f) => f())
   }
 }
+
+// Whether an observer has run in any state.
+const ran = (target, name) => data.states.some((state) => data.modes.some((mode) => `signal/${target}/${name}/${mode}` in state.lines))
 
 function card(target, name) {
   const look = data.looks[name]
@@ -238,11 +242,14 @@ function card(target, name) {
   const value = row && (name === "truth" && !loop ? row.truth_rms_um : row.rms_um)
   const base = loop ? "z, residual" : known ? "truth" : "z, next z"
   const relative = row && row.normalised_rms !== null ? `${row.normalised_rms.toFixed(2)} × ${base}` : ""
+  const interval = data.states[shown.state].intervals[`${name}/${target}/${shown.mode}`]
+  const inUnit = (um) => number(um * data.states[shown.state].scale[shown.unit])
   const missing = name === "truth" ? "" : drawn ? "no truth" : "no result"
   return {
     name, label: loop ? "Recorded loop" : look.label, colour: loop ? "transparent" : look[dark ? "dark" : "light"], dash: look.dash,
     value: row ? number(value * data.states[shown.state].scale[shown.unit]) : "–",
     unit: row ? data.units[shown.unit] : "", note: row ? (known && name === "truth" ? "rms" : own(row) || relative) : missing,
+    range: interval ? `mean ${interval.map(inUnit).join(" – ")}` : undefined,
   }
 }
 
@@ -288,6 +295,9 @@ function draw() {
   for (const target of Object.keys(data.names)) {
     drawFigures(target)
     strips[target]()
+  }
+  for (const it of document.querySelectorAll("[data-verdict]")) {
+    it.hidden = it.dataset.verdict !== `${shown.state}` || it.dataset.mode !== shown.mode
   }
   drawTable()
 }
@@ -361,6 +371,7 @@ try {
   Object.values(figures).forEach(paint)
   drawAxes()
   draw()
+  Object.keys(data.names).forEach(toggled)
   const turn = (to) => { dark = to; repaint() }
   night.onchange = () => turn(night.matches)
   window.addEventListener("beforeprint", () => turn(false))

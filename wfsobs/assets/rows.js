@@ -32,7 +32,6 @@ export function render({model, el}) {
     input.inputMode = "decimal"
     input.dataset.cell = `${row}.${column.key}`
     input.setAttribute("aria-label", `${noun} ${row + 1}: ${column.name}`)
-    input.title = column.doc
     input.onchange = () => {
       known.set(input, input.value)
       model.send_msg({action: "edit", row, key: column.key, text: input.value})

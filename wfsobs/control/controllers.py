@@ -104,7 +104,7 @@ CONTROLLERS = Registry(
             prior=(Lines, LgsStars),
             settings=("multipeak",),
             counts=_nothing_more,
-            look=Look("LQG multi-peak", "#00707F", "#4DD0E1", (14, 3)),
+            look=Look("LQG multi-peak", "#AE7D40", "#BA6A26", (14, 3)),
         ),
         Controller(
             "lqg-multirate",
@@ -116,7 +116,7 @@ CONTROLLERS = Registry(
             settings=("multirate",),
             ngs=True,
             counts=_nothing_more,
-            look=Look("LQG multi-rate", "#E31FFF", "#F08BFF", (10, 2, 2, 2)),
+            look=Look("LQG multi-rate", "#E31FFF", "#7E75C8", (10, 2, 2, 2)),
         ),
         Controller(
             "lqg-multirate-optimal",
@@ -128,7 +128,7 @@ CONTROLLERS = Registry(
             settings=("multirate",),
             ngs=True,
             counts=_nothing_more,
-            look=Look("LQG opt. multi-rate", "#7A1FA2", "#C9A0FF", (3, 2)),
+            look=Look("LQG opt. multi-rate", "#5718C1", "#B848F9", (3, 2)),
         ),
         Controller(
             "lqg-multirate-multi",
@@ -140,7 +140,7 @@ CONTROLLERS = Registry(
             settings=("multirate", "multipeak"),
             ngs=True,
             counts=_nothing_more,
-            look=Look("LQG multi-rate multi-peak", "#B40000", "#FF7A70", (8, 3)),
+            look=Look("LQG multi-rate multi-peak", "#AB64CF", "#F26FF3", (8, 3)),
         ),
         Controller(
             "integrator+gpr-offline",
@@ -154,7 +154,7 @@ CONTROLLERS = Registry(
             asks=_gain,
             weight=20.0,
             counts=_offline_used,
-            look=Look("Int. + offline", "#0A960A", "#4FD64F", (12, 2, 2, 2, 2, 2)),
+            look=Look("Int. + offline", "#183B2C", "#37C9B2", (12, 2, 2, 2, 2, 2)),
         ),
         Controller(
             "integrator+gpr-online",
@@ -169,7 +169,7 @@ CONTROLLERS = Registry(
             weight=200.0,
             seconds=_online_seconds,
             counts=_online_used,
-            look=Look("Int. + online", "#004B00", "#A6E3A6", (10, 2, 2, 2)),
+            look=Look("Int. + online", "#046D72", "#5B8A77", (10, 2, 4, 2)),
         ),
     ),
     reserved_ids=("truth", "loop", "bound", "bound-both", "bound-stars"),

@@ -55,8 +55,6 @@ class Look:
         Pattern, empty for solid [px].
     width : float
         Line width [px].
-    in_figures : bool
-        False for a row of tables only: its line would be the axis, or hide the others.
     """
 
     label: str = ""
@@ -64,7 +62,6 @@ class Look:
     dark: str = "#BBBBDD"
     dash: tuple[int, ...] = ()
     width: float = 1.4
-    in_figures: bool = True
 
     def colour(self, dark: bool) -> str:
         """Return the colour for the mode."""

@@ -167,7 +167,7 @@ BUTTERWORTH_OL = Observer(
     causal=False,
     linear=True,
     tunable=Tunable(("butterworth.bandwidth_offline",), ("butterworth.order",)),
-    look=Look("Butterworth OL", "#B40000", "#FF7A70", (2, 2)),
+    look=Look("Butterworth OL", "#B40000", "#E4695E", (2, 2)),
 )
 
 BUTTERWORTH_CL = Observer(
@@ -179,7 +179,7 @@ BUTTERWORTH_CL = Observer(
     prior=(OnlineBands,),
     linear=True,
     tunable=Tunable(("butterworth.bandwidth_online",), ("butterworth.order",)),
-    look=Look("Butterworth CL", "#B40000", "#FF7A70", (8, 3)),
+    look=Look("Butterworth CL", "#B40000", "#E4695E", (8, 3)),
     step=step_butterworth_cl,
 )
 
@@ -191,7 +191,7 @@ PERSISTENCE = Observer(
     help="the newest measurement taken for the turbulence",
     linear=True,
     weight=0.1,
-    look=Look("Persistence", "#707070", "#A8A8A8", (1, 3), in_figures=False),
+    look=Look("Persistence", "#8F8F63", "#A37F9E", (1, 3)),
     step=step_persistence,
 )
 
@@ -203,6 +203,6 @@ ZERO = Observer(
     help="the trivial baseline",
     linear=True,
     weight=0.1,
-    look=Look("Zero", "#8A8A8A", "#9A9A9A", (2, 4), in_figures=False),
+    look=Look("Zero", "#8A8A8A", "#9A9A9A", (2, 4)),
     step=step_zero,
 )

@@ -150,7 +150,7 @@ RIDGE = Observer(
         ("gpr_offline.noise_std", "gpr_offline.depth"),
         ("gpr_offline.length_scale", *tunable("gpr_offline"), "butterworth.bandwidth_offline", "butterworth.order"),
     ),
-    look=Look("Ridge", "#6B6B00", "#C8C84D", (4, 2), in_figures=False),
+    look=Look("Ridge", "#757E9A", "#9A97BE", (4, 2)),
     step=step_ridge,
 )
 
@@ -164,6 +164,6 @@ RIDGE_30 = Observer(
     needs=("training",),
     linear=True,
     tunable=Tunable(("butterworth.bandwidth_offline",), ("butterworth.order",)),
-    look=Look("30-tap predictor", "#8A5A00", "#D8A44D", (2, 3), in_figures=False),
+    look=Look("30-tap predictor", "#3E4E6C", "#C8A299", (2, 3)),
     step=step_ridge_30,
 )

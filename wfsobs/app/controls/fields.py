@@ -20,6 +20,9 @@ from wfsobs.settings.parameters import Reals
 
 NUMBER_WIDTH = 92
 
+ROOM_OF_NUMBER = 7
+"""Characters for which a small box has room."""
+
 UNNAMED = {
     "& .MuiInputLabel-root": {"clipPath": "inset(50%)", "overflow": "hidden", "width": "1px", "height": "1px"},
     "& legend": {"display": "none"},
@@ -32,6 +35,16 @@ UNNAMED = {
 def number_text(value: float) -> str:
     """Write a number as a person would type it."""
     return f"{value:.10g}"
+
+
+def short_number(value: float) -> str:
+    """Write a number for a small box, in as many digits as it has room for; what is not typed over keeps all of its own.
+
+    >>> short_number(18.475123), short_number(0.0123456), short_number(47.0), short_number(1.23456e-7)
+    ('18.4751', '0.01235', '47', '1.2e-07')
+    """
+    texts = [number_text(value), *(number_text(float(f"{value:.{digits}g}")) for digits in (6, 5, 4, 3, 2))]
+    return next((text for text in texts if len(text) <= ROOM_OF_NUMBER), texts[-1])
 
 
 def parse_number(text: str) -> float | str:
@@ -149,6 +162,10 @@ class SliderField(TextField):
             label=names["label"], tags=[TAG + self.path], width=NUMBER_WIDTH, margin=(4, 0, 4, 8), align="end", sx=UNNAMED
         )
         return [slider, text]
+
+    def to_text(self, value: Any) -> str:
+        """Write the value as text that the box beside the slider has room for."""
+        return short_number(value)
 
     def _row(self) -> Any:
         return pn.Row(*self.widgets, sizing_mode="stretch_width", margin=0)

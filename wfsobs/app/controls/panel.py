@@ -199,6 +199,7 @@ class Controls:
         self.store.param.watch(once(self._count_changes, AFTERWARDS_MS), ["scenario", "preset"])
         self.store.param.watch(self._refresh_parts, ["scenario", "source"])
         self.store.param.watch(self._refresh_run, ["errors", "waiting"])
+        self.store.session.param.watch(self._refresh_run, "doing")
         # Last, so that "Done" is said of what has been drawn.
         self.store.run.param.watch(self._refresh_run, ["state", "progress", "place", "message"], precedence=2)
 
@@ -230,8 +231,8 @@ class Controls:
         run = self.store.run
         running = run.state == RUNNING
         self.cancel.disabled = not running
-        text, note = status_of(self.store)
-        self.status.param.update(progress=run.progress, text=text, note=note)
+        progress, text, note = status_of(self.store)
+        self.status.param.update(progress=progress, text=text, note=note)
 
 
 def topic_of(path: str) -> str:

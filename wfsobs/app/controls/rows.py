@@ -10,7 +10,7 @@ import param
 from panel.custom import JSComponent
 
 from wfsobs.app.controls.field import TAG, idle_html
-from wfsobs.app.controls.fields import number_text, parse_number
+from wfsobs.app.controls.fields import parse_number, short_number
 from wfsobs.app.controls.names import column_of, name_settings
 from wfsobs.app.display import unit_text
 from wfsobs.app.store import Store
@@ -18,9 +18,6 @@ from wfsobs.app.style import asset
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.settings.group import Group
 from wfsobs.settings.parameters import Reals, unit_of
-
-ROOM = 7
-"""Characters that a cell has room for."""
 
 
 class RowTable(JSComponent):
@@ -135,7 +132,4 @@ def _cell(item: Group, key: str) -> str:
     value = getattr(item, name)
     if mode:
         value = value[int(mode)] if int(mode) < len(value) else 0.0
-    if isinstance(value, str):
-        return value
-    texts = [number_text(value), *(number_text(float(f"{value:.{digits}g}")) for digits in (4, 3))]
-    return next((text for text in texts if len(text) <= ROOM), texts[-1])
+    return value if isinstance(value, str) else short_number(value)

@@ -49,9 +49,12 @@ class Status(JSComponent):
     _stylesheets = [asset("status.css")]
 
 
-def status_of(store: Store) -> tuple[str, str]:
-    """Describe the run in one line, and what was refused in another."""
-    run = store.run
+def status_of(store: Store) -> tuple[float, str, str]:
+    """Return how much of the run is done, its state in one line, and what was refused in another.
+
+    Work that goes on after it takes its place.
+    """
+    run, progress = store.run, store.run.progress
     seconds = f" in {run.result.seconds:.2f} s{_share(run.result)}" if run.result and run.state == DONE else ""
     text = {
         RUNNING: run.line(),
@@ -61,8 +64,10 @@ def status_of(store: Store) -> tuple[str, str]:
     }.get(run.state, "")
     if store.waiting:
         text = waiting_text(store.waiting)
+    elif run.state != RUNNING and store.session.doing:
+        progress, text = next(reversed(store.session.doing.values()))
     note = f"Not accepted: {', '.join(map(setting_name, store.errors))}" if store.errors else ""
-    return text, note
+    return progress, text, note
 
 
 def _share(run: RunResults) -> str:

@@ -22,7 +22,8 @@ class BackgroundTask(param.Parameterized):
 
     Starting another supersedes the one before: it is left, and nothing of it lands any more, however late it comes.
     What is told of a job is gathered and lands in one `param.update` on the session's thread. Where its result is to be
-    `drawn_first`, that it is done lands a moment later.
+    `drawn_first`, that it is done lands a moment later. A task with a `title` is named at the top of the page while
+    it goes on.
     """
 
     state = param.Selector(default=IDLE, objects=[IDLE, RUNNING, DONE, CANCELLED, FAILED])
@@ -32,9 +33,11 @@ class BackgroundTask(param.Parameterized):
     latest = param.Parameter(None, doc="What the work has told of itself so far.")
     result = param.Parameter(None, doc="The latest result, in parts where it comes in parts.")
 
-    def __init__(self, session: Session, drawn_first: bool = False):
+    def __init__(self, session: Session, drawn_first: bool = False, title: str = ""):
         super().__init__()
-        self.session, self._drawn_first = session, drawn_first
+        self.session, self._drawn_first, self._title = session, drawn_first, title
+        if title:
+            self.param.watch(self._announce, ["state", "progress", "place"])
         session.tasks.append(self)
         self._lock = threading.Lock()
         self._generation = 0
@@ -68,6 +71,11 @@ class BackgroundTask(param.Parameterized):
     def line(self, doing: str = "Running") -> str:
         """How it is going, while it is."""
         return f"Waiting: position {self.place}" if self.place else f"{doing}, {int(100 * self.progress)} %"
+
+    def _announce(self, *_: object) -> None:
+        others = {title: line for title, line in self.session.doing.items() if title != self._title}
+        own = {self._title: (self.progress, self.line(self._title))} if self.state == RUNNING else {}
+        self.session.doing = {**others, **own}
 
     def _supersede(self) -> int:
         with self._lock:

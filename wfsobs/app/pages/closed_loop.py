@@ -63,7 +63,7 @@ class ClosedLoopPage(PageActions):
     def __init__(self, store: Store, display: Display):
         self.store, self.run, self.display = store, store.run, display
         run = store.run
-        self.work = BackgroundTask(store.session)
+        self.work = BackgroundTask(store.session, title="Closed loop")
         self.visible, self._of = False, object()
         self._rooms = list[pn.viewable.Viewable]()
         self.note, self.table, self.margins = html(), html(), html()

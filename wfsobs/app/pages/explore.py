@@ -12,7 +12,18 @@ import panel_material_ui as pmui
 from wfsobs.app.causes import Causes
 from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL
 from wfsobs.app.history import History
-from wfsobs.app.pages.parts import EDITED, SMALL_LABEL, TALL, WIDE, box, grid_style, group, zoom_buttons
+from wfsobs.app.pages.parts import (
+    BELOW_FIGURES,
+    EDITED,
+    ON_ONE_LINE,
+    SMALL_LABEL,
+    TALL,
+    WIDE,
+    box,
+    grid_style,
+    group,
+    zoom_buttons,
+)
 from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset
@@ -29,6 +40,7 @@ from wfsobs.app.views.strip import Strip
 from wfsobs.app.views.table import Table
 from wfsobs.app.views.traces import Traces
 from wfsobs.app.views.verdict import VerdictLine
+from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.theory import Theory
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION
 
@@ -50,8 +62,11 @@ class Explore:
 
     def __init__(self, history: History, seeds: SeedRuns | None = None):
         run, display = history.store.run, history.display
-        self.display, self.seeds = display, seeds
-        self.lines = MainLines(run, display)
+        self.run, self.display, self.seeds = run, display, seeds
+        self.show_switch = group(display, "show", {"Signal": SIGNAL, "Error": ERROR, "Running rms": RUNNING_RMS})
+        self._wanted_show = display.show
+        run.param.watch(self._offer_errors, "result")  # before the figures, which then draw once
+        self.lines = MainLines(run, display, seeds)
         self.traces = Traces(run, display)
         self.spectra = SpectraFigures(run, display, self.traces.x_range)
         self.strips = {target: Strip(target, run, display, seeds) for target in TARGETS}
@@ -85,7 +100,7 @@ class Explore:
 
     def _switches(self) -> pn.FlexBox:
         return pn.FlexBox(
-            group(self.display, "show", {"Signal": SIGNAL, "Error": ERROR, "Running rms": RUNNING_RMS}),
+            self.show_switch,
             group(self.display, "spectrum", {"PSD": PSD, "Cumulative rms": CUMULATIVE}),
             pn.Row(*zoom_buttons(self.traces.zoom, ZOOMS), margin=0),
             self._tick("window_spectra"),
@@ -94,7 +109,19 @@ class Explore:
             gap="12px",
             align_items="center",
             **WIDE,
+            stylesheets=[ON_ONE_LINE],
         )
+
+    def _offer_errors(self, *_: object) -> None:
+        """Leave no choice but the signals of a record without truth; what was chosen comes back with the next truth."""
+        results = self.run.result
+        has_truth = results is None or any(results.values(TRUTH, target) is not None for target in TARGETS)
+        if has_truth == self.show_switch.disabled:
+            self.show_switch.disabled = not has_truth
+            if has_truth:
+                self.display.show = self._wanted_show
+            else:
+                self._wanted_show, self.display.show = self.display.show, SIGNAL
 
     def _tick(self, switch: str) -> pmui.Checkbox:
         return pmui.Checkbox.from_param(self.display.param[switch], size="small", margin=0, stylesheets=[SMALL_LABEL])
@@ -123,6 +150,8 @@ class Explore:
         )
         figures = pn.Column(traces, self.rooms[target], **WIDE, stylesheets=[GRID])
         parts = self.verdicts[target].pane, cards, figures, self.stretches[target].pane
+        for part in parts[:2]:
+            part.stylesheets = [*part.stylesheets, BELOW_FIGURES]
         return box(target.capitalize(), *parts, about=ABOUT[target])
 
     def _room(self, target: str, caption: pn.pane.HTML, pane: pn.pane.Bokeh) -> pn.Column:

@@ -62,7 +62,7 @@ class IdentifyPage(PageActions):
 
     def __init__(self, store: Store, display: Display):
         self.store, self.run, self.display = store, store.run, display
-        self.work = BackgroundTask(store.session)
+        self.work = BackgroundTask(store.session, title="Identification")
         self.starter = Starter(
             self.work, "Identify the record", "Progress of the identification", uses=("Filters only", "As a new simulation")
         )

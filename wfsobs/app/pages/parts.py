@@ -59,6 +59,18 @@ class PageActions:
 WIDE: Mapping[str, Any] = MappingProxyType({"sizing_mode": "stretch_width", "margin": 0})
 
 
+ON_ONE_LINE = """
+@media (max-height: 560px) {
+  [id^="flexbox"] { flex-wrap: nowrap !important; overflow: auto hidden; }
+  [id^="flex-item"] > * { flex: none !important; }
+}
+"""
+"""Style of a row of switches that does not wrap where there is no height for it: a window of 1080 pixels at a zoom of 200 %."""
+
+BELOW_FIGURES = "@media (max-height: 560px) { :host { order: 1; } }"
+"""Style of what stands above the figures of its box where there is height for both."""
+
+
 def heading(title: str, about: str = "") -> pn.pane.HTML:
     """Make the title of a box; about : beside it, what is in the box."""
     words = f'<span class="about">{escape(about)}</span>' if about else ""
@@ -176,7 +188,7 @@ class Starter:
         said = {RUNNING: work.line("Computing"), CANCELLED: "Stopped", DONE: "Finished"}.get(work.state, "")
         self.cancel.disabled = not running
         for use in self.uses:
-            use.disabled = running or work.result is None
+            use.disabled = work.state != DONE or work.result is None
         self.status.param.update(
             progress=work.progress, text=said + self._detail(), note=name_settings(work.message), visible=work.state != IDLE
         )

@@ -50,7 +50,7 @@ class TunePage(PageActions):
 
     def __init__(self, store: Store, display: Display):
         self.store, self.run, self.display = store, store.run, display
-        self.work = BackgroundTask(store.session)
+        self.work = BackgroundTask(store.session, title="Tuning")
         self.starter = Starter(self.work, "Start tuning", "Progress of the tuning", self._so_far)
         self.observer = pmui.Select(label="Observer", options=choices(), value=START, size="small", width=250, margin=0)
         self.target = pmui.Select(label="Error of", options=[], size="small", width=130, margin=0)

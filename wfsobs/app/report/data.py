@@ -16,16 +16,18 @@ from numpy.typing import NDArray
 from wfsobs.app.report.grid import WINDOW_S, Array, Floats, Grid
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.envelope import envelope, envelope_times
+from wfsobs.app.views.main_lines import main_observers
 from wfsobs.app.work import TRUTH
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import rows as controller_rows
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.evaluation.budget import budget_row, error_budget
+from wfsobs.evaluation.budget import Budget, budget_row, error_budget
 from wfsobs.evaluation.error_spectra import cumulative_rms, spectra
 from wfsobs.evaluation.evidence import Evidence
 from wfsobs.evaluation.rows import Row, score_rows
 from wfsobs.evaluation.scores import SCORED
+from wfsobs.evaluation.verdict import Verdict, verdict
 from wfsobs.observers.base import TARGETS
 from wfsobs.priors_from.selection import usual_observers
 from wfsobs.record import RecordError
@@ -57,6 +59,8 @@ class State:
               cumulative-error [um]; frequencies [Hz] of the latter two pairs as "frequency", "frequency-cumulative"
     loop    : as `wfsobs loop --json` gives them, of the controllers without a GPR; none where the record has no truth
     budgets : as `wfsobs run --budget --json` gives them, of the linear observers; none where the sources are not known
+    verdicts : (target, mode, sentences); none where the record has no truth
+    main    : target -> the observers whose lines are shown at first
     seeds   : what further seeds say: their number, intervals [um] by "observer/target/mode", and by "target/mode" the best and
               those that do not differ significantly from it; empty for one record
     """
@@ -69,6 +73,8 @@ class State:
     loop: Sequence[Row] = ()
     budgets: Sequence[Row] = ()
     seeds: Mapping[str, Any] = field(default_factory=dict)
+    verdicts: Sequence[tuple[str, str, list[str]]] = ()
+    main: Mapping[str, list[str]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -113,7 +119,7 @@ def state_of(result: Result, states: int = 1, *, is_simulated: bool = True, evid
     lines: dict[str, Floats] = {}
     shown = {(target, name) for target in TARGETS for name in observers_of(target)}
     drawn = {(e.target, e.observer): e.values for e in result.estimates if (e.target, e.observer) in shown}
-    grid = Grid(record.n_steps, record.dt, bins_for(states, len(shown), len(names)))
+    grid = Grid(record.n_steps, record.dt, bins_for(states, len(drawn), len(names)))
     truths = {target: record.truth(target) for target in TARGETS}
     drawn |= {(target, TRUTH): truth for target, truth in truths.items() if truth is not None}
     for (target, observer), values in drawn.items():
@@ -131,20 +137,48 @@ def state_of(result: Result, states: int = 1, *, is_simulated: bool = True, evid
                     lines[f"psd{suffix}/{where}"], lines[f"cumulative{suffix}/{where}"] = _spectra(found[0], density[:, i])
     scores = [evidence.over_seeds(score) for score in result.scores] if evidence else result.scores
     rows = score_rows(scores, scenario.run.seed, source=result.prior_source)
-    budgets = budget_rows(result) if is_simulated else []
+    budgets = list_budgets(result) if is_simulated else []
     return State(
-        scenario, rows, tuple(_reasons(result)), grid, lines, loop_rows(result), budgets, seeds_of(evidence) if evidence else {}
+        scenario,
+        rows,
+        tuple(_reasons(result)),
+        grid,
+        lines,
+        loop_rows(result),
+        budget_rows(budgets),
+        seeds_of(evidence) if evidence else {},
+        [
+            (target, mode, found.sentences())
+            for target in TARGETS
+            for mode in names
+            if (found := _verdict(result, target, mode, scenario if is_simulated else None, evidence, budgets)) is not None
+        ],
+        {
+            target: main_observers(result.scores, target, names[0], evidence.leaders(target, names[0]) if evidence else ())
+            for target in TARGETS
+        },
     )
 
 
-def budget_rows(result: Result) -> list[Row]:
-    """List the error budgets of the linear observers by target and mode; nothing where the sources are not known."""
+def _verdict(
+    result: Result, target: str, mode: str, simulation: Scenario | None, evidence: Evidence | None, budgets: Sequence[Budget]
+) -> Verdict | None:
+    of = result.scenario, result.record, result.estimates, result.scores
+    return verdict(*of, target, mode, simulation=simulation, evidence=evidence, budgets=budgets)
+
+
+def list_budgets(result: Result) -> list[Budget]:
+    """Return the error budgets of the linear observers by target and mode; nothing where the sources are not known."""
     try:
         found = [it for it in error_budget(result) if it.terms]
     except ValueError:
         return []
-    found.sort(key=lambda it: (SCORED.index(it.target), [m.name for m in result.scenario.modes].index(it.mode)))
-    return [{"observer": it.observer, "target": it.target, "mode": it.mode, **budget_row(it)} for it in found]
+    return sorted(found, key=lambda it: (SCORED.index(it.target), [m.name for m in result.scenario.modes].index(it.mode)))
+
+
+def budget_rows(budgets: Sequence[Budget]) -> list[Row]:
+    """List error budgets as plain values."""
+    return [{"observer": it.observer, "target": it.target, "mode": it.mode, **budget_row(it)} for it in budgets]
 
 
 def seeds_of(evidence: Evidence) -> dict[str, Any]:

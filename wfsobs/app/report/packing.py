@@ -32,6 +32,8 @@ def pack(report: Report) -> bytes:
                 "loop": list(s.loop),
                 "budgets": list(s.budgets),
                 "seeds": s.seeds,
+                "verdicts": list(s.verdicts),
+                "main": s.main,
             }
             for s in report.states
         ],
@@ -52,7 +54,14 @@ def unpack(content: bytes) -> Report:
             if slash:
                 lines[int(number)][name] = file[key]
     states = tuple(
-        State(from_toml(s["toml"]), s["rows"], tuple(s["reasons"]), Grid(*s["grid"]), of, s["loop"], s["budgets"], s["seeds"])
+        State(
+            from_toml(s["toml"]),
+            s["rows"],
+            tuple(s["reasons"]),
+            Grid(*s["grid"]),
+            of,
+            *(s[name] for name in ("loop", "budgets", "seeds", "verdicts", "main")),
+        )
         for s, of in zip(words["states"], lines, strict=True)
     )
     variations = tuple(Variation(path, tuple(values)) for path, values in words["variations"])

@@ -129,6 +129,10 @@ def _data(report: Report) -> dict[str, Any]:
             name: {"label": look(name).label, "light": look(name).light, "dark": look(name).dark, "dash": look(name).dash}
             for name in _line_names()
         },
+        "hidden": {
+            target: [name for name in observers_of(target) if name not in report.states[report.start].main[target]]
+            for target in TARGETS
+        },
         "names": {target: [TRUTH, *observers_of(target)] for target in TARGETS},
         "modes": _modes(report),
         "tilts": [m.name for m in TIP_TILT],
@@ -161,5 +165,6 @@ def _state(state: State, pool: Pool) -> dict[str, Any]:
         "lines": lines,
         "axes": {name: pool.add(axis.astype("<f4").tobytes()) for name, axis in axes.items()},
         "peaks": [[p.frequency, f"peak {p.frequency:.5g} Hz, damping {p.damping:.3g}"] for p in marked_peaks(scenario)],
+        "intervals": state.seeds.get("intervals", {}),
         "model": [[scenario.kalman.frequency, f"model of the Kalman filters {scenario.kalman.frequency:.5g} Hz"]],
     }

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
 
 from wfsobs.app.display import Display
 from wfsobs.app.jobs.job import RUNNING
@@ -12,6 +13,9 @@ from wfsobs.evaluation.rows import can_be_best
 from wfsobs.evaluation.scores import PREDICTION, Score
 from wfsobs.observers.base import TARGETS
 
+if TYPE_CHECKING:
+    from wfsobs.app.seeds import SeedRuns
+
 REFERENCES = ("kf-lgs", "gpr-online")
 """The two that the paper compares: always shown."""
 
@@ -19,8 +23,10 @@ BEST = 2
 """How many of the best are shown beside them."""
 
 
-def main_observers(scores: Iterable[Score], target: str, mode: str) -> list[str]:
+def main_observers(scores: Iterable[Score], target: str, mode: str, leaders: Sequence[str] = ()) -> list[str]:
     """List the observers of a target that matter: the references, and the best of those that can be compared.
+
+    leaders : the best over several seeds, of which the first is that of the verdict
 
     Without truth the best are those that predict the next measurement best. All, where there is no score at all.
     """
@@ -29,7 +35,7 @@ def main_observers(scores: Iterable[Score], target: str, mode: str) -> list[str]
     ranked = sorted(
         [s for s in of_mode if s.target == target] or [s for s in of_mode if s.target == PREDICTION], key=lambda s: s.rms
     )
-    best = [s.observer for s in ranked[:BEST]]
+    best = [*leaders[:1], *(s.observer for s in ranked[:BEST])]
     return [name for name in drawn if name in best or name in REFERENCES] if best else drawn
 
 
@@ -39,11 +45,13 @@ class MainLines:
     Made before the figures, so that they draw once. While a run goes on its first choice stays.
     """
 
-    def __init__(self, run: BackgroundTask, display: Display):
-        self.run, self.display = run, display
+    def __init__(self, run: BackgroundTask, display: Display, seeds: SeedRuns | None = None):
+        self.run, self.display, self.seeds = run, display, seeds
         self._chosen_targets: set[str] = set()
         run.param.watch(self._on_results, ["result", "state"])  # the last result may come before the run is over
         display.param.watch(self._follow, "mode")
+        if seeds is not None:
+            seeds.param.watch(self._follow, "evidence")
 
     def choose(self, target: str, hidden_names: list[str]) -> None:
         """Hide these lines and no others from now on."""
@@ -70,7 +78,9 @@ class MainLines:
         hidden = dict(self.display.hidden_lines)
         for target in TARGETS:
             if target not in self._chosen_targets:
-                main = main_observers(results.result.scores, target, self.display.mode)
+                evidence = self.seeds.evidence if self.seeds else None
+                leaders = evidence.leaders(target, self.display.mode) if evidence else ()
+                main = main_observers(results.result.scores, target, self.display.mode, leaders)
                 hidden[target] = [name for name in observers_of(target) if name not in main]
         if hidden != self.display.hidden_lines:
             self.display.hidden_lines = hidden

@@ -19,6 +19,7 @@ from wfsobs.app.views.table import find
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.rows import NOT_OBSERVERS, own_interval, score_rows
 from wfsobs.evaluation.scores import LOOP, PREDICTION, RESIDUAL, Score
+from wfsobs.priors_from.selection import usual_observers
 
 MAIN = "Show the main ones"
 
@@ -82,7 +83,8 @@ class Strip:
     def items(self) -> list[dict[str, Any]]:
         """Describe the cards."""
         shown = self.run.result
-        observers = [self._observer(name, shown) for name in observers_of(self.target)]
+        runs = usual_observers(shown.scenario, shown.result.record) if shown else observers_of(self.target)
+        observers = [self._observer(name, shown) for name in observers_of(self.target) if name in runs]
         cards = [self._truth(shown), *observers]
         return [card | {"compared": self._compared_rows(card["name"], shown)} for card in cards]
 

@@ -121,7 +121,7 @@ class Table:
         shown = self.run.result
         scores = {
             name: self._score(name, target)
-            for name in (*observers_of(target, with_hidden=True), *BOUNDS)
+            for name in (*observers_of(target, with_zero=True), *BOUNDS)
             if not shown or name in BOUNDS or is_usual(OBSERVERS[name], shown.result.scenario, shown.result.record)
         }
         for name in set(BOUNDS).difference(COMMON_BOUNDS):  # only where stars differ, or modes are coupled

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable
 from html import escape
 
 import panel as pn
@@ -16,9 +14,7 @@ from wfsobs.app.jobs.task import IDLE, BackgroundTask
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset
 from wfsobs.app.work import TRUTH
-from wfsobs.evaluation.rows import row_label
 from wfsobs.evaluation.verdict import verdict
-from wfsobs.observers import OBSERVERS
 
 NO_TRUTH = (
     "The record has no truth: the figures show the estimates instead of their errors, and the RMS errors are those of predicting "
@@ -76,7 +72,6 @@ class VerdictLine:
             return ""
         scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
         first, *others = found.sentences(scale, self.display.unit_label)
-        first = _say_where(first, (found.best.observer, *found.ties))
         more = "".join(f"<br>{escape(sentence)}" for sentence in others)
         text = f"<strong>{explain_first(first, 'theoretical limit', BOUND)}</strong>{more}".replace(" %", "&nbsp;%")
         self._sentence = of, text
@@ -86,16 +81,3 @@ class VerdictLine:
 def _paragraph(text: str, kind: str) -> str:
     """Write what has its room before it comes, so that the figures below do not move."""
     return f'<p class="{kind}">{text}</p>'
-
-
-def _say_where(sentence: str, observers: Iterable[str]) -> str:
-    """Say of observers without a card where they are.
-
-    >>> _say_where("Multi-rate KF has the smallest error, 15 nm, tied with GP on both sensors over 8 seeds", ["gp-both"])
-    'Multi-rate KF has the smallest error, 15 nm, tied with GP on both sensors (in the table) over 8 seeds'
-    """
-    for name in observers:
-        if not OBSERVERS[name].look.in_figures:
-            label = rf"({re.escape(row_label(name))})(?=,| and | over | on this | has | is )"
-            sentence = re.sub(label, r"\1 (in the table)", sentence, count=1)
-    return sentence

@@ -37,6 +37,6 @@ GP_BOTH = Observer(
     takes_missing=True,
     sensors=("lgs", "ngs"),
     tunable=Tunable(("gp.background_rms", "gp.background_scale"), ("kalman.lgs_noise", "kalman.ngs_noise")),
-    look=Look("GP, both", "#7A3B00", "#E8B07A", (6, 2, 2, 2, 2, 2), in_figures=False),
+    look=Look("GP, both", "#55A17F", "#03E49C", (6, 2, 2, 2, 2, 2)),
     step=_FILTERS.step,
 )

@@ -146,6 +146,6 @@ GP_LGS = Observer(
     weight=2.0,
     takes_missing=True,
     tunable=Tunable(("gp.background_rms", "gp.background_scale"), ("kalman.lgs_noise", "kalman.turbulence_rms")),
-    look=Look("GP in time", "#5B4B00", "#E0C95A", (6, 2, 2, 2), in_figures=False),
+    look=Look("GP in time", "#478B83", "#8EFAF0", (6, 2, 2, 2)),
     step=step_gp_lgs,
 )

@@ -87,7 +87,7 @@ GPR_ADAPTIVE = Observer(
     tunable=Tunable(("adaptive.window", "adaptive.depth"), ("adaptive.interval",)),
     weight=50.0,
     seconds=seconds,
-    look=Look("Adaptive GPR", "#3D6B00", "#B7F06A", (20, 2, 2, 2), width=1.8),
+    look=Look("Adaptive GPR", "#01734F", "#7AFED9", (20, 2, 2, 2), width=1.8),
     step=step_gpr_adaptive,
     counts=_settings_used,
 )

@@ -146,6 +146,6 @@ GPR_OFFLINE = Observer(
     ),
     weight=20.0,
     seconds=seconds,
-    look=Look("Offline GPR", "#0A960A", "#4FD64F", (12, 2, 2, 2, 2, 2)),
+    look=Look("Offline GPR", "#183B2C", "#37C9B2", (12, 2, 2, 2, 2, 2)),
     step=step_gpr_offline,
 )

@@ -186,6 +186,6 @@ GPR_ONLINE = Observer(
     ),
     weight=200.0,
     seconds=seconds,
-    look=Look("Online GPR", "#004B00", "#A6E3A6", (10, 2, 2, 2)),
+    look=Look("Online GPR", "#046D72", "#5B8A77", (10, 2, 2, 2)),
     step=step_gpr_online,
 )

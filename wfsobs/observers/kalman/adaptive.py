@@ -158,7 +158,7 @@ KF_ADAPTIVE = Observer(
     tunable=Tunable(("adaptive.window",), ("adaptive.interval",)),  # a shorter interval costs time, which no error shows
     weight=50.0,
     seconds=seconds,
-    look=Look("Adaptive KF", "#E0006E", "#FF7AB8", (20, 2), width=1.8),
+    look=Look("Adaptive KF", "#522C0A", "#F4C173", (20, 2), width=1.8),
     step=step_kf_adaptive,
     counts=identification_settings,
 )

@@ -67,7 +67,7 @@ KF_ASTERISM = Observer(
     sensors=("lgs", "ngs"),
     weight=5.0,
     tunable=Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
-    look=Look("Asterism", "#4E342E", "#BCAAA4", (8, 2, 2, 2), in_figures=False),
+    look=Look("Asterism", "#923222", "#F5B022", (8, 2, 2, 2)),
     step=step_kf_asterism,
     counts=vibration_used,
 )

@@ -241,7 +241,7 @@ KF_COUPLED = Observer(
     couples_modes=True,
     weight=2.0,
     tunable=Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
-    look=Look("Coupled", "#004D40", "#80CBC4", (10, 2, 2, 2), in_figures=False),
+    look=Look("Coupled", "#D35312", "#D48F4D", (10, 2, 2, 2)),
     step=step_kf_coupled,
     counts=vibration_used,
 )

@@ -69,7 +69,7 @@ KF_MULTI = Observer(
     linear=True,
     takes_missing=True,
     tunable=Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
-    look=Look("Multi-peak", "#00707F", "#4DD0E1", (14, 3)),
+    look=Look("Multi-peak", "#AE7D40", "#BA6A26", (14, 3)),
     step=step_kf_multi,
     counts=vibration_used,
 )

@@ -214,7 +214,7 @@ MULTIRATE = Observer(
     takes_missing=True,
     sensors=("lgs", "ngs"),
     tunable=TUNABLE,
-    look=Look("Multi-rate KF", "#E31FFF", "#F08BFF", (10, 2, 2, 2)),
+    look=Look("Multi-rate KF", "#E31FFF", "#7E75C8", (10, 2, 2, 2)),
     step=step_multirate,
     counts=noise_used,
 )

@@ -144,7 +144,7 @@ MULTIRATE_ADAPTIVE = Observer(
     tunable=Tunable(("adaptive.window",), ("adaptive.longest", "adaptive.interval")),
     weight=50.0,
     seconds=seconds,
-    look=Look("Adaptive multi-rate", "#9A0048", "#FF9FC4", (20, 2, 3, 2), width=1.8),
+    look=Look("Adaptive multi-rate", "#591677", "#F3C1F7", (20, 2, 3, 2), width=1.8),
     step=step_multirate_adaptive,
     counts=_settings_used,
 )

@@ -59,7 +59,7 @@ MULTIRATE_MULTI = Observer(
         ("multipeak.line_width", "kalman.lgs_noise", "kalman.ngs_noise"),
         ("multipeak.turbulence_order", "kalman.turbulence_rms"),
     ),
-    look=Look("Multi-rate multi-peak", "#8C1D00", "#FFB59A", (16, 3, 3, 3)),
+    look=Look("Multi-rate multi-peak", "#AB64CF", "#F26FF3", (16, 3, 3, 3)),
     step=_FILTERS.step,
     counts=vibration_used,
 )

@@ -158,6 +158,6 @@ MULTIRATE_OPTIMAL = Observer(
     takes_missing=True,
     sensors=("lgs", "ngs"),
     tunable=TUNABLE,
-    look=Look("Opt. multi-rate", "#7A1FA2", "#C9A0FF", (3, 2)),
+    look=Look("Opt. multi-rate", "#5718C1", "#B848F9", (3, 2)),
     step=_FILTERS.step,
 )
