@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from wfsobs.cli.options import load_declared
 from wfsobs.record import Record
+from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.command_response import DECIDED, command_response, saturation_lines
+from wfsobs.telemetry.intake import DeclaredFormat
+from wfsobs.telemetry.preview import preview
+from wfsobs.telemetry.records import save_record
 from wfsobs.typing import Array
 
 GAIN, LEAK, NOISE = 0.4, 0.995, 0.05
@@ -97,7 +103,7 @@ def limited_loop(disturbance: Array, rail: float, recorded: bool) -> Record:
 
 
 @pytest.mark.parametrize("rate", [0.02, 0.1])
-def test_commands_beyond_a_rail(rate: float) -> None:
+def test_commands_beyond_a_rail(rate: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Smooth disturbances of 0.4 um; the level is that of the rail, and without one nothing is said."""
     rng, n = np.random.default_rng(5), 8000
     kernel = np.exp(-rate * np.arange(600.0))
@@ -116,6 +122,13 @@ def test_commands_beyond_a_rail(rate: float) -> None:
     (stays, _) = saturation_lines(limited_loop(disturbance, 0.6, recorded=True))
     assert re.fullmatch(r"tip: commands stay at their largest value in \d+ frames, as at the limit of a mirror", stays)
     assert saturation_lines(replace(rails, u=0.0 * rails.u)) == []
+    path = tmp_path / "rails.npz"
+    save_record(path, rails)
+    shown = preview(path.read_bytes(), path.name).reading.lines()
+    assert [line for line in shown if "do nothing" in line] == lines, "on the page"
+    load_declared(str(path), Scenario(), DeclaredFormat())
+    said = capsys.readouterr().err
+    assert all(f"wfsobs: {path}: {line}\n" in said for line in lines), "on the command line"
 
 
 def test_no_rail_is_seen_in_loops_without(disturbance: Array) -> None:
