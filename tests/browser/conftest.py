@@ -45,13 +45,16 @@ CLOSED_MID_UPDATE = (
 page that closes before its session is there, and a change that is read when its connection has been closed."""
 
 
+PATIENCE = 300_000
+"""For what is to be there at last [ms]: a busy machine is no fault."""
+
+expect.set_options(timeout=PATIENCE)
+
+
 def carded(target: str) -> list[str]:
     """The observers of a target that run on the paper's scenario, each with a card."""
     usual = usual_observers(PRESETS["paper"]())
     return [name for name in observers_of(target) if name in usual]
-
-
-expect.set_options(timeout=60_000)  # a busy machine is no fault
 
 
 class Server:
@@ -183,7 +186,7 @@ def opening(server: Server, contexts: Contexts) -> Iterator[Any]:
     ) -> Page:
         page = contexts(**options).new_page()
         page.set_viewport_size({"width": width, "height": height})
-        page.set_default_timeout(120_000)
+        page.set_default_timeout(PATIENCE)
         if script:
             page.add_init_script(script)
         opened.append((page, Watched(page)))
@@ -239,6 +242,26 @@ DRAWN = """() => {
 SETTINGS = """() => [...(window.Bokeh?.index?.roots?.[0]?.model.document._all_models.values() ?? [])]
     .some((m) => m.type === "panel.models.esm.ReactComponent" && m.data?.label === "Preset")"""
 """Whether the drawer has its settings: they come after the first picture."""
+
+
+ANSWERED = """() => {
+  const link = Bokeh.index.roots[0].model.document.wfsobs
+  window.question ??= (link.ask(), link.asked)
+  return link.model.last_arrival >= window.question && delete window.question
+}"""
+
+
+def answered(page: Page) -> None:
+    """Wait until the server has done what the page has told it so far."""
+    page.wait_for_function(ANSWERED, polling=50)
+
+
+def eventually(page: Page, holds: Callable[[], object], seconds: float = PATIENCE / 1000) -> None:
+    """Wait until something holds that one look at the page cannot tell."""
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end, "it never was so"
+        page.wait_for_timeout(50)
 
 
 def finished(page: Page) -> None:

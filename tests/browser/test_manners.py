@@ -99,7 +99,7 @@ def test_the_theme_of_the_system_unless_another_is_chosen(open_page: Any, server
     becomes(page, True)
     remembered(page, "dark")
     page.reload()
-    page.locator("[role=status]", has_text="Done in").first.wait_for(state="attached", timeout=240_000)
+    page.locator("[role=status]", has_text="Done in").first.wait_for(state="attached")
     becomes(page, True)
     page.emulate_media(color_scheme="dark")
     page.get_by_role("button", name=re.compile("theme", re.I)).click()

@@ -25,8 +25,6 @@ ERRORS = """() => {
   return found(document).map((row) => Number(row.cells[1].textContent.trim().split(/\\s/).at(-1)))
 }"""
 """Of the observers of the turbulence, in the order of the table."""
-SLOW = 60_000
-"""What a page may take on a machine that is busy with other things [ms]."""
 IN_EACH = [1 + len(carded(target)) for target in TARGETS]
 ALL_LINES = 2 * sum(IN_EACH)
 LINES_OF_FIGURES = 2 * 2 + 2 * 2 + 2 * 4 + 3 * 4
@@ -59,7 +57,7 @@ def test_best_first(wide: Page) -> None:
     expect(rows.first).to_contain_text(re.compile("smallest|best|tied"))  # the first of one record
     page.wait_for_function(f"() => ({ERRORS})().every((error, i, all) => i === 0 || all[i - 1] <= error)")
     page.get_by_role("checkbox", name="Best first").click()
-    expect(rows.first).to_have_attribute("data-observer", "kf-lgs", timeout=SLOW)
+    expect(rows.first).to_have_attribute("data-observer", "kf-lgs")
 
 
 def test_the_figures_of_the_paper(wide: Page, tmp_path: Path) -> None:
@@ -68,7 +66,7 @@ def test_the_figures_of_the_paper(wide: Page, tmp_path: Path) -> None:
     assert 0 < len(before) < ALL_LINES, "lines of cards that are not shown, and figures of other pages, are not made yet"
     turn(page, "Paper figures")
     for number in ("4a", "4b", "5", "6"):
-        expect(page.get_by_role("heading", name=f"Figure {number} of the paper")).to_be_visible(timeout=SLOW)
+        expect(page.get_by_role("heading", name=f"Figure {number} of the paper")).to_be_visible()
     drawn = f"""([before, n]) => {{
         const made = ({LINES})().filter(([name, length]) => !before.includes(name))
         return made.length === n && made.every(([name, length]) => length > 100)
@@ -77,7 +75,7 @@ def test_the_figures_of_the_paper(wide: Page, tmp_path: Path) -> None:
     expect(page.get_by_role("heading", name="RMS errors")).to_be_hidden()
     page.screenshot(path=tmp_path / "figures.png")
     turn(page, "Explore")
-    expect(page.get_by_role("heading", name="RMS errors")).to_be_visible(timeout=SLOW)
+    expect(page.get_by_role("heading", name="RMS errors")).to_be_visible()
     expect(page.get_by_role("heading", name="Figure 5 of the paper")).to_be_hidden()
 
 
@@ -93,14 +91,14 @@ def test_cumulative_rms(wide: Page) -> None:
 def test_the_model(wide: Page) -> None:
     page = wide
     turn(page, "Model")
-    expect(page.get_by_role("heading", name="State space: equations 6 and 7")).to_be_visible(timeout=SLOW)
+    expect(page.get_by_role("heading", name="State space: equations 6 and 7")).to_be_visible()
     expect(page.get_by_text("Poles of one cycle, 5 ms").first).to_be_visible()
     coefficient = page.get_by_role("cell", name="1.987308")
     expect(coefficient).to_be_visible()
     box = page.get_by_role("textbox", name="m/s")
     box.fill("30")
     box.press("Enter")
-    expect(coefficient).to_have_count(0, timeout=SLOW)
+    expect(coefficient).to_have_count(0)
 
 
 def test_by_keyboard_on_a_phone(open_page: Any) -> None:
@@ -109,11 +107,11 @@ def test_by_keyboard_on_a_phone(open_page: Any) -> None:
     button = page.get_by_role("button", name="Model", exact=True)
     button.focus()
     page.keyboard.press("Enter")
-    expect(page.get_by_role("heading", name="State space: equations 6 and 7")).to_be_visible(timeout=SLOW)
+    expect(page.get_by_role("heading", name="State space: equations 6 and 7")).to_be_visible()
     no_wider_than(page, 390)
     page.get_by_role("button", name="Paper figures", exact=True).focus()
     page.keyboard.press("Space")
-    expect(page.get_by_role("heading", name="Figure 4a of the paper")).to_be_visible(timeout=SLOW)
+    expect(page.get_by_role("heading", name="Figure 4a of the paper")).to_be_visible()
     no_wider_than(page, 390)
 
 
@@ -122,7 +120,7 @@ def test_pin_and_compare(open_page: Any) -> None:
     before = cells(page, "kf-lgs", "turbulence")[0].split()[-1]
     page.get_by_role("button", name="Pin this run to compare others with it").click()
     legend = page.get_by_role("status").filter(has_text="Compared with, faint in the figures")
-    expect(legend).to_contain_text("Preset Paper since then: the same settings", timeout=SLOW)
+    expect(legend).to_contain_text("Preset Paper since then: the same settings")
     for button in page.get_by_role("button", name="Show all").all():
         button.click()
     # a trace of errors has no line of the truth, their spectra have
@@ -131,10 +129,10 @@ def test_pin_and_compare(open_page: Any) -> None:
     box = page.get_by_role("textbox", name="m/s")
     box.fill("30")
     box.press("Enter")
-    expect(legend).to_contain_text("Wind speed V₀ 15 → 30 m/s", timeout=SLOW)
-    expect(page.get_by_role("columnheader", name="A [nm]")).to_be_visible(timeout=SLOW)
+    expect(legend).to_contain_text("Wind speed V₀ 15 → 30 m/s")
+    expect(page.get_by_role("columnheader", name="A [nm]")).to_be_visible()
     row = page.locator('tr[data-observer="kf-lgs"][data-target="turbulence"] td')
-    expect(row.nth(1)).to_have_text(re.compile(r"^(?!\+0\.0 %)[+−]\d.* %\s+\d.*$"), timeout=SLOW)  # nor a dash, of one at work
+    expect(row.nth(1)).to_have_text(re.compile(r"^(?!\+0\.0 %)[+−]\d.* %\s+\d.*$"))  # nor a dash, of one at work
     value, compared = (text.split() for text in row.all_inner_texts()[:2])
     change, _, pinned = compared
     assert pinned == before
@@ -142,5 +140,5 @@ def test_pin_and_compare(open_page: Any) -> None:
     card = page.get_by_role("button", name=re.compile("^LGS")).first.locator(".compared")
     expect(card).to_have_text(f"A{before}{change} %")
     page.get_by_role("button", name="Unpin: compare with no other run").click()
-    expect(page.get_by_role("columnheader", name="A [nm]")).to_have_count(0, timeout=SLOW)
+    expect(page.get_by_role("columnheader", name="A [nm]")).to_have_count(0)
     page.wait_for_function(f"({PINNED})().every(n => n === 0)")

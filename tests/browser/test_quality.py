@@ -118,7 +118,7 @@ def test_accessibility(open_page: Any, width: int, dark: bool) -> None:
             page.get_by_role("textbox", name="Evaluations").fill("2")
             page.keyboard.press("Enter")
         page.get_by_role("button", name=start).click()
-        expect(page.get_by_role("region", name=done)).to_be_visible(timeout=240_000)
+        expect(page.get_by_role("region", name=done)).to_be_visible()
         accessible(page)
         fits(page, width)
 
@@ -325,7 +325,7 @@ def test_a_long_run_grows_and_stops_at_once(open_page: Any) -> None:
     duration.press("Enter")
     expect(page.get_by_text(re.compile("changed: .*Duration"))).to_be_visible()
     page.get_by_role("button", name="Run", exact=True).first.click()
-    page.wait_for_function(f"() => {{ const part = ({ONLINE})(); return part > 0.02 && part < 0.9 }}", timeout=240_000)
+    page.wait_for_function(f"() => {{ const part = ({ONLINE})(); return part > 0.02 && part < 0.9 }}")
     part = page.evaluate(ONLINE)
     page.wait_for_function(f"part => ({ONLINE})() > part", arg=part)
     page.get_by_role("button", name="Cancel", exact=True).click()

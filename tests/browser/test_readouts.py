@@ -15,9 +15,15 @@ def page(open_shared: Any) -> Page:
     return open_shared()
 
 
+PAINTED = """name => [...Bokeh.index.query((it) => it.model.type === "Figure" && it.model.name === name)]
+    .some((it) => it.has_finished())"""
+"""Whether a figure stands, so that it hears of the pointer."""
+
+
 def test_values_at_the_pointer_and_by_the_arrow_keys(page: Page) -> None:
     box = page.locator(".values")
     figure = page.get_by_role("figure", name="Turbulence time trace")
+    page.wait_for_function(PAINTED, arg="Turbulence time trace")
     at = figure.bounding_box()
     page.mouse.move(at["x"] + at["width"] / 2, at["y"] + at["height"] / 2)
     expect(box).to_have_text(re.compile(r"time\s*[\d.]+ s.*LGS KF\s*[−\d.]+ nm", re.S))
@@ -46,6 +52,7 @@ def test_a_brush_over_time_and_over_a_band(page: Page) -> None:
     expect(line).to_contain_text("4.50 – 6.50 s")
     figure = page.get_by_role("figure", name="Vibration spectrum")
     figure.scroll_into_view_if_needed()
+    page.wait_for_function(PAINTED, arg="Vibration spectrum")
     at = figure.bounding_box()
     y = at["y"] + at["height"] / 2
     page.mouse.move(at["x"] + 0.5 * at["width"], y)

@@ -20,6 +20,7 @@ from click.testing import CliRunner
 from playwright.sync_api import Browser, Locator, Page, expect
 
 import wfsobs
+from tests.browser.conftest import PATIENCE
 from wfsobs.app.display import UNITS, per_micrometre
 from wfsobs.app.numerals import number
 from wfsobs.app.style import TERM_COLOURS
@@ -91,12 +92,14 @@ def open_report(browser: Browser, report: Path) -> Iterator[Callable[..., Page]]
         context = browser.new_context(viewport={"width": width, "height": 900}, offline=True, **options)
         contexts.append(context)
         page = context.new_page()
+        page.set_default_timeout(PATIENCE)
         page.on("console", lambda m: faults.append(f"console: {m.text}") if m.type in ("error", "warning") else None)
         page.on("pageerror", lambda e: faults.append(f"page: {e}"))
         page.on("request", lambda r: faults.append(f"request: {r.url}") if r.url != report.as_uri() else None)
         page.goto(report.as_uri())
         if options.get("java_script_enabled", True):
             page.locator("#table tbody").first.wait_for()
+            page.wait_for_function("() => window.Bokeh?.documents?.[0]?.get_model_by_name('spectrum-vibration')")
         return page
 
     open_it.allowed = allowed  # type: ignore[attr-defined]
@@ -229,6 +232,9 @@ def test_a_card_hides_its_line(open_report: Any) -> None:
     card = page.locator('#cards-vibration [data-name="kf-lgs"]')
     canvas = page.locator("#trace-vibration")
     page.mouse.move(0, 0)
+    page.wait_for_function(
+        "() => [...Bokeh.index.query((it) => it.model.name === 'trace-vibration')].some((it) => it.has_finished())"
+    )
     before = canvas.screenshot()
     card.click()
     expect(card).to_have_attribute("aria-pressed", "false")
@@ -369,7 +375,7 @@ def test_the_button_saves_what_is_shown(open_page: Any, server: Any, tmp_path: P
     page = open_page(url=f"{server.url}?{link}&turbulence.wind_speed=22")
     button = page.get_by_role("button", name="Report", exact=True)
     button.evaluate(SEEN)
-    with page.expect_download(timeout=240_000) as waiting:
+    with page.expect_download() as waiting:
         button.click()
     page.wait_for_function("() => window.seen.includes('Making the report …, true')")
     assert waiting.value.suggested_filename == "wfsobs-report.html"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import threading
-import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -15,7 +14,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.browser.conftest import Contexts, leave
+from tests.browser.conftest import PATIENCE, Contexts, leave
 
 FLAGS = ["--public", "--runs", "1", "--max-duration", "100", "--lifetime", "5"]
 """Runs of a page that is gone stop with its session, and only then the next one begins."""
@@ -41,7 +40,7 @@ def visit(contexts: Contexts, serve: Any) -> Iterator[Callable[..., Page]]:
     def open_it(query: str = "") -> Page:
         page = contexts().new_page()
         page.set_viewport_size({"width": 1400, "height": 1000})
-        page.set_default_timeout(120_000)
+        page.set_default_timeout(PATIENCE)
         opened.append(page)
         page.goto(serve.url + query)
         return page
@@ -146,10 +145,8 @@ def test_told_to_stop_in_the_middle_of_a_run(visit: Callable[..., Page], serve: 
     page = visit(LONG + "3")
     start(page)
     status(page, "Running")
-    begin = time.monotonic()
     serve.process.send_signal(signal.SIGTERM)
-    assert serve.process.wait(20) == 0
-    assert time.monotonic() - begin < 20
+    assert serve.process.wait(60) == 0  # the run would take minutes
     log = serve.log.read_text()
     assert "Traceback" not in log and "ERROR" not in log
     assert " INFO stopped sessions=" in log.rstrip().splitlines()[-1]

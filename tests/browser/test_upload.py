@@ -53,7 +53,7 @@ def test_template_and_sample(page: Page, tmp_path: Path) -> None:
     with page.expect_download() as waiting:
         page.get_by_role("button", name="Template CSV").click()
     assert waiting.value.suggested_filename == "wfsobs-template.csv"
-    with page.expect_download(timeout=60_000) as waiting:
+    with page.expect_download() as waiting:
         page.get_by_role("button", name="Sample record").click()
     waiting.value.save_as(tmp_path / "sample.csv")
     page.get_by_label("Record file").set_input_files(tmp_path / "sample.csv")
