@@ -84,7 +84,7 @@ class Evidence:
         if not ranked or 1 < self.n_seeds < FEWEST:
             return ()
         mean = np.array([self.errors[name, target, mode].mean() for name in ranked])
-        worse = self._differ(ranked, target, mode)[0, :-1] & (mean > mean[0] * (1.0 + SAME))
+        worse = means_differ(*self._values(ranked, target, mode, False))[0] & (mean > mean[0] * (1.0 + SAME))
         return tuple(name for name, is_worse in zip(ranked, worse, strict=True) if not is_worse)
 
     def harmful(self, target: str, mode: str) -> dict[str, bool]:
@@ -92,19 +92,19 @@ class Evidence:
         ranked = self.ranking(target, mode)
         if not ranked:
             return {}
-        apart = dict(zip(ranked, self._differ(ranked, target, mode)[-1, :-1].tolist(), strict=True))
+        apart = dict(zip(ranked, means_differ(*self._values(ranked, target, mode, True))[-1, :-1].tolist(), strict=True))
         known = {name: (name, target, mode) for name in reversed(ranked)}
         return {name: apart[name] for name, key in known.items() if self.errors[key].mean() >= self.truths[key].mean()}
 
-    def _differ(self, names: Sequence[str], target: str, mode: str) -> NDArray[np.bool_]:
-        """Return which of some observers, and no estimate after them, differ significantly."""
+    def _values(self, names: Sequence[str], target: str, mode: str, with_truth: bool) -> tuple[Array, bool]:
+        """Return errors of observers, and the truth after them, as columns; and whether rows are pieces of one record."""
         keys = [(name, target, mode) for name in names]
         if self.n_seeds > 1:
-            return means_differ(np.array([*(self.errors[key] for key in keys), self.truths[keys[0]]]).T)
+            return np.array([*(self.errors[key] for key in keys), self.truths[keys[0]]][: len(keys) + with_truth]).T, False
         pieces = [np.array(self.record[key].pieces).reshape(-1, 2) for key in keys]
         if min(map(len, pieces)) < 3:
-            return np.zeros((len(keys) + 1,) * 2, dtype=bool)
-        return means_differ(np.column_stack([*(of[:, 0] for of in pieces), pieces[0][:, 1]]), in_order=True)
+            return np.ones((3, len(keys) + with_truth)), True  # nothing differs
+        return np.column_stack([*(of[:, 0] for of in pieces), pieces[0][:, 1]][: len(keys) + with_truth]), True
 
 
 def means_differ(values: Array, in_order: bool = False) -> NDArray[np.bool_]:
