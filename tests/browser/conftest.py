@@ -51,6 +51,13 @@ PATIENCE = 300_000
 expect.set_options(timeout=PATIENCE)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Leave the tests of this folder as long as one of them may wait, three times."""
+    for item in items:
+        if item.path.parent == ROOT / "tests" / "browser":
+            item.add_marker(pytest.mark.timeout(3 * PATIENCE / 1000))
+
+
 def carded(target: str) -> list[str]:
     """The observers of a target that run on the paper's scenario, each with a card."""
     usual = usual_observers(PRESETS["paper"]())
