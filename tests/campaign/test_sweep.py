@@ -77,7 +77,7 @@ def test_the_winner_is_that_of_a_paired_t_test(base: Scenario) -> None:
         common = rng.normal(1.0, 0.2, 6)  # what the records have in common: it cancels in pairs
         errors = {name: list(common + shift + rng.normal(0.0, 0.02, 6)) for name, shift in (("kf-lgs", 0.02), ("kf-multi", 0.0))}
         best = invented(base, {**errors, "zero": [0.1] * 6}).winner(0, "turbulence", "tip")
-        assert best is not None
+        assert best is not None and best.margin is not None
         first, second = sorted(errors, key=lambda name: float(np.mean(errors[name])))
         assert best.name == first, "an estimate of zero is never the best"
         assert best.margin == pytest.approx(np.mean(errors[second]) / np.mean(errors[first]) - 1.0, rel=1e-12)
