@@ -19,7 +19,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry import preview as module
-from wfsobs.telemetry.formats import FORMATS, format_of
+from wfsobs.telemetry.formats import FORMATS, format_of, npz
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.preview import MOST_FILE, preview
 from wfsobs.telemetry.records import read_record, record_arrays
@@ -156,6 +156,18 @@ def test_a_zip_bomb_is_not_unpacked(monkeypatch) -> None:
     tracemalloc.start()
     try:
         assert "holds more than 10 MB of numbers" in refused(bomb, "bomb.npz")
+        assert tracemalloc.get_traced_memory()[1] < 5_000_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_zeros_that_no_measurement_packs_like_are_not_unpacked(monkeypatch) -> None:
+    bomb = zipped({"y_lgs.npy": npy(np.zeros((2_000_000, 2))), "u.npy": npy(np.zeros((2, 2)))})
+    monkeypatch.setattr(npz, "LARGE", 10_000_000)
+    tracemalloc.start()
+    try:
+        with pytest.raises(RecordError, match=r"^bomb\.npz: unpacks from 0\.\d+ to 32 MB, as no measurements do$"):
+            read_record(io.BytesIO(bomb), "bomb.npz")
         assert tracemalloc.get_traced_memory()[1] < 5_000_000
     finally:
         tracemalloc.stop()

@@ -25,6 +25,7 @@ from wfsobs.cli.campaign_results import print_csv, select_rows, summary_table
 from wfsobs.cli.campaign_together import print_together
 from wfsobs.cli.show import show_table
 from wfsobs.evaluation.scores import COMMON_BOUNDS
+from wfsobs.observers import OBSERVERS
 from wfsobs.settings.errors import SettingError
 
 KEY_BYTES, ROW_BYTES, FILE_BYTES = 34, 12, 6_000
@@ -56,7 +57,7 @@ def print_plan(plan_file: str, workers: int | None) -> None:
     """Say how many runs, hours and bytes a campaign takes."""
     plan, side_by_side = load_plan(plan_file), workers or usable_processors()
     hours, measured = _core_hours(plan)
-    rows = _rows_of_a_run(plan) * plan.n_runs
+    rows = rows_of_a_run(plan) * plan.n_runs
     batches = max(1.0, hours * 3600 / BATCH)
     click.echo(f"{plan.name}: {len(plan.cells)} scenarios x {len(plan.seeds)} seeds = {plan.n_runs} runs")
     click.echo(f"observers: {', '.join(plan.observers) or 'none'}; controllers: {', '.join(plan.controllers) or 'none'}")
@@ -71,7 +72,7 @@ def print_plan(plan_file: str, workers: int | None) -> None:
 def stored_bytes(plan: Campaign, batches: float) -> float:
     """Return about how many bytes the rows of a plan take in so many files."""
     keys = len(plan.observers) + len(plan.controllers) + len(COMMON_BOUNDS)
-    return plan.n_runs * (keys * KEY_BYTES + _rows_of_a_run(plan) * ROW_BYTES) + batches * FILE_BYTES
+    return plan.n_runs * (keys * KEY_BYTES + rows_of_a_run(plan) * ROW_BYTES) + batches * FILE_BYTES
 
 
 def _span(hours: float) -> str:
@@ -95,10 +96,12 @@ def _core_hours(plan: Campaign) -> tuple[float, str]:
     return mean * plan.n_runs / 3600, how
 
 
-def _rows_of_a_run(plan: Campaign) -> int:
-    modes = len(plan.cells[0].scenario().modes)
-    observers, controllers = ((len(names) + len(COMMON_BOUNDS)) * bool(names) for names in (plan.observers, plan.controllers))
-    return modes * (2 * observers + controllers)
+def rows_of_a_run(plan: Campaign) -> int:
+    """Return the rows of a run: of every observer its targets, and their sum where it has both; of every bound all three."""
+    of_observers = [len(OBSERVERS[name].targets) for name in plan.observers]
+    rows = sum(n + (n > 1) for n in of_observers) + 3 * len(COMMON_BOUNDS) * bool(of_observers)
+    rows += (len(plan.controllers) + len(COMMON_BOUNDS)) * bool(plan.controllers)
+    return rows * len(plan.cells[0].scenario().modes)
 
 
 @campaign.command()

@@ -18,7 +18,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import order_of
 from wfsobs.telemetry import timestamps as clock
 from wfsobs.telemetry.bridged import without_bridged
-from wfsobs.telemetry.formats.contents import APART, FAST, FRAME, NGS, SIGNALS, STARS, TIME, TRAINING, Contents
+from wfsobs.telemetry.formats.contents import APART, FAST, FRAME, LARGEST, NGS, SIGNALS, STARS, TIME, TRAINING, Contents
 from wfsobs.typing import Array
 from wfsobs.units import ANGLES, micrometres_per, parse_unit
 
@@ -100,10 +100,11 @@ def _signal(name: str, raw: Array) -> Array:
     if raw.ndim != 2:
         raise RecordError(f"{name} has shape {raw.shape}; expected (any, any)")
     out = np.array(raw, dtype=np.float64, order="C")
-    bad = np.isinf(out) if name not in TRAINING else ~np.isfinite(out)
+    bad = np.abs(out) > LARGEST if name not in TRAINING else ~(np.abs(out) <= LARGEST)
     if bad.any():
         row, column = np.argwhere(bad)[0]
-        raise RecordError(f"{name} is {out[row, column]} at step {row}, mode {column}; it takes finite numbers")
+        most = f" up to {LARGEST:g}, NaN where one is missing" if np.isfinite(out[row, column]) else ""
+        raise RecordError(f"{name} is {out[row, column]} at step {row}, mode {column}; it takes finite numbers{most}")
     return out
 
 

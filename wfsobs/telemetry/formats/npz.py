@@ -20,6 +20,9 @@ KINDS = "fiuUb"
 
 DAMAGED = "damaged, or holds more than plain arrays"
 DAMAGES = (ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError, RuntimeError, NotImplementedError, MemoryError)
+LARGE, PACKED = 100_000_000, 200
+"""Bytes from which arrays are not unpacked where they are packed in so many times less: those of noise hardly shrink."""
+
 HEADER = 10_000
 """Maximum header of an array [bytes]."""
 
@@ -36,9 +39,11 @@ def read(file: IO[bytes], most: int) -> FileColumns:
         with zipfile.ZipFile(file) as archive:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
             known = {name: members[name] for name in NAMES if name in members}
-            room = most - sum(info.file_size for info in known.values())
-            if room < 0:
+            size, packed = (sum(getattr(info, what) for info in known.values()) for what in ("file_size", "compress_size"))
+            if (room := most - size) < 0:
                 raise TooLargeError(most)
+            if size > LARGE and size > PACKED * packed:
+                raise RecordError(f"unpacks from {packed / 1e6:.3g} to {size / 1e6:.4g} MB, as no measurements do")
             for name, info in known.items():
                 out.contents.arrays[name] = _array(archive, info, name)
                 if name not in (*NUMBERS, *TEXTS):
