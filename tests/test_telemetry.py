@@ -78,7 +78,7 @@ WRONG = [
     (lambda a: a | {"ratio": np.array(2.5)}, "ratio takes a whole number, not 2.5"),
     (lambda a: a | {"ratio": np.array(4)}, r"y_ngs has a frame at step 5; with ratio = 4 frames are at"),
     (lambda a: changed(a, "y_ngs", 7, 0.0), "y_ngs has a frame at step 7; with ratio = 5"),
-    (lambda a: changed(a, "u", 3, 1e300), "u is 1e+300 at step 3, mode 0; it takes finite numbers up to 1e+12, NaN where one is"),
+    (lambda a: changed(a, "u", 3, 1e300), r"u is 1e\+300 at step 3, mode 0; it takes finite numbers up to 1e\+12, NaN"),
     (lambda a: changed(a, "y_lgs", 3, -np.inf), "y_lgs is -inf at step 3, mode 0; it takes finite numbers"),
     (lambda a: changed(a, "y_lgs", slice(None), np.nan), "y_lgs holds no measurement of one of its modes"),
     (lambda a: a | {"training_y": changed(a, "u", 2, np.nan)["u"], "training_u": a["u"]}, "training_y is nan at step 2, mode 0"),
