@@ -8,16 +8,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from wfsobs.cli import main
 from wfsobs.cli.options import load_declared
-from wfsobs.record import Record
+from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.command_response import DECIDED, command_response, saturation_lines
+from wfsobs.telemetry.contradiction import contradiction
 from wfsobs.telemetry.intake import DeclaredFormat
-from wfsobs.telemetry.preview import preview
-from wfsobs.telemetry.records import save_record
+from wfsobs.telemetry.preview import Preview, preview
+from wfsobs.telemetry.records import load, save_record
 from wfsobs.typing import Array
 
 GAIN, LEAK, NOISE = 0.4, 0.995, 0.05
@@ -140,3 +143,49 @@ def test_no_rail_is_seen_in_loops_without(disturbance: Array) -> None:
     y[5000:5400], u[5000:5400] = np.nan, np.nan
     for record in (clean, replace(clean, y_lgs=y, u=u), replace(clean, u=clean.u + 200.0)):
         assert saturation_lines(record) == []
+
+
+@pytest.mark.parametrize("steps", [2000, 20_000])
+@pytest.mark.parametrize("delay", [1, 2, 3])
+def test_what_the_data_exclude(disturbance: Array, delay: int, steps: int) -> None:
+    """The wrong sign always, the right one never; nor the right delay, nor those beside it, which are nearly as likely."""
+    noise = NOISE * np.random.default_rng(3).standard_normal(disturbance.shape)
+    record = closed_loop(disturbance, noise, 1, delay)
+    record = replace(record, y_lgs=record.y_lgs[:steps], u=record.u[:steps] + 30.0, delay=delay)
+    assert contradiction(record) == ""
+    reverse = contradiction(replace(record, u=-record.u), -1)
+    assert reverse.startswith("command sign -1 is excluded by the data") and "and with +1 the spectrum" in reverse
+    if delay < 3:
+        assert contradiction(replace(record, delay=5)).startswith("command delay 5 is excluded by the data: with")
+
+
+def test_what_does_not_decide_is_not_excluded() -> None:
+    """Commands that follow nothing, too few steps, a mirror at rest, a loop so slow that its commands are lost in the noise."""
+    rng = np.random.default_rng(5)
+    noise, u = rng.standard_normal((5000, 2)), rng.standard_normal((5000, 2)).cumsum(axis=0)
+    for y, commands in ((noise, u), (noise[:300], u[:300]), (noise, 0.0 * u), (noise, -1e-3 * noise.cumsum(axis=0)), (u, u)):
+        for sign in (1, -1):
+            assert contradiction(Record(y, sign * commands, 1e-3)) == ""
+
+
+def test_every_way_in_refuses_a_wrong_sign_unless_it_is_trusted(tmp_path: Path) -> None:
+    record = simulate(PRESETS["paper"]().replace({"run.duration": 5.0}))
+    wrong = tmp_path / "wrong.npz"
+    save_record(wrong, replace(record, u=-record.u))
+    for words in (
+        ["observe", "RECORD", "--json"],
+        ["identify", "RECORD"],
+        ["loop", "--controller", "integrator", "--record", "RECORD"],
+        ["live", "--headless", "--seconds", "0.2", "--observer", "zero", "--no-controllers", "--replay", "RECORD"],
+    ):
+        words = [str(wrong) if word == "RECORD" else word for word in words]
+        done = CliRunner().invoke(main, words)
+        assert done.exit_code != 0 and done.stdout == ""
+        assert re.fullmatch(r"wfsobs: .*wrong.npz: command sign \+1 is excluded by the data: .*; --trust goes on\n", done.stderr)
+        done = CliRunner().invoke(main, [*words, "--trust"])
+        assert done.exit_code == 0, done.output
+    with pytest.raises(RecordError, match="command sign"):
+        load(wrong)
+    assert load(wrong, trust=True).n_steps == record.n_steps
+    found = preview(wrong.read_bytes(), "wrong.npz")
+    assert isinstance(found, Preview) and "trust those stated: command sign +1 is excluded" in found.reading.missing

@@ -42,7 +42,7 @@ def test_the_numbers_of_a_record(ending: str) -> None:
     found = preview(CONTENT[ending], f"night{ending}")
     assert (found.rate, found.duration, found.record.missing) == (pytest.approx(1000.0), pytest.approx(1.5), 0)
     assert found.rms["y_lgs"] == pytest.approx(np.sqrt(np.mean(RECORD.y_lgs**2, axis=0)))
-    assert found.rms["z"] == pytest.approx(np.sqrt(np.mean(RECORD.z**2, axis=0)))
+    assert found.rms["z"] == pytest.approx(np.sqrt(np.mean(RECORD.z[RECORD.delay :] ** 2, axis=0)))
     assert found.lines()[0] == "1500 steps at 1000 Hz, 1.5 s, 0 missing"
     assert found.lines()[3] == "NGS: 200 Hz, 0 frames missing"
 

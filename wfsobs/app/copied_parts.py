@@ -35,6 +35,7 @@ def stated_options(source: LoadedRecord) -> list[str]:
         "sha256": source.sha256 or None,
     }
     words = [word for name, value in named.items() if value is not None for word in (f"--{name}", str(value))]
+    words += ["--trust"] * stated.trust
     return words + [word for role, name in stated.columns.items() for word in ("--column", f"{role}={name}")]
 
 
@@ -44,7 +45,7 @@ RECORD_IMPORTS = {"from wfsobs.telemetry.intake import DeclaredFormat", "from wf
 
 def record_code(source: LoadedRecord) -> str:
     """Write the line of Python that loads a record."""
-    stated = "".join(f"{name}={value!r}, " for name, value in vars(source.declaration).items() if value not in (None, {}))
+    stated = "".join(f"{name}={value!r}, " for name, value in vars(source.declaration).items() if value not in (None, {}, False))
     check = f", sha256={source.sha256!r}" if source.sha256 else ""
     return f"record = load_record({source.name!r}, scenario, DeclaredFormat({stated.removesuffix(', ')}){check})"
 

@@ -27,6 +27,7 @@ STATEMENTS: dict[str, tuple[str, Callable[[str], Any], str]] = {
     "sign": ("command_sign", int, "takes 1 or -1"),
     "delay": ("command_delay", int, "takes a whole number of steps from 1"),
     "rate": ("rate", float, "takes a rate above 0 Hz"),
+    "trust": ("trust", lambda text: bool(("False", "True").index(text)), "takes True"),
 }
 """Field -> part of the declaration, its reading, what it takes."""
 
@@ -59,7 +60,7 @@ def record_fields(record: NamedRecord) -> dict[str, str]:
     """Write a record as fields of a link."""
     said = {key: getattr(record.declaration, part) for key, (part, _, _) in STATEMENTS.items()}
     fields = {"name": record.name, "sha256": record.sha256}
-    fields |= {key: f"{value:.17g}" if key == "rate" else str(value) for key, value in said.items() if value is not None}
+    fields |= {key: f"{value:.17g}" if key == "rate" else str(value) for key, value in said.items() if value not in (None, False)}
     fields |= {COLUMN + role: name for role, name in record.declaration.columns.items()}
     return {PREFIX + key: text for key, text in fields.items()}
 

@@ -25,18 +25,19 @@ class SessionError(ValueError):
 def read_declaration(values: Mapping[str, Any]) -> DeclaredFormat:
     """Read what was said of a record's file. Raises SessionError."""
     unit, sign, delay, rate = (values.get(name) for name in ("unit", "command_sign", "command_delay", "rate"))
-    columns = get_value(values, "columns", dict)
+    columns, trust = get_value(values, "columns", dict), values.get("trust", False)
     valid = (
         (unit is None or unit in UNITS)
         and sign in (None, 1, -1)
         and (delay is None or (type(delay) is int and 1 <= delay < 1e6))
         and (rate is None or (type(rate) in (int, float) and 0 < rate < 1e6))
+        and isinstance(trust, bool)
         and len(columns) <= 64
         and all(isinstance(name, str) and len(name) <= LONGEST_TEXT for name in columns.values())
     )
     if not valid:
         raise SessionError("what is said of a record makes no sense")
-    return DeclaredFormat(unit, sign, delay, rate, columns)
+    return DeclaredFormat(unit, sign, delay, rate, columns, trust)
 
 
 def read_score(values: Any) -> Score:

@@ -24,7 +24,8 @@ class UploadFields:
         self.unit = _select("Unit", [SILENT, *UNITS])
         self.sign = _select("Commands", {SILENT: 0, "are added to the measurement (+1)": 1, "are subtracted (-1)": -1})
         self.delay, self.rate = _text("Delay of commands [steps]", 240), _text("Rate [Hz]")
-        self.widgets = (self.unit, self.sign, self.delay, self.rate)
+        self.trust = pmui.Checkbox(label="Trust sign and delay as stated", value=False, size="small", margin=(4, 0))
+        self.widgets = (self.unit, self.sign, self.delay, self.rate, self.trust)
         for widget in self.widgets:
             widget.param.watch(lambda _event: on_change(), "value")
 
@@ -32,7 +33,7 @@ class UploadFields:
         """Read the fields; roles : of columns that have been chosen. Raises RecordError where a field holds no number."""
         unit = None if self.unit.value == SILENT else self.unit.value
         delay, rate = _number(self.delay, int, 1), _number(self.rate, float, 1e-3)
-        return DeclaredFormat(unit, self.sign.value or None, delay, rate, roles)
+        return DeclaredFormat(unit, self.sign.value or None, delay, rate, roles, self.trust.value)
 
     def take_proposals(self, preview: Preview) -> None:
         """Fill in the sign and the delay that the data propose."""

@@ -87,6 +87,7 @@ def live(
     command_delay: int | None,
     rate: float | None,
     columns: tuple[str, ...],
+    trust: bool,
     sha256: str | None,
     observers: tuple[str, ...],
     controllers: tuple[str, ...],
@@ -107,7 +108,7 @@ def live(
         if file:
             check_writable(file)
     scenario = configfile.scenario_from(preset, config, assignments)
-    declaration = declare_format(unit, command_sign, command_delay, rate, columns)
+    declaration = declare_format(unit, command_sign, command_delay, rate, columns, trust)
     if not replay_file and (sha256 or replace(declaration, unit=None) != DeclaredFormat()):
         raise SettingError("live: what is said of a record is of that of --replay")
     source = _source(scenario, replay_file, stream, modes, declaration, sha256)

@@ -59,8 +59,9 @@ def ngs_options(command: Callable) -> Callable:
 
 
 def record_options(command: Callable) -> Callable:
-    """Add --unit, --command-sign, --command-delay, --rate, --column and --sha256, the declarations on a record file."""
+    """Add --unit, --command-sign, --command-delay, --rate, --column, --trust and --sha256, the declarations on a record file."""
     for option in (
+        click.option("--trust", is_flag=True, help="Go on though the data exclude the sign or the delay of the commands."),
         click.option("--sha256", metavar="HEX", help="Refuse the record unless its file has this SHA-256."),
         click.option(
             "--column",
@@ -92,7 +93,7 @@ def record_options(command: Callable) -> Callable:
 
 
 def declare_format(
-    unit: str | None, command_sign: str | None, command_delay: int | None, rate: float | None, columns: Sequence[str]
+    unit: str | None, command_sign: str | None, command_delay: int | None, rate: float | None, columns: Sequence[str], trust: bool
 ) -> DeclaredFormat:
     """Collect what the options say of a record file. Raises SettingError."""
     roles = {}
@@ -101,7 +102,7 @@ def declare_format(
         if not equals:
             raise SettingError(f"--column {text}: takes ROLE=NAME, such as y_lgs/tip=slope_x")
         roles[role.strip()] = name
-    return DeclaredFormat(unit, int(command_sign) if command_sign else None, command_delay, rate, roles)
+    return DeclaredFormat(unit, int(command_sign) if command_sign else None, command_delay, rate, roles, trust)
 
 
 def training_options(command: Callable) -> Callable:

@@ -147,6 +147,7 @@ def loop(
     command_delay: int | None,
     rate: float | None,
     columns: tuple[str, ...],
+    trust: bool,
     sha256: str | None,
     train: str | None,
     train_until: float | None,
@@ -159,7 +160,7 @@ def loop(
     if record_file is not None:
         if seeds > 1:
             raise SettingError("--seeds: only for simulated records, not with --record")
-        stated = declare_format(unit, command_sign, command_delay, rate, columns)
+        stated = declare_format(unit, command_sign, command_delay, rate, columns, trust)
         record = load_declared(record_file, scenario, stated, sha256)
         scenario = as_stated(record, scenario)
         learnt = training(train, train_until, record, scenario, stated)

@@ -50,6 +50,7 @@ def observe(
     command_delay: int | None,
     rate: float | None,
     columns: tuple[str, ...],
+    trust: bool,
     sha256: str | None,
     train: str | None,
     train_until: float | None,
@@ -66,7 +67,7 @@ def observe(
         scenario = told_by(configfile.load_scenario(prior), scenario)
         for path, value in map(configfile.parse_assignment, assignments):
             scenario.set(path, value)
-    stated = declare_format(unit, command_sign, command_delay, rate, columns)
+    stated = declare_format(unit, command_sign, command_delay, rate, columns, trust)
     record = load_declared(record_file, scenario, stated, sha256)
     learnt = training(train, train_until, record, scenario, stated)
     with progress_bar() as update:
@@ -115,6 +116,7 @@ def identify(
     command_delay: int | None,
     rate: float | None,
     columns: tuple[str, ...],
+    trust: bool,
     sha256: str | None,
     level: float,
     lowest: float,
@@ -123,7 +125,7 @@ def identify(
 ) -> None:
     """Find noise, turbulence and vibration peaks in a record (docs/identification.md)."""
     scenario = configfile.scenario_from(preset, config, assignments)
-    stated = declare_format(unit, command_sign, command_delay, rate, columns)
+    stated = declare_format(unit, command_sign, command_delay, rate, columns, trust)
     record = load_declared(record_file, scenario, stated, sha256)
     if out:
         check_writable(out)

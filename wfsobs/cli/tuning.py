@@ -68,6 +68,7 @@ def tune(
     command_delay: int | None,
     rate: float | None,
     columns: tuple[str, ...],
+    trust: bool,
     sha256: str | None,
     out: str | None,
     as_json: bool,
@@ -77,7 +78,7 @@ def tune(
     if record_file is not None:
         if validation is not None:
             raise SettingError("--validation: only for simulated records, not with --record")
-        stated = declare_format(unit, command_sign, command_delay, rate, columns)
+        stated = declare_format(unit, command_sign, command_delay, rate, columns, trust)
         record = load_declared(record_file, scenario, stated, sha256)
     if out:
         check_writable(out)

@@ -119,7 +119,7 @@ def command_response(record: Record) -> CommandResponse | None:
     moving = np.ptp(u, axis=0) > 0
     if len(y) - ORDER - SPAN < 40 * BLOCKS or not moving.any():
         return None
-    y, u = y[:, moving], u[:, moving]
+    y, u = (x[:, moving] - x[:, moving].mean(axis=0) for x in (y, u))
     h, g, reply = (np.array(part) for part in zip(*map(_responses, y.T, u.T), strict=True))
     h, shifted = _rough(h[:, :, 1:]), {d: _rough(_shift(g, d)) for d in range(1, LONGEST + 1)}
     sign = -int(np.sign(reply.mean()))

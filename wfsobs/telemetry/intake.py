@@ -41,8 +41,9 @@ class DeclaredFormat:
     rate : float or None
         Rate of the fast steps [Hz].
     columns : mapping
-        Which column of the file is what, {role: name in the file}, of `wfsobs.telemetry.columns.ROLES`; empty where the names
-        are those of a record.
+        Which column of the file is what, {one of `wfsobs.telemetry.columns.ROLES`: name in the file}.
+    trust : bool
+        Whether sign and delay of the commands hold whatever the data say.
     """
 
     unit: str | None = None
@@ -50,6 +51,7 @@ class DeclaredFormat:
     command_delay: int | None = None
     rate: float | None = None
     columns: Mapping[str, str] = field(default_factory=dict)
+    trust: bool = False
 
 
 def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredFormat) -> Record:
@@ -73,9 +75,8 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
     if APART in arrays:
         signals[APART] = _stars_apart(arrays[APART], n, n_modes)
     origin, sign = _into_micrometres(signals, contents, declaration, scenario.telescope.diameter)
-    signals["u"] *= sign
-    if "training_u" in signals:
-        signals["training_u"] *= sign
+    for name in {"u", "training_u"} & signals.keys():
+        signals[name] *= sign
     if STARS in arrays:
         signals[STARS] = _star_counts(arrays[STARS], n)
     dt, ratio, timing = _apply_timestamps(signals, contents, declaration)
@@ -141,8 +142,7 @@ def _into_micrometres(
     if set(units.values()) & set(ANGLES) and signals["y_lgs"].shape[1] > 2:
         raise RecordError("angles are units of tip and tilt alone, which are two modes")
     for name, unit in units.items():
-        if unit != "um":
-            signals[name] *= micrometres_per(unit, diameter)
+        signals[name] *= micrometres_per(unit, diameter)
     sign = _whole("command_sign", arrays, declaration.command_sign, 1)
     if sign not in (1, -1):
         raise RecordError(f"command_sign takes 1 or -1, not {sign}")

@@ -20,7 +20,7 @@ from wfsobs.telemetry.command_response import CommandResponse, command_response,
 from wfsobs.telemetry.formats.contents import TIME, Contents
 from wfsobs.telemetry.formats.psd import NoSpectrumError, read_psd
 from wfsobs.telemetry.intake import DeclaredFormat, to_record
-from wfsobs.telemetry.records import read_columns, read_contents
+from wfsobs.telemetry.records import contradiction_of, read_columns, read_contents, stated_sign
 from wfsobs.typing import Array
 from wfsobs.units import UNITS, micrometres_per
 
@@ -52,12 +52,15 @@ class Reading:
         Units under which the size of z is plausible -> its rms [um]; empty where the file or the user states the unit.
     limits : list of str
         What the data say of commands at the limit of the mirror, a line per mode.
+    contradiction : str
+        Why the data exclude its sign or delay, unless that is trusted.
     """
 
     sign: int = 1
     response: CommandResponse | None = None
     units: dict[str, float] = field(default_factory=dict)
     limits: list[str] = field(default_factory=list)
+    contradiction: str = ""
 
     def lines(self) -> list[str]:
         """Return the evidence, a line each."""
@@ -70,9 +73,9 @@ class Reading:
 
     @property
     def missing(self) -> str:
-        """What has to be said before the record can be used, in a line; empty where nothing is."""
-        if set(self.units) <= {"um"}:
-            return ""
+        """What to say before the record can be used, in a line; empty where nothing is."""
+        if self.contradiction or set(self.units) <= {"um"}:
+            return self.contradiction and f"Take the proposed sign and delay, or trust those stated: {self.contradiction}."
         return f"Choose the unit first: the file does not say it, and the numbers are plausible as {' or '.join(self.units)}."
 
 
@@ -223,22 +226,19 @@ def preview(data: bytes, name: str, scenario: Scenario | None = None, declaratio
         record = to_record(contents, scenario, stated)
     except RecordError as error:
         raise RecordError(f"{shown}: {error}") from None
-    z = record.z
-    signals = {"y_lgs": record.y_lgs, "u": record.u, "z": z}
-    values = {key: tuple(rms(column[~np.isnan(column)]) for column in signal.T) for key, signal in signals.items()}
+    signals = {"y_lgs": record.y_lgs, "u": record.u, "z": (z := record.z[record.delay :])}.items()
+    values = {key: tuple(rms(column[~np.isnan(column)]) for column in signal.T) for key, signal in signals}
     frequency, spectrum = welch_psd(hold_last(z), record.dt)
     return Preview(record, shown, values, frequency, spectrum, _read_off(record, contents, stated, scenario, max(values["z"])))
 
 
 def _read_off(record: Record, contents: Contents, declaration: DeclaredFormat, scenario: Scenario, size: float) -> Reading:
     """Return what the data say of sign, delay and unit; size : rms of z, as read [um]."""
-    sign = int(contents.arrays.get("command_sign", declaration.command_sign or 1))
-    response = command_response(replace(record, u=sign * record.u))
-    limits = saturation_lines(record)
-    if declaration.unit or contents.units or "unit" in contents.arrays:
-        return Reading(sign, response, limits=limits)
-    units = {unit: size * micrometres_per(unit, scenario.telescope.diameter) for unit in UNITS}
-    return Reading(sign, response, {unit: x for unit, x in units.items() if PLAUSIBLE[0] <= x <= PLAUSIBLE[1]}, limits)
+    sign, known = stated_sign(contents, declaration), declaration.unit or contents.units or "unit" in contents.arrays
+    response, excluded = command_response(replace(record, u=sign * record.u)), contradiction_of(record, contents, declaration)
+    units = {} if known else {unit: size * micrometres_per(unit, scenario.telescope.diameter) for unit in UNITS}
+    plausible = {unit: x for unit, x in units.items() if PLAUSIBLE[0] <= x <= PLAUSIBLE[1]}
+    return Reading(sign, response, plausible, saturation_lines(record), excluded)
 
 
 def safe_name(name: str) -> str:

@@ -13,6 +13,7 @@ from wfsobs.files import write_whole
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.telemetry.columns import to_contents
+from wfsobs.telemetry.contradiction import contradiction
 from wfsobs.telemetry.formats import format_of
 from wfsobs.telemetry.formats.contents import Contents, FileColumns
 from wfsobs.telemetry.formats.npz import write as write_npz
@@ -80,6 +81,7 @@ def load(
     command_sign: int | None = None,
     command_delay: int | None = None,
     rate: float | None = None,
+    trust: bool = False,
 ) -> Record:
     """Read the record of a file: .npz, .csv, .fits or AOT (docs/data.md).
 
@@ -97,6 +99,8 @@ def load(
         Steps from a command to the first measurement that sees it.
     rate : float, optional
         Rate of rows without time stamps [Hz].
+    trust : bool
+        Whether sign and delay of the commands hold though the data exclude them.
 
     Returns
     -------
@@ -108,7 +112,7 @@ def load(
     RecordError
         The file cannot be used; one line naming what, where and what is expected.
     """
-    return load_record(path, scenario, DeclaredFormat(unit, command_sign, command_delay, rate))
+    return load_record(path, scenario, DeclaredFormat(unit, command_sign, command_delay, rate, trust=trust))
 
 
 def read_record(
@@ -121,9 +125,23 @@ def read_record(
     """Read the record of an open file; its name gives the format and is never opened. most : maximum bytes of numbers."""
     try:
         stated = declaration or DeclaredFormat()
-        return to_record(read_contents(file, name, stated.columns, most), scenario or Scenario(), stated)
+        contents = read_contents(file, name, stated.columns, most)
+        record = to_record(contents, scenario or Scenario(), stated)
+        if why := contradiction_of(record, contents, stated):
+            raise RecordError(f"{why}; --trust goes on")
+        return record
     except RecordError as error:
         raise RecordError(f"{name}: {error}") from None
+
+
+def stated_sign(contents: Contents, declaration: DeclaredFormat) -> int:
+    """Return the sign of the commands as the file or the user states it, 1 where neither does."""
+    return int(contents.arrays.get("command_sign", declaration.command_sign or 1))
+
+
+def contradiction_of(record: Record, contents: Contents, declaration: DeclaredFormat) -> str:
+    """Return why the data exclude the sign or the delay with which a record was read; empty where they do not, or are not to."""
+    return "" if declaration.trust else contradiction(record, stated_sign(contents, declaration))
 
 
 def read_contents(file: IO[bytes], name: str, roles: Mapping[str, str], most: int = MOST_BYTES) -> Contents:
