@@ -302,6 +302,20 @@ def test_nothing_is_found_in_turbulence_and_noise_nor_turbulence_in_noise() -> N
     assert nothing.scenario().turbulence.source == "none" and nothing.scenario().vibration.source == "none"
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_vibration_is_not_called_turbulence_where_there_is_none(seed: int) -> None:
+    """Three resonances in white noise: the filter of what was found predicts other records as that of the truth does."""
+    rng, n = np.random.default_rng(seed), 20_000
+    peaks = [Ar2(2 * pi * f, 0.012, rms, DT) for f, rms in ((23.8, 0.03), (47.5, 0.05), (80.0, 0.02))]
+    z = 0.014 * rng.standard_normal(2 * n) + sum(p.sample(2 * n, rng) for p in peaks)
+    (mode,) = identify(Record(z[:n, None], np.zeros((n, 1)), DT)).modes
+    assert mode.turbulence is None and ("no turbulence", None, None, None) in mode_rows(mode)
+    assert [p.frequency.value for p in mode.peaks] == pytest.approx([23.8, 47.5, 80.0], abs=1.0)
+    truth = Spectrum(0.014, DT, None, tuple(peaks))
+    found, true = (np.std(innovations(z[n:], spectrum)) for spectrum in (mode.spectrum, truth))
+    assert found < 1.01 * true
+
+
 def test_third_order_and_background_are_found_where_they_are() -> None:
     """Turbulence that falls as f^-6, and coloured noise such as aliasing; a scenario holds both, and the means over the modes."""
     s = known().replace(

@@ -1,4 +1,4 @@
-"""Resonances that are not vibration: they shape the continuum, without a visible peak."""
+"""Which processes of a spectrum are vibration: what shapes the continuum has no visible peak."""
 
 from __future__ import annotations
 
@@ -7,18 +7,21 @@ from math import pi
 import numpy as np
 
 from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3
 from wfsobs.spectral.model import Spectrum
 
 BROAD = 0.1
 """Minimum damping of a resonance of the continuum: modes of structures have 0.005 to 0.05."""
+SLOWEST = 10.0
+"""Minimum periods of turbulence in a record for what its corner and damping tell: a slower one is not resolved."""
 STANDS_OUT = 1.25
 """Minimum density at the maximum of a broad vibration peak, over that of the dip below it."""
 POINTS = 200
 """Points at which the density is evaluated."""
 
 
-def is_continuum(spectrum: Spectrum, p: Ar2, lowest: float) -> bool:
-    """Return whether a resonance of the spectrum belongs to turbulence or background.
+def is_continuum(spectrum: Spectrum, p: Ar2 | Ar3, lowest: float) -> bool:
+    """Return whether a process of the spectrum belongs to turbulence or background.
 
     It does if it lies below `lowest`, the minimum frequency of peaks [Hz]; or if it is broad, and the density of the
     whole model has no maximum there that stands out of the dip on its lower side. Likelihood cannot decide: where no model

@@ -98,7 +98,7 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
     modes = []
     for column in z.T:
         watch.check()
-        modes.append(OneMode(column, record.dt))
+        modes.append(OneMode(column, record.dt, lowest))
     add_peaks(modes, level, lowest, watch)
     left = count_unexplained(modes, level, lowest)
     found = tuple(

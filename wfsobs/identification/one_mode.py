@@ -7,7 +7,7 @@ from math import pi
 import numpy as np
 
 from wfsobs.identification.misfit import margin
-from wfsobs.identification.order import choose_order, with_background
+from wfsobs.identification.order import choose_order, with_background, without_vibration
 from wfsobs.identification.resonances import (
     NEIGHBOURS,
     add_resonance,
@@ -23,7 +23,7 @@ from wfsobs.spectral.lines import Sinusoid, nearest_line
 from wfsobs.spectral.missing import MissingSamples
 from wfsobs.spectral.model import RMS, Spectrum
 from wfsobs.spectral.periodogram import Cells, inflation, periodogram, periodogram_frequencies
-from wfsobs.spectral.search import PAD, Candidate
+from wfsobs.spectral.search import LOWEST, PAD, Candidate
 from wfsobs.spectral.whittle import first_guess, fit_spectrum, standard_deviations
 from wfsobs.typing import Array
 
@@ -47,6 +47,8 @@ class OneMode:
         Pseudo-open-loop measurement, (n,) [um]; NaN is a missing sample.
     dt : float
         Time step [s].
+    lowest : float
+        Minimum frequency of a peak [Hz].
     rng : numpy.random.Generator, optional
         For the draws of missing samples.
 
@@ -66,7 +68,8 @@ class OneMode:
         Frequencies of resonances that were removed for their uncertainty [Hz].
     """
 
-    def __init__(self, z: Array, dt: float, rng: np.random.Generator | None = None):
+    def __init__(self, z: Array, dt: float, lowest: float = LOWEST, rng: np.random.Generator | None = None):
+        self.lowest = lowest
         self.measurement, self.dt, self.n = z - np.nanmean(z), dt, len(z)
         self.missing = MissingSamples(np.isnan(z), dt, rng or np.random.default_rng(0))
         self.f = periodogram_frequencies(self.n, dt)
@@ -133,10 +136,11 @@ class OneMode:
         reshape : whether the order of the turbulence and the background are chosen anew; third : third order in any case
         """
         cells = self.cells()
-        self.spectrum = fit_spectrum(self.spectrum, cells)
+        self.spectrum = without_vibration(fit_spectrum(self.spectrum, cells), cells, self.lowest)
         if reshape:
+            cells = self.cells()
             self.spectrum = with_background(choose_order(self.spectrum, cells, third), cells)
-        for p in [p for p in self.spectrum.resonances if not is_peak(p, self.f)]:
+        for p in [p for p in self.spectrum.resonances if not is_peak(p, self.f[0])]:
             self.spectrum = self.spectrum.without(p)
             self.rejections.append(Candidate(p.omega / (2 * pi), WIDEST_LINE, 0.0))  # or it would come back
         self._fill()
@@ -170,7 +174,7 @@ class OneMode:
         for some, shape in trials:
             self.lines = some
             self._subtract_lines()
-            if len(shape.resonances) > len(spectrum.resonances) and not is_peak(shape.resonances[-1], self.f):
+            if len(shape.resonances) > len(spectrum.resonances) and not is_peak(shape.resonances[-1], self.f[0]):
                 continue
             peaks_more = len(some) - len(lines) + len(shape.resonances) - len(spectrum.resonances)
             gain = before - misfit_of(shape, self.f[window], self.I[window]) - WORTH * peaks_more

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import pi
 
+from wfsobs.identification.continuum import BROAD, SLOWEST, is_continuum
+from wfsobs.identification.resonances import is_peak
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.spectral import background
@@ -46,6 +49,35 @@ def with_background(spectrum: Spectrum, cells: Cells) -> Spectrum:
         without, wide = spectrum, min(shapes, key=lambda s: spectrum_negative_log_likelihood(s, cells))
     gain = spectrum_negative_log_likelihood(without, cells) - spectrum_negative_log_likelihood(wide, cells)
     return wide if gain > background.WORTH and _beyond_turbulence(wide) else without
+
+
+def without_vibration(spectrum: Spectrum, cells: Cells, lowest: float) -> Spectrum:
+    """Return a fitted spectrum whose turbulence is none of the vibration.
+
+    A fit may end on a peak, above all where there is no turbulence. The peak is a resonance; turbulence is fitted beside it, and
+    there is none where that is not worth it. lowest : minimum frequency of peaks [Hz]
+    """
+    t = spectrum.turbulence
+    if t is None or _can_be_turbulence(spectrum, cells, lowest):
+        return spectrum
+    rest = replace(spectrum, turbulence=None)
+    if is_peak(peak := Ar2(t.omega, t.damping, t.rms, t.dt), cells.bin_width):
+        rest = replace(rest, resonances=(*rest.resonances, peak))
+    rest = fit_spectrum(rest, cells)
+    slow = [Ar2(2.0 * pi * corner, 0.7, t.rms, t.dt) for corner in (3.0 * cells.bin_width, 0.5 * lowest)]
+    shapes = [_smooth(replace(rest, turbulence=one), cells) for one in slow]
+    best = min(shapes, key=lambda s: spectrum_negative_log_likelihood(s, cells))
+    gain = spectrum_negative_log_likelihood(rest, cells) - spectrum_negative_log_likelihood(best, cells)
+    return best if gain > background.WORTH and _can_be_turbulence(best, cells, lowest) else rest
+
+
+def _can_be_turbulence(spectrum: Spectrum, cells: Cells, lowest: float) -> bool:
+    """Return whether there is turbulence that is broad, or slower than the record resolves, without a peak above `lowest`."""
+    t = spectrum.turbulence
+    if t is None:
+        return False
+    broad = t.damping > BROAD or t.omega < 2.0 * pi * SLOWEST * cells.bin_width
+    return broad and is_continuum(spectrum, t, lowest)
 
 
 def _beyond_turbulence(spectrum: Spectrum) -> bool:

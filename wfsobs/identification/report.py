@@ -64,6 +64,8 @@ def mode_rows(mode: IdentifiedMode) -> list[Row]:
         out.append(("turbulence", t.frequency, t.damping, t.rms))
         if (third := t.third_corner) is not None:
             out.append(("its third corner", Number(*(x * t.frequency.value for x in third)), None, None))
+    else:
+        out.append(("no turbulence", None, None, None))
     if (b := mode.background) is not None:
         out.append(("background, up to", b.frequency, None, b.rms))
     if (d := mode.difference) is not None:

@@ -47,9 +47,9 @@ def strongest_bin(candidate: Candidate, f: Array, ratio: Array) -> float:
     return float(f[near][np.argmax(ratio[near])])
 
 
-def is_peak(p: Ar2, f: Array) -> bool:
+def is_peak(p: Ar2, bin_width: float) -> bool:
     """Return whether a resonance is narrower than turbulence, not slower than the record, and below half the rate."""
-    return p.damping < WIDEST and 2.0 * f[0] < p.omega / (2 * pi) < f[-1]
+    return p.damping < WIDEST and 2.0 * bin_width < p.omega / (2 * pi) < 0.5 / p.dt - bin_width
 
 
 def add_resonance(spectrum: Spectrum, f: Array, I: Array, candidate: Candidate) -> Spectrum:  # noqa: E741
@@ -90,4 +90,4 @@ def split_resonance(spectrum: Spectrum, f: Array, I: Array, p: Ar2) -> Spectrum 
     count = len(start.vector)
     shape = fit_spectrum(start, cells, range(count - 6, count))
     gain = spectrum_negative_log_likelihood(spectrum, cells) - spectrum_negative_log_likelihood(shape, cells)
-    return shape if gain > SPLIT and all(is_peak(q, f) for q in shape.resonances[-2:]) else None
+    return shape if gain > SPLIT and all(is_peak(q, f[0]) for q in shape.resonances[-2:]) else None
