@@ -11,6 +11,7 @@ from scipy.special import expit, logit
 
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
+from wfsobs.spectral.densities import densities
 from wfsobs.typing import Array
 
 STEP = 1e-4
@@ -95,21 +96,31 @@ class Spectrum:
 
     def slopes(self, f: Array, indices: Sequence[int]) -> Array:
         """Return the derivatives of the density by parameters, in the order of `indices`, (len(indices), len(f)) [um^2/Hz]."""
-        on = _Frequencies(f, self.dt)
         rows = {0: np.full_like(f, 4.0 * self.dt * self.noise**2)}
-        for start, p in zip(self.starts, self.processes, strict=False):
-            at = _vector(p)
-            for i in range(len(at)):
-                if start + i not in indices:
-                    continue
-                if i == RMS:
-                    rows[start + i] = 2.0 * on.density(p)
-                    continue
-                move = np.zeros(len(at))
-                move[i] = STEP * p.damping if i == 0 else STEP  # a resonance is as narrow as its damping
-                up, down = (on.density(_process(at + sign * move, self.dt)) for sign in (1.0, -1.0))
-                rows[start + i] = (up - down) / (2.0 * move[i])
+        moved = [(start, p) for start, p in zip(self.starts, self.processes, strict=False) if _any_of(p, start, indices)]
+        second = [(start, p) for start, p in moved if isinstance(p, Ar2)]
+        if second:
+            density, slopes = densities(np.array([_vector(p) for _, p in second]), self.dt, f)
+            slopes *= density[:, None]
+            rows |= {start + i: slopes[k, i] for k, (start, _) in enumerate(second) for i in range(3)}
+        for start, p in moved:
+            if isinstance(p, Ar3):
+                rows |= {start + i: row for i, row in enumerate(_slopes_of_third_order(p, f))}
         return np.array([rows[i] for i in indices])
+
+
+def _any_of(p: Ar2 | Ar3, start: int, indices: Sequence[int]) -> bool:
+    return any(start <= i < start + 3 + isinstance(p, Ar3) for i in indices)
+
+
+def _slopes_of_third_order(p: Ar3, f: Array) -> Array:
+    """Return the derivatives of the density by the parameters of a process, (4, len(f)) [um^2/Hz]."""
+    at, rows = _vector(p), []
+    for i in range(len(at)):
+        move = STEP * (p.damping if i == 0 else 1.0) * np.eye(len(at))[i]
+        up, down = (_process(at + sign * move, p.dt).psd(f) for sign in (1.0, -1.0))
+        rows.append((up - down) / (2.0 * move[i]))
+    return np.array(rows)
 
 
 class _Frequencies:
