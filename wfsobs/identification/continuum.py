@@ -12,8 +12,6 @@ from wfsobs.spectral.model import Spectrum
 
 BROAD = 0.1
 """Minimum damping of a resonance of the continuum: modes of structures have 0.005 to 0.05."""
-SLOWEST = 10.0
-"""Minimum periods of turbulence in a record for what its corner and damping tell: a slower one is not resolved."""
 STANDS_OUT = 1.25
 """Minimum density at the maximum of a broad vibration peak, over that of the dip below it."""
 POINTS = 200

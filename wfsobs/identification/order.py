@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from math import pi
 
-from wfsobs.identification.continuum import BROAD, SLOWEST, is_continuum
+from wfsobs.identification.continuum import is_continuum
 from wfsobs.identification.resonances import is_peak
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
@@ -58,26 +58,18 @@ def without_vibration(spectrum: Spectrum, cells: Cells, lowest: float) -> Spectr
     there is none where that is not worth it. lowest : minimum frequency of peaks [Hz]
     """
     t = spectrum.turbulence
-    if t is None or _can_be_turbulence(spectrum, cells, lowest):
+    if t is None or is_continuum(spectrum, t, lowest):
         return spectrum
     rest = replace(spectrum, turbulence=None)
     if is_peak(peak := Ar2(t.omega, t.damping, t.rms, t.dt), cells.bin_width):
         rest = replace(rest, resonances=(*rest.resonances, peak))
     rest = fit_spectrum(rest, cells)
-    slow = [Ar2(2.0 * pi * corner, 0.7, t.rms, t.dt) for corner in (3.0 * cells.bin_width, 0.5 * lowest)]
-    shapes = [_smooth(replace(rest, turbulence=one), cells) for one in slow]
+    starts = [Ar2(2.0 * pi * corner, 0.7, t.rms, t.dt) for corner in (3.0 * cells.bin_width, 0.5 * lowest)]
+    shapes = [_smooth(replace(rest, turbulence=one), cells) for one in starts]
     best = min(shapes, key=lambda s: spectrum_negative_log_likelihood(s, cells))
     gain = spectrum_negative_log_likelihood(rest, cells) - spectrum_negative_log_likelihood(best, cells)
-    return best if gain > background.WORTH and _can_be_turbulence(best, cells, lowest) else rest
-
-
-def _can_be_turbulence(spectrum: Spectrum, cells: Cells, lowest: float) -> bool:
-    """Return whether there is turbulence that is broad, or slower than the record resolves, without a peak above `lowest`."""
-    t = spectrum.turbulence
-    if t is None:
-        return False
-    broad = t.damping > BROAD or t.omega < 2.0 * pi * SLOWEST * cells.bin_width
-    return broad and is_continuum(spectrum, t, lowest)
+    slow = best.turbulence is not None and is_continuum(best, best.turbulence, lowest)
+    return best if slow and gain > background.WORTH else rest
 
 
 def _beyond_turbulence(spectrum: Spectrum) -> bool:

@@ -7,7 +7,7 @@ from math import nan, pi, sqrt
 from typing import Any
 
 from wfsobs.identification.both_sensors import SensorDifference, error_of_a_star, without_error
-from wfsobs.identification.continuum import SLOWEST, is_continuum
+from wfsobs.identification.continuum import is_continuum
 from wfsobs.identification.one_mode import OneMode
 from wfsobs.identification.process import (
     IdentifiedPeak,
@@ -29,6 +29,8 @@ from wfsobs.signal.ar2 import Ar2, turbulence_corner
 from wfsobs.simulation.layers import relative_cone_error, relative_rms
 from wfsobs.spectral.model import Spectrum
 
+SLOWEST = 10.0
+"""Minimum periods of turbulence in a record for a standard deviation of its corner: a slower one is not resolved."""
 LARGEST = 100.0
 """Maximum strength of turbulence [um] in a scenario's settings."""
 
