@@ -22,6 +22,7 @@ from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.errors import SettingError
+from wfsobs.telemetry.columns import to_contents
 from wfsobs.telemetry.formats import npz
 from wfsobs.telemetry.intake import DeclaredFormat, to_record
 from wfsobs.telemetry.preview import safe_name
@@ -165,7 +166,7 @@ class _Records:
             info = self._members.get(_member(number))
             if info is None:
                 raise SessionError("one of its records is missing")
-            contents = npz.read(io.BytesIO(_unpack(self._archive, info, self._left)), self._left)
+            contents = to_contents(npz.read(io.BytesIO(_unpack(self._archive, info, self._left)), self._left), {})
             self._left -= sum(array.nbytes for array in contents.arrays.values())
             record = to_record(contents, self._largest, DeclaredFormat())
             self._records[number] = record, record_key(record)
