@@ -48,14 +48,12 @@ class Context:
         return self.made[-1][1]
 
 
-class App:
-    prefix, secret_key, sign_sessions, session_token_expiration = "/lab", b"secret", True, 60
-
-
 def run(service: Service, steps: Callable[[Any, Context], Any]) -> None:
     async def inside() -> None:
-        context = Context()
-        await steps(ready.NextPage(service, App(), context, 0.0), context)  # type: ignore[arg-type]
+        context: Any = Context()
+        page = ready.NextPage(service, "/lab", b"secret", 60, 0.0)
+        page.context = context
+        await steps(page, context)
 
     asyncio.run(inside())
 

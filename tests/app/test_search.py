@@ -8,7 +8,7 @@ from wfsobs.scenario import Scenario
 
 
 def titles(dashboard: Dashboard) -> dict[str, str]:
-    return dict(zip(dashboard.controls.topics, dashboard.controls.accordion._names, strict=True))
+    return {name: title.object for name, title in dashboard.controls.titles.items()}
 
 
 class TestSearch:

@@ -5,13 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 
-import panel as pn
 import pytest
 from bokeh.document import Document
 from panel.io.document import _cleanup_doc
 from panel.io.state import set_curdoc
 
-from wfsobs.app import warm
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.limits import NONE
 from wfsobs.app.service import Service
@@ -27,19 +25,6 @@ def service() -> Iterator[Service]:
     service = Service(NONE, 2, 100_000_000, compute)
     yield service
     service.close(20.0)
-
-
-def test_the_first_run_is_under_way_and_the_page_is_gone(
-    service: Service, short: Scenario, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(warm, "PRESETS", {"short": lambda: short})
-    pages, sessions = len(pn.state._views), service.sessions
-    warm.warm_up(service)
-    assert len(pn.state._views) == pages and service.sessions == sessions
-    end = time.monotonic() + 60
-    while not service.is_cached(short) and time.monotonic() < end:
-        time.sleep(0.05)
-    assert service.is_cached(short)
 
 
 def test_the_first_picture_comes_with_the_page_and_is_made_of_little(service: Service, short: Scenario) -> None:

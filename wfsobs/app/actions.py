@@ -7,15 +7,14 @@ from functools import partial
 from typing import Any
 
 import param
-from panel.custom import JSComponent
 
+from wfsobs.app.component import Component
 from wfsobs.app.copies import EXPLORED, to_command, to_python
 from wfsobs.app.downloads import Save, TooLarge, data_csv, data_npz
 from wfsobs.app.jobs.job import DONE, FAILED, RUNNING, Job
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.pages.pages import Pages
 from wfsobs.app.pages.parts import PageActions
-from wfsobs.app.picker import file_message
 from wfsobs.app.record_link import name_record
 from wfsobs.app.report.maker import LIMIT, ReportError, make
 from wfsobs.app.seeds import SeedRuns
@@ -34,7 +33,7 @@ LARGEST = 2_000_000
 REPORT = "wfsobs-report.html"
 
 
-class Toolbar(JSComponent):
+class Toolbar(Component):
     """The row in the browser: texts down, messages {action, ...} up, files down as messages."""
 
     query = param.String("", doc="What a link to the settings has after its ?.")
@@ -54,26 +53,13 @@ class Toolbar(JSComponent):
     _esm = asset("figures.js") + asset("actions.js")
     _stylesheets = [asset("actions.css")]
 
-    def __init__(self, **params: Any):
-        self.on_action: Callable[[dict[str, Any]], None] | None = None
-        super().__init__(**params)
-
-    def _handle_msg(self, data: dict[str, Any]) -> None:
-        if self.on_action is not None and isinstance(data, dict) and isinstance(data.get("action"), str):
-            self.on_action(data)
-
-    def save(self, name: str, kind: str, content: bytes) -> None:
-        """Have the browser save a file."""
-        self._send_msg(file_message(name, kind, content))
-
 
 class Actions:
     """The toolbar over a store."""
 
     def __init__(self, store: Store):
         self.store = store
-        self.toolbar = Toolbar(labels=labels(), sizing_mode="stretch_width", margin=0)
-        self.toolbar.on_action = self.handle
+        self.toolbar = Toolbar(self.handle, labels=labels(), sizing_mode="stretch_width", margin=0)
         self._tasks: dict[str, BackgroundTask] = {}
         self._under_way: dict[str, tuple[str, Callable[[Any], None]]] = {}
         self._pages: Pages | None = None
@@ -131,8 +117,8 @@ class Actions:
             "npz": lambda: self.save_data("wfsobs.npz", "application/octet-stream", data_npz),
             "page": lambda: self.save_of_page(str(msg.get("name", ""))),
         }
-        if msg.get("action") in does:
-            does[msg["action"]]()
+        if (action := str(msg.get("action"))) in does:
+            does[action]()
 
     def open_link(self, query: str) -> None:
         """Take the settings that the page's address asks for, and name what cannot be taken."""

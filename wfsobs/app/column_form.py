@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import param
-from panel.custom import JSComponent
 
+from wfsobs.app.component import Component
 from wfsobs.app.style import asset
 from wfsobs.telemetry.columns import ROLES
 
@@ -17,7 +17,7 @@ HINT = (
 )
 
 
-class ColumnForm(JSComponent):
+class ColumnForm(Component):
     """The form in the browser: columns and roles down, messages {column, role} up."""
 
     columns = param.Dict({}, doc="Name of a column -> its values in a few words.")
@@ -30,13 +30,13 @@ class ColumnForm(JSComponent):
 
     def __init__(self, on_change: Callable[[], None], **params: Any):
         self.on_change = on_change
-        super().__init__(**params)
+        super().__init__(self._take, **params)
 
     def show(self, columns: Mapping[str, str], roles: Mapping[str, str]) -> None:
         """Show the columns of another file."""
         self.param.update(columns=dict(columns), roles=dict(roles))
 
-    def _handle_msg(self, data: Any) -> None:
+    def _take(self, data: dict[str, Any]) -> None:
         column, role = (str(data.get(key, "")) for key in ("column", "role"))
         if column not in self.columns or (role and role not in self.labels):
             return

@@ -7,15 +7,15 @@ from typing import Any
 from uuid import uuid4
 
 import param
-from panel.custom import JSComponent
 
+from wfsobs.app.component import Component
 from wfsobs.app.style import asset
 
 MOST = 1000
 """Changes that are taken at once."""
 
 
-class Connection(JSComponent):
+class Connection(Component):
     """The banner in the browser: questions {ask} and unsent changes {changes} up, the last question that has arrived down."""
 
     session = param.String("", doc="A name of the session, to tell it from one made anew.")
@@ -27,11 +27,9 @@ class Connection(JSComponent):
     def __init__(self, take: Callable[[dict[str, Any]], None], **params: Any):
         """Connect a page. take : makes a change again that did not arrive."""
         self._take = take
-        super().__init__(session=uuid4().hex, **params)
+        super().__init__(self._hear, session=uuid4().hex, **params)
 
-    def _handle_msg(self, data: Any) -> None:
-        if not isinstance(data, dict):
-            return
+    def _hear(self, data: dict[str, Any]) -> None:
         if isinstance(data.get("ask"), int):
             self.last_arrival = data["ask"]
         changes = data.get("changes")

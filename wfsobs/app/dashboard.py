@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import panel as pn
 import panel_material_ui as pmui
 import param
-from panel.custom import JSComponent
 from panel.util.parameters import edit_readonly
 
 from wfsobs.app.actions import Actions
+from wfsobs.app.component import Component
 from wfsobs.app.connection import Connection
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.controls.panel import Controls
@@ -48,7 +46,7 @@ NARROW = {"@media (max-width: 600px)": {"& .header a:has(.title)": {"display": "
 """On a phone the bar at the top has room for the run, not for the name."""
 
 
-class Frame(JSComponent):
+class Frame(Component):
     """Closes the drawer of a phone, tells the theme that is wanted and when the first picture stands, and fades stale results."""
 
     wants_dark = param.Boolean(False, doc="Whether the visitor's system has a dark theme, unless one was chosen here.")
@@ -59,16 +57,8 @@ class Frame(JSComponent):
 
     _esm = asset("patch.js") + asset("frame.js")
 
-    def __init__(self, **params: Any):
-        self.on_drawn: Callable[[], None] = lambda: None
-        super().__init__(**params)
 
-    def _handle_msg(self, data: object) -> None:
-        if isinstance(data, dict) and data.get("drawn"):
-            self.on_drawn()
-
-
-class Keyboard(JSComponent):
+class Keyboard(Component):
     """What the keyboard needs, and a first stop that leads to what is after it."""
 
     _esm = asset("keyboard.js")
@@ -147,7 +137,7 @@ class Dashboard:
                 self.body,
             ],
         )
-        self.frame.on_drawn = lambda: self._post(self._stand)
+        self.frame.on_message = lambda message: message.get("drawn") and self._post(self._stand)
         if pn.state.curdoc is None:  # nobody will say that it has been drawn
             self.complete()
         with edit_readonly(page):

@@ -7,8 +7,8 @@ from types import MappingProxyType
 from typing import Any
 
 import param
-from panel.custom import JSComponent
 
+from wfsobs.app.component import Component
 from wfsobs.app.glossary import TERMS
 from wfsobs.app.style import asset
 
@@ -30,7 +30,7 @@ SHORTCUTS: Mapping[str, str] = MappingProxyType(
 """Key -> what it does."""
 
 
-class Help(JSComponent):
+class Help(Component):
     """The button at the top, and what it opens."""
 
     shortcuts = param.Dict(dict(SHORTCUTS), doc="Key -> what it does.")

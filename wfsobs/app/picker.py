@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import base64
 import binascii
-from collections.abc import Callable
 from typing import Any
 
 import param
-from panel.custom import JSComponent
 
+from wfsobs.app.component import Component
 from wfsobs.app.style import asset
 from wfsobs.telemetry.preview import safe_name
 
@@ -20,7 +19,7 @@ PART = 1_000_000
 """Of what the browser sends at a time [bytes]."""
 
 
-class Picker(JSComponent):
+class Picker(Component):
     """The button and what is said beside it; files up in parts."""
 
     message = param.String("", doc="What there is to say, in one line.")
@@ -31,23 +30,6 @@ class Picker(JSComponent):
 
     _esm = asset("parts.js") + asset("upload.js")
     _stylesheets = [asset("actions.css")]
-
-    def __init__(self, **params: Any):
-        self.on_message: Callable[[dict[str, Any]], None] | None = None
-        super().__init__(**params)
-
-    def save(self, name: str, kind: str, content: bytes) -> None:
-        """Have the browser save a file."""
-        self._send_msg(file_message(name, kind, content))
-
-    def _handle_msg(self, data: dict[str, Any]) -> None:
-        if self.on_message is not None:
-            self.on_message(data)
-
-
-def file_message(name: str, kind: str, content: bytes) -> dict[str, str]:
-    """Return the message by which a browser saves a file."""
-    return {"name": name, "kind": kind, "content": base64.b64encode(content).decode()}
 
 
 class PartialFile:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from contextvars import ContextVar
 from time import monotonic
 
-from bokeh.server.contexts import ApplicationContext
+from bokeh.application.application import ServerContext
+from bokeh.application.handlers.handler import Handler
+from bokeh.document import Document
+from bokeh.server.contexts import ApplicationContext, BokehServerContext
 from bokeh.server.session import ServerSession
-from bokeh.server.tornado import BokehTornado
 from bokeh.util.token import generate_jwt_token, generate_session_id
 from tornado.httputil import HTTPServerRequest, RequestStartLine
 from tornado.ioloop import IOLoop, PeriodicCallback
@@ -27,18 +29,28 @@ NEXT: ContextVar[Session | None] = ContextVar("NEXT", default=None)
 """The session whose page is being made before its visitor comes."""
 
 
-class NextPage:
-    """The page of the next visitor who asks for the address alone; made while the server has nothing else to do."""
+class NextPage(Handler):
+    """The page of the next visitor who asks for the address alone; made while the server has nothing else to do.
 
-    def __init__(self, service: Service, app: BokehTornado, context: ApplicationContext, lifetime: float):
-        """Make none yet. context : of the page; lifetime : of a page that nobody connects to [s]."""
+    A handler of the application, which the server tells of the context that makes its sessions.
+    """
+
+    def __init__(self, service: Service, prefix: str, secret: bytes | None, token_lifetime: int, lifetime: float):
+        """Make none yet. prefix, secret, token_lifetime : as the server has them; lifetime : of an unconnected page [s]."""
+        super().__init__()
         self.service, self.lifetime = service, lifetime
-        self._app, self._context = app, context
+        self._prefix, self._secret, self._token_lifetime = f"/{prefix.strip('/')}".rstrip("/"), secret, token_lifetime
+        self.context: ApplicationContext | None = None
         self._page: tuple[Session, ServerSession, float] | None = None
         self._looks = PeriodicCallback(self.look, 1e3 * EVERY)
 
-    def start(self) -> None:
+    def modify_document(self, doc: Document) -> None:
+        """Leave the page as the other handler of the application makes it."""
+
+    def on_server_loaded(self, server_context: ServerContext) -> None:
         """Look from now on whether a page can be made."""
+        assert isinstance(server_context, BokehServerContext)
+        self.context = server_context.application_context
         self._looks.start()
 
     async def look(self) -> None:
@@ -64,16 +76,15 @@ class NextPage:
         return session
 
     async def _make(self) -> None:
-        app, session = self._app, self.service.new_session()
-        request = HTTPServerRequest(start_line=RequestStartLine("GET", f"{app.prefix}/", "HTTP/1.0"))
-        name = generate_session_id(app.secret_key, signed=app.sign_sessions)
-        payload = {"headers": {}, "cookies": {}, "arguments": {}, **self._context.application.process_request(request)}
-        token = generate_jwt_token(
-            name, app.secret_key, signed=app.sign_sessions, expiration=app.session_token_expiration, extra_payload=payload
-        )
+        assert self.context is not None
+        session = self.service.new_session()
+        request = HTTPServerRequest(start_line=RequestStartLine("GET", f"{self._prefix}/", "HTTP/1.0"))
+        name = generate_session_id(self._secret, signed=True)
+        payload = {"headers": {}, "cookies": {}, "arguments": {}, **self.context.application.process_request(request)}
+        token = generate_jwt_token(name, self._secret, signed=True, expiration=self._token_lifetime, extra_payload=payload)
         before = NEXT.set(session)
         try:
-            page = await self._context.create_session_if_needed(name, request, token)
+            page = await self.context.create_session_if_needed(name, request, token)
         finally:
             NEXT.reset(before)
         page.block_expiration()

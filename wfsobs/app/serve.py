@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from ipaddress import ip_address
@@ -16,10 +17,13 @@ from typing import Any
 
 import panel as pn
 from bokeh.server.server import Server
+from bokeh.server.urls import per_app_patterns
 from bokeh.server.views.autoload_js_handler import AutoloadJsHandler
+from bokeh.server.views.doc_handler import DocHandler
 from bokeh.server.views.metadata_handler import MetadataHandler
 from bokeh.util.token import generate_secret_key
-from panel.io.server import DocHandler, get_server
+from panel.io.application import build_applications
+from panel.io.server import get_server
 from tornado.ioloop import IOLoop
 
 from wfsobs.app.dashboard import Dashboard
@@ -29,12 +33,13 @@ from wfsobs.app.live_order import LiveOrder
 from wfsobs.app.live_work import share_loop
 from wfsobs.app.logs import event, to_stream
 from wfsobs.app.ready import NEXT, NextPage
-from wfsobs.app.service import Full, Service
+from wfsobs.app.service import Full, Service, Session
 from wfsobs.app.session import session_page
-from wfsobs.app.warm import warm_up
 from wfsobs.app.work import one_blas_thread
 from wfsobs.campaign.follow import CampaignFolder
 from wfsobs.live.paced import prefer
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.settings.errors import SettingError
 
 CACHE_MB = 256
 MESSAGE_BYTES = 6_000_000
@@ -112,7 +117,8 @@ def serve(options: Options, live: LiveOrder | None = None) -> None:
     service = make_service(options.limits, options.runs, options.cache_mb)
     if options.campaign:
         service.campaign = CampaignFolder(Path(options.campaign))
-    warm_up(service)
+    with suppress(SettingError):  # larger than the limits allow
+        service.queue.submit(service.run(PRESETS[next(iter(PRESETS))]()), "server", lambda _news: None)
     loop, status = IOLoop.current(), 0
 
     def fail() -> None:
@@ -179,10 +185,10 @@ def _end(service: Service, then: Any, number: int, frame: Any) -> None:
         sys.exit(0)
 
 
-def new_page(service: Service) -> Any:
-    """Build the page of a new session."""
+def new_page(service: Service, session: Session | None = None) -> Any:
+    """Build the page of a session, by default of a new visitor's."""
     try:
-        session = NEXT.get() or service.enter()
+        session = session or NEXT.get() or service.enter()
     except Full as error:
         return pn.pane.HTML(full_html(str(error)), margin=40)
     pn.state.on_session_destroyed(lambda _context: session.leave())
@@ -190,37 +196,41 @@ def new_page(service: Service) -> Any:
 
 
 def make_server(options: Options, service: Service) -> Server:
-    """Make a server that listens but has not started."""
-    server = get_server(
-        {"/": lambda: new_page(service)},
-        port=options.port,
-        address=options.address,
-        show=options.open_browser,
-        prefix=options.prefix,
-        title="wfsobs",
-        websocket_origin=origins(options),
-        websocket_max_message_size=MESSAGE_BYTES,
-        use_xheaders=bool(options.origins),
-        # A session is reached by a name that this server has signed, and keeps nothing of who the visitor is.
-        sign_sessions=True,
-        secret_key=generate_secret_key(),
-        include_headers=[],
-        include_cookies=[],
-        session_token_expiration=TOKEN,  # a page that was open for days may come back as well
-        unused_session_lifetime_milliseconds=round(1000 * options.lifetime),
-        check_unused_sessions_milliseconds=round(250 * options.lifetime),
-        extra_patterns=[("/liveness", Liveness, {"service": service})],
-    )
-    server._tornado.add_transform(partial(SecurityHeaders, options.embedders))  # type: ignore[arg-type]  # called like a class
-    router = server._tornado.wildcard_router
-    router.rules = [rule for rule in router.rules if not issubclass(rule.target, UNUSED)]
-    for rule in router.rules:
-        if rule.target is DocHandler:
-            context = rule.target_kwargs["application_context"]
-            ready = NextPage(service, server._tornado, context, options.lifetime)
-            ready.start()
-            rule.target = type("Door", (PageHandler,), {"service": service, "next_page": ready})
-    return server
+    """Make a server that listens but has not started. A page is made and dropped first: its imports take longer than the page."""
+    secret = generate_secret_key()
+    warm = iter([service.new_session()])
+    applications: Any = build_applications({"/": lambda: new_page(service, next(warm, None))}, title="wfsobs")
+    ready = NextPage(service, options.prefix, secret.encode(), TOKEN, options.lifetime)
+    applications["/"].add(ready)
+    door = type("Door", (PageHandler,), {"service": service, "next_page": ready})
+    routes = list(per_app_patterns)
+    per_app_patterns[:] = [
+        (entry[0], door if issubclass(entry[1], DocHandler) else entry[1]) for entry in routes if not issubclass(entry[1], UNUSED)
+    ]
+    try:
+        return get_server(
+            applications,
+            port=options.port,
+            address=options.address,
+            show=options.open_browser,
+            prefix=options.prefix,
+            warm=True,
+            websocket_origin=origins(options),
+            websocket_max_message_size=MESSAGE_BYTES,
+            use_xheaders=bool(options.origins),
+            # A session is reached by a name that this server has signed, and keeps nothing of who the visitor is.
+            sign_sessions=True,
+            secret_key=secret,
+            include_headers=[],
+            include_cookies=[],
+            session_token_expiration=TOKEN,  # a page that was open for days may come back as well
+            unused_session_lifetime_milliseconds=round(1000 * options.lifetime),
+            check_unused_sessions_milliseconds=round(250 * options.lifetime),
+            extra_patterns=[("/liveness", Liveness, {"service": service})],
+            transforms=[partial(SecurityHeaders, options.embedders)],
+        )
+    finally:
+        per_app_patterns[:] = routes
 
 
 def origins(options: Options) -> list[str]:

@@ -16,7 +16,6 @@ from urllib.parse import parse_qsl, quote, urlencode
 import panel as pn
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.mends import mend_panel
 from wfsobs.app.pages.pages import LIVE
 from wfsobs.app.service import Post
 from wfsobs.app.share import has_settings
@@ -27,7 +26,6 @@ log = logging.getLogger(__name__)
 
 def session_page(build: Callable[[Post], Dashboard]) -> Any:
     """Build the page of a new session; one with the error where it cannot be built."""
-    mend_panel()
     try:
         post = Poster()
         dashboard = build(post)

@@ -6,15 +6,15 @@ from collections.abc import Callable
 from typing import Any
 
 import param
-from panel.custom import JSComponent
 
+from wfsobs.app.component import Component
 from wfsobs.app.controls.names import preset_title
 from wfsobs.app.style import asset
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.disturbance import vibration_lines
 
 
-class Gallery(JSComponent):
+class Gallery(Component):
     """The button and what it opens; it gets the presets when it is first opened, and says which one was chosen."""
 
     items = param.List([], doc="{name, title, line, peaks: [Hz, um], events} of every preset.")
@@ -25,9 +25,9 @@ class Gallery(JSComponent):
     def __init__(self, choose: Callable[[str], None], **params: Any):
         """Make the button. choose : starts from the preset of a name."""
         self._choose = choose
-        super().__init__(**params)
+        super().__init__(self._take, **params)
 
-    def _handle_msg(self, data: dict[str, Any]) -> None:
+    def _take(self, data: dict[str, Any]) -> None:
         if data.get("open") and not self.items:
             self.items = presets_shown()
         elif data.get("choose") in PRESETS:

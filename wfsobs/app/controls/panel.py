@@ -80,8 +80,9 @@ class Controls:
         self.search = Search(self.open_setting, self._idle, sizing_mode="stretch_width", margin=(8, 0, 4, 0))
         self.topics = _names()
         self.rooms = {name: pn.Column(sizing_mode="stretch_width", margin=0) for name in self.topics}
+        self.titles = {name: pmui.Typography(title, variant="body2", margin=0) for name, title in self.topics.items()}
         self.accordion = pmui.Accordion(
-            *((title, self.rooms[name]) for name, title in self.topics.items()),
+            *((self.titles[name], self.rooms[name]) for name in self.topics),
             title_variant="body2",
             variant="outlined",
             disable_gutters=True,
@@ -223,9 +224,8 @@ class Controls:
         self.preset.helper_text = told
         self.reset.disabled = not changed
         count = Counter(path.split(".")[0] for path in changed)
-        names = [title + (f" · {count[name]} changed" if count[name] else "") for name, title in self.topics.items()]
-        if names != self.accordion._names:
-            self.accordion._names = names
+        for name, title in self.topics.items():
+            self.titles[name].object = title + (f" · {count[name]} changed" if count[name] else "")
 
     def _refresh_run(self, *_: object) -> None:
         run = self.store.run

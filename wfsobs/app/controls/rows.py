@@ -7,8 +7,8 @@ from typing import Any
 
 import panel as pn
 import param
-from panel.custom import JSComponent
 
+from wfsobs.app.component import Component
 from wfsobs.app.controls.field import TAG, idle_html
 from wfsobs.app.controls.fields import parse_number, short_number
 from wfsobs.app.controls.names import column_of, name_settings
@@ -20,7 +20,7 @@ from wfsobs.settings.group import Group
 from wfsobs.settings.parameters import Reals, unit_of
 
 
-class RowTable(JSComponent):
+class RowTable(Component):
     """The table in the browser: texts down, messages {action, row, key, text} up."""
 
     rows = param.List([], doc="One list of texts per item, None for what means nothing in it.")
@@ -31,14 +31,6 @@ class RowTable(JSComponent):
     _esm = asset("rows.js")
     _stylesheets = [asset("rows.css")]
 
-    def __init__(self, **params: Any):
-        self.on_edit: Any = None
-        super().__init__(**params)
-
-    def _handle_msg(self, msg: dict[str, Any]) -> None:
-        if self.on_edit is not None:
-            self.on_edit(msg)
-
 
 class RowEditor:
     """The table of one list of groups, kept in step with the store."""
@@ -48,13 +40,13 @@ class RowEditor:
         self._kind: type[Group] = p.item_type  # type: ignore[assignment]
         self._texts: dict[str, str] = {}
         self.table = RowTable(
+            self.handle,
             columns=_columns(self._kind),
             noun=self._kind.__name__.lower(),
             tags=[TAG + path],
             sizing_mode="stretch_width",
             margin=(0, 0, 8, 0),
         )
-        self.table.on_edit = self.handle
         self.label, self.idle = str(p.label), ""
         self.view = pn.Column(self.table, sizing_mode="stretch_width", margin=0)
         self.refresh()

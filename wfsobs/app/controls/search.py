@@ -6,15 +6,15 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import param
-from panel.custom import JSComponent
 
+from wfsobs.app.component import Component
 from wfsobs.app.display import label_of, unit_text
 from wfsobs.app.style import asset
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.idle import why_idle_at
 
 
-class Search(JSComponent):
+class Search(Component):
     """The box in the browser; it gets the settings when it is first used, and says which one has been chosen."""
 
     items = param.List([], doc="{path, label, topic, doc, unused} of every setting.")
@@ -30,9 +30,9 @@ class Search(JSComponent):
         """
         self._reveal, self._idle = reveal, idle
         self.on_sweep: Callable[[str], None] = lambda path: None
-        super().__init__(**params)
+        super().__init__(self._take, **params)
 
-    def _handle_msg(self, data: dict[str, Any]) -> None:
+    def _take(self, data: dict[str, Any]) -> None:
         if data.get("open"):
             self.items = settings_found(self._idle())
         elif (path := str(data.get("path", ""))) in {item["path"] for item in self.items}:

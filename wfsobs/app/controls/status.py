@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import param
-from panel.custom import JSComponent
 
+from wfsobs.app.component import Component
 from wfsobs.app.controls.names import setting_name
 from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.run_results import RunResults
@@ -37,7 +37,7 @@ progress::-moz-progress-bar { background: #8fd3f0; }
 """
 
 
-class Status(JSComponent):
+class Status(Component):
     """The state of the run in the browser."""
 
     progress = param.Number(0.0, doc="Fraction done.")

@@ -8,8 +8,8 @@ from typing import Any
 
 import panel_material_ui as pmui
 import param
-from panel.custom import JSComponent
 
+from wfsobs.app.component import Component
 from wfsobs.app.pages.live_table import QUANTITIES
 from wfsobs.app.pages.live_waterfall import MEASUREMENT
 from wfsobs.app.pages.parts import WIDE, line
@@ -49,7 +49,7 @@ BUTTONS = {
 """Button -> its icon."""
 
 
-class Pulse(JSComponent):
+class Pulse(Component):
     """Tells when a picture has been painted."""
 
     picture = param.Integer(0, doc="Number of the last one.")
@@ -59,7 +59,7 @@ class Pulse(JSComponent):
     def __init__(self, **params: Any):
         self.answer, self._time = -1, 0.0
         self._waiting: Callable[[], None] | None = None
-        super().__init__(**params)
+        super().__init__(self._take, **params)
 
     def _update_model(self, events: Any, msg: dict[str, Any], root: Any, model: Any, doc: Any, comm: Any) -> None:
         """Send what changes alone: the usual way looks at all that a component may have, which takes as long as a figure."""
@@ -73,8 +73,8 @@ class Pulse(JSComponent):
         finally:
             self._changing.pop(ref, None)
 
-    def _handle_msg(self, data: object) -> None:
-        if isinstance(data, dict) and isinstance(number := data.get("painted"), int):
+    def _take(self, data: dict[str, Any]) -> None:
+        if isinstance(number := data.get("painted"), int):
             self.answer = number
             if self._waiting is not None and self.is_free:
                 self.when_free(self._waiting)

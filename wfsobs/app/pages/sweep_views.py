@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import param
-from panel.custom import JSComponent
 
+from wfsobs.app.component import Component
 from wfsobs.app.controls.names import setting_name
 from wfsobs.app.display import Display, per_micrometre, unit_text
 from wfsobs.app.numerals import number
@@ -34,7 +34,7 @@ REPORT_COLUMNS = ("target", "mode", "observer", "seeds", "mean rms [nm]", "95 % 
 OPEN, DECIDED, WAITING, FAILED, LEFT_OUT = "open", "decided", "waiting", "failed", "left-out"
 
 
-class SweepMap(JSComponent):
+class SweepMap(Component):
     """The map in the browser; a click on a cell asks for its scenario."""
 
     grid = param.Dict({}, doc="Title, names of the axes and their values, cells row by row, and the key of the colours.")
@@ -45,10 +45,10 @@ class SweepMap(JSComponent):
     def __init__(self, load: Callable[[int], None], **params: Any):
         """Make the map. load : takes the number of a cell."""
         self._load = load
-        super().__init__(**params)
+        super().__init__(self._take, **params)
 
-    def _handle_msg(self, data: object) -> None:
-        if isinstance(data, dict) and isinstance(cell := data.get("load"), int):
+    def _take(self, data: dict[str, Any]) -> None:
+        if isinstance(cell := data.get("load"), int):
             self._load(cell)
 
 

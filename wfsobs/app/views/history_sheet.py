@@ -6,9 +6,9 @@ from collections.abc import Callable
 from typing import Any
 
 import param
-from panel.custom import JSComponent
 
 from wfsobs.app.compared import LETTERS
+from wfsobs.app.component import Component
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.downloads import TooLarge
@@ -17,7 +17,7 @@ from wfsobs.app.history_entry import HistoryEntry
 from wfsobs.app.jobs.job import DONE, FAILED, RUNNING, Job
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.numerals import number
-from wfsobs.app.picker import LARGEST, PART, PartialFile, file_message, too_large
+from wfsobs.app.picker import LARGEST, PART, PartialFile, too_large
 from wfsobs.app.session_file import SUFFIX, read_session, write_session
 from wfsobs.app.session_values import SessionError
 from wfsobs.app.style import asset, look
@@ -30,7 +30,7 @@ from wfsobs.telemetry.preview import safe_name
 FILE = f"session{SUFFIX}"
 
 
-class Sheet(JSComponent):
+class Sheet(Component):
     """The sheet in the browser; it asks by messages {action, key, ...}, and has rows only while it is open."""
 
     open = param.Boolean(False, doc="Whether it is seen.")
@@ -45,18 +45,6 @@ class Sheet(JSComponent):
 
     _esm = asset("patch.js") + asset("parts.js") + asset("history.js")
     _stylesheets = [asset("history.css")]
-
-    def __init__(self, hear: Callable[[dict[str, Any]], None], **params: Any):
-        self._hear = hear
-        super().__init__(**params)
-
-    def _handle_msg(self, data: object) -> None:
-        if isinstance(data, dict):
-            self._hear(data)
-
-    def save(self, name: str, kind: str, content: bytes) -> None:
-        """Have the browser save a file."""
-        self._send_msg(file_message(name, kind, content))
 
 
 class HistorySheet:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import param
-from panel.custom import JSComponent
 
+from wfsobs.app.component import Component
 from wfsobs.app.style import asset, labels
 
 
-class Readout(JSComponent):
+class Readout(Component):
     """Follows the pointer, and the arrow keys in a figure that has the focus; one for all figures of the page."""
 
     labels = param.Dict({}, doc="Name of a line in the figures -> what it is called.")

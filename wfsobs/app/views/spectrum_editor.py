@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from math import isfinite
 from time import monotonic
@@ -12,8 +12,8 @@ import numpy as np
 import panel as pn
 import param
 from bokeh.plotting import figure
-from panel.custom import JSComponent
 
+from wfsobs.app.component import Component
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.handles import PEAK, Handle, changes_of, handles_of, has_peaks, highest_frequency, with_new_peak, without_peak
 from wfsobs.app.numerals import number
@@ -42,7 +42,7 @@ FRAME = 0.05
 """Time after which a frame of a drag begins no more observers [s]: those that are left come first in the next one."""
 
 
-class HandleLayer(JSComponent):
+class HandleLayer(Component):
     """The handles in the browser, and the numbers below the figure. All that it shows is one frame, made here."""
 
     figure = param.String("", doc="Name of the figure that the handles lie over.")
@@ -50,14 +50,6 @@ class HandleLayer(JSComponent):
 
     _esm = asset("handles.js")
     _stylesheets = [asset("handles.css")]
-
-    def __init__(self, hear: Callable[[Mapping[str, Any]], None], **params: Any):
-        self._hear = hear
-        super().__init__(**params)
-
-    def _handle_msg(self, data: object) -> None:
-        if isinstance(data, dict):
-            self._hear(data)
 
 
 class SpectrumEditor:

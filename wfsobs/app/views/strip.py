@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import param
-from panel.custom import JSComponent
 
+from wfsobs.app.component import Component
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.glossary import RELATIVE, TERMS
 from wfsobs.app.jobs.job import RUNNING
@@ -24,7 +24,7 @@ from wfsobs.priors_from.selection import usual_observers
 MAIN = "Show the main ones"
 
 
-class Cards(JSComponent):
+class Cards(Component):
     """The cards in the browser; a click on one hides or shows its line, a double click shows it alone."""
 
     items = param.List([], doc="{name, label, colour, dash, value, unit, note, range, compared} of every card.")
@@ -38,12 +38,10 @@ class Cards(JSComponent):
 
     def __init__(self, **params: Any):
         self.on_main: Callable[[], None] = lambda: None
-        super().__init__(**params)
+        super().__init__(self._take, **params)
 
-    def _handle_msg(self, data: object) -> None:
+    def _take(self, data: dict[str, Any]) -> None:
         """Take a click: the names to hide, or the wish for the main lines."""
-        if not isinstance(data, dict):
-            return
         if data.get("main"):
             self.on_main()
         elif isinstance(names := data.get("hidden"), list):

@@ -1,0 +1,38 @@
+"""The base of the page's own components: parameters go down to the browser, messages come up."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable
+from typing import Any
+
+import panel as pn
+from panel.custom import JSComponent
+
+
+class Component(JSComponent):
+    """A component of the page in JavaScript.
+
+    on_message : gets the messages {name: value, ...} of the browser, and may change figures. Panel answers a message without the
+    lock of the document while a changed property is on its way; held changes need none.
+    """
+
+    __abstract = True
+
+    def __init__(self, on_message: Callable[[dict[str, Any]], object] | None = None, **params: Any):
+        self.on_message: Callable[[dict[str, Any]], object] = on_message or (lambda _message: None)
+        super().__init__(**params)
+
+    def _handle_msg(self, data: object) -> None:
+        if isinstance(data, dict):
+            with pn.io.hold():
+                self.on_message(data)
+
+    def save(self, name: str, kind: str, content: bytes) -> None:
+        """Have the browser save a file; for components whose script has `parts.js` or the like."""
+        self._send_msg(file_message(name, kind, content))
+
+
+def file_message(name: str, kind: str, content: bytes) -> dict[str, str]:
+    """Return the message by which a browser saves a file."""
+    return {"name": name, "kind": kind, "content": base64.b64encode(content).decode()}
