@@ -72,7 +72,8 @@ def test_learners_have_bars_by_simulation_which_can_be_stopped_and_gone_on_with(
     loop.finish(store)
     view.open.value = True
     loop.until(lambda: view.task.state == DONE)
-    assert learners.start.visible and not learners.stop.visible and "No bars yet" in learners.line.object
+    assert learners.start.visible and not learners.stop.visible
+    assert "Nonlinear observers need a simulation" in learners.line.object
     learners.simulate()
     loop.until(lambda: bool(learners.by_observer))
     learners.stop.clicks += 1

@@ -159,7 +159,7 @@ class TestTable:
             for s in dashboard.store.run.result.result.scores
             if s.mode == "tip" and s.normalised_rms is not None and s.normalised_rms > 1
         ]
-        assert html.count(">above truth<") == len(worse) > 0
+        assert html.count(">worse than zero<") == len(worse) > 0
 
     def test_real_time_factor(self, dashboard: Dashboard) -> None:
         score = next(s for s in dashboard.store.run.result.result.scores if s.observer == "gpr-online" and s.mode == "tip")

@@ -224,7 +224,7 @@ def test_one_observer_is_identified_anew_while_the_loop_runs(running: Page) -> N
     page = running
     page.get_by_role("combobox", name="Speed").click()
     page.get_by_role("option", name="0.2 ×", exact=True).click()  # the observers leave the identification no processor else
-    page.get_by_role("combobox", name="New design of").click()
+    page.get_by_role("combobox", name="Redesign").click()
     page.get_by_role("option", name="Multi-rate multi-peak", exact=True).click()
     page.get_by_role("button", name="Identify", exact=True).last.click()  # the first one leads to the page of that name
     events = page.get_by_role("list", name="Events")
@@ -234,7 +234,7 @@ def test_one_observer_is_identified_anew_while_the_loop_runs(running: Page) -> N
     assert told is not None
     page.wait_for_function(f"({MARKS})().some((x) => Math.abs(x - {told[1]}) < 0.006)")
     assert re.findall(r"s: (.+) has a new design", events.inner_text()) == ["Multi-rate multi-peak"]
-    page.get_by_role("button", name="Design anew", exact=True).click()
+    page.get_by_role("button", name="Redesign now", exact=True).click()
     expect(events).to_have_text(re.compile("(Multi-rate multi-peak has a new design.*){2}", re.S))
     assert set(re.findall(r"s: (.+) has a new design", events.inner_text())) == {"Multi-rate multi-peak"}
     expect(page.get_by_text(re.compile("^Running at 0.2 × real time"))).to_be_visible()

@@ -155,7 +155,7 @@ def test_every_state_shows_the_numbers_of_its_run(open_report: Any) -> None:
             assert len(of_mode) == len(table) > 10
             for row in of_mode:
                 key = f"{row['target']}/{row['observer']}"
-                cells = [re.sub(r"^(smallest|above truth) ", "", cell) for cell in table[key]]
+                cells = [re.sub(r"^(smallest|worse than zero) ", "", cell) for cell in table[key]]
                 assert cells[0].startswith(row_label(row["observer"]))
                 error, truth = number(row["rms_um"] * scale), number(row["truth_rms_um"] * scale)
                 ends = " – ".join(number(x * scale) for x in row["interval_um"] or ())

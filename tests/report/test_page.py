@@ -111,7 +111,7 @@ def test_the_numbers_are_those_of_the_run(report: Report, text: str, parse: Any)
                 "–" if row[TIME] is None else number(row[TIME] / 1000.0, 2),
                 "–" if row["sd_um"] is None else number(1e3 * row["sd_um"]),
             ]
-        plain = {key: [re.sub(r"^(smallest|above truth) ", "", cell) for cell in cells] for key, cells in got.items()}
+        plain = {key: [re.sub(r"^(smallest|worse than zero) ", "", cell) for cell in cells] for key, cells in got.items()}
         assert plain == want
         assert not any("−0.00" in cells for cells in plain.values()), "a lag of nothing has no sign"
         for key in {title for title, _ in want}:
@@ -119,7 +119,7 @@ def test_the_numbers_are_those_of_the_run(report: Report, text: str, parse: Any)
             causal = {name: c for (title, name), c in got.items() if title == key and not any(o in name for o in others)}
             best = [name for name, cells in causal.items() if cells[0].startswith("smallest ")]
             assert best == [next(iter(causal))], "the first of them, and of one record no more than that"
-        above = {key for key, cells in got.items() if cells[2].startswith("above truth")}
+        above = {key for key, cells in got.items() if cells[2].startswith("worse than zero")}
         assert above == {key for key, cells in want.items() if cells[2] != "1.00" and float(cells[2]) > 1}
 
 

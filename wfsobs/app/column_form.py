@@ -12,8 +12,8 @@ from wfsobs.app.style import asset
 from wfsobs.telemetry.columns import ROLES
 
 HINT = (
-    "Say what the columns are. A record needs a measurement and a command of the same modes, and a time or a rate; "
-    "what their names suggest is filled in, and what always rises as the time."
+    "Assign the columns. Likely matches are preselected. A record needs a measurement and a command of the same modes, and a "
+    "time or a rate."
 )
 
 

@@ -18,7 +18,7 @@ SHORTCUTS: Mapping[str, str] = MappingProxyType(
         "/": "Find a setting",
         "H": "The history: every result of the session",
         "Ctrl+Z, Ctrl+Shift+Z": "Undo and redo a change of the settings",
-        "Alt+O in a setting": "The error over this setting, on the page Sweep",
+        "Alt+O in a setting": "Sweep this setting",
         "Enter or Space on a card": "Hide or show its line",
         "S on a card": "Its line alone, and those before again",
         "Double click on a figure": "All of it again, after a zoom",

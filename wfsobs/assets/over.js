@@ -17,7 +17,7 @@ function settingAt(event) {
 
 function offerSweep(model, el) {
   const button = document.createElement("button")
-  Object.assign(button, {type: "button", className: "over", textContent: "error over this", popover: "manual"})
+  Object.assign(button, {type: "button", className: "over", textContent: "Sweep this setting", popover: "manual"})
   button.title = "Run the scenario over values of this setting (Alt+O)"
   button.setAttribute("aria-keyshortcuts", "Alt+O")
   el.append(button)

@@ -31,7 +31,7 @@ function examples(model, bar) {
   const details = document.createElement("details")
   details.append(Object.assign(document.createElement("summary"), {textContent: "File format"}))
   const list = document.createElement("div")
-  list.append(Object.assign(document.createElement("p"), {textContent: "CSV, NPZ, FITS or AOT: a row per step, measurements, commands and the time or the rate. A file may be dropped anywhere on the page; columns of other names can be said what they are."}))
+  list.append(Object.assign(document.createElement("p"), {textContent: "CSV, NPZ, FITS or AOT: a row per step, measurements, commands and the time or the rate. A file may be dropped anywhere on the page; columns with other names can be mapped after loading."}))
   for (const [action, textContent] of [["template", "Template CSV"], ["sample", "Sample record"]]) {
     const button = Object.assign(document.createElement("button"), {type: "button", textContent})
     button.onclick = () => model.send_msg({action})

@@ -47,8 +47,8 @@ from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION
 GRID = grid_style("minmax(0, 3fr) minmax(0, 2fr)")
 ABOUT: Mapping[str, str] = MappingProxyType(
     {
-        TURBULENCE: "what the air does to the light; observers estimate it from guide stars: the smaller the error, the better",
-        VIBRATION: "what the shaking of the telescope adds, told apart from the air in the same measurements",
+        TURBULENCE: "Atmospheric tip/tilt, estimated from the guide stars",
+        VIBRATION: "Structural vibration, separated from turbulence",
     }
 )
 """Target -> what it is, for who comes first to the page."""

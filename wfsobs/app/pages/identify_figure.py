@@ -13,11 +13,11 @@ from wfsobs.identification.result import IdentifiedMode
 
 HEIGHT = 400
 NAMES = {
-    "measured": "measured, mean",
-    "highest": "and highest of every bin",
+    "measured": "measured PSD (mean)",
+    "highest": "measured PSD (maximum per bin)",
     "fitted": "model",
-    "parts": "its processes and noise",
-    "found": "peaks, and the height of lines",
+    "parts": "model components",
+    "found": "identified peaks",
 }
 """Look -> what it is called in the legend."""
 

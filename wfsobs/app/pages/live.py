@@ -69,7 +69,7 @@ class LivePage(PageActions):
             "Pause": lambda loop: loop.pause() if loop.is_playing else loop.play(),
             "Step": lambda loop: loop.step(),
             "Stop": lambda _: self.work.cancel(),
-            "Design anew": lambda loop: loop.redesign(c.names_to_design),
+            "Redesign now": lambda loop: loop.redesign(c.names_to_design),
             "Identify": lambda loop: loop.identify(c.names_to_design),
             "Record": self._toggle_recording,
         }

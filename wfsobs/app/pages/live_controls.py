@@ -28,7 +28,7 @@ SPEEDS = {f"{speed:g} ×": speed for speed in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.
 WINDOWS = {f"{seconds:g} s": seconds for seconds in (2.0, 5.0, 10.0)}
 ALL = "all"
 """Stands for all that run."""
-LOSSES = {"no frame": 0.0, "1 % of frames": 0.01, "5 % of frames": 0.05, "20 % of frames": 0.2}
+LOSSES = {"none": 0.0, "1 % of frames": 0.01, "5 % of frames": 0.05, "20 % of frames": 0.2}
 FIRST = ("kf-lgs", "kf-multi", "multirate", "multirate-multi", "gpr-online")
 """Observers that run first: as many as two cores keep up with beside the page."""
 MAIN = ("kf-multi", "multirate-multi", "gpr-online")
@@ -42,7 +42,7 @@ BUTTONS = {
     "Pause": "pause",
     "Step": "skip_next",
     "Stop": "stop",
-    "Design anew": "build",
+    "Redesign now": "build",
     "Identify": "search",
     "Record": "fiber_manual_record",
 }
@@ -115,14 +115,14 @@ class LiveControls:
         self.target = pmui.Select(label="Errors of", options=QUANTITIES, value=TARGETS[0], width=300, **select)
         self.lasers = pmui.Checkbox(label="Lasers", value=True, **select)
         self.ngs = pmui.Checkbox(label="NGS", value=True, **select)
-        self.losses = pmui.Select(label="Lost", options=LOSSES, value=0.0, width=160, **select)
+        self.losses = pmui.Select(label="Frame loss", options=LOSSES, value=0.0, width=160, **select)
         self.running = pmui.MultiChoice(
             label="Observers", options={look(name).label: name for name in SLOTS}, value=list(FIRST), **APART
         )
         self.controllers = pmui.MultiChoice(
             label="Controllers", options={look(name).label: name for name in SEATS}, value=list(USUAL), **APART
         )
-        self.whose = pmui.Select(label="New design of", options={"All that run": ALL}, value=ALL, width=230, **select)
+        self.whose = pmui.Select(label="Redesign", options={"All that run": ALL}, value=ALL, width=230, **select)
         for field in (self.running, self.controllers):
             field.param.watch(self._offer, "value")
         self._offer()
@@ -172,7 +172,7 @@ class LiveControls:
         return [
             line(b["Start"], b["Pause"], b["Step"], self.speed, b["Stop"]),
             line(self.lasers, self.ngs, self.losses, b["Record"]),
-            line(self.whose, b["Design anew"], b["Identify"]),
+            line(self.whose, b["Redesign now"], b["Identify"]),
             self.running,
         ]
 

@@ -40,7 +40,7 @@ EARLIER = "The settings in the drawer have changed since this sweep."
 FIRST = (("turbulence.wind_speed", "5:25:5"), ("sensors.exposure_ratio", "2,5,10,20"))
 SEEDS = 4
 QUICK, EVERY = "quick", "every"
-OBSERVERS_OF = {"All but those that learn": QUICK, "All": EVERY}
+OBSERVERS_OF = {"Fast observers only (no GPR)": QUICK, "All": EVERY}
 REDRAW = 0.3
 """Least time between two pictures while runs come in [s]."""
 

@@ -35,10 +35,10 @@ from wfsobs.tuning.report import tuning_toml
 from wfsobs.tuning.tuning import EVALUATIONS
 
 INTRO = (
-    "Searches the settings of one observer for the least RMS error on a validation record, which is neither the training nor the "
-    "test record, and scores the settings before and after on the test record, which the search never sees. From settings the "
-    "records are simulated; a loaded record is cut into pieces, and without truth the least is sought of the one-step prediction "
-    "error of z, or of the distance to a Butterworth reference. “Use it” takes the tuned settings into the drawer."
+    "Searches the settings of one observer for the smallest RMS error on a validation record, which is neither the training nor "
+    "the test record, and scores the settings before and after on the test record, which the search never uses. Records are "
+    "simulated from the settings; a loaded record is cut into pieces. Without truth, tuning minimises the one-step prediction "
+    "error, or the distance to a Butterworth reference. “Use it” takes the tuned settings into the drawer."
 )
 EARLIER = "The settings in the drawer have changed since this tuning."
 START = "gpr-online"

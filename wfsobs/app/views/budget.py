@@ -38,9 +38,7 @@ class BudgetView:
     def __init__(self, store: Store, display: Display):
         self.store, self.run, self.display = store, store.run, display
         self.task = BackgroundTask(store.session)
-        self.open = pmui.Checkbox(
-            label="Show why every error is as large as it is", value=False, size="small", margin=(0, 0, 4, 0)
-        )
+        self.open = pmui.Checkbox(label="Show error budget", value=False, size="small", margin=(0, 0, 4, 0))
         self.line, self.room = html(), pn.Column(**WIDE)
         self.learners = LearnersBudget(store, self._draw)
         self.bars: dict[str, Bars] = {}

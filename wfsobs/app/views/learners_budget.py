@@ -110,7 +110,7 @@ class LearnersBudget:
         if self.by_observer and self._names:
             said.append(f"By {RUNS} runs each, averaged over all orders of switching the causes on: {_labels(self.by_observer)}.")
         if left:
-            said.append(f"No bars yet: {_labels(left)}. They are not linear.")
+            said.append(f"Nonlinear observers need a simulation: {_labels(left)}.")
         if busy:
             said.append(f"{self.task.line('Simulating')}.")
         elif self.task.state == FAILED:

@@ -44,7 +44,7 @@ class SeedSwitch:
         elif seeds.task.state == FAILED:
             said = f"{seeds.n_known} of {seeds.count} seeds: {seeds.task.message}"
         elif seeds.n_known < seeds.count:
-            said = f"{seeds.n_known} of {seeds.count} seeds, the next ones in idle time"
+            said = f"{seeds.n_known} of {seeds.count} seeds done, more running in the background"
         else:
             said = f"over {seeds.n_known} seeds"
         return f'<span class="caption seeds">{said}</span>'

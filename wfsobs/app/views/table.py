@@ -36,7 +36,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.priors_from.selection import is_usual
 from wfsobs.result import Failure
 
-BEST, TIED, ABOVE = macro("tag", "best", "best"), macro("tag", "tied", "tied"), macro("tag", "above", "above truth")
+BEST, TIED, ABOVE = macro("tag", "best", "best"), macro("tag", "tied", "tied"), macro("tag", "above", "worse than zero")
 SMALLEST = macro("tag", "smallest", "smallest")
 """Error of one record, which does not tell who is best."""
 

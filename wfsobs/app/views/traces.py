@@ -102,7 +102,7 @@ class _Band:
         self.figure, self.source = fig, ColumnDataSource({"x": [], "low": [], "high": []})
         self.renderer: GlyphRenderer | None = None
         place = {"x": 6, "y": 6, "x_units": "screen", "y_units": "screen", "text_font_size": "12px"}
-        self.label = Label(text="shaded: where 95 % are by its own model", visible=False, **place)
+        self.label = Label(text="95 % band predicted by the filter", visible=False, **place)
         fig.add_layout(self.label)  # from the start: the browser looks for it in vain if it comes later
 
     def draw(self, x: Array, low: Array, high: Array, colour: str) -> None:
