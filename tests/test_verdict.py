@@ -11,10 +11,12 @@ from scipy.signal import lfilter
 
 from wfsobs.evaluation.budget import error_budget
 from wfsobs.evaluation.evidence import LEVEL, means_differ
-from wfsobs.evaluation.rows import can_be_best, row_label
+from wfsobs.evaluation.known_lines import NOTHING, PEAKS, prior_knowledge
+from wfsobs.evaluation.rows import can_be_best, row_label, target_title
 from wfsobs.evaluation.samples import BATCHES, batch_means
-from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS
+from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS, PREDICTION
 from wfsobs.evaluation.verdict import explain_harm, verdict
+from wfsobs.evaluation.verdict_words import HEADINGS
 from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import observe, run
 from wfsobs.result import Result
@@ -50,7 +52,7 @@ def power_near(x: Array, dt: float, lines: list[float]) -> float:
     return float(power[near].sum() / power.sum())
 
 
-def test_the_best_is_the_least_error_of_the_table_and_the_sentence_has_its_numbers(result: Result) -> None:
+def test_the_best_by_prior_knowledge_is_the_least_error_of_the_table_and_the_sentence_has_its_numbers(result: Result) -> None:
     for target in ("turbulence", "vibration"):
         for mode in ("tip", "tilt"):
             of = [s for s in result.scores if (s.target, s.mode) == (target, mode)]
@@ -61,15 +63,26 @@ def test_the_best_is_the_least_error_of_the_table_and_the_sentence_has_its_numbe
             least = min(rivals.values())
             same = [name for name in OBSERVERS if rivals.get(name, np.inf) <= 1.001 * least]  # two ways of one filter
             assert found is not None and found.best.observer == same[0]
-            first = found.sentences()[0]
-            assert first.startswith(f"{target.capitalize()}, {mode}: {row_label(found.best.observer)} ")
-            # Three digits, so that half of the last is at most 0.5 %.
-            said = re.search(r"(?:best|error), ([\d.]+) ± ([\d.]+) nm", first)
-            assert said and float(said[1]) == pytest.approx(found.best.rms * 1e3, rel=5e-3)
-            score = next(s for s in of if s.observer == found.best.observer)
-            assert found.best.interval == score.interval and score.interval is not None
-            low, high = score.interval
-            assert low < score.rms < high and float(said[2]) == pytest.approx(500.0 * (high - low), abs=0.051)
+            lead, *others = found.sentences()
+            assert lead.startswith(f"{target.capitalize()}, {mode}. ")
+            said = dict(re.findall(r"(With[a-z ]+(?:\d+ of \d+ [a-z ]+)?): (.*?)\.(?= |$)", lead))
+            for kind in {NOTHING, PEAKS, found.best.knowledge}:
+                of_kind = {name: rms for name, rms in rivals.items() if prior_knowledge(name) == kind}
+                if not of_kind:
+                    continue
+                place, text = found.best_with(kind), said[HEADINGS[kind]]
+                assert place is not None and place.rms <= 1.001 * min(of_kind.values())
+                assert text.startswith(f"{row_label(place.observer)} ")
+                number = re.search(r" ([\d.]+) ± ([\d.]+) nm", text)
+                # Three digits, so that half of the last is at most 0.5 %.
+                assert number and float(number[1]) == pytest.approx(place.rms * 1e3, rel=5e-3)
+                score = next(s for s in of if s.observer == place.observer)
+                assert place.interval == score.interval and score.interval is not None
+                low, high = score.interval
+                assert low < score.rms < high and float(number[2]) == pytest.approx(500.0 * (high - low), abs=0.051)
+                assert ("statistically equal to the best" in text) == (place.is_tie and place is not found.best)
+            first = said[HEADINGS[found.best.knowledge]]
+            low, high = found.best.interval or (0.0, 0.0)
             bound = next(s.rms for s in of if s.observer == BOUND_BOTH)
             percent = re.search(r"(\d+) % (above|below) the theoretical limit using LGS and NGS", first)
             if low <= bound <= high:
@@ -77,9 +90,19 @@ def test_the_best_is_the_least_error_of_the_table_and_the_sentence_has_its_numbe
             else:
                 assert percent and percent[2] == ("above" if bound < low else "below")
                 assert float(percent[1]) == pytest.approx(100.0 * abs(found.best.rms / bound - 1.0), abs=0.51)
-            assert ("statistically equal to" in first) == bool(found.ties) and all(
-                row_label(name) in first for name in found.ties
-            )
+            assert ("statistically equal to" in lead) == bool(found.ties) and all(row_label(name) in lead for name in found.ties)
+            assert f"LGS KF {rivals['kf-lgs'] * 1e3:#.3g} ± " in " ".join([lead, *others]), "always named"
+
+
+def test_a_record_without_truth_has_a_verdict_on_the_next_measurement() -> None:
+    simulated = run(SCENARIOS["paper"].replace({"run.duration": 4.0}), observers=("kf-lgs", "kf-multi", "persistence"))
+    record = replace(simulated.record, turbulence=None, vibration=None)
+    result = observe(record, SCENARIOS["paper"], observers=("kf-lgs", "kf-multi", "persistence"))
+    found = verdict(result.scenario, record, result.estimates, result.scores, PREDICTION, "tip")
+    scores = {s.observer: s.rms for s in result.scores if (s.target, s.mode) == (PREDICTION, "tip")}
+    assert found is not None and not found.harms
+    assert found.best.observer == min((n for n in scores if n in OBSERVERS), key=scores.__getitem__)
+    assert found.sentences()[0].startswith(f"{target_title(PREDICTION)}, tip. ")
 
 
 def test_who_does_harm_is_named_with_where_its_error_lies(result: Result) -> None:
@@ -114,7 +137,8 @@ def test_a_filter_of_one_line_does_harm_at_the_others_and_not_where_there_are_no
         by_name[name] = found
     (harm,) = by_name["paper"].harms
     assert harm.observer == "kf-lgs" and harm.worse and harm.at_others > 0.6 > 0.3 > harm.at_known
-    assert "LGS KF is worse than assuming no vibration: its model has one of 12 peaks" in by_name["paper"].sentences()[1]
+    said = by_name["paper"].sentences()[-1]
+    assert said.startswith("LGS KF ") and " nm is worse than assuming no vibration: its model has one of 12 peaks" in said
     # With one line both filters have the same model.
     assert not by_name["one line"].harms and by_name["one line"].ties
 

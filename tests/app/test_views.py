@@ -335,16 +335,16 @@ def test_the_verdict_stays_dimmed_until_the_next_one(dashboard: Dashboard, loop:
     """What is below it does not move: its place is never empty, and what it says is marked as that of the run before."""
     line = dashboard.explore.verdicts["vibration"]
     said = line.pane.object
-    assert said.startswith('<p class="verdict"><strong>Vibration, tip: ')
+    assert said.startswith('<p class="verdict"><strong>Vibration, tip.</strong> ')
     dashboard.store.change("turbulence.wind_speed", 30)
     assert line.pane.object == said.replace('"verdict"', '"verdict before"', 1)
     loop.finish(dashboard.store)
-    assert line.pane.object.startswith('<p class="verdict"><strong>Vibration, tip: ') and line.pane.object != said
+    assert line.pane.object.startswith('<p class="verdict"><strong>Vibration, tip.</strong> ') and line.pane.object != said
     dashboard.store.change("turbulence.wind_speed", 20)
     dashboard.display.mode = "tilt"
     assert line.pane.object == '<p class="verdict before"></p>', "nothing is known of another mode yet"
     loop.finish(dashboard.store)
-    assert "Vibration, tilt: " in line.pane.object
+    assert "Vibration, tilt.</strong> " in line.pane.object
 
 
 def test_a_record_without_truth_leaves_no_choice_but_its_signals(dashboard: Dashboard, loop: Any, short: Scenario) -> None:

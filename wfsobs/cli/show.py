@@ -17,6 +17,7 @@ from wfsobs.cli.tables import score_table
 from wfsobs.evaluation.budget import Budget, budget_row, error_budget
 from wfsobs.evaluation.evidence import Evidence
 from wfsobs.evaluation.rows import TIME, Row
+from wfsobs.evaluation.scores import PREDICTION
 from wfsobs.evaluation.verdict import explain_harm, verdict
 from wfsobs.observers.base import TARGETS
 from wfsobs.progress import Watch
@@ -45,15 +46,16 @@ def show_table(table: Table) -> None:
     (console if console.is_terminal else Console(width=195)).print(table)
 
 
-def show_verdicts(result: Result, budgets: Sequence[Budget] = (), evidence: Evidence | None = None) -> None:
-    """Print what the table of a simulated record says, a paragraph per target and mode.
+def show_verdicts(result: Result, budgets: Sequence[Budget] = (), evidence: Evidence | None = None, *, simulated: bool) -> None:
+    """Print what the table of a record says, a paragraph per target and mode.
 
-    budgets : those that are known;  evidence : what further seeds say
+    budgets : those that are known;  evidence : what further seeds say;  simulated : whether the record is of the scenario
     """
-    of = dict.fromkeys((s.target, s.mode) for s in result.scores if s.target in TARGETS)
-    known = [*explain_harm(result), *budgets]
+    of = dict.fromkeys((s.target, s.mode) for s in result.scores if s.target in (*TARGETS, PREDICTION))
+    known = [*explain_harm(result), *budgets] if simulated else []
+    simulation = result.scenario if simulated else None
     given = result.scenario, result.record, result.estimates, result.scores
-    found = (verdict(*given, *key, simulation=result.scenario, budgets=known, evidence=evidence) for key in of)
+    found = (verdict(*given, *key, simulation=simulation, budgets=known, evidence=evidence) for key in of)
     for it in found:
         if it is not None:
             click.echo("\n" + "\n".join(f"{'  ' * bool(i)}{line}" for i, line in enumerate(it.sentences())))

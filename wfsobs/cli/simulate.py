@@ -119,7 +119,7 @@ def run(
     all_rows = [row for it in results for row in score_rows(it.scores, it.scenario.run.seed)]
     show(add_budgets(all_rows, budgets), as_json)
     if not as_json and seeds not in range(2, FEWEST):
-        show_verdicts(results[0], budgets, gather_evidence([it.scores for it in results]))
+        show_verdicts(results[0], budgets, gather_evidence([it.scores for it in results]), simulated=True)
         show_budgets(budgets)
 
 

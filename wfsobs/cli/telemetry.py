@@ -16,7 +16,7 @@ from wfsobs.cli.options import (
     training,
     training_options,
 )
-from wfsobs.cli.show import progress_bar, show, show_table, warn
+from wfsobs.cli.show import progress_bar, show, show_table, show_verdicts, warn
 from wfsobs.evaluation.rows import score_rows
 from wfsobs.files import check_writable, write_whole
 from wfsobs.identification import identify as identify_record
@@ -82,6 +82,8 @@ def observe(
         click.echo(f"wfsobs: {record_file}: {len(result.estimates)} estimates, no scores: nothing after the warm-up", err=True)
         return
     show(score_rows(result.scores, None, source=result.prior_source), as_json)
+    if not as_json:
+        show_verdicts(result, simulated=False)
 
 
 @click.command()

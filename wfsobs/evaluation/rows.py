@@ -14,6 +14,7 @@ from wfsobs.evaluation.scores import (
     BOUND_STARS,
     BOUNDS,
     LOOP,
+    PREDICTION,
     Score,
 )
 from wfsobs.observers import OBSERVERS
@@ -58,7 +59,7 @@ def own_bound(observer: str) -> str | None:
 
 def target_title(target: str) -> str:
     """Return a target as the beginning of a heading."""
-    return "Turbulence and vibration together" if target == TOTAL else target.capitalize()
+    return {TOTAL: "Turbulence and vibration together", PREDICTION: "Next measurement"}.get(target, target.capitalize())
 
 
 def score_rows(scores: Iterable[Score], seed: int | None, *, source: PriorSource = TRUE) -> list[Row]:

@@ -12,8 +12,8 @@ from wfsobs.evaluation.budget import Budget, error_budget
 from wfsobs.evaluation.evidence import Evidence, gather_evidence
 from wfsobs.evaluation.known_lines import given_lines, is_near, prior_knowledge
 from wfsobs.evaluation.rows import JOINT_BOUNDS, above_bound
-from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS, Score
-from wfsobs.evaluation.verdict_words import best_sentence, harm_sentences
+from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS, PREDICTION, Score
+from wfsobs.evaluation.verdict_words import verdict_sentences
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import Estimate
@@ -108,7 +108,7 @@ class Verdict:
 
     def sentences(self, scale: float = 1e3, unit: str = "nm") -> list[str]:
         """Return the verdict in words; scale: from micrometres to the unit."""
-        return [best_sentence(self, scale, unit), *harm_sentences(self)]
+        return verdict_sentences(self, scale, unit)
 
 
 def verdict(
@@ -125,14 +125,16 @@ def verdict(
 ) -> Verdict | None:
     """Return the verdict on one target and mode, None where nothing can be compared or there is no truth.
 
+    Of a record without truth the target PREDICTION has one: on errors of predicting the next measurement.
+
     scenario   : what the observers' priors were made from
     simulation : what the record was made from, so that the lines of the vibration are known
     evidence   : errors over several seeds, on which the verdict then rests; where the errors lie is that of the record
     budgets    : error budgets of the record, from which it is said why an observer does harm (`explain_harm`)
     """
-    found, truth = evidence or gather_evidence([scores]), record.truth(target)
+    found, truth = evidence or gather_evidence([scores]), None if target == PREDICTION else record.truth(target)
     ranked, leaders = found.ranking(target, mode), found.leaders(target, mode)
-    if not ranked or truth is None or not found.truths[ranked[0], target, mode].mean() > 0:
+    if not ranked or (truth is None and target != PREDICTION) or not found.truths[ranked[0], target, mode].mean() > 0:
         return None
     column = [m.name for m in scenario.modes].index(mode)
     lines = () if simulation is None else tuple(line[0] for line in vibration_lines(simulation, column))
@@ -154,13 +156,17 @@ def verdict(
     causes = {b.observer: _largest_term(b) for b in budgets if (b.target, b.mode) == (target, mode) and b.terms}
     values = {e.observer: e.values[:, column] for e in estimates if e.target == target}
     harms = (
-        Harm(
-            places[name],
-            worse,
-            *_shares(_keep_scored(record, values[name] - truth[:, column], of[name]), record.dt, lines, given[name]),
-            *causes.get(name, ("", 0.0)),
+        ()
+        if truth is None
+        else (
+            Harm(
+                places[name],
+                worse,
+                *_shares(_keep_scored(record, values[name] - truth[:, column], of[name]), record.dt, lines, given[name]),
+                *causes.get(name, ("", 0.0)),
+            )
+            for name, worse in found.harmful(target, mode).items()
         )
-        for name, worse in found.harmful(target, mode).items()
     )
     return Verdict(target, mode, tuple(places.values()), len(lines), tuple(harms), found.n_seeds)
 

@@ -9,11 +9,23 @@ import numpy as np
 
 from wfsobs.evaluation.budget import CONE, LAG, LINES, MISMATCH, NOISE
 from wfsobs.evaluation.known_lines import BANDS, NOTHING, ONE_PEAK, PEAKS, TRAINED
-from wfsobs.evaluation.rows import row_label
+from wfsobs.evaluation.rows import row_label, target_title
 from wfsobs.evaluation.scores import BOUND_ASTERISM, BOUND_BOTH, BOUND_BOTH_MODES, BOUND_MODES
 
 if TYPE_CHECKING:
     from wfsobs.evaluation.verdict import Contender, Harm, Verdict
+
+HEADINGS = {
+    NOTHING: "Without prior knowledge",
+    PEAKS: "With known peak frequencies",
+    ONE_PEAK: "With one known peak",
+    TRAINED: "With training data",
+    BANDS: "With known frequency bands",
+}
+"""Kinds of prior knowledge, as the beginning of a sentence."""
+
+ALWAYS = ("gpr-online", "kf-lgs")
+"""Observers that are named whatever their error: the subject of the paper, and what it is compared with."""
 
 MOST = 3
 """Observers that are named as equal to the best; the table has all."""
@@ -54,18 +66,39 @@ def knowledge_clause(place: Contender, lines: int, several: bool = False) -> str
     }[place.knowledge]
 
 
-def best_sentence(it: Verdict, scale: float, unit: str) -> str:
-    """Write who is best, by how much, and what it knows; scale: from micrometres to the unit."""
-    name, low_high = row_label(it.best.observer), it.best.interval
-    half = 0.5 * (low_high[1] - low_high[0]) * scale if low_high else None
-    size = f"{_format_number(it.best.rms * scale, half)} {unit}"
-    over = f"over {it.seeds} seeds" if it.seeds > 1 else ""
-    if it.ties:
-        equal = f"statistically equal to {_join_labels(it.ties, MOST)} {over or 'on this record'}"
-        start = f"{name} has the smallest error, {size}, {equal}"
-    else:
-        start = f"{name} is best{f' {over}' * bool(over)}, {size}"
-    return f"{it.target.capitalize()}, {it.mode}: {start}{_to_limit(it.best)}; {knowledge_clause(it.best, it.lines)}."
+def verdict_sentences(it: Verdict, scale: float, unit: str) -> list[str]:
+    """Write the best with each kind of prior knowledge and the limit, then the observers of the paper, then those that do harm.
+
+    scale : from micrometres to the unit
+    """
+    chosen = {place.observer: place for kind in HEADINGS if (place := it.best_with(kind)) and kind in (NOTHING, PEAKS)}
+    chosen.setdefault(it.best.observer, it.best)
+    named = [place for place in it.places if place.observer in ALWAYS and place.observer not in chosen]
+    harmful = {harm.observer for harm in it.harms}
+    equal = [name for name in it.ties if name not in chosen]
+    parts = []
+    for place in chosen.values():
+        notes = [_to_limit(place)] if place is it.best else ["statistically equal to the best"] if place.is_tie else []
+        if place is it.best and equal:
+            notes.append(f"statistically equal to {_join_labels(equal, MOST)}")
+        parts.append(f"{_heading(place, it.lines)}: {', '.join(filter(None, (_with_size(place, scale, unit), *notes)))}.")
+    over = f", over {it.seeds} seeds" if it.seeds > 1 else ""
+    others = [f"{_with_size(place, scale, unit)}." for place in named if place.observer not in harmful]
+    lead = f"{target_title(it.target)}, {it.mode}{over}. {' '.join(parts)}"
+    return [lead, *([" ".join(others)] if others else []), *harm_sentences(it, scale, unit)]
+
+
+def _heading(place: Place, lines: int) -> str:
+    """Name a kind of prior knowledge; lines : of the vibration, 0 where that is not known."""
+    if place.knowledge == PEAKS and place.n_peaks < lines:
+        return f"With {place.n_peaks} of {lines} peak frequencies known"
+    return HEADINGS[place.knowledge]
+
+
+def _with_size(place: Place, scale: float, unit: str) -> str:
+    """Write an observer and its error with the interval of that."""
+    half = 0.5 * (place.interval[1] - place.interval[0]) * scale if place.interval else None
+    return f"{row_label(place.observer)} {_format_number(place.rms * scale, half)} {unit}"
 
 
 def _to_limit(place: Contender) -> str:
@@ -75,21 +108,22 @@ def _to_limit(place: Contender) -> str:
         return ""
     percent = round(100.0 * above)
     where = f"{abs(percent)} % {'above' if percent > 0 else 'below'}" if percent else "at"
-    return f", {where} the theoretical limit using {USING[place.limit[1]]}"
+    return f"{where} the theoretical limit using {USING[place.limit[1]]}"
 
 
-def harm_sentences(it: Verdict) -> list[str]:
+def harm_sentences(it: Verdict, scale: float, unit: str) -> list[str]:
     """Write a sentence for all observers that know the same and fail for the same reason."""
     groups: dict[tuple[object, ...], list[Harm]] = {}
     for harm in it.harms:
         groups.setdefault((harm.worse, knowledge_clause(harm.place, it.lines), harm.cause), []).append(harm)
-    return [_harm_sentence(it, of) for of in groups.values()]
+    return [_harm_sentence(it, of, scale, unit) for of in groups.values()]
 
 
-def _harm_sentence(it: Verdict, harms: Sequence[Harm]) -> str:
+def _harm_sentence(it: Verdict, harms: Sequence[Harm], scale: float, unit: str) -> str:
     """Observers that know the same, together; shares are the mean of theirs."""
     several = len(harms) > 1
-    names, be = _join_labels([harm.observer for harm in harms]), "are" if several else "is"
+    be = "are" if several else "is"
+    names = _join([_with_size(h.place, scale, unit) if h.observer in ALWAYS else row_label(h.observer) for h in harms])
     reason = _reason(it, harms, "their" if several else "its", "models" if several else "model")
     knowledge = knowledge_clause(harms[0].place, it.lines, several)
     return f"{names} {be} {'worse' if harms[0].worse else 'no better'} than assuming no {it.target}: {knowledge}{reason}."
@@ -121,6 +155,10 @@ def _join_labels(observers: Sequence[str], most: int | None = None) -> str:
     names = [row_label(observer) for observer in observers]
     if most is not None and len(names) > most + 1:
         names[most:] = [f"{len(names) - most} others"]
+    return _join(names)
+
+
+def _join(names: Sequence[str]) -> str:
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 

@@ -1,4 +1,4 @@
-"""One or two sentences above the figures of a target: who is best, and who does harm and why."""
+"""The verdict above the figures of a target: the best by prior knowledge, the limit, and what does harm and why."""
 
 from __future__ import annotations
 
@@ -14,12 +14,11 @@ from wfsobs.app.jobs.task import IDLE, BackgroundTask
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset
 from wfsobs.app.work import TRUTH
+from wfsobs.evaluation.scores import PREDICTION
 from wfsobs.evaluation.verdict import verdict
+from wfsobs.observers.base import TARGETS
 
-NO_TRUTH = (
-    "The record has no truth: the figures show the estimates instead of their errors, and the RMS errors are those of predicting "
-    "the next measurement."
-)
+NO_TRUTH = "The record has no truth: figures show estimates, and RMS errors are those of predicting the next measurement."
 
 
 class VerdictLine:
@@ -55,25 +54,29 @@ class VerdictLine:
         if shown is None or self.run.state != DONE:
             return ""
         it = shown.result
-        if shown.values(TRUTH, self.target) is None:
+        has_truth = shown.values(TRUTH, self.target) is not None
+        if not has_truth and self.target != TARGETS[0]:
             return _paragraph(NO_TRUTH, "verdict")
         found = verdict(
             it.scenario,
             it.record,
             it.estimates,
             it.scores,
-            self.target,
+            self.target if has_truth else PREDICTION,
             self.display.mode,
             simulation=shown.simulation,
             evidence=self.seeds.evidence if self.seeds else None,
             budgets=self.causes.budgets if self.causes else (),
         )
         if found is None:
-            return ""
+            return "" if has_truth else _paragraph(NO_TRUTH, "verdict")
         scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
-        first, *others = found.sentences(scale, self.display.unit_label)
-        more = "".join(f"<br>{escape(sentence)}" for sentence in others)
-        text = f"<strong>{explain_first(first, 'theoretical limit', BOUND)}</strong>{more}".replace(" %", "&nbsp;%")
+        lead, *others = found.sentences(scale, self.display.unit_label)
+        head, _, first = lead.partition(". ")
+        lines = [f"<strong>{escape(head)}.</strong> {explain_first(first, 'theoretical limit', BOUND)}", escape(" ".join(others))]
+        if not has_truth:
+            lines.append(NO_TRUTH)
+        text = "<br>".join(filter(None, lines)).replace(" %", "&nbsp;%")
         self._sentence = of, text
         return _paragraph(text, "verdict")
 
