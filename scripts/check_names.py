@@ -19,7 +19,7 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "wfsobs"
 
-LONGEST = 250
+LONGEST = 600
 """Maximum number of lines of a module."""
 
 IRREGULAR = frozenset(

@@ -208,11 +208,8 @@ def test_a_loaded_record_promises_no_simulation(result: Result, parse: Any) -> N
     said = parse(page(unpack(pack(named)), MADE)).text
     assert command in said and "RECORD" not in said and "saved as" not in said
     assert {row["target"] for row in state.rows} == {"next z", "residual y"}
-    assert (
-        "Next measurement, tip" in said
-        and "psd/vibration/kf-lgs/tip" in state.lines
-        and "error/vibration/kf-lgs/tip" not in state.lines
-    )
+    assert "Next measurement, tip" in said
+    assert "psd/vibration/kf-lgs/tip" in state.lines and "error/vibration/kf-lgs/tip" not in state.lines
 
 
 def test_no_text_escapes(result: Result, parse: Any) -> None:

@@ -46,14 +46,14 @@ def show_table(table: Table) -> None:
     (console if console.is_terminal else Console(width=195)).print(table)
 
 
-def show_verdicts(result: Result, budgets: Sequence[Budget] = (), evidence: Evidence | None = None, *, simulated: bool) -> None:
+def show_verdicts(result: Result, budgets: Sequence[Budget] = (), evidence: Evidence | None = None, *, is_simulated: bool) -> None:
     """Print what the table of a record says, a paragraph per target and mode.
 
-    budgets : those that are known;  evidence : what further seeds say;  simulated : whether the record is of the scenario
+    budgets : those that are known;  evidence : what further seeds say;  is_simulated : whether the record is of the scenario
     """
     of = dict.fromkeys((s.target, s.mode) for s in result.scores if s.target in (*TARGETS, PREDICTION))
-    known = [*explain_harm(result), *budgets] if simulated else []
-    simulation = result.scenario if simulated else None
+    known = [*explain_harm(result), *budgets] if is_simulated else []
+    simulation = result.scenario if is_simulated else None
     given = result.scenario, result.record, result.estimates, result.scores
     found = (verdict(*given, *key, simulation=simulation, budgets=known, evidence=evidence) for key in of)
     for it in found:

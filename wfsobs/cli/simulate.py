@@ -106,7 +106,7 @@ def run(
             if save:
                 save_record(save, record, configfile.to_toml(one))
             inner = Watch(progress=lambda f, i=i: update((i + f) / seeds))
-            result = observe_record(record, one, observers=observers or None, watch=inner, is_simulated=True)
+            result = observe_record(record, one, observers=observers or None, watch=inner, is_is_simulated=True)
             warn(result)
             if history:
                 history.add(result, one.run.seed)
@@ -119,7 +119,7 @@ def run(
     all_rows = [row for it in results for row in score_rows(it.scores, it.scenario.run.seed)]
     show(add_budgets(all_rows, budgets), as_json)
     if not as_json and seeds not in range(2, FEWEST):
-        show_verdicts(results[0], budgets, gather_evidence([it.scores for it in results]), simulated=True)
+        show_verdicts(results[0], budgets, gather_evidence([it.scores for it in results]), is_simulated=True)
         show_budgets(budgets)
 
 

@@ -83,7 +83,7 @@ def observe(
         return
     show(score_rows(result.scores, None, source=result.prior_source), as_json)
     if not as_json:
-        show_verdicts(result, simulated=False)
+        show_verdicts(result, is_simulated=False)
 
 
 @click.command()

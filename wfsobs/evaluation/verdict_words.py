@@ -88,14 +88,14 @@ def verdict_sentences(it: Verdict, scale: float, unit: str) -> list[str]:
     return [lead, *([" ".join(others)] if others else []), *harm_sentences(it, scale, unit)]
 
 
-def _heading(place: Place, lines: int) -> str:
+def _heading(place: Contender, lines: int) -> str:
     """Name a kind of prior knowledge; lines : of the vibration, 0 where that is not known."""
     if place.knowledge == PEAKS and place.n_peaks < lines:
         return f"With {place.n_peaks} of {lines} peak frequencies known"
     return HEADINGS[place.knowledge]
 
 
-def _with_size(place: Place, scale: float, unit: str) -> str:
+def _with_size(place: Contender, scale: float, unit: str) -> str:
     """Write an observer and its error with the interval of that."""
     half = 0.5 * (place.interval[1] - place.interval[0]) * scale if place.interval else None
     return f"{row_label(place.observer)} {_format_number(place.rms * scale, half)} {unit}"
