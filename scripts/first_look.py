@@ -2,9 +2,9 @@
 
     python scripts/first_look.py [--save FOLDER]
 
-Starts `wfsobs serve` and a headless Chromium ($CHROMIUM, else /usr/bin/chromium) and waits until the run is done. A control takes
-the focus, by Tab or by the arrow keys of its group; a word is text between blanks, outside of a canvas; either counts where a part
-of it is visible in the window, not scrolled or clipped away. Figure: the distance of the first figure from the top of the window.
+Starts `wfsobs serve` and a headless Chromium ($CHROMIUM, else /usr/bin/chromium) and waits until the run is done. A control
+takes the focus, by Tab or by the arrow keys of its group; a word is text between blanks, outside of a canvas; either counts where
+a part of it is visible in the window, not scrolled or clipped away. Figure: the distance of the first one from the window's top.
 """
 
 from __future__ import annotations

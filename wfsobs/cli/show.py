@@ -46,7 +46,9 @@ def show_table(table: Table) -> None:
     (console if console.is_terminal else Console(width=195)).print(table)
 
 
-def show_verdicts(result: Result, budgets: Sequence[Budget] = (), evidence: Evidence | None = None, *, is_simulated: bool) -> None:
+def show_verdicts(
+    result: Result, budgets: Sequence[Budget] = (), evidence: Evidence | None = None, *, is_simulated: bool
+) -> None:
     """Print what the table of a record says, a paragraph per target and mode.
 
     budgets : those that are known;  evidence : what further seeds say;  is_simulated : whether the record is of the scenario

@@ -106,7 +106,7 @@ def run(
             if save:
                 save_record(save, record, configfile.to_toml(one))
             inner = Watch(progress=lambda f, i=i: update((i + f) / seeds))
-            result = observe_record(record, one, observers=observers or None, watch=inner, is_is_simulated=True)
+            result = observe_record(record, one, observers=observers or None, watch=inner, is_simulated=True)
             warn(result)
             if history:
                 history.add(result, one.run.seed)
