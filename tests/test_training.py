@@ -132,7 +132,7 @@ def _files(night: Record, other: Record, tmp_path_factory: pytest.TempPathFactor
         (("--train", "none.npz"), "none.npz: cannot be read"),
         (("--train", "slow.npz"), "the training data has a rate of 500 Hz, the record 1000 Hz"),
         (("--train", "tip.npz"), "the training data has 1 modes, the record 2"),
-        (("--train", "late.npz"), "the training data has 3 steps of delay, the record 2"),
+        (("--train", "late.npz", "--trust"), "the training data has 3 steps of delay, the record 2"),
         (("--train", "short.npz"), "the training data has 100 steps; gpr_offline.depth + training_size need 225"),
         (("--train", "night.npz"), "the training data is the record itself"),
         (("--train-until", "2"), "takes more than 0 and less than the record's 2 s"),

@@ -199,9 +199,9 @@ FOUND = [{"frequency": 14.0, "damping": 0.003, "rms": [0.01, 0.01]}, {"frequency
 @pytest.mark.parametrize(
     ("peaks", "counted", "words"),
     [
-        ([], 0, "knows 0 of 14 peak frequencies"),
-        ([*FOUND, {"frequency": 40.0, "damping": 0.003, "rms": [0.01, 0.01]}], 2, "knows 2 of 14 peak frequencies"),
-        (PRESETS["paper"]().vibration.peaks, 14, "knows all 14 peak frequencies"),
+        ([], 0, "With 0 of 14 peak frequencies known: "),
+        ([*FOUND, {"frequency": 40.0, "damping": 0.003, "rms": [0.01, 0.01]}], 2, "With 2 of 14 peak frequencies known: "),
+        (PRESETS["paper"]().vibration.peaks, 14, "With known peak frequencies: "),
     ],
 )
 def test_the_peaks_that_are_counted_are_those_that_the_observers_are_told(peaks: list, counted: int, words: str) -> None:
