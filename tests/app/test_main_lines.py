@@ -15,6 +15,8 @@ from wfsobs.app.jobs.job import DONE, RUNNING
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.main_lines import REFERENCES, MainLines, main_observers
 from wfsobs.app.views.traces import first_window
+from wfsobs.evaluation.evidence import rank_observers
+from wfsobs.evaluation.known_lines import NOTHING, PEAKS, prior_knowledge
 from wfsobs.evaluation.rows import NO_ESTIMATE, is_non_causal
 from wfsobs.evaluation.scores import PREDICTION, Score
 from wfsobs.observers import OBSERVERS
@@ -49,14 +51,15 @@ class Run(param.Parameterized):
 
 class TestRule:
     @pytest.mark.parametrize("target", TARGETS)
-    def test_the_references_and_the_two_best_that_are_causal(self, scores: tuple[Score, ...], target: str) -> None:
+    def test_the_references_and_the_best_by_prior_knowledge_that_are_causal(self, scores: tuple[Score, ...], target: str) -> None:
         errors = {
             s.observer: s.rms
             for s in scores
             if (s.target, s.mode) == (target, "tip") and s.observer in observers_of(target) and not is_non_causal(s.observer)
         }
-        one, two, *_ = sorted(errors, key=errors.__getitem__)
-        expected = {one, two} | {name for name in REFERENCES if target in OBSERVERS[name].targets}
+        ranked = rank_observers(errors)
+        best = {kind: name for name in reversed(ranked) if (kind := prior_knowledge(name)) in (NOTHING, PEAKS)}
+        expected = {ranked[0], *best.values()} | {name for name in REFERENCES if target in OBSERVERS[name].targets}
         assert set(main_observers(scores, target, "tip")) == expected
 
     def test_who_looks_ahead_is_not_among_the_best(self, scores: tuple[Score, ...]) -> None:

@@ -9,6 +9,8 @@ from wfsobs.app.display import Display
 from wfsobs.app.jobs.job import RUNNING
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import observers_of
+from wfsobs.evaluation.evidence import rank_observers
+from wfsobs.evaluation.known_lines import NOTHING, PEAKS, prior_knowledge
 from wfsobs.evaluation.rows import can_be_best
 from wfsobs.evaluation.scores import PREDICTION, Score
 from wfsobs.observers.base import TARGETS
@@ -19,23 +21,22 @@ if TYPE_CHECKING:
 REFERENCES = ("kf-lgs", "gpr-online")
 """The two that the paper compares: always shown."""
 
-BEST = 2
-"""How many of the best are shown beside them."""
-
 
 def main_observers(scores: Iterable[Score], target: str, mode: str, leaders: Sequence[str] = ()) -> list[str]:
-    """List the observers of a target that matter: the references, and the best of those that can be compared.
+    """List the observers of a target that matter: those that the verdict names.
 
-    leaders : the best over several seeds, of which the first is that of the verdict
+    These are the references, the best of all that can be compared, the best without prior knowledge and the best with known
+    peak frequencies. leaders : the best over several seeds, of which the first is that of the verdict.
 
     Without truth the best are those that predict the next measurement best. All, where there is no score at all.
     """
     drawn = observers_of(target)
     of_mode = [s for s in scores if s.mode == mode and s.observer in drawn and can_be_best(s.observer, s.apart)]
-    ranked = sorted(
-        [s for s in of_mode if s.target == target] or [s for s in of_mode if s.target == PREDICTION], key=lambda s: s.rms
-    )
-    best = [*leaders[:1], *(s.observer for s in ranked[:BEST])]
+    rivals = [s for s in of_mode if s.target == target] or [s for s in of_mode if s.target == PREDICTION]
+    ranked = rank_observers({s.observer: s.rms for s in rivals})
+    best = [*leaders[:1], *ranked[:1]]
+    for kind in (NOTHING, PEAKS):
+        best += [name for name in ranked if prior_knowledge(name) == kind][:1]
     return [name for name in drawn if name in best or name in REFERENCES] if best else drawn
 
 
