@@ -75,6 +75,8 @@ def main() -> None:
             page = browser.new_page(viewport={"width": width, "height": height})
             page.goto(url)
             page.get_by_text("Done in").first.wait_for(state="attached", timeout=120_000)
+            if width > 1000:  # with its drawer, whose settings come last
+                page.get_by_role("button", name="Add peak").wait_for(state="attached", timeout=120_000)
             page.wait_for_function("() => document.fonts.status === 'loaded'")
             found = page.evaluate(COUNT)
             sizes = ", ".join(sorted(found["sizes"], key=lambda it: float(it[:-2])))

@@ -34,7 +34,7 @@ from wfsobs.app.views.readout import Readout
 from wfsobs.scenario import Scenario
 
 ACTIONS = """
-:host { display: flex !important; flex-wrap: wrap; gap: 24px 8px; padding-bottom: 16px; }
+:host { display: flex !important; flex-wrap: wrap; gap: 24px 8px; padding-bottom: 4px; }
 :host > * { flex: 0 1 auto; width: auto !important; }
 """
 BODY = ":host { gap: 10px; max-height: none !important; }"

@@ -99,9 +99,13 @@ _BREAKPOINTS = {"values": {"xs": 0, "sm": 1000, "md": 1100, "lg": 1200, "xl": 15
 """Widths [px]; below `sm` the drawer lies over the page: beside it, at a zoom of 200 %, there is no room for a figure."""
 
 
+_TYPOGRAPHY = {"body1": {"fontSize": 14}, "body2": {"fontSize": 14}, "button": {"fontSize": 14}, "caption": {"fontSize": 12}}
+"""Few sizes of text [px]."""
+
+
 def theme() -> dict[str, Any]:
     """Return the page's colours in light and dark mode; units are written as they are, not in capitals."""
-    common = {"components": _COMPONENTS, "breakpoints": _BREAKPOINTS}
+    common = {"components": _COMPONENTS, "breakpoints": _BREAKPOINTS, "typography": _TYPOGRAPHY}
     return {
         "light": {"palette": {"primary": {"main": PRIMARY}}, **common},
         "dark": {"palette": {"primary": {"main": "#6FB7D6", "dark": "#8CC9E2"}}, **common},
