@@ -103,7 +103,7 @@ def test_the_verdict_over_seeds_has_their_mean_and_says_how_many() -> None:
     assert found is not None and found.best.observer == "kf-multi" and found.seeds == 4
     of = [s.rms for r in results for s in r.scores if (s.observer, s.target, s.mode) == ("kf-multi", "vibration", "tip")]
     assert found.best.rms == pytest.approx(np.mean(of))
-    assert "is best over 4 seeds, " in found.sentences()[0] or "over 4 seeds, at" in found.sentences()[0]
+    assert found.sentences()[0].startswith("Vibration, tip, over 4 seeds. With known peak frequencies: Multi-peak KF ")
     single = verdict(first.scenario, first.record, first.estimates, first.scores, "vibration", "tip", simulation=scenario)
     assert single is not None and "seeds" not in " ".join(single.sentences())
     worse = replace(evidence, errors={k: v * (100.0 if k[0] == "kf-lgs" else 1.0) for k, v in evidence.errors.items()})

@@ -199,5 +199,5 @@ def test_the_bytes_of_a_plan_are_those_that_are_written(plan, undisturbed, tmp_p
 def test_the_plan_says_how_much_it_is(plan):
     said = campaign("plan", plan).stdout
     assert "Tiny: 2 scenarios x 40 seeds = 80 runs" in said and "turbulence.wind_speed: 5, 10" in said
-    # 2 modes x 2 targets x 2 observers and two bounds, in each of 80 runs
-    assert f"{80 * 2 * 2 * 4} rows" in said
+    # in each of 80 runs 2 modes; turbulence, vibration and both of kf-lgs and two bounds, turbulence alone of persistence
+    assert f"{80 * 2 * (3 * 3 + 1)} rows" in said

@@ -78,7 +78,7 @@ def test_its_bound_is_a_row_of_its_table_and_of_no_other() -> None:
     assert rows == {key: min(value, alone[key]) for key, value in found.items()}, "no higher than that of a mode by itself"
     assert not [s for s in run(short, observers=["zero"]).scores if s.observer == BOUND_MODES]
     said = verdict(short, result.record, result.estimates, result.scores, "turbulence", names[0])
-    assert said is not None and "the bound of the LGS in all modes" in said.sentences()[0]
+    assert said is not None and "the theoretical limit using the LGS in all modes" in said.sentences()[0]
 
 
 def test_what_it_states_is_near_the_bound_and_below_the_independent_filters() -> None:

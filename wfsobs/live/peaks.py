@@ -79,6 +79,8 @@ def peak_changes(findings: Sequence[Finding]) -> list[str]:
     lines = []
     for peak in last.peaks:
         if (origin := moves.get(peak, last.drifts.get(peak))) is not None:
+            was = origin if before is None else before.same.get(origin, origin)
+            origin = min(origin, was, key=lambda one: one.frequency_std)  # the rest of a line that has jumped is known less well
             lines.append(f"peak moved from {origin.frequency:.2f} to {peak.frequency:.2f} Hz")
         elif peak in last.new:
             lines.append(f"new peak at {peak.frequency:.2f} Hz, {1e3 * peak.rms:.1f} nm")

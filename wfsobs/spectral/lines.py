@@ -21,8 +21,9 @@ from scipy.optimize import minimize_scalar
 from wfsobs.spectral.periodogram import MOST_TAPERED, taper
 from wfsobs.typing import Array
 
-BAND = 64
-"""Bins about a line that are looked at, and samples of its amplitude."""
+BANDS = (64, 32, 16)
+"""Bins about a line that are looked at, and samples of its amplitude: the first that is not above a quarter of its periods in it,
+as what is beside the line must vary little over them."""
 HALF_WIDTHS = np.concatenate([[1e-4], np.geomspace(0.05, 8.0, 18)])
 """Half widths of a line that are compared, in bins: the first is that of an undamped one. All are as likely beforehand."""
 POWERS = np.geomspace(0.1, 20.0, 16)
@@ -95,21 +96,22 @@ def line_in_record(x: Array, dt: float, near: float, floor: Callable[[Array], Ar
         Of the line within the record, not of the process that it is drawn from [um].
     """
     n, T = len(x), len(x) * dt
-    bins = np.fft.fftfreq(BAND, 1.0 / BAND)
+    band = next((it for it in BANDS if it <= 0.25 * near * T), BANDS[-1])
+    bins = np.fft.fftfreq(band, 1.0 / band)
     f = near + bins / T
     S = floor(np.clip(np.abs(f), 1.0 / T, 0.5 / dt))
     # white noise of the density S has the variance 1 in every sample of y, and a line the energy T rms^2 / S
     h = short_taper(n, dt, near)
     y = sqrt(2.0 * dt / n) * fft(h * x * _phasor(near, n, dt).conj())[bins.astype(int)] / np.sqrt(S)
-    t = (np.arange(BAND) + 0.5) / BAND
-    y = sqrt(BAND) * ifft(y * np.exp(1j * pi * bins / BAND))
-    edges = np.arange(BAND + 1) * n // BAND
+    t = (np.arange(band) + 0.5) / band
+    y = sqrt(band) * ifft(y * np.exp(1j * pi * bins / band))
+    edges = np.arange(band + 1) * n // band
     y /= np.add.reduceat(h, edges[:-1]) / np.diff(edges)
-    shapes, variances = _own_coordinates()
-    energy = max(float(np.sum(np.abs(y) ** 2)) - BAND, 8.0)
+    shapes, variances = _own_coordinates(band)
+    energy = max(float(np.sum(np.abs(y) ** 2)) - band, 8.0)
     variance = energy * POWERS[:, None] * variances[:, None, :]  # of every coordinate by the line alone
     passed, constant = variance / (variance + 1.0), -np.sum(np.log1p(variance), axis=-1)
-    inside = 2.0 / pi * np.arctan(0.5 * BAND / HALF_WIDTHS)  # part of the power of a line
+    inside = 2.0 / pi * np.arctan(0.5 * band / HALF_WIDTHS)  # part of the power of a line
     offsets = OFFSETS
     for again in range(PASSES + 1):
         turned = y[:, None] * np.exp(-2j * pi * t[:, None] * offsets)
@@ -140,14 +142,14 @@ def short_taper(n: int, dt: float, frequency: float) -> Array:
     return h
 
 
-@lru_cache(maxsize=1)
-def _own_coordinates() -> tuple[Array, Array]:
-    """Return the eigenvectors (widths, coordinates, BAND) and eigenvalues (widths, coordinates) of the covariances of a line.
+@lru_cache(maxsize=len(BANDS))
+def _own_coordinates(band: int) -> tuple[Array, Array]:
+    """Return the eigenvectors (widths, coordinates, band) and eigenvalues (widths, coordinates) of the covariances of a line.
 
-    Of the amplitude of a line of every half width, mean square 1 / BAND.
+    Of the amplitude of a line of every half width, mean square 1 / band.
     """
-    k = np.arange(BAND)
-    values, vectors = np.linalg.eigh(np.exp(-2.0 * pi / BAND * HALF_WIDTHS[:, None, None] * np.abs(k[:, None] - k)) / BAND)
+    k = np.arange(band)
+    values, vectors = np.linalg.eigh(np.exp(-2.0 * pi / band * HALF_WIDTHS[:, None, None] * np.abs(k[:, None] - k)) / band)
     return np.swapaxes(vectors, 1, 2), np.maximum(values, 0.0)
 
 

@@ -97,7 +97,8 @@ def is_counter(values: Array, n: int) -> bool:
     >>> is_counter(np.array([65534.0, 65535.0, 0.0, 1.0, 3.0]), 5), is_counter(np.zeros(9), 9)
     (True, False)
     """
-    return values.size == n > 2 and bool((values == np.round(values)).all()) and 1 <= np.median(np.diff(values)) <= 1000
+    is_whole = values.size == n > 2 and (values == np.round(values)).all()
+    return bool(is_whole and 1 <= np.median(np.diff(values)) <= 1000)
 
 
 def _has_counter_name(name: str) -> bool:

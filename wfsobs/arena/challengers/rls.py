@@ -125,6 +125,7 @@ def run_rls(measurements: Measurements, _prior: Prior, _settings: Any, watch: Wa
     z, forgetting = measurements.z, float(np.exp(-measurements.dt / MEMORY))
     start = max(float(np.mean(z[:ORDER] ** 2)), 1e-12)
     predicted, _ = predict_rls(z, ORDER, forgetting, PENALTY * start, watch)
+    predicted[: ORDER - 1] = 0.0  # before all is measured that the penalty is taken from
     return whole_estimate(predicted, recent_sd(z, predicted, forgetting))
 
 
