@@ -8,7 +8,7 @@ from wfsobs.scenario import Scenario
 
 
 def titles(dashboard: Dashboard) -> dict[str, str]:
-    return {name: title.object for name, title in dashboard.controls.titles.items()}
+    return dict(dashboard.controls.titles)
 
 
 class TestSearch:

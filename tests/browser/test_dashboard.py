@@ -10,6 +10,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from tests.browser.conftest import carded
+from wfsobs.app.style import look
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario.presets import PRESETS
 
@@ -213,7 +214,7 @@ def test_dark(wide: Page, tmp_path: Path) -> None:
     button.click()
     colour = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
         .filter(m => m.type === "GlyphRenderer" && m.name === "gpr-online").map(m => m.glyph.line_color.value)"""
-    page.wait_for_function(f"({colour})().every(c => c === '#A6E3A6')")
+    page.wait_for_function(f"({colour})().every(c => c === '{look('gpr-online').colour(True)}')")
     page.wait_for_function("before => getComputedStyle(document.body).backgroundColor !== before", arg=ground)
     still(page)
     shot(page, tmp_path, "dark")

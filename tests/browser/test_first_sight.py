@@ -52,7 +52,7 @@ def test_a_setting_is_found_and_gets_the_focus(wide: Page) -> None:
 def test_a_word_says_what_it_means(wide: Page) -> None:
     page = wide
     for word, meaning in (
-        ("bound", "Smallest RMS error"),
+        ("theoretical limit", "Smallest RMS error"),
         ("Lag [ms]", "cross-correlation"),
         ("× truth", "1 is as good as no estimate"),
     ):

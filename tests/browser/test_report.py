@@ -326,9 +326,9 @@ def test_opens_with_the_verdict_and_the_errors_of_the_main_lines(open_report: An
     page = open_report()
     expect(page.locator(".box h2").first).to_have_text("Verdict")
     best = page.locator("p.verdict").filter(visible=True)
-    expect(best).to_have_text([re.compile("^Turbulence, tip: "), re.compile("^Vibration, tip: ")])
+    expect(best).to_have_text([re.compile(r"^Turbulence, tip\. "), re.compile(r"^Vibration, tip\. ")])
     choose(page, "Tilt")
-    expect(best).to_have_text([re.compile("^Turbulence, tilt: "), re.compile("^Vibration, tilt: ")])
+    expect(best).to_have_text([re.compile(r"^Turbulence, tilt\. "), re.compile(r"^Vibration, tilt\. ")])
     first = line(page, "trace-vibration", "kf-lgs")
     assert first["label"].startswith("error of tilt") and first["visible"]
     shown = page.locator("#cards-vibration .card[aria-pressed=true]")

@@ -44,13 +44,14 @@ export function render({model, el}) {
   const solo = (name, was) => {
     if (isAlone(name, was)) return hide(among)
     if (!model.items.some((item) => isAlone(item.name, was))) among = was
-    hide(model.items.map((item) => item.name).filter((it) => it !== name))
+    const cards = model.items.map((item) => item.name)
+    hide([...was.filter((it) => !cards.includes(it)), ...cards.filter((it) => it !== name)])  // a line without a card stays hidden
   }
 
   const cardOf = (item) => {
     const card = document.createElement("button")
     card.type = "button"
-    card.className = "card"
+    card.className = hidden.includes(item.name) ? "card minor" : "card"  // until it is drawn again: a click moves no card
     card.dataset.name = item.name
     card.style.setProperty("--colour", item.colour)
     part(card, "line", "").innerHTML = line(item)
@@ -115,7 +116,7 @@ export function render({model, el}) {
   }
   const count = document.createElement("span")
   hint.append(count)
-  const all = button("Show all", () => hide([]))
+  const all = button("Show all", () => { hide([]); draw() })
   if (model.main) button(model.main, () => model.send_msg({main: true}))
 
   for (const [word, meaning] of Object.entries(model.terms)) {
@@ -131,8 +132,10 @@ export function render({model, el}) {
   model.on("items", draw)
   const follow = () => {
     if (asked !== model.last_arrival) return  // another click is on its way
+    const own = hidden.join() === model.hidden_lines.join()
     hidden = model.hidden_lines
-    mark()
+    if (own) mark()
+    else draw()
   }
   model.on("hidden_lines", follow)
   model.on("last_arrival", follow)

@@ -80,9 +80,9 @@ class Controls:
         self.search = Search(self.open_setting, self._idle, sizing_mode="stretch_width", margin=(8, 0, 4, 0))
         self.topics = _names()
         self.rooms = {name: pn.Column(sizing_mode="stretch_width", margin=0) for name in self.topics}
-        self.titles = {name: pmui.Typography(title, variant="body2", margin=0) for name, title in self.topics.items()}
+        self.titles = dict(self.topics)
         self.accordion = pmui.Accordion(
-            *((self.titles[name], self.rooms[name]) for name in self.topics),
+            *((title, self.rooms[name]) for name, title in self.topics.items()),
             title_variant="body2",
             variant="outlined",
             disable_gutters=True,
@@ -224,8 +224,12 @@ class Controls:
         self.preset.helper_text = told
         self.reset.disabled = not changed
         count = Counter(path.split(".")[0] for path in changed)
-        for name, title in self.topics.items():
-            self.titles[name].object = title + (f" · {count[name]} changed" if count[name] else "")
+        titles = {name: title + (f" · {count[name]} changed" if count[name] else "") for name, title in self.topics.items()}
+        if titles != self.titles:
+            self.titles = titles
+            for i, (name, title) in enumerate(titles.items()):
+                self.accordion[i] = (title, self.rooms[name])
+            self.accordion.param.trigger("objects")  # which are the same
 
     def _refresh_run(self, *_: object) -> None:
         run = self.store.run
