@@ -198,7 +198,8 @@ def new_page(service: Service, session: Session | None = None) -> Any:
 def make_server(options: Options, service: Service) -> Server:
     """Make a server that listens but has not started. A page is made and dropped first: its imports take longer than the page."""
     secret = generate_secret_key()
-    warm = iter([service.new_session()])
+    is_warm = service.live is None  # a page of a live loop needs the event loop to run
+    warm = iter([service.new_session()] if is_warm else [])
     applications: Any = build_applications({"/": lambda: new_page(service, next(warm, None))}, title="wfsobs")
     ready = NextPage(service, options.prefix, secret.encode(), TOKEN, options.lifetime)
     applications["/"].add(ready)
@@ -214,7 +215,7 @@ def make_server(options: Options, service: Service) -> Server:
             address=options.address,
             show=options.open_browser,
             prefix=options.prefix,
-            warm=True,
+            warm=is_warm,
             websocket_origin=origins(options),
             websocket_max_message_size=MESSAGE_BYTES,
             use_xheaders=bool(options.origins),
