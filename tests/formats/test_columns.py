@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from click.testing import CliRunner
 
 from wfsobs.cli import main
@@ -66,7 +67,6 @@ def test_npz_with_arrays_of_two_columns_either_way_round() -> None:
 
 
 def test_fits_tables_and_images() -> None:
-    fits = pytest.importorskip("astropy.io.fits")
     file = io.BytesIO()
     table = fits.BinTableHDU.from_columns([fits.Column("CENTROID", "2D", unit="mas", array=Y), fits.Column("T", "D", array=TIME)])
     fits.HDUList([fits.PrimaryHDU(), table, fits.ImageHDU(U, name="COMMANDS")]).writeto(file)
@@ -131,7 +131,7 @@ def test_a_time_in_the_unit_of_its_name(name: str, factor: float, start: int) ->
     """Of an epoch as well, where a double resolves 0.2 us: the rate is the roundest within that."""
     stamps = start * factor + np.round(0.002 * factor * np.arange(N), 6)
     is_as_clean(read_record(io.BytesIO(table((name, *OWN[1:]), stamps, *Y.T, *U.T)), "a.csv"), "unit nm")
-    fits, file = pytest.importorskip("astropy.io.fits"), io.BytesIO()
+    file = io.BytesIO()
     unit = name.rpartition("_")[2] if "_" in name else "s"
     if unit in SECONDS and "_" in name:
         columns = [fits.Column("TIME", "D", unit=unit, array=stamps), fits.Column("Y_LGS", "2D", unit="nm", array=Y)]
@@ -150,7 +150,6 @@ def test_columns_that_nobody_names_keep_their_names(ending: str) -> None:
     elif ending == ".npz":
         np.savez(file, y_lgs=Y, a=U[:, 0], b=U[:, 1], stamp_ms=stamps, unit="nm", cube=np.zeros((3, 4, 5)), note=np.array("x"))
     else:
-        fits = pytest.importorskip("astropy.io.fits")
         columns = [fits.Column("stamp_ms", "D", array=stamps), fits.Column("Y_LGS", "2D", unit="nm", array=Y)]
         columns += [fits.Column(name, "D", array=u) for name, u in zip("ab", U.T, strict=True)]
         fits.BinTableHDU.from_columns(columns).writeto(file)

@@ -29,7 +29,7 @@ class Component(JSComponent):
                 self.on_message(data)
 
     def save(self, name: str, kind: str, content: bytes) -> None:
-        """Have the browser save a file; for components whose script has `parts.js` or the like."""
+        """Have the browser save a file, where the component's script takes such messages."""
         self._send_msg(file_message(name, kind, content))
 
 
