@@ -195,3 +195,9 @@ def test_back_and_reload_return_to_the_view(open_page: Any) -> None:
     page.go_back()
     page.wait_for_function("location.search === ''")
     expect(page.get_by_role("button", name="Tip", exact=True)).to_have_attribute("aria-pressed", "true")
+
+
+def test_back_before_the_page_is_drawn_is_heard(open_page: Any, server: Any) -> None:
+    left = "if (location.pathname.endsWith('/app')) history.replaceState(null, '', location.pathname)"
+    page = open_page(url=f"{server.url}?view.mode=tilt", seeds=0, script=left, wait=False)
+    expect(page.get_by_role("button", name="Tip", exact=True)).to_have_attribute("aria-pressed", "true")

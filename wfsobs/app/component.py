@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import panel as pn
@@ -14,7 +15,8 @@ class Component(JSComponent):
     """A component of the page in JavaScript.
 
     on_message : gets the messages {name: value, ...} of the browser, and may change figures. Panel answers a message without the
-    lock of the document while a changed property is on its way; held changes need none.
+    lock of the document while a changed property is on its way; held changes need none. Until the page has been drawn Panel drops
+    held changes, so that messages wait.
     """
 
     __abstract = True
@@ -25,8 +27,12 @@ class Component(JSComponent):
 
     def _handle_msg(self, data: object) -> None:
         if isinstance(data, dict):
-            with pn.io.hold():
-                self.on_message(data)
+            answer = partial(self._answer, data)
+            answer() if pn.state.loaded else pn.state.onload(answer)
+
+    def _answer(self, message: dict[str, Any]) -> None:
+        with pn.io.hold():
+            self.on_message(message)
 
     def save(self, name: str, kind: str, content: bytes) -> None:
         """Have the browser save a file, where the component's script takes such messages."""

@@ -191,7 +191,7 @@ function noteBox(el, model, say) {
 const OWN = ["view.page", "view.mode", "view.unit", "view.show", "view.spectrum"]
 
 // Keep the address in step with the view, and the view with where Back and Forward lead.
-function travel(model, replace, push) {
+function travel(model, document, replace, push) {
   const own = (query) => JSON.stringify(OWN.map((key) => new URLSearchParams(query).get(key)))
   let travelling = false
   model.on("view", () => {
@@ -204,6 +204,8 @@ function travel(model, replace, push) {
     model.send_msg({action: "view", query: location.search})
   }
   window.addEventListener("popstate", went)
+  const fetched = new URL(performance.getEntriesByType("navigation")[0].name).search
+  if (!known.has(document) && fetched !== location.search) went()  // Back was pressed before this was here
   model.on("remove", () => window.removeEventListener("popstate", went))
 }
 
@@ -244,7 +246,7 @@ export function render({model, view, el}) {
 
   const address = () => history.replaceState(history.state, "", here() + location.hash)
   model.on("query", address)
-  travel(model, address, () => history.pushState(null, "", here()))
+  travel(model, view.model.document, address, () => history.pushState(null, "", here()))
   if (known.has(view.model.document)) address()
   known.add(view.model.document)
   model.on("msg:custom", (event) => {
