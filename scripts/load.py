@@ -32,7 +32,7 @@ from visitor import Visitor
 
 import wfsobs
 from wfsobs.app.display import per_micrometre
-from wfsobs.app.numerals import number
+from wfsobs.app.render import number
 from wfsobs.scenario import Scenario
 
 ROOT = Path(__file__).parents[1]

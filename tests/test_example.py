@@ -102,7 +102,7 @@ from wfsobs.app.service import Service
 from wfsobs.app.share import from_query, to_query
 from wfsobs.app.store import Store
 from wfsobs.app.style import look, observers_of
-from wfsobs.app.tune_work import choices
+from wfsobs.app.pages.tune import choices
 from wfsobs.app.work import compute
 from wfsobs.cost import part_seconds
 from wfsobs.progress import QUIET

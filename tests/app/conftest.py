@@ -13,7 +13,7 @@ import pytest
 
 from wfsobs.app.cache import freeze, key_of
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.jobs.job import RUNNING, Tell
+from wfsobs.app.jobs import RUNNING, Tell
 from wfsobs.app.limits import NONE, Limits
 from wfsobs.app.service import Service, Session
 from wfsobs.app.sources import Source

@@ -9,7 +9,7 @@ import pytest
 
 from wfsobs.app.causes import Causes
 from wfsobs.app.display import Display
-from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING
+from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.views.budget import BudgetView, bar_data

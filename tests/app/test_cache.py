@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs.app.cache import Cache, arrays_in, key_of, size_of
-from wfsobs.app.jobs.job import CANCELLED, FAILED, RUNNING, Tell
+from wfsobs.app.jobs import CANCELLED, FAILED, RUNNING, Tell
 from wfsobs.app.limits import NONE
 from wfsobs.app.service import Service
 from wfsobs.app.work import RunResults, SignalAndError, compute

@@ -17,10 +17,10 @@ import pytest
 from wfsobs.app.copies import CAMPAIGN as COPIED
 from wfsobs.app.copies import CopiedTask, to_command, to_python
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.jobs.job import DONE
-from wfsobs.app.numerals import number
+from wfsobs.app.jobs import DONE
 from wfsobs.app.pages.campaign import CampaignPage
 from wfsobs.app.pages.pages import CAMPAIGN, EXPLORE
+from wfsobs.app.render import number
 from wfsobs.app.service import Session
 from wfsobs.campaign.compare import compare
 from wfsobs.campaign.follow import CampaignFolder

@@ -10,12 +10,11 @@ import pytest
 from wfsobs.app import loop_work
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.display import per_micrometre
-from wfsobs.app.jobs.job import DONE
-from wfsobs.app.pages.closed_loop import ClosedLoopPage
-from wfsobs.app.pages.loop_figures import CURVES
+from wfsobs.app.jobs import DONE
+from wfsobs.app.pages.closed_loop import CURVES, ClosedLoopPage
 from wfsobs.app.pages.pages import EXPLORE, LOOP
 from wfsobs.app.style import look
-from wfsobs.app.views.envelope import envelope
+from wfsobs.app.views.plots import envelope
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import rows
 from wfsobs.closed_loop.run import closed_loop

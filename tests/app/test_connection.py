@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from wfsobs.app.connection import MOST, Connection
+from wfsobs.app.dashboard import MOST, Connection
 
 
 def test_questions_and_changes() -> None:

@@ -19,7 +19,7 @@ import pytest
 
 from wfsobs.app.copies import LOOP, OBSERVE, TUNE, CopiedTask, to_command
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.jobs.job import RUNNING
+from wfsobs.app.jobs import RUNNING
 from wfsobs.app.pages.closed_loop import ClosedLoopPage
 from wfsobs.app.pages.identify import IdentifyPage
 from wfsobs.app.pages.sweep import SweepPage

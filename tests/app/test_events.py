@@ -12,7 +12,7 @@ import pytest
 from wfsobs.app.controls.panel import Controls
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.store import Store
-from wfsobs.app.views.envelope import envelope
+from wfsobs.app.views.plots import envelope
 from wfsobs.app.views.traces import BINS
 from wfsobs.evaluation.recovery import running_rms
 from wfsobs.scenario import Scenario

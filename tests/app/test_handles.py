@@ -8,12 +8,20 @@ import numpy as np
 import pytest
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.handles import PEAK, changes_of, handles_of, highest_frequency, with_new_peak, without_peak
 from wfsobs.app.pages.pages import LOOP
 from wfsobs.app.views import spectrum_editor
-from wfsobs.app.views.frames import Frames
 from wfsobs.app.views.gain_editor import GainEditor
-from wfsobs.app.views.spectrum_editor import DRAGGED, SpectrumEditor
+from wfsobs.app.views.spectrum_editor import (
+    DRAGGED,
+    PEAK,
+    Frames,
+    SpectrumEditor,
+    changes_of,
+    handles_of,
+    highest_frequency,
+    with_new_peak,
+    without_peak,
+)
 from wfsobs.closed_loop.design import design
 from wfsobs.control.integrator import highest_stable_gain
 from wfsobs.evaluation.theory import Theory

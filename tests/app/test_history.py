@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from wfsobs.app.controls.panel import Controls
-from wfsobs.app.jobs.job import DONE
+from wfsobs.app.jobs import DONE
 from wfsobs.app.store import STEPS_BACK, Store
 from wfsobs.app.work import RunResults
 from wfsobs.cost import run_seconds

@@ -11,11 +11,10 @@ import pytest
 
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.display import per_micrometre
-from wfsobs.app.identify_work import same_measurements, seconds
-from wfsobs.app.jobs.job import DONE, FAILED, RUNNING
+from wfsobs.app.jobs import DONE, FAILED, RUNNING
 from wfsobs.app.limits import PUBLIC, Limits
 from wfsobs.app.pages import identify as module
-from wfsobs.app.pages.identify import EARLIER, IdentifyPage
+from wfsobs.app.pages.identify import EARLIER, IdentifyPage, same_measurements, seconds
 from wfsobs.app.pages.pages import EXPLORE, IDENTIFY
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord
 from wfsobs.app.style import LOOKS

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from tornado.httputil import HTTPHeaders, HTTPServerRequest, RequestStartLine
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.handlers import SecurityHeaders, full_html
 from wfsobs.app.limits import NONE, PUBLIC, Limits
-from wfsobs.app.serve import Options, options, origins
+from wfsobs.app.serve import Options, SecurityHeaders, full_html, options, origins
 from wfsobs.app.service import Full, Service
 from wfsobs.app.share import from_query, to_file
 from wfsobs.app.store import Store

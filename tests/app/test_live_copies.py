@@ -18,7 +18,7 @@ from tests.app.test_copies import in_shell
 from wfsobs.app.copies import LIVE as LIVE_TASK
 from wfsobs.app.copies import CopiedTask, to_command, to_python
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.live_order import LiveOrder
+from wfsobs.app.live_work import LiveOrder
 from wfsobs.app.pages.live import LivePage
 from wfsobs.app.pages.pages import LIVE
 from wfsobs.app.sources import LoadedRecord

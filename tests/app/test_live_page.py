@@ -13,16 +13,14 @@ import numpy as np
 import pytest
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.jobs.job import FAILED, RUNNING, Job
-from wfsobs.app.jobs.task import IDLE
+from wfsobs.app.jobs import FAILED, IDLE, RUNNING, Job
 from wfsobs.app.limits import NONE
-from wfsobs.app.live_order import LiveOrder
-from wfsobs.app.live_work import record_saves
-from wfsobs.app.numerals import number
+from wfsobs.app.live_work import LiveOrder, record_saves
 from wfsobs.app.pages.live import LivePage
+from wfsobs.app.pages.live_controls import events_html, peaks_html, ranking
 from wfsobs.app.pages.live_figures import LiveMarks
-from wfsobs.app.pages.live_table import events_html, peaks_html, ranking
 from wfsobs.app.pages.pages import EXPLORE, LIVE
+from wfsobs.app.render import number
 from wfsobs.app.service import Service
 from wfsobs.app.session import opens_on_live
 from wfsobs.app.sources import LoadedRecord

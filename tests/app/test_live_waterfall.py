@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from wfsobs.app.display import Display
-from wfsobs.app.pages.live_waterfall import COLUMNS, LOWEST, MEASUREMENT, ROWS, Waterfall, second_spectrum
+from wfsobs.app.pages.live_figures import COLUMNS, LOWEST, MEASUREMENT, ROWS, Waterfall, second_spectrum
 from wfsobs.live.crew import trace_width
 from wfsobs.live.ring import LiveFrame
 from wfsobs.live.view import LiveView

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from tornado.websocket import WebSocketClosedError
 
-from wfsobs.app.jobs.job import Job
+from wfsobs.app.jobs import Job
 from wfsobs.app.limits import NONE
 from wfsobs.app.logs import event, to_stream
 from wfsobs.app.service import Service

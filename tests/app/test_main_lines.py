@@ -11,7 +11,7 @@ import pytest
 
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.display import Display
-from wfsobs.app.jobs.job import DONE, RUNNING
+from wfsobs.app.jobs import DONE, RUNNING
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.main_lines import REFERENCES, MainLines, main_observers
 from wfsobs.app.views.traces import first_window

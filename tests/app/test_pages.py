@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.numerals import short
 from wfsobs.app.pages import model
 from wfsobs.app.pages.figures import PSD_TOP_HZ, Figures
 from wfsobs.app.pages.pages import EXPLORE, FIGURES, MODEL
-from wfsobs.app.render import matrix, tex
+from wfsobs.app.render import matrix, short, tex
 from wfsobs.app.style import look
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.description import describe

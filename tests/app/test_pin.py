@@ -11,7 +11,7 @@ import pytest
 from wfsobs.app.change_names import differences, name_of_difference
 from wfsobs.app.compared import thin_lines
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.numerals import change, number
+from wfsobs.app.render import change, number
 from wfsobs.app.style import observers_of
 from wfsobs.app.work import TRUTH
 from wfsobs.observers.base import TARGETS

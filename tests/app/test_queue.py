@@ -12,12 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from wfsobs.app import jobs as module
 from wfsobs.app.cache import Cache
 from wfsobs.app.controls.status import status_of
-from wfsobs.app.jobs import queue as module
-from wfsobs.app.jobs.job import CANCELLED, CLICK, DONE, FAILED, LONG, RUNNING, SWEEP, Job
-from wfsobs.app.jobs.queue import JobQueue
-from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.jobs import BATCH, CANCELLED, CLICK, DONE, FAILED, LONG, RUNNING, BackgroundTask, Job, JobQueue
 from wfsobs.app.limits import NONE
 from wfsobs.app.service import Service
 from wfsobs.progress import Watch
@@ -137,11 +135,11 @@ def test_who_has_something_at_work_comes_after_who_has_not(make_queue: Any) -> N
 
 
 def test_a_click_before_a_sweep_until_the_sweep_has_waited_long(make_queue: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert [Job("run", lambda *_: None, cost=cost).priority for cost in (LONG, LONG + 1)] == [CLICK, SWEEP]
+    assert [Job("run", lambda *_: None, cost=cost).priority for cost in (LONG, LONG + 1)] == [CLICK, BATCH]
     queue, log, gate = make_queue(1), Log(), threading.Event()
     Asked(log, "a", gate=gate).into(queue)
     log.until(lambda: log.started == ["a"])
-    sweep = Asked(log, "b", "sweep", gate, kind="tune", cost=1.0, priority=SWEEP).into(queue)
+    sweep = Asked(log, "b", "sweep", gate, kind="tune", cost=1.0, priority=BATCH).into(queue)
     long = Asked(log, "c", "long", gate, cost=LONG + 1).into(queue)
     click = Asked(log, "d", "click", gate).into(queue)
     assert [one.places[-1] for one in (sweep, long, click)] == [2, 3, 1]
@@ -188,7 +186,7 @@ def test_who_leaves_is_not_waited_for(make_queue: Any) -> None:
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.integers(1, 4), st.lists(st.tuples(st.sampled_from("abcde"), st.sampled_from([CLICK, SWEEP])), max_size=12))
+@given(st.integers(1, 4), st.lists(st.tuples(st.sampled_from("abcde"), st.sampled_from([CLICK, BATCH])), max_size=12))
 def test_everything_is_done_never_too_much_at_once(workers: int, jobs: list[tuple[str, int]]) -> None:
     queue, log, gate = JobQueue(workers, Cache(0)), Log(), threading.Event()
     try:

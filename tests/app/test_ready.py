@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from wfsobs.app import ready
-from wfsobs.app.jobs.job import Job
+from wfsobs.app import serve as ready
+from wfsobs.app.jobs import Job
 from wfsobs.app.limits import Limits
 from wfsobs.app.service import Full, Service
 

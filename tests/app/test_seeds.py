@@ -12,12 +12,11 @@ import pytest
 
 from wfsobs.app.cache import Cache
 from wfsobs.app.display import Display
-from wfsobs.app.jobs.job import CLICK, DONE, IDLE_TIME, SWEEP, Job
-from wfsobs.app.jobs.queue import JobQueue
+from wfsobs.app.jobs import BATCH, CLICK, DONE, IDLE_TIME, Job, JobQueue
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.store import Store
-from wfsobs.app.views.seed_switch import SeedSwitch
 from wfsobs.app.views.strip import Strip
+from wfsobs.app.views.switches import SeedSwitch
 from wfsobs.app.views.table import Table
 from wfsobs.app.views.verdict import VerdictLine
 from wfsobs.pipeline import run
@@ -52,7 +51,7 @@ def test_a_job_for_idle_time_gives_way_to_a_click_and_begins_again(queue: JobQue
     heard: list[Any] = []
     queue.submit(Job("seed", idle, priority=IDLE_TIME), "a", heard.append)
     begun.wait(30)
-    for priority in (CLICK, SWEEP):
+    for priority in (CLICK, BATCH):
         before = len(log)
         queue.submit(Job("run", lambda *_: log.append("click"), priority=priority), "b", lambda _news: None)
         wait(lambda before=before: len(log) >= before + 2)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from wfsobs import pipeline
-from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING, Tell
+from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING, Tell
 from wfsobs.app.store import Store
 from wfsobs.app.work import RunResults
 from wfsobs.progress import Cancelled, Watch

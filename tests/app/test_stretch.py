@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.numerals import number
+from wfsobs.app.render import number
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.error_spectra import band_rms, cumulative_rms
 from wfsobs.signal.welch import welch_psd

@@ -11,20 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wfsobs.app import sweep_work
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING, Job
+from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING, Job
 from wfsobs.app.limits import NONE, Limits
-from wfsobs.app.numerals import number
+from wfsobs.app.pages import sweep as sweep_work
 from wfsobs.app.pages.pages import EXPLORE, SWEEP
-from wfsobs.app.pages.sweep import EVERY, SweepPage
-from wfsobs.app.pages.sweep_settings import sweep_settings, usual_values
+from wfsobs.app.pages.sweep import EVERY, SweepPage, SweepTask, sweep_settings, usual_values
 from wfsobs.app.pages.sweep_views import FULL_MARGIN, GROUNDS, mix
+from wfsobs.app.render import number
 from wfsobs.app.seeds import SeedScores
 from wfsobs.app.service import Service
 from wfsobs.app.sources import SimulatedRecord
 from wfsobs.app.style import look
-from wfsobs.app.sweep_work import SweepTask
 from wfsobs.campaign.sweep import parse_axis, plan_sweep
 from wfsobs.campaign.sweep_results import SweepResults, run_sweep
 from wfsobs.evaluation.scores import Score

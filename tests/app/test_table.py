@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from wfsobs.app.display import Display
-from wfsobs.app.jobs.job import DONE
+from wfsobs.app.jobs import DONE
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.views.table import Table

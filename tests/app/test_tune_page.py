@@ -12,16 +12,13 @@ import pytest
 
 from wfsobs.app.controls.names import setting_name
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING
-from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING, BackgroundTask
 from wfsobs.app.limits import Limits
-from wfsobs.app.numerals import number
 from wfsobs.app.pages.pages import TUNE
 from wfsobs.app.pages.parts import Starter
-from wfsobs.app.pages.tune import TunePage
-from wfsobs.app.pages.tune_views import unit_for
+from wfsobs.app.pages.tune import TunePage, best_so_far, choices, seconds, unit_for
+from wfsobs.app.render import number
 from wfsobs.app.sources import LoadedRecord
-from wfsobs.app.tune_work import best_so_far, choices, seconds
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings

@@ -14,8 +14,8 @@ import pytest
 from wfsobs.app import picker as module
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.limits import Limits
-from wfsobs.app.numerals import number
 from wfsobs.app.picker import LARGEST
+from wfsobs.app.render import number
 from wfsobs.app.service import Service
 from wfsobs.app.upload_fields import SILENT
 from wfsobs.pipeline import observe

@@ -14,10 +14,10 @@ from tests.records import ON_PAPER
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.display import RUNNING_RMS, SIGNAL, per_micrometre
 from wfsobs.app.downloads import data_csv
-from wfsobs.app.numerals import number
+from wfsobs.app.render import number
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.style import look
-from wfsobs.app.views.envelope import envelope, envelope_times
+from wfsobs.app.views.plots import envelope, envelope_times
 from wfsobs.app.views.traces import BINS
 from wfsobs.app.work import TRUTH
 from wfsobs.control.controllers import CONTROLLERS

@@ -22,7 +22,7 @@ from playwright.sync_api import Browser, Locator, Page, expect
 import wfsobs
 from tests.browser.conftest import PATIENCE
 from wfsobs.app.display import UNITS, per_micrometre
-from wfsobs.app.numerals import number
+from wfsobs.app.render import number
 from wfsobs.app.style import TERM_COLOURS
 from wfsobs.app.work import TRUTH
 from wfsobs.cli import main

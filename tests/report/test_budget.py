@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from wfsobs.app.display import AT_LIMIT
-from wfsobs.app.numerals import number
+from wfsobs.app.render import number
 from wfsobs.app.report.budget import budget_state_table
 from wfsobs.app.report.data import Report, State, state_of
 from wfsobs.app.report.packing import pack, unpack

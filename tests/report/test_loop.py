@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 
 import pytest
 
-from wfsobs.app.numerals import number
+from wfsobs.app.render import number
 from wfsobs.app.report.data import Report, state_of
 from wfsobs.app.report.packing import pack, unpack
 from wfsobs.app.report.page import page

@@ -18,7 +18,7 @@ import pytest
 
 from wfsobs import __version__
 from wfsobs.app.display import AT_LIMIT
-from wfsobs.app.numerals import number
+from wfsobs.app.render import number
 from wfsobs.app.report.data import Report, state_of
 from wfsobs.app.report.grid import Grid
 from wfsobs.app.report.packing import pack, unpack

@@ -11,8 +11,7 @@ import param
 from wfsobs.app.component import Component
 from wfsobs.app.copies import EXPLORED, to_command, to_python
 from wfsobs.app.downloads import Save, TooLarge, data_csv, data_npz
-from wfsobs.app.jobs.job import DONE, FAILED, RUNNING, Job
-from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.jobs import DONE, FAILED, RUNNING, BackgroundTask, Job
 from wfsobs.app.pages.pages import Pages
 from wfsobs.app.pages.parts import PageActions
 from wfsobs.app.record_link import name_record
@@ -23,7 +22,7 @@ from wfsobs.app.sources import LoadedRecord, SimulatedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, labels
 from wfsobs.app.view_state import ViewState
-from wfsobs.app.views.settle import AFTERWARDS_MS, once
+from wfsobs.app.views.plots import AFTERWARDS_MS, once
 from wfsobs.app.work import RunResults
 from wfsobs.settings.errors import SettingError
 

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import param
 
 from wfsobs.app.display import Display
-from wfsobs.app.jobs.job import DONE, IDLE_TIME, Job
-from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.jobs import DONE, IDLE_TIME, BackgroundTask, Job
 from wfsobs.app.store import Store
 from wfsobs.app.work import RunResults
 from wfsobs.cost import run_seconds

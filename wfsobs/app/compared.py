@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wfsobs.app.numerals import NOTHING, change, number
+from wfsobs.app.render import NOTHING, change, number
 from wfsobs.app.style import observers_of
-from wfsobs.app.views.envelope import envelope, envelope_times
+from wfsobs.app.views.plots import envelope, envelope_times
 from wfsobs.app.work import TRUTH, Key, RunResults, SignalAndError
 from wfsobs.evaluation.rows import row_label, target_title
 from wfsobs.evaluation.scores import Score

@@ -2,24 +2,123 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from textwrap import indent
 from typing import Any
 
-from wfsobs.app.copied_parts import (
-    RECORD_IMPORTS,
-    as_path,
-    given_options,
-    import_order,
-    record_code,
-    scenario_code,
-    stated_options,
-)
-from wfsobs.app.live_copies import live_command, live_script
-from wfsobs.app.share import FILE
+from wfsobs.app.live_work import LiveOrder
+from wfsobs.app.share import FILE, LONGEST, changes
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source
-from wfsobs.scenario import Scenario
+from wfsobs.scenario import Scenario, configfile
+
+
+def as_path(name: str) -> str:
+    """Return the name of a file; one that starts with a dash would be read as an option."""
+    return f"./{name}" if name.startswith("-") else name
+
+
+def given_options(scenario: Scenario, preset: str, file: str) -> list[str]:
+    """List the options that give the settings, or a file of them where they are long."""
+    words = ["--preset", preset]
+    for path, value in changes(scenario, preset).items():
+        words += ["--set", f"{path}={configfile.format_value(value)}"]
+    return words if len(shlex.join(words)) <= LONGEST else ["--config", file]
+
+
+def stated_options(source: LoadedRecord) -> list[str]:
+    """List what the user stated about a file, and what tells the file from others."""
+    stated = source.declaration
+    sign = None if stated.command_sign is None else f"{stated.command_sign:+d}"
+    named = {
+        "unit": stated.unit,
+        "command-sign": sign,
+        "command-delay": stated.command_delay,
+        "rate": stated.rate,
+        "sha256": source.sha256 or None,
+    }
+    words = [word for name, value in named.items() if value is not None for word in (f"--{name}", str(value))]
+    words += ["--trust"] * stated.trust
+    return words + [word for role, name in stated.columns.items() for word in ("--column", f"{role}={name}")]
+
+
+RECORD_IMPORTS = {"from wfsobs.telemetry.intake import DeclaredFormat", "from wfsobs.telemetry.records import load_record"}
+"""Of `record_code`."""
+
+
+def record_code(source: LoadedRecord) -> str:
+    """Write the line of Python that loads a record."""
+    stated = "".join(f"{name}={value!r}, " for name, value in vars(source.declaration).items() if value not in (None, {}, False))
+    check = f", sha256={source.sha256!r}" if source.sha256 else ""
+    return f"record = load_record({source.name!r}, scenario, DeclaredFormat({stated.removesuffix(', ')}){check})"
+
+
+def import_order(line: str) -> tuple[bool, str]:
+    """Return the place of a line among the imports."""
+    return line.startswith("from"), line
+
+
+def scenario_code(scenario: Scenario, preset: str, file: str) -> str:
+    """Write the settings as an expression of Python, or the loading of a file of them where they are long."""
+    lines = [f"    {json.dumps(path)}: {value!r},\n" for path, value in changes(scenario, preset).items()]
+    made = f'wfsobs.PRESETS["{preset}"]()' + (f".replace({{\n{''.join(lines)}}})" if lines else "")
+    return made if len(made) <= LONGEST else f'configfile.load_scenario("{file}")'
+
+
+LIVE_LOOP = """loop = LiveLoop(source, scenario, {observers!r}, speed={speed!r})
+for controller in {controllers!r}:
+    loop.control(controller, True)
+loop.play()
+while not loop.failure() and loop.count < n:
+    time.sleep(0.1)
+for observer in loop.board.active():
+    for target in OBSERVERS[observer].targets:
+        print(observer, target, *(1e3 * loop.board[observer].rms(target)), "nm")
+loop.stop()
+"""
+"""Lines of a script."""
+
+
+def live_command(scenario: Scenario, preset: str, source: Source | None, order: LiveOrder) -> str:
+    """Write the command that runs the loop and shows it on its page."""
+    words = [*_source_options(source, order), *_loop_options(order), *given_options(scenario, preset, FILE)]
+    return shlex.join(["wfsobs", "live", *words])
+
+
+def _source_options(source: Source | None, order: LiveOrder) -> list[str]:
+    """Name what a live loop runs on, where it is not the simulation of the settings."""
+    if isinstance(source, LoadedRecord):
+        return ["--replay", as_path(source.name), *stated_options(source)]
+    return list(order.options)
+
+
+def _loop_options(order: LiveOrder) -> list[str]:
+    words = [word for name in order.observers for word in ("--observer", name)]
+    words += [word for name in order.controllers for word in ("--controller", name)] or ["--no-controllers"]
+    return words if order.speed == 1.0 else [*words, "--speed", f"{order.speed:g}"]
+
+
+def live_script(scenario: Scenario, preset: str, source: Source | None, order: LiveOrder) -> str:
+    """Write a script that runs the loop for 10,000 frames, or a record to its end, and prints the errors."""
+    imports = {"import time", "import wfsobs", "from wfsobs.live.loop import LiveLoop", "from wfsobs.observers import OBSERVERS"}
+    lines = [f"scenario = {scenario_code(scenario, preset, FILE)}"]
+    if "configfile." in lines[0]:
+        imports.add("from wfsobs.scenario import configfile")
+    if isinstance(source, LoadedRecord):
+        imports |= {*RECORD_IMPORTS, "from wfsobs.live.replay import Replay"}
+        lines += [record_code(source), "source, n = Replay(record), record.n_steps"]
+    elif order.options:
+        imports |= {"from wfsobs.live.attached import StreamSource", "from wfsobs.streams.wiring import NgsWiring"}
+        lines.append(f"source, n = {order.source!r}, 10_000")
+    else:
+        imports.add("from wfsobs.live.simulated import SimulatedLoop")
+        lines.append("source, n = SimulatedLoop(scenario), 10_000")
+    lines.append(LIVE_LOOP.format(observers=list(order.observers), speed=order.speed, controllers=list(order.controllers)))
+    main = 'if __name__ == "__main__":  # its processes import this file'
+    return "\n".join([*sorted(imports, key=import_order), "", main, indent("\n".join(lines), "    ")])
+
 
 RECORD, SIMULATION = "wfsobs-record.npz", "wfsobs-simulation.toml"
 """Files of a command: a simulation that is saved, and its settings where they are too long to be written out."""

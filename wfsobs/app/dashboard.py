@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any
+from uuid import uuid4
 
 import panel as pn
 import panel_material_ui as pmui
@@ -11,27 +14,64 @@ from panel.util.parameters import edit_readonly
 
 from wfsobs.app.actions import Actions
 from wfsobs.app.component import Component
-from wfsobs.app.connection import Connection
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.controls.panel import Controls
 from wfsobs.app.controls.status import waiting_text
 from wfsobs.app.display import Display
 from wfsobs.app.help import Help
 from wfsobs.app.history import History
-from wfsobs.app.jobs.job import FAILED
+from wfsobs.app.jobs import FAILED
 from wfsobs.app.pages.explore import Explore
 from wfsobs.app.pages.pages import LIVE, Pages
 from wfsobs.app.pages.parts import ON_ONE_LINE, WIDE
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import Post, Session
 from wfsobs.app.store import Store
-from wfsobs.app.style import asset, theme
+from wfsobs.app.style import asset, labels, theme
 from wfsobs.app.upload import Upload
 from wfsobs.app.view_state import ViewState
 from wfsobs.app.views.history_sheet import HistorySheet
-from wfsobs.app.views.modes import ModeSwitch, UnitSwitch
-from wfsobs.app.views.readout import Readout
+from wfsobs.app.views.switches import ModeSwitch, UnitSwitch
 from wfsobs.scenario import Scenario
+
+MOST = 1000
+"""Changes that are taken at once."""
+
+
+class Connection(Component):
+    """The banner in the browser: questions {ask} and unsent changes {changes} up, the last question that has arrived down."""
+
+    session = param.String("", doc="A name of the session, to tell it from one made anew.")
+    last_arrival = param.Integer(0, doc="Number of the last question that has arrived, and all before it.")
+
+    _esm = asset("connection.js")
+    _stylesheets = [asset("connection.css")]
+
+    def __init__(self, take: Callable[[dict[str, Any]], None], **params: Any):
+        """Connect a page. take : makes a change again that did not arrive."""
+        self._take = take
+        super().__init__(self._hear, session=uuid4().hex, **params)
+
+    def _hear(self, data: dict[str, Any]) -> None:
+        if isinstance(data.get("ask"), int):
+            self.last_arrival = data["ask"]
+        changes = data.get("changes")
+        for change in changes[:MOST] if isinstance(changes, list) else []:
+            if isinstance(change, dict):
+                self._take(change)
+
+
+class Readout(Component):
+    """Follows the pointer, and the arrow keys in a figure that has the focus; one for all figures of the page."""
+
+    labels = param.Dict({}, doc="Name of a line in the figures -> what it is called.")
+
+    _esm = asset("readout.js")
+    _stylesheets = [asset("readout.css")]
+
+    def __init__(self, **params: Any):
+        super().__init__(labels=labels(), width=0, height=0, margin=0, **params)
+
 
 ACTIONS = """
 :host { display: flex !important; flex-wrap: wrap; gap: 24px 8px; padding-bottom: 4px; }

@@ -16,8 +16,7 @@ from wfsobs.app.change_names import name_of_change
 from wfsobs.app.compared import LETTERS, ComparedRun, thin_lines
 from wfsobs.app.display import Display
 from wfsobs.app.history_entry import LONGEST_NAME, MOST, RECORD_BYTES, HistoryEntry, let_go, make_entry
-from wfsobs.app.jobs.job import DONE, FAILED
-from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.jobs import DONE, FAILED, BackgroundTask
 from wfsobs.app.service import run_key
 from wfsobs.app.session_file import SessionContent
 from wfsobs.app.sources import Step

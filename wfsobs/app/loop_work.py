@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from wfsobs.app.jobs.job import Tell
+from wfsobs.app.jobs import Tell
 from wfsobs.app.work import RunResults
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import Row, rows

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from wfsobs.app.jobs.job import DONE, FAILED, Job
-from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.jobs import DONE, FAILED, BackgroundTask, Job
 from wfsobs.app.picker import Picker
 from wfsobs.app.store import Store
 from wfsobs.telemetry.examples import TEMPLATE, sample_csv

@@ -9,8 +9,7 @@ import numpy as np
 import param
 
 from wfsobs.app.cache import size_of
-from wfsobs.app.jobs.job import DONE, IDLE_TIME, Job, Tell
-from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.jobs import DONE, IDLE_TIME, BackgroundTask, Job, Tell
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source
 from wfsobs.app.store import Store
 from wfsobs.app.work import RunResults

@@ -9,37 +9,186 @@ import signal
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from html import escape
 from ipaddress import ip_address
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import panel as pn
+from bokeh.application.application import ServerContext
+from bokeh.application.handlers.handler import Handler
+from bokeh.document import Document
+from bokeh.server.contexts import ApplicationContext, BokehServerContext
 from bokeh.server.server import Server
+from bokeh.server.session import ServerSession
 from bokeh.server.urls import per_app_patterns
 from bokeh.server.views.autoload_js_handler import AutoloadJsHandler
-from bokeh.server.views.doc_handler import DocHandler
 from bokeh.server.views.metadata_handler import MetadataHandler
-from bokeh.util.token import generate_secret_key
+from bokeh.util.token import generate_jwt_token, generate_secret_key, generate_session_id
 from panel.io.application import build_applications
-from panel.io.server import get_server
-from tornado.ioloop import IOLoop
+from panel.io.server import DocHandler, get_server
+from tornado.httputil import HTTPHeaders, HTTPServerRequest, RequestStartLine
+from tornado.ioloop import IOLoop, PeriodicCallback
+from tornado.web import OutputTransform, RequestHandler
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.handlers import Liveness, PageHandler, SecurityHeaders, full_html
 from wfsobs.app.limits import NONE, PUBLIC, Limits
-from wfsobs.app.live_order import LiveOrder
-from wfsobs.app.live_work import share_loop
+from wfsobs.app.live_work import LiveOrder, live_counts, share_loop
 from wfsobs.app.logs import event, to_stream
-from wfsobs.app.ready import NEXT, NextPage
 from wfsobs.app.service import Full, Service, Session
 from wfsobs.app.session import session_page
+from wfsobs.app.share import LONGEST
 from wfsobs.app.work import one_blas_thread
 from wfsobs.campaign.follow import CampaignFolder
 from wfsobs.live.paced import prefer
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.errors import SettingError
+
+QUIET = 2.0
+"""How long nobody must have wanted anything before a page is made [s]: it keeps the thread of all pages for half a second."""
+
+EVERY = 0.5
+"""How often to look whether a page can be made [s]."""
+
+FRESH = 86_400.0
+"""A page that has waited longer is made anew [s]: its token expires."""
+
+NEXT: ContextVar[Session | None] = ContextVar("NEXT", default=None)
+"""The session whose page is being made before its visitor comes."""
+
+
+class NextPage(Handler):
+    """The page of the next visitor who asks for the address alone; made while the server has nothing else to do.
+
+    A handler of the application, which the server tells of the context that makes its sessions.
+    """
+
+    def __init__(self, service: Service, prefix: str, secret: bytes | None, token_lifetime: int, lifetime: float):
+        """Make none yet. prefix, secret, token_lifetime : as the server has them; lifetime : of an unconnected page [s]."""
+        super().__init__()
+        self.service, self.lifetime = service, lifetime
+        self._prefix, self._secret, self._token_lifetime = f"/{prefix.strip('/')}".rstrip("/"), secret, token_lifetime
+        self.context: ApplicationContext | None = None
+        self._page: tuple[Session, ServerSession, float] | None = None
+        self._looks = PeriodicCallback(self.look, 1e3 * EVERY)
+
+    def modify_document(self, doc: Document) -> None:
+        """Leave the page as the other handler of the application makes it."""
+
+    def on_server_loaded(self, server_context: ServerContext) -> None:
+        """Look from now on whether a page can be made."""
+        assert isinstance(server_context, BokehServerContext)
+        self.context = server_context.application_context
+        self._looks.start()
+
+    async def look(self) -> None:
+        """Make a page if there is none, and nobody wants anything."""
+        if self._page and monotonic() - self._page[2] > FRESH:
+            self._let_go()
+        if self._page is None and not self.service.full and self.service.quiet_seconds > QUIET:
+            await self._make()
+
+    def take(self) -> ServerSession | None:
+        """Give the page to a visitor; None if there is none."""
+        if self._page is None or monotonic() - self._page[2] > FRESH:
+            return None
+        self._page[0].enter()
+        return self._let_go()
+
+    def _let_go(self) -> ServerSession:
+        """Hold the page no more; it ends as all pages do if nobody connects to it."""
+        assert self._page is not None
+        session = self._page[1]
+        self._page = None
+        IOLoop.current().call_later(self.lifetime, session.unblock_expiration)
+        return session
+
+    async def _make(self) -> None:
+        assert self.context is not None
+        session = self.service.new_session()
+        request = HTTPServerRequest(start_line=RequestStartLine("GET", f"{self._prefix}/", "HTTP/1.0"))
+        name = generate_session_id(self._secret, signed=True)
+        payload = {"headers": {}, "cookies": {}, "arguments": {}, **self.context.application.process_request(request)}
+        token = generate_jwt_token(name, self._secret, signed=True, expiration=self._token_lifetime, extra_payload=payload)
+        before = NEXT.set(session)
+        try:
+            page = await self.context.create_session_if_needed(name, request, token)
+        finally:
+            NEXT.reset(before)
+        page.block_expiration()
+        self._page = session, page, monotonic()
+
+
+class PageHandler(DocHandler):
+    """The page: turns visitors away who are too many, and takes no session's name and no endless query from an address."""
+
+    service: Service
+    next_page: NextPage
+
+    async def get_session(self) -> ServerSession:
+        """Return the page that is ready where the address asks for nothing else, or make one."""
+        self.service.note_wish()
+        page = None if self.request.arguments else self.next_page.take()
+        if page is not None:
+            return page
+        made: ServerSession = await super().get_session()  # type: ignore[misc]
+        return made
+
+    async def prepare(self) -> None:
+        """Turn the visitor away if the server is full."""
+        await super().prepare()
+        if self.service.full:
+            self.set_status(503)
+            self.set_header("Retry-After", "60")
+            self.finish(full_html("There are as many visitors as this server takes. Please try again later."))
+            return
+        arguments = self.request.arguments
+        for name in ("bokeh-token", "bokeh-session-id"):
+            arguments.pop(name, None)
+        self.request.headers.pop("Bokeh-Session-Id", None)
+        if len(self.request.query) > LONGEST:  # the page says that it was not used; here it would be sent to and fro
+            arguments.clear()
+
+
+class SecurityHeaders(OutputTransform):
+    """Headers of every answer: no guessing of types, no address for other sites, no frame but in the pages named."""
+
+    def __init__(self, embedders: Sequence[str], request: HTTPServerRequest):
+        super().__init__(request)
+        self._ancestors = " ".join(embedders) or "'none'"
+
+    def transform_first_chunk(
+        self, status_code: int, headers: HTTPHeaders, chunk: bytes, finishing: bool
+    ) -> tuple[int, HTTPHeaders, bytes]:
+        """Add them; called by Tornado."""
+        headers["X-Content-Type-Options"] = "nosniff"
+        headers["Referrer-Policy"] = "same-origin"
+        headers["Content-Security-Policy"] = f"frame-ancestors {self._ancestors}"
+        return status_code, headers, chunk
+
+
+class Liveness(RequestHandler):
+    """Whether the server answers, and how busy it is."""
+
+    def initialize(self, service: Service) -> None:
+        """Take what was given beside the pattern; called by Tornado."""
+        self.service = service
+
+    def get(self) -> None:
+        """Answer in JSON."""
+        queue = self.service.queue
+        counts = {"ok": True, "sessions": self.service.sessions, "running": queue.running, "waiting": queue.length}
+        self.write(counts | live_counts(self.service.live_loop))
+
+
+def full_html(line: str) -> str:
+    """Write the page for a visitor for whom there is no room."""
+    return f"<!doctype html><title>wfsobs</title><h1>wfsobs is full</h1><p>{escape(line)}</p>"
+
 
 CACHE_MB = 256
 MESSAGE_BYTES = 6_000_000

@@ -16,9 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import param
 
 from wfsobs.app.cache import Cache, key_of
-from wfsobs.app.jobs.job import IDLE_TIME, Job, Listener, Tell, Work
-from wfsobs.app.jobs.queue import JobQueue, release_memory
-from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.jobs import IDLE_TIME, BackgroundTask, Job, JobQueue, Listener, Tell, Work, release_memory
 from wfsobs.app.limits import Limits
 from wfsobs.app.logs import event
 from wfsobs.app.sources import Source
@@ -30,7 +28,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 
 if TYPE_CHECKING:
-    from wfsobs.app.live_order import LiveOrder
+    from wfsobs.app.live_work import LiveOrder
     from wfsobs.campaign.follow import CampaignFolder
     from wfsobs.live.loop import LiveLoop
 

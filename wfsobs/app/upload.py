@@ -15,14 +15,12 @@ import panel_material_ui as pmui
 
 from wfsobs.app.column_form import ColumnForm
 from wfsobs.app.controls.names import name_settings
-from wfsobs.app.jobs.job import CANCELLED, FAILED, RUNNING, Job
-from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.jobs import CANCELLED, FAILED, RUNNING, BackgroundTask, Job
 from wfsobs.app.picker import PartialFile, Picker, too_large
-from wfsobs.app.record_place import RecordPlace
 from wfsobs.app.sample_files import Examples
 from wfsobs.app.session_file import SUFFIX
 from wfsobs.app.sources import fit_to_record
-from wfsobs.app.store import Store
+from wfsobs.app.store import RecordPlace, Store
 from wfsobs.app.upload_fields import UploadFields, differs_from_proposals
 from wfsobs.app.upload_preview import AnyPreview, PreviewView, read_stranger
 from wfsobs.record import RecordError

@@ -17,7 +17,7 @@ from wfsobs.app.pages.parts import PageActions
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.main_lines import MainLines
-from wfsobs.app.views.settle import on_settle
+from wfsobs.app.views.plots import on_settle
 from wfsobs.app.views.traces import Traces
 from wfsobs.app.work import TRUTH
 from wfsobs.observers.base import TARGETS

@@ -18,10 +18,10 @@ from wfsobs.app.controls.names import preset_title, setting_name
 from wfsobs.app.controls.rows import RowEditor
 from wfsobs.app.controls.search import Search
 from wfsobs.app.controls.status import BAR, ON_BAR, STATUS_ON_BAR, Status, status_of
-from wfsobs.app.jobs.job import RUNNING
+from wfsobs.app.jobs import RUNNING
 from wfsobs.app.store import Store
 from wfsobs.app.style import PRIMARY
-from wfsobs.app.views.settle import AFTERWARDS_MS, once
+from wfsobs.app.views.plots import AFTERWARDS_MS, once
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.idle import idle_settings
 from wfsobs.scenario.presets import PRESETS

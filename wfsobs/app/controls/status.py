@@ -6,10 +6,10 @@ import param
 
 from wfsobs.app.component import Component
 from wfsobs.app.controls.names import setting_name
-from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING
-from wfsobs.app.run_results import RunResults
+from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset
+from wfsobs.app.work import RunResults
 
 ON_BAR = {
     "color": "#fff",

@@ -28,15 +28,13 @@ from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset
 from wfsobs.app.views.budget import BudgetView
-from wfsobs.app.views.frames import Frames
 from wfsobs.app.views.main_lines import MainLines
-from wfsobs.app.views.pinning import Pinning
 from wfsobs.app.views.plots import call
-from wfsobs.app.views.seed_switch import SeedSwitch
 from wfsobs.app.views.spectra import MODEL, PEAKS, SpectraFigures
-from wfsobs.app.views.spectrum_editor import SpectrumEditor
+from wfsobs.app.views.spectrum_editor import Frames, SpectrumEditor
 from wfsobs.app.views.stretch import Stretch
 from wfsobs.app.views.strip import Strip
+from wfsobs.app.views.switches import Pinning, SeedSwitch
 from wfsobs.app.views.table import Table
 from wfsobs.app.views.traces import Traces
 from wfsobs.app.views.verdict import VerdictLine

@@ -11,11 +11,10 @@ from bokeh.models import BoxAnnotation, ColumnDataSource, DataRange1d, GlyphRend
 from bokeh.plotting import figure
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.numerals import number
+from wfsobs.app.jobs import BackgroundTask
+from wfsobs.app.render import number
 from wfsobs.app.style import asset, look, swatch
-from wfsobs.app.views.envelope import envelope, envelope_times
-from wfsobs.app.views.plots import call, new_figure
+from wfsobs.app.views.plots import call, envelope, envelope_times, new_figure
 from wfsobs.app.views.table import find
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.observers.base import TURBULENCE, VIBRATION

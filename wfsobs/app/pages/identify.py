@@ -3,41 +3,255 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from html import escape
 
+import numpy as np
 import panel as pn
 import panel_material_ui as pmui
+from bokeh.models import ColumnDataSource, HoverTool, Range1d
 
 from wfsobs.app.controls.fields import parse_number
 from wfsobs.app.copies import IDENTIFY, CopiedTask
-from wfsobs.app.display import Display
+from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.downloads import Save
-from wfsobs.app.identify_work import (
-    RecordSpectrum,
-    compute,
-    estimate_record_spectrum,
-    fitted_spectrum,
-    same_measurements,
-    seconds,
-)
-from wfsobs.app.jobs.job import DONE, FAILED, RUNNING, Job
-from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.pages.identify_figure import NAMES, SpectrumFigure
-from wfsobs.app.pages.identify_table import identification_html, verdict_html
-from wfsobs.app.pages.link import LinkedFields
-from wfsobs.app.pages.parts import WIDE, PageActions, Starter, box, html, legend, line, text
+from wfsobs.app.jobs import DONE, FAILED, RUNNING, BackgroundTask, Job, Tell
+from wfsobs.app.pages.parts import WIDE, LinkedFields, PageActions, Starter, box, html, legend, line, text
+from wfsobs.app.render import Row, macro, table
 from wfsobs.app.sources import SimulatedRecord, Source
 from wfsobs.app.store import Store
-from wfsobs.identification import Identification
+from wfsobs.app.style import look
+from wfsobs.app.views.plots import call, new_figure
+from wfsobs.app.work import RunResults
+from wfsobs.identification import Identification, identify
 from wfsobs.identification.identification import LEVEL
-from wfsobs.identification.report import identification_toml
+from wfsobs.identification.process import Number
+from wfsobs.identification.report import format_number, identification_toml, mode_rows, whiteness_lines
+from wfsobs.identification.result import IdentifiedMode
+from wfsobs.observers.missing import fill_missing
 from wfsobs.pipeline import as_stated
+from wfsobs.prior import Model
+from wfsobs.priors_from.scenario import prior_of
+from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 from wfsobs.settings.parameters import hint
+from wfsobs.spectral.periodogram import fast_length, periodogram, periodogram_frequencies, taper
 from wfsobs.spectral.search import LOWEST
+from wfsobs.typing import Array
+
+BINS = 900
+"""Of the measured spectrum over the whole axis, all equally wide on it."""
+PER_SAMPLE = 40e-6
+"""Time per sample and mode of a record with some ten peaks [s]; one with thirty takes ten times as long."""
+
+
+@dataclass(frozen=True)
+class RecordSpectrum:
+    """The periodogram of z in the bins of an axis: mean and highest, (bins, n_modes) [um^2/Hz], at frequency (bins,) [Hz].
+
+    duration [s]
+    """
+
+    record: Record
+    frequency: Array
+    mean: Array
+    highest: Array
+    duration: float
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The model of one mode on a grid of frequencies [Hz] that has every resonance in it: densities [um^2/Hz].
+
+    parts : noise, turbulence and background where there are any, and the resonances, each by itself
+    lines : per pure line, frequency, density under it, and how high the periodogram stands at it
+    """
+
+    frequency: Array
+    total: Array
+    parts: tuple[Array, ...]
+    lines: tuple[tuple[float, float, float], ...]
+
+
+def estimate_record_spectrum(of: RunResults, _watch: Watch, _tell: Tell) -> RecordSpectrum:
+    """Estimate the spectrum of the record shown, with the taper that the identification uses. Raises RecordError."""
+    record = of.result.record
+    z = fill_missing(record, prior_of(of.result.scenario.before_events, record, (Model,))).z[record.delay :]
+    z = z[: fast_length(len(z))]
+    if len(z) < 100:
+        raise RecordError(f"the record has {record.n_steps} samples, too few for a spectrum")
+    f = periodogram_frequencies(len(z), record.dt)
+    start = np.flatnonzero(np.diff(np.floor(np.log(f / f[0]) / np.log(f[-1] / f[0]) * BINS), prepend=-1.0))
+    count = np.diff(start, append=len(f))
+    density = np.column_stack([periodogram(column - column.mean(), record.dt) for column in z.T])
+    return RecordSpectrum(
+        record,
+        np.add.reduceat(f, start) / count,
+        np.add.reduceat(density, start) / count[:, None],
+        np.maximum.reduceat(density, start),
+        len(z) * record.dt,
+    )
+
+
+def fitted_spectrum(mode: IdentifiedMode, result: Identification) -> Fit:
+    """Compute the spectrum of the model identified in a mode."""
+    s, T = mode.spectrum, result.duration
+    centres = [(p.omega / (2 * np.pi), p.damping) for p in s.processes]
+    near = [c * (1.0 + max(damping, 1e-5) * np.linspace(-8.0, 8.0, 65)) for c, damping in centres]
+    f = np.unique(np.concatenate([np.geomspace(1.0 / T, 0.5 / result.dt, 600), *near]))
+    f = f[(f >= 1.0 / T) & (f <= 0.5 / result.dt)]
+    parts = (np.full_like(f, 2.0 * s.dt * s.noise**2), *(p.psd(f) for p in s.processes))
+    gain = T * float(np.mean(taper(result.n_steps))) ** 2
+    lines = []
+    for peak in (p for p in mode.peaks if p.pure):
+        floor = float(s.psd(np.array([peak.frequency.value]))[0])
+        lines.append((peak.frequency.value, floor, floor + gain * peak.rms.value**2))
+    return Fit(f, s.psd(f), parts, tuple(lines))
+
+
+def seconds(record: Record) -> float:
+    """About how long an identification takes [s]."""
+    return PER_SAMPLE * record.n_steps * record.n_modes
+
+
+def same_measurements(one: Record, other: Record) -> bool:
+    """Whether two records hold the same measurements."""
+    return one is other or (
+        one.y_lgs.shape == other.y_lgs.shape
+        and one.dt == other.dt
+        and one.delay == other.delay
+        and np.array_equal(one.y_lgs, other.y_lgs, equal_nan=True)
+        and np.array_equal(one.u, other.u, equal_nan=True)
+    )
+
+
+def compute(of: RunResults, level: float, lowest: float, watch: Watch, _tell: Tell) -> tuple[Identification, Record]:
+    """Identify a model in the record shown; return both. Raises RecordError, Cancelled."""
+    return identify(of.result.record, level=level, lowest=lowest, watch=watch), of.result.record
+
+
+HEIGHT = 400
+NAMES = {
+    "measured": "measured PSD (mean)",
+    "highest": "measured PSD (maximum per bin)",
+    "fitted": "model",
+    "parts": "model components",
+    "found": "identified peaks",
+}
+"""Look -> what it is called in the legend."""
+
+
+class SpectrumFigure:
+    """What was measured, mean and highest value of every bin; over it the model, its parts, and a mark on every peak."""
+
+    def __init__(self) -> None:
+        self.figure = new_figure(
+            x_range=Range1d(start=0.1, end=500.0), y_range=Range1d(start=1e-6, end=1.0), x_axis_type="log", y_axis_type="log"
+        )
+        self.figure.height = HEIGHT
+        call(self.figure, "Spectrum of z and its model")
+        self.figure.xaxis.axis_label = "frequency [Hz]"
+        self.measurement = ColumnDataSource({"x": [], "mean": [], "highest": []})
+        self.total = ColumnDataSource({"x": [], "y": []})
+        self.parts = ColumnDataSource({"xs": [], "ys": []})
+        self.spikes = ColumnDataSource({"x": [], "low": [], "high": []})
+        self.peaks = ColumnDataSource({"x": [], "y": [], "text": []})
+        fig = self.figure
+        self._renderers = {
+            "highest": [fig.line("x", "highest", source=self.measurement, line_alpha=0.45, line_width=1.0)],
+            "measured": [fig.line("x", "mean", source=self.measurement, line_width=1.0)],
+            "parts": [fig.multi_line("xs", "ys", source=self.parts, line_width=1.2, line_dash=list(look("parts").dash))],
+            "fitted": [fig.line("x", "y", source=self.total, line_width=2.2)],
+        }
+        marks = fig.scatter("x", "y", source=self.peaks, marker="inverted_triangle", size=8)
+        spikes = fig.segment("x", "low", "x", "high", source=self.spikes, line_width=2.2)
+        self._renderers["found"] = [marks, spikes]
+        fig.add_tools(HoverTool(renderers=[marks], tooltips="@text"))
+
+    def draw_measured(self, of: RecordSpectrum, display: Display, diameter: float) -> None:
+        """Send what was measured, and have the axes hold it."""
+        scale, column = per_micrometre(display.unit, diameter) ** 2, display.column
+        mean, highest = scale * of.mean[:, column], scale * of.highest[:, column]
+        self.measurement.data = {"x": of.frequency, "mean": mean, "highest": highest}
+        positive = mean[mean > 0]
+        if positive.size:
+            low, high = float(np.quantile(positive, 0.01)) / 5.0, float(highest.max()) * 6.0
+            self.figure.y_range.update(start=low, end=high, reset_start=low, reset_end=high)
+        ends = float(of.frequency[0]), float(of.frequency[-1])
+        self.figure.x_range.update(start=ends[0], end=ends[1], reset_start=ends[0], reset_end=ends[1])
+        self.figure.yaxis.axis_label = f"PSD of z, {display.mode_label} [{display.unit_label}²/Hz]"
+
+    def draw_fit(self, mode: IdentifiedMode | None, of: Fit | None, display: Display, diameter: float) -> None:
+        """Send the model of the mode shown, or nothing."""
+        if mode is None or of is None:
+            for source in (self.total, self.parts, self.spikes, self.peaks):
+                source.data = {str(name): [] for name in source.data}
+            return
+        scale = per_micrometre(display.unit, diameter) ** 2
+        self.total.data = {"x": of.frequency, "y": scale * of.total}
+        self.parts.data = {"xs": [of.frequency] * len(of.parts), "ys": [scale * part for part in of.parts]}
+        self.spikes.data = {
+            "x": [f for f, _, _ in of.lines],
+            "low": [scale * low for _, low, _ in of.lines],
+            "high": [scale * high for *_, high in of.lines],
+        }
+        tops = {f: high for f, _, high in of.lines}
+        at = [p.frequency.value for p in mode.peaks]
+        height = [tops.get(f) or float(np.interp(f, of.frequency, of.total)) for f in at]
+        self.peaks.data = {
+            "x": at,
+            "y": [1.6 * scale * y for y in height],
+            "text": [f"{'line' if p.pure else 'resonance'} {p.frequency.value:.5g} Hz" for p in mode.peaks],
+        }
+
+    def restyle(self, dark: bool) -> None:
+        """Set the colours of light or dark mode."""
+        for name, renderers in self._renderers.items():
+            for renderer in renderers:
+                renderer.glyph.line_color = look(name).colour(dark)
+                if "fill_color" in renderer.glyph.properties():
+                    renderer.glyph.fill_color = look(name).colour(dark)
+
+
+WHITE, COLOURED = macro("tag", "best", "white"), macro("tag", "above", "not white")
+
+
+def identification_html(mode: IdentifiedMode, display: Display, diameter: float) -> str:
+    """Noise, turbulence and peaks of a mode, each number with its standard deviation."""
+    scale = per_micrometre(display.unit, diameter)
+    columns = {
+        "What": "by frequency",
+        "Frequency [Hz]": "natural frequency; of turbulence the corner",
+        "Damping": "0 for a line",
+        f"Rms [{display.unit_label}]": "standard deviation of it in z; of a peak within this record",
+    }
+    body = []
+    for what, frequency, damping, rms in mode_rows(mode):
+        scaled = None if rms is None else Number(rms.value * scale, rms.std * scale)
+        body.append(Row(what, ["" if n is None else deviation_text(n) for n in (frequency, damping, scaled)]))
+    return str(table(f"Identified in {mode.name}", columns, [("", body)]))
+
+
+def deviation_text(number: Number) -> str:
+    """Write a number and its standard deviation, where there is one.
+
+    >>> deviation_text(Number(47.43812, 0.0264)), deviation_text(Number(1.9, float("nan")))
+    ('47.438 ± 0.026', '1.9')
+    """
+    return format_number(number).replace("+-", "±").replace("-", "−").removesuffix(" ± −")
+
+
+def verdict_html(result: Identification) -> str:
+    """Whether anything is left, mode by mode."""
+    lines = [
+        (WHITE if mode.whiteness.white else COLOURED) + f"{line}."
+        for mode, line in zip(result.modes, whiteness_lines(result), strict=True)
+    ]
+    return f'<div role="status">{macro("texts", "text", lines)}</div>'
+
 
 INTRO = (
     "A model is fitted to the pseudo-open-loop measurement z of the record shown, simulated or loaded: white noise, turbulence, "

@@ -2,36 +2,219 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Mapping
 from functools import partial
 from html import escape
+from time import monotonic
 
 import panel as pn
+import panel_material_ui as pmui
 import param
 
 from wfsobs.app.change_names import name_of_difference
 from wfsobs.app.copies import LIVE, CopiedTask
-from wfsobs.app.display import Display
+from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL, Display, per_micrometre
 from wfsobs.app.downloads import Save
-from wfsobs.app.jobs.job import FAILED, RUNNING
-from wfsobs.app.jobs.task import IDLE
-from wfsobs.app.live_order import LiveOrder
-from wfsobs.app.live_work import LiveTask, record_saves
-from wfsobs.app.pages.live_beat import Beat
-from wfsobs.app.pages.live_controls import LiveControls, Pulse
-from wfsobs.app.pages.live_room import LiveRoom
-from wfsobs.app.pages.live_table import status_line
-from wfsobs.app.pages.live_text import live_text
-from wfsobs.app.pages.parts import WIDE, PageActions, box, text
+from wfsobs.app.jobs import FAILED, IDLE, RUNNING
+from wfsobs.app.live_work import LiveOrder, LiveTask, record_saves
+from wfsobs.app.pages.live_controls import LiveControls, control_html, events_html, live_html, peaks_html, status_line
+from wfsobs.app.pages.live_figures import (
+    MEASUREMENT,
+    LatencyHistogram,
+    Painter,
+    Pulse,
+    RollingSpectra,
+    RollingTraces,
+    Stars,
+    Waterfall,
+    live_text,
+)
+from wfsobs.app.pages.parts import HALVES, WIDE, PageActions, box, figure_with_caption, group, legend, line, text
+from wfsobs.app.service import Post
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
+from wfsobs.app.style import look
+from wfsobs.app.views.spectrum_editor import Frames, SpectrumEditor
+from wfsobs.app.work import TRUTH
+from wfsobs.evaluation.scores import BOUNDS
+from wfsobs.evaluation.theory import Theory
+from wfsobs.live.board import NEXT
 from wfsobs.live.checks import can_control, can_run
+from wfsobs.live.finding import Bounds
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.replay import Replay
 from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.live.source import SIMULATION
-from wfsobs.live.view import LiveView
+from wfsobs.live.view import SHARED, LiveView
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import TARGETS
 from wfsobs.settings.errors import SettingError
+
+PERIOD = SHARED
+"""Between two pictures [s]: of pages that are late with one, those up to the next one still share a reading."""
+
+
+class Beat:
+    """Has a page drawn when a picture is due, on the thread of its session, which has an event loop.
+
+    A picture that is late does not delay those that follow.
+
+    Parameters
+    ----------
+    post : callable
+        Has a function run on that thread.
+    draw : callable
+        Draws.
+    """
+
+    def __init__(self, post: Post, draw: Callable[[], None]):
+        self._post, self._draw = post, draw
+        self._loop = asyncio.get_running_loop()
+        self._due = 0.0
+        self._next: asyncio.TimerHandle | None = None
+
+    @property
+    def runs(self) -> bool:
+        """Whether pictures are due."""
+        return self._next is not None
+
+    def start(self) -> None:
+        """Draw again and again."""
+        if self._next is None:
+            self._plan()
+
+    def stop(self) -> None:
+        """Draw no more."""
+        if self._next is not None:
+            self._next.cancel()
+            self._next = None
+
+    def _plan(self) -> None:
+        """Wait for the next due time; of those that have passed only the last one is left."""
+        now = self._loop.time()
+        self._due = next_due(self._due, now)
+        self._next = self._loop.call_at(self._due, self._post, self._ring)
+
+    def _ring(self) -> None:
+        if self._next is not None:
+            try:
+                self._draw()
+            finally:
+                self._plan()
+
+
+def next_due(due: float, now: float) -> float:
+    """Return the multiple of PERIOD that follows `due`, or the last one before `now` if that is later [s].
+
+    >>> round(next_due(0.32, 0.36), 2), round(next_due(0.32, 0.52), 2), round(next_due(0.32, 0.9), 2)
+    (0.48, 0.48, 0.8)
+    """
+    return PERIOD * max(round(due / PERIOD) + 1, int(now / PERIOD))
+
+
+SLOW = 1.0
+"""Between two tables [s]."""
+
+
+class LiveRoom:
+    """The figures and tables of one page."""
+
+    def __init__(self, store: Store, display: Display, controls: LiveControls, pulse: Pulse):
+        self.display, self.store, self.controls = display, store, controls
+        self._painter = painter = Painter(pulse)
+        self.traces, self.spectra, self.waterfall = RollingTraces(painter), RollingSpectra(painter), Waterfall()
+        self.latencies, self.stars = LatencyHistogram(painter), Stars(painter)
+        self.table, self.control_table, self.news, self.peaks = (live_text() for _ in range(4))
+        self.editor: SpectrumEditor | None = None
+        self.legend = live_text()
+        self._second = 0
+        self._bounds: Bounds = {}
+        self._spectra_room = figure_with_caption("Spectra", self.spectra.figure)
+
+    def view(self) -> list[pn.Column]:
+        """Return the boxes."""
+        c = self.controls
+        figures = [
+            figure_with_caption("The last seconds", self.traces.figure),
+            self._spectra_room,
+            pn.Column(figure_with_caption("Waterfall", self.waterfall.figure), **WIDE),
+            figure_with_caption("Latencies", self.latencies.figure),
+        ]
+        switches = line(
+            c.window,
+            c.target,
+            group(self.display, "show", {"Signal": SIGNAL, "Error": ERROR, "Running rms": RUNNING_RMS}),
+            group(self.display, "spectrum", {"PSD": PSD, "Cumulative rms": CUMULATIVE}),
+            c.waterfall,
+            pmui.Checkbox.from_param(self.display.param.editing, size="small", margin=0),
+        )
+        return [
+            box("Now", switches, c.lines, self.legend, pn.Column(*figures, **WIDE, stylesheets=[HALVES])),
+            box("Observers", self.table, self.peaks),
+            box("Controllers on the same disturbance", c.controllers, self.control_table, self.stars.row),
+            box("Events", self.news),
+        ]
+
+    def draw(self, loop: LiveLoop, view: LiveView) -> None:
+        """Send the present."""
+        display, dark = self.display, self.display.dark
+        target = self._target(loop)
+        scale = per_micrometre(display.unit, loop.scenario.telescope.diameter)
+        active = loop.board.active()
+        names = [name for name in active if name in self.controls.lines.value]
+        run_in = RollingTraces.run_in(display)
+        longer = view.n * view.dt + run_in
+        before = loop.readings.look(loop.view, longer, anew=not loop.is_playing) if run_in else view
+        self.traces.draw(before, view.n, target, names, display, scale, list(loop.events), self._bounds)
+        self.spectra.draw(view, target, names, display, scale)
+        what = self.controls.waterfall.value
+        self.waterfall.draw(view, what if what in active else MEASUREMENT, target, display, scale)
+        running = [name for name in self.controls.controllers.value if name in loop.controllers]
+        seconds = self.controls.window.value
+        left = view.once(("left", seconds), lambda: loop.control_view(seconds))
+        self.stars.draw(view, left, running, loop.scenario, dark)
+        self._edit(loop, target)
+        if (second := int(monotonic() / SLOW)) != self._second or not loop.is_playing:  # all pages at the same time
+            self._second = second
+            self._draw_tables(loop, view, target, scale)
+            self.latencies.draw(loop.board, names, loop.sampling.dt, dark)
+        self._painter.send()
+
+    def _target(self, loop: LiveLoop) -> str:
+        """Return what errors are shown of: without truth, of the next measurement."""
+        return self.controls.target.value if loop.source.has_truth else NEXT
+
+    def _draw_tables(self, loop: LiveLoop, view: LiveView, target: str, scale: float) -> None:
+        self._bounds = loop.workshop.bounds(loop.scenario)
+        self.legend.object = self._legend(loop, target)
+        d, seconds = self.display, self.controls.window.value
+        of = (d.column, d.unit, d.dark)
+        key = ("table", target, tuple(self._bounds), *of)
+        self.table.object = view.once(key, lambda: live_html(loop, view, target, d, scale, self._bounds))
+        self.control_table.object = view.once(("controls", seconds, *of), lambda: control_html(loop, seconds, d))
+        self.news.object = events_html(loop.events, loop.sampling.dt)
+        self.peaks.object = peaks_html(loop.workshop.change, scale, self.display.unit_label)
+
+    def _legend(self, loop: LiveLoop, target: str) -> str:
+        """Write what the lines of the figures are."""
+        wanted = (target,) if target in TARGETS else TARGETS
+        active = [name for name in loop.board.active() if name in self.controls.lines.value]
+        names = [name for name in active if set(wanted) <= set(OBSERVERS[name].targets)]
+        truth = [] if self.display.error else [TRUTH]
+        bounds = [name for name in BOUNDS if self.display.running and target in self._bounds.get(name, ())]
+        return legend({name: look(name).label for name in (*truth, *names, *bounds)}, self.display.dark)
+
+    def _edit(self, loop: LiveLoop, target: str) -> None:
+        """Lay the handles over the spectra of a simulation, whose settings they are."""
+        if self.editor is None:
+            if not self.display.editing:
+                return
+            store, session = self.store, self.store.session
+            self.editor = SpectrumEditor(TARGETS[0], self.spectra.figure, store, self.display, Frames(session), Theory())
+            self._spectra_room.append(self.editor.layer)
+        self.editor.turn_to(target if loop.source.name == SIMULATION and target in TARGETS else None)
+
 
 APART = ":host { gap: 10px; }"
 """Style of boxes one below the other."""

@@ -1,29 +1,184 @@
-"""The buttons and fields of the live loop, and what tells that a picture has been painted."""
+"""The buttons, fields and tables of the live loop."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from time import monotonic
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from math import inf, isnan
 from typing import Any
 
+import numpy as np
 import panel_material_ui as pmui
-import param
+from markupsafe import Markup
 
-from wfsobs.app.component import Component
-from wfsobs.app.pages.live_table import QUANTITIES
-from wfsobs.app.pages.live_waterfall import MEASUREMENT
+from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.pages.live_figures import MEASUREMENT
 from wfsobs.app.pages.parts import WIDE, line
-from wfsobs.app.style import asset, look
-from wfsobs.live.board import ADAPTIVE, NEXT, SLOTS
+from wfsobs.app.render import NOTHING, Row, number, table
+from wfsobs.app.style import look, swatch
+from wfsobs.closed_loop.run import strehl
+from wfsobs.evaluation.rows import row_label, target_title
+from wfsobs.live.alarms import ALARM
+from wfsobs.live.board import ADAPTIVE, NEXT, SCORED, SLOTS
 from wfsobs.live.checks import has_error, speed_of
 from wfsobs.live.control_crew import SEATS, USUAL
+from wfsobs.live.finding import Bounds, PeakFinding
 from wfsobs.live.loop import LiveLoop
+from wfsobs.live.peaks import Change, moves_of
 from wfsobs.live.source import SIMULATION, STREAM, LiveSource
+from wfsobs.live.view import LiveEvent, LiveView
+from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
+from wfsobs.observers.estimates import TOTAL
 from wfsobs.settings.group import SettingError
+from wfsobs.typing import Array
 
-PATIENCE = 10.0
-"""Time after which a picture that the browser has not answered is given up [s]."""
+SHOWN_EVENTS = 8
+FAR_BEHIND = 2.0
+"""Beyond this the observers do not catch up by themselves [s]."""
+WHAT_RUNS = re.compile(
+    r"^\S+(?= (?:on|off|has a new design)$)|(?<=error of )\S+(?= up|$)|(?<=identified for )\S+(?=:)|(?<= s for )\S+$"
+)
+"""The id of an observer or a controller in an event."""
+QUANTITIES = {"Next measurement" if target == NEXT else target_title(target): target for target in (*TARGETS, TOTAL, NEXT)}
+"""What errors are shown of."""
+
+
+def ranking(view: LiveView, names: Iterable[str], target: str, column: int) -> list[tuple[str, float]]:
+    """Return the observers with their rms errors over the view [um], best first; those without one last."""
+    errors = [(name, float(view.rms(name, target)[column])) for name in names]
+    return sorted(errors, key=lambda one: inf if isnan(one[1]) else one[1])
+
+
+def live_html(loop: LiveLoop, view: LiveView, target: str, display: Display, scale: float, bounds: Bounds) -> str:
+    """Write the table of all observers that run."""
+    unit, seconds = display.unit_label, view.n * view.dt
+    columns = {
+        "Observer": "",
+        f"RMS error [{unit}]": f"over the last {seconds:.1f} s",
+        f"Since its start [{unit}]": "after its warm-up",
+        "error / bound": "the smallest bound of the two",
+        "Step, median [µs]": "update and estimate of all modes",
+        "99.9 % [µs]": "",
+        "Longer than a frame": "steps",
+    }
+    of = {name: by_target[target][display.column] for name, by_target in bounds.items() if target in by_target}
+    least = min(of.values(), default=float("nan"))
+    rows = [
+        _row(loop, name, rms, target, display, scale, least)
+        for name, rms in ranking(view, loop.board.active(), target, display.column)
+    ]
+    rows += [
+        Row(swatch(name, display.dark) + row_label(name), [number(scale * rms), *[NOTHING] * 5], {"name": name})
+        for name, rms in of.items()
+    ]
+    return str(table("Live", columns, [("", rows)]))
+
+
+def _row(loop: LiveLoop, name: str, rms: float, target: str, display: Display, scale: float, least: float) -> Row:
+    counts = loop.board[name]
+    whole = float(counts.rms(target)[display.column]) if target in SCORED else float("nan")
+    lacks = [one for one in ((target,) if target in TARGETS else TARGETS) if one not in OBSERVERS[name].targets]
+    cells = [
+        Markup('<span title="it has no {}">{}</span>').format(lacks[0], NOTHING) if lacks else _number(scale * rms),
+        _number(scale * whole),
+        _number(rms / least),
+        *(_number(1e6 * counts.latencies.quantile(share)) for share in (0.5, 0.999)),
+        str(int(counts.late[0])),
+    ]
+    return Row(swatch(name, display.dark) + look(name).label, cells, {"name": name})
+
+
+def control_html(loop: LiveLoop, seconds: float, display: Display) -> str:
+    """Write what every controller leaves, least first; nothing before one runs."""
+    left = loop.control_view(seconds)
+    if left is None or not loop.controllers:
+        return ""
+    c, diameter, column = loop.scenario.control, loop.scenario.telescope.diameter, display.column
+    of = "the disturbance" if loop.source.has_truth else "what its sensor would see, with its noise"
+    columns = {
+        "Controller": "",
+        "Residual [nm]": f"rms of {of}, over the last {seconds:g} s, in the mode shown",
+        "Residual [mas]": "the same; tip and tilt alone",
+        "Since its start [nm]": "after its warm-up",
+        f"Strehl at {c.wavelength:g} µm": f"of all modes together, over the last {seconds:g} s",
+        "Strehl since its start": "after its warm-up",
+    }
+    mas = per_micrometre("mas", diameter) if loop.scenario.modes[column].radial_order == 1 else float("nan")
+    found = {name: (left.rms(name), left.rms_since_start(name)) for name in loop.controllers}
+
+    def cells(now: Array, whole: Array) -> list[str]:
+        ratios = [NOTHING if np.isnan(rms).any() else f"{strehl(rms.tolist(), c.wavelength):.4f}" for rms in (now, whole)]
+        return [*map(_number, (1e3 * now[column], mas * now[column], 1e3 * whole[column])), *ratios]
+
+    order = sorted(found, key=lambda name: inf if isnan(found[name][0][column]) else found[name][0][column])
+    rows = [Row(swatch(name, display.dark) + look(name).label, cells(*found[name]), {"controller": name}) for name in order]
+    return str(table("Controllers of the live loop", columns, [("", rows)]))
+
+
+def peaks_html(change: Change | None, scale: float, unit: str) -> str:
+    """Write the peaks of the last identification, and how far each is from where the one before had it."""
+    if change is None:
+        return ""
+    columns = {
+        "Peak [Hz]": "",
+        "± [Hz]": "standard deviation",
+        "Moved by [Hz]": "since the identification before; nothing where that did not find it",
+        "Damping": "",
+        f"RMS [{unit}]": "of the mode that has most of it",
+    }
+    was = {**change.same, **moves_of(change)}
+
+    def moved(peak: PeakFinding) -> str:
+        if peak not in was:
+            return "new" if peak in change.new else NOTHING
+        by = round(peak.frequency - was[peak].frequency, 2)
+        return f"{by:+.2f}".replace("-", "−") if by else "0"
+
+    rows = [
+        Row(number(p.frequency, 4), [_number(p.frequency_std), moved(p), _number(p.damping), number(scale * p.rms)])
+        for p in change.peaks
+    ]
+    title = "Peaks of the last minute"
+    return f'<div class="caption apart">{title}</div>{table(title, columns, [("", rows)])}'
+
+
+def _number(x: float) -> str:
+    return NOTHING if isnan(x) else number(x)
+
+
+def status_line(loop: LiveLoop, view: LiveView) -> str:
+    """Say how the loop goes, in one line."""
+    if not loop.is_ready:
+        return "The observers are being designed"
+    state = "Running" if loop.is_playing else "Paused"
+    behind = max(loop.newest - loop.count, 0) * loop.sampling.dt / loop.speed  # the two are read one after the other
+    advice = ": more than this machine does, switch some off or run slower" if behind > FAR_BEHIND else ""
+    parts = [
+        f"{state} at {loop.speed:g} × real time",
+        f"{view.dt * (view.first + view.n):.1f} s",
+        f"{loop.delivery.frames} frames",
+        f"{loop.delivery.losses} lost",
+        f"{100.0 * loop.delivery.late_share:.2f} % later than 1 ms",
+        f"observers {behind:.2f} s behind{advice}",
+    ]
+    return " · ".join([*parts, "recording"] if loop.recorder.is_on else parts)
+
+
+def events_html(events: Iterable[LiveEvent], dt: float) -> str:
+    """List the latest events, by time, the last one first."""
+    latest = sorted(list(events)[-SHOWN_EVENTS:], key=lambda event: event.frame)[::-1]  # some are told late
+    lines = [f"<li>{event.frame * dt:.2f} s: {_event_html(event.line)}</li>" for event in latest]
+    return f'<ul class="text" aria-label="Events">{"".join(lines)}</ul>' if lines else ""
+
+
+def _event_html(line: str) -> str:
+    """Write an event; an alarm stands out, and what runs has the name that it has everywhere on the page."""
+    line = WHAT_RUNS.sub(lambda found: look(found[0]).label, line)
+    return f"<strong>{escape(line)}</strong>" if line.startswith(ALARM) else escape(line)
+
+
 SPEEDS = {f"{speed:g} ×": speed for speed in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)}
 WINDOWS = {f"{seconds:g} s": seconds for seconds in (2.0, 5.0, 10.0)}
 ALL = "all"
@@ -33,7 +188,7 @@ FIRST = ("kf-lgs", "kf-multi", "multirate", "multirate-multi", "gpr-online")
 """Observers that run first: as many as two cores keep up with beside the page."""
 MAIN = ("kf-multi", "multirate-multi", "gpr-online")
 """Observers whose lines are shown first."""
-OBSERVERS, CONTROLLERS, SPEED, ERRORS, WINDOW = "observers", "controllers", "speed", "errors", "window"
+RUNNING, CONTROLLERS, SPEED, ERRORS, WINDOW = "observers", "controllers", "speed", "errors", "window"
 """Fields of a link."""
 APART: dict[str, Any] = {**WIDE, "margin": (10, 0, 4, 0)}
 """As wide as the page, its label clear of the row above."""
@@ -47,58 +202,6 @@ BUTTONS = {
     "Record": "fiber_manual_record",
 }
 """Button -> its icon."""
-
-
-class Pulse(Component):
-    """Tells when a picture has been painted."""
-
-    picture = param.Integer(0, doc="Number of the last one.")
-    changes = param.List([], doc="What a Painter changes with it.")
-    _esm = asset("pulse.js")
-
-    def __init__(self, **params: Any):
-        self.answer, self._time = -1, 0.0
-        self._waiting: Callable[[], None] | None = None
-        super().__init__(self._take, **params)
-
-    def _update_model(self, events: Any, msg: dict[str, Any], root: Any, model: Any, doc: Any, comm: Any) -> None:
-        """Send what changes alone: the usual way looks at all that a component may have, which takes as long as a figure."""
-        if not set(msg) <= {"picture", "changes"}:
-            super()._update_model(events, msg, root, model, doc, comm)
-            return
-        ref = root.ref["id"]
-        self._changing[ref] = list(msg)  # it comes from here, not from the browser
-        try:
-            model.data.update(**msg)
-        finally:
-            self._changing.pop(ref, None)
-
-    def _take(self, data: dict[str, Any]) -> None:
-        if isinstance(number := data.get("painted"), int):
-            self.answer = number
-            if self._waiting is not None and self.is_free:
-                self.when_free(self._waiting)
-
-    @property
-    def is_seen(self) -> bool:
-        """Whether the browser has drawn the page."""
-        return self.answer >= 0
-
-    @property
-    def is_free(self) -> bool:
-        """Whether the browser is ready for another; for the first once it has drawn the page."""
-        return self.answer >= self.picture or (self.answer >= 0 and monotonic() - self._time > PATIENCE)
-
-    def when_free(self, act: Callable[[], None]) -> None:
-        """Do something, or have it done as soon as the browser is ready: else a picture that it is a little late for is lost."""
-        self._waiting = None if self.is_free else act
-        if self._waiting is None:
-            act()
-
-    def beat(self) -> None:
-        """Ask for an answer to the picture that has been sent."""
-        self._time = monotonic()
-        self.picture += 1
 
 
 class LiveControls:
@@ -178,7 +281,7 @@ class LiveControls:
 
     def link_fields(self) -> dict[str, str]:
         """Return what of the loop differs from what is usual, as a link has it."""
-        chosen = {OBSERVERS: (self.running.value, FIRST), CONTROLLERS: (self.controllers.value, USUAL)}
+        chosen = {RUNNING: (self.running.value, FIRST), CONTROLLERS: (self.controllers.value, USUAL)}
         fields = {name: ",".join(now) for name, (now, usual) in chosen.items() if tuple(now) != tuple(usual)}
         fields |= {} if self.speed.value == 1.0 else {SPEED: f"{self.speed.value:g}"}
         return fields | {name: _text(field.value) for name, field, usual in self._choices if field.value != usual}
@@ -191,7 +294,7 @@ class LiveControls:
 
     def open_link(self, fields: Mapping[str, str], *, runs: bool) -> list[str]:
         """Choose what a link has, or what is usual; return a line for each field refused. runs : a loop, which is left alone."""
-        known_fields = (OBSERVERS, CONTROLLERS, SPEED, ERRORS, WINDOW)
+        known_fields = (RUNNING, CONTROLLERS, SPEED, ERRORS, WINDOW)
         refused = [f"{name}: there is no such part of a view" for name in fields if name not in known_fields]
         for name, select, usual in self._choices:
             of = {_text(value): value for value in select.options.values()}
@@ -201,7 +304,7 @@ class LiveControls:
 
     def _open_loop(self, fields: Mapping[str, str]) -> list[str]:
         refused = []
-        for name, field, usual in ((OBSERVERS, self.running, FIRST), (CONTROLLERS, self.controllers, USUAL)):
+        for name, field, usual in ((RUNNING, self.running, FIRST), (CONTROLLERS, self.controllers, USUAL)):
             names, known = fields[name].split(",") if fields.get(name) else [], set(field.options.values())
             field.value = [one for one in names if one in known] if name in fields else list(usual)
             refused += [f"{name} = {one[:80]}: there is none of that name" for one in names if one not in known]

@@ -1,35 +1,137 @@
-"""The figures of the live loop: traces that roll, spectra, latencies."""
+"""The figures of the live loop: traces that roll, spectra, latencies, waterfall, detectors; and how they are sent."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from time import monotonic
 from typing import Any
 
 import numpy as np
+import panel as pn
+import param
 from bokeh.core.validation import silence
 from bokeh.core.validation.warnings import MISSING_RENDERERS
-from bokeh.models import ColumnDataSource, Range1d, Span
+from bokeh.model import Model
+from bokeh.models import BasicTicker, ColorBar, ColumnDataSource, Image, LogColorMapper, Range1d, Span
+from bokeh.palettes import Viridis256
 from bokeh.plotting import figure
 
-from wfsobs.app.display import Display
-from wfsobs.app.pages.live_paint import Painter
-from wfsobs.app.views.envelope import envelope, envelope_times
-from wfsobs.app.views.lines import FigureLines
-from wfsobs.app.views.plots import new_figure
+from wfsobs.app.component import Component
+from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.pages.parts import WIDE, grid_style
+from wfsobs.app.style import asset, look
+from wfsobs.app.views.plots import FigureLines, call, envelope, envelope_times, new_figure
 from wfsobs.app.views.traces import WINDOW_S
 from wfsobs.app.work import TRUTH
+from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.error_spectra import cumulative_rms
 from wfsobs.evaluation.recovery import trailing_rms
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.latencies import EDGES
 from wfsobs.live.alarms import ALARM
 from wfsobs.live.board import SLOTS, Board
+from wfsobs.live.control_process import ControlView
 from wfsobs.live.finding import Bounds
 from wfsobs.live.spectrum_of_minute import bridge_missing
 from wfsobs.live.view import LiveEvent, LiveView
+from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import welch_psd
 from wfsobs.typing import Array
+
+PATIENCE = 10.0
+"""Time after which a picture that the browser has not answered is given up [s]."""
+
+
+class Pulse(Component):
+    """Tells when a picture has been painted."""
+
+    picture = param.Integer(0, doc="Number of the last one.")
+    changes = param.List([], doc="What a Painter changes with it.")
+    _esm = asset("pulse.js")
+
+    def __init__(self, **params: Any):
+        self.answer, self._time = -1, 0.0
+        self._waiting: Callable[[], None] | None = None
+        super().__init__(self._take, **params)
+
+    def _update_model(self, events: Any, msg: dict[str, Any], root: Any, model: Any, doc: Any, comm: Any) -> None:
+        """Send what changes alone: the usual way looks at all that a component may have, which takes as long as a figure."""
+        if not set(msg) <= {"picture", "changes"}:
+            super()._update_model(events, msg, root, model, doc, comm)
+            return
+        ref = root.ref["id"]
+        self._changing[ref] = list(msg)  # it comes from here, not from the browser
+        try:
+            model.data.update(**msg)
+        finally:
+            self._changing.pop(ref, None)
+
+    def _take(self, data: dict[str, Any]) -> None:
+        if isinstance(number := data.get("painted"), int):
+            self.answer = number
+            if self._waiting is not None and self.is_free:
+                self.when_free(self._waiting)
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether the browser has drawn the page."""
+        return self.answer >= 0
+
+    @property
+    def is_free(self) -> bool:
+        """Whether the browser is ready for another; for the first once it has drawn the page."""
+        return self.answer >= self.picture or (self.answer >= 0 and monotonic() - self._time > PATIENCE)
+
+    def when_free(self, act: Callable[[], None]) -> None:
+        """Do something, or have it done as soon as the browser is ready: else a picture that it is a little late for is lost."""
+        self._waiting = None if self.is_free else act
+        if self._waiting is None:
+            act()
+
+    def beat(self) -> None:
+        """Ask for an answer to the picture that has been sent."""
+        self._time = monotonic()
+        self.picture += 1
+
+
+class Painter:
+    """Collects changes of models, and has the browser make them; those of models that it has not seen are made here.
+
+    Once the browser makes them the models of the server keep the values of before.
+    """
+
+    def __init__(self, pulse: Pulse):
+        self._pulse = pulse
+        self._steps: list[list[Any]] = []
+        self._numbers: list[Array] = []
+
+    def data(self, fig: figure, source: ColumnDataSource, columns: Mapping[str, Array]) -> None:
+        """Have a source of a figure hold these numbers, columns of one length, in single precision."""
+        numbers = {name: np.asarray(x, dtype=np.float32) for name, x in columns.items()}
+        if not self._reaches(source):
+            source.data = {**numbers}
+            return
+        self._steps.append([fig.id, source.id, list(numbers), len(next(iter(numbers.values()))), []])
+        self._numbers += numbers.values()
+
+    def update(self, fig: figure, model: Model, **values: float) -> None:
+        """Set properties of a part of a figure that are numbers."""
+        if self._reaches(model):
+            self._steps.append([fig.id, model.id, [], 0, [list(pair) for pair in values.items()]])
+        else:
+            model.update(**values)
+
+    def send(self) -> None:
+        """Send what has been collected."""
+        if self._steps:
+            numbers = np.concatenate(self._numbers) if self._numbers else np.empty(0, dtype=np.float32)
+            self._pulse.changes = [self._steps, numbers]
+            self._steps, self._numbers = [], []
+
+    def _reaches(self, model: Model) -> bool:
+        return self._pulse.is_seen and model.document is not None
+
 
 BINS = 300
 """Pairs of extremes of a trace."""
@@ -244,3 +346,201 @@ class LatencyHistogram(LiveFigure):
         self.put(data, dark)
         top = 1.1 * max((float(y.max()) for _, y in data.values()), default=1.0) or 1.0
         self.figure.y_range.update(end=top)
+
+
+MEASUREMENT = "measurement"
+LENGTH, HOP = 1.0, 0.5
+"""Time that a spectrum is of, and between two [s]."""
+COLUMNS, ROWS = 120, 128
+"""Spectra that are kept: a minute. Frequencies of each, in equal steps of the logarithm."""
+LOWEST = 1.0
+"""Frequency at which it begins [Hz]."""
+FLOOR, SPAN = 0.05, 2.0
+"""The darkest colour is that below which this part of the spectra is; the colours span so many decades at least."""
+
+
+class Waterfall:
+    """Spectra of a signal over the last minute.
+
+    Attributes
+    ----------
+    figure : figure
+        Time to the right, frequency upwards.
+    columns : Array
+        Spectra, (ROWS, COLUMNS) [um^2/Hz], the newest last; NaN where there is none.
+    """
+
+    def __init__(self) -> None:
+        self.figure = new_figure(x_range=Range1d(start=0.0, end=1.0), y_range=Range1d(start=LOWEST, end=500.0), y_axis_type="log")
+        self.figure.xaxis.axis_label, self.figure.yaxis.axis_label = "time of the loop [s]", "frequency [Hz]"
+        self.figure.grid.visible = False
+        self._colours = LogColorMapper(palette=Viridis256, low=1e-6, high=1.0, nan_color="rgba(0, 0, 0, 0)")
+        self._source = ColumnDataSource({"image": [], "x": [], "y": [], "dw": [], "dh": []})
+        glyph = Image(image="image", x="x", y="y", dw="dw", dh="dh", color_mapper=self._colours)
+        self.figure.add_glyph(self._source, glyph, level="image")
+        self._bar = ColorBar(color_mapper=self._colours, width=8, padding=4, title_text_font_style="normal")
+        self.figure.add_layout(self._bar, "right")
+        self.columns = np.full((ROWS, COLUMNS), np.nan)
+        self._of: tuple[str, str, int] = ("", "", 0)
+        self._number = 0
+        self._sent_in = ("", False)
+
+    def draw(self, view: LiveView, what: str, target: str, display: Display, scale: float) -> None:
+        """Take new spectra in, and send them; what : MEASUREMENT, or the observer whose error it is; scale : as for lines."""
+        hop = round(HOP / view.dt)
+        newest, of = (view.first + view.n) // hop, (what, target, display.column)
+        fresh = of != self._of or newest < self._number
+        if fresh:
+            self.columns[:], self._of, self._number = np.nan, of, max(0, newest - COLUMNS)
+        elif newest == self._number and (display.unit, display.dark) == self._sent_in:
+            return
+        self._take(view, hop, newest)
+        self._send(newest * HOP, view.dt, scale, display)
+
+    def _take(self, view: LiveView, hop: int, newest: int) -> None:
+        """Move the spectra to the left, and add those of which the view has all frames."""
+        step = min(newest - self._number, COLUMNS)
+        if step:
+            self.columns[:, : -step or None] = self.columns[:, step:] if step < COLUMNS else np.nan
+            self.columns[:, COLUMNS - step :] = np.nan
+        self._number = newest
+        for back in range(step):
+            stop = (newest - back) * hop - view.first
+            if stop < round(LENGTH / view.dt):
+                return
+            spectrum = view.once(("second", stop, *self._of), partial(self._spectrum, view, stop))
+            self.columns[:, COLUMNS - 1 - back] = spectrum
+
+    def _spectrum(self, view: LiveView, stop: int) -> Array:
+        """Return the spectrum of the second before a frame of the view."""
+        what, target, column = self._of
+        signal = view.frames.z if what == MEASUREMENT else view.error(what, target)
+        return second_spectrum(signal[stop - round(LENGTH / view.dt) : stop, column], view.dt)
+
+    def _send(self, end: float, dt: float, scale: float, display: Display) -> None:
+        self._sent_in = display.unit, display.dark
+        image = (scale**2 * self.columns).astype(np.float32)
+        left, top = end - COLUMNS * HOP, 0.5 / dt
+        if not np.isfinite(image).any():
+            return
+        high = float(np.nanmax(image))
+        self._colours.update(low=min(float(np.nanquantile(image, FLOOR)), high * 10.0**-SPAN), high=high)
+        self._bar.update(
+            title=f"{display.unit_label}²/Hz",
+            background_fill_alpha=0.0,
+            title_text_color="#C8C8C8" if display.dark else "#404040",
+            major_label_text_color="#C8C8C8" if display.dark else "#404040",
+        )
+        # An image is drawn between its corners, in equal steps of the axis: of a logarithmic one, of the logarithm.
+        self._source.data = {"image": [image], "x": [left], "y": [LOWEST], "dw": [end - left], "dh": [top - LOWEST]}
+        self.figure.x_range.update(start=max(left, 0.0), end=end)  # before the loop there was nothing
+        self.figure.y_range.update(start=LOWEST, end=top)
+        self.figure.yaxis.axis_label = f"frequency [Hz], {display.mode_label}"
+
+
+def second_spectrum(x: Array, dt: float) -> Array:
+    """Return the spectrum of a second of a signal (n,) [um] in ROWS equal steps of the logarithm of the frequency [um^2/Hz].
+
+    Each is the mean over its band of the spectrum taken as constant around every frequency. NaN where too much is missing.
+    """
+    whole = bridge_missing(x)
+    if whole is None:
+        return np.full(ROWS, np.nan)
+    frequency, density = welch_psd(whole[:, None], dt, 1.0 / LENGTH)
+    half = 0.5 * frequency[1]
+    edges = np.geomspace(LOWEST, 0.5 / dt, ROWS + 1)
+    power = np.concatenate([[0.0], np.cumsum(density[:, 0] * 2.0 * half)])
+    below = np.interp(edges, np.concatenate([[-half], frequency + half]), power)
+    return np.diff(below) / np.diff(edges)
+
+
+TRAIL, POINTS = 0.2, 60
+"""Length of the trail of the star [s], and its points."""
+SIDE = 150
+"""Of a detector at least [px]."""
+GRID = grid_style(CELLS := "repeat(auto-fill, minmax(180px, 1fr))", CELLS)
+FWHM = 1.03
+"""Full width at half maximum of an Airy pattern, in wavelengths over the diameter."""
+
+
+class Detector:
+    """One detector: the core of the star, and where it has been in the last instants.
+
+    Attributes
+    ----------
+    view : pn.Column
+        The figure under its caption.
+    """
+
+    def __init__(self, name: str, painter: Painter):
+        self.painter = painter
+        self.name, self.label = name, look("none" if name == TRUTH else name).label
+        ranges = {"x_range": Range1d(start=-1.0, end=1.0), "y_range": Range1d(start=-1.0, end=1.0)}
+        self.figure: figure = new_figure(**ranges)
+        self.figure.update(height=None, aspect_ratio=1.0, min_width=SIDE, min_border_left=36, toolbar_location=None)
+        for axis in self.figure.axis:
+            ticker = BasicTicker(desired_num_ticks=3)
+            axis.update(major_label_text_font_size="10px", minor_tick_line_color=None, ticker=ticker)
+        self.figure.xaxis.update(axis_label="mas", axis_label_text_font_size="10px", axis_label_standoff=2)
+        call(self.figure, f"Star: {self.label}")
+        self._trail, self._spot = ColumnDataSource({"x": [], "y": []}), ColumnDataSource({"x": [], "y": []})
+        self._line = self.figure.line("x", "y", source=self._trail, line_alpha=0.5).glyph
+        self._core = self.figure.circle("x", "y", radius=1.0, source=self._spot, fill_alpha=0.6).glyph
+        self._style: tuple[float, float, str] | None = None
+        caption = pn.pane.HTML(f'<div class="caption">{self.label}</div>', margin=0, stylesheets=[asset("style.css")])
+        self.view = pn.Column(caption, pn.pane.Bokeh(self.figure, sizing_mode=self.figure.sizing_mode, margin=0), **WIDE)
+
+    def draw(self, points: Array, reach: float, radius: float, dark: bool) -> None:
+        """Send the last instants (n, 2), the newest last; reach : of the axes;  radius : of the core, all in mas."""
+        points = points[~np.isnan(points).any(axis=1)]
+        for source, shown in ((self._trail, points), (self._spot, points[-1:])):
+            self.painter.data(self.figure, source, {"x": shown[:, 0], "y": shown[:, 1]})
+        colour = look(self.name).colour(dark)
+        if (style := (reach, radius, colour)) == self._style:
+            return
+        self._style = style
+        for axis in (self.figure.x_range, self.figure.y_range):
+            axis.update(start=-reach, end=reach)
+        self._line.line_color = colour
+        self._core.update(radius=radius, fill_color=colour, line_color=colour)
+
+
+class Stars:
+    """The detectors, of one scale."""
+
+    def __init__(self, painter: Painter) -> None:
+        self._painter = painter
+        self.row = pn.Column(**{**WIDE, "margin": (12, 0, 0, 0)}, stylesheets=[GRID])
+        self._detectors: dict[str, Detector] = {}
+        self._reach = 1.0
+
+    def draw(self, view: LiveView, left: ControlView | None, names: Sequence[str], scenario: Scenario, dark: bool) -> None:
+        """Send the last instants; left, names : controllers, and what they leave."""
+        scale, n = per_micrometre("mas", scenario.telescope.diameter), max(2, round(TRAIL / view.dt))
+        come = view.truth("turbulence") + view.truth("vibration")
+        signals = {TRUTH: view.frames.z if np.isnan(come).all() else come}
+        if left is not None:
+            signals |= {name: left.residual(name) for name in names if CONTROLLERS[name].law is not None}
+        if list(signals) != list(self._detectors):
+            self._detectors = {name: self._detectors.get(name) or Detector(name, self._painter) for name in signals}
+            self.row[:] = [detector.view for detector in self._detectors.values()]
+        reach = 1.1 * float(np.nanmax(np.abs(scale * signals[TRUTH][:, :2]), initial=1e-3))
+        if not self._reach / 1.6 < reach < self._reach:
+            self._reach = 1.25 * reach
+        # wavelength [um] over diameter [m] is in microradians
+        radius = 0.5 * FWHM * np.degrees(scenario.control.wavelength * 1e-6 / scenario.telescope.diameter) * 3.6e6
+        step = max(1, n // POINTS)
+        for name, detector in self._detectors.items():
+            detector.draw(scale * signals[name][-n:, :2][::-step][::-1], self._reach, radius, dark)
+
+
+class LiveText(pn.pane.HTML):
+    """HTML of which only the text is sent when it changes: as a usual pane does, all else is looked at, for milliseconds."""
+
+    def _update(self, ref: str, model: Any) -> None:
+        model.text = self._transform_object(self.object)["object"]
+
+
+def live_text() -> LiveText:
+    """Make one in the page's style."""
+    return LiveText("", **WIDE, stylesheets=[asset("style.css")])

@@ -5,8 +5,7 @@ from __future__ import annotations
 import panel as pn
 
 from wfsobs.app.display import Display
-from wfsobs.app.numerals import short
-from wfsobs.app.render import render
+from wfsobs.app.render import render, short
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, swatch
 from wfsobs.evaluation.description import Description, describe

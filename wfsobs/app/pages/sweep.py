@@ -2,34 +2,245 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from time import monotonic
+from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 import panel as pn
 import panel_material_ui as pmui
+import param
 
-from wfsobs.app.controls.fields import parse_number
+from wfsobs.app.cache import key_of
+from wfsobs.app.component import Component
+from wfsobs.app.controls.fields import number_text, parse_number
+from wfsobs.app.controls.names import name_settings
 from wfsobs.app.copies import SWEEP, CopiedTask
 from wfsobs.app.display import Display
 from wfsobs.app.downloads import Save, table_csv
-from wfsobs.app.jobs.job import RUNNING
-from wfsobs.app.pages.link import LinkedFields
-from wfsobs.app.pages.parts import TALL, WIDE, PageActions, Starter, box, html, legend, line, text
-from wfsobs.app.pages.sweep_axis import NONE, AxisFields
-from wfsobs.app.pages.sweep_settings import line_of, read_axis, sweep_settings
-from wfsobs.app.pages.sweep_views import SweepMap, legend_of_shades, line_part, map_grid
+from wfsobs.app.jobs import BATCH, CANCELLED, DONE, FAILED, RUNNING, BackgroundTask, Job, Tell
+from wfsobs.app.limits import Limits
+from wfsobs.app.pages.parts import TALL, WIDE, LinkedFields, PageActions, Starter, box, html, legend, line, text
+from wfsobs.app.pages.sweep_views import SweepLines, axis_title, legend_of_shades, line_part, map_grid, parameter_of
+from wfsobs.app.seeds import SeedScores
+from wfsobs.app.service import Session
 from wfsobs.app.store import Store
-from wfsobs.app.style import look
-from wfsobs.app.sweep_work import SweepTask
-from wfsobs.app.views.sweep_lines import SweepLines
-from wfsobs.campaign.sweep import MOST_SEEDS, Sweep, plan_sweep
-from wfsobs.campaign.sweep_results import SweepResults
+from wfsobs.app.style import asset, look
+from wfsobs.campaign.sweep import MOST_SEEDS, SEED, Sweep, parse_axis, plan_sweep
+from wfsobs.campaign.sweep_results import SweepResults, run_cell
 from wfsobs.evaluation.rows import target_title
 from wfsobs.evaluation.scores import SCORED
 from wfsobs.priors_from.selection import quick_observers
+from wfsobs.progress import Watch
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.configfile import format_value
+from wfsobs.scenario.grid import Variation
 from wfsobs.settings.errors import SettingError
+from wfsobs.settings.parameters import Reals
+
+
+def compute(sweep: Sweep, cell: int, number: int, limits: Limits, watch: Watch, _tell: Tell) -> SeedScores:
+    """Run a cell with one seed. Raises SettingError, Cancelled."""
+    limits.check(sweep.scenario(cell, number))
+    scores = run_cell(sweep, cell, number, watch)
+    return SeedScores(scores, np.array([s.rms for s in scores]))
+
+
+class SweepTask(BackgroundTask):
+    """All runs of a sweep as one task; its result grows with every run.
+
+    A run that was done before, by anybody, comes from what the server keeps: to stop and start again goes on.
+    """
+
+    def __init__(self, session: Session):
+        super().__init__(session, title="Sweep")
+        self._one = BackgroundTask(session)
+        self._cell, self._base_key, self._start = 0, "", 0.0
+        self._one.param.watch(self._take, ["state", "place"])
+
+    def begin(self, sweep: Sweep) -> None:
+        """Run a sweep, in place of the one before."""
+        self.close()
+        self._base_key, self._start = key_of(sweep.base), monotonic()
+        self.param.update(state=RUNNING, progress=0.0, place=0, message="", result=SweepResults(sweep))
+        self._go_on()
+
+    def close(self) -> None:
+        """Leave the run under way, and hear no more of it."""
+        super().close()
+        self._one.close()
+
+    @property
+    def seconds_left(self) -> float:
+        """Time that the rest takes at the rate so far [s]; 0 where nothing is known of it."""
+        return (monotonic() - self._start) * (1.0 / self.progress - 1.0) if self.progress else 0.0
+
+    def _go_on(self) -> None:
+        results: SweepResults = self.result
+        following = results.next_run()
+        if following is None:
+            self.param.update(state=DONE, progress=1.0)
+            return
+        self._cell = following[0]
+        self._one.start(self._job(results.sweep, *following))
+
+    def _job(self, sweep: Sweep, cell: int, number: int) -> Job:
+        limits = self.session.service.limits
+        return Job(
+            "sweep",
+            lambda watch, tell: compute(sweep, cell, number, limits, watch, tell),
+            key=f"{number} of {sorted(sweep.cells[cell].items())} by {sweep.observers} of {self._base_key}",
+            cost=sweep.seconds / sweep.n_runs,
+            priority=BATCH,
+            time_limit=limits.seconds,
+            refusal=SettingError,
+        )
+
+    def _take(self, *_: object) -> None:
+        """Take what a run has given, and have the next one done."""
+        one, results = self._one, self.result
+        if self.state != RUNNING:
+            return
+        if one.state == RUNNING:
+            self.place = one.place
+        elif one.state == CANCELLED:  # the server stops
+            self.cancel()
+        elif one.state in (DONE, FAILED):
+            done = one.state == DONE
+            results = results.add(self._cell, one.result.scores) if done else results.add_failure(self._cell, one.message)
+            self.param.update(result=results, progress=results.n_done / results.sweep.n_runs)
+            self._go_on()
+
+
+def line_of(error: SettingError) -> str:
+    """Return the first line of an error, with the names of settings as the page has them."""
+    return name_settings(str(error).removeprefix("--over ").partition("\n")[0])
+
+
+def read_axis(path: str, values: str) -> Variation:
+    """Read the values of a setting as they were typed. Raises SettingError."""
+    if not values.strip():
+        raise SettingError(f"{path}: takes values, such as 5:20:4 or 5,10,20; for a list [5],[5,10]")
+    return parse_axis(f"{path}={values.replace('−', '-').strip()}")
+
+
+def sweep_settings(scenario: Scenario) -> dict[str, str]:
+    """Name -> path of every setting that a sweep can be over; those of lists, and those with one choice, are left out."""
+    lists = tuple(f"{path}." for path, _ in scenario.lists())
+    kinds = (param.Number, param.Selector, param.Boolean)
+    topics = Scenario.settings()
+    out = {}
+    for path, _, p in scenario.walk():
+        several = not isinstance(p, param.Selector) or len(p.objects) > 1
+        if path != SEED and isinstance(p, kinds) and several and not path.startswith(lists):
+            topic, name = str(topics[path.split(".")[0]].label), axis_title(scenario, path)
+            out[name if name.startswith(f"{topic}:") else f"{topic}: {name}"] = path
+    return out
+
+
+def usual_values(scenario: Scenario, path: str) -> str:
+    """Suggest values of a setting that it takes beside the others: over its usual range, or around its present value.
+
+    Empty where there is nothing to go by.
+    """
+    p = parameter_of(scenario, path)
+    if isinstance(p, param.Boolean):
+        return "false,true"
+    if isinstance(p, param.Selector):
+        return ",".join(map(str, _values_that_fit(scenario, path, p.objects)))
+    if isinstance(p, Reals) and path.rpartition(".")[2].isdecimal():
+        return _numbers(scenario, path, p.item_bounds, None, whole=False)
+    if isinstance(p, Reals):
+        now = scenario.lookup(path)
+        scaled = [[factor * x for x in now] for factor in (0.5, 1.0, 2.0)] if any(now) else []
+        return ",".join(map(format_value, _values_that_fit(scenario, path, scaled)))
+    assert isinstance(p, param.Number)
+    return _numbers(scenario, path, p.bounds, p.softbounds, whole=isinstance(p, param.Integer))
+
+
+def _numbers(scenario: Scenario, path: str, bounds: Any, usual: Any, *, whole: bool) -> str:
+    """Suggest numbers, evenly spaced: over the usual range, around the present value where that range has few that are taken."""
+    now, (least, most) = _number_at(scenario, path), bounds
+    around = (0.5 * now, 2.0 * now) if now else (least, least + 1.0)
+    low, high = 0.0, 0.0
+    values: list[Any] = []
+    for low, high in (usual or around, around):
+        low, high = max(low, least), min(high, most)
+        count = min(5, int(high) - int(low) + 1) if whole else 5
+        spaced = [low + (high - low) * i / max(count - 1, 1) for i in range(count)]
+        values = list(dict.fromkeys(map(round, spaced))) if whole else [float(number_text(v)) for v in spaced]
+        taken = _values_that_fit(scenario, path, values)
+        if len(taken) > 2:
+            break
+    if whole or len(taken) < len(values):
+        return ",".join(map(number_text, taken))
+    return f"{number_text(low)}:{number_text(high)}:5"
+
+
+def _number_at(scenario: Scenario, path: str) -> float:
+    """Return the present value; of one in a list of numbers that is 0 or missing, the largest of the list."""
+    above, _, number = path.rpartition(".")
+    if not number.isdecimal():
+        return float(scenario.lookup(path))
+    numbers = scenario.lookup(above)
+    return (numbers[int(number)] if int(number) < len(numbers) else 0.0) or max(numbers, default=0.0)
+
+
+def _values_that_fit(scenario: Scenario, path: str, values: Sequence[Any]) -> list[Any]:
+    """Return those of some values that a setting takes beside the others; all where that are fewer than two."""
+    taken = [value for value in values if _fits(scenario, path, value)]
+    return taken if len(taken) > 1 else list(values)
+
+
+def _fits(scenario: Scenario, path: str, value: Any) -> bool:
+    try:
+        scenario.replace({path: value}).validate()
+    except SettingError:
+        return False
+    return True
+
+
+NONE = ""
+"""No setting."""
+
+LONG: Mapping[str, Any] = MappingProxyType({"sizing_mode": "stretch_width", "max_width": 440, "margin": 0})
+"""As wide as the longest words, or as a phone."""
+
+
+class AxisFields:
+    """The fields; a setting that is chosen brings its usual values."""
+
+    def __init__(self, store: Store, labels: tuple[str, str], options: dict[str, str], path: str, values: str):
+        """Make the fields. labels : of the setting and of its values; options : name -> path of those to choose from."""
+        self.store = store
+        self.select = pmui.Select(label=labels[0], options=options, value=path, size="small", searchable=True, **LONG)
+        self.values = pmui.TextInput(label=labels[1], value=values, size="small", width=150, margin=0)
+        self.select.param.watch(self._suggest, "value")
+
+    @property
+    def path(self) -> str:
+        """The setting that is chosen; NONE for none."""
+        return self.select.value
+
+    def offer(self, path: str) -> bool:
+        """Have a setting among those to choose from; return whether there is one of that path."""
+        if path not in self.select.options.values() and parameter_of(self.store.scenario, path) is not None:
+            self.select.options = {**self.select.options, axis_title(self.store.scenario, path): path}
+        return path in self.select.options.values()
+
+    def choose(self, path: str) -> None:
+        """Choose a setting, and its usual values though it was chosen before."""
+        if self.path == path != NONE:
+            self.values.value = usual_values(self.store.scenario, path)
+        self.select.value = path
+
+    def _suggest(self, event: param.parameterized.Event) -> None:
+        if event.new != NONE:
+            self.values.value = usual_values(self.store.scenario, event.new)
+        self.values.disabled = event.new == NONE
+
 
 INTRO = (
     "Runs the scenario in the drawer over the values of one setting, or every combination of two, with several seeds of each. "
@@ -43,6 +254,24 @@ QUICK, EVERY = "quick", "every"
 OBSERVERS_OF = {"Fast observers only (no GPR)": QUICK, "All": EVERY}
 REDRAW = 0.3
 """Least time between two pictures while runs come in [s]."""
+
+
+class SweepMap(Component):
+    """The map in the browser; a click on a cell asks for its scenario."""
+
+    grid = param.Dict({}, doc="Title, names of the axes and their values, cells row by row, and the key of the colours.")
+
+    _esm = asset("sweep.js")
+    _stylesheets = [asset("sweep.css")]
+
+    def __init__(self, load: Callable[[int], None], **params: Any):
+        """Make the map. load : takes the number of a cell."""
+        self._load = load
+        super().__init__(self._take, **params)
+
+    def _take(self, data: dict[str, Any]) -> None:
+        if isinstance(cell := data.get("load"), int):
+            self._load(cell)
 
 
 class SweepPage(PageActions):

@@ -2,37 +2,211 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from html import escape
+from itertools import groupby
+from time import monotonic
 from typing import Any
 
+import numpy as np
 import panel as pn
 import panel_material_ui as pmui
+from bokeh.models import ColumnDataSource, DataRange1d
+from markupsafe import Markup
 
 from wfsobs.app.controls.fields import parse_number
 from wfsobs.app.controls.names import setting_name
 from wfsobs.app.copies import TUNE, CopiedTask
-from wfsobs.app.display import UNITS, Display, per_micrometre
+from wfsobs.app.display import NO_ANGLE, UNITS, Display, per_micrometre
 from wfsobs.app.downloads import Save, table_csv
-from wfsobs.app.jobs.job import RUNNING, SWEEP, Job
-from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.numerals import number
-from wfsobs.app.pages.link import LinkedFields
-from wfsobs.app.pages.parts import WIDE, PageActions, Starter, box, html, legend, line, text
-from wfsobs.app.pages.tune_views import LEGEND, HistoryFigure, tuning_html, unit_for
+from wfsobs.app.jobs import BATCH, INTERVAL, RUNNING, BackgroundTask, Job, Tell
+from wfsobs.app.pages.parts import WIDE, LinkedFields, PageActions, Starter, box, html, legend, line, text
+from wfsobs.app.render import NOTHING, Row, change, macro, number, table
 from wfsobs.app.store import Store
-from wfsobs.app.tune_work import MOST, best_so_far, choices, compute, minimised_measure, seconds, tuning_rows
+from wfsobs.app.style import look
+from wfsobs.app.views.plots import call, new_figure
+from wfsobs.app.work import RunResults
+from wfsobs.cost import part_seconds
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import VIBRATION
+from wfsobs.progress import Watch
 from wfsobs.record import RecordError
+from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings
+from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.settings.errors import SettingError
 from wfsobs.settings.parameters import hint
-from wfsobs.tuning import Evaluation, TuningResult
-from wfsobs.tuning.records import MEASURES, TRUTH
-from wfsobs.tuning.report import tuning_toml
+from wfsobs.tuning import Evaluation, Stage, TuningResult, tune
+from wfsobs.tuning.judge import Errors
+from wfsobs.tuning.records import MEASURES, NEXT, REFERENCE, TRUTH, judged_by
+from wfsobs.tuning.report import settings, tuning_remarks, tuning_toml
 from wfsobs.tuning.tuning import EVALUATIONS
+
+MOST = 1000
+"""Evaluations."""
+
+Rows = list[tuple[str, str, float | str | None, float | str | None]]
+"""(section, name, before, after)."""
+
+SETTING, VALIDATION, TEST, OTHER, LIKELIHOOD = "setting", "validation", "test", "other target", "likelihood"
+
+
+def choices() -> dict[str, str]:
+    """Label -> observer, of those that have something to tune."""
+    return {o.label: o.id for o in OBSERVERS.values() if o.tunable.usual}
+
+
+def seconds(of: RunResults, scenario: Scenario, observer: str, evaluations: int) -> float:
+    """Estimate how long a tuning takes [s].
+
+    The observer is taken to need the time per step that it had in the results shown, on records of the same length, or on at
+    most half of a record that was loaded.
+    """
+    each = max((e.seconds_per_step for e in of.result.estimates if e.observer == observer), default=0.0)
+    record, share = of.result.record, 0.5 if of.is_recorded else 1.0
+    simulation = 0.0 if of.is_recorded else 3.0 * part_seconds(scenario)["rest"]
+    return (evaluations + 2) * each * share * record.n_steps * record.n_modes + simulation
+
+
+def minimised_measure(of: RunResults, observer: str, target: str) -> str:
+    """Say what a tuning minimises. Raises RecordError where a loaded record has nothing to judge by."""
+    return MEASURES[judged_by(of.result.record, observer, target)[1] if of.is_recorded else TRUTH]
+
+
+def compute(
+    of: RunResults, scenario: Scenario, observer: str, target: str, evaluations: int, watch: Watch, tell: Tell
+) -> TuningResult:
+    """Tune on simulated records, or on the pieces of a record that was loaded; tells of all evaluations so far.
+
+    Raises SettingError, RecordError, Cancelled.
+    """
+    history: list[Evaluation] = []
+    last = 0.0
+
+    def told(evaluation: Evaluation) -> None:
+        nonlocal last
+        history.append(evaluation)
+        if monotonic() - last >= INTERVAL:
+            last = monotonic()
+            tell(latest=tuple(history))
+
+    record = of.result.record if of.is_recorded else None
+    return tune(scenario, observer, evaluations=evaluations, record=record, target=target, on_evaluation=told, watch=watch)
+
+
+def best_so_far(history: Sequence[Evaluation]) -> list[float]:
+    """Compute the least error after every evaluation [um], infinite until one has succeeded."""
+    out: list[float] = []
+    for evaluation in history:
+        out.append(min(evaluation.rms, out[-1] if out else evaluation.rms))
+    return out
+
+
+def tuning_rows(result: TuningResult) -> Rows:
+    """List settings as text, errors [um] by mode and together, a GPR's log marginal likelihoods by mode; None for failures."""
+    out: Rows = [(SETTING, *row) for row in settings(result)]
+    stages = result.before, result.after
+    for section, before, after in (
+        (VALIDATION, *(s.validation for s in stages)),
+        (TEST, *(s.test for s in stages)),
+    ):
+        out += [(section, name, _error(before, name), _error(after, name)) for name in (*_modes(stages), TOGETHER)]
+    if any(s.other for s in stages):
+        before, after = stages
+        out.append((OTHER, TOGETHER, _error(before.other, TOGETHER), _error(after.other, TOGETHER)))
+    if any(s.likelihood for s in stages):
+        values = [s.likelihood or (None,) * len(_modes(stages)) for s in stages]
+        out += [(LIKELIHOOD, *row) for row in zip(_modes(stages), *values, strict=True)]
+    return out
+
+
+TOGETHER = "rms over modes"
+
+
+def _error(errors: Errors | None, name: str) -> float | None:
+    return None if errors is None else errors.rms if name == TOGETHER else errors.modes[name]
+
+
+def _modes(stages: Sequence[Stage]) -> tuple[str, ...]:
+    return tuple(next(e.modes for s in stages for e in (s.validation, s.test) if e))
+
+
+TITLES = {
+    SETTING: "Settings",
+    VALIDATION: "{measure} on the validation record, used in the search [{unit}]",
+    TEST: "{measure} on the test record, not used in the search [{unit}]",
+    OTHER: "The same for the other target, turbulence or vibration [{unit}]",
+    LIKELIHOOD: "Log marginal likelihood of the training targets, for information",
+}
+LEGEND = {"tried": "evaluations", "fitted": "best so far"}
+
+AXES = {MEASURES[TRUTH]: "rms error", MEASURES[NEXT]: "prediction error", MEASURES[REFERENCE]: "rms distance"}
+"""What a tuning makes small, short enough for an axis."""
+
+
+class HistoryFigure:
+    """The error, or what takes its place, on the validation record of every evaluation, and the least so far."""
+
+    def __init__(self) -> None:
+        self.figure = new_figure(x_range=DataRange1d(range_padding=0.02), y_range=DataRange1d())
+        call(self.figure, "History of the tuning")
+        self.figure.xaxis.axis_label = "evaluation"
+        self.source = ColumnDataSource({"x": [], "tried": [], "best": []})
+        self._trials = self.figure.scatter("x", "tried", source=self.source, size=6, fill_alpha=0.7)
+        self._best = self.figure.step("x", "best", source=self.source, mode="after", line_width=2.0)
+
+    def draw(self, history: Sequence[Evaluation], measure: str, unit: str, diameter: float) -> None:
+        """Send the evaluations so far; what failed has no point."""
+        scale = per_micrometre(unit, diameter)
+        tried, best = (scale * np.array(y, dtype=float) for y in ([e.rms for e in history], best_so_far(history)))
+        self.source.data = {
+            "x": np.arange(1, len(history) + 1),
+            "tried": np.where(np.isfinite(tried), tried, np.nan),
+            "best": np.where(np.isfinite(best), best, np.nan),
+        }
+        self.figure.yaxis.axis_label = f"{AXES[measure]}, validation [{UNITS[unit]}]"
+
+    def restyle(self, dark: bool) -> None:
+        """Set the colours of light or dark mode."""
+        colour = look("tried").colour(dark)
+        self._trials.glyph.update(line_color=colour, fill_color=colour)
+        self._best.glyph.update(line_color=look("fitted").colour(dark))
+
+
+def unit_for(result: TuningResult | None, display: Display) -> str:
+    """Choose the unit: the one shown, or nm where it is an angle and the modes have none."""
+    modes = (result.before.validation or result.after.validation) if result else None
+    angles = modes is None or set(modes.modes) <= {mode.name for mode in TIP_TILT}
+    return "nm" if display.unit in NO_ANGLE and not angles else display.unit
+
+
+def tuning_html(result: TuningResult, display: Display, diameter: float) -> str:
+    """Write settings, errors and likelihoods before and after."""
+    unit = unit_for(result, display)
+    scale = per_micrometre(unit, diameter)
+    groups = [
+        (TITLES[section].format(measure=result.measure, unit=UNITS[unit]), [_row(*row, scale) for row in found])
+        for section, found in groupby(tuning_rows(result), key=lambda row: row[0])
+    ]
+    columns = {"What": "", "Before": "", "After": "", "Change [%]": ""}
+    notes = [f"{line[0].upper()}{line[1:]}." for line in tuning_remarks(result) if "likelihood" not in line]
+    return f"{table('Before and after', columns, groups)}{macro('texts', 'text', notes)}"
+
+
+def _row(section: str, name: str, before: float | str | None, after: float | str | None, scale: float) -> Row:
+    error, name = section in (VALIDATION, TEST, OTHER), setting_name(name) if section == SETTING else name
+    cells = [_cell(x, scale if error else 1.0) for x in (before, after)]
+    known = error and isinstance(before, float) and isinstance(after, float)
+    cells.append(change(before, after) if known else "")  # type: ignore[arg-type]
+    return Row(Markup("<b>{}</b>").format(name) if name == TOGETHER else name, cells, {"section": section})
+
+
+def _cell(value: float | str | None, scale: float) -> str:
+    if isinstance(value, str):
+        return value
+    return NOTHING if value is None else number(value * scale, 4)
+
 
 INTRO = (
     "Searches the settings of one observer for the smallest RMS error on a validation record, which is neither the training nor "
@@ -104,7 +278,7 @@ class TunePage(PageActions):
             self.work.refuse(str(error))
         else:
             work = partial(compute, of, scenario, observer, target, evaluations)
-            self.work.start(Job("tune", work, cost=cost, priority=SWEEP, time_limit=self.store.limits.seconds))
+            self.work.start(Job("tune", work, cost=cost, priority=BATCH, time_limit=self.store.limits.seconds))
 
     def use(self) -> None:
         """Take what was tuned into the settings, and leave the others as they are by now."""

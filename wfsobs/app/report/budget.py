@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from itertools import groupby
 from typing import Any
 
-from wfsobs.app.numerals import number
+from wfsobs.app.render import number
 from wfsobs.app.report.data import State
 from wfsobs.app.style import BOUND_MARKS, TERM_COLOURS
 from wfsobs.evaluation.budget import TERMS

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from wfsobs.app.report.grid import WINDOW_S, Array, Floats, Grid
 from wfsobs.app.style import observers_of
-from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.main_lines import main_observers
+from wfsobs.app.views.plots import envelope, envelope_times
 from wfsobs.app.work import TRUTH
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import rows as controller_rows

@@ -8,9 +8,9 @@ from typing import Any
 from bokeh.models import BoxAnnotation, ColumnDataSource, CrosshairTool, DataRenderer, HoverTool, Range1d, Span, VSpan
 from bokeh.plotting import figure
 
+from wfsobs.app.pages.sweep_views import SweepLines
 from wfsobs.app.style import look, observers_of
 from wfsobs.app.views.plots import MODEL, PEAKS, add_line, new_figure
-from wfsobs.app.views.sweep_lines import SweepLines
 from wfsobs.app.work import TRUTH
 from wfsobs.observers.base import TARGETS, VIBRATION
 

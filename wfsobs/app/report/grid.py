@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from wfsobs.app.views.envelope import envelope, envelope_times
+from wfsobs.app.views.plots import envelope, envelope_times
 
 Array = NDArray[np.float64]
 

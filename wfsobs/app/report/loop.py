@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import groupby
 from typing import Any
 
-from wfsobs.app.numerals import NOTHING, number
+from wfsobs.app.render import NOTHING, number
 from wfsobs.app.report.data import State
 from wfsobs.closed_loop.rows import NOT_APPLICABLE, label
 from wfsobs.evaluation.rows import Row

@@ -7,7 +7,7 @@ from itertools import groupby
 from typing import Any
 
 from wfsobs.app.display import AT_LIMIT, IN_MOST, OVER_SEEDS, score_columns
-from wfsobs.app.numerals import NOTHING
+from wfsobs.app.render import NOTHING
 from wfsobs.app.report.data import State
 from wfsobs.evaluation.evidence import rank_observers
 from wfsobs.evaluation.rows import (

@@ -13,8 +13,7 @@ from bokeh.models import ColumnDataSource, FactorRange, HoverTool, Span
 from bokeh.plotting import figure
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.jobs.job import DONE, FAILED, RUNNING, Job
-from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.jobs import DONE, FAILED, RUNNING, BackgroundTask, Job
 from wfsobs.app.pages.parts import WIDE, html
 from wfsobs.app.store import Store
 from wfsobs.app.style import BOUND_MARKS, TERM_COLOURS

@@ -14,10 +14,9 @@ from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.downloads import TooLarge
 from wfsobs.app.history import History
 from wfsobs.app.history_entry import HistoryEntry
-from wfsobs.app.jobs.job import DONE, FAILED, RUNNING, Job
-from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.numerals import number
+from wfsobs.app.jobs import DONE, FAILED, RUNNING, BackgroundTask, Job
 from wfsobs.app.picker import LARGEST, PART, PartialFile, too_large
+from wfsobs.app.render import number
 from wfsobs.app.session_file import SUFFIX, read_session, write_session
 from wfsobs.app.session_values import SessionError
 from wfsobs.app.style import asset, look

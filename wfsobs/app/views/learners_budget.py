@@ -9,8 +9,7 @@ from html import escape
 import panel as pn
 import panel_material_ui as pmui
 
-from wfsobs.app.jobs.job import FAILED, RUNNING, SWEEP, Job, Tell
-from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.jobs import BATCH, FAILED, RUNNING, BackgroundTask, Job, Tell
 from wfsobs.app.pages.parts import html
 from wfsobs.app.store import Store
 from wfsobs.app.work import RunResults
@@ -85,7 +84,7 @@ class LearnersBudget:
             self.task.refuse(str(error))
             return
         work = partial(simulate_budgets, results, mode, left, self.by_observer)
-        self.task.start(Job("budget", work, cost=seconds, priority=SWEEP))
+        self.task.start(Job("budget", work, cost=seconds, priority=BATCH))
 
     @property
     def _left(self) -> list[str]:

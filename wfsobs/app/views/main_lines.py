@@ -6,8 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from wfsobs.app.display import Display
-from wfsobs.app.jobs.job import RUNNING
-from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.jobs import RUNNING, BackgroundTask
 from wfsobs.app.style import observers_of
 from wfsobs.evaluation.evidence import rank_observers
 from wfsobs.evaluation.known_lines import NOTHING, PEAKS, prior_knowledge

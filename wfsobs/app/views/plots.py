@@ -2,19 +2,115 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import panel as pn
 from bokeh.events import DoubleTap
-from bokeh.models import ColumnDataSource, CustomJS, GlyphRenderer, Line
+from bokeh.models import AllIndices, CDSView, ColumnDataSource, CustomJS, GlyphRenderer, Line, Range1d
 from bokeh.plotting import figure
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from wfsobs.app.style import look, run_look
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.vibration import Peak
 from wfsobs.scenario.measured_spectra import measured_spectrum
+
+SETTLE_MS = 60
+"""A zoom is answered when the window has not moved for this long."""
+
+
+AFTERWARDS_MS = 500
+"""What a change has beside its picture is told this much later: until then the processors are the run's and the browser's."""
+
+
+def on_settle(axes: Iterable[Range1d], function: Callable[[], None]) -> None:
+    """Call a function a little after an axis has moved, once for all moves until then."""
+    settled = once(function, SETTLE_MS)
+
+    def moved(_attr: str, _old: object, _new: object) -> None:
+        settled()
+
+    for axis in axes:
+        axis.on_change("start", moved)
+        axis.on_change("end", moved)
+
+
+def once(function: Callable[[], None], milliseconds: int) -> Callable[..., None]:
+    """Return what has a function called a little later, once for all calls until then."""
+    waiting = False
+
+    def ask(*_: object) -> None:
+        nonlocal waiting
+        if not waiting:
+            waiting = True
+            later(answer, milliseconds)
+
+    def answer() -> None:
+        nonlocal waiting
+        waiting = False
+        function()
+
+    return ask
+
+
+def zoom_of(axis: Range1d) -> tuple[float, float] | None:
+    """Return what of an axis is in view; None where all of it is."""
+    start, end, first, last = (float(x) for x in (axis.start, axis.end, axis.reset_start, axis.reset_end) if x is not None)  # type: ignore[arg-type]
+    start, end = min(start, end), max(start, end)
+    return None if start <= first and end >= last else (start, end)
+
+
+def later(function: Any, milliseconds: int) -> None:
+    """Call a function a little later on the session's thread; at once where there is no session, or no page in its browser."""
+    doc = pn.state.curdoc
+    if doc is None or doc.session_context is None or not pn.state.loaded:
+        function()
+    else:
+        doc.add_timeout_callback(function, milliseconds)
+
+
+Array = NDArray[np.float64]
+
+
+def envelope_times(start: int, stop: int, bins: int, dt: float) -> Array:
+    """Compute the times [s] that belong to `envelope` of samples start ... stop - 1."""
+    n = stop - start
+    if n <= 2 * bins:
+        return dt * np.arange(start, stop, dtype=np.float64)
+    edges = _edges(n, bins)
+    width = np.diff(edges)
+    left = start + edges[:-1] + 0.25 * (width - 1)
+    return np.column_stack([left, left + 0.5 * (width - 1)]).ravel() * dt
+
+
+def envelope(x: Array, bins: int) -> Array:
+    """At most 2 * bins values of x (n,): the extremes of every bin, in the order in which the signal rises or falls.
+
+    Every sample is in a bin, the last ragged one included. NaN is left out; a bin of NaN alone is NaN.
+    """
+    n = x.size
+    if n <= 2 * bins:
+        return x
+    edges = _edges(n, bins)
+    low, high = np.fmin.reduceat(x, edges[:-1]), np.fmax.reduceat(x, edges[:-1])
+    falling = x[edges[1:] - 1] < x[edges[:-1]]
+    return np.column_stack([np.where(falling, high, low), np.where(falling, low, high)]).ravel()
+
+
+def band_envelope(low: Array, high: Array, bins: int) -> tuple[Array, Array]:
+    """Return the lowest and the highest of a band in every bin, at the times of `envelope_times`."""
+    n = low.size
+    if n <= 2 * bins:
+        return low, high
+    starts = _edges(n, bins)[:-1]
+    return np.repeat(np.fmin.reduceat(low, starts), 2), np.repeat(np.fmax.reduceat(high, starts), 2)
+
+
+def _edges(n: int, bins: int) -> NDArray[np.int64]:
+    return np.linspace(0, n, bins + 1).astype(np.int64)
+
 
 HEIGHT = 230
 
@@ -142,3 +238,59 @@ class ComparedLines(ExtraLines):
             [(x, y, (run if alone else look(name)).colour(dark)) for run, (_, name, x, y) in zip(looks, lines, strict=True)],
             dash=[" ".join(map(str, run.dash)) for run in looks],
         )
+
+
+class LazyLine:
+    """A line that is in its figure once it has been shown."""
+
+    def __init__(self, make: Callable[[], GlyphRenderer]):
+        self._make = make
+        self.renderer: GlyphRenderer | None = None
+
+    @property
+    def visible(self) -> bool:
+        """Whether it is shown."""
+        return self.renderer is not None and self.renderer.visible
+
+    def show(self, visible: bool, colour: str) -> None:
+        """Show it in a colour, or hide it."""
+        if self.renderer is None and visible:
+            self.renderer = self._make()
+        if self.renderer is not None:
+            self.renderer.glyph.line_color = colour
+            self.renderer.visible = visible
+
+
+class FigureLines(Mapping[str, LazyLine]):
+    """The lines of a figure by name; those that come first lie below."""
+
+    def __init__(self, fig: figure, columns: Mapping[str, tuple[ColumnDataSource, str]]):
+        """Make none yet. columns : name -> where its data are, and the column of y."""
+        self.figure = fig
+        self._all = AllIndices()
+        self._lines = {name: LazyLine(self._maker(name, *at)) for name, at in columns.items()}
+
+    def __getitem__(self, name: str) -> LazyLine:
+        return self._lines[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._lines)
+
+    def __len__(self) -> int:
+        return len(self._lines)
+
+    def restyle(self, dark: bool, hidden_names: Sequence[str]) -> None:
+        """Show every line but those that are to be hidden, in the colours of light or dark mode."""
+        for name, line in self.items():
+            line.show(name not in hidden_names, look(name).colour(dark))
+
+    def _maker(self, name: str, source: ColumnDataSource, y: str) -> Callable[[], GlyphRenderer]:
+        def make() -> GlyphRenderer:
+            renderer = make_line(name, source, y, view=CDSView(filter=self._all))
+            names = list(self)
+            above = [line.renderer for line in map(self.get, names[names.index(name) + 1 :]) if line and line.renderer]
+            renderers = self.figure.renderers
+            renderers.insert(renderers.index(above[0]) if above else len(renderers), renderer)
+            return renderer
+
+        return make

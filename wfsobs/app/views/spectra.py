@@ -8,11 +8,20 @@ import numpy as np
 from bokeh.models import ColumnDataSource, HoverTool, Range1d, UnionRenderers, VSpan
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.jobs import BackgroundTask
 from wfsobs.app.style import observers_of
-from wfsobs.app.views.lines import FigureLines
-from wfsobs.app.views.plots import MODEL, PEAKS, ComparedLines, marked_peaks, new_figure, send, show_all_on_double_click
-from wfsobs.app.views.settle import on_settle, zoom_of
+from wfsobs.app.views.plots import (
+    MODEL,
+    PEAKS,
+    ComparedLines,
+    FigureLines,
+    marked_peaks,
+    new_figure,
+    on_settle,
+    send,
+    show_all_on_double_click,
+    zoom_of,
+)
 from wfsobs.app.views.target_figures import TargetFigures, shows_error
 from wfsobs.app.work import TRUTH, Array, Key, RunResults, SignalAndError
 from wfsobs.evaluation.error_spectra import cumulative_rms, spectra

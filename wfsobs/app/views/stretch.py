@@ -9,10 +9,10 @@ import panel as pn
 from bokeh.models import Range1d
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.numerals import number
+from wfsobs.app.jobs import BackgroundTask
+from wfsobs.app.render import number
 from wfsobs.app.style import asset, look, observers_of, swatch
-from wfsobs.app.views.settle import on_settle, zoom_of
+from wfsobs.app.views.plots import on_settle, zoom_of
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.error_spectra import band_rms
 

@@ -10,9 +10,8 @@ import param
 from wfsobs.app.component import Component
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.glossary import RELATIVE, TERMS
-from wfsobs.app.jobs.job import RUNNING
-from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.numerals import NOTHING, change, number
+from wfsobs.app.jobs import RUNNING, BackgroundTask
+from wfsobs.app.render import NOTHING, change, number
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset, look, observers_of
 from wfsobs.app.views.table import find

@@ -12,9 +12,8 @@ from wfsobs.app.compared import ComparedRun
 from wfsobs.app.display import AT_LIMIT, IN_MOST, OVER_SEEDS, Display, per_micrometre, score_columns
 from wfsobs.app.glossary import BOUND as TERM_OF_BOUND
 from wfsobs.app.glossary import term
-from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.numerals import NOTHING, change, number
-from wfsobs.app.render import Row, macro, table
+from wfsobs.app.jobs import BackgroundTask
+from wfsobs.app.render import NOTHING, Row, change, macro, number, table
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset, observers_of, swatch
 from wfsobs.app.work import RunResults

@@ -9,8 +9,8 @@ import panel as pn
 from bokeh.plotting import figure
 
 from wfsobs.app.display import Display
-from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.views.lines import FigureLines
+from wfsobs.app.jobs import BackgroundTask
+from wfsobs.app.views.plots import FigureLines
 from wfsobs.app.work import TRUTH, RunResults
 
 

@@ -11,13 +11,21 @@ from bokeh.plotting import figure
 from numpy.typing import NDArray
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.jobs import BackgroundTask
 from wfsobs.app.style import look, observers_of
-from wfsobs.app.views.envelope import band_envelope, envelope, envelope_times
 from wfsobs.app.views.event_marks import EventMarks, events_of, room
-from wfsobs.app.views.lines import FigureLines
-from wfsobs.app.views.plots import ComparedLines, new_figure, send, show_all_on_double_click
-from wfsobs.app.views.settle import on_settle, zoom_of
+from wfsobs.app.views.plots import (
+    ComparedLines,
+    FigureLines,
+    band_envelope,
+    envelope,
+    envelope_times,
+    new_figure,
+    on_settle,
+    send,
+    show_all_on_double_click,
+    zoom_of,
+)
 from wfsobs.app.views.target_figures import TargetFigures, shows_error
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.calibration import half_width

@@ -9,8 +9,7 @@ import panel as pn
 from wfsobs.app.causes import Causes
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.glossary import BOUND, explain_first
-from wfsobs.app.jobs.job import DONE, RUNNING
-from wfsobs.app.jobs.task import IDLE, BackgroundTask
+from wfsobs.app.jobs import DONE, IDLE, RUNNING, BackgroundTask
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset
 from wfsobs.app.work import TRUTH

@@ -1,16 +1,24 @@
-"""The switch between modes: two buttons for tip and tilt, a list where there are more."""
+"""Switches beside the page's figures: mode, unit, seeds, and the run that others are compared with."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import panel as pn
 import panel_material_ui as pmui
+from markupsafe import Markup
 
+from wfsobs.app.change_names import name_of_difference
+from wfsobs.app.compared import ComparedRun
 from wfsobs.app.controls.field import SOON
 from wfsobs.app.display import UNITS, Display, short_name
-from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.style import HEARD
+from wfsobs.app.history import History
+from wfsobs.app.jobs import FAILED, BackgroundTask
+from wfsobs.app.render import macro
+from wfsobs.app.seeds import SeedRuns
+from wfsobs.app.style import HEARD, asset, run_swatch
+from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import TIP_TILT, Mode
 
 
@@ -114,3 +122,86 @@ def _title(mode: Mode) -> str:
     """Write a mode's name in a list, with the short one of the axes."""
     short = short_name(mode)
     return mode.name[0].upper() + mode.name[1:] + (f" ({short})" if short != mode.name else "")
+
+
+NO_STEPPERS = ".MuiIconButton-root { display: none !important; }"
+"""The buttons of panel-material-ui beside a number have no names; the arrow keys do the same."""
+
+
+class SeedSwitch:
+    """The number of seeds, to be set, beside the table."""
+
+    def __init__(self, seeds: SeedRuns):
+        self.seeds = seeds
+        self.field = pmui.IntInput.from_param(
+            seeds.param.count, size="small", width=90, margin=(0, 0, 4, 0), stylesheets=[NO_STEPPERS]
+        )
+        self.line = pn.pane.HTML(self.text(), margin=0, stylesheets=[asset("style.css")])
+        seeds.param.watch(self._refresh, ["evidence", "count"])
+        seeds.run.param.watch(self._refresh, ["state", "result"])
+        seeds.task.param.watch(self._refresh, ["state", "message"])
+
+    def view(self) -> list[Any]:
+        """Return the field and what is said beside it."""
+        return [self.field, self.line]
+
+    def text(self) -> str:
+        """Say how many seeds are done."""
+        seeds = self.seeds
+        if not seeds.n_known:
+            said = ""
+        elif seeds.count == 1:
+            said = "one record"
+        elif not seeds.possible:
+            said = "only for simulations that do not take long"
+        elif seeds.task.state == FAILED:
+            said = f"{seeds.n_known} of {seeds.count} seeds: {seeds.task.message}"
+        elif seeds.n_known < seeds.count:
+            said = f"{seeds.n_known} of {seeds.count} seeds done, more running in the background"
+        else:
+            said = f"over {seeds.n_known} seeds"
+        return f'<span class="caption seeds">{said}</span>'
+
+    def _refresh(self, *_: object) -> None:
+        self.line.object = self.text()
+
+
+PIN, UNPIN = "Pin this run to compare others with it", "Unpin: compare with no other run"
+
+
+class Pinning:
+    """Pin and unpin, one button: the result shown is the first one that is compared, or none is any more."""
+
+    def __init__(self, run: BackgroundTask, display: Display, history: History):
+        self.run, self.display, self.history = run, display, history
+        self.button = pmui.Button(
+            label="Pin", icon="push_pin", size="small", variant="outlined", margin=0, disabled=True, description=PIN
+        )
+        self.note = pn.pane.HTML("", margin=0, visible=False, stylesheets=[asset("style.css")])
+        self.button.on_click(self._on_press)
+        run.param.watch(self._refresh, "result")
+        history.param.watch(self._refresh, "current")
+        display.param.watch(self._refresh, ["compared_runs", "dark"])
+
+    def view(self) -> list[object]:
+        """Return the button and the legend."""
+        return [self.button, self.note]
+
+    def _on_press(self, _event: object) -> None:
+        if self.display.compared_runs:
+            self.history.compare_none()
+        else:
+            self.history.compare(self.history.current)
+
+    def _refresh(self, *_: object) -> None:
+        runs, shown = self.display.compared_runs, self.run.result
+        if (self.button.label == "Unpin") != bool(runs):
+            self.button.param.update(label="Unpin" if runs else "Pin", description=UNPIN if runs else PIN)
+            self.note.visible = bool(runs)
+        self.button.disabled = not (runs or self.history.current)
+        if runs and shown is not None:
+            self.note.object = str(macro("compared", [self._item(run, shown.scenario) for run in runs]))
+
+    def _item(self, run: ComparedRun, now: Scenario) -> tuple[Markup, str, str]:
+        """Describe a run: its mark, its name, and what has changed since."""
+        return run_swatch(run.letter, self.display.dark), run.name, name_of_difference(run.scenario, now)

@@ -1,0 +1,485 @@
+"""Computations of the server: a job for all who want it, the line of jobs before the processors, and what a session shows of one."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import itertools
+import logging
+import math
+import os
+import sys
+import threading
+from collections.abc import Callable, Hashable, Mapping
+from functools import partial
+from time import monotonic
+from typing import TYPE_CHECKING, Any
+
+import param
+
+from wfsobs.app.cache import Cache
+from wfsobs.app.logs import event
+from wfsobs.progress import Cancelled, Watch
+
+if TYPE_CHECKING:
+    from wfsobs.app.service import Session
+
+
+log = logging.getLogger(__name__)
+
+RUNNING, DONE, CANCELLED, FAILED = "running", "done", "cancelled", "failed"
+
+CLICK, BATCH, IDLE_TIME = 0, 1, 2
+"""Priorities: somebody waits for the answer to a click; a search or a long run takes its time anyway; what nobody has asked for
+is done while there is nothing else, and begins again after all else."""
+
+LONG = 5.0
+"""A job that takes longer is no click [s]."""
+
+INTERVAL = 0.15
+"""Least time between two reports of progress [s]."""
+
+Tell = Callable[..., None]
+"""Told by the work, by keyword: `latest`, how far it is, or `result`, what there is of the result."""
+
+Work = Callable[[Watch, Tell], Any]
+"""What is to be done -> its result."""
+
+Listener = Callable[[Mapping[str, Any]], None]
+"""Told what has changed, from any thread: state, place, progress, latest, result, message. Must not wait."""
+
+
+class Job:
+    """One computation for all who listen to it; it goes on as long as somebody does.
+
+    kind       : what it is called in the log
+    key        : names its result, where sessions may share it
+    cost       : how long it takes, about [s]
+    priority   : CLICK or BATCH; by its cost if not given
+    time_limit : of the work, after which it is told to stop [s]
+    wait_limit : of the time in the line, after which it is given up [s]
+    refusal    : exceptions of the work that are a reason in one line; others are bugs, and logged
+    endless    : goes on until it is stopped; one place among the jobs is kept free of such
+    quiet      : one of many in a second, of which the log says nothing unless it is asked for everything
+    """
+
+    numbers = itertools.count(1)
+
+    def __init__(
+        self,
+        kind: str,
+        work: Work,
+        *,
+        key: str = "",
+        cost: float = 0.0,
+        priority: int | None = None,
+        time_limit: float = math.inf,
+        wait_limit: float = math.inf,
+        refusal: type[Exception] = ValueError,
+        endless: bool = False,
+        quiet: bool = False,
+    ):
+        self.kind, self.key, self.cost = kind, key, cost
+        self.priority = (CLICK if cost <= LONG else BATCH) if priority is None else priority
+        self.time_limit, self.wait_limit, self.endless = time_limit, wait_limit, endless
+        self.number, self.since, self.turn = next(Job.numbers), monotonic(), 0
+        self._work, self._refusal = work, refusal
+        self._level = logging.DEBUG if quiet else logging.INFO
+        self._lock = threading.RLock()  # where a session has no thread of its own, a listener may leave
+        self._listeners: dict[Listener, Hashable] = {}
+        self._is_unwanted = False
+        self._state: dict[str, Any] = {}
+
+    @property
+    def owner(self) -> Hashable:
+        """Who has listened longest."""
+        with self._lock:
+            return next(iter(self._listeners.values()), None)
+
+    def join(self, owner: Hashable, listener: Listener) -> bool:
+        """One more who wants the result, told at once what is known; false where the job has been given up."""
+        with self._lock:
+            if self._is_unwanted:
+                return False
+            self._listeners[listener] = owner
+            if self._state:
+                listener(dict(self._state))
+            return True
+
+    def leave(self, listener: Listener) -> bool:
+        """One less; whether nobody is left, and the job told to stop."""
+        with self._lock:
+            self._listeners.pop(listener, None)
+            self._is_unwanted = not self._listeners
+            return self._is_unwanted
+
+    def tell(self, **news: Any) -> None:
+        """Tell all who listen."""
+        with self._lock:
+            self._state |= news
+            for listener in [*self._listeners]:
+                listener(news)
+
+    def tell_place(self, place: int) -> None:
+        """Its place in the line may have changed."""
+        if self._state.get("place", 0) != place:
+            self.tell(place=place)
+
+    def run(self, closing: Callable[[], bool], keep: Callable[[str, Any], Any], busy: Callable[[], bool] = lambda: False) -> bool:
+        """Do the work, in a thread of the queue; return whether it gave way and is to be done again.
+
+        Keep is given the key, if there is one, and the result; busy tells a job for idle time that there is other work.
+        """
+        start, told = monotonic(), 0.0
+        event(
+            f"{self.kind}-start",
+            self._level,
+            **{self.kind: self.number},
+            session=self.owner,
+            wait=start - self.since,
+            estimate=self.cost,
+        )
+
+        def progress(fraction: float) -> None:
+            nonlocal told
+            if (now := monotonic()) - told >= INTERVAL:
+                told = now
+                self.tell(progress=min(max(fraction, 0.0), 1.0))
+
+        def stopped() -> bool:
+            return self._is_unwanted or closing()
+
+        gave_way = False
+
+        def gives_way() -> bool:
+            nonlocal gave_way
+            gave_way = gave_way or (self.priority == IDLE_TIME and busy())
+            return gave_way
+
+        said, news = "failed", {"state": FAILED}
+        try:
+            result = self._work(
+                Watch(progress, lambda: stopped() or gives_way() or monotonic() - start > self.time_limit), self.tell
+            )
+            if self.key:
+                keep(self.key, result)
+            said, news = "done", {"state": DONE, "progress": 1.0, "result": result}
+        except Cancelled:
+            if gave_way and not stopped():
+                said = "gave way"
+                return True
+            if stopped() or monotonic() - start <= self.time_limit:
+                said, news = "cancelled", {"state": CANCELLED}
+            else:
+                said, news["message"] = "late", f"It took more than {self.time_limit:g} s, which is what this server allows"
+        except self._refusal as error:
+            said, news["message"] = "refused", str(error)
+        except Exception as error:  # a bug, but the server goes on
+            log.exception("%s %d failed", self.kind, self.number)
+            news["message"] = f"{type(error).__name__}: {error}"
+        finally:
+            level = logging.ERROR if said == "failed" else self._level
+            event(f"{self.kind}-end", level, **{self.kind: self.number}, state=said, seconds=monotonic() - start)
+            if said != "gave way":
+                self.tell(**news)
+        return False
+
+
+IDLE = "idle"
+
+
+class BackgroundTask(param.Parameterized):
+    """The state of one job of a session.
+
+    Starting another supersedes the one before: it is left, and nothing of it lands any more, however late it comes.
+    What is told of a job is gathered and lands in one `param.update` on the session's thread. Where its result is to be
+    `drawn_first`, that it is done lands a moment later. A task with a `title` is named at the top of the page while
+    it goes on.
+    """
+
+    state = param.Selector(default=IDLE, objects=[IDLE, RUNNING, DONE, CANCELLED, FAILED])
+    progress = param.Number(0.0, bounds=(0.0, 1.0), doc="Fraction done.")
+    place = param.Integer(0, doc="Place in the line of jobs, from 1; 0 when it is being done.")
+    message = param.String("", doc="Why it failed, in one line.")
+    latest = param.Parameter(None, doc="What the work has told of itself so far.")
+    result = param.Parameter(None, doc="The latest result, in parts where it comes in parts.")
+
+    def __init__(self, session: Session, drawn_first: bool = False, title: str = ""):
+        super().__init__()
+        self.session, self._drawn_first, self._title = session, drawn_first, title
+        if title:
+            self.param.watch(self._announce, ["state", "progress", "place"])
+        session.tasks.append(self)
+        self._lock = threading.Lock()
+        self._generation = 0
+        self._news: dict[str, Any] = {}
+        self._is_posted = False
+        self._leave: Callable[[], None] = _nothing
+
+    def start(self, job: Job) -> None:
+        """Have a job done, in place of the one before."""
+        generation = self._supersede()
+        self.param.update(state=RUNNING, progress=0.0, place=0, message="", latest=None)
+        self._leave = self.session.submit(job, partial(self._hear, generation), self._leave)
+
+    def cancel(self) -> None:
+        """Stop, or leave the line; what has been delivered stays."""
+        if self.state == RUNNING:
+            self.close()
+            self.param.update(state=CANCELLED)
+
+    def refuse(self, why: str) -> None:
+        """Say in one line why it is not even begun."""
+        self.close()
+        self.param.update(state=FAILED, message=why)
+
+    def close(self) -> None:
+        """Hear no more of it."""
+        self._supersede()
+        before, self._leave = self._leave, _nothing
+        before()
+
+    def line(self, doing: str = "Running") -> str:
+        """How it is going, while it is."""
+        return f"Waiting: position {self.place}" if self.place else f"{doing}, {int(100 * self.progress)} %"
+
+    def _announce(self, *_: object) -> None:
+        others = {title: line for title, line in self.session.doing.items() if title != self._title}
+        own = {self._title: (self.progress, self.line(self._title))} if self.state == RUNNING else {}
+        self.session.doing = {**others, **own}
+
+    def _supersede(self) -> int:
+        with self._lock:
+            self._generation += 1
+            self._news = {}
+            return self._generation
+
+    def _hear(self, generation: int, news: Mapping[str, Any]) -> None:
+        """In any thread."""
+        with self._lock:
+            if generation != self._generation:
+                return
+            self._news |= news
+            if self._is_posted:
+                return
+            self._is_posted = True
+        self.session.post(self._land)
+
+    def _land(self) -> None:
+        with self._lock:
+            news, self._news, self._is_posted = self._news, {}, False
+            if self._drawn_first and news.get("state") == DONE and "result" in news:
+                self._news, self._is_posted = {"state": news.pop("state")}, True
+            again = self._is_posted
+        if news:
+            self.param.update(**news)
+        if again:
+            self.session.post(self._land)
+
+
+def _nothing() -> None:
+    return None
+
+
+PATIENCE = 60.0
+"""A sweep that has waited longer goes like a click [s], so that its turn comes."""
+
+REST = 1.0
+"""Time left to the page and the browser before a job for idle time [s]."""
+
+
+class JobQueue:
+    """Threads of their own, as many as jobs may be done at once, and the results kept of jobs that have a key.
+
+    Clicks go before sweeps, and both before what is done in idle time, which gives way to them. Then turns are taken: the first
+    job of every owner before the second of anybody, whoever comes later beginning with the turn that is being done, and within a
+    turn first come first served. What is wanted twice is done once.
+    """
+
+    def __init__(self, workers: int, cache: Cache[Any], rest: float = REST):
+        self.cache, self.rest = cache, rest
+        self.closing = False
+        self._waiting: list[Job] = []
+        self._running: list[Job] = []
+        self._shared_jobs: dict[str, Job] = {}
+        self._turn = 0  # the latest that has begun
+        self._last_answer = -math.inf  # when something was last handed over, which is to be drawn
+        self._change = threading.Condition()
+        self._timers: dict[Job, threading.Timer] = {}
+        self._threads = [threading.Thread(target=self._work, name=f"wfsobs-work-{i}", daemon=True) for i in range(workers)]
+        for thread in self._threads:
+            thread.start()
+
+    def submit(
+        self, job: Job, owner: Hashable, listener: Listener, before: Callable[[], None] = lambda: None
+    ) -> Callable[[], None]:
+        """Have a job done when its turn comes, or tell the listener what there is of the same; how to take it back.
+
+        before : takes back what this replaces; that would end the same job if it were done any sooner
+        """
+        with self._change:
+            found = self.cache.get(job.key) if job.key else None
+            shared = self._shared_jobs.get(job.key) if found is None else None
+            joined = shared is not None and shared.join(owner, listener)
+            if job.key:
+                how = "hit" if found is not None else "joined" if joined else "miss"
+                event("result", session=owner, key=job.key[:12], cache=how)
+            before()
+            if found is not None:
+                self._last_answer = monotonic()
+                listener({"state": DONE, "progress": 1.0, "result": found})
+                return lambda: None
+            if shared is not None and joined:
+                job = shared
+            else:
+                job.join(owner, listener)
+                self._put(job)
+        return partial(self._leave, job, listener)
+
+    def _put(self, job: Job) -> None:
+        if self.closing:
+            job.tell(state=CANCELLED)
+            return
+        if job.key:
+            self._shared_jobs[job.key] = job
+        if job.wait_limit < math.inf:
+            self._timers[job] = threading.Timer(job.wait_limit, self._overdue, (job,))
+            self._timers[job].daemon = True
+            self._timers[job].start()
+        owner = job.owner
+        job.turn = max([self._turn, *(other.turn + 1 for other in self._requests if other.owner == owner)])
+        self._waiting.append(job)
+        self._change.notify_all()
+        self._tell_places()
+
+    def _leave(self, job: Job, listener: Listener) -> None:
+        if job.leave(listener):
+            with self._change:
+                self._take_out(job)
+
+    def _overdue(self, job: Job) -> None:
+        with self._change:
+            if self._take_out(job):
+                job.tell(state=FAILED, message=f"the server is busy: no turn within {job.wait_limit:g} s, try again")
+
+    def _take_out(self, job: Job) -> bool:
+        """Out of the line and of what is shared; whether it was in the line."""
+        if self._shared_jobs.get(job.key) is job:
+            del self._shared_jobs[job.key]
+        if job not in self._waiting:
+            return False
+        self._waiting.remove(job)
+        if job in self._timers:
+            self._timers.pop(job).cancel()
+        self._tell_places()
+        return True
+
+    @property
+    def workers(self) -> int:
+        """Jobs that may be done at once."""
+        return len(self._threads)
+
+    @property
+    def length(self) -> int:
+        """How many wait."""
+        with self._change:
+            return len(self._waiting)
+
+    @property
+    def running(self) -> int:
+        """How many are being done."""
+        with self._change:
+            return len(self._running)
+
+    def close(self, timeout: float) -> bool:
+        """Start nothing any more, and wait [s] for what is being done; whether all of that has ended."""
+        with self._change:
+            self.closing = True
+            for job in [*self._waiting]:
+                self._take_out(job)
+                job.tell(state=CANCELLED)
+            self._change.notify_all()
+        end = monotonic() + timeout
+        for thread in self._threads:
+            thread.join(max(end - monotonic(), 0.0))
+        return not any(thread.is_alive() for thread in self._threads)
+
+    def _work(self) -> None:
+        lower_priority()
+        while (job := self._next()) is not None:
+            again = False
+            try:
+                again = job.run(lambda: self.closing, self.cache.put, self.is_busy)
+            except Exception:  # a bug, but the thread is for all
+                log.exception("a job failed")
+            finally:
+                with self._change:
+                    self._running.remove(job)
+                    self._last_answer = monotonic()
+                    if again:
+                        self._waiting.append(job)
+                    else:
+                        self._take_out(job)
+                    self._change.notify_all()
+                del job
+                release_memory()
+
+    def _next(self) -> Job | None:
+        """Take the first job of the line; None when there will be no more."""
+        with self._change:
+            while not self.closing:
+                job, rest = next(filter(self._has_room, self._line()), None), 0.0
+                if job is not None and job.priority == IDLE_TIME:
+                    rest = math.inf if self.is_busy() else self._last_answer + self.rest - monotonic()
+                if job is not None and rest <= 0.0:
+                    self._waiting.remove(job)
+                    if job in self._timers:
+                        self._timers.pop(job).cancel()
+                    self._running.append(job)
+                    self._turn = max(self._turn, job.turn)
+                    job.tell_place(0)
+                    self._tell_places()
+                    return job
+                self._change.wait(rest if 0.0 < rest < math.inf else None)
+            return None
+
+    def _line(self) -> list[Job]:
+        """Who waits, in the order of their turns."""
+        late = monotonic() - PATIENCE
+
+        def place(job: Job) -> tuple[int, int]:
+            return CLICK if job.since < late and job.priority != IDLE_TIME else job.priority, job.turn
+
+        return sorted(self._waiting, key=place)
+
+    def _has_room(self, job: Job) -> bool:
+        """Whether a job may begin: one place is kept for those that come to an end."""
+        return not job.endless or sum(other.endless for other in self._running) < len(self._threads) - 1
+
+    @property
+    def _requests(self) -> list[Job]:
+        """Jobs that somebody has asked for, waiting or being done."""
+        return [job for job in (*self._running, *self._waiting) if job.priority != IDLE_TIME]
+
+    def is_busy(self) -> bool:
+        """Whether somebody waits for a job."""
+        return bool(self._requests)
+
+    def _tell_places(self) -> None:
+        """Tell the waiting jobs their places; a free thread takes the next job at once."""
+        if len(self._running) >= len(self._threads):
+            for place, job in enumerate(self._line(), 1):
+                job.tell_place(place)
+
+
+def release_memory() -> None:
+    """Return free memory to the system: glibc keeps what was freed in another thread than the page's."""
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError, AttributeError):  # another C library
+            ctypes.CDLL(None).malloc_trim(0)
+
+
+def lower_priority() -> None:
+    """Let the page's own thread, and a browser on the same machine, go first. On Linux priority is the thread's own."""
+    if sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
