@@ -1,4 +1,4 @@
-"""Computations of the server: a job for all who want it, the line of jobs before the processors, and what a session shows of one."""
+"""Computations of the server: a job for all who want it, the line before the processors, and what a session shows of one."""
 
 from __future__ import annotations
 
