@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.stats import binom, ttest_1samp, ttest_rel
 
-from wfsobs.evaluation.evidence import Evidence, columns_differ, gather_evidence, holm
+from wfsobs.evaluation.evidence import Evidence, columns_differ, gather_evidence, holm, means_differ
 from wfsobs.evaluation.rows import can_be_best
+from wfsobs.evaluation.samples import batch_means
 from wfsobs.evaluation.scores import Score
 from wfsobs.evaluation.verdict import verdict
 from wfsobs.observers import OBSERVERS
@@ -49,6 +51,19 @@ def test_of_equals_any_is_called_worse_in_at_most_five_per_cent(names: int, seed
         unequal += len(Evidence(of, of, seeds).leaders("vibration", "tip")) < len(ids)
     most = binom.ppf(0.9999, n, 0.05) / n
     assert worse / n <= most and unequal / n <= most
+
+
+@pytest.mark.parametrize("slow", [0.0, 0.3, 0.6, 1.0])
+def test_of_equals_on_one_record_any_is_called_different_in_at_most_five_per_cent(slow: float) -> None:
+    """Eight errors of nine seconds, first-order autoregressions of a correlation time [s]."""
+    rng, n, dt = np.random.default_rng(3), 400, 1e-2
+    a = np.exp(-dt / slow) if slow else 0.0
+    different = 0
+    for _ in range(n):
+        errors = lfilter([1.0], [1.0, -a], rng.standard_normal((1700, 8)), axis=0)[-900:]
+        pieces = batch_means(errors**2)
+        different += bool(means_differ(pieces, in_order=True)[pieces.mean(axis=0).argmin()].any())
+    assert different / n <= binom.ppf(0.9999, n, 0.05) / n
 
 
 def test_one_of_many_that_is_worse_is_found() -> None:
