@@ -11,7 +11,7 @@ import pytest
 
 from wfsobs.app import dashboard as module
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.session import session_page
+from wfsobs.app.serve import session_page
 from wfsobs.app.work import RunResults, compute
 from wfsobs.scenario import Scenario
 

@@ -21,8 +21,8 @@ from wfsobs.app.pages.live_controls import events_html, peaks_html, ranking
 from wfsobs.app.pages.live_figures import LiveMarks
 from wfsobs.app.pages.pages import EXPLORE, LIVE
 from wfsobs.app.render import number
+from wfsobs.app.serve import opens_on_live
 from wfsobs.app.service import Service
-from wfsobs.app.session import opens_on_live
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.views.plots import new_figure

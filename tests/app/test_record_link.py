@@ -14,9 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.record_link import NamedRecord
 from wfsobs.app.service import Session
-from wfsobs.app.share import from_query, to_query
+from wfsobs.app.share import NamedRecord, from_query, to_query
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate

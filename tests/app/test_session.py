@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from wfsobs.app import session
+from wfsobs.app import serve as session
 
 
 class Page:

@@ -16,10 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs.app import session_file as module
-from wfsobs.app.history_entry import MOST, HistoryEntry, make_entry
 from wfsobs.app.service import run_key
-from wfsobs.app.session_file import SessionContent, read_session, write_session
-from wfsobs.app.session_values import SessionError
+from wfsobs.app.session_file import MOST, HistoryEntry, SessionContent, SessionError, make_entry, read_session, write_session
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, record_key
 from wfsobs.evaluation.calibration import Calibration
 from wfsobs.evaluation.scores import Score

@@ -13,9 +13,9 @@ from wfsobs.app.change_names import name_of_change
 from wfsobs.app.compared import LETTERS, ComparedRun
 from wfsobs.app.display import Display
 from wfsobs.app.history import History
-from wfsobs.app.history_entry import HistoryEntry
 from wfsobs.app.limits import NONE, Limits
 from wfsobs.app.service import Service
+from wfsobs.app.session_file import HistoryEntry
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source
 from wfsobs.app.store import Store
 from wfsobs.app.work import RunResults

@@ -54,7 +54,7 @@ ONLINE = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
     .map(m => [...m.data["gpr-online"]].filter(Number.isFinite).length / m.data["gpr-online"].length)[0]"""
 
 BROKEN = """
-from wfsobs.app.session import session_page
+from wfsobs.app.serve import session_page
 
 def build(post):
     raise RuntimeError("no such mirror")

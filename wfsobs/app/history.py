@@ -15,10 +15,9 @@ import param
 from wfsobs.app.change_names import name_of_change
 from wfsobs.app.compared import LETTERS, ComparedRun, thin_lines
 from wfsobs.app.display import Display
-from wfsobs.app.history_entry import LONGEST_NAME, MOST, RECORD_BYTES, HistoryEntry, let_go, make_entry
 from wfsobs.app.jobs import DONE, FAILED, BackgroundTask
 from wfsobs.app.service import run_key
-from wfsobs.app.session_file import SessionContent
+from wfsobs.app.session_file import LONGEST_NAME, MOST, RECORD_BYTES, HistoryEntry, SessionContent, let_go, make_entry
 from wfsobs.app.sources import Step
 from wfsobs.app.store import Store
 from wfsobs.app.work import RunResults

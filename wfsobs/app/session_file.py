@@ -8,16 +8,21 @@ from __future__ import annotations
 
 import io
 import json
+import time
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from typing import Any, TypeVar
 
-from wfsobs.app.history_entry import LONGEST_NAME, MOST, MOST_RECORD_BYTES, HistoryEntry
+from wfsobs.app.cache import owners_in
+from wfsobs.app.compared import DrawnLines
 from wfsobs.app.service import run_key
-from wfsobs.app.session_values import DAMAGED, SessionError, get_number, get_text, get_value, read_declaration, read_score
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, Step, record_key
+from wfsobs.app.work import RunResults
+from wfsobs.evaluation.calibration import Calibration
+from wfsobs.evaluation.scores import Score
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -27,6 +32,183 @@ from wfsobs.telemetry.formats import npz
 from wfsobs.telemetry.intake import DeclaredFormat, to_record
 from wfsobs.telemetry.preview import safe_name
 from wfsobs.telemetry.records import record_arrays
+from wfsobs.units import UNITS
+
+LONGEST_TEXT = 2_000
+
+DAMAGED = "damaged, or no session of wfsobs"
+
+T = TypeVar("T")
+
+
+class SessionError(ValueError):
+    """Error: a file that is no session that can be opened; one line saying why."""
+
+
+def read_declaration(values: Mapping[str, Any]) -> DeclaredFormat:
+    """Read what was said of a record's file. Raises SessionError."""
+    unit, sign, delay, rate = (values.get(name) for name in ("unit", "command_sign", "command_delay", "rate"))
+    columns, trust = get_value(values, "columns", dict), values.get("trust", False)
+    valid = (
+        (unit is None or unit in UNITS)
+        and sign in (None, 1, -1)
+        and (delay is None or (type(delay) is int and 1 <= delay < 1e6))
+        and (rate is None or (type(rate) in (int, float) and 0 < rate < 1e6))
+        and isinstance(trust, bool)
+        and len(columns) <= 64
+        and all(isinstance(name, str) and len(name) <= LONGEST_TEXT for name in columns.values())
+    )
+    if not valid:
+        raise SessionError("what is said of a record makes no sense")
+    return DeclaredFormat(unit, sign, delay, rate, columns, trust)
+
+
+def read_score(values: Any) -> Score:
+    """Read a score. Raises SessionError."""
+    if not isinstance(values, dict):
+        raise SessionError(DAMAGED)
+    text, one, some = partial(get_text, values), partial(get_number, values), partial(_get_numbers, values)
+    calibration = some("calibration", 4)
+    return Score(
+        text("observer"),
+        text("target"),
+        text("mode"),
+        one("rms"),
+        one("truth_rms"),
+        _get_optional(values, "normalised_rms"),
+        _get_optional(values, "lag"),
+        one("seconds_per_step"),
+        _get_optional(values, "start"),
+        _get_optional(values, "stop"),
+        get_value(values, "apart", bool),
+        some("interval", 2),  # type: ignore[arg-type]
+        some("phases", None),
+        Calibration(*calibration) if calibration else None,
+    )
+
+
+def get_value(values: Mapping[str, Any], name: str, kind: type[T]) -> T:
+    """Return a value of one type and no other. Raises SessionError."""
+    value = values.get(name)
+    if type(value) is not kind:
+        raise SessionError(f"{name} is missing or of the wrong kind")
+    return value
+
+
+def get_text(values: Mapping[str, Any], name: str, most: int = LONGEST_TEXT) -> str:
+    """Return a text, cut at some characters. Raises SessionError."""
+    return get_value(values, name, str)[:most]
+
+
+def get_number(values: Mapping[str, Any], name: str) -> float:
+    """Return a number. Raises SessionError."""
+    value = values.get(name)
+    if not isinstance(value, (int, float)) or isinstance(value, bool):
+        raise SessionError(f"{name} takes a number")
+    return float(value)
+
+
+def _get_optional(values: Mapping[str, Any], name: str) -> float | None:
+    return None if values.get(name) is None else get_number(values, name)
+
+
+def _get_numbers(values: Mapping[str, Any], name: str, count: int | None) -> tuple[float, ...] | None:
+    listed = values.get(name)
+    if listed is None:
+        return None
+    if type(listed) is not list or len(listed) > 1000 or (count is not None and len(listed) != count):
+        raise SessionError(f"{name} takes a list of numbers")
+    return tuple(get_number({name: item}, name) for item in listed)
+
+
+MOST = 200
+"""Entries of a history; the oldest that have neither a star nor are compared go first."""
+
+LONGEST_NAME = 200
+"""Characters of an entry's name."""
+
+RECORD_BYTES = 800_000_000
+"""Of all loaded records that the sessions of a server hold in their histories [bytes]."""
+
+MOST_RECORD_BYTES = 200_000_000
+"""Of the records in one file of a session [bytes]."""
+
+
+@dataclass(eq=False)
+class HistoryEntry:
+    """A result of the session.
+
+    key     : names the settings and the record
+    time    : when it was last computed or shown [s since 1970]
+    record  : name of the loaded record; empty for a simulation
+    source  : what the observers ran on where that is not the simulation of the settings; None too for a record no longer held
+    view    : the page's view when it was last shown, as a query
+    own_name : whether a visitor gave it its name
+    results : with traces, as long as they are held
+    """
+
+    key: str
+    name: str
+    time: float
+    scenario: Scenario
+    preset: str
+    source: Source | None = None
+    record: str = ""
+    scores: tuple[Score, ...] = ()
+    star: bool = False
+    view: str = ""
+    own_name: bool = False
+    results: RunResults | None = field(default=None, repr=False)
+
+    @property
+    def is_restorable(self) -> bool:
+        """Whether what it ran on is there."""
+        return not self.record or self.source is not None
+
+    @property
+    def step(self) -> Step:
+        """Settings, preset and record."""
+        return self.scenario, self.preset, self.source
+
+
+def make_entry(step: Step, name: str, results: RunResults | None = None) -> HistoryEntry:
+    """Make an entry of settings and what they gave."""
+    scenario, preset, source = step
+    record = source.name if isinstance(source, LoadedRecord) else ""
+    scores = results.result.scores if results else ()
+    return HistoryEntry(run_key(scenario, source), name, time.time(), scenario, preset, source, record, scores, results=results)
+
+
+def let_go(
+    entries: Iterable[HistoryEntry],
+    current: str,
+    most_bytes: int,
+    most_record_bytes: int,
+    lines: Iterable[DrawnLines | None] = (),
+) -> None:
+    """Let go of traces and of loaded records beyond some bytes: those of starred entries last.
+
+    current : key of the entry whose results are shown, which holds its record; lines : of compared runs, which stay
+    """
+    names, names_of_records = set[int](), set[int]()
+    left, left_of_records = most_bytes - sum(_new_bytes(drawn, names) for drawn in lines), most_record_bytes
+    for entry in sorted(entries, key=lambda entry: (entry.key != current, not entry.star)):
+        if entry.results is not None:
+            left -= _new_bytes(entry.results, names)
+            if left < 0:
+                entry.results = None
+        if isinstance(entry.source, LoadedRecord):
+            left_of_records -= _new_bytes(entry.source.record, names_of_records)
+            if left_of_records < 0 and entry.key != current:
+                entry.source = entry.results = None
+
+
+def _new_bytes(value: Any, names: set[int]) -> int:
+    """Return the memory of the arrays in a value beyond those named already [bytes], and name them."""
+    owners = {name: size for name, size in owners_in(value).items() if name not in names}
+    names |= owners.keys()
+    return sum(owners.values())
+
 
 SUFFIX = ".wfsobs-session"
 FORMAT, VERSION = "wfsobs-session", 1

@@ -6,14 +6,13 @@ A `Scenario` in the store is replaced, never changed in place, so whoever holds 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import panel as pn
 import param
 from param.parameterized import batch_call_watchers
 
 from wfsobs.app.jobs import DONE, IDLE, BackgroundTask
-from wfsobs.app.record_link import NamedRecord
 from wfsobs.app.service import Post, Session
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, Step, fit_to_record, give_same_record, record_key
 from wfsobs.cost import rerun_seconds, run_seconds
@@ -23,6 +22,9 @@ from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.errors import SettingError
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.preview import Preview
+
+if TYPE_CHECKING:
+    from wfsobs.app.share import NamedRecord
 
 AFTER_FIT = ("telescope.radial_order", "run.warm_up")
 """Settings that follow a record, and may be changed afterwards."""

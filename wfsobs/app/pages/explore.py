@@ -32,10 +32,10 @@ from wfsobs.app.views.main_lines import MainLines
 from wfsobs.app.views.plots import call
 from wfsobs.app.views.spectra import MODEL, PEAKS, SpectraFigures
 from wfsobs.app.views.spectrum_editor import Frames, SpectrumEditor
-from wfsobs.app.views.stretch import Stretch
 from wfsobs.app.views.strip import Strip
 from wfsobs.app.views.switches import Pinning, SeedSwitch
 from wfsobs.app.views.table import Table
+from wfsobs.app.views.target_figures import Stretch
 from wfsobs.app.views.traces import Traces
 from wfsobs.app.views.verdict import VerdictLine
 from wfsobs.app.work import TRUTH

@@ -13,12 +13,10 @@ from wfsobs.app.controls.names import name_settings
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.downloads import TooLarge
 from wfsobs.app.history import History
-from wfsobs.app.history_entry import HistoryEntry
 from wfsobs.app.jobs import DONE, FAILED, RUNNING, BackgroundTask, Job
 from wfsobs.app.picker import LARGEST, PART, PartialFile, too_large
 from wfsobs.app.render import number
-from wfsobs.app.session_file import SUFFIX, read_session, write_session
-from wfsobs.app.session_values import SessionError
+from wfsobs.app.session_file import SUFFIX, HistoryEntry, SessionError, read_session, write_session
 from wfsobs.app.style import asset, look
 from wfsobs.evaluation.evidence import rank_observers
 from wfsobs.evaluation.rows import can_be_best

@@ -229,8 +229,6 @@ def without_peak(scenario: Scenario, index: int) -> dict[str, Any]:
     return {"vibration.peaks": [p.to_dict() for i, p in enumerate(scenario.vibration.peaks) if i != index]}
 
 
-CAPTION = "Predicted rms error"
-
 DRAGGED, LOOSE, ROUGH = 65_536, 0.001, 0.01
 """The most frequencies to predict with while a handle is on its way, and what may be left at the end of a response: numbers are
 within 1 % of those once it is let go, in a fraction of the time, and a change of less is none."""

@@ -3,15 +3,77 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from html import escape
 from typing import Protocol
 
+import numpy as np
 import panel as pn
+from bokeh.models import Range1d
 from bokeh.plotting import figure
 
-from wfsobs.app.display import Display
+from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs import BackgroundTask
-from wfsobs.app.views.plots import FigureLines
+from wfsobs.app.render import number
+from wfsobs.app.style import asset, look, observers_of, swatch
+from wfsobs.app.views.plots import FigureLines, on_settle, zoom_of
 from wfsobs.app.work import TRUTH, RunResults
+from wfsobs.evaluation.error_spectra import band_rms
+
+
+class Stretch:
+    """A line below the figures of a target: the rms error of every line that is shown, where they are zoomed to."""
+
+    def __init__(self, target: str, run: BackgroundTask, display: Display, times: Range1d, frequencies: Range1d):
+        self.target, self.run, self.display = target, run, display
+        self.times, self.frequencies = times, frequencies
+        self.pane = pn.pane.HTML("", sizing_mode="stretch_width", margin=0, stylesheets=[asset("style.css")])
+        run.param.watch(self._refresh, "result")
+        display.param.watch(self._refresh, ["mode", "unit", "hidden_lines", "dark"])
+        on_settle([times, frequencies], self._refresh)
+
+    def _refresh(self, *_: object) -> None:
+        self.pane.object = self.html()
+
+    def html(self) -> str:
+        """Write the errors; nothing where there is no truth or nothing is zoomed."""
+        results = self.run.result
+        if results is None or results.values(TRUTH, self.target) is None:
+            return ""
+        hidden = self.display.hidden_lines.get(self.target, [])
+        names = [name for name in observers_of(self.target) if name not in hidden]
+        lines = []
+        if (ends := zoom_of(self.times)) is not None:
+            lines.append(self._line(f"{ends[0]:.2f} – {ends[1]:.2f} s", self._over_time(results, names, *ends), results))
+        if (ends := zoom_of(self.frequencies)) is not None:
+            lines.append(self._line(f"{ends[0]:.3g} – {ends[1]:.3g} Hz", self._in_band(results, names, *ends), results))
+        return "".join(lines)
+
+    def _over_time(self, results: RunResults, names: list[str], start: float, end: float) -> dict[str, float]:
+        """Compute the rms error of each observer over the samples that all have [um]."""
+        record, truth = results.result.record, results.values(TRUTH, self.target)
+        assert truth is not None
+        cut = slice(max(round(start / record.dt), 0), round(end / record.dt) + 1), self.display.column
+        found = {name: values[cut] for name in names if (values := results.values(name, self.target)) is not None}
+        found = {name: values for name, values in found.items() if np.isfinite(values).any()}
+        if not found:
+            return {}
+        errors = np.column_stack([*found.values()]) - truth[cut][:, None]
+        errors = errors[np.isfinite(errors).all(axis=1)]
+        return dict(zip(found, np.sqrt(np.mean(errors**2, axis=0)), strict=True)) if len(errors) else {}
+
+    def _in_band(self, results: RunResults, names: list[str], low: float, high: float) -> dict[str, float]:
+        """Compute the rms error of each observer in a band, over the whole record [um]."""
+        spectra = {name: spectrum for name in names if (spectrum := results.spectra.get((name, self.target))) is not None}
+        return {name: band_rms(s.frequency, s.error[:, self.display.column], low, high) for name, s in spectra.items()}
+
+    def _line(self, where: str, errors: dict[str, float], results: RunResults) -> str:
+        scale = per_micrometre(self.display.unit, results.scenario.telescope.diameter)
+        entries = [
+            f'<span class="mark">{swatch(name, self.display.dark)}{escape(look(name).label)} '
+            f"<b>{number(error * scale)}</b> {self.display.unit_label}</span>"
+            for name, error in sorted(errors.items(), key=lambda item: item[1])
+        ]
+        return f'<p class="text stretch legend">RMS error, {where}: {"".join(entries)}</p>' if entries else ""
 
 
 class Drawing(Protocol):
