@@ -125,8 +125,9 @@ def means_differ(values: Array, in_order: bool = False) -> NDArray[np.bool_]:
     mean = np.maximum(values.mean(axis=0), np.finfo(float).tiny)
     influence = values[:, other] / mean[other] - values[:, one] / mean[one]
     _, error, freedom = scatter_of_mean(influence, independent=not in_order)
-    widened = (1.0 + 1.0 / freedom) ** 2 * (SLOW_FACTOR if freedom.size and np.median(freedom) < SLOW else 1.0) if in_order else 1.0
-    return pairs_differ(t_probability(np.log(mean[other] / mean[one]), widened * error, freedom))
+    if in_order:
+        error *= (1.0 + 1.0 / freedom) ** 2 * (SLOW_FACTOR if freedom.size and np.median(freedom) < SLOW else 1.0)
+    return pairs_differ(t_probability(np.log(mean[other] / mean[one]), error, freedom))
 
 
 def seeds_interval(errors: Array) -> tuple[float, float] | None:
