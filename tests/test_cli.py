@@ -101,7 +101,7 @@ def test_a_saved_record_gives_the_same_numbers(tmp_path):
     assert same[0] == same[1]
     # Who observes a file is not told by what it was simulated from.
     needs = [{row["observer"]: row["needs"] for row in observed(r)} for r in (first, second)]
-    assert needs[0]["kf-multi"] == "model, true lines" and needs[1]["kf-multi"] == "model, given lines"
+    assert needs[0]["kf-multi"] == "model, true peaks" and needs[1]["kf-multi"] == "model, given peaks"
     assert needs[1] == {observer: text.replace("true", "given") for observer, text in needs[0].items()}
     with np.load(estimates, allow_pickle=False) as file:
         keys = {f"{name}/{t}" for name in ON_PAPER for t in OBSERVERS[name].targets}
@@ -222,7 +222,7 @@ def test_the_file_of_an_identification_is_all_that_telemetry_needs(tmp_path):
     as_prior, without = errors("--prior", found, *light), errors(*light)
     assert as_prior == errors("--config", found, *light) and as_prior.keys() == without.keys()
     table = call("observe", record, "--prior", found, *light).stdout
-    assert "model, identified lines" in table and "true" not in table.replace("truth", "")
+    assert "model, identified peaks" in table and "true" not in table.replace("truth", "")
     moved = {key[0] for key, value in as_prior.items() if value != without[key]}
     filters = {"kf-lgs", "kf-multi", "kf-ngs", "multirate", "multirate-optimal", "multirate-multi"}
     assert moved == filters | {"gp-lgs", "gp-both"}

@@ -44,7 +44,7 @@ def errors(python: Run, *more: str) -> dict[str, float]:
 
 def test_it_is_in_the_table_of_a_run_and_takes_its_setting(python: Run) -> None:
     table = said(python("-m", "wfsobs", "run", *SHORT))
-    assert any("Low-pass" in line and "turbulence" in line and "nothing" in line for line in table.splitlines())
+    assert any("Low-pass" in line and "turbulence" in line and "none" in line for line in table.splitlines())
     usual, slow = errors(python, "run"), errors(python, "run", "--set", "low_pass.corner=1")
     assert usual["low-pass"] < usual["persistence"], "it takes noise and vibration out"
     assert slow["low-pass"] > 2.0 * usual["low-pass"], "a lag of 0.16 s"

@@ -253,7 +253,7 @@ def test_what_is_copied_has_the_numbers_of_the_page(
         assert float(row["rms_nm"]) == pytest.approx(np.prod(squares[name]) ** (1 / len(cells)), rel=1e-12)
         shown = cells_of(page, name)
         assert shown["Error [nm]"] == number(float(row["rms_nm"])) and shown["Records"] == row["records"] == str(2 * len(cells))
-        assert shown["error / bound"] == number(float(row["over_bound"]))
+        assert shown["Error / limit"] == number(float(row["over_bound"]))
         assert shown["Wins"] == (f"{row['wins']} ({row['decided_wins']})" if row["wins"] else "–")
         assert shown["Rank"] == row["rank"].replace("not tested", "–")
     capsys.readouterr()

@@ -17,7 +17,7 @@ def test_lines_are_true_for_the_simulation_of_the_settings_and_given_for_a_loade
     table = Table(store.run, Display())
     store.start()
     loop.until(lambda: store.run.state == DONE)
-    assert "model, true lines" in table.pane.object and "given lines" not in table.pane.object
+    assert "model, true peaks" in table.pane.object and "given peaks" not in table.pane.object
     store.run_on(LoadedRecord(simulate(store.scenario), "mine", "key"), store.scenario)
     loop.until(lambda: store.run.state == DONE and store.run.result.is_recorded)
-    assert "model, given lines" in table.pane.object and "true lines" not in table.pane.object
+    assert "model, given peaks" in table.pane.object and "true peaks" not in table.pane.object

@@ -55,7 +55,7 @@ def test_an_entry_runs_once_and_stands_on_the_page(arena: Arena, tmp_path: Path,
     values = tables(arena, [again])
     write_results(values, tmp_path)
     row = json.loads((tmp_path / "results.json").read_text())["tracks"][0]["rows"][0]
-    assert row["rank"] == 1 and row["told"] == "nothing" and row["failures"] == 0
+    assert row["rank"] == 1 and row["told"] == "none" and row["failures"] == 0
     page = (tmp_path / "index.html").read_text()
     assert "Persistence" in page and f"{row['score']:.3f}" in page
     assert "http" not in page  # self-contained
@@ -113,9 +113,9 @@ def test_who_enters_where() -> None:
 
 def test_what_an_entry_is_told() -> None:
     multi, rls = find_entries(["kf-multi", "rls"])
-    assert needs_of(multi, TRACKS["vibration"]) == "model, true lines"
-    assert needs_of(multi, TRACKS["next"]) == "model, identified lines"
-    assert needs_of(rls, TRACKS["next"]) == "nothing"
+    assert needs_of(multi, TRACKS["vibration"]) == "model, true peaks"
+    assert needs_of(multi, TRACKS["next"]) == "model, identified peaks"
+    assert needs_of(rls, TRACKS["next"]) == "none"
 
 
 @pytest.mark.parametrize("name", ["nobody", "nowhere:ME", "wfsobs.record:DELAY"])

@@ -54,7 +54,7 @@ def test_a_word_says_what_it_means(wide: Page) -> None:
     for word, meaning in (
         ("theoretical limit", "Smallest RMS error"),
         ("Lag [ms]", "cross-correlation"),
-        ("× truth", "1 is as good as no estimate"),
+        ("Relative error", "1 is as good as an estimate of zero"),
     ):
         button = page.get_by_role("button", name=word, exact=True).first
         definition = page.get_by_role("note").filter(has_text=meaning).first

@@ -186,7 +186,7 @@ def test_errors_of_both_targets_together(running: Page) -> None:
 
     # five seconds behind the start, at which filters settle; the table is of the second before at most
     expect(page.get_by_text(re.compile(r"real time · (8|9|\d\d+)\.\d s ·"))).to_be_visible()
-    bounds, filters = known("Bound, LGS and NGS"), [known(name) for name in ("Multi-peak", "Multi-rate multi-peak")]
+    bounds, filters = known("Theoretical limit, LGS and NGS"), [known(name) for name in ("Multi-peak", "Multi-rate multi-peak")]
     # of the bound of endless records, which both are near to; five seconds scatter by a few per cent
     assert all(0.8 * bounds < rms < 1.3 * bounds for rms in filters)
     expect(of("Online GPR")).to_have_text("–")

@@ -50,7 +50,7 @@ def wide(open_shared: Any) -> Page:
 
 def test_best_first(wide: Page) -> None:
     page = wide
-    expect(page.get_by_role("columnheader", name=re.compile("Stated"))).to_be_visible()
+    expect(page.get_by_role("columnheader", name=re.compile("Predicted sigma"))).to_be_visible()
     table = page.get_by_role("region", name="RMS errors")
     assert table.evaluate("it => it.scrollWidth <= it.clientWidth"), "all columns at 1400 pixels, the drawer open"
     rows = page.locator('tr[data-target="turbulence"]:not([data-observer^=bound])')

@@ -71,7 +71,7 @@ def test_the_table_names_every_controller_and_what_it_needs() -> None:
     table = call(*QUICK).stdout
     for name in (*CONTROLLERS, *COMMON_BOUNDS):
         assert label(name) in table
-    assert "true spectra, training data" in table and "model, true lines" in table and "nothing" in table
+    assert "true spectra, training data" in table and "model, true peaks" in table and "none" in table
     assert "true spectra, training data" not in call(*QUICK, "--set", "control.integrator=manual").stdout
     spread = call(*QUICK, "--controller", "none", "--seeds", "3").stdout
     assert "95 %, nm" in spread and "mean over seeds" in spread

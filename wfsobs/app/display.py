@@ -72,12 +72,12 @@ def score_columns(unit: str, base: str = "truth", compared_columns: Mapping[str,
         f"RMS error [{unit}]": TERMS[RMS_ERROR] if base == "truth" else of_z,
         **compared_columns,
         f"RMS {base} [{unit}]": "Error of an estimate of zero",
-        f"error / {base}": TERMS[RELATIVE] if base == "truth" else "Above 1: worse than an estimate of zero",
-        "Needs": TERMS[NEEDS],
+        "Relative error": TERMS[RELATIVE] if base == "truth" else "Error over RMS of z; above 1 worse than zero",
+        "Prior knowledge": TERMS[NEEDS],
         "Lag [ms]": TERMS[LAG],
         "Time per step [µs]": "Computing time per step and mode",
         "Real-time factor": TERMS[REAL_TIME],
-        f"Stated [{unit}]": TERMS[STATED],
+        f"Predicted sigma [{unit}]": TERMS[STATED],
     }
 
 

@@ -14,14 +14,14 @@ KF, GPR, LGS, NGS, BOUND, NEEDS, LAG, STREHL, RELATIVE, RMS_ERROR, REAL_TIME, ST
     "GPR",
     "LGS",
     "NGS",
-    "Bound",
-    "Needs",
+    "Theoretical limit",
+    "Prior knowledge",
     "Lag",
     "Strehl",
-    "× truth",
+    "Relative error",
     "RMS error",
     "Real-time factor",
-    "Stated",
+    "Predicted sigma",
 )
 
 TERMS: Mapping[str, str] = MappingProxyType(
@@ -40,25 +40,21 @@ TERMS: Mapping[str, str] = MappingProxyType(
             "Root mean square of estimate minus truth after the warm-up, over the samples that all observers have. "
             "Smaller is better."
         ),
-        RELATIVE: (
-            "RMS error over the RMS of the truth. 0 is perfect, 1 is as good as no estimate; above 1 the estimate does harm."
-        ),
+        RELATIVE: ("RMS error over the RMS of the truth. 0 is perfect, 1 is as good as an estimate of zero, above 1 is worse."),
         BOUND: (
             "Smallest RMS error that a causal linear observer of the mean LGS measurement, or of both sensors, can have, from "
-            "the true spectra (Wiener). Where the LGS see different air, a third row is that of an observer that is given each "
-            "of them by itself. It is a mean over records: on one record an observer may come out a little below."
+            "the true spectra (Wiener). Where each LGS passes different turbulence, a third row is for an observer that has each "
+            "of them separately. On a single record an observer may come out slightly below."
         ),
-        NEEDS: (
-            "What an observer must be given beside measurements: a model, vibration lines, frequency bands or training data."
-        ),
+        NEEDS: ("What an observer must know beside measurements: a model, peak frequencies, frequency bands or training data."),
         LAG: (
             "Delay of the estimate: where its cross-correlation with the truth has its maximum. Negative if the estimate leads. "
-            "Of an oscillation it is known but for whole periods: the one nearest to zero."
+            "For an oscillation it is ambiguous by whole periods: the value nearest to zero is shown."
         ),
-        REAL_TIME: "Computing time per step over the period of the loop. Below 1 the observer is fast enough for it.",
+        REAL_TIME: "Computing time per step over the period of the loop. Below 1 the observer is fast enough.",
         STATED: (
             "Standard deviation that the observer's own model gives its estimates. Equal to the RMS error where that model is "
-            "true; far below it, the observer is too sure of itself. A line that is shown alone has its 95 % band."
+            "true; far below it, the observer is overconfident. A line shown alone has its 95 % band."
         ),
         STREHL: "Peak intensity over that of an image without error, from the residual of the simulated modes; at most 1.",
     }

@@ -72,7 +72,7 @@ class SimulatedRecord:
         vibration = self.simulation.vibration
         count = 0 if "peaks" in vibration.idle() else len(vibration.peaks)
         peaks = f" with {count} peak{'s' * (count > 1)}" if count else ""
-        return f"The simulation{peaks} is kept; the settings are what the filters are told."
+        return f"The simulation{peaks} is kept; the settings are the prior knowledge of the filters."
 
 
 Source = LoadedRecord | SimulatedRecord

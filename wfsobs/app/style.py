@@ -30,12 +30,12 @@ from wfsobs.observers.estimates import TOTAL
 LOOKS: Mapping[str, Look] = MappingProxyType(
     {
         TRUTH: Look("Truth", "#606060", "#C8C8C8", (6, 3)),
-        BOUND: Look("Bound, mean of the LGS", "#202020", "#E8E8E8", (1, 2)),
-        BOUND_BOTH: Look("Bound, LGS and NGS", "#202020", "#E8E8E8", (6, 2, 1, 2)),
-        BOUND_STARS: Look("Bound, every LGS apart, and NGS", "#202020", "#E8E8E8", (10, 2, 1, 2, 1, 2)),
-        BOUND_MODES: Look("Bound, mean of the LGS in all modes", "#202020", "#E8E8E8", (1, 4)),
-        BOUND_BOTH_MODES: Look("Bound, LGS and NGS in all modes", "#202020", "#E8E8E8", (6, 4, 1, 4)),
-        BOUND_ASTERISM: Look("Bound, every LGS in all modes, and NGS", "#202020", "#E8E8E8", (14, 2, 1, 2, 1, 2)),
+        BOUND: Look("Theoretical limit, mean of the LGS", "#202020", "#E8E8E8", (1, 2)),
+        BOUND_BOTH: Look("Theoretical limit, LGS and NGS", "#202020", "#E8E8E8", (6, 2, 1, 2)),
+        BOUND_STARS: Look("Theoretical limit, every LGS apart, and NGS", "#202020", "#E8E8E8", (10, 2, 1, 2, 1, 2)),
+        BOUND_MODES: Look("Theoretical limit, mean of the LGS in all modes", "#202020", "#E8E8E8", (1, 4)),
+        BOUND_BOTH_MODES: Look("Theoretical limit, LGS and NGS in all modes", "#202020", "#E8E8E8", (6, 4, 1, 4)),
+        BOUND_ASTERISM: Look("Theoretical limit, every LGS in all modes, and NGS", "#202020", "#E8E8E8", (14, 2, 1, 2, 1, 2)),
         "measured": Look("Measured", "#606060", "#C8C8C8"),
         "highest": Look("Highest", "#8A8A8A", "#9A9A9A"),
         "fitted": Look("Model", "#E04E00", "#FF8533", width=2.2),
@@ -63,7 +63,10 @@ TERM_COLOURS: Mapping[str, str] = MappingProxyType(
 """Terms of an error budget."""
 
 BOUND_MARKS: Mapping[str, tuple[str, str, str]] = MappingProxyType(
-    {BOUND: ("#D64533", "dashed", "bound of the LGS"), BOUND_BOTH: ("#7A4FBF", "dotted", "bound of both sensors")}
+    {
+        BOUND: ("#D64533", "dashed", "theoretical limit using LGS"),
+        BOUND_BOTH: ("#7A4FBF", "dotted", "theoretical limit using LGS and NGS"),
+    }
 )
 """Bound -> its colour, its dash, and how it is called beside an error budget."""
 

@@ -13,7 +13,7 @@ from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.preview import Preview
 from wfsobs.units import UNITS
 
-SILENT = "as the file says"
+SILENT = "from the file"
 
 
 class UploadFields:

@@ -39,7 +39,7 @@ class PreviewView:
         self.figure.yaxis.axis_label = "PSD [µm²/Hz]" if isinstance(preview, SpectrumPreview) else "PSD of z [µm²/Hz]"
         self.text.object = f"<p><b>{escape(name)}</b></p>{_list(known.lines() if known else [str(preview)])}"
         if isinstance(preview, Preview):
-            self.text.object += f'<p>What the data say:</p><div class="evidence">{_list(preview.reading.lines())}</div>'
+            self.text.object += f'<p>Evidence in the data:</p><div class="evidence">{_list(preview.reading.lines())}</div>'
         self.figure.visible = known is not None
         for mode, source in enumerate(self.sources):
             there = known is not None and mode < known.spectrum.shape[1]

@@ -166,7 +166,7 @@ def check(algorithm: Any, watch: Watch) -> None:
         check_controller(algorithm, watch=watch)
         return
     if not algorithm.causal:
-        raise CheckError(f"{algorithm.id}: looks ahead, as it says itself")
+        raise CheckError(f"{algorithm.id}: declared as looking ahead")
     check_observer(algorithm, PRESETS["paper"]().replace({**QUICK, "vibration.synthesis": "gaussian"}), watch=watch)
 
 

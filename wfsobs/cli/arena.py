@@ -24,7 +24,7 @@ SEEDS = click.option(
     "--seeds", type=click.IntRange(1, 1000), default=None, metavar="N", help="Only the first N records of a scenario."
 )
 QUICK = click.option(
-    "--quick", is_flag=True, help="One short scenario per track and two seeds: a trial, whose scores say nothing."
+    "--quick", is_flag=True, help="One short scenario per track and two seeds: a trial, whose scores are not meaningful."
 )
 
 
@@ -110,8 +110,8 @@ def _select_tracks(whole: Arena, tracks: tuple[str, ...]) -> Arena:
 def _table(track: dict) -> Table:
     """Return the rows of a track for the terminal."""
     table = Table(title=f"{track['label']}: {track['help']}", caption="~: tied; scenarios: error over the reference")
-    for name in ("Rank", "Entry", "Score", "95 %", *(one["name"] for one in track["scenarios"]), "us", "Told"):
-        table.add_column(name, justify="left" if name in ("Entry", "Told") else "right")
+    for name in ("Rank", "Entry", "Score", "95 %", *(one["name"] for one in track["scenarios"]), "us", "Prior knowledge"):
+        table.add_column(name, justify="left" if name in ("Entry", "Prior knowledge") else "right")
     for row in track["rows"]:
         between = "" if row["interval"] is None else f"{row['interval'][0]:.3f} to {row['interval'][1]:.3f}"
         time = "" if row["microseconds"] is None else f"{row['microseconds']:.3g}"

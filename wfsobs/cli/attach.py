@@ -47,7 +47,7 @@ from wfsobs.units import UNITS, micrometres_per
     "--modes",
     default=None,
     metavar="I,J,...",
-    help="Elements of a frame, from 0, that are its modes; the first ones unless told.",
+    help="Elements of a frame, from 0, that are its modes; by default the first ones.",
 )
 @ngs_options
 @click.option("--unit", type=click.Choice(UNITS), default="um", show_default=True, help="Unit of the streams.")
@@ -66,7 +66,7 @@ from wfsobs.units import UNITS, micrometres_per
     "--limit",
     type=click.FloatRange(0, 1e12, min_open=True),
     metavar="X",
-    help=f"Magnitude that no estimate may exceed; unless told {LIMIT:g} times the rms of a measurement by the prior.",
+    help=f"Magnitude that no estimate may exceed; by default {LIMIT:g} times the rms of a measurement by the prior.",
 )
 @click.option(
     "--stuck", type=click.FloatRange(1e-3, 60), default=STUCK, show_default=True, metavar="S", help="Time without a frame."
@@ -77,7 +77,7 @@ from wfsobs.units import UNITS, micrometres_per
     metavar="N",
     help="Wait for this one of the stream, or a free one; else the counter is watched.",
 )
-@click.option("--seconds", type=click.FloatRange(0, min_open=True), metavar="S", help="Duration; until Ctrl+C unless told.")
+@click.option("--seconds", type=click.FloatRange(0, min_open=True), metavar="S", help="Duration; by default until Ctrl+C.")
 @click.option("--json", "as_json", is_flag=True, help="At the end print one JSON object.")
 def attach(
     preset: str | None,

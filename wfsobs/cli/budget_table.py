@@ -17,7 +17,7 @@ def budget_table(budgets: Sequence[Budget]) -> Table:
     out = Table(title="Error budget: parts of the mean square error, nm^2, and their shares", caption=_caption(budgets))
     for name in ("Target", "Mode", "Observer"):
         out.add_column(name, no_wrap=True)
-    for name in ("error, nm", "nm^2", *TERMS.values(), "bound, nm^2"):
+    for name in ("error, nm", "nm^2", *TERMS.values(), "limit, nm^2"):
         out.add_column(name, justify="right")
     last = None
     for it in sorted((b for b in budgets if b.terms), key=lambda b: (SCORED.index(b.target), _mode_order(budgets, b), b.total)):

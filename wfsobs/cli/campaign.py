@@ -198,7 +198,7 @@ def _shard(text: str | None) -> tuple[int, int]:
     "--only",
     multiple=True,
     metavar="NAME=VALUE",
-    help="Only scenarios with this value, such as turbulence.wind_speed=20, or NAME=LOW..HIGH; can be given many times.",
+    help="Only scenarios with this value, such as turbulence.wind_speed=20, or NAME=LOW..HIGH; can be repeated.",
 )
 @click.option("--target", metavar="TARGET", help="Only errors of this target.")
 @click.option("--mode", metavar="MODE", help="Only errors of this mode.")
@@ -234,7 +234,7 @@ def print_table(
 
 @campaign.command()
 @click.argument("folder", metavar="DIR")
-@click.option("--out", default=None, metavar="FILE", help="HTML file; report.html in DIR unless told.")
+@click.option("--out", default=None, metavar="FILE", help="HTML file; by default report.html in DIR.")
 def report(folder: str, out: str | None) -> None:
     """Write the results of a campaign as one HTML file: maps of winners, ranks, all comparisons."""
     from wfsobs.campaign.report import write_report

@@ -18,7 +18,7 @@ from wfsobs.cli.show import show_table
 from wfsobs.evaluation.rows import NOT_OBSERVERS
 
 TEXTS = ("Target", "Mode", "Name")
-NUMBERS = ("rms, nm", "rms / bound", "95 %", "above the best, %", "rank", "wins", "records", "failed")
+NUMBERS = ("rms, nm", "rms / limit", "95 %", "above the best, %", "rank", "wins", "records", "failed")
 
 
 def print_together(folder: Path, only: Sequence[str], target: str | None, mode: str | None, as_csv: bool) -> None:

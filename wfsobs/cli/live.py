@@ -59,7 +59,7 @@ from wfsobs.units import micrometres_per
     "controllers",
     multiple=True,
     metavar="NAME",
-    help="Run this controller alone beside it; can be given many times.",
+    help="Run this controller alone beside it; can be repeated.",
 )
 @click.option("--no-controllers", is_flag=True, help="Run no controller beside it.")
 @click.option("--speed", type=click.FloatRange(0.1, 20), default=1.0, metavar="X", help="1 is real time, the default.")
@@ -70,7 +70,7 @@ from wfsobs.units import micrometres_per
 )
 @click.option("--open", "open_browser", is_flag=True, help="Open a browser.")
 @click.option("--headless", is_flag=True, help="Run without a page, for --seconds, and print a table.")
-@click.option("--seconds", type=click.FloatRange(0.01, 86_400), default=10.0, metavar="N", help="How long; 10 unless told.")
+@click.option("--seconds", type=click.FloatRange(0.01, 86_400), default=10.0, metavar="N", help="Duration; by default 10.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of a table.")
 def live(
     preset: str | None,
@@ -110,7 +110,7 @@ def live(
     scenario = configfile.scenario_from(preset, config, assignments)
     declaration = declare_format(unit, command_sign, command_delay, rate, columns, trust)
     if not replay_file and (sha256 or replace(declaration, unit=None) != DeclaredFormat()):
-        raise SettingError("live: what is said of a record is of that of --replay")
+        raise SettingError("live: options of a record need --replay")
     source = _source(scenario, replay_file, stream, modes, declaration, sha256)
     if not isinstance(source, SimulatedLoop):
         scenario = scenario.before_events

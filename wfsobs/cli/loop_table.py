@@ -17,7 +17,7 @@ def loop_table(rows: Sequence[Row]) -> Table:
     """Return the residual table, best controller first; residuals are means over seeds with intervals, all else medians."""
     several = len({r["seed"] for r in rows}) > 1
     out = Table(title="Residual in closed loop after warm-up" + (", mean over seeds" if several else ""))
-    for name in ("Mode", "Controller", "Needs"):
+    for name in ("Mode", "Controller", "Prior knowledge"):
         out.add_column(name, no_wrap=True)
     spread = ("95 %, nm",) if several else ()
     for name in ("rms, nm", *spread, "mas", "Strehl", "theory, nm", "gain", "margins", "delay, ms", "at limit, %"):

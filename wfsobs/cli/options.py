@@ -26,17 +26,17 @@ def scenario_options(command: Callable) -> Callable:
             "assignments",
             multiple=True,
             metavar="NAME=VALUE",
-            help="Change one setting, such as turbulence.wind_speed=20; can be given many times.",
+            help="Change one setting, such as turbulence.wind_speed=20; can be repeated.",
         ),
         click.option("--config", metavar="F.toml", help="Settings from a TOML file, on top of the preset."),
-        click.option("--preset", metavar="NAME", help=f"Start from {', '.join(PRESETS)}; paper unless told."),
+        click.option("--preset", metavar="NAME", help=f"Start from {', '.join(PRESETS)}; by default paper."),
     ):
         command = option(command)
     return command
 
 
 observer_option = click.option(
-    "--observer", "observers", multiple=True, metavar="NAME", help="Run this observer alone; can be given many times."
+    "--observer", "observers", multiple=True, metavar="NAME", help="Run this observer alone; can be repeated."
 )
 
 
@@ -68,14 +68,14 @@ def record_options(command: Callable) -> Callable:
             "columns",
             multiple=True,
             metavar="ROLE=NAME",
-            help="Which column of the file is what, such as y_lgs/tip=slope_x; can be given many times.",
+            help="Which column of the file is what, such as y_lgs/tip=slope_x; can be repeated.",
         ),
         click.option("--rate", type=click.FloatRange(0, min_open=True), metavar="HZ", help="Rate of rows without time stamps."),
         click.option(
             "--command-delay",
             type=click.IntRange(1, 100),
             metavar="N",
-            help=f"Steps from a command to the first measurement that sees it; {DELAY} unless told.",
+            help=f"Steps from a command to the first measurement that sees it; by default {DELAY}.",
         ),
         click.option(
             "--command-sign",
@@ -85,7 +85,7 @@ def record_options(command: Callable) -> Callable:
         click.option(
             "--unit",
             type=click.Choice(UNITS),
-            help="Unit of the record where the file gives none, or of the stream; um by default.",
+            help="Unit of the record where the file has none, or of the stream; um by default.",
         ),
     ):
         command = option(command)

@@ -31,7 +31,7 @@ def _check_embedders(_context: click.Context, _option: click.Parameter, origins:
     "origins",
     multiple=True,
     metavar="HOST[:PORT]",
-    help="Host name of the page behind a proxy; can be given many times.",
+    help="Host name of the page behind a proxy; can be repeated.",
 )
 @click.option(
     "--embed",
@@ -39,7 +39,7 @@ def _check_embedders(_context: click.Context, _option: click.Parameter, origins:
     multiple=True,
     metavar="ORIGIN",
     callback=_check_embedders,
-    help="Origin (https://HOST[:PORT]) whose pages may show this one in a frame; can be given many times. By default none.",
+    help="Origin (https://HOST[:PORT]) whose pages may show this one in a frame; can be repeated. By default none.",
 )
 @click.option("--prefix", default="", metavar="PATH", help="Path of the page behind a proxy.")
 @click.option(

@@ -65,10 +65,10 @@ from wfsobs.units import UNITS
     metavar="SECONDS",
     help="Print the running error over this time against time (docs/events.md).",
 )
-@click.option("--psd-unit", type=click.Choice(UNITS), help="Unit of the spectrum, squared per Hz, where the file gives none.")
+@click.option("--psd-unit", type=click.Choice(UNITS), help="Unit of the spectrum, squared per Hz, where the file has none.")
 @click.option("--budget", is_flag=True, help="Also print the error budget of every linear observer (docs/error-budget.md).")
 @click.option(
-    "--budget-of", multiple=True, metavar="NAME", help="Print the error budget of this observer alone; can be given many times."
+    "--budget-of", multiple=True, metavar="NAME", help="Print the error budget of this observer alone; can be repeated."
 )
 def run(
     preset: str | None,
@@ -125,9 +125,7 @@ def run(
 
 @click.command()
 @scenario_options
-@click.option(
-    "--controller", "controllers", multiple=True, metavar="NAME", help="Run this controller alone; can be given many times."
-)
+@click.option("--controller", "controllers", multiple=True, metavar="NAME", help="Run this controller alone; can be repeated.")
 @click.option(
     "--seeds", type=click.IntRange(1, 100_000), default=1, metavar="N", help="Repeat with seeds run.seed ... run.seed + N - 1."
 )

@@ -29,7 +29,7 @@ from wfsobs.scenario import configfile
     multiple=True,
     required=True,
     metavar="NAME=VALUES",
-    help="Setting and its values: low:high:number, low:high:number:log or v1,v2,v3; given twice for a map over two settings.",
+    help="Setting and its values: low:high:number, low:high:number:log or v1,v2,v3; repeated for a map over two settings.",
 )
 @click.option(
     "--seeds",
@@ -82,7 +82,7 @@ def _settings(results: SweepResults, cell: int) -> str:
 def _winners(results: SweepResults) -> Table:
     """Return a table with one row per scenario, target and mode."""
     out = Table(title="Best observers", caption=f"~: another is not significantly worse, or fewer than {FEWEST} seeds")
-    for name in ("Settings", "Target", "Mode", "Best", "mean rms, nm", "before the next, %", "Tied with"):
+    for name in ("Settings", "Target", "Mode", "Best", "mean rms, nm", "before the next, %", "Equal to"):
         out.add_column(name, justify="right" if name in ("mean rms, nm", "before the next, %") else "left")
     groups = list(dict.fromkeys(key[1:] for key in results.known_keys()))
     for cell in range(len(results.sweep.cells)):

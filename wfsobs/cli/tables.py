@@ -35,11 +35,11 @@ def score_table(rows: Sequence[Row]) -> Table:
     unknown = any(r["target"] == RESIDUAL for r in rows)
     title, base = ("One-step prediction error of z, and residual,", "z") if unknown else ("RMS error", "truth")
     table = Table(title=f"{title} after warm-up" + (", mean over seeds" if several else ""), caption=_caption(rows))
-    for name in ("Target", "Mode", "Observer", "Needs"):
+    for name in ("Target", "Mode", "Observer", "Prior knowledge"):
         table.add_column(name, no_wrap=True)
     bounds = {_group(r): r["rms_um"] for r in rows if r["observer"] in NOT_OBSERVERS}
-    bounded = ("to bound",) if any(own_bound(r["observer"]) in {name for *_, name in bounds} for r in rows) else ()
-    stated = ("stated, nm",) if any(r["sd_um"] for r in rows) else ()
+    bounded = ("to limit",) if any(own_bound(r["observer"]) in {name for *_, name in bounds} for r in rows) else ()
+    stated = ("sigma, nm",) if any(r["sd_um"] for r in rows) else ()
     for name in ("error, nm", "95 %, nm", *bounded, *stated, f"{base}, nm", f"error / {base}", "lag, ms", "us / step"):
         table.add_column(name, justify="right", no_wrap=True)
     last = None

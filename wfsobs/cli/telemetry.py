@@ -59,7 +59,7 @@ def observe(
     out: str | None,
     as_json: bool,
 ) -> None:
-    """Run the observers on a record: .npz, .csv, .fits or AOT (preset paper unless told)."""
+    """Run the observers on a record: .npz, .csv, .fits or AOT (by default preset paper)."""
     scenario = configfile.scenario_from(preset, config, assignments)
     if out:
         check_writable(out)

@@ -30,7 +30,7 @@ NAMES = [o.id for o in OBSERVERS.values() if o.tunable.usual]
     "settings",
     multiple=True,
     metavar="NAME",
-    help="Tune this setting instead of the usual ones; can be given many times.",
+    help="Tune this setting instead of the usual ones; can be repeated.",
 )
 @click.option(
     "--target", type=click.Choice(TARGETS), help="Target of the error; by default vibration where the observer estimates it."

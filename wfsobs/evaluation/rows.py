@@ -29,12 +29,12 @@ TIME = "time_per_step_us"
 
 NOT_OBSERVERS = {
     LOOP: "Recorded loop",
-    BOUND: "Bound, mean of the LGS",
-    BOUND_BOTH: "Bound, LGS and NGS",
-    BOUND_STARS: "Bound, every LGS apart, and NGS",
-    BOUND_MODES: "Bound, mean of the LGS in all modes",
-    BOUND_BOTH_MODES: "Bound, LGS and NGS in all modes",
-    BOUND_ASTERISM: "Bound, every LGS in all modes, and NGS",
+    BOUND: "Theoretical limit, mean of the LGS",
+    BOUND_BOTH: "Theoretical limit, LGS and NGS",
+    BOUND_STARS: "Theoretical limit, every LGS apart, and NGS",
+    BOUND_MODES: "Theoretical limit, mean of the LGS in all modes",
+    BOUND_BOTH_MODES: "Theoretical limit, LGS and NGS in all modes",
+    BOUND_ASTERISM: "Theoretical limit, every LGS in all modes, and NGS",
 }
 """Labels of rows in a table of observers that are not observers."""
 

@@ -100,7 +100,7 @@ class ControlCrew:
                 controller.take_over(before)
             except StepError as error:
                 self._waiting[name] = controller
-                self._say((number, f"{error}: it starts anew"))
+                self._say((number, f"{error}: restarted"))
             else:
                 self._active[name] = controller
                 self._say((number, f"{name} has a new design"))

@@ -178,7 +178,7 @@ class Crew:
             observer.take_over(follower.observer)
         except StepError as error:
             self._waiting[observer.id] = observer
-            self._say((number, f"{error}: it starts anew"))
+            self._say((number, f"{error}: restarted"))
         else:
             follower.observer = observer
             self._say((number, f"{observer.id} has a new design"))

@@ -26,7 +26,7 @@ TARGETS = (TURBULENCE, VIBRATION)
 SLOW = 50.0
 """Weight of an observer for which no other waits: those that learn during the run."""
 
-NOTHING, SPECTRA, MODEL, LINES, BANDS, TRAINING = "nothing", "true spectra", "model", "true lines", "bands", "training data"
+NOTHING, SPECTRA, MODEL, LINES, BANDS, TRAINING = "none", "true spectra", "model", "true peaks", "bands", "training data"
 """What an observer or a controller may have to be given beside measurements: the spectra of turbulence, vibration and noise;
 a model with numbers, of one vibration peak; every line of the vibration; where the vibration is; a record to learn from."""
 

@@ -74,7 +74,7 @@ _WORDS: dict[Part, tuple[str, ...]] = {
     Noise: ("model",),
     LgsError: ("model",),
     LgsStars: (),
-    Lines: ("model", "{source} lines"),
+    Lines: ("model", "{source} peaks"),
     Beams: ("model",),
     Flow: ("model",),
     FlowOfBoth: ("model",),
@@ -85,14 +85,14 @@ _WORDS: dict[Part, tuple[str, ...]] = {
     Spectra: ("{source} spectra",),
     Training: ("training data",),
 }
-"""Part -> what it is called in the column "Needs", by the source of the prior."""
+"""Part -> what it is called in the column "Prior knowledge", by the source of the prior."""
 
 
 def words_for(parts: Iterable[Part], *, source: PriorSource = TRUE) -> tuple[str, ...]:
-    """Return what parts of a prior are called in the column "Needs", each word once.
+    """Return what parts of a prior are called in the column "Prior knowledge", each word once.
 
     >>> words_for((Model, Lines), source=IDENTIFIED)
-    ('model', 'identified lines')
+    ('model', 'identified peaks')
     """
     return tuple(dict.fromkeys(word.format(source=source) for part in parts for word in _WORDS[part]))
 

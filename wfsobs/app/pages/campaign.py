@@ -117,10 +117,10 @@ def standings_html(view: CampaignView, display: Display) -> str:
     columns = {
         "Observer": "",
         f"Error [{display.unit_label}]": "rms over the seeds; over scenarios the geometric mean",
-        "error / bound": "geometric mean over the scenarios; the smallest bound of each",
-        "95 %": "of error / bound, over the scenarios",
+        "Error / limit": "geometric mean over the scenarios; the lowest theoretical limit of each",
+        "95 %": "of error / limit, over the scenarios",
         "Above the best [%]": f"paired over the {'scenarios' if several else 'seeds'}, with its interval of 95 %",
-        "Rank": f"best: all others differ significantly; tied: no significant difference from the best; {NOTHING}: not tested",
+        "Rank": f"best: all others differ significantly; tied: statistically equal to the best; {NOTHING}: not tested",
         "Wins": "scenarios with the smallest error, and how many of them are significant",
         "Records": "",
         "Failed": "runs without an estimate",
@@ -206,7 +206,7 @@ def _square(view: CampaignView, cells: list[int] | None, where: str, display: Di
     if np.isfinite(verdict.margin):
         said += f", {number(100 * verdict.margin, 2)} % before the next"
     if verdict.ties:
-        said += f"; tied with {', '.join(map(name_label, verdict.ties))}"
+        said += f"; statistically equal to {', '.join(map(name_label, verdict.ties))}"
     elif not decided and np.isfinite(verdict.margin):
         said += "; too few results to tell"
     if len(cells) > 1:

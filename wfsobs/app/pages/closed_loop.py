@@ -265,7 +265,7 @@ def loop_html(results: LoopResults, display: Display) -> str:
         f"Strehl at {results.result.scenario.control.wavelength:g} µm": TERMS[STREHL],
         "Gain": "of the integrator",
         "At a limit [%]": "steps in which a limit of the mirror changed the command",
-        "Needs": TERMS[NEEDS],
+        "Prior knowledge": TERMS[NEEDS],
     }
     rows = of_mode(results, display)
     smallest = next((r["controller"] for r in rows if r["controller"] not in BOUNDS and r["residual_rms_nm"] is not None), None)

@@ -221,9 +221,8 @@ APART = ":host { gap: 10px; }"
 LOOK_BACK = 120.0
 """What a recording has of the time before it [s]."""
 INTRO = (
-    "Simulates the scenario in the drawer by the clock, in a process of its own, or plays the record that is loaded; every "
-    "observer follows it frame by frame in another. A change in the drawer, of wind or peaks or noise, fades in within a second; "
-    "the observers keep their designs until they are designed anew."
+    "Runs the scenario, or the loaded record, in real time with every observer frame by frame. A changed setting of the "
+    "disturbance fades in within a second; the observers keep their designs until they are redesigned."
 )
 
 

@@ -209,7 +209,7 @@ def _cell(results: SweepResults, cell: int, target: str, display: Display) -> di
     if best.margin is not None:
         said += f", {100 * best.margin:.0f} % before the next"
     if best.ties:
-        said += f"; tied with {', '.join(map(row_label, best.ties))}"
+        said += f"; statistically equal to {', '.join(map(row_label, best.ties))}"
     elif not best.is_significant:
         said += "; too few seeds to tell"
     said += f"; {best.seeds} {'seed' if best.seeds == 1 else 'seeds'}"

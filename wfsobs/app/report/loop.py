@@ -32,7 +32,7 @@ def loop_state_table(state: State, name: str) -> dict[str, Any]:
             "Phase margin [°]",
             "Delay margin [ms]",
             "At a limit [%]",
-            "Needs",
+            "Prior knowledge",
         ),
         "groups": [
             {"mode": mode, "title": mode[0].upper() + mode[1:], "rows": [_row(row) for row in rows]}

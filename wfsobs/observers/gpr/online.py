@@ -28,7 +28,7 @@ from wfsobs.typing import Array
 
 
 class OnlineGpr(Gpr):
-    """Online GPR: trained anew at every step on the last windows."""
+    """Online GPR: retrained at every step on the last windows."""
 
     training_size = Whole(511, bounds=(2, 2048), label="Training size m", doc="Number of training windows (paper, Table 4).")
     depth = Whole(170, bounds=(1, 2000), label="Depth d", doc="Samples in a window (paper, Table 4).")
@@ -175,7 +175,7 @@ GPR_ONLINE = Observer(
     "Online GPR",
     (VIBRATION,),
     gpr_online,
-    help="trained anew at every step on the last windows",
+    help="retrained at every step on the last windows",
     prior=(OnlineBands,),
     settings=Section("gpr_online", "Online GPR", OnlineGpr),
     asks=standardised_parts,

@@ -30,7 +30,7 @@ from wfsobs.typing import Array
 
 
 class Adaptive(Group):
-    """The Kalman filter of a model that is identified anew all the time."""
+    """The Kalman filter whose model is re-identified all the time."""
 
     window = Real(
         4.0,
@@ -152,7 +152,7 @@ KF_ADAPTIVE = Observer(
     "Adaptive KF",
     TARGETS,
     kf_adaptive,
-    help="noise, turbulence and peaks identified anew from the last 4 s, twice a second; not in the paper",
+    help="noise, turbulence and peaks re-identified from the last 4 s, twice a second; not in the paper",
     settings=ADAPTIVE,
     takes_missing=True,
     tunable=Tunable(("adaptive.window",), ("adaptive.interval",)),  # a shorter interval costs time, which no error shows
