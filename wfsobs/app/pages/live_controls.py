@@ -58,7 +58,7 @@ def live_html(loop: LiveLoop, view: LiveView, target: str, display: Display, sca
         "Observer": "",
         f"RMS error [{unit}]": f"over the last {seconds:.1f} s",
         f"Since its start [{unit}]": "after its warm-up",
-        "error / bound": "the smallest bound of the two",
+        "Error / limit": "the lower theoretical limit of the two",
         "Step, median [µs]": "update and estimate of all modes",
         "99.9 % [µs]": "",
         "Longer than a frame": "steps",
