@@ -15,7 +15,7 @@ export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 # Stamps carry the checksum of what they were made from, so that nothing runs twice and no change is missed.
 # An environment works in one place only, so that the place counts as well.
 PLACE := $(firstword $(shell echo "$(CURDIR)" | cksum))
-PINS := $(PLACE)-$(firstword $(shell cat pyproject.toml requirements*.txt | cksum))
+PINS := $(PLACE)-$(firstword $(shell cat pyproject.toml packages/*/pyproject.toml requirements*.txt | cksum))
 MADE := $(VENV)/.made-$(PLACE)
 RUN := $(VENV)/.run-$(PINS)
 TEST := $(VENV)/.test-$(PINS)
@@ -23,12 +23,12 @@ BENCH := $(VENV)/.bench-$(PINS)
 DOCS := $(VENV)-docs/.docs-$(PINS)
 PEERS := pyrtc hcipy
 
-# $(call install,requirements): these pins and the project itself, editable; stamps of other pins go.
+# $(call install,requirements[,packages]): these pins and the project itself with its packages, editable; stamps of other pins go.
 define install
 @echo "Installing $(1) in $(VENV) ..."
 @find $(VENV) -maxdepth 1 -name '.[rtb]*-*' ! -name '*-$(PINS)' -delete
 @$(PIP) install --quiet -r $(1)
-@$(PIP) install --quiet --no-build-isolation --no-deps --editable .
+@$(PIP) install --quiet --no-build-isolation --no-deps --editable . $(2:%=--editable packages/%)
 @$(PIP) check
 @touch $@ $(RUN)
 endef
@@ -50,7 +50,7 @@ test: setup  ## run all tests, then the tutorials, then those in a browser
 	exit $$status
 
 test-fast: $(TEST)  ## the quick tests alone: no dashboard, no report, none that takes long (tests/slow.txt)
-	@$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow" tests wfsobs --ignore=tests/app --ignore=tests/report --ignore=wfsobs/app
+	@$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow" tests wfsobs packages --ignore=tests/app --ignore=tests/report --ignore=wfsobs/app
 
 test-peers: $(PEERS:%=test-peer-%)  ## run the tests in pyRTC and HCIPy, each in an environment of its own (make test-peer-specula, test-peer-oopao, test-peer-soapy: in those)
 
@@ -91,7 +91,7 @@ docs: $(DOCS)  ## build this documentation in build/site, the tutorials run agai
 
 clean:  ## remove .venv and all that was built
 	rm -rf $(VENV) $(VENV)-* build dist *.egg-info .pytest_cache .ruff_cache .hypothesis test-output
-	find docs scripts tests wfsobs -name __pycache__ -prune -exec rm -rf {} +
+	find docs packages scripts tests wfsobs -name __pycache__ -prune -exec rm -rf {} +
 
 $(MADE):
 	@scripts/make_venv.sh "$(PYTHON)" $(VENV)
@@ -101,7 +101,7 @@ $(RUN): | $(MADE)
 	$(call install,requirements.txt)
 
 $(TEST): | $(MADE)
-	$(call install,requirements-test.txt)
+	$(call install,requirements-test.txt,wfsobs-arena)
 
 $(BENCH): | $(MADE)
 	$(call install,requirements-bench.txt)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, NamedTuple
 
 import click
@@ -19,7 +20,6 @@ class Place(NamedTuple):
 
 
 COMMANDS = {
-    "arena": Place("arena", "Rank observers and controllers under the same rules on the same records."),
     "attach": Place("attach", "Run an observer on the streams of a running loop, in shared memory or by ZeroMQ."),
     "bench": Place("bench", "Time the observers beside textbook versions, and other libraries if installed."),
     "campaign": Place("campaign", "Run many scenarios and seeds, on many processes or machines."),
@@ -39,24 +39,38 @@ COMMANDS = {
     "tune": Place("tuning", "Search for the settings of an observer that are best on a validation record."),
 }
 
+ENTRY_POINTS = "wfsobs.commands"
+"""Group of entry points by which installed packages bring commands of their own."""
+
+PACKAGES = {"arena": "wfsobs-arena"}
+"""Commands that come with a package of this repository, and which."""
+
 
 class Commands(click.Group):
     """Imports a command when it is called, and turns the errors a user can cause into one line and exit status 2."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of all commands."""
-        return sorted(COMMANDS)
+        return sorted({*COMMANDS, *_entries()})
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Return the command of this name."""
-        if cmd_name not in COMMANDS:
-            return None
-        return getattr(import_module(f"wfsobs.cli.{COMMANDS[cmd_name].module}"), cmd_name.replace("-", "_"))
+        if cmd_name in COMMANDS:
+            return getattr(import_module(f"wfsobs.cli.{COMMANDS[cmd_name].module}"), cmd_name.replace("-", "_"))
+        if (point := _entries().get(cmd_name)) is not None:
+            try:
+                return point.load()
+            except Exception as error:
+                ctx.fail(f"{cmd_name}: {point.value} cannot be imported: {type(error).__name__}: {error}")
+        if cmd_name in PACKAGES:
+            ctx.fail(f"{cmd_name} is a package of its own: pip install {PACKAGES[cmd_name]}")
+        return None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the list of commands, without importing them."""
+        lines = {name: f"Of the package {point.module.partition('.')[0]}." for name, point in _entries().items()}
         with formatter.section("Commands"):
-            formatter.write_dl([(name, COMMANDS[name].help) for name in self.list_commands(ctx)])
+            formatter.write_dl(sorted((lines | {name: place.help for name, place in COMMANDS.items()}).items()))
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command."""
@@ -72,6 +86,11 @@ class Commands(click.Group):
         except OSError as error:
             click.echo(f"wfsobs: {error.filename or 'file'}: {error.strerror or error}", err=True)
         ctx.exit(2)
+
+
+def _entries() -> dict[str, EntryPoint]:
+    """Return the commands of installed packages by name."""
+    return {point.name: point for point in entry_points(group=ENTRY_POINTS)}
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})

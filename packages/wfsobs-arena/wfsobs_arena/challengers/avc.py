@@ -17,12 +17,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from wfsobs.arena.challengers.base import Challenger
 from wfsobs.observers.base import VIBRATION, Observer
 from wfsobs.prior import Bands, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements
 from wfsobs.typing import Array
+from wfsobs_arena.challengers.base import Challenger
 
 MAGNITUDE = 0.5
 """Bandwidth of the magnitudes [Hz]."""

@@ -10,16 +10,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from wfsobs_arena.definition import Arena, load_arena
+from wfsobs_arena.entries import find_entries
+from wfsobs_arena.process import EntryError, EntryProcess
+from wfsobs_arena.run import run_arena
 
-from wfsobs.arena.definition import Arena, load_arena
-from wfsobs.arena.entries import find_entries
-from wfsobs.arena.process import EntryError, EntryProcess
-from wfsobs.arena.run import run_arena
 from wfsobs.prior import Prior
 from wfsobs.record import Measurements
 from wfsobs.settings.errors import SettingError
 
 HERE = Path(__file__).parent
+
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
@@ -76,8 +78,8 @@ def test_what_sleeps_in_the_checks_is_ended(here: None, capfd: pytest.CaptureFix
 
 
 ASK = """
-from wfsobs.arena.entries import find_entries
-from wfsobs.arena.process import EntryProcess
+from wfsobs_arena.entries import find_entries
+from wfsobs_arena.process import EntryProcess
 if __name__ == "__main__":
     with EntryProcess(find_entries(["cheats:SLEEPS"])[0], 4.0) as process:
         process.check(600.0)

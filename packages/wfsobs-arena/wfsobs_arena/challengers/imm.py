@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from wfsobs.arena.challengers.base import Challenger
 from wfsobs.observers.base import TARGETS, Observer
 from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimates
 from wfsobs.prior import Model, Prior
@@ -23,6 +22,7 @@ from wfsobs.progress import Watch
 from wfsobs.record import Measurements
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
+from wfsobs_arena.challengers.base import Challenger
 
 STAY = 2.0
 """Mean time in a hypothesis [s]."""

@@ -19,8 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from wfsobs.arena.challengers.base import Challenger
-from wfsobs.arena.challengers.rls import BLOCK, MEMORY, ORDER, Rls
 from wfsobs.control.base import Controller, Settings
 from wfsobs.control.law import Law
 from wfsobs.control.mirror import Mirror, Plant
@@ -33,6 +31,8 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.signal.stepping import Saved
 from wfsobs.typing import Array
+from wfsobs_arena.challengers.base import Challenger
+from wfsobs_arena.challengers.rls import BLOCK, MEMORY, ORDER, Rls
 
 PENALTY = 1e-6
 """Of the squares of the weights at the start [um^2]."""

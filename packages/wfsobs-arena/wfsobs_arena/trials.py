@@ -9,11 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from wfsobs.arena.cases import Case, mean_square
-from wfsobs.arena.definition import Rules
-from wfsobs.arena.entries import ArenaEntry, load_object
-from wfsobs.arena.process import Answer, EntryError, EntryProcess
-from wfsobs.arena.tracks import DISTURBANCE, NEXT, TRACKS, Track
 from wfsobs.control.base import Controller
 from wfsobs.evaluation.calibration import calibration
 from wfsobs.observers.base import Observer
@@ -21,6 +16,11 @@ from wfsobs.observers.estimates import NEXT_Z, TOTAL
 from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
 from wfsobs.record import Record
 from wfsobs.typing import Array
+from wfsobs_arena.cases import Case, mean_square
+from wfsobs_arena.definition import Rules
+from wfsobs_arena.entries import ArenaEntry, load_object
+from wfsobs_arena.process import Answer, EntryError, EntryProcess
+from wfsobs_arena.tracks import DISTURBANCE, NEXT, TRACKS, Track
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from wfsobs.arena.entries import ArenaEntry, load_object
 from wfsobs.observers.base import Observer
 from wfsobs.observers.estimates import NEXT_Z, TOTAL
 from wfsobs.progress import Watch
@@ -27,6 +26,7 @@ from wfsobs.scenario.presets import PRESETS
 from wfsobs.testing import QUICK, CheckError, check_controller, check_observer
 from wfsobs.testing.common import error_line
 from wfsobs.typing import Array
+from wfsobs_arena.entries import ArenaEntry, load_object
 
 READY_TIME = 120.0
 """Time to start a process and import what the entry needs [s]."""

@@ -9,15 +9,15 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from wfsobs_arena.challengers import CHALLENGERS
+from wfsobs_arena.challengers.avc import lock_lines
+from wfsobs_arena.challengers.coupled_ar import NormalEquations
+from wfsobs_arena.challengers.gru import FILE, predict_gru, stored_weights
+from wfsobs_arena.challengers.imm import run_mixture, to_pairs
+from wfsobs_arena.challengers.predictive import ORDER, PENALTY, PredictiveLaw
+from wfsobs_arena.challengers.rls import MEMORY, histories, predict_rls
+from wfsobs_arena.challengers.subspace import fit_subspace, joint_moments
 
-from wfsobs.arena.challengers import CHALLENGERS
-from wfsobs.arena.challengers.avc import lock_lines
-from wfsobs.arena.challengers.coupled_ar import NormalEquations
-from wfsobs.arena.challengers.gru import FILE, predict_gru, stored_weights
-from wfsobs.arena.challengers.imm import run_mixture, to_pairs
-from wfsobs.arena.challengers.predictive import ORDER, PENALTY, PredictiveLaw
-from wfsobs.arena.challengers.rls import MEMORY, histories, predict_rls
-from wfsobs.arena.challengers.subspace import fit_subspace, joint_moments
 from wfsobs.closed_loop.design import design
 from wfsobs.control.base import Controller
 from wfsobs.control.controllers import CONTROLLERS
@@ -34,6 +34,7 @@ from wfsobs.simulation.loop import simulate
 from wfsobs.testing import check_controller, check_observer
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CHALLENGERS)
 def test_challengers_keep_the_rules(name: str) -> None:
     algorithm = CHALLENGERS[name].algorithm
@@ -78,6 +79,7 @@ def test_predictive_control_commands_what_least_squares_say_of_the_steps_on_whic
     np.testing.assert_allclose(u[-1], -H[-1] @ batch, rtol=1e-5)  # 300 rank-one updates, condition 1e5
 
 
+@pytest.mark.slow
 def test_predictive_control_comes_between_the_integrator_and_the_bound() -> None:
     """A pure line and resonances, without the slow error of the LGS. The rms of 4 s scatters by a few per cent about its mean."""
     changes = {"run.duration": 8.0, "vibration.synthesis": "gaussian", "sensors.lgs_low_frequency_rms": 0.0}
@@ -146,6 +148,7 @@ def test_the_hypothesis_that_made_the_record_gets_probable() -> None:
     assert found.probabilities[2000:, 1].mean() > 0.9
 
 
+@pytest.mark.slow
 def test_phase_locked_loops_lock_on_pure_lines() -> None:
     t = np.arange(20_001) * 1e-3
     clean = np.column_stack([0.03 * np.cos(2 * np.pi * 47.9 * t + 1.0), 0.01 * np.cos(2 * np.pi * 48.2 * t)])
@@ -180,7 +183,7 @@ def test_the_subspace_predictor_finds_the_states_and_predicts_like_the_kalman_fi
 @pytest.fixture(scope="module")
 def training() -> ModuleType:
     """The script that trains the network."""
-    path = Path(__file__).parents[2] / "scripts" / "train_gru.py"
+    path = Path(__file__).parents[1] / "train_gru.py"
     spec = importlib.util.spec_from_file_location("train_gru", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -226,6 +229,7 @@ def test_the_network_is_trained_along_its_gradient(training: ModuleType) -> None
         assert float(np.sum(gradient[name] * along)) == pytest.approx((two[0] - two[1]) / 2e-5, abs=1e-8)
 
 
+@pytest.mark.slow
 def test_the_stored_network_is_small_and_predicts_better_than_the_last_measurement() -> None:
     assert FILE.stat().st_size < 100_000
     scenario = PRESETS["ut4"]().replace({"run.duration": 3.0, "run.seed": 99})

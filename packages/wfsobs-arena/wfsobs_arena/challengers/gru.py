@@ -21,14 +21,14 @@ from typing import Any
 import numpy as np
 from scipy.special import expit
 
-from wfsobs.arena.challengers.base import WHOLE, Challenger, whole_estimate
-from wfsobs.arena.challengers.rls import histories
 from wfsobs.observers.base import TARGETS, Observer
 from wfsobs.observers.estimates import Estimates
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements
 from wfsobs.typing import Array
+from wfsobs_arena.challengers.base import WHOLE, Challenger, whole_estimate
+from wfsobs_arena.challengers.rls import histories
 
 FILE = Path(__file__).with_name("gru.npz")
 """The weights: W (taps, 3 units), U (units, 3 units), b (3 units,) for r, g and c; v (taps,), w (units,)."""

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from wfsobs.arena.cases import Case, SimulatedCase
-from wfsobs.arena.telemetry import TelemetryCase
-from wfsobs.arena.tracks import TRACKS
 from wfsobs.scenario.configfile import parse_toml, preset
 from wfsobs.settings.errors import SettingError
 from wfsobs.settings.tree import leaves
 from wfsobs.simulation.synthesis import period_steps
+from wfsobs_arena.cases import Case, SimulatedCase
+from wfsobs_arena.telemetry import TelemetryCase
+from wfsobs_arena.tracks import TRACKS
 
 FILE = Path(__file__).with_name("arena.toml")
 """The arena of this version."""

@@ -16,8 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from wfsobs.arena.cases import mean_square
-from wfsobs.arena.reference import TAPS, taps_error
 from wfsobs.identification.identification import identify
 from wfsobs.observers.base import Observer
 from wfsobs.pipeline import as_stated
@@ -28,6 +26,8 @@ from wfsobs.record import Record, RecordError, hold_last
 from wfsobs.scenario import Scenario
 from wfsobs.telemetry.records import load
 from wfsobs.typing import Array
+from wfsobs_arena.cases import mean_square
+from wfsobs_arena.reference import TAPS, taps_error
 
 PARTS = 8
 """Parts of the second half that are scored each by itself."""
@@ -35,7 +35,7 @@ PARTS = 8
 
 @dataclass(frozen=True)
 class TelemetryCase:
-    """A record of telemetry in the track "next"; see `wfsobs.arena.cases.Case`."""
+    """A record of telemetry in the track "next"; see `wfsobs_arena.cases.Case`."""
 
     path: Path
 

@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from wfsobs.arena.challengers.base import WHOLE, Challenger, whole_estimate
 from wfsobs.observers.base import TARGETS, Observer
 from wfsobs.observers.estimates import Estimates
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements
 from wfsobs.typing import Array
+from wfsobs_arena.challengers.base import WHOLE, Challenger, whole_estimate
 
 ORDER = 20
 """Measurements of each mode that a prediction uses."""

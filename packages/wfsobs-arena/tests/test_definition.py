@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from wfsobs_arena.cases import SimulatedCase
+from wfsobs_arena.definition import FILE, load_arena
+from wfsobs_arena.tracks import TRACKS, Track, add_track
 
-from wfsobs.arena.cases import SimulatedCase
-from wfsobs.arena.definition import FILE, load_arena
-from wfsobs.arena.tracks import TRACKS, Track, add_track
 from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.synthesis import period_steps
 

@@ -8,15 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from wfsobs_arena import identity
+from wfsobs_arena.challengers import CHALLENGERS
+from wfsobs_arena.identity import code_version
 
 import wfsobs
-from wfsobs.arena import identity
-from wfsobs.arena.challengers import CHALLENGERS
-from wfsobs.arena.identity import code_version
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 
-ASK = "from mine.entry import ME; from wfsobs.arena.identity import code_version; print(code_version(ME))"
+ASK = "from mine.entry import ME; from wfsobs_arena.identity import code_version; print(code_version(ME))"
 FILES = {
     "__init__.py": "",
     "entry.py": """
@@ -53,6 +53,7 @@ def version_of(package: Path) -> str:
     return subprocess.run([sys.executable, "-c", ASK], cwd=package.parent, check=True, capture_output=True, text=True).stdout
 
 
+@pytest.mark.slow
 def test_a_change_of_what_it_imports_is_another_version_and_one_of_the_rest_is_not(package: Path) -> None:
     versions = [version_of(package)]
     assert versions[0].startswith(f"wfsobs {wfsobs.__version__} mine 0 ")

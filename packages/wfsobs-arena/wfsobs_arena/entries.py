@@ -11,14 +11,14 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from wfsobs.arena.challengers import CHALLENGERS
-from wfsobs.arena.identity import code_version
-from wfsobs.arena.tracks import Track
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
 from wfsobs.settings.errors import SettingError
 from wfsobs.testing.common import error_line
+from wfsobs_arena.challengers import CHALLENGERS
+from wfsobs_arena.identity import code_version
+from wfsobs_arena.tracks import Track
 
 REGISTERED, CHALLENGER, MODULE, FOLDER = "registered", "challenger", "module", "folder"
 

@@ -14,14 +14,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from wfsobs.arena.challengers.base import WHOLE, Challenger, whole_estimate
-from wfsobs.arena.challengers.rls import histories
 from wfsobs.observers.base import TARGETS, Observer
 from wfsobs.observers.estimates import Estimates
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements
 from wfsobs.typing import Array
+from wfsobs_arena.challengers.base import WHOLE, Challenger, whole_estimate
+from wfsobs_arena.challengers.rls import histories
 
 PAST, FUTURE = 50, 25
 """Measurements of each mode in the past and in the future."""

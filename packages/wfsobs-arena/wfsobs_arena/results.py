@@ -13,14 +13,6 @@ from typing import Any
 import numpy as np
 
 from wfsobs import __version__
-from wfsobs.arena.cases import Case
-from wfsobs.arena.challengers import CHALLENGERS
-from wfsobs.arena.definition import Arena
-from wfsobs.arena.entries import FOLDER, ArenaEntry, load_object
-from wfsobs.arena.run import EntryOutcome
-from wfsobs.arena.scores import geometric_mean, rank_entries
-from wfsobs.arena.tracks import NEXT, TRACKS, Track
-from wfsobs.arena.trials import Trial
 from wfsobs.campaign.keys import PHYSICS_VERSION
 from wfsobs.files import write_whole
 from wfsobs.observers.base import Observer
@@ -28,6 +20,14 @@ from wfsobs.prior import IDENTIFIED, TRUE
 from wfsobs.priors_from.controllers import own_settings
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
+from wfsobs_arena.cases import Case
+from wfsobs_arena.challengers import CHALLENGERS
+from wfsobs_arena.definition import Arena
+from wfsobs_arena.entries import FOLDER, ArenaEntry, load_object
+from wfsobs_arena.run import EntryOutcome
+from wfsobs_arena.scores import geometric_mean, rank_entries
+from wfsobs_arena.tracks import NEXT, TRACKS, Track
+from wfsobs_arena.trials import Trial
 
 Table = dict[str, Any]
 
@@ -144,7 +144,7 @@ def write_results(values: Table, folder: Path) -> None:
     text = json.dumps(values, indent=1) + "\n"
     write_whole(folder / "results.json", lambda file: file.write(text.encode()))
     environment = Environment(
-        loader=PackageLoader("wfsobs.arena"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=PackageLoader("wfsobs_arena"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     page = environment.get_template("arena.html").render(results=values, source_of=source_of)
     write_whole(folder / "index.html", lambda file: file.write(page.encode()))

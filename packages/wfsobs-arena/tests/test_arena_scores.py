@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.stats import binom
-
-from wfsobs.arena.scores import log_ratio, rank_entries
+from wfsobs_arena.scores import log_ratio, rank_entries
 
 
 def test_a_score_is_the_geometric_mean_of_ratios_of_rms() -> None:

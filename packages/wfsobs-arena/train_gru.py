@@ -1,4 +1,4 @@
-"""Train the recurrent network of the arena, wfsobs/arena/challengers/gru.npz: `python scripts/train_gru.py [EPOCHS]`.
+"""Train the recurrent network of the arena, challengers/gru.npz: `python packages/wfsobs-arena/train_gru.py [EPOCHS]`.
 
 Records of scenarios with random noise and wind, of seeds that the arena does not have. Adam on the squared error of the next
 difference over its rms, gradients by backpropagation through WINDOW steps, the state carried on from window to window.
@@ -12,8 +12,8 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.special import expit
 from threadpoolctl import threadpool_limits
+from wfsobs_arena.challengers.gru import FILE, Weights, scaled_differences
 
-from wfsobs.arena.challengers.gru import FILE, Weights, scaled_differences
 from wfsobs.files import write_whole
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate

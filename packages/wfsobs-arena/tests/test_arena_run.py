@@ -10,18 +10,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from wfsobs_arena import trials
+from wfsobs_arena.cases import SimulatedCase, mean_square
+from wfsobs_arena.challengers import CHALLENGERS
+from wfsobs_arena.definition import Arena, add_records, load_arena
+from wfsobs_arena.entries import ArenaEntry, admits, find_entries, load_object
+from wfsobs_arena.process import Answer, EntryProcess, solve
+from wfsobs_arena.reference import taps_error
+from wfsobs_arena.results import needs_of, tables, write_results
+from wfsobs_arena.run import run_arena
+from wfsobs_arena.tracks import TRACKS
+from wfsobs_arena.trials import try_record
 
-from wfsobs.arena import trials
-from wfsobs.arena.cases import SimulatedCase, mean_square
-from wfsobs.arena.challengers import CHALLENGERS
-from wfsobs.arena.definition import Arena, add_records, load_arena
-from wfsobs.arena.entries import ArenaEntry, admits, find_entries, load_object
-from wfsobs.arena.process import Answer, EntryProcess, solve
-from wfsobs.arena.reference import taps_error
-from wfsobs.arena.results import needs_of, tables, write_results
-from wfsobs.arena.run import run_arena
-from wfsobs.arena.tracks import TRACKS
-from wfsobs.arena.trials import try_record
 from wfsobs.prior import Prior
 from wfsobs.record import Record
 from wfsobs.settings.errors import SettingError
@@ -34,6 +34,7 @@ def arena() -> Arena:
     return Arena(quick.version, tuple(case for case in quick.cases if case.track == "turbulence"), quick.rules)
 
 
+@pytest.mark.slow
 def test_an_entry_runs_once_and_stands_on_the_page(arena: Arena, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     entries = find_entries(["persistence"])
     (first,) = run_arena(arena, entries, tmp_path)

@@ -8,14 +8,14 @@ import click
 import numpy as np
 from rich.table import Table
 
-from wfsobs.arena.definition import Arena, add_records, load_arena
-from wfsobs.arena.entries import find_entries
-from wfsobs.arena.results import need_jinja, tables, write_results
-from wfsobs.arena.run import run_arena
-from wfsobs.arena.tracks import TRACKS
 from wfsobs.cli.show import show_table
 from wfsobs.settings.errors import SettingError
 from wfsobs.telemetry.records import save_arrays
+from wfsobs_arena.definition import Arena, add_records, load_arena
+from wfsobs_arena.entries import find_entries
+from wfsobs_arena.results import need_jinja, tables, write_results
+from wfsobs_arena.run import run_arena
+from wfsobs_arena.tracks import TRACKS
 
 TRACK = click.option(
     "--track", "tracks", multiple=True, metavar="TRACK", help=f"Only this track, of {', '.join(TRACKS)}; repeat it."

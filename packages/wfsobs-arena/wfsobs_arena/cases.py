@@ -11,8 +11,6 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from wfsobs.arena.reference import TAPS, taps_error
-from wfsobs.arena.tracks import DISTURBANCE, RESIDUAL, TRACKS, Track
 from wfsobs.campaign.keys import PHYSICS_VERSION
 from wfsobs.closed_loop.design import design
 from wfsobs.evaluation.bound import least_errors
@@ -26,6 +24,8 @@ from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import simulate, training_settings
 from wfsobs.simulation.true_spectra import has_known_spectra, true_spectra
 from wfsobs.typing import Array
+from wfsobs_arena.reference import TAPS, taps_error
+from wfsobs_arena.tracks import DISTURBANCE, RESIDUAL, TRACKS, Track
 
 BOUND = "bound"
 """What an error is divided by where the spectra are known; else the error of a predictor of TAPS taps."""

@@ -8,15 +8,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from wfsobs.arena.cases import Case
-from wfsobs.arena.definition import Arena
-from wfsobs.arena.entries import FOLDER, ArenaEntry, admits
-from wfsobs.arena.process import EntryError, EntryProcess
-from wfsobs.arena.tracks import TRACKS
-from wfsobs.arena.trials import Trial, try_record
 from wfsobs.files import write_whole
 from wfsobs.record import Record
 from wfsobs.testing import QUICK
+from wfsobs_arena.cases import Case
+from wfsobs_arena.definition import Arena
+from wfsobs_arena.entries import FOLDER, ArenaEntry, admits
+from wfsobs_arena.process import EntryError, EntryProcess
+from wfsobs_arena.tracks import TRACKS
+from wfsobs_arena.trials import Trial, try_record
 
 CHECKS = 2
 """Version of the checks: what has passed those of another is checked again."""

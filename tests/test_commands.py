@@ -1,0 +1,43 @@
+"""Commands of installed packages: by entry points; the command line names what is not there."""
+
+from importlib.metadata import EntryPoint
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from wfsobs.cli import group
+
+
+@click.command()
+def hello() -> None:
+    """Greet."""
+    click.echo("hello")
+
+
+@pytest.fixture
+def points(monkeypatch: pytest.MonkeyPatch) -> list[EntryPoint]:
+    points: list[EntryPoint] = []
+    monkeypatch.setattr(group, "entry_points", lambda group: [point for point in points if point.group == group])
+    return points
+
+
+def test_a_package_brings_a_command(points: list[EntryPoint], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(EntryPoint, "load", lambda _self: hello)
+    points.append(EntryPoint("hello", "somewhere.cli:hello", group.ENTRY_POINTS))
+    assert CliRunner().invoke(group.main, ["hello"]).output == "hello\n"
+    assert "Of the package somewhere." in CliRunner().invoke(group.main, ["--help"]).output
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("hello", "Error: hello: no.such:hello cannot be imported: ModuleNotFoundError: No module named 'no'"),
+        ("arena", "Error: arena is a package of its own: pip install wfsobs-arena"),
+        ("nothing", "Error: No such command 'nothing'."),
+    ],
+)
+def test_what_is_not_there_is_named(points: list[EntryPoint], name: str, line: str) -> None:
+    points.append(EntryPoint("hello", "no.such:hello", group.ENTRY_POINTS))
+    result = CliRunner().invoke(group.main, [name])
+    assert result.exit_code == 2 and result.output.splitlines()[-1] == line
