@@ -86,7 +86,7 @@ def test_a_link_is_one_step_and_names_what_it_could_not_use(actions: Actions) ->
 
 def test_a_file_is_one_step(actions: Actions, loop: Any) -> None:
     before = actions.store.scenario
-    actions.handle({"action": "open", "name": "mine.toml", "text": 'preset = "ut4"\nloop.gain = 0.2'})
+    actions.open_file("mine.toml", 'preset = "ut4"\nloop.gain = 0.2')
     store = actions.store
     loop.until(lambda: actions.toolbar.message.startswith("Opened"))  # on a busy machine it waits in the line first
     assert store.scenario == PRESETS["ut4"]().replace({"loop.gain": 0.2}) and store.preset == "ut4"
@@ -98,12 +98,12 @@ def test_a_file_is_one_step(actions: Actions, loop: Any) -> None:
 @pytest.mark.parametrize("text", ["loop.gain = 9", "nonsense", "run.warm_up = 20", "#" * (LARGEST + 1), None, 3])
 def test_a_bad_file_changes_nothing_and_has_one_line(actions: Actions, loop: Any, text: Any) -> None:
     before = actions.store.scenario
-    actions.handle({"action": "open", "name": "mine.toml", "text": text})
+    actions.open_file("mine.toml", text)
     loop.until(lambda: actions.toolbar.notes != [])
     assert actions.store.scenario is before
     (note,) = actions.toolbar.notes
     assert note.startswith("mine.toml: ") and "\n" not in note
-    actions.handle({"action": "open", "name": "mine.toml", "text": "loop.gain = 0.2"})
+    actions.open_file("mine.toml", "loop.gain = 0.2")
     loop.until(lambda: actions.toolbar.notes == [])
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from wfsobs.app.controls.fields import SliderField, parse_number
 from wfsobs.app.controls.names import setting_name
-from wfsobs.app.controls.panel import FIRST, Controls
+from wfsobs.app.controls.panel import AT_HAND, Controls
 from wfsobs.app.controls.status import status_of
 from wfsobs.app.display import label_of, unit_text
 from wfsobs.app.work import RunResults
@@ -92,7 +92,9 @@ def test_labels_come_from_the_settings(controls: Controls) -> None:
 
 
 def test_what_matters_most_stands_first(controls: Controls) -> None:
-    assert FIRST == ("turbulence.wind_speed", "sensors.exposure_ratio")
+    first = ("turbulence.wind_speed", "sensors.exposure_ratio")
+    assert AT_HAND == (*first, *(f"gpr_online.{name}" for name in ("length_scale", "signal_std", "training_size")), PATH)
+    assert set(AT_HAND) <= controls.fields.keys() | controls.lists.keys(), "made with the drawer"
     assert list(controls.topics)[:3] == ["vibration", "gpr_offline", "gpr_online"]
 
 
@@ -111,6 +113,36 @@ def test_a_slider_that_is_let_go_runs(controls: Controls, loop: Any) -> None:
     loop.finish(controls.store)
     assert controls.store.run.result is not before
     assert controls.store.run.result.scenario.turbulence.wind_speed == 22.0
+
+
+def test_a_slider_over_decades_is_logarithmic(controls: Controls) -> None:
+    open_all(controls)
+    wide = {
+        path: softbounds
+        for path, field in controls.fields.items()
+        if isinstance(field, SliderField)
+        and (softbounds := field.parameter.softbounds)[0] > 0
+        and softbounds[1] / softbounds[0] >= 1e3
+    }
+    assert {"gpr_online.length_scale", "gpr_online.signal_std", "gpr_offline.length_scale"} <= wide.keys()
+    for path, (low, high) in wide.items():
+        slider = controls.fields[path].widgets[0]
+        assert slider.start == pytest.approx(np.log10(low)) and slider.end >= np.log10(high) and slider.step == 0.01
+    assert not controls.fields["turbulence.wind_speed"].is_log
+
+
+def test_a_logarithmic_slider_keeps_typed_values(controls: Controls) -> None:
+    store, (slider, box) = controls.store, field_of(controls, "gpr_online.length_scale").widgets
+    release(slider, 2.0)
+    assert store.scenario.gpr_online.length_scale == 100.0 and box.value == "100"
+    release(slider, np.log10(2.0))
+    assert store.scenario.gpr_online.length_scale == 2.0, "a value of three digits, not a power of ten"
+    box.value = "123.4567"
+    assert store.scenario.gpr_online.length_scale == 123.4567 and slider.value == np.log10(123.4567)
+    store.undo()
+    assert store.scenario.gpr_online.length_scale == 2.0 and slider.value == slider.value_throttled == np.log10(2.0)
+    controls.take({"setting": "gpr_online.length_scale", "value": 1.5})  # where it stood while the server was away
+    assert store.scenario.gpr_online.length_scale == 31.6
 
 
 def test_a_slider_under_way_does_not_run(controls: Controls) -> None:
@@ -230,6 +262,8 @@ def test_every_widget_follows_the_store(controls: Controls, loop: Any) -> None:
         value = controls.store.value(path)
         for widget in field.widgets:
             expected = field.to_text(value) if widget is field.widgets[-1] and hasattr(field, "to_text") else value
+            if widget is field.widgets[0] and getattr(field, "is_log", False):
+                expected = np.log10(value)
             assert widget.value == expected, path
     for field in controls.fields.values():
         if isinstance(field, SliderField):

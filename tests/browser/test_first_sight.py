@@ -8,8 +8,6 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 
-from wfsobs.scenario.presets import PRESETS
-
 
 @pytest.fixture(scope="module")
 def wide(open_shared: Any) -> Page:
@@ -123,14 +121,3 @@ def test_a_heading_says_what_differs(phone: Page) -> None:
     page.get_by_role("textbox", name="m/s").fill("20")
     page.get_by_role("textbox", name="m/s").press("Enter")
     expect(page.get_by_role("button", name=re.compile("Turbulence · 1 changed"))).to_be_visible()
-
-
-def test_a_preset_is_chosen_from_the_gallery(phone: Page) -> None:
-    page = phone
-    page.get_by_role("button", name="Gallery").click()
-    sheet = page.get_by_role("dialog", name="Gallery of presets")
-    expect(sheet.get_by_role("button")).to_have_count(len(PRESETS))
-    expect(sheet.locator("svg")).to_have_count(len(PRESETS))
-    sheet.get_by_role("button", name=re.compile("Strong turbulence")).click()
-    expect(sheet).to_be_hidden()
-    expect(page.get_by_role("combobox", name="Preset")).to_have_text("Strong turbulence")

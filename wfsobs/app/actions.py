@@ -1,4 +1,4 @@
-"""The row of actions: share the settings, save data and figures, make a report, open a scenario; undo and redo by keys."""
+"""The menus: load and open files, save data and figures, make a report, share the settings; undo and redo by keys."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ REPORT = "wfsobs-report.html"
 
 
 class Toolbar(Component):
-    """The row in the browser: texts down, messages {action, ...} up, files down as messages."""
+    """The menus in the browser: texts down, messages {action, ...} up, files down as messages."""
 
     query = param.String("", doc="What a link to the settings has after its ?.")
     view = param.String("", doc="What the address has beside the settings, of the view.")
@@ -46,7 +46,6 @@ class Toolbar(Component):
     notes = param.List([], doc="What was refused, a line each.")
     labels = param.Dict({}, doc="Name of a line in the figures -> what it is called, for the legends of figures that are saved.")
     saves = param.List([], doc="What the page can save beside the data, as it is called in the menu.")
-    largest = param.Integer(LARGEST, doc="The largest scenario file that is read [bytes].")
 
     _esm = asset("figures.js") + asset("actions.js")
     _stylesheets = [asset("actions.css")]
@@ -57,12 +56,13 @@ class Actions:
 
     def __init__(self, store: Store):
         self.store = store
-        self.toolbar = Toolbar(self.handle, labels=labels(), sizing_mode="stretch_width", margin=0)
+        self.toolbar = Toolbar(self.handle, labels=labels(), margin=0)
         self._tasks: dict[str, BackgroundTask] = {}
         self._under_way: dict[str, tuple[str, Callable[[Any], None]]] = {}
         self._pages: Pages | None = None
         self._view: ViewState | None = None
         self.open_history: Callable[[], None] = lambda: None
+        self.session: Callable[[], Save] | None = None
         store.param.watch(once(self._refresh, AFTERWARDS_MS), ["scenario", "preset", "source", "wanted_record"])
         store.param.watch(lambda _event: self.toolbar.param.update(notes=[]), "source")  # of files before the one that is used
         store.run.param.watch(lambda event: self.toolbar.param.update(ready=event.new is not None), "result")
@@ -104,7 +104,7 @@ class Actions:
             "undo": self.store.undo,
             "redo": self.store.redo,
             "history": self.open_history,
-            "open": lambda: self.open_file(str(msg.get("name", "")), msg.get("text")),
+            "session": lambda: self.session and self._save(self.session()),
             "unlinked": lambda: self._note("These settings are too long for a link: save the scenario and send the file."),
             "dismiss": lambda: self.toolbar.param.update(notes=[]),
             "read": lambda: self._take_back(msg.get("text")),

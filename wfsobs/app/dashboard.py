@@ -22,7 +22,7 @@ from wfsobs.app.help import Help
 from wfsobs.app.history import History
 from wfsobs.app.jobs import FAILED
 from wfsobs.app.pages.explore import Explore
-from wfsobs.app.pages.pages import LIVE, Pages
+from wfsobs.app.pages.pages import EXPLORE, LIVE, Pages
 from wfsobs.app.pages.parts import ON_ONE_LINE, WIDE
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import Post, Session
@@ -30,7 +30,7 @@ from wfsobs.app.store import Store
 from wfsobs.app.style import asset, labels, theme
 from wfsobs.app.upload import Upload
 from wfsobs.app.view_state import ViewState
-from wfsobs.app.views.history_sheet import HistorySheet
+from wfsobs.app.views.history_sheet import HistorySheet, session_save
 from wfsobs.app.views.switches import ModeSwitch, UnitSwitch
 from wfsobs.scenario import Scenario
 
@@ -73,17 +73,37 @@ class Readout(Component):
         super().__init__(labels=labels(), width=0, height=0, margin=0, **params)
 
 
-ACTIONS = """
-:host { display: flex !important; flex-wrap: wrap; gap: 24px 8px; padding-bottom: 4px; }
-:host > * { flex: 0 1 auto; width: auto !important; }
+HEADER = """
+:host { position: static !important; align-items: center; gap: 8px; min-width: 0; padding-left: 16px; }
+.run { flex: 1 1 240px; }
+.pages { flex: 0 1 auto; width: auto !important; min-width: 0; }
+@media (max-width: 1239.95px) {
+  .pages { position: absolute !important; left: 16px; right: 16px; bottom: 8px; }
+}
+@media (max-width: 600px) { :host { padding-left: 0; } }
 """
+"""Run and pages beside each other, or, where the window is narrow, one below the other over the whole width of the bar."""
+
+PAGES = """
+:host { gap: 8px; align-items: center; justify-content: space-between; }
+:host > :first-child { flex: 0 1 auto; width: auto !important; min-width: 0; overflow: auto hidden; scrollbar-width: none; }
+"""
+"""The pages scroll where there is no room for all of them."""
+
 BODY = ":host { gap: 10px; max-height: none !important; }"
 """As long as its contents: the toolkit's limit is the window, which all boxes inside take over, and longer ones overlap."""
 
 STALE = "These results are not those of the settings."
 
-NARROW = {"@media (max-width: 600px)": {"& .header a:has(.title)": {"display": "none !important"}}}
-"""On a phone the bar at the top has room for the run, not for the name."""
+BAR = {
+    "& .MuiToolbar-root": {"minHeight": "56px !important"},
+    "@media (max-width: 1239.95px)": {
+        "& .MuiToolbar-root": {"minHeight": "92px !important"},
+        "& .header .MuiToolbar-root": {"alignItems": "flex-start", "paddingTop": "6px", "boxSizing": "border-box"},
+    },
+    "@media (max-width: 600px)": {"& .header a:has(.title)": {"display": "none !important"}},
+}
+"""The bar at the top, and the rooms under it that are as high; on a phone it has room for the run, not for the name."""
 
 
 class Frame(Component):
@@ -125,6 +145,7 @@ class Dashboard:
         self.history = History(self.store, self.display)
         self.history_sheet = HistorySheet(self.history, lambda sheet: self.body.append(sheet))
         self.actions.open_history = self.history_sheet.toggle
+        self.actions.session = lambda: session_save(self.history)
         self.upload.open_session = self.history_sheet.open_file
         self.modes, self.units = ModeSwitch(self.store.run, self.display), UnitSwitch(self.display)
         self.seeds = SeedRuns(self.store)
@@ -150,8 +171,8 @@ class Dashboard:
         self.history.open_view = self.view_state.open
         self.view_state.param.watch(lambda event: self.history.follow_view(event.new), "query")
         self.body = pn.Column(
-            self._top(),
-            self._row_of_actions(),
+            self._switches(),
+            self.upload.picker,
             self.upload.room,
             self.alert,
             self.stale,
@@ -166,11 +187,11 @@ class Dashboard:
         )
         page = pmui.Page(
             title="wfsobs",
-            header=[self.controls.bar(), Help(styles={"margin-left": "auto"})],
+            header=[self._header()],
             sidebar=[self.drawer],
             sidebar_width=340,
             theme_config=theme(),
-            sx=NARROW,
+            sx=BAR,
             favicon=None,
             main=[
                 _title(),
@@ -222,20 +243,20 @@ class Dashboard:
             self.frame.preferred_theme = "dark" if event.new else "light"
             self.view_state.choose_theme(event.new)
 
-    def _top(self) -> pn.FlexBox:
-        """Lay out the buttons of the pages, and the switches that all pages share."""
-        return pn.FlexBox(
-            self.pages.switch,
-            *self.modes.view(),
-            *self.units.view(),
-            gap="12px",
-            align_items="center",
-            **WIDE,
-            stylesheets=[ON_ONE_LINE],
-        )
+    def _header(self) -> pn.Row:
+        """Lay out what stays in sight: the run, the pages and what can be done with them, the help."""
+        run = self.controls.bar()
+        pages = pn.Row(self.pages.switch, self.actions.toolbar, margin=0, css_classes=["pages"], stylesheets=[PAGES])
+        run.css_classes = ["run"]
+        return pn.Row(run, pages, Help(), sizing_mode="stretch_width", margin=0, stylesheets=[HEADER])
 
-    def _row_of_actions(self) -> pn.Row:
-        return pn.Row(self.actions.toolbar, self.upload.picker, **WIDE, stylesheets=[ACTIONS])
+    def _switches(self) -> pn.FlexBox:
+        """Lay out the switches that all pages share, and those of the first."""
+        first = self.explore.switches()
+        self.pages.param.watch(lambda event: setattr(first, "visible", event.new == EXPLORE), "current")
+        return pn.FlexBox(
+            *self.modes.view(), *self.units.view(), first, gap="8px", align_items="center", **WIDE, stylesheets=[ON_ONE_LINE]
+        )
 
     def _refresh(self, *_: object) -> None:
         run = self.store.run

@@ -28,8 +28,8 @@ class Picker(Component):
     largest = param.Integer(LARGEST, doc="The largest file that is sent [bytes].")
     part = param.Integer(PART, doc="How much is sent at a time [bytes].")
 
-    _esm = asset("parts.js") + asset("upload.js")
-    _stylesheets = [asset("actions.css")]
+    _esm = asset("dark.js") + asset("parts.js") + asset("upload.js")
+    _stylesheets = [asset("upload.css")]
 
 
 class PartialFile:

@@ -77,7 +77,7 @@ PRIMARY = "#0B4F6C"
 
 _COMPONENTS = {
     "MuiAppBar": {"styleOverrides": {"root": {"backgroundColor": f"{PRIMARY} !important", "color": "#fff !important"}}},
-    "MuiButton": {"styleOverrides": {"root": {"textTransform": "none"}}},
+    "MuiButton": {"styleOverrides": {"root": {"textTransform": "none", "letterSpacing": 0, "minWidth": "32px"}}},
     # The drawer over a narrow page is open when the page comes, until the browser has closed it (frame.js).
     "MuiDrawer": {"styleOverrides": {"modal": {"@media (max-width: 999.95px)": {"visibility": "var(--wfsobs-drawer, hidden)"}}}},
     # Why a setting has no effect is to be read, though its box is grey.
@@ -92,7 +92,13 @@ _COMPONENTS = {
     "MuiToggleButton": {
         "styleOverrides": {
             # On the grey that is under the pointer the words would be too faint.
-            "root": {"textTransform": "none", "whiteSpace": "nowrap", "&:hover:not(.Mui-selected)": {"color": "inherit"}}
+            "root": {
+                "textTransform": "none",
+                "letterSpacing": 0,
+                "whiteSpace": "nowrap",
+                "&:hover:not(.Mui-selected)": {"color": "inherit"},
+                "&.MuiToggleButton-sizeSmall": {"padding": "5px 6px"},
+            }
         }
     },
 }

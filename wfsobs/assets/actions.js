@@ -1,5 +1,5 @@
-// The row of actions: menus to share and to save, opening a scenario, and what there is to say about it. It also keeps the
-// address in step with the settings, and hears the keys for undo and redo.
+// The menus of files and of sharing, the button of the history, and what there is to say about them. It also keeps the address in
+// step with the settings, and hears the keys for undo and redo.
 
 const SAID_MS = 6_000 // for which something that was done is told
 
@@ -33,7 +33,6 @@ function menu(bar, label, items) {
         const item = tag("button", list, {type: "button", textContent: text, tabIndex: -1}, {role: "menuitem"})
         item.onclick = () => { list.hidePopover(); button.focus(); act() }
       }
-      list.style.background = ground(bar)
     }
   })
   list.addEventListener("toggle", (event) => {
@@ -59,15 +58,6 @@ function move(event, items, focused) {
   if (to === undefined) return
   event.preventDefault()
   items[to % items.length]?.focus()
-}
-
-// The colour behind an element: menus lie on top of everything, where nothing is inherited.
-function ground(element) {
-  for (let it = element; it; it = it.parentElement ?? it.getRootNode().host) {
-    const colour = getComputedStyle(it).backgroundColor
-    if (colour.startsWith("rgb(")) return colour  // the others let something through
-  }
-  return "Canvas"
 }
 
 // ------------------------------------------------------------------ figures
@@ -140,31 +130,14 @@ function textBox(el, say) {
   }
 }
 
-function opener(bar, model) {
-  const input = tag("input", bar, {type: "file", accept: ".toml", hidden: true}, {"aria-label": "Scenario file"})
-  input.onchange = async () => {
-    const file = input.files[0]
-    if (file) {
-      const text = file.size <= model.largest ? await file.text() : null
-      model.send_msg({action: "open", name: file.name, text})
-    }
+// Opens a file as if it had been dropped on the page.
+function opener(bar) {
+  const input = tag("input", bar, {type: "file", accept: ".toml,.wfsobs-session", hidden: true}, {"aria-label": "Scenario file"})
+  input.onchange = () => {
+    if (input.files[0]) document.dispatchEvent(new CustomEvent("wfsobs:file", {detail: input.files[0]}))
     input.value = ""
   }
-  tag("button", bar, {type: "button", textContent: "Open scenario"}).onclick = () => input.click()
-}
-
-function reporter(bar, model) {
-  const button = tag("button", bar, {type: "button", className: "report"})
-  const draw = () => {
-    button.textContent = model.reporting ? "Making the report …" : "Report"
-    button.setAttribute("aria-disabled", !model.ready || model.reporting)
-  }
-  button.onclick = () => {
-    if (model.ready && !model.reporting) model.send_msg({action: "report"})
-  }
-  model.on("reporting", draw)
-  model.on("ready", draw)
-  draw()
+  return () => input.click()
 }
 
 // What was refused; the function that takes it away.
@@ -218,28 +191,31 @@ export function render({model, view, el}) {
     return location.origin + location.pathname + (query ? `?${query}` : "")
   }
   const copyLink = () => model.has_link ? copy(here(), model.record ? `link, which is without ${model.record}` : "link") : model.send_msg({action: "unlinked"})
-  const ask = (message) => () => {
+  const ask = (message, what = "Preparing the file …") => () => {
     dismiss()
-    say("Preparing the file …")
+    say(what)
     model.send_msg(message)
   }
+  const open = opener(bar)
+  menu(bar, "File", () => [
+    ["Load data …", () => document.dispatchEvent(new Event("wfsobs:load"))],
+    ["Open scenario or session …", open],
+    ["Save scenario as TOML", ask({action: "toml"})],
+    ["Save session", ask({action: "session"})],
+    ...model.saves.map((name) => [`Save ${name}`, ask({action: "page", name})]),
+    ...(model.ready ? [["Save data as CSV", ask({action: "csv"})], ["Save data as NPZ", ask({action: "npz"})]] : []),
+    ...(model.ready && !model.reporting ? [["Save report", ask({action: "report"}, "Making the report …")]] : []),
+    ...figures().flatMap(([name, view]) =>
+      KINDS.map((kind) => [`Save ${name} as ${kind.toUpperCase()}`, () => saveFigure(name, view, kind, model.labels, say)])),
+  ])
   menu(bar, "Share", () => [
     ["Copy link", copyLink],
     ["Copy as command line", () => copy(model.command, "command line")],
     ["Copy as Python", () => copy(model.python, "Python")],
   ])
-  menu(bar, "Save", () => [
-    ["Scenario as TOML", ask({action: "toml"})],
-    ...model.saves.map((name) => [name, ask({action: "page", name})]),
-    ...(model.ready ? [["Data as CSV", ask({action: "csv"})], ["Data as NPZ", ask({action: "npz"})]] : []),
-    ...figures().flatMap(([name, view]) =>
-      KINDS.map((kind) => [`${name} as ${kind.toUpperCase()}`, () => saveFigure(name, view, kind, model.labels, say)])),
-  ])
-  reporter(bar, model)
-  opener(bar, model)
   tag("button", bar, {type: "button", textContent: "History", title: "Every result of this session, to compare, restore and save (H)"},
       {"aria-haspopup": "dialog"}).onclick = () => model.send_msg({action: "history"})
-  const say = speaker(tag("span", bar, {className: "said below"}, {role: "status"}), model)
+  const say = speaker(tag("span", bar, {className: "said"}, {role: "status"}), model)
   const copy = textBox(el, say)
   const dismiss = noteBox(el, model, say)
   keys(model)

@@ -1,4 +1,5 @@
-// A table of numbers edited in place: rows and columns come from Python, edits go back as messages.
+// A table of numbers edited in place: rows and columns come from Python, edits go back as messages. Its lines are text, but for the
+// one that is edited, to which a click or the arrow keys lead: one stop of the Tab key for each of its cells, not for all there are.
 
 const MOST = 6 // columns of a table
 
@@ -11,12 +12,14 @@ export function render({model, el}) {
   note.setAttribute("role", "alert")
   const known = new WeakMap() // cell -> its text as sent or received
   let shape = "" // which cells there are
+  let current = 0 // the line that is edited
   let next = "" // where the focus goes when the rows have changed
   const add = document.createElement("button")
   add.type = "button"
   add.className = "add"
   add.textContent = `+ Add ${model.noun}`
   add.onclick = () => {
+    current = model.rows.length
     next = `[data-cell^="${model.rows.length}."]`
     model.send_msg({action: "add"})
   }
@@ -56,7 +59,8 @@ export function render({model, el}) {
     remove.setAttribute("aria-label", remove.title)
     remove.dataset.remove = i
     remove.onclick = () => {
-      next = `[data-remove="${Math.min(i, model.rows.length - 2)}"]`
+      current = Math.max(0, Math.min(i, model.rows.length - 2))
+      next = `[data-remove="${current}"]`
       model.send_msg({action: "remove", row: i})
     }
     return remove
@@ -77,8 +81,14 @@ export function render({model, el}) {
     const body = table.createTBody()
     model.rows.forEach((row, i) => {
       const line = body.insertRow()
-      model.columns.forEach((column, j) => line.insertCell().append(cell(i, column, row[j])))
-      line.insertCell().append(remover(i))
+      const open = isOpen(i)
+      model.columns.forEach((column, j) => {
+        const at = line.insertCell()
+        if (open) at.append(cell(i, column, row[j]))
+        else Object.assign(at.dataset, {cell: `${i}.${column.key}`})
+      })
+      const last = line.insertCell()
+      if (open) last.append(remover(i))
     })
     return [table]
   }
@@ -99,9 +109,11 @@ export function render({model, el}) {
     return block
   })
 
+  const isOpen = (i) => i === current || Object.keys(model.errors).some((at) => at.startsWith(`${i}.`))
+
   const draw = () => {
     const before = shape
-    shape = JSON.stringify(model.rows.map((row) => row.map((text) => text === null)))
+    shape = JSON.stringify(model.rows.map((row, i) => [isOpen(i), ...row.map((text) => text === null)]))
     if (shape === before) mark()
     else redraw()
   }
@@ -118,32 +130,34 @@ export function render({model, el}) {
       scroll.querySelector(`[data-cell="${focused}"]`)?.focus()
     }
     next = ""
-    rove()
   }
 
-  // The lines of a table are one stop each for the arrows, and one together for the Tab key: that with the focus, or the first.
-  const lines = () => [...scroll.querySelectorAll("tbody tr")]
-  const rove = (line = lines().find((it) => it.contains(el.getRootNode().activeElement)) ?? lines()[0]) => {
-    for (const it of lines()) {
-      it.querySelectorAll("input, select, button").forEach((part) => { part.tabIndex = it === line ? 0 : -1 })
-    }
+  // Edit a line, from one of its cells on.
+  const edit = (row, at) => {
+    current = row
+    next = `[data-cell="${at}"]`
+    draw()
   }
-  scroll.addEventListener("focusin", (event) => {
-    if (event.target.closest("tr")) rove(event.target.closest("tr"))
+  scroll.addEventListener("click", (event) => {
+    const at = event.target.closest("td[data-cell]")?.dataset.cell
+    if (at) edit(Number(at.split(".")[0]), at)
   })
   scroll.addEventListener("keydown", (event) => {
-    const line = event.target.closest("tbody tr")
-    const to = {ArrowDown: line?.nextElementSibling, ArrowUp: line?.previousElementSibling}[event.key]
-    if (!to || event.target.tagName === "SELECT") return
+    const [row, ...key] = (event.target.closest("tbody tr")?.querySelector("[data-cell]").dataset.cell ?? "").split(".")
+    const to = Number(row) + ({ArrowDown: 1, ArrowUp: -1}[event.key] ?? NaN)
+    if (!key.length || !(to in model.rows) || event.target.tagName === "SELECT") return
     event.preventDefault()
-    to.cells[event.target.closest("td").cellIndex].firstElementChild.focus()
+    const column = model.columns[event.target.closest("td").cellIndex] ?? model.columns[0]
+    event.target.blur() // takes over what was typed
+    edit(to, `${to}.${column.key}`)
   })
 
   const mark = () => {
     const errors = model.errors
-    scroll.querySelectorAll("input, select").forEach((input) => {
+    scroll.querySelectorAll("[data-cell]").forEach((input) => {
       const [row, ...key] = input.dataset.cell.split(".")
       const column = model.columns.findIndex((it) => it.key === key.join("."))
+      if (input.tagName === "TD") return input.replaceChildren(model.rows[row]?.[column] ?? "")
       const error = errors[input.dataset.cell]
       put(input, error?.text ?? model.rows[row]?.[column] ?? known.get(input))
       input.setAttribute("aria-invalid", error ? "true" : "false")
@@ -152,6 +166,6 @@ export function render({model, el}) {
   }
 
   model.on("rows", draw)
-  model.on("errors", mark)
+  model.on("errors", draw)
   draw()
 }

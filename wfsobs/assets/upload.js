@@ -1,4 +1,4 @@
-// Loading a record: the button, the file sent in parts, and what there is to say about it.
+// Loading a record: the dialog, the file sent in parts, and what there is to say about it.
 
 // A file may be dropped anywhere; while one is over the page, a cover says so.
 function takeDrops(model, root) {
@@ -12,33 +12,38 @@ function takeDrops(model, root) {
     cover.hidden = false
   }
   const leave = (event) => { if (!event.relatedTarget) cover.hidden = true }
-  const drop = async (event) => {
+  const drop = (event) => {
     cover.hidden = true
     if (!isFile(event)) return
     event.preventDefault()
-    const file = event.dataTransfer.files[0]
-    if (!file) return
+    if (event.dataTransfer.files[0]) take(event.dataTransfer.files[0])
+  }
+  const take = async (file) => {
     if (/\.toml$/i.test(file.name) && file.size <= model.part) model.send_msg({action: "scenario", name: file.name, text: await file.text()})
     else send(model, file)
   }
-  const listeners = {dragover: over, dragenter: over, dragleave: leave, drop}
+  const listeners = {dragover: over, dragenter: over, dragleave: leave, drop, "wfsobs:file": (event) => take(event.detail)}
   for (const [name, act] of Object.entries(listeners)) document.addEventListener(name, act)
   model.on("remove", () => { for (const [name, act] of Object.entries(listeners)) document.removeEventListener(name, act) })
 }
 
-// What a file looks like: a template to fill in, and a sample.
-function examples(model, bar) {
-  const details = document.createElement("details")
-  details.append(Object.assign(document.createElement("summary"), {textContent: "File format"}))
-  const list = document.createElement("div")
-  list.append(Object.assign(document.createElement("p"), {textContent: "CSV, NPZ, FITS or AOT: a row per step, measurements, commands and the time or the rate. A file may be dropped anywhere on the page; columns with other names can be mapped after loading."}))
-  for (const [action, textContent] of [["template", "Template CSV"], ["sample", "Sample record"]]) {
+const FORMAT = "CSV, NPZ, FITS or AOT: a row per step, measurements, commands and the time or the rate; or a vibration spectrum. A file may also be dropped anywhere on the page; columns with other names can be mapped after loading."
+
+// What a file looks like, a template to fill in, a sample, and the button that chooses one.
+function dialog(model, el, choose) {
+  const sheet = Object.assign(document.createElement("dialog"), {className: "load"})
+  sheet.setAttribute("aria-label", "Load data")
+  sheet.append(Object.assign(document.createElement("p"), {textContent: FORMAT}))
+  const send = (action) => () => model.send_msg({action})
+  for (const [textContent, act] of [["Choose a file", choose], ["Template CSV", send("template")], ["Sample record", send("sample")], ["Close", () => {}]]) {
     const button = Object.assign(document.createElement("button"), {type: "button", textContent})
-    button.onclick = () => model.send_msg({action})
-    list.append(button)
+    button.onclick = () => { sheet.close(); act() }
+    sheet.append(button)
   }
-  details.append(list)
-  bar.append(details)
+  el.append(sheet)
+  const open = () => { paint(sheet); sheet.showModal() }
+  document.addEventListener("wfsobs:load", open)
+  model.on("remove", () => document.removeEventListener("wfsobs:load", open))
 }
 
 export function render({model, el}) {
@@ -50,18 +55,14 @@ export function render({model, el}) {
     if (input.files[0]) send(model, input.files[0])
     input.value = ""
   }
-  const open = Object.assign(document.createElement("button"), {type: "button", textContent: "Load data"})
-  open.title = "A record of telemetry in place of the simulation, or a vibration spectrum: .npz, .csv, .fits"
-  open.onclick = () => input.click()
   const back = Object.assign(document.createElement("button"), {type: "button"})
   back.onclick = () => model.send_msg({action: "simulate"})
   const loaded = document.createElement("span")
   const said = Object.assign(document.createElement("span"), {className: "said"})
   said.setAttribute("role", "status")
-  bar.append(input, open)
-  examples(model, bar)
-  bar.append(loaded, back, said)
+  bar.append(input, loaded, back, said)
   el.append(bar)
+  dialog(model, el, () => input.click())
   takeDrops(model, el)
   model.on("msg:custom", (event) => {
     const {name, kind, content} = event.data ?? event
@@ -72,6 +73,7 @@ export function render({model, el}) {
     back.hidden = !model.source_title
     back.textContent = model.back
     said.textContent = model.message
+    el.getRootNode().host.style.position = model.source_title || model.message ? "" : "absolute"
   }
   model.on("source_title", draw)
   model.on("back", draw)

@@ -13,12 +13,16 @@ from typing import Any
 import panel as pn
 import panel_material_ui as pmui
 import param
+from bokeh.models import CustomJSTickFormatter
 
 from wfsobs.app.controls.field import ROOM, TAG, Field
 from wfsobs.app.store import Store
 from wfsobs.settings.parameters import Reals
 
 NUMBER_WIDTH = 92
+
+DECADES = 2
+"""A slider whose range spans as many, all of it positive, is logarithmic."""
 
 ROOM_OF_NUMBER = 7
 """Characters for which a small box has room."""
@@ -135,45 +139,61 @@ class NumbersField(TextField):
 
 
 class SliderField(TextField):
-    """A number with a usual range: a slider over that range, and the number itself to type."""
+    """A number with a usual range: a slider over that range, and the number itself to type.
+
+    A logarithmic slider stands at the logarithm of the value to base 10, and goes to values of three digits.
+    """
 
     has_help = False
     _value: Any = None
-    """What the slider stands at, as far as it has said or was told."""
+    """What the slider stands for, as far as it has said or was told."""
 
     def _widgets(self) -> list[Any]:
         p: Any = self.parameter
         whole = isinstance(p, param.Integer)
         low, high = p.softbounds
+        self.is_log = p.bounds[0] > 0 and low > 0 and high >= low * 10.0**DECADES
+        low, high = self._place(low), self._place(high)
         names = self._names()
-        kind = pmui.IntSlider if whole else pmui.FloatSlider
-        slider = kind(
-            start=low,
-            end=high,
-            value=low,
-            step=p.step or (1 if whole else _step(low, high)),
-            show_value=False,
-            size="small",
-            **names,
-            **ROOM,
-        )
+        kind = pmui.IntSlider if whole and not self.is_log else pmui.FloatSlider
+        options: dict[str, Any] = {"step": p.step or (1 if whole else _step(low, high))}
+        if self.is_log:
+            options = {"step": 0.01, "format": CustomJSTickFormatter(code="return Number((10 ** tick).toPrecision(3))")}
+        slider = kind(start=low, end=high, value=low, show_value=False, size="small", **options, **names, **ROOM)
         slider.param.watch(self._on_release, "value_throttled")
         text = self._text(
             label=names["label"], tags=[TAG + self.path], width=NUMBER_WIDTH, margin=(4, 0, 4, 8), align="end", sx=UNNAMED
         )
         return [slider, text]
 
+    def _place(self, value: float) -> float:
+        """Return where the slider stands for a value."""
+        return math.log10(value) if self.is_log else value
+
+    def _value_at(self, place: float) -> Any:
+        """Return the value for which the slider stands at a place."""
+        if not self.is_log:
+            return place
+        value = float(f"{10.0**place:.3g}")
+        return round(value) if isinstance(self.parameter, param.Integer) else value
+
     def to_text(self, value: Any) -> str:
         """Write the value as text that the box beside the slider has room for."""
         return short_number(value)
+
+    def enter(self, value: Any) -> None:
+        """Type a text, or the number for which the slider stands."""
+        super().enter(value if isinstance(value, str) else self._value_at(float(value)))
 
     def _row(self) -> Any:
         return pn.Row(*self.widgets, sizing_mode="stretch_width", margin=0)
 
     def _on_release(self, event: param.parameterized.Event) -> None:
-        self._value = event.new
-        if event.new is not None and event.new != self.store.value(self.path):
-            self.store.change(self.path, event.new)
+        if event.new is None or (self._value is not None and event.new == self._place(self._value)):
+            return  # put there by `show`
+        self._value = self._value_at(event.new)
+        if self._value != self.store.value(self.path):
+            self.store.change(self.path, self._value)
 
     def show(self, value: Any) -> None:
         """Put a value into the text and the slider, whose range grows to hold it.
@@ -185,9 +205,9 @@ class SliderField(TextField):
             return
         self._value = value
         slider = self.widgets[0]
-        low, high = self.parameter.softbounds
+        low, high, place = (self._place(at) for at in (*self.parameter.softbounds, value))
         with param.edit_constant(slider):  # value_throttled too: releasing at its old value must count as news
-            slider.param.update(start=min(low, value), end=max(high, value), value=value, value_throttled=value)
+            slider.param.update(start=min(low, place), end=max(high, place), value=place, value_throttled=place)
 
 
 def make_field(store: Store, path: str, p: param.Parameter) -> Field:

@@ -9,6 +9,7 @@ from functools import cache
 import param
 
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.presets import PRESETS
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.settings.group import Group, holds_groups
 
@@ -98,3 +99,8 @@ def preset_title(preset: str) -> str:
     """
     words = [word.upper() if word in ACRONYMS else word for word in preset.split("-")]
     return " ".join([words[0] if words[0].isupper() else words[0].capitalize(), *words[1:]])
+
+
+def preset_line(name: str) -> str:
+    """Say in a line what a preset is: the first of its documentation."""
+    return str(PRESETS[name].__doc__).strip().partition("\n")[0]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from html import escape
+from types import MappingProxyType
 from typing import Any
 
 import panel as pn
@@ -13,8 +15,7 @@ import param
 
 from wfsobs.app.controls.field import ROOM, TAG, Field, idle_html
 from wfsobs.app.controls.fields import make_field
-from wfsobs.app.controls.gallery import Gallery, preset_line
-from wfsobs.app.controls.names import preset_title, setting_name
+from wfsobs.app.controls.names import preset_line, preset_title, setting_name
 from wfsobs.app.controls.rows import RowEditor
 from wfsobs.app.controls.search import Search
 from wfsobs.app.controls.status import BAR, ON_BAR, STATUS_ON_BAR, Status, status_of
@@ -27,8 +28,16 @@ from wfsobs.scenario.idle import idle_settings
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.group import Group
 
-FIRST = ("turbulence.wind_speed", "sensors.exposure_ratio")
-"""Settings that stand above the topics."""
+FIRST: Mapping[str, Sequence[str]] = MappingProxyType(
+    {
+        "": ("turbulence.wind_speed", "sensors.exposure_ratio"),
+        "Online GPR": ("gpr_online.length_scale", "gpr_online.signal_std", "gpr_online.training_size"),
+        "Vibration": ("vibration.peaks",),
+    }
+)
+"""Settings that stand above the topics, under a heading."""
+
+AT_HAND = tuple(path for paths in FIRST.values() for path in paths)
 
 TOPICS = ("vibration", "gpr_offline", "gpr_online")
 """Topics that come first; the others follow as declared."""
@@ -74,9 +83,8 @@ class Controls:
         self.run = pmui.Button(
             label="Run", icon="play_arrow", size="small", margin=0, sx=ON_BAR | {"backgroundColor": "#fff", "color": PRIMARY}
         )
-        self.cancel = pmui.Button(label="Cancel", icon="stop", variant="outlined", size="small", margin=(0, 10, 0, 8), sx=ON_BAR)
-        self.status = Status(sizing_mode="stretch_width", max_width=220, margin=0, stylesheets=[STATUS_ON_BAR])
-        self.gallery = Gallery(store.choose, width=78, margin=(4, 6, 4, 0))
+        self.cancel = pmui.Button(label="Cancel", icon="stop", variant="outlined", size="small", margin=(0, 10, 0, 6), sx=ON_BAR)
+        self.status = Status(sizing_mode="stretch_width", max_width=200, margin=0, stylesheets=[STATUS_ON_BAR])
         self.search = Search(self.open_setting, self._idle, sizing_mode="stretch_width", margin=(8, 0, 4, 0))
         self.topics = _names()
         self.rooms = {name: pn.Column(sizing_mode="stretch_width", margin=0) for name in self.topics}
@@ -97,12 +105,15 @@ class Controls:
 
     def view(self) -> pn.Column:
         """Make the contents of the drawer."""
-        first = [self._field(path) for path in FIRST]
-        self.accordion.active = self.accordion.active or [0]
+        first: list[Any] = []
+        for title, paths in FIRST.items():
+            first += [pn.pane.HTML(f"<b>{title}</b>", margin=(8, 0, 0, 0))] if title else []
+            first += [self._part(path).view for path in paths]
+        self._refresh_parts()
         return pn.Column(
             self.preset,
-            pn.Row(self.gallery, self.undo, self.redo, self.reset, sizing_mode="stretch_width", margin=0),
-            *(f.view for f in first),
+            pn.Row(self.undo, self.redo, self.reset, sizing_mode="stretch_width", margin=0),
+            *first,
             self.search,
             self.accordion,
             sizing_mode="stretch_width",
@@ -111,12 +122,12 @@ class Controls:
 
     def bar(self) -> pn.Row:
         """Return what stays in sight: the buttons of the run, and how it is going."""
-        return pn.Row(self.run, self.cancel, self.status, sizing_mode="stretch_width", margin=(0, 8, 0, 12), stylesheets=[BAR])
+        return pn.Row(self.run, self.cancel, self.status, sizing_mode="stretch_width", margin=0, stylesheets=[BAR])
 
     def open_setting(self, path: str) -> None:
         """Open the topic of a setting."""
         index = list(self.topics).index(path.split(".")[0])
-        if path not in FIRST and index not in self.accordion.active:
+        if path not in AT_HAND and index not in self.accordion.active:
             self.accordion.active = [*self.accordion.active, index]
 
     def open_topic(self, name: str) -> None:
@@ -124,9 +135,8 @@ class Controls:
         column = self.rooms[name]
         if len(column):
             return
-        own = {path: RowEditor(self.store, path, p) for path, p in self.store.scenario.lists() if path.split(".")[0] == name}
-        self.lists |= own
-        views = [*((path, editor.view) for path, editor in own.items()), *self._fields_of(name)]
+        own = [path for path, _ in self.store.scenario.lists() if topic_of(path) == name and path not in AT_HAND]
+        views = [*((path, self._part(path).view) for path in own), *self._fields_of(name)]
         self.parts += views
         self._refresh_parts()
         column[:] = [view for _, view in views]
@@ -140,12 +150,13 @@ class Controls:
         with contextlib.suppress(ValueError, TypeError, KeyError, IndexError):
             if path == PRESET:
                 self.preset.value = value
-            elif isinstance(path, str) and path.split(".")[0] in self.rooms:
-                self.open_topic(path.split(".")[0])
-                if path in FIRST or path in self.fields:
-                    self._field(path).enter(value)
-                elif path in self.lists and isinstance(message, dict):
-                    self.lists[path].handle(message)
+            elif isinstance(path, str) and topic_of(path) in self.rooms:
+                self.open_topic(topic_of(path))
+                part = self._part(path)
+                if isinstance(part, Field):
+                    part.enter(value)
+                elif isinstance(message, dict):
+                    part.handle(message)
 
     def _idle(self) -> dict[str, str]:
         return idle_settings(self.store.scenario, is_simulated=self.store.source is None)
@@ -171,7 +182,7 @@ class Controls:
         views: list[tuple[str, Any]] = []
         heading = name
         for setting, _, _ in group.walk(f"{name}."):
-            if setting in FIRST or any(setting.startswith(f"{listed}.") for listed in self.lists):
+            if setting in AT_HAND or any(setting.startswith(f"{listed}.") for listed, _ in self.store.scenario.lists()):
                 continue
             *_, above, _name = setting.split(".")
             if above != heading:
@@ -179,14 +190,20 @@ class Controls:
                 pane = pn.pane.HTML(margin=(8, 0, 0, 0))
                 self.headings[f"{name}.{above}"] = escape(str(group.settings()[above].label)), pane
                 views.append((f"{name}.{above}", pane))
-            views.append((setting, self._field(setting).view))
+            views.append((setting, self._part(setting).view))
         return views
 
-    def _field(self, path: str) -> Field:
-        if path not in self.fields:
-            p = next(p for where, _, p in self.store.scenario.walk() if where == path)
-            self.fields[path] = make_field(self.store, path, p)
-        return self.fields[path]
+    def _part(self, path: str) -> Field | RowEditor:
+        """Return the field of a setting or the table of a list, made when first wanted. Raises KeyError where there is none."""
+        known = self.fields.get(path) or self.lists.get(path)
+        if known is None:
+            lists = dict(self.store.scenario.lists())
+            if path in lists:
+                known = self.lists[path] = RowEditor(self.store, path, lists[path])
+            else:
+                settings = {where: p for where, _, p in self.store.scenario.walk()}
+                known = self.fields[path] = make_field(self.store, path, settings[path])
+        return known
 
     def _watch(self) -> None:
         self.preset.param.watch(self._on_choice, "value")

@@ -15,12 +15,12 @@ from wfsobs.app.history import History
 from wfsobs.app.pages.parts import (
     BELOW_FIGURES,
     EDITED,
+    HALVES,
     ON_ONE_LINE,
     SMALL_LABEL,
     TALL,
     WIDE,
     box,
-    grid_style,
     group,
     zoom_buttons,
 )
@@ -42,7 +42,6 @@ from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.theory import Theory
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION
 
-GRID = grid_style("minmax(0, 3fr) minmax(0, 2fr)")
 ABOUT: Mapping[str, str] = MappingProxyType(
     {
         TURBULENCE: "Atmospheric tip/tilt, estimated from the guide stars",
@@ -82,31 +81,31 @@ class Explore:
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""
-        body = pn.Column(
+        return pn.Column(
             *(self._section(target) for target in TARGETS),
             box("RMS errors", self._above_table(), self.table.pane),
             *([box("Error budget", *self.budget.view())] if self.budget else []),
             **WIDE,
             stylesheets=[GAP],
         )
-        return pn.Column(self._switches(), body, **WIDE, stylesheets=[GAP])
 
     def show(self, visible: bool) -> None:
         """Draw what has come meanwhile, and go on while visible."""
         for figures in (self.traces, self.spectra):
             figures.show(visible)
 
-    def _switches(self) -> pn.FlexBox:
+    def switches(self) -> pn.FlexBox:
+        """Return the switches of this page alone."""
         return pn.FlexBox(
             self.show_switch,
             group(self.display, "spectrum", {"PSD": PSD, "Cumulative rms": CUMULATIVE}),
             pn.Row(*zoom_buttons(self.traces.zoom, ZOOMS), margin=0),
-            self._tick("window_spectra"),
             *([self._tick("editing")] if self.seeds else []),
             *self.pinning.view(),
-            gap="12px",
+            gap="8px",
             align_items="center",
-            **WIDE,
+            margin=0,
+            width_policy="min",
             stylesheets=[ON_ONE_LINE],
         )
 
@@ -146,8 +145,10 @@ class Explore:
                 (_caption("Spectrum", marks), self.spectra.pane(target)),
             )
         )
-        figures = pn.Column(traces, self.rooms[target], **WIDE, stylesheets=[GRID])
-        parts = self.verdicts[target].pane, cards, figures, self.stretches[target].pane
+        figures = pn.Column(traces, self.rooms[target], **WIDE, stylesheets=[HALVES])
+        window = [self._tick("window_spectra")] if target == TARGETS[0] else []
+        below = pn.FlexBox(self.stretches[target].pane, *window, justify_content="space-between", align_items="center", **WIDE)
+        parts = self.verdicts[target].pane, cards, figures, below
         for part in parts[:2]:
             part.stylesheets = [*part.stylesheets, BELOW_FIGURES]
         return box(target.capitalize(), *parts, about=ABOUT[target])

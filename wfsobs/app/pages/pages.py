@@ -23,7 +23,7 @@ from wfsobs.app.pages.sweep import SweepPage
 from wfsobs.app.pages.sweep_views import report_part
 from wfsobs.app.pages.tune import TunePage
 from wfsobs.app.store import Store
-from wfsobs.app.style import HEARD
+from wfsobs.app.style import HEARD, PRIMARY
 from wfsobs.result import Result
 
 EXPLORE, IDENTIFY, TUNE, SWEEP, LOOP, LIVE = "explore", "identify", "tune", "sweep", "loop", "live"
@@ -42,8 +42,20 @@ TITLES: Mapping[str, str] = MappingProxyType(
     }
 )
 
-WRAPPED = {"flexWrap": "wrap", "& .MuiToggleButton-root": {"width": "auto"}}
-"""As many lines of buttons as a narrow window takes."""
+TABS = {
+    "& .MuiToggleButton-root": {
+        "width": "auto",
+        "padding": "5px 8px",
+        "fontSize": "13px",
+        "border": 0,
+        "borderRadius": "4px !important",
+        "color": "#fff",
+        "&:hover:not(.Mui-selected)": {"backgroundColor": "#ffffff30", "color": "#fff"},
+        "&.Mui-selected, &.Mui-selected:hover": {"backgroundColor": "#fff !important", "color": f"{PRIMARY} !important"},
+        "&.Mui-focusVisible": {"outline": "2px solid #fff", "outlineOffset": "-2px"},
+    }
+}
+"""Pages on the dark bar at the top."""
 
 
 class Page(Protocol):
@@ -84,7 +96,7 @@ class Pages(param.Parameterized):
             **{name: pn.Column(visible=False, sizing_mode="stretch_width", margin=0) for name in self._makers},
         }
         self.switch = pmui.RadioButtonGroup.from_param(
-            self.param.current, options=known, size="small", margin=0, color="primary", sx=WRAPPED, stylesheets=[HEARD]
+            self.param.current, options=known, size="small", margin=0, sx=TABS, stylesheets=[HEARD]
         )
         self.view = pn.Column(*self.rooms.values(), sizing_mode="stretch_width", margin=0)
         self.param.watch(self._turn, "current")

@@ -181,12 +181,12 @@ WIDE: Mapping[str, Any] = MappingProxyType({"sizing_mode": "stretch_width", "mar
 
 
 ON_ONE_LINE = """
-@media (max-height: 560px) {
+@media (max-height: 560px), (max-width: 600px) {
   [id^="flexbox"] { flex-wrap: nowrap !important; overflow: auto hidden; }
   [id^="flex-item"] > * { flex: none !important; }
 }
 """
-"""Style of a row of switches that does not wrap where there is no height for it: a window of 1080 pixels at a zoom of 200 %."""
+"""Style of a row of switches that does not wrap where there is no height for it: on a phone, or at a zoom of 200 %."""
 
 BELOW_FIGURES = "@media (max-height: 560px) { :host { order: 1; } }"
 """Style of what stands above the figures of its box where there is height for both."""

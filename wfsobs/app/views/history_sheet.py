@@ -11,7 +11,7 @@ from wfsobs.app.compared import LETTERS
 from wfsobs.app.component import Component
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.downloads import TooLarge
+from wfsobs.app.downloads import Save, TooLarge
 from wfsobs.app.history import History
 from wfsobs.app.jobs import DONE, FAILED, RUNNING, BackgroundTask, Job
 from wfsobs.app.picker import LARGEST, PART, PartialFile, too_large
@@ -91,15 +91,8 @@ class HistorySheet:
 
     def save(self) -> None:
         """Make the session's file beside the page, and send it."""
-        content = self.history.content()
-
-        def write(*_: object) -> bytes:
-            file = write_session(content)
-            if len(file) > LARGEST:
-                raise TooLarge(f"The session has {len(file) / 1e6:.0f} MB, more than can be opened: delete results of records")
-            return file
-
-        self.saving.start(Job("save", write, refusal=TooLarge))
+        save = session_save(self.history)
+        self.saving.start(Job("save", lambda *_: save.content(), refusal=TooLarge))
 
     def _save(self, *_: object) -> None:
         task = self.saving
@@ -181,6 +174,19 @@ class HistorySheet:
         if entry.results is None and entry.key != self.history.current:
             return "Restoring runs it again"
         return ""
+
+
+def session_save(history: History) -> Save:
+    """Offer a session as a file."""
+    content = history.content()
+
+    def write() -> bytes:
+        file = write_session(content)
+        if len(file) > LARGEST:
+            raise TooLarge(f"The session has {len(file) / 1e6:.0f} MB, more than can be opened: delete results of records")
+        return file
+
+    return Save(FILE, "application/zip", write)
 
 
 def best_scores(entry: HistoryEntry, display: Display) -> str:
