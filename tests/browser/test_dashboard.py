@@ -235,7 +235,7 @@ def test_the_wind_speed_slider_runs_again(open_page: Any) -> None:
 
 def test_peaks_are_added_removed_and_edited(open_page: Any) -> None:
     page = open_page()
-    cells = page.locator('input[data-cell$=".frequency"]')
+    cells = page.locator('[data-cell$=".frequency"]')
     n = len(PRESETS["paper"]().vibration.peaks)
     expect(cells).to_have_count(n)
     truth = row(page, "kf-lgs", "vibration")[1]
@@ -257,6 +257,7 @@ def test_choosing_a_preset(open_page: Any) -> None:
     page = open_page()
     page.get_by_role("combobox", name="Preset").click()
     page.get_by_role("option", name="UT4", exact=True).click()
+    page.get_by_role("button", name="Vibration", exact=True).click()
     expect(page.get_by_role("combobox", name="Source").first).to_have_text("measured")
     expect(page.get_by_role("combobox", name="Preset")).to_have_text("UT4")
     expect(page.locator('tr[data-observer="kf-lgs"][data-target="vibration"] td').first).not_to_have_text("–")

@@ -72,7 +72,7 @@ def test_a_comma_gets_a_hint(wide: Page) -> None:
 
 def test_nothing_moves_under_the_pointer(wide: Page) -> None:
     page = wide
-    load, source = page.get_by_role("button", name="Load data"), page.get_by_role("combobox", name="Source").first
+    load, source = page.get_by_role("button", name="File", exact=True), page.get_by_role("combobox", name="Find a setting")
     run, box = page.get_by_role("button", name="Run", exact=True).first, page.get_by_role("textbox", name="m/s")
     page.wait_for_function("() => document.fonts.status === 'loaded'")
     before = [place(it) for it in (load, run, box, source)]

@@ -130,9 +130,9 @@ def test_a_sweep_over_one_setting_runs_after_back(open_page: Any, server: Any) -
     expect(page.get_by_text("2 scenarios × 1 seed = 2 runs")).to_be_visible()
     page.get_by_role("button", name="Run the sweep").click()
     expect(page.get_by_text("Finished · 2 of 2 runs")).to_be_visible()
-    page.get_by_role("button", name="Save").click()
+    page.get_by_role("button", name="File", exact=True).click()
     with page.expect_download() as saved:
-        page.get_by_text("Sweep as CSV").click()
+        page.get_by_text("Save Sweep as CSV").click()
     head, *rows = Path(saved.value.path()).read_text().splitlines()
     assert head.startswith("turbulence.wind_speed,target,mode,observer,seeds,mean_rms_nm")
     assert {row.split(",")[0] for row in rows} == {"5", "20"} and {row.split(",")[4] for row in rows} == {"1"}

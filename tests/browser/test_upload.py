@@ -49,12 +49,15 @@ def test_a_record_is_previewed_used_and_taken_back(page: Page, tmp_path: Path) -
 
 def test_template_and_sample(page: Page, tmp_path: Path) -> None:
     """The sample is a record that can be loaded at once."""
-    page.get_by_text("File format").click()
-    with page.expect_download() as waiting:
-        page.get_by_role("button", name="Template CSV").click()
-    assert waiting.value.suggested_filename == "wfsobs-template.csv"
-    with page.expect_download() as waiting:
-        page.get_by_role("button", name="Sample record").click()
+    dialog = page.get_by_role("dialog", name="Load data")
+    for button, name in (("Template CSV", "wfsobs-template.csv"), ("Sample record", "wfsobs-sample.csv")):
+        page.get_by_role("button", name="File", exact=True).click()
+        page.get_by_role("menuitem", name="Load data").click()
+        expect(dialog.get_by_text("a row per step")).to_be_visible()
+        with page.expect_download() as waiting:
+            dialog.get_by_role("button", name=button).click()
+        assert waiting.value.suggested_filename == name
+        expect(dialog).to_be_hidden()
     waiting.value.save_as(tmp_path / "sample.csv")
     page.get_by_label("Record file").set_input_files(tmp_path / "sample.csv")
     expect(page.get_by_text("5000 steps at 1000 Hz, 5 s, 0 missing")).to_be_visible()

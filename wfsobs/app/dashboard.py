@@ -86,7 +86,7 @@ HEADER = """
 
 PAGES = """
 :host { gap: 8px; align-items: center; justify-content: space-between; }
-:host > :first-child { flex: 0 1 auto; width: auto !important; min-width: 0; overflow: auto hidden; scrollbar-width: none; }
+.tabs { flex: 0 1 auto !important; width: auto !important; min-width: 0 !important; overflow: auto hidden; }
 """
 """The pages scroll where there is no room for all of them."""
 

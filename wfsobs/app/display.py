@@ -97,6 +97,7 @@ class Display(param.Parameterized):
     show = param.Selector(default=ERROR, objects=[SIGNAL, ERROR, RUNNING_RMS], label="Show")
     unit = param.Selector(default="nm", objects=list(UNITS), label="Unit")
     hidden_lines = param.Dict({}, doc="Target -> names of its hidden lines.")
+    named_lines = param.Dict({}, doc="Target -> names of the lines that matter: those that the verdict names.")
     dark = param.Boolean(False, doc="Dark mode.")
     spectrum = param.Selector(default=PSD, objects=[PSD, CUMULATIVE], label="Spectrum")
     window_spectra = param.Boolean(False, label="Spectra of the window", doc="Spectra of the stretch of time in view alone.")

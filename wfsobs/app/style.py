@@ -114,7 +114,7 @@ _TYPOGRAPHY = {"body1": {"fontSize": 14}, "body2": {"fontSize": 14}, "button": {
 
 def theme() -> dict[str, Any]:
     """Return the page's colours in light and dark mode; units are written as they are, not in capitals."""
-    common = {"components": _COMPONENTS, "breakpoints": _BREAKPOINTS, "typography": _TYPOGRAPHY}
+    common = {"components": _COMPONENTS, "breakpoints": _BREAKPOINTS, "typography": _TYPOGRAPHY, "chart_style": "classic"}
     return {
         "light": {"palette": {"primary": {"main": PRIMARY}}, **common},
         "dark": {"palette": {"primary": {"main": "#6FB7D6", "dark": "#8CC9E2"}}, **common},

@@ -44,10 +44,25 @@ export function render({model, el}) {
     } else if (mark.matches(":popover-open")) mark.hidePopover()
   }
 
+  // A line that recedes has its own colour while its card is pointed at or has the focus.
+  let pointed = []
+  const point = (name) => {
+    if (name === pointed.name) return
+    for (const [glyph, colour] of pointed) glyph.setv({line_color: colour}, {sync: false})
+    const all = [...Bokeh.index.query((it) => it.model.type === "Figure")].flatMap((it) => it.model.renderers)
+    const lines = name ? all.filter((it) => it.name === name && it.tags.length) : []
+    pointed = lines.map(({glyph}) => [glyph, glyph.line_color])
+    for (const {glyph, tags} of lines) glyph.setv({line_color: {value: tags[0]}}, {sync: false})
+    pointed.name = name
+  }
+  const nameAt = (path) => path.find((it) => it.classList?.contains("card"))?.dataset.name
+
   const stop = new AbortController()
   const on = (type, heard) => document.addEventListener(type, heard, {signal: stop.signal, capture: true, passive: true})
   let moved = null
+  on("keyup", (event) => point(nameAt(event.composedPath())))
   on("pointermove", (event) => {
+    point(nameAt(event.composedPath()))
     const view = event.buttons ? null : viewOf(event)
     const asked = moved !== null
     moved = {view, x: event.clientX, y: event.clientY}

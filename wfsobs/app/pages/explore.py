@@ -16,7 +16,6 @@ from wfsobs.app.pages.parts import (
     BELOW_FIGURES,
     EDITED,
     HALVES,
-    ON_ONE_LINE,
     SMALL_LABEL,
     TALL,
     WIDE,
@@ -50,6 +49,11 @@ ABOUT: Mapping[str, str] = MappingProxyType(
 )
 """Target -> what it is, for who comes first to the page."""
 GAP = ":host { gap: 10px; }"
+WRAPPED = ":host { flex-wrap: wrap; gap: 8px; align-items: center; }"
+SWITCHES = """
+:host { gap: 8px; align-items: center; width: max-content !important; }
+@media (min-width: 600.05px) and (min-height: 560.05px) { :host { flex-wrap: wrap; max-width: 100%; } }
+"""
 ZOOMS: Mapping[str, float | None] = MappingProxyType({"Whole record": None, "2 s": 2.0, "0.2 s": 0.2})
 MARKS = macro("marks", PEAKS, MODEL)
 
@@ -94,19 +98,16 @@ class Explore:
         for figures in (self.traces, self.spectra):
             figures.show(visible)
 
-    def switches(self) -> pn.FlexBox:
+    def switches(self) -> pn.Row:
         """Return the switches of this page alone."""
-        return pn.FlexBox(
+        return pn.Row(
             self.show_switch,
             group(self.display, "spectrum", {"PSD": PSD, "Cumulative rms": CUMULATIVE}),
             pn.Row(*zoom_buttons(self.traces.zoom, ZOOMS), margin=0),
             *([self._tick("editing")] if self.seeds else []),
             *self.pinning.view(),
-            gap="8px",
-            align_items="center",
             margin=0,
-            width_policy="min",
-            stylesheets=[ON_ONE_LINE],
+            stylesheets=[SWITCHES],
         )
 
     def _offer_errors(self, *_: object) -> None:
@@ -147,7 +148,8 @@ class Explore:
         )
         figures = pn.Column(traces, self.rooms[target], **WIDE, stylesheets=[HALVES])
         window = [self._tick("window_spectra")] if target == TARGETS[0] else []
-        below = pn.FlexBox(self.stretches[target].pane, *window, justify_content="space-between", align_items="center", **WIDE)
+        below = pn.Row(self.stretches[target].pane, *window, **WIDE, stylesheets=[WRAPPED])
+        self.stretches[target].pane.styles = {"flex": "1 1 240px"}
         parts = self.verdicts[target].pane, cards, figures, below
         for part in parts[:2]:
             part.stylesheets = [*part.stylesheets, BELOW_FIGURES]

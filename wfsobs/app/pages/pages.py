@@ -96,7 +96,7 @@ class Pages(param.Parameterized):
             **{name: pn.Column(visible=False, sizing_mode="stretch_width", margin=0) for name in self._makers},
         }
         self.switch = pmui.RadioButtonGroup.from_param(
-            self.param.current, options=known, size="small", margin=0, sx=TABS, stylesheets=[HEARD]
+            self.param.current, options=known, size="small", margin=0, css_classes=["tabs"], sx=TABS, stylesheets=[HEARD]
         )
         self.view = pn.Column(*self.rooms.values(), sizing_mode="stretch_width", margin=0)
         self.param.watch(self._turn, "current")

@@ -75,12 +75,12 @@ class MainLines:
         results = self.run.result
         if results is None:
             return
-        hidden = dict(self.display.hidden_lines)
+        hidden, named = dict(self.display.hidden_lines), {}
+        evidence = self.seeds.evidence if self.seeds else None
         for target in TARGETS:
+            leaders = evidence.leaders(target, self.display.mode) if evidence else ()
+            named[target] = main_observers(results.result.scores, target, self.display.mode, leaders)
             if target not in self._chosen_targets:
-                evidence = self.seeds.evidence if self.seeds else None
-                leaders = evidence.leaders(target, self.display.mode) if evidence else ()
-                main = main_observers(results.result.scores, target, self.display.mode, leaders)
-                hidden[target] = [name for name in observers_of(target) if name not in main]
-        if hidden != self.display.hidden_lines:
-            self.display.hidden_lines = hidden
+                hidden[target] = [name for name in observers_of(target) if name not in named[target]]
+        if (hidden, named) != (self.display.hidden_lines, self.display.named_lines):
+            self.display.param.update(hidden_lines=hidden, named_lines=named)

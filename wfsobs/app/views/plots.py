@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import panel as pn
 from bokeh.events import DoubleTap
-from bokeh.models import AllIndices, CDSView, ColumnDataSource, CustomJS, GlyphRenderer, Line, Range1d
+from bokeh.models import AllIndices, CDSView, ColumnDataSource, CustomJS, GlyphRenderer, HTMLLabelSet, Line, LogAxis, Range1d
 from bokeh.plotting import figure
 from numpy.typing import ArrayLike, NDArray
 
 from wfsobs.app.style import look, run_look
+from wfsobs.app.work import TRUTH
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.vibration import Peak
 from wfsobs.scenario.measured_spectra import measured_spectrum
@@ -116,6 +117,18 @@ HEIGHT = 230
 
 PEAKS, MODEL = "#888888", "#FF6600"
 """Colours of the marks: the scenario's peaks, and the one that the Kalman filters model."""
+
+GREY = {False: "#B4B4B4", True: "#666666"}
+"""Dark mode -> the colour of lines that recede."""
+
+MOST_COLOURED = 6
+"""Of more lines in a figure those recede that the verdict does not name, until their cards are pointed at."""
+
+APART = 0.13
+"""Between the names at the ends of two lines, of the height of the axis: two lines of text."""
+
+ROOM_FOR_NAMES = 78
+"""Beside a figure, for the names of its lines [px]."""
 
 MARKED_LINE = 0.004
 """Lines of a measured spectrum get a mark above this rms in either axis [um]."""
@@ -240,6 +253,72 @@ class ComparedLines(ExtraLines):
         )
 
 
+class EndLabels:
+    """The names of the lines beside their right ends, in their colours, moved apart."""
+
+    def __init__(self, fig: figure):
+        self.figure = fig
+        self.source = ColumnDataSource({name: [] for name in ("x", "y", "text", "colour", "dash")})
+        box: dict[str, Any] = {"border_line_color": "colour", "border_line_dash": "dash", "text_baseline": "middle"}
+        box |= {"text_font": "Roboto, Helvetica, Arial, sans-serif", "text_font_size": "12px"}
+        # In the page and not on the canvas, where what is beside the frame would be cut off.
+        self.labels = HTMLLabelSet(x="x", y="y", text="text", x_offset=5, source=self.source, **box)
+        fig.add_layout(self.labels)
+        fig.min_border_right = ROOM_FOR_NAMES
+
+    def draw(self, lines: Mapping[str, tuple[ArrayLike, ArrayLike]], dark: bool) -> None:
+        """Name lines (name -> x, y) where they leave the axis of x."""
+        fig: Any = self.figure
+        is_log, end = isinstance(fig.yaxis[0], LogAxis), float(fig.x_range.end)
+        scale: Callable[[Any], Any] = np.log10 if is_log else np.asarray
+        low, high = (float(scale(y)) for y in (fig.y_range.start, fig.y_range.end))
+        places: dict[str, float] = {}
+        for name, (x, y) in lines.items():
+            values = np.asarray(y)
+            seen = values[(np.asarray(x) <= end) & np.isfinite(values) & (not is_log or values > 0)][-LAST:]
+            if seen.size:
+                places[name] = (float(scale(np.median(seen))) - low) / (high - low)
+        names = sorted(places, key=places.__getitem__)
+        apart = spread([places[name] for name in names], APART)
+        at = [low + (high - low) * place for place in apart]
+        self.labels.update(text_color="#E8E8E8" if dark else "#202020")
+        send(
+            self.source,
+            {
+                "x": [end] * len(names),
+                "y": [float(10**y) for y in at] if is_log else at,
+                "text": [_in_two_lines(look(name).label) for name in names],
+                "colour": [look(name).colour(dark) for name in names],
+                "dash": [list(look(name).dash) for name in names],
+            },
+        )
+
+
+def _in_two_lines(text: str) -> str:
+    return text.replace(" ", "\n", 1) if len(text) > 10 else text
+
+
+LAST = 20
+"""Samples at the right end of a line whose median says where it ends."""
+
+
+def spread(places: Sequence[float], least: float) -> list[float]:
+    """Move places from 0 to 1, in order, as little apart as their distances need.
+
+    >>> [round(place, 3) for place in spread([0.0, 0.5, 0.52, 2.0], 0.1)]
+    [0.05, 0.5, 0.6, 0.95]
+    >>> [round(place, 3) for place in spread([0.9, 0.9, 0.9], 0.1)]
+    [0.75, 0.85, 0.95]
+    """
+    least = min(least, 1.0 / max(len(places), 1))
+    moved: list[float] = []
+    for place in places:
+        moved.append(max(place, moved[-1] + least if moved else 0.5 * least))
+    for i in reversed(range(len(moved))):
+        moved[i] = min(moved[i], moved[i + 1] - least if i + 1 < len(moved) else 1.0 - 0.5 * least)
+    return moved
+
+
 class LazyLine:
     """A line that is in its figure once it has been shown."""
 
@@ -252,13 +331,18 @@ class LazyLine:
         """Whether it is shown."""
         return self.renderer is not None and self.renderer.visible
 
-    def show(self, visible: bool, colour: str) -> None:
-        """Show it in a colour, or hide it."""
+    @property
+    def recedes(self) -> bool:
+        """Whether it is shown in grey."""
+        return self.renderer is not None and bool(self.renderer.tags)
+
+    def show(self, visible: bool, colour: str, own: str = "") -> None:
+        """Show it in a colour, or hide it. own : the colour that it has when it is pointed at, where that is another."""
         if self.renderer is None and visible:
             self.renderer = self._make()
         if self.renderer is not None:
             self.renderer.glyph.line_color = colour
-            self.renderer.visible = visible
+            self.renderer.update(visible=visible, tags=[own] if own else [], level="underlay" if own else "glyph")
 
 
 class FigureLines(Mapping[str, LazyLine]):
@@ -279,10 +363,16 @@ class FigureLines(Mapping[str, LazyLine]):
     def __len__(self) -> int:
         return len(self._lines)
 
-    def restyle(self, dark: bool, hidden_names: Sequence[str]) -> None:
-        """Show every line but those that are to be hidden, in the colours of light or dark mode."""
+    def restyle(self, dark: bool, hidden_names: Sequence[str], named: Sequence[str] = ()) -> None:
+        """Show every line but those that are to be hidden, in the colours of light or dark mode.
+
+        named : the ones that keep their colours where there are many
+        """
+        many = len(self) - len({*hidden_names} & {*self}) > MOST_COLOURED and len(named) > 0
         for name, line in self.items():
-            line.show(name not in hidden_names, look(name).colour(dark))
+            own = look(name).colour(dark)
+            recedes = many and name != TRUTH and name not in named
+            line.show(name not in hidden_names, GREY[dark] if recedes else own, own if recedes else "")
 
     def _maker(self, name: str, source: ColumnDataSource, y: str) -> Callable[[], GlyphRenderer]:
         def make() -> GlyphRenderer:

@@ -14,6 +14,7 @@ from wfsobs.app.views.plots import (
     MODEL,
     PEAKS,
     ComparedLines,
+    EndLabels,
     FigureLines,
     marked_peaks,
     new_figure,
@@ -75,6 +76,7 @@ class _Spectrum:
         }
         self.lines = FigureLines(self.figure, {name: (source, "y") for name, source in self.sources.items()})
         self.faint = ComparedLines(self.figure)
+        self.names_at_end = EndLabels(self.figure)
 
     def _add_marks(self) -> None:
         """Vertical lines at the scenario's peaks and at the one that the Kalman filters model."""
@@ -87,7 +89,7 @@ class _Spectrum:
     def draw(self, results: RunResults, spectra: Mapping[Key, SignalAndError], display: Display) -> None:
         """Send every line, its axis and the marks."""
         diameter, error = results.scenario.telescope.diameter, shows_error(results, self.target, display)
-        drawn: list[Array] = []
+        drawn: dict[str, tuple[Array, Array]] = {}
         for name, source in self.sources.items():
             spectrum = spectra.get((name, self.target)) if self.lines[name].visible else None
             if spectrum is None:  # what is hidden is sent when it is shown
@@ -95,8 +97,9 @@ class _Spectrum:
                 continue
             y = _curve(spectrum, error and name != TRUTH, display, diameter)
             send(source, {"x": spectrum.frequency[1:], "y": y})
-            drawn.append(y)
-        self._fit(drawn + self._draw_compared(display, error), display.cumulative)
+            drawn[name] = spectrum.frequency[1:], y
+        self._fit([*(y for _, y in drawn.values()), *self._draw_compared(display, error)], display.cumulative)
+        self.names_at_end.draw({name: line for name, line in drawn.items() if not self.lines[name].recedes}, display.dark)
         of = " of error" if error else ""
         what, unit = (
             (f"cumulative rms{of}", display.unit_label) if display.cumulative else (f"PSD{of}", f"{display.unit_label}²/Hz")

@@ -91,7 +91,7 @@ class TargetFigures:
         self.run, self.display, self._drawings = run, display, drawings
         self.visible, self._behind = True, False
         run.param.watch(self._redraw, "result")
-        display.param.watch(self._redraw, [*switches, "dark", "hidden_lines"])
+        display.param.watch(self._redraw, [*switches, "dark", "hidden_lines", "named_lines"])
 
     def pane(self, target: str) -> pn.pane.Bokeh:
         """Return the figure of one target."""
@@ -110,7 +110,8 @@ class TargetFigures:
         if results is not None and self.visible:
             with pn.io.hold():
                 for target, drawing in self._drawings.items():
-                    drawing.lines.restyle(self.display.dark, self.display.hidden_lines.get(target, []))
+                    hidden, named = (lines.get(target, []) for lines in (self.display.hidden_lines, self.display.named_lines))
+                    drawing.lines.restyle(self.display.dark, hidden, named)
                 self._draw(results)
 
     def _draw(self, results: RunResults) -> None:

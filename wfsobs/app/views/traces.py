@@ -16,6 +16,7 @@ from wfsobs.app.jobs import BackgroundTask
 from wfsobs.app.style import look, observers_of
 from wfsobs.app.views.plots import (
     ComparedLines,
+    EndLabels,
     FigureLines,
     band_envelope,
     envelope,
@@ -238,6 +239,7 @@ class _Trace:
         self.figure.add_layout(self.warm_up)
         self.lines = FigureLines(self.figure, {name: (self.source, name) for name in self.names})
         self.faint = ComparedLines(self.figure)
+        self.names_at_end = EndLabels(self.figure)
         self.events = EventMarks(self.figure)
         self.band = _Band(self.figure)
 
@@ -256,6 +258,7 @@ class _Trace:
         error = shows_error(results, self.target, display)
         extra = self._draw_compared(display, error, data["x"]) + self._draw_band(results, display, first, last, data["x"])
         self._fit(data, settled, extra, room(results))
+        self.names_at_end.draw({name: (data["x"], data[name]) for name, line in self.lines.items() if line.visible}, display.dark)
         self.events.draw(results, display.dark)
         what = f"{'running rms of ' if error and display.running else ''}{'error of ' if error else ''}{display.mode_label}"
         self.figure.yaxis.axis_label = f"{what} [{display.unit_label}]"
