@@ -363,15 +363,15 @@ class FigureLines(Mapping[str, LazyLine]):
     def __len__(self) -> int:
         return len(self._lines)
 
-    def restyle(self, dark: bool, hidden_names: Sequence[str], named: Sequence[str] = ()) -> None:
+    def restyle(self, dark: bool, hidden_names: Sequence[str], main_names: Sequence[str] = ()) -> None:
         """Show every line but those that are to be hidden, in the colours of light or dark mode.
 
-        named : the ones that keep their colours where there are many
+        main_names : the ones that keep their colours where there are many
         """
-        many = len(self) - len({*hidden_names} & {*self}) > MOST_COLOURED and len(named) > 0
+        many = len(self) - len({*hidden_names} & {*self}) > MOST_COLOURED and len(main_names) > 0
         for name, line in self.items():
             own = look(name).colour(dark)
-            recedes = many and name != TRUTH and name not in named
+            recedes = many and name != TRUTH and name not in main_names
             line.show(name not in hidden_names, GREY[dark] if recedes else own, own if recedes else "")
 
     def _maker(self, name: str, source: ColumnDataSource, y: str) -> Callable[[], GlyphRenderer]:
