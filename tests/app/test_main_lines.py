@@ -159,6 +159,7 @@ class TestFirstWindow:
         dashboard.store.change("run.duration", 4.0)
         loop.finish(dashboard.store)
         assert first_window(dashboard.store.run.result) == (1.25, 3.25)
+        assert dashboard.explore.stretches["vibration"].html() == "", "the cards say it of the whole record"
 
     def test_around_the_first_event(self, dashboard: Dashboard, loop: Any, short: Scenario) -> None:
         events = [{"kind": "wind", "start": 2.5, "wind_factor": 2.0}]

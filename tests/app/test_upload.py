@@ -17,7 +17,7 @@ from wfsobs.app.limits import Limits
 from wfsobs.app.picker import LARGEST
 from wfsobs.app.render import number
 from wfsobs.app.service import Service
-from wfsobs.app.upload_fields import SILENT
+from wfsobs.app.upload import SILENT
 from wfsobs.pipeline import observe
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper

@@ -7,28 +7,177 @@ is confirmed. Reading is done beside the page, in a thread.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from html import escape
 from typing import Any
 
+import numpy as np
 import panel as pn
 import panel_material_ui as pmui
+import param
+from bokeh.models import ColumnDataSource
 
-from wfsobs.app.column_form import ColumnForm
+from wfsobs.app.component import Component
 from wfsobs.app.controls.names import name_settings
-from wfsobs.app.jobs import CANCELLED, FAILED, RUNNING, BackgroundTask, Job
+from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING, BackgroundTask, Job
 from wfsobs.app.picker import PartialFile, Picker, too_large
-from wfsobs.app.sample_files import Examples
 from wfsobs.app.session_file import SUFFIX
 from wfsobs.app.sources import fit_to_record
 from wfsobs.app.store import RecordPlace, Store
-from wfsobs.app.upload_fields import UploadFields, differs_from_proposals
-from wfsobs.app.upload_preview import AnyPreview, PreviewView, read_stranger
+from wfsobs.app.style import asset
+from wfsobs.app.views.plots import new_figure, send
 from wfsobs.record import RecordError
+from wfsobs.scenario import Scenario
+from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.settings.errors import SettingError
+from wfsobs.settings.parameters import hint
+from wfsobs.telemetry.columns import ROLES
+from wfsobs.telemetry.examples import TEMPLATE, sample_csv
 from wfsobs.telemetry.intake import DeclaredFormat
-from wfsobs.telemetry.preview import ColumnsPreview, Preview, SpectrumPreview, safe_name
+from wfsobs.telemetry.preview import ColumnsPreview, Preview, SpectrumPreview, preview_any, safe_name
+from wfsobs.units import UNITS
 
 BACK, STAY = "Back to the simulation", "Stay with the simulation"
+
+TEMPLATE_NAME, SAMPLE_NAME = "wfsobs-template.csv", "wfsobs-sample.csv"
+SILENT = "from the file"
+
+
+class UploadFields:
+    """The fields. An empty one, or one at its first choice, leaves the question to the file."""
+
+    def __init__(self, on_change: Callable[[], None]):
+        """Make the fields. on_change : called after every change of one."""
+        self.unit = _select("Unit", [SILENT, *UNITS])
+        self.sign = _select("Commands", {SILENT: 0, "are added to the measurement (+1)": 1, "are subtracted (-1)": -1})
+        self.delay, self.rate = _text("Delay of commands [steps]", 240), _text("Rate [Hz]")
+        self.trust = pmui.Checkbox(label="Trust sign and delay as stated", value=False, size="small", margin=(4, 0))
+        self.widgets = (self.unit, self.sign, self.delay, self.rate, self.trust)
+        for widget in self.widgets:
+            widget.param.watch(lambda _event: on_change(), "value")
+
+    def read(self, roles: dict[str, str]) -> DeclaredFormat:
+        """Read the fields; roles : of columns that have been chosen. Raises RecordError where a field holds no number."""
+        unit = None if self.unit.value == SILENT else self.unit.value
+        delay, rate = _number(self.delay, int, 1), _number(self.rate, float, 1e-3)
+        return DeclaredFormat(unit, self.sign.value or None, delay, rate, roles, self.trust.value)
+
+    def take_proposals(self, preview: Preview) -> None:
+        """Fill in the sign and the delay that the data propose."""
+        if (found := preview.reading.response) is not None:
+            self.sign.value = found.sign or self.sign.value
+            self.delay.value = str(found.delay) if found.delay else self.delay.value
+
+
+def differs_from_proposals(preview: Preview) -> bool:
+    """Return whether the data propose another sign or delay than those with which the record was read."""
+    found = preview.reading.response
+    read = preview.reading.sign, preview.record.delay
+    return found is not None and any(
+        new is not None and new != old for new, old in zip((found.sign, found.delay), read, strict=True)
+    )
+
+
+def _number(field: Any, kind: type, least: float) -> Any:
+    """Return the number in a field, None for an empty one."""
+    text = str(field.value or "").strip()
+    if not text:
+        return None
+    try:
+        value = kind(text)
+    except ValueError:
+        value = -1
+    if not least <= value < 1e6:
+        raise RecordError(f"{field.label}: takes a number from {least:g}, not {text[:40]!r}{hint(text)}")
+    return value
+
+
+def _select(label: str, options: Any) -> pmui.Select:
+    first = options[0] if isinstance(options, list) else next(iter(options.values()))
+    return pmui.Select(label=label, options=options, value=first, size="small", width=190, margin=(4, 0))
+
+
+def _text(label: str, width: int = 190) -> pmui.TextInput:
+    return pmui.TextInput(label=label, value="", placeholder=SILENT, size="small", width=width, margin=(4, 0))
+
+
+AnyPreview = Preview | SpectrumPreview | ColumnsPreview
+COLOURS = ("#0B4F6C", "#FF6600")
+NOTHING = np.empty(0)
+
+
+class PreviewView:
+    """The text and the figure of a preview."""
+
+    def __init__(self) -> None:
+        self.text = pn.pane.HTML("", sizing_mode="stretch_width", margin=(4, 0))
+        self.figure = new_figure(x_axis_type="log", y_axis_type="log")
+        self.figure.name = "Spectrum of the record"
+        self.figure.xaxis.axis_label, self.figure.yaxis.axis_label = "frequency [Hz]", "PSD of z [µm²/Hz]"
+        self.sources = [ColumnDataSource({"x": [], "y": []}) for _ in TIP_TILT]
+        for source, colour, mode in zip(self.sources, COLOURS, TIP_TILT, strict=True):
+            self.figure.line("x", "y", source=source, color=colour, line_width=1.4, legend_label=mode.name)
+
+    def show(self, name: str, preview: Preview | SpectrumPreview | RecordError) -> None:
+        """Show what was read of the file of this name, or why it could not be."""
+        known = None if isinstance(preview, RecordError) else preview
+        self.figure.yaxis.axis_label = "PSD [µm²/Hz]" if isinstance(preview, SpectrumPreview) else "PSD of z [µm²/Hz]"
+        self.text.object = f"<p><b>{escape(name)}</b></p>{_list(known.lines() if known else [str(preview)])}"
+        if isinstance(preview, Preview):
+            self.text.object += f'<p>Evidence in the data:</p><div class="evidence">{_list(preview.reading.lines())}</div>'
+        self.figure.visible = known is not None
+        for mode, source in enumerate(self.sources):
+            there = known is not None and mode < known.spectrum.shape[1]
+            x, y = (known.frequency, known.spectrum[:, mode]) if known and there else (NOTHING, NOTHING)
+            send(source, {"x": x[x > 0], "y": y[x > 0]})
+
+
+def _list(lines: Sequence[str]) -> str:
+    return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>"
+
+
+def read_stranger(content: bytes, name: str, scenario: Scenario, declaration: DeclaredFormat) -> AnyPreview:
+    """Read a file that may be anything. Raises RecordError, one line."""
+    try:
+        return preview_any(content, name, scenario, declaration)
+    except RecordError:
+        raise
+    except Exception:  # whatever a stranger's file may do
+        raise RecordError(f"{name}: cannot be read") from None
+
+
+HINT = (
+    "Assign the columns. Likely matches are preselected. A record needs a measurement and a command of the same modes, and a "
+    "time or a rate."
+)
+
+
+class ColumnForm(Component):
+    """The form in the browser: columns and roles down, messages {column, role} up."""
+
+    columns = param.Dict({}, doc="Name of a column -> its values in a few words.")
+    roles = param.Dict({}, doc="Role -> name of the column that has it.")
+    labels = param.Dict(ROLES, doc="Role -> what it is called.")
+    hint = param.String(HINT, doc="What to do.")
+
+    _esm = asset("columns.js")
+    _stylesheets = [asset("columns.css")]
+
+    def __init__(self, on_change: Callable[[], None], **params: Any):
+        self.on_change = on_change
+        super().__init__(self._take, **params)
+
+    def show(self, columns: Mapping[str, str], roles: Mapping[str, str]) -> None:
+        """Show the columns of another file."""
+        self.param.update(columns=dict(columns), roles=dict(roles))
+
+    def _take(self, data: dict[str, Any]) -> None:
+        column, role = (str(data.get(key, "")) for key in ("column", "role"))
+        if column not in self.columns or (role and role not in self.labels):
+            return
+        roles = {r: name for r, name in self.roles.items() if name != column and r != role}
+        self.roles = {**roles, **({role: column} if role else {})}
+        self.on_change()
 
 
 class Upload:
@@ -48,7 +197,8 @@ class Upload:
         )
         self.take.on_click(lambda _event: self.take_proposals())
         self.place = RecordPlace(store)
-        self.examples = Examples(store, self.picker, self._say)
+        self._simulating = BackgroundTask(store.session)
+        self._simulating.param.watch(self._save_sample, ["state", "place"])
         self.open_scenario: Callable[[str, object], None] = lambda _name, _text: None
         self.open_session: Callable[[str, bytes], None] = lambda _name, _content: None
         self.room = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
@@ -89,11 +239,17 @@ class Upload:
         elif action == "part":
             self._take(msg)
         elif action == "template":
-            self.examples.send_template()
+            self.picker.save(TEMPLATE_NAME, "text/csv", TEMPLATE.encode())
         elif action == "sample":
-            self.examples.send_sample()
+            self._simulating.start(Job("save", lambda watch, _tell: sample_csv(watch)))
         elif action == "scenario":
             self.open_scenario(str(msg.get("name", "")), msg.get("text"))
+
+    def _save_sample(self, *_: object) -> None:
+        task = self._simulating
+        self._say("" if task.state == DONE else task.message if task.state == FAILED else task.line("Simulating a sample"))
+        if task.state == DONE:
+            self.picker.save(SAMPLE_NAME, "text/csv", task.result)
 
     def _take(self, msg: dict[str, Any]) -> None:
         if msg.get("index") == 0:

@@ -75,10 +75,9 @@ class Controls:
             stylesheets=[TWO_LINES],
             **ROOM,
         )
-        self.reset = pmui.Button(label="Reset", icon="restart_alt", variant="text", size="small", margin=(4, 0))
+        self.reset = pmui.Button(label="Reset", variant="text", size="small", margin=(4, 0))
         self.undo, self.redo = (
-            pmui.Button(label=name, icon=name.lower(), variant="text", size="small", margin=(4, 4, 4, 0), disabled=True)
-            for name in ("Undo", "Redo")
+            pmui.Button(label=name, variant="text", size="small", margin=(4, 4, 4, 0), disabled=True) for name in ("Undo", "Redo")
         )
         self.run = pmui.Button(
             label="Run", icon="play_arrow", size="small", margin=0, sx=ON_BAR | {"backgroundColor": "#fff", "color": PRIMARY}
@@ -107,7 +106,7 @@ class Controls:
         """Make the contents of the drawer."""
         first: list[Any] = []
         for title, paths in FIRST.items():
-            first += [pn.pane.HTML(f"<b>{title}</b>", margin=(8, 0, 0, 0))] if title else []
+            first += [pn.pane.HTML(f"<b>{title}</b>", margin=(8, 0, 0, 0), styles={"font-size": "13px"})] if title else []
             first += [self._part(path).view for path in paths]
         self._refresh_parts()
         return pn.Column(

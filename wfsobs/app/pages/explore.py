@@ -74,7 +74,7 @@ class Explore:
         causes = Causes(seeds.store, display) if seeds else None
         self.verdicts = {target: VerdictLine(target, run, display, seeds, causes) for target in TARGETS}
         axes = self.traces.x_range, self.spectra.x_range
-        self.stretches = {target: Stretch(target, run, display, *axes) for target in TARGETS}
+        self.stretches = {target: Stretch(target, run, display, *axes, self.traces.chosen_window) for target in TARGETS}
         self.table = Table(run, display, seeds)
         self.pinning = Pinning(run, display, history)
         self.rooms: dict[str, pn.Column] = {}
@@ -122,7 +122,9 @@ class Explore:
                 self._wanted_show, self.display.show = self.display.show, SIGNAL
 
     def _tick(self, switch: str) -> pmui.Checkbox:
-        return pmui.Checkbox.from_param(self.display.param[switch], size="small", margin=0, stylesheets=[SMALL_LABEL])
+        return pmui.Checkbox.from_param(
+            self.display.param[switch], size="small", margin=0, align="center", stylesheets=[SMALL_LABEL]
+        )
 
     def _above_table(self) -> pn.FlexBox:
         seeds = SeedSwitch(self.seeds).view() if self.seeds else []

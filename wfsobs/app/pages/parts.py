@@ -231,16 +231,19 @@ def line(*parts: Any) -> pn.FlexBox:
 SMALL_LABEL = ".MuiFormControlLabel-label.MuiTypography-root { font-size: 0.8125rem; }"
 """As large as that of the buttons beside it."""
 
+HEIGHT = "clamp(230px, min(100vh - 440px, 60vh), 640px)"
+"""Of a figure: what a window has room for below what stands above the first one."""
+
 TALL: Mapping[str, Any] = MappingProxyType(
     {
         **WIDE,
         "height": 230,
-        "stylesheets": [":host { height: clamp(230px, 42vh, 560px) !important; flex-basis: auto !important; }"],
+        "stylesheets": [f":host {{ height: {HEIGHT} !important; flex-basis: auto !important; }}"],
     }
 )
 """A figure as high as the window has room for."""
 
-EDITED = ":host { height: calc(clamp(230px, 42vh, 560px) + 120px) !important; }"
+EDITED = f":host {{ height: calc({HEIGHT} + 120px) !important; }}"
 """The same with its handles, whose legend stands below it."""
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from typing import Protocol
 
@@ -21,11 +21,19 @@ from wfsobs.evaluation.error_spectra import band_rms
 
 
 class Stretch:
-    """A line below the figures of a target: the rms error of every line that is shown, where they are zoomed to."""
+    """A line below the figures of a target: the rms error of every line that is shown, where a visitor has zoomed to."""
 
-    def __init__(self, target: str, run: BackgroundTask, display: Display, times: Range1d, frequencies: Range1d):
+    def __init__(
+        self,
+        target: str,
+        run: BackgroundTask,
+        display: Display,
+        times: Range1d,
+        frequencies: Range1d,
+        chosen_window: Callable[[], tuple[float, float] | None],
+    ):
         self.target, self.run, self.display = target, run, display
-        self.times, self.frequencies = times, frequencies
+        self.times, self.frequencies, self.chosen_window = times, frequencies, chosen_window
         self.pane = pn.pane.HTML("", sizing_mode="stretch_width", margin=0, stylesheets=[asset("style.css")])
         run.param.watch(self._refresh, "result")
         display.param.watch(self._refresh, ["mode", "unit", "hidden_lines", "dark"])
@@ -42,7 +50,7 @@ class Stretch:
         hidden = self.display.hidden_lines.get(self.target, [])
         names = [name for name in observers_of(self.target) if name not in hidden]
         lines = []
-        if (ends := zoom_of(self.times)) is not None:
+        if (ends := zoom_of(self.times)) is not None and self.chosen_window() is not None:
             lines.append(self._line(f"{ends[0]:.2f} – {ends[1]:.2f} s", self._over_time(results, names, *ends), results))
         if (ends := zoom_of(self.frequencies)) is not None:
             lines.append(self._line(f"{ends[0]:.3g} – {ends[1]:.3g} Hz", self._in_band(results, names, *ends), results))
