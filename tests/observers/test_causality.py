@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ import pytest
 from tests.records import ON_PAPER
 from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
+from wfsobs.observers.estimates import Estimates
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -38,9 +40,20 @@ def scenario(inputs: str = "u-y") -> Scenario:
     return s
 
 
-@pytest.fixture(scope="module", name="record")
-def _record() -> Record:
+@cache
+def whole() -> Record:
     return simulate(scenario())
+
+
+@pytest.fixture(name="record")
+def _record() -> Record:
+    return whole()
+
+
+@cache
+def of_whole(name: str, inputs: str = "u-y") -> Estimates:
+    """The estimates of an observer on the record as it is."""
+    return run_observer(name, whole(), scenario(inputs))
 
 
 def changed_after(record: Record, k: int) -> Record:
@@ -80,7 +93,7 @@ def test_nothing_after_a_step_changes_its_estimate(name: str, k: int, record: Re
         u = later.u.copy()
         u[k] = record.u[k]
         later = replace(later, u=u)
-    base, other = run_observer(name, record, s), run_observer(name, later, s)
+    base, other = of_whole(name), run_observer(name, later, s)
     assert set(base) >= set(OBSERVERS[name].targets)
     for target, values in base.items():
         if name in GPR:
@@ -98,7 +111,7 @@ def test_nothing_after_a_step_changes_its_estimate(name: str, k: int, record: Re
 def test_the_change_is_seen_afterwards(name: str, record: Record) -> None:
     """So that the test above can fail: some 60 steps later every estimate has moved."""
     s, later = scenario(), changed_after(record, 400)
-    base, other = run_observer(name, record, s), run_observer(name, later, s)
+    base, other = of_whole(name), run_observer(name, later, s)
     for target, values in base.items():
         assert (np.abs(other[target] - values)[405:460] > 1e-6).mean() > 0.9
 
@@ -110,7 +123,7 @@ def test_the_command_of_the_step_itself_is_used_only_where_the_paper_has_it(name
     s, k = scenario(inputs), 500
     u = record.u.copy()
     u[k] += 3.0
-    base = run_observer(name, record, s)
+    base = of_whole(name, inputs)
     other = run_observer(name, replace(record, u=u), s)
     for target, values in base.items():
         moved = np.abs(other[target][k] - values[k]).max() > 1e-9 * np.nanstd(values)
@@ -121,7 +134,7 @@ def test_the_command_of_the_step_itself_is_used_only_where_the_paper_has_it(name
 def test_no_observer_reads_the_truth(name: str, record: Record) -> None:
     """Poisoned with NaN, or absent, it makes no difference at all."""
     s = scenario()
-    base = run_observer(name, record, s)
+    base = of_whole(name)
     poison = np.full_like(record.y_lgs, np.nan)
     for other in (
         replace(record, turbulence=poison, vibration=poison),
@@ -147,7 +160,7 @@ def test_what_an_observer_does_not_need_it_does_not_read(name: str, field: str, 
         assert observer.missing(bare) == (field,)
     else:
         assert observer.missing(bare) == ()
-        base, found = run_observer(observer.id, record, scenario()), run_observer(observer.id, bare, scenario())
+        base, found = of_whole(name), run_observer(name, bare, scenario())
         assert all(np.array_equal(found[target], values, equal_nan=True) for target, values in base.items())
 
 
@@ -165,7 +178,7 @@ def test_a_record_that_ends_early_gives_the_same_beginning(name: str, record: Re
         turbulence=None,
         vibration=None,
     )
-    base, found = run_observer(name, record, s), run_observer(name, short, s)
+    base, found = of_whole(name), run_observer(name, short, s)
     for target, values in base.items():
         # matrix products of another width round in another order: 1e-9 as above for the GPR, 1e-12 for the filters
         bound = (1e-9 if name in GPR else 1e-12) * max(np.nanstd(values), 1e-30)
@@ -178,6 +191,6 @@ def test_modes_do_not_mix(name: str, record: Record) -> None:
     """Each mode alone is what it is beside the other, and a loud neighbour changes nothing."""
     s = scenario()
     loud = replace(record, y_lgs=record.y_lgs * [1.0, 10.0], u=record.u * [1.0, 10.0])
-    base, found = run_observer(name, record, s), run_observer(name, loud, s)
+    base, found = of_whole(name), run_observer(name, loud, s)
     for target, values in base.items():
         assert np.array_equal(found[target][:, 0], values[:, 0], equal_nan=True)
