@@ -7,15 +7,15 @@ import csv
 import hashlib
 import io
 import json
-import os
+import shlex
 import subprocess
-import sys
 import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from wfsobs.app.copies import LOOP, OBSERVE, TUNE, CopiedTask, to_command
 from wfsobs.app.dashboard import Dashboard
@@ -27,6 +27,7 @@ from wfsobs.app.pages.tune import TunePage
 from wfsobs.app.share import from_query
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord
 from wfsobs.app.work import RunResults
+from wfsobs.cli import main
 from wfsobs.closed_loop.rows import rows
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.identification import report as identified
@@ -109,11 +110,15 @@ def columns(dashboard: Dashboard, loop: Any, short: Scenario, tmp_path: Path, mo
 
 
 def in_shell(command: str) -> str:
-    """What a command prints."""
-    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
-    done = subprocess.run(command, shell=True, capture_output=True, text=True, env={**os.environ, "PATH": path})
-    assert done.returncode == 0, f"{command}\n{done.stderr}"
-    return done.stdout
+    """What commands print, split into words as a shell does it."""
+    out = ""
+    for one in command.split("&&"):
+        program, *words = shlex.split(one)
+        assert program == "wfsobs"
+        done = CliRunner().invoke(main, words, catch_exceptions=False)
+        assert done.exit_code == 0, f"{command}\n{done.stderr}"
+        out += done.stdout
+    return out
 
 
 def shell(dashboard: Dashboard) -> Any:
