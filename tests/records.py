@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+from collections.abc import Iterable
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -61,3 +62,8 @@ def short(preset: str) -> tuple[Record, Scenario]:
     events = [e.to_dict() | {k: getattr(e, k) * 0.8 / s.run.duration for k in ("start", "duration")} for e in s.events]
     scenario = s.replace({**QUICK, "run.duration": 0.8, "events": events})
     return recorded(scenario), scenario
+
+
+def third_of_pairs(names: Iterable[str], presets: Iterable[str]) -> list[tuple[str, str]]:
+    """Return every third pair of a name and a preset: each name with several presets, and each preset with several names."""
+    return [(name, preset) for i, name in enumerate(names) for j, preset in enumerate(presets) if (i + j) % 3 == 0]

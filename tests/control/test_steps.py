@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import wfsobs
-from tests.records import short
+from tests.records import short, third_of_pairs
 from wfsobs import PRESETS
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers.step_checks import StepError
@@ -43,8 +43,7 @@ def difference(name: str, record: Record, scenario: Scenario) -> float:
     return float(np.abs(got - want).max() / (want.std() or 1.0))
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.parametrize(("name", "preset"), third_of_pairs(CONTROLLERS, PRESETS))
 def test_steps_are_the_run_over_the_record(name: str, preset: str) -> None:
     record, scenario = with_gaps(preset)
     assert difference(name, record, scenario) <= (GPR if "gpr" in name else ROUNDING)

@@ -57,7 +57,9 @@ def options(tmp_path):
         sender.join()
 
 
-@pytest.mark.parametrize(("source", "name"), [(source, name) for source, names in PROCESSES.items() for name in names])
+@pytest.mark.parametrize(
+    ("source", "name"), [*(("simulation", name) for name in PROCESSES["simulation"]), ("record", SOURCE), ("stream", SOURCE)]
+)
 def test_a_process_that_is_killed_ends_the_command_in_one_line_that_names_it(options, source, name):
     names = PROCESSES[source]
     command = [sys.executable, "-m", "wfsobs", "live", "--headless", "--json", "--seconds", "600", "--observer", "kf-lgs"]

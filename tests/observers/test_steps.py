@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import wfsobs
-from tests.records import ON_PAPER, short
+from tests.records import ON_PAPER, short, third_of_pairs
 from wfsobs import PRESETS
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.mirror import Mirror, Plant
@@ -60,8 +60,7 @@ def with_gaps(preset: str) -> tuple[Record, Scenario]:
     return replace(record, y_lgs=y, u=u, y_ngs=ngs), scenario.before_events
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("name", STEPS)
+@pytest.mark.parametrize(("name", "preset"), third_of_pairs(STEPS, PRESETS))
 def test_steps_are_the_run_over_the_record(name: str, preset: str) -> None:
     record, scenario = with_gaps(preset)
     try:
