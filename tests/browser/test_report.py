@@ -23,6 +23,7 @@ import wfsobs
 from tests.browser.conftest import PATIENCE
 from wfsobs.app.display import UNITS, per_micrometre
 from wfsobs.app.render import number
+from wfsobs.app.report.page import STEP
 from wfsobs.app.style import TERM_COLOURS
 from wfsobs.app.work import TRUTH
 from wfsobs.cli import main
@@ -173,7 +174,7 @@ def test_lines_follow_the_switches(open_report: Any) -> None:
         got = line(page, "trace-vibration", name)
         y = np.array(got["y"], dtype=float)
         assert len(y) == len(got["x"]) == result.record.n_steps, "every sample of a short record"
-        np.testing.assert_allclose(y, values * scale, rtol=0, atol=np.ptp(values) * scale / 65000)
+        np.testing.assert_allclose(y, values * scale, rtol=0, atol=STEP * np.subtract(*np.percentile(values, (75, 25))) * scale)
         return got
 
     assert shows("kf-lgs", estimate.values[:, 0], 1e3)["label"] == "tip [nm]"
@@ -193,10 +194,10 @@ def test_lines_follow_the_switches(open_report: Any) -> None:
     found = spectra(result.record, "vibration", estimate.values, 0.5)
     assert found is not None
     frequency, _, density = found
-    np.testing.assert_allclose(power["y"][:300], density[1:301, 1] * mas**2, rtol=1e-3)
+    np.testing.assert_allclose(power["y"][:300], density[1:301, 1] * mas**2, rtol=1.2e-3)  # half a step of a logarithm
     total = cumulative_rms(frequency[1:], density[1:])[:, 1]
     at = np.searchsorted(frequency[1:], np.array(summed["x"]) - 1e-3)
-    np.testing.assert_allclose(summed["y"], total[at] * mas, rtol=1e-3)
+    np.testing.assert_allclose(summed["y"], total[at] * mas, rtol=1.2e-3)
 
 
 def test_errors_over_a_setting(open_report: Any) -> None:
@@ -320,6 +321,9 @@ def test_opens_with_the_verdict_and_the_errors_of_the_main_lines(open_report: An
     expect(page.locator(".box h2").first).to_have_text("Verdict")
     best = page.locator("p.verdict").filter(visible=True)
     expect(best).to_have_text([re.compile(r"^Turbulence, tip\. "), re.compile(r"^Vibration, tip\. ")])
+    expect(page.locator(".box h2").nth(1)).to_have_text("Error budget")
+    bars = page.locator("table.budget").filter(visible=True).locator("th.target")
+    expect(bars).to_have_text(["Turbulence, tip", "Vibration, tip"])
     choose(page, "Tilt")
     expect(best).to_have_text([re.compile(r"^Turbulence, tilt\. "), re.compile(r"^Vibration, tilt\. ")])
     first = line(page, "trace-vibration", "kf-lgs")
@@ -336,7 +340,10 @@ def test_opens_with_the_verdict_and_the_errors_of_the_main_lines(open_report: An
 
 def test_on_paper_bars_have_their_colours_and_nothing_is_cut(open_report: Any) -> None:
     page = open_report()
-    parts = re.findall(rb"stream\r?\n(.*?)\r?\nendstream", page.pdf(format="A4"), re.S)
+    pdf = page.pdf(format="A4")
+    pages = len(re.findall(rb"/Type\s*/Page\b", pdf))
+    assert 4 <= pages <= 9, "verdict, budget and figures, the errors of one state of four, closed loop, words"
+    parts = re.findall(rb"stream\r?\n(.*?)\r?\nendstream", pdf, re.S)
     drawn = b"".join(zlib.decompress(part) for part in parts if part[:1] == b"x")
     fills = {tuple(map(float, colour)) for colour in re.findall(rb"([\d.]+) ([\d.]+) ([\d.]+) rg", drawn)}
     for colour in TERM_COLOURS.values():

@@ -11,14 +11,14 @@ import pytest
 
 from wfsobs.app.display import AT_LIMIT
 from wfsobs.app.render import number
-from wfsobs.app.report.budget import budget_state_table
-from wfsobs.app.report.data import Report, State, state_of
-from wfsobs.app.report.packing import pack, unpack
+from wfsobs.app.report.data import Report, State, pack, state_of, unpack
 from wfsobs.app.report.page import page
+from wfsobs.app.report.sections import budget_state_table
 from wfsobs.evaluation.budget import TERMS, error_budget
 from wfsobs.evaluation.evidence import gather_evidence
 from wfsobs.evaluation.rows import row_label, target_title
 from wfsobs.evaluation.scores import BOUND, SCORED
+from wfsobs.observers.base import TARGETS
 from wfsobs.pipeline import run
 from wfsobs.result import Result
 from wfsobs.scenario import Scenario
@@ -28,7 +28,12 @@ MADE = datetime(2026, 1, 2, tzinfo=UTC)
 
 def test_every_linear_observer_has_its_terms_in_the_page(result: Result, short: Scenario, parse: Any) -> None:
     it = parse(page(unpack(pack(Report("paper", short, (), (state_of(result),)))), MADE))
-    table = next(t for t in it.tables if t[0][:2] == ["Observer", "Parts"])
+    tip, tilt, table = (t for t in it.tables if t[0][:2] == ["Observer", "Parts"])
+    main = {row_label(name) for names in state_of(result).main.values() for name in names}
+    for mode, few in (("tip", tip), ("tilt", tilt)):  # beside the verdict those that it names
+        assert [row[0] for row in few[1:] if len(row) == 1] == [f"{target_title(target)}, {mode}" for target in TARGETS]
+        assert {row[0] for row in few[1:] if len(row) > 1} <= main and all(row in table for row in few)
+    assert it.text.index("Error budget") < it.text.index("RMS errors")
     assert table[0][3:] == list(TERMS.values())
     titles = [row[0] for row in table[1:] if len(row) == 1]
     assert titles == [f"{target_title(target)}, {mode}" for target in SCORED for mode in ("tip", "tilt")]

@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 
 from wfsobs.app.compared import ComparedRun, comparison_of
-from wfsobs.app.report.data import Report, state_of
-from wfsobs.app.report.packing import pack, unpack
+from wfsobs.app.report.data import Report, pack, state_of, unpack
 from wfsobs.app.report.page import page
 from wfsobs.result import Result
 

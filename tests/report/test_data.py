@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
-from wfsobs.app.report.data import Report, bins_for, state_of, window_of
-from wfsobs.app.report.encoding import LEVELS, Pool, encode
-from wfsobs.app.report.grid import Grid
-from wfsobs.app.report.packing import pack, unpack
+from tests.report.levels import read_levels
+from wfsobs.app.report.data import Grid, Report, bins_for, pack, state_of, unpack, window_of
+from wfsobs.app.report.page import DECADES, LEVELS, STEP, Pool, encode
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.error_spectra import cumulative_rms
 from wfsobs.evaluation.rows import score_rows
@@ -47,33 +47,49 @@ def test_more_states_leave_fewer_points() -> None:
     assert kept[11] > 400, "about a pair a pixel for twelve"
 
 
+def levels_in(pool: Pool, index: float) -> NDArray[np.int64]:
+    (raw,) = [content for content, number in pool.number.items() if number == index]
+    return read_levels(raw)
+
+
 @given(st.lists(st.floats(-1e6, 1e6) | st.just(float("nan")), min_size=1, max_size=50))
 def test_a_line_is_written_to_half_a_step(line: list[float]) -> None:
     pool = Pool()
     index, low, step = encode(line, pool)
-    levels = np.frombuffer(pool.all()[int(index)], dtype="<u2").astype(float)
+    levels = levels_in(pool, index)
     x = np.array(line)
     read = np.where(levels == LEVELS + 1, np.nan, low + step * levels)
     assert np.array_equal(np.isnan(read), np.isnan(x))
     known = ~np.isnan(x)
     if known.any():
-        assert step <= max((x[known].max() - x[known].min()) / LEVELS, 1.0) * (1 + 1e-9)
+        spread = np.subtract(*np.percentile(x[known], (75, 25)))
+        assert step <= max(np.ptp(x[known]) / LEVELS, STEP * spread, 1.0 if step == 1.0 else 0.0) * (1 + 1e-9)
         assert np.abs(read - x)[known].max() <= 0.5 * step * (1 + 1e-6) + 1e-9
+
+
+def test_a_transient_takes_no_digits_from_what_comes_after_it() -> None:
+    line = np.random.default_rng(1).normal(size=2000)
+    line[:20] = 40.0
+    pool = Pool()
+    index, low, step = encode(line, pool)
+    # The middle half of a normal distribution is 1.35 standard deviations wide.
+    assert step == pytest.approx(1.35 * STEP, rel=0.1)
+    np.testing.assert_allclose(low + step * levels_in(pool, index), line, atol=0.51 * step)
 
 
 def test_densities_are_written_as_logarithms_and_zero_is_none() -> None:
     pool = Pool()
     density = np.array([0.0, 1e-9, 1e-3, 10.0])
     index, low, step = encode(density, pool, logarithmic=True)
-    levels = np.frombuffer(pool.all()[int(index)], dtype="<u2")
+    levels = levels_in(pool, index)
     assert levels[0] == LEVELS + 1
-    np.testing.assert_allclose(10 ** (low + step * levels[1:].astype(float)), density[1:], rtol=10 / LEVELS * 2.31)
+    np.testing.assert_allclose(10 ** (low + step * levels[1:].astype(float)), density[1:], rtol=0.51 * DECADES * 2.31)
 
 
 def test_what_two_states_share_is_there_once() -> None:
     pool = Pool()
     line = np.arange(5.0)
-    assert encode(line, pool)[0] == encode(2 * line + 1, pool)[0] and len(pool.all()) == 1, "the same levels"
+    assert encode(line, pool)[0] == encode(2 * line + 1, pool)[0] and len(pool.number) == 1, "the same levels"
 
 
 def test_a_state_has_the_lines_of_the_result(result: Result) -> None:

@@ -13,8 +13,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from wfsobs import pipeline
-from wfsobs.app.report import maker
-from wfsobs.app.report.maker import ReportError
+from wfsobs.app.report import export as report_export
+from wfsobs.app.report.export import ReportError
 from wfsobs.app.work import RunResults
 from wfsobs.cli import main
 from wfsobs.evaluation.rows import TIME, score_rows
@@ -132,7 +132,7 @@ def test_a_run_that_fails_leaves_what_was_there(tmp_path: Path, monkeypatch: pyt
 
 
 def test_the_dashboards_report_has_the_numbers_given_to_it(result: Any, parse: Any) -> None:
-    it = parse(maker.make(RunResults(result), "paper", QUIET).decode())
+    it = parse(report_export.make(RunResults(result), "paper", QUIET).decode())
     assert it.data("rows")[0]["rows"] == score_rows(result.scores, result.scenario.run.seed)
     assert "wfsobs export report.html --preset paper --set" in it.text
 
@@ -145,17 +145,17 @@ def test_what_nobody_wants_any_more_is_stopped(result: Any, monkeypatch: pytest.
             super().__init__(*given, **how)
             begun.append(self)
 
-    monkeypatch.setattr(maker.subprocess, "Popen", Noted)
+    monkeypatch.setattr(report_export.subprocess, "Popen", Noted)
     with pytest.raises(Cancelled):
-        maker.make(RunResults(result), "paper", Watch(is_cancelled=lambda: bool(begun)))
+        report_export.make(RunResults(result), "paper", Watch(is_cancelled=lambda: bool(begun)))
     (process,) = begun
     assert process.returncode == -signal.SIGKILL
 
 
 def test_a_process_that_fails_is_one_line(result: Any, monkeypatch: pytest.MonkeyPatch, caplog: Any) -> None:
-    monkeypatch.setattr(maker, "pack", lambda report: b"nonsense")
+    monkeypatch.setattr(report_export, "pack", lambda report: b"nonsense")
     with pytest.raises(ReportError, match="it could not be made; the server's log has the details"):
-        maker.make(RunResults(result), "paper", QUIET)
+        report_export.make(RunResults(result), "paper", QUIET)
     assert "Traceback" in caplog.text
 
 

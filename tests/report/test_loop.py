@@ -8,8 +8,7 @@ from datetime import UTC, datetime
 import pytest
 
 from wfsobs.app.render import number
-from wfsobs.app.report.data import Report, state_of
-from wfsobs.app.report.packing import pack, unpack
+from wfsobs.app.report.data import Report, pack, state_of, unpack
 from wfsobs.app.report.page import page
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label
 from wfsobs.control.controllers import CONTROLLERS

@@ -11,8 +11,7 @@ from bokeh.document import Document
 from scipy import stats
 
 from wfsobs.app.pages.sweep_views import report_part
-from wfsobs.app.report.data import Report, state_of
-from wfsobs.app.report.packing import pack, unpack
+from wfsobs.app.report.data import Report, pack, state_of, unpack
 from wfsobs.app.report.page import page
 from wfsobs.campaign.sweep import parse_axis, plan_sweep
 from wfsobs.campaign.sweep_results import SweepResults

@@ -14,7 +14,7 @@ from wfsobs.app.downloads import Save, TooLarge, data_csv, data_npz
 from wfsobs.app.jobs import DONE, FAILED, RUNNING, BackgroundTask, Job
 from wfsobs.app.pages.pages import Pages
 from wfsobs.app.pages.parts import PageActions
-from wfsobs.app.report.maker import LIMIT, ReportError, make
+from wfsobs.app.report.export import LIMIT, ReportError, make
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.share import FILE, Link, from_file, from_query, name_record, to_file, to_query
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord

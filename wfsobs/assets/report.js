@@ -26,9 +26,10 @@ export function number(value, digits = 3) {
   return size < 1e-4 || size >= 1e6 ? text : text.replace("-", "−")
 }
 
-function bytes(index) {
-  return Uint8Array.from(atob(data.arrays[index]), (c) => c.charCodeAt(0)).buffer
-}
+const packed = Uint8Array.from(atob(data.arrays), (c) => c.charCodeAt(0))
+const pool = await new Response(new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer()
+const ends = data.lengths.reduce((sums, length) => [...sums, sums.at(-1) + length], [0])
+const bytes = (index) => pool.slice(ends[index], ends[index + 1])
 
 const decoded = new Map()
 function once(key, make) {
@@ -47,10 +48,16 @@ function points(state, kind, target, name) {
   if (!line) return null
   const [index, low, step] = line
   const logarithmic = kind.startsWith("psd") || kind.startsWith("cumulative")
-  return once(`${index} ${low} ${step}`, () => Float64Array.from(new Uint16Array(bytes(index)), (level) => {
-    const value = level === NONE ? NaN : low + step * level
-    return logarithmic ? 10 ** value : value
-  }))
+  return once(`${index} ${low} ${step}`, () => {
+    const raw = new Uint8Array(bytes(index)), n = raw.length / 2
+    let level = 0
+    return Float64Array.from({length: n}, (_, i) => {
+      const change = raw[i] | raw[n + i] << 8
+      level = level + (change >> 1 ^ -(change & 1)) & NONE
+      const value = level === NONE ? NaN : low + step * level
+      return logarithmic ? 10 ** value : value
+    })
+  })
 }
 
 // ------------------------------------------------------------------ figures
@@ -200,6 +207,18 @@ function hide(figure, target) {
   for (const it of lines(figure)) it.visible = !hidden[target].includes(it.name)
 }
 
+// Figures are as wide as the window: on paper stands a picture of each, as wide as the page has room.
+function toPaper() {
+  for (const it of document.querySelectorAll("canvas.paper")) it.remove()
+  for (const [name, figure] of Object.entries(figures)) {
+    const [view] = Bokeh.index.query((it) => it.model === figure)
+    const {canvas} = view.export("png")
+    canvas.className = "paper"
+    canvas.removeAttribute("style")
+    document.getElementById(name).after(canvas)
+  }
+}
+
 // ------------------------------------------------------------------ time window
 
 function zoom(figure, state) {
@@ -240,8 +259,8 @@ function card(target, name) {
   const loop = name === "truth" && !known && rowOf(shown.state, "residual y", "loop")  // where there is no truth
   const row = known || loop || (drawn && rowOf(shown.state, "next z", name))
   const value = row && (name === "truth" && !loop ? row.truth_rms_um : row.rms_um)
-  const base = loop ? "z, residual" : known ? "truth" : "z, next z"
-  const relative = row && row.normalised_rms !== null ? `${row.normalised_rms.toFixed(2)} × ${base}` : ""
+  const base = loop ? " × z, residual" : known ? "" : " × z, next z"
+  const relative = row && row.normalised_rms !== null ? `${base ? "" : "relative error "}${row.normalised_rms.toFixed(2)}${base}` : ""
   const interval = data.states[shown.state].intervals[`${name}/${target}/${shown.mode}`]
   const inUnit = (um) => number(um * data.states[shown.state].scale[shown.unit])
   const missing = name === "truth" ? "" : drawn ? "no truth" : "no result"
@@ -374,7 +393,7 @@ try {
   Object.keys(data.names).forEach(toggled)
   const turn = (to) => { dark = to; repaint() }
   night.onchange = () => turn(night.matches)
-  window.addEventListener("beforeprint", () => turn(false))
+  window.addEventListener("beforeprint", () => { turn(false); toPaper() })
   window.addEventListener("afterprint", () => turn(night.matches))
 } catch (error) {
   document.documentElement.classList.remove("js")

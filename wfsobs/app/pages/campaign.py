@@ -22,7 +22,7 @@ from wfsobs.app.pages.parts import WIDE, LinkedFields, LinkedLater, PageActions,
 from wfsobs.app.pages.sweep import SweepMap, line_of
 from wfsobs.app.pages.sweep_views import DECIDED, FULL_MARGIN, GROUNDS, LEFT_OUT, OPEN, WAITING, axis_title, ink_on, mix
 from wfsobs.app.render import NOTHING, Row, number, table
-from wfsobs.app.report.text import value_of
+from wfsobs.app.report.sections import value_of
 from wfsobs.app.store import Store
 from wfsobs.app.style import look, swatch
 from wfsobs.app.views.plots import add_line, call, new_figure

@@ -13,7 +13,7 @@ from bokeh.plotting import figure
 from wfsobs.app.controls.names import setting_name
 from wfsobs.app.display import Display, per_micrometre, unit_text
 from wfsobs.app.render import number
-from wfsobs.app.report.text import value_of
+from wfsobs.app.report.sections import value_of
 from wfsobs.app.style import look, observers_of
 from wfsobs.app.views.plots import add_line, call, new_figure
 from wfsobs.campaign.sweep_results import SweepResults

@@ -1,10 +1,9 @@
-"""What a report holds: the rows of every state, and its lines as few points.
-
-Nothing in this package imports Panel: with it in the process Bokeh's files do not work offline.
-"""
+"""What a report holds: the rows of every state, its lines as few points, and both on their way to another process."""
 
 from __future__ import annotations
 
+import io
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -13,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wfsobs.app.report.grid import WINDOW_S, Array, Floats, Grid
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.main_lines import main_observers
 from wfsobs.app.views.plots import envelope, envelope_times
@@ -33,10 +31,66 @@ from wfsobs.priors_from.selection import usual_observers
 from wfsobs.record import RecordError
 from wfsobs.result import Result
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.configfile import from_toml, to_toml
 from wfsobs.scenario.grid import Variation
 
+Array = NDArray[np.float64]
+
+Floats = NDArray[np.float32]
+
+WINDOW_S = 0.5
+"""A stretch in the middle of the record that keeps every sample [s]."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Which points of a line are kept.
+
+    They are the extremes of bins, but every sample between `first` and `last`, and where bins save nothing.
+    """
+
+    n: int
+    dt: float
+    bins: int
+
+    @property
+    def whole(self) -> bool:
+        """Whether every sample of the record is kept."""
+        return self.n <= 2 * self.bins + self.width
+
+    @property
+    def width(self) -> int:
+        """Samples in the window."""
+        return min(round(WINDOW_S / self.dt), self.n)
+
+    @property
+    def first(self) -> int:
+        """The window's first sample."""
+        return 0 if self.whole else (self.n - self.width) // 2
+
+    @property
+    def last(self) -> int:
+        """One past the window's last sample."""
+        return self.n if self.whole else self.first + self.width
+
+    def _parts(self) -> list[tuple[int, int, int]]:
+        """(start, stop, bins) of the pieces, all samples where the bins are 0."""
+        left, right = self.first, self.n - self.last
+        share = round(self.bins * left / max(left + right, 1))
+        parts = [(0, left, share), (self.first, self.last, 0), (self.last, self.n, self.bins - share)]
+        return [part for part in parts if part[1] > part[0]]
+
+    def times(self) -> Array:
+        """Return the times [s] of the points kept."""
+        return np.concatenate([envelope_times(a, b, bins or b - a, self.dt) for a, b, bins in self._parts()])
+
+    def thin(self, x: Array) -> Floats:
+        """Select the points kept of a signal (n,)."""
+        return np.concatenate([envelope(x[a:b], bins or b - a) for a, b, bins in self._parts()]).astype(np.float32)
+
+
 POINTS = 1_250_000
-"""Points of all lines of all states together, spectra included: what fits into 5 MB beside Bokeh."""
+"""Points of all lines of all states together, spectra included: what fits into 4 MB with Bokeh."""
 
 SPECTRUM, SPECTRUM_BINS = 400, 100
 """Points of a spectrum that are kept as they are (up to 200 Hz), and pairs of extremes of those above."""
@@ -233,9 +287,6 @@ def _spread_indices(n: int) -> NDArray[np.int64]:
     return np.unique(np.round(np.geomspace(1, n - 1, CUMULATIVE)).astype(np.int64))
 
 
-# ---------------------------------------------------------------------- into the file
-
-
 def window_of(states: Sequence[State]) -> tuple[float, float] | None:
     """(start, end) [s] of the stretch that keeps every sample in all states; None where all of the record does."""
     grids = [s.grid for s in states]
@@ -244,3 +295,62 @@ def window_of(states: Sequence[State]) -> tuple[float, float] | None:
     if any((a.n, a.dt) != (b.n, b.dt) for a, b in pairwise(grids)):
         return None
     return grids[0].first * grids[0].dt, (grids[0].last - 1) * grids[0].dt
+
+
+# -------------------------------------------------------------------------------------------- to another process
+
+
+def pack(report: Report) -> bytes:
+    """Write a report as a file of plain arrays and text."""
+    words = {
+        "preset": report.preset,
+        "base": to_toml(report.base),
+        "recorded": report.is_recorded,
+        "command": report.command,
+        "sweep": report.sweep,
+        "comparison": report.comparison,
+        "variations": [[v.path, v.values] for v in report.variations],
+        "states": [
+            {
+                "toml": to_toml(s.scenario),
+                "rows": s.rows,
+                "reasons": s.reasons,
+                "grid": [s.grid.n, s.grid.dt, s.grid.bins],
+                "loop": list(s.loop),
+                "budgets": list(s.budgets),
+                "seeds": s.seeds,
+                "verdicts": list(s.verdicts),
+                "main": s.main,
+            }
+            for s in report.states
+        ],
+    }
+    arrays = {f"{i}/{name}": line for i, s in enumerate(report.states) for name, line in s.lines.items()}
+    file = io.BytesIO()
+    np.savez(file, allow_pickle=False, words=np.array(json.dumps(words)), **arrays)
+    return file.getvalue()
+
+
+def unpack(content: bytes) -> Report:
+    """Read the report that `pack` wrote."""
+    with np.load(io.BytesIO(content), allow_pickle=False) as file:
+        words = json.loads(str(file["words"]))
+        lines: list[dict[str, Floats]] = [{} for _ in words["states"]]
+        for key in file.files:
+            number, slash, name = key.partition("/")
+            if slash:
+                lines[int(number)][name] = file[key]
+    states = tuple(
+        State(
+            from_toml(s["toml"]),
+            s["rows"],
+            tuple(s["reasons"]),
+            Grid(*s["grid"]),
+            of,
+            *(s[name] for name in ("loop", "budgets", "seeds", "verdicts", "main")),
+        )
+        for s, of in zip(words["states"], lines, strict=True)
+    )
+    variations = tuple(Variation(path, tuple(values)) for path, values in words["variations"])
+    rest = (words[name] for name in ("recorded", "command", "sweep", "comparison"))
+    return Report(words["preset"], from_toml(words["base"]), variations, states, *rest)

@@ -7,31 +7,47 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import os
+import sys
+import zlib
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from typing import Any
 
+import numpy as np
 from bokeh.document import Document
-from bokeh.resources import Resources
+from bokeh.models import BoxAnnotation, ColumnDataSource, CrosshairTool, DataRenderer, HoverTool, Range1d, Span, VSpan
+from bokeh.plotting import figure
+from bokeh.util.paths import bokehjs_path
 from markupsafe import Markup
+from numpy.typing import ArrayLike
 
 from wfsobs import __version__
 from wfsobs.app.display import NO_ANGLE, UNITS, per_micrometre
+from wfsobs.app.pages.sweep_views import SweepLines
 from wfsobs.app.render import render
-from wfsobs.app.report.budget import budget_key, budget_state_table
-from wfsobs.app.report.data import Report, State, window_of
-from wfsobs.app.report.encoding import Pool, encode
-from wfsobs.app.report.figures import SHADES, all_figures
-from wfsobs.app.report.loop import loop_state_table
-from wfsobs.app.report.table import state_table
-from wfsobs.app.report.text import meaning_values, origin_values, scenario_values, setting_label, state_name, summary, value_of
+from wfsobs.app.report.data import Report, State, unpack, window_of
+from wfsobs.app.report.sections import (
+    budget_key,
+    budget_state_table,
+    loop_state_table,
+    meaning_values,
+    origin_values,
+    scenario_values,
+    setting_label,
+    state_name,
+    state_table,
+    summary,
+    value_of,
+)
 from wfsobs.app.style import PRIMARY, asset, look, observers_of
-from wfsobs.app.views.plots import MODEL, PEAKS, marked_peaks
+from wfsobs.app.views.plots import MODEL, PEAKS, add_line, marked_peaks, new_figure
 from wfsobs.app.work import TRUTH
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE
 from wfsobs.evaluation.budget import TERMS
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import TARGETS
+from wfsobs.observers.base import TARGETS, VIBRATION
 from wfsobs.sensors.modes import TIP_TILT
 
 START = 'document.documentElement.classList.add("js")'
@@ -40,7 +56,7 @@ START = 'document.documentElement.classList.add("js")'
 
 def page(report: Report, date: datetime) -> str:
     """Write the whole file; date: now, in the zone to write it in."""
-    bokeh = "\n".join(Resources(mode="inline", components=["bokeh"], minified=True, log_level="warn").js_raw)
+    bokeh = (bokehjs_path() / "js/bokeh.min.js").read_text(encoding="utf-8") + "\nBokeh.set_log_level('warn')"
     scripts = {"start": START, "bokeh": bokeh, "page": f"{asset('patch.js')}\n{asset('strip.js')}\n{asset('report.js')}"}
     names = [state_name(report, state, i) or "All modes" for i, state in enumerate(report.states)]
     states = list(zip(report.states, names, strict=True))
@@ -110,8 +126,8 @@ def _figures(report: Report) -> dict[str, Any]:
     """Collect the figures without data, and where each is drawn."""
     document = Document()
     parts = report.sweep["lines"] if report.sweep else ()
-    for figure in all_figures(bool(_sweeps(report)), parts).values():
-        document.add_root(figure)
+    for fig in all_figures(bool(_sweeps(report)), parts).values():
+        document.add_root(fig)
     return {"document": document.to_json(deferred=False), "roots": {root.id: str(root.name) for root in document.roots}}
 
 
@@ -145,7 +161,7 @@ def _data(report: Report) -> dict[str, Any]:
         },
         "window": window_of(report.states),
         "states": states,
-        "arrays": [base64.b64encode(array).decode() for array in pool.all()],
+        **pool.write(),
     }
 
 
@@ -168,3 +184,148 @@ def _state(state: State, pool: Pool) -> dict[str, Any]:
         "intervals": state.seeds.get("intervals", {}),
         "model": [[scenario.kalman.frequency, f"model of the Kalman filters {scenario.kalman.frequency:.5g} Hz"]],
     }
+
+
+# ------------------------------------------------------------------------------------------------------- figures
+
+
+TRACE, SPECTRUM, SWEEP, PART = "trace", "spectrum", "sweep", "part"
+
+WARM_UP, WINDOW = "warm-up", "window"
+NOW = "now"
+SHADES = {WARM_UP: "#808080", WINDOW: "#2B8AB3"}
+"""Stretches of a trace that are shaded."""
+
+
+def all_figures(sweeps: bool, parts: Sequence[Mapping[str, Any]] = ()) -> dict[str, figure]:
+    """Make all figures by name, as in "trace-turbulence"; the traces share their time axis, the spectra their frequencies.
+
+    sweeps : with those of errors over a setting that varies; parts : errors of a sweep over one setting, which have their data
+    """
+    times, frequencies = Range1d(start=0.0, end=10.0), Range1d(start=0.5, end=500.0)
+    crosshair = CrosshairTool(dimensions="height", overlay=Span(dimension="height", line_alpha=0.4, line_width=1))
+    made = {f"{TRACE}-{target}": _trace(target, times, crosshair) for target in TARGETS}
+    made |= {f"{SPECTRUM}-{target}": _spectrum(target, frequencies) for target in TARGETS}
+    if sweeps:
+        values = Range1d(start=0.0, end=1.0)
+        made |= {f"{SWEEP}-{target}": _sweep(target, values) for target in TARGETS}
+    made |= {f"{PART}-{i}": _part(part) for i, part in enumerate(parts)}
+    for name, fig in made.items():  # see-through from the start: a white ground leaves its edge behind in dark mode
+        fig.update(name=name, background_fill_alpha=0.0, border_fill_alpha=0.0)
+    return made
+
+
+def _trace(target: str, times: Range1d, crosshair: CrosshairTool) -> figure:
+    """Time traces of the truth and the estimates; warm-up and the stretch of every sample shaded."""
+    fig = new_figure(x_range=times, y_range=Range1d(start=-1.0, end=1.0))
+    fig.xaxis.axis_label = "time [s]"
+    fig.add_tools(crosshair)
+    for name, colour in SHADES.items():
+        fig.add_layout(
+            BoxAnnotation(left=0, right=0, fill_color=colour, fill_alpha=0.10, line_width=0, level="underlay", name=name)
+        )
+    source = ColumnDataSource({"x": [], **{name: [] for name in _names(target)}})
+    for name in _names(target):
+        add_line(fig, name, source, name)
+    return fig
+
+
+def _spectrum(target: str, frequencies: Range1d) -> figure:
+    """Spectra, log-log, the peaks of the vibration and of the Kalman filters' model marked."""
+    fig = new_figure(x_range=frequencies, y_range=Range1d(start=1e-6, end=1.0), x_axis_type="log", y_axis_type="log")
+    fig.xaxis.axis_label = "frequency [Hz]"
+    if target == VIBRATION:
+        marks: list[DataRenderer] = [
+            fig.add_glyph(ColumnDataSource({"x": [], "text": []}), VSpan(x="x", **look), name=name)
+            for name, look in (
+                ("peaks", {"line_color": PEAKS, "line_alpha": 0.4, "line_width": 1.5}),
+                ("model", {"line_color": MODEL, "line_dash": [4, 3], "line_width": 1.5}),
+            )
+        ]
+        fig.add_tools(HoverTool(renderers=marks, tooltips="@text"))
+    source = ColumnDataSource({"x": [], **{name: [] for name in _names(target)}})
+    for name in _names(target):
+        add_line(fig, name, source, name)
+    return fig
+
+
+def _sweep(target: str, values: Range1d) -> figure:
+    """RMS errors over the values of a setting, a dot for every run; the present one marked."""
+    fig = new_figure(x_range=values, y_range=Range1d(start=0.0, end=1.0))
+    fig.add_glyph(ColumnDataSource({"x": []}), VSpan(x="x", line_color=PEAKS, line_alpha=0.6, line_width=1.5), name=NOW)
+    source = ColumnDataSource({"x": [], **{name: [] for name in _names(target)}})
+    for name in _names(target):
+        add_line(fig, name, source, name)
+        fig.scatter("x", name, source=source, size=5, color=look(name).light, name=name)
+    return fig
+
+
+def _part(part: Mapping[str, Any]) -> figure:
+    """Errors of a sweep over its one setting, as on the page of sweeps."""
+    lines = SweepLines(part)
+    lines.draw(part)
+    return lines.figure
+
+
+def _names(target: str) -> list[str]:
+    return [TRUTH, *observers_of(target)]
+
+
+# -------------------------------------------------------------------------------------------------------- arrays
+
+LEVELS = 65_534
+"""Most steps between the lowest and the highest point of a line; one number more stands for none."""
+
+STEP, DECADES = 2e-3, 1e-3
+"""Step of a line over the spread of the middle half of its points, and of a logarithm: finer than a pixel."""
+
+
+class Pool:
+    """Arrays in the file, each once however many states share it."""
+
+    def __init__(self) -> None:
+        self.number: dict[bytes, int] = {}
+
+    def add(self, content: bytes) -> int:
+        """Add the bytes of an array; return its number."""
+        return self.number.setdefault(content, len(self.number))
+
+    def write(self) -> dict[str, Any]:
+        """Return the length of every array [bytes], and all of them compressed."""
+        return {
+            "lengths": [len(content) for content in self.number],
+            "arrays": base64.b64encode(zlib.compress(b"".join(self.number), 9)).decode(),
+        }
+
+
+def encode(line: ArrayLike, pool: Pool, logarithmic: bool = False) -> list[float]:
+    """Write a line as differences of levels: [number in the pool, lowest, step]; of its decimal logarithm if asked for.
+
+    A difference, modulo 2^16, is small: -1, 1, -2, ... are 1, 2, 3, ..., and the low bytes of all come before the high ones.
+    """
+    x = np.asarray(line, dtype=np.float64)
+    if logarithmic:
+        x = np.log10(np.where(x > 0, x, np.nan))
+    known = np.isfinite(x)
+    low, high = (float(x[known].min()), float(x[known].max())) if known.any() else (0.0, 0.0)
+    fine = DECADES if logarithmic or not known.any() else STEP * float(np.subtract(*np.percentile(x[known], (75, 25))))
+    step = max((high - low) / LEVELS, fine) or 1.0
+    levels = np.full(x.size, LEVELS + 1, dtype=np.uint16)
+    levels[known] = np.round((x[known] - low) / step).astype(np.uint16)
+    changes = np.diff(levels, prepend=np.uint16(0)).view(np.int16)
+    folded = ((changes << 1) ^ (changes >> 15)).astype("<i2").view(np.uint8).reshape(-1, 2)
+    return [pool.add(folded.T.tobytes()), low, step]
+
+
+# ---------------------------------------------------------------------- `python -m wfsobs.app.report.page`
+
+
+def main() -> None:
+    """Write the page of a packed report on standard input; behind all else in priority: a report can wait."""
+    os.nice(10)
+    report = unpack(sys.stdin.buffer.read())
+    sys.stdout.buffer.write(page(report, datetime.now().astimezone()).encode())
+
+
+if __name__ == "__main__":
+    main()

@@ -124,7 +124,9 @@ class Strip:
         return self._score_fields(name, mean, results, "truth") | {"range": ends and f"mean {ends}"}
 
     def _score_fields(self, name: str, score: Score, results: RunResults, base: str) -> dict[str, Any]:
-        relative = f"{score.normalised_rms:.2f} × {base}" if score.normalised_rms is not None else ""
+        relative = f"{score.normalised_rms:.2f}" if score.normalised_rms is not None else ""
+        if relative:
+            relative = f"relative error {relative}" if base == "truth" else f"{relative} × {base}"
         return self._card(name, self._in_unit(score.rms, results), own_interval(score_rows([score], None)[0]) or relative)
 
     def _without_truth(self, name: str, results: RunResults) -> dict[str, Any]:

@@ -1,0 +1,371 @@
+"""The tables and the words of a report: errors, error budgets, closed loop, settings, and what the numbers mean."""
+
+from __future__ import annotations
+
+import base64
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import datetime
+from itertools import groupby
+from typing import Any
+
+from wfsobs import __version__
+from wfsobs.app.display import AT_LIMIT, IN_MOST, OVER_SEEDS, label_of, score_columns
+from wfsobs.app.render import NOTHING, number
+from wfsobs.app.report.data import Report, State, window_of
+from wfsobs.app.style import BOUND_MARKS, TERM_COLOURS
+from wfsobs.bench.measure import machine
+from wfsobs.closed_loop.rows import NOT_APPLICABLE, label
+from wfsobs.evaluation.budget import TERMS
+from wfsobs.evaluation.evidence import rank_observers
+from wfsobs.evaluation.rows import (
+    TIME,
+    Row,
+    above_bound,
+    can_be_best,
+    is_non_causal,
+    own_bound,
+    own_interval,
+    row_label,
+    scored_interval,
+    target_title,
+)
+from wfsobs.evaluation.scores import BOUND, BOUNDS, RESIDUAL
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.configfile import changed_settings, format_value, reference_preset, to_toml
+
+
+def state_table(state: State, name: str) -> dict[str, Any]:
+    """Collect what the table of a state shows: a group per target and mode, best first, and what is missing."""
+    groups = [list(rows) for _, rows in groupby(sorted(state.rows, key=_order(state.rows)), _group)]
+    return {
+        "name": name,
+        "columns": score_columns("nm", "z" if any(row["target"] == RESIDUAL for row in state.rows) else "truth"),
+        "groups": [_body(rows, state.grid.dt, state.seeds) for rows in groups],
+        "reasons": state.reasons,
+    }
+
+
+def _group(row: Row) -> tuple[str, str]:
+    return row["target"], row["mode"]
+
+
+def _order(rows: list[Row]):
+    """Targets and modes as they come, best first, those that stand apart last."""
+    groups = list(dict.fromkeys(map(_group, rows)))
+    return lambda row: (groups.index(_group(row)), row["apart"], row["rms_um"])
+
+
+def _body(rows: list[Row], dt: float, seeds: Mapping[str, Any]) -> dict[str, Any]:
+    target, mode = _group(rows[0])
+    marks = _marks(rows, seeds.get("leaders", {}).get(f"{target}/{mode}", []))
+    bounds = {row["observer"]: row["rms_um"] for row in rows if row["observer"] in BOUNDS}
+    limits = {
+        row["observer"]
+        for row in rows
+        if above_bound(row["rms_um"], row["interval_um"], bounds.get(own_bound(row["observer"]) or "")) == 0.0
+    }
+    over_seeds = f"{OVER_SEEDS}, {seeds.get('count', 1)} seeds"
+    return {
+        "target": target,
+        "mode": mode,
+        "title": ", ".join((target_title(target), mode, *filter(None, [scored_interval(rows)]))),
+        "rows": [
+            {
+                **row,
+                "label": row_label(row["observer"]),
+                "looks_ahead": is_non_causal(row["observer"]),
+                "stretch": own_interval(row),
+                "mark": marks.get(row["observer"]),
+                "at_limit": row["observer"] in limits and AT_LIMIT,
+                "interval": row["interval_um"] if seeds or row["observer"] in BOUNDS else None,
+                "meaning": IN_MOST if row["observer"] in BOUNDS else over_seeds,
+                "lag": NOTHING if row["lag_s"] is None else f"{1e3 * row['lag_s']:z.2f}".replace("-", "−"),
+                "time": row[TIME],
+                "factor": None if row[TIME] is None else 1e-6 * row[TIME] / dt,
+            }
+            for row in rows
+        ],
+    }
+
+
+def _marks(rows: list[Row], leaders: Sequence[str]) -> dict[str, str]:
+    """Mark the best, which differs significantly from all others over the seeds, or those tied; of one record the smallest."""
+    if leaders:
+        return dict.fromkeys(leaders, "tied" if len(leaders) > 1 else "best")
+    rivals = {row["observer"]: row["rms_um"] for row in rows if can_be_best(row["observer"], row["apart"])}
+    return dict.fromkeys(rank_observers(rivals)[:1], "smallest")
+
+
+# ------------------------------------------------------------------------------------------------- error budgets
+
+
+LEAST = 0.05
+"""Share of a bar that is drawn [%]."""
+
+
+ROUNDING = 1e-6
+"""Share of the error below which a term is 0."""
+
+
+def budget_key() -> dict[str, list[tuple[str, str]]]:
+    """Return the colours of the terms and of the bounds, with their labels."""
+    terms = [(TERM_COLOURS[name], label) for name, label in TERMS.items()]
+    return {"terms": terms, "bounds": [(f"2px {dash} {colour}", label) for colour, dash, label in BOUND_MARKS.values()]}
+
+
+def budget_state_table(state: State, name: str) -> dict[str, Any]:
+    """Collect what the table of a state shows: a group per target and mode, least error first."""
+    groups = groupby(state.budgets, key=lambda row: (row["target"], row["mode"]))
+    return {"name": name, "groups": [_budget_group(state, target, mode, list(rows)) for (target, mode), rows in groups]}
+
+
+def _budget_group(state: State, target: str, mode: str, rows: list[Row]) -> dict[str, Any]:
+    bounds = {
+        row["observer"]: row["rms_um"] ** 2
+        for row in state.rows
+        if (row["target"], row["mode"]) == (target, mode) and row["observer"] in BOUND_MARKS
+    }
+    ends = [(sum(min(x, 0.0) for x in terms.values()), sum(max(x, 0.0) for x in terms.values())) for terms in _all_terms(rows)]
+    low, high = min(low for low, _ in ends), max([*(high for _, high in ends), *bounds.values()])
+    span = high - low or 1.0
+    marks = [(*BOUND_MARKS[name][:2], f"{100.0 * (at - low) / span:.1f}") for name, at in bounds.items()]
+    return {
+        "target": target,
+        "mode": mode,
+        "title": f"{target_title(target)}, {mode}",
+        "marks": marks,
+        "rows": [_budget_row(row, low, span) for row in sorted(rows, key=lambda row: row["total_um2"])],
+    }
+
+
+def _all_terms(rows: list[Row]) -> list[Mapping[str, float]]:
+    return [row["terms_um2"] for row in rows]
+
+
+def _budget_row(row: Row, low: float, span: float) -> dict[str, Any]:
+    """Return the cells of an observer, and its bar: the space before it and its pieces in percent, negative ones first."""
+    terms: Mapping[str, float] = row["terms_um2"]
+    shares = {name: 100.0 * terms[name] / span for name in TERMS}
+    negative = sum(-x for x in shares.values() if x < 0)
+    ordered = sorted(TERMS, key=lambda name: shares[name] >= 0)
+    return {
+        "observer": row["observer"],
+        "label": row_label(row["observer"]),
+        "space": f"{100.0 * -low / span - negative:.1f}",
+        "pieces": [(TERM_COLOURS[name], f"{abs(shares[name]):.1f}") for name in ordered if abs(shares[name]) >= LEAST],
+        "total": number(1e6 * row["total_um2"]),
+        "cells": [_term_cell(terms[name], row["total_um2"]) for name in TERMS],
+    }
+
+
+def _term_cell(term: float, total: float) -> tuple[str, str]:
+    """Write a term [nm^2] and its share [%]; as 0 where rounding would show more than the cause."""
+    share = round(100.0 * term / total) if total else 0
+    return number(1e6 * term if abs(term) > ROUNDING * total else 0.0), f"{share}".replace("-", "−")
+
+
+# --------------------------------------------------------------------------------------------------- closed loop
+
+
+def loop_state_table(state: State, name: str) -> dict[str, Any]:
+    """Collect what the table of a state shows: a group per mode, least residual first."""
+    modes = list(dict.fromkeys(row["mode"] for row in state.loop))
+
+    def order(row: Row) -> tuple[int, float]:
+        residual = row["residual_rms_nm"]
+        return modes.index(row["mode"]), float("inf") if residual is None else residual
+
+    return {
+        "name": name,
+        "columns": (
+            "Controller",
+            "Residual [nm]",
+            "Residual [mas]",
+            f"Strehl at {state.scenario.control.wavelength:g} µm",
+            "Theory [nm]",
+            "Gain",
+            "Gain margin [dB]",
+            "Phase margin [°]",
+            "Delay margin [ms]",
+            "At a limit [%]",
+            "Prior knowledge",
+        ),
+        "groups": [
+            {"mode": mode, "title": mode[0].upper() + mode[1:], "rows": [_loop_row(row) for row in rows]}
+            for mode, rows in groupby(sorted(state.loop, key=order), key=lambda row: row["mode"])
+        ],
+    }
+
+
+def _loop_row(row: Row) -> dict[str, Any]:
+    linear = ("predicted_rms_nm", "gain", "gain_margin_db", "phase_margin_deg", "delay_margin_ms")
+    cells = [
+        number(row["residual_rms_nm"]),
+        number(row["residual_rms_mas"]),
+        NOTHING if row["strehl"] is None else f"{row['strehl']:.4f}",
+        *(NOT_APPLICABLE if row["limited"] and key != "gain" else number(row[key]) for key in linear),
+        NOTHING if row["limited"] is None else number(100.0 * row["limited"], 2),
+        row["needs"],
+    ]
+    return {
+        "controller": row["controller"],
+        "label": label(row["controller"]),
+        "unstable": row["stable"] is False,
+        "cells": cells,
+    }
+
+
+# --------------------------------------------------------------------------------------------------------- words
+
+
+LONGEST = 8000
+"""Characters of a command line; settings that need more go by file."""
+
+FILE = "wfsobs.toml"
+
+
+def summary(report: Report, date: datetime) -> str:
+    """Say in one line what this is."""
+    base, count = report.base, len(changed_settings(report.base, reference_preset(report.preset)))
+    length = report.states[0].grid.n * report.states[0].grid.dt
+    parts = [
+        f"Preset {report.preset}" + (f", {count} setting{'s' * (count > 1)} changed" if count else ""),
+        f"{length:g} s at {base.sensors.lgs_rate:g} Hz",
+        "of a loaded record" if report.is_recorded else f"seed {base.run.seed}",
+        *([f"{len(report.states)} variations"] if len(report.states) > 1 else []),
+        f"made {date:%Y-%m-%d %H:%M %Z}".rstrip() + f" with wfsobs {__version__}",
+    ]
+    return " · ".join(parts)
+
+
+# ---------------------------------------------------------------------- settings in words
+
+
+def setting_label(scenario: Scenario, path: str) -> str:
+    """Write a setting's label with its unit in [brackets]; the path itself if it has no label."""
+    p = {known: p for known, _, p in scenario.walk()}.get(path)
+    return path if p is None else label_of(p)
+
+
+def value_of(value: Any) -> str:
+    """Write a setting's value for people."""
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    text = f"{value:.6g}" if isinstance(value, (int, float)) else format_value(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def state_name(report: Report, state: State, index: int) -> str:
+    """Name a state by the values of what varies."""
+    parts = []
+    for variation, value in zip(report.variations, values_of(report, index), strict=True):
+        label, bracket, unit = setting_label(state.scenario, variation.path).partition(" [")
+        parts.append(f"{label} {value_of(value)}{' ' + unit.rstrip(']') if bracket else ''}")
+    return ", ".join(parts)
+
+
+def values_of(report: Report, index: int) -> list[Any]:
+    """List the value of every variation in a state."""
+    out = []
+    for variation in reversed(report.variations):
+        index, at = divmod(index, len(variation.values))
+        out.append(variation.values[at])
+    return out[::-1]
+
+
+# ---------------------------------------------------------------------- sections
+
+
+def scenario_values(report: Report) -> dict[str, Any]:
+    """Collect what differs from the preset, what varies, and every setting."""
+    preset = reference_preset(report.preset)
+    toml = f'preset = "{report.preset}"\n{to_toml(report.base)}'
+    return {
+        "changed": [
+            {
+                "name": setting_label(report.base, path),
+                "path": path,
+                "before": value_of(_at(preset, path)),
+                "now": value_of(value),
+            }
+            for path, value in changed_settings(report.base, preset).items()
+        ],
+        "variations": [
+            {
+                "name": setting_label(report.states[0].scenario, v.path),
+                "path": v.path,
+                "texts": [value_of(value) for value in v.values],
+            }
+            for v in report.variations
+        ],
+        "file": FILE,
+        "toml": toml,
+        "toml_base64": base64.b64encode(toml.encode()).decode(),
+    }
+
+
+def meaning_values(report: Report) -> dict[str, Any]:
+    """Collect what the explanation of the numbers depends on.
+
+    matched : what the Kalman filters are given that a real one has to estimate
+    points  : points kept of a trace, the fewest and the most of the states; none where every sample is
+    """
+    rows = [row for state in report.states for row in state.rows]
+    kalman, grids = report.base.kalman, [state.grid for state in report.states]
+    noises = {"disturbances": kalman.process_noise, "sensor noise": kalman.measurement_noise}
+    counts = sorted({g.n if g.whole else 2 * g.bins + g.width for g in grids})
+    return {
+        "warm_up": f"{report.base.run.warm_up:g}",
+        "truthless": any(row["target"] == RESIDUAL for row in rows),
+        "bounded": any(row["observer"] == BOUND for row in rows),
+        "seeds": n_seeds(report),
+        "budgeted": any(state.budgets for state in report.states),
+        "matched": [what for what, how in noises.items() if how == "matched"],
+        "points": [] if all(g.whole for g in grids) else counts if len(counts) < 2 else [counts[0], counts[-1]],
+        "window": window_of(report.states),
+    }
+
+
+def n_seeds(report: Report) -> int:
+    """Return the number of seeds that the errors rest on."""
+    return max((int(state.seeds.get("count", 1)) for state in report.states), default=1)
+
+
+def origin_values(report: Report, date: datetime) -> dict[str, Any]:
+    """Collect versions, date, seed, and the command that makes the report again."""
+    command, by_file = command_of(report)
+    facts = {"Program": f"wfsobs {__version__}, {machine(('bokeh',))}", "Made": f"{date:%Y-%m-%d %H:%M:%S %Z}".rstrip()}
+    if not report.is_recorded:
+        facts["Seed"] = str(report.base.run.seed)
+    return {"facts": facts, "command": command, "by_file": by_file}
+
+
+def command_of(report: Report) -> tuple[str, bool]:
+    """Write the command line of a report; say whether it takes its settings from FILE, being too long otherwise."""
+    if report.is_recorded:
+        command = report.command or f"wfsobs observe RECORD --config {FILE}"
+        return command, f"--config {FILE}" in command
+    changed = changed_settings(report.base, reference_preset(report.preset))
+    seeds = n_seeds(report)
+    ends = [*_words("--vary", report.variations), *(["--seeds", str(seeds)] if seeds > 1 else [])]
+    command = _command(
+        ["--preset", report.preset, *_words("--set", (f"{k}={format_value(v)}" for k, v in changed.items())), *ends]
+    )
+    return (command, False) if len(command) <= LONGEST else (_command(["--config", FILE, *ends]), True)
+
+
+def _command(words: Sequence[str]) -> str:
+    return shlex.join(["wfsobs", "export", "report.html", *words])
+
+
+def _words(option: str, values: Iterable[object]) -> list[str]:
+    return [word for value in values for word in (option, str(value))]
+
+
+def _at(scenario: Scenario, path: str) -> Any:
+    """Look up the plain value at a dotted path of groups."""
+    node: Any = scenario.to_dict()
+    for key in path.split("."):
+        node = node[key]
+    return node
