@@ -74,7 +74,7 @@ def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: 
         (s.observer, s.target, s.mode, s.rms) for s in expected.scores
     ]
     table = dashboard.explore.table.html()
-    assert "one step ahead: the record has no truth" in table and "Recorded loop, residual" in table and "error / z" in table
+    assert "one step ahead: the record has no truth" in table and "Recorded loop, residual" in table and "Relative error" in table
     assert "nan" not in table
     line = dashboard.explore.traces.traces["vibration"].source.data
     assert np.isfinite(line["kf-lgs"]).all() and np.isnan(line["truth"]).all()
