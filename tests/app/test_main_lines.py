@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -12,9 +13,12 @@ import pytest
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.display import Display
 from wfsobs.app.jobs import DONE, RUNNING
-from wfsobs.app.style import observers_of
+from wfsobs.app.render import number
+from wfsobs.app.style import look, observers_of
 from wfsobs.app.views.main_lines import REFERENCES, MainLines, main_observers
+from wfsobs.app.views.plots import APART, GREY, MOST_COLOURED
 from wfsobs.app.views.traces import first_window
+from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.evidence import rank_observers
 from wfsobs.evaluation.known_lines import NOTHING, PEAKS, prior_knowledge
 from wfsobs.evaluation.rows import NO_ESTIMATE, is_non_causal
@@ -166,3 +170,55 @@ class TestFirstWindow:
         dashboard.store.load(short.replace({"run.duration": 4.0, "events": events}))
         loop.finish(dashboard.store)
         assert first_window(dashboard.store.run.result) == (1.5, 3.5)
+
+
+class TestNamesAndGrey:
+    def test_names_stand_at_the_ends_of_the_lines_and_apart(self, dashboard: Dashboard) -> None:
+        for figures in (dashboard.explore.traces.traces, dashboard.explore.spectra.spectra):
+            for target, view in figures.items():
+                source, axis = view.names_at_end.source.data, view.figure.y_range
+                shown = [look(name).label for name, line in view.lines.items() if line.visible]
+                names = [text.replace("\n", " ") for text in source["text"]]
+                assert {*names} <= {*shown} and look("kf-lgs").label in names
+                assert set(source["x"]) == {view.figure.x_range.end}, target
+                scale = np.log10 if view is dashboard.explore.spectra.spectra[target] else np.asarray
+                low, high = scale(axis.start), scale(axis.end)
+                places = (scale(source["y"]) - low) / (high - low)
+                assert 0.0 < places.min() and places.max() < 1.0
+                assert np.diff(places).min(initial=1.0) >= min(APART, 1.0 / len(places)) - 1e-9
+
+    def test_of_many_lines_those_that_the_verdict_does_not_name_recede(self, dashboard: Dashboard) -> None:
+        main = dashboard.display.named_lines["vibration"]
+        other = next(name for name in observers_of("vibration") if name not in main)
+        lines = dashboard.explore.traces.traces["vibration"].lines
+        dashboard.explore.lines.choose("vibration", [])
+        assert [name for name, line in lines.items() if not line.recedes] == [TRUTH, *main]
+        grey = lines[other].renderer
+        assert grey is not None and grey.glyph.line_color == GREY[False] and grey.tags == [look(other).light]
+        few = [*main[: MOST_COLOURED - 2], other]
+        dashboard.explore.lines.choose("vibration", [name for name in observers_of("vibration") if name not in few])
+        assert not any(line.recedes for line in lines.values()) and grey.glyph.line_color == look(other).light
+
+    def test_the_effect_of_a_change_stands_below_its_setting(self, dashboard: Dashboard, loop: Any) -> None:
+        dashboard.complete()
+        before = dashboard.store.run.result.result.scores
+        dashboard.store.change("turbulence.wind_speed", 25.0)
+        loop.finish(dashboard.store)
+        html = dashboard.controls.fields["turbulence.wind_speed"].view[-1].object
+        target, old, new = re.fullmatch(r"(\w+), .*: ([\d.]+) → ([\d.]+) nm", html).groups()
+        after = dashboard.store.run.result.result.scores
+        pairs = {
+            (number(1e3 * a.rms), number(1e3 * b.rms))
+            for a in before
+            for b in after
+            if (a.observer, a.target, a.mode) == (b.observer, b.target, b.mode) == (b.observer, target.lower(), "tip")
+            and a.observer in OBSERVERS
+            and prior_knowledge(a.observer) == NOTHING
+        }
+        assert (old, new) in pairs
+        dashboard.store.change("sensors.exposure_ratio", 4)
+        loop.finish(dashboard.store)
+        assert len(dashboard.controls.fields["turbulence.wind_speed"].view) == 1, "of the last change alone"
+        dashboard.store.choose("ut4")
+        loop.finish(dashboard.store)
+        assert len(dashboard.controls.fields["sensors.exposure_ratio"].view) == 1, "several settings at once"

@@ -31,6 +31,7 @@ from wfsobs.app.style import asset, labels, theme
 from wfsobs.app.upload import Upload
 from wfsobs.app.view_state import ViewState
 from wfsobs.app.views.history_sheet import HistorySheet, session_save
+from wfsobs.app.views.main_lines import effect_line
 from wfsobs.app.views.switches import ModeSwitch, UnitSwitch
 from wfsobs.scenario import Scenario
 
@@ -140,6 +141,7 @@ class Dashboard:
         self.display = Display()
         self._theme_chosen = False
         self.controls = Controls(self.store)
+        self.controls.effect_of = partial(effect_line, self.display)
         self.actions = Actions(self.store)
         self.upload.open_scenario = self.actions.open_file
         self.history = History(self.store, self.display)

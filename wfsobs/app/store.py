@@ -199,7 +199,7 @@ class Store(param.Parameterized):
 
     def changed_paths(self) -> list[str]:
         """Dotted paths of the settings that differ from the preset's."""
-        return _paths(self.scenario.difference(reference_preset(self.preset)))
+        return paths_between(reference_preset(self.preset), self.scenario)
 
     def close(self) -> None:
         """Release what the store holds; called when the session ends."""
@@ -257,6 +257,11 @@ def _of_one_file(steps: list[Step], source: Source | None) -> list[Step]:
 def _covers(path: str, other: str) -> bool:
     """Whether setting `path` replaces what stands at `other`."""
     return other == path or other.startswith(f"{path}.")
+
+
+def paths_between(before: Scenario, now: Scenario) -> list[str]:
+    """Dotted paths of the settings that differ between two scenarios."""
+    return _paths(now.difference(before))
 
 
 def _paths(tree: dict[str, Any], prefix: str = "") -> list[str]:

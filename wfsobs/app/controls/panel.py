@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from types import MappingProxyType
 from typing import Any
@@ -19,10 +19,11 @@ from wfsobs.app.controls.names import preset_line, preset_title, setting_name
 from wfsobs.app.controls.rows import RowEditor
 from wfsobs.app.controls.search import Search
 from wfsobs.app.controls.status import BAR, ON_BAR, STATUS_ON_BAR, Status, status_of
-from wfsobs.app.jobs import RUNNING
-from wfsobs.app.store import Store
+from wfsobs.app.jobs import DONE, RUNNING
+from wfsobs.app.store import Store, paths_between
 from wfsobs.app.style import PRIMARY
 from wfsobs.app.views.plots import AFTERWARDS_MS, once
+from wfsobs.app.work import RunResults
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.idle import idle_settings
 from wfsobs.scenario.presets import PRESETS
@@ -56,6 +57,17 @@ TWO_LINES = """
 """What is below must not move under the pointer with every change."""
 
 
+EFFECT = {
+    "position": "absolute",
+    "bottom": "-6px",
+    "left": "0",
+    "font-size": "12px",
+    "line-height": "14px",
+    "pointer-events": "none",
+}
+"""In the gap below a setting: what a change has done takes no room of its own."""
+
+
 class Controls:
     """Everything in the drawer, in step with the store."""
 
@@ -85,6 +97,10 @@ class Controls:
         self.cancel = pmui.Button(label="Cancel", icon="stop", variant="outlined", size="small", margin=(0, 10, 0, 6), sx=ON_BAR)
         self.status = Status(sizing_mode="stretch_width", max_width=200, margin=0, stylesheets=[STATUS_ON_BAR])
         self.search = Search(self.open_setting, self._idle, sizing_mode="stretch_width", margin=(8, 0, 4, 0))
+        self.effect_of: Callable[[RunResults, RunResults], str] = lambda _before, _now: ""
+        self._effect = pn.pane.HTML("", margin=0, styles=EFFECT)
+        self._before: RunResults | None = None
+        self._changed_part: Field | RowEditor | None = None
         self.topics = _names()
         self.rooms = {name: pn.Column(sizing_mode="stretch_width", margin=0) for name in self.topics}
         self.titles = dict(self.topics)
@@ -217,6 +233,7 @@ class Controls:
         self.store.param.watch(self._refresh_parts, ["scenario", "source"])
         self.store.param.watch(self._refresh_run, ["errors", "waiting"])
         self.store.session.param.watch(self._refresh_run, "doing")
+        self.store.run.param.watch(self._show_effect, "state")
         # Last, so that "Done" is said of what has been drawn.
         self.store.run.param.watch(self._refresh_run, ["state", "progress", "place", "message"], precedence=2)
 
@@ -246,6 +263,19 @@ class Controls:
             for i, (name, title) in enumerate(titles.items()):
                 self.accordion[i] = (title, self.rooms[name])
             self.accordion.param.trigger("objects")  # which are the same
+
+    def _show_effect(self, event: param.parameterized.Event) -> None:
+        """Say below the one setting that changed what came of it."""
+        now = self.store.run.result
+        if event.new != DONE or now is None or now is self._before:
+            return
+        before, self._before = self._before, now
+        changed = paths_between(before.scenario, now.scenario) if before else []
+        part = (self.fields.get(changed[0]) or self.lists.get(changed[0])) if len(changed) == 1 else None
+        self._effect.object = self.effect_of(before, now) if before and part else ""
+        for at in (it for it in {self._changed_part, part} if it is not None):
+            at.view[:] = [*(it for it in at.view if it is not self._effect), *([self._effect] if at is part else [])]
+        self._changed_part = part
 
     def _refresh_run(self, *_: object) -> None:
         run = self.store.run

@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
-from wfsobs.app.display import Display
+import numpy as np
+
+from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs import RUNNING, BackgroundTask
-from wfsobs.app.style import observers_of
+from wfsobs.app.render import number
+from wfsobs.app.style import look, observers_of
+from wfsobs.app.work import RunResults
 from wfsobs.evaluation.evidence import rank_observers
 from wfsobs.evaluation.known_lines import NOTHING, PEAKS, prior_knowledge
 from wfsobs.evaluation.rows import can_be_best
@@ -37,6 +41,31 @@ def main_observers(scores: Iterable[Score], target: str, mode: str, leaders: Seq
     for kind in (NOTHING, PEAKS):
         best += [name for name in ranked if prior_knowledge(name) == kind][:1]
     return [name for name in drawn if name in best or name in REFERENCES] if best else drawn
+
+
+def effect_line(display: Display, before: RunResults, now: RunResults) -> str:
+    """Write how the error of the best observer without prior knowledge has changed, of the target where it did most.
+
+    Nothing where it did not, or there is no such error of either run.
+    """
+    found: list[tuple[float, str]] = []
+    scale = per_micrometre(display.unit, now.scenario.telescope.diameter)
+    for target in TARGETS:
+        old, new = (
+            {
+                s.observer: s.rms
+                for s in results.result.scores
+                if (s.target, s.mode) == (target, display.mode)
+                and can_be_best(s.observer, s.apart)
+                and prior_knowledge(s.observer) == NOTHING
+            }
+            for results in (before, now)
+        )
+        best = next((name for name in rank_observers(new) if name in old and name in observers_of(target)), None)
+        if best is not None and new[best] != old[best]:
+            errors = f"{number(scale * old[best])} → {number(scale * new[best])} {display.unit_label}"
+            found.append((abs(np.log(new[best] / old[best])), f"{target.capitalize()}, {look(best).label}: {errors}"))
+    return max(found)[1] if found else ""
 
 
 class MainLines:

@@ -258,7 +258,8 @@ class _Trace:
         error = shows_error(results, self.target, display)
         extra = self._draw_compared(display, error, data["x"]) + self._draw_band(results, display, first, last, data["x"])
         self._fit(data, settled, extra, room(results))
-        self.names_at_end.draw({name: (data["x"], data[name]) for name, line in self.lines.items() if line.visible}, display.dark)
+        shown = {name: (data["x"], data[name]) for name, line in self.lines.items() if line.visible and not line.recedes}
+        self.names_at_end.draw(shown, display.dark)
         self.events.draw(results, display.dark)
         what = f"{'running rms of ' if error and display.running else ''}{'error of ' if error else ''}{display.mode_label}"
         self.figure.yaxis.axis_label = f"{what} [{display.unit_label}]"
