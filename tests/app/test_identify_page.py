@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +15,7 @@ from wfsobs.app.display import per_micrometre
 from wfsobs.app.jobs import DONE, FAILED, RUNNING
 from wfsobs.app.limits import PUBLIC, Limits
 from wfsobs.app.pages import identify as module
-from wfsobs.app.pages.identify import EARLIER, IdentifyPage, same_measurements, seconds
+from wfsobs.app.pages.identify import EARLIER, IDENTIFIED, NEXT, IdentifyPage, same_measurements, seconds
 from wfsobs.app.pages.pages import EXPLORE, IDENTIFY
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord
 from wfsobs.app.style import LOOKS
@@ -23,6 +24,7 @@ from wfsobs.identification import Identification, identify
 from wfsobs.identification.process import Number
 from wfsobs.identification.report import format_number, whiteness_lines
 from wfsobs.pipeline import observe
+from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.formats import format_of
@@ -166,13 +168,41 @@ def test_as_a_new_simulation(page: IdentifyPage, dashboard: Dashboard, loop: Any
     assert not page.stale.visible, "an observer's setting is not the record's"
 
 
-def test_a_loaded_record_stays(page: IdentifyPage, dashboard: Dashboard, loop: Any, short: Scenario) -> None:
+def load_record(dashboard: Dashboard, loop: Any, scenario: Scenario) -> Record:
+    """Load the record of a night, whose truth nobody knows."""
     file = io.BytesIO()
-    record = simulate(short.replace({"run.seed": 9}))
+    record = simulate(scenario.replace({"run.seed": 9}))
     format_of(".npz").write(file, record_arrays(replace(record, turbulence=None, vibration=None)))
     file.seek(0)
     dashboard.store.run_on(LoadedRecord(loaded := read_record(file, "night.npz"), "night.npz", "key"), dashboard.store.scenario)
     loop.finish(dashboard.store)
+    return loaded
+
+
+def test_the_first_suggestion_for_a_loaded_record(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
+    """One button identifies it, has the observers use the model, and says so; undo brings the suggestion back."""
+    it = dashboard.pages.suggestion
+    assert not it.view.visible, "of a simulation the settings are known"
+    load_record(dashboard, loop, short)
+    assert it.view.visible and it.button.visible and NEXT in it.words.object
+    before = dashboard.store.run.result
+    it.button.param.trigger("clicks")
+    assert it.button.disabled and "Identifying" in it.words.object
+    loop.until(lambda: IDENTIFIED in it.words.object)
+    loop.finish(dashboard.store)
+    assert not it.button.visible and dashboard.pages.current == EXPLORE
+    (peak,) = dashboard.store.scenario.vibration.peaks
+    assert peak.frequency == pytest.approx(LINE, abs=0.2)
+    after = dashboard.store.run.result
+    assert before is not None and after is not None and after.result.record is before.result.record
+    sentence = re.sub("<.*?>", "", dashboard.explore.verdicts["turbulence"].html())
+    assert "next measurement" in sentence.lower() and "peak" in sentence
+    dashboard.store.undo()
+    assert it.button.visible and NEXT in it.words.object
+
+
+def test_a_loaded_record_stays(page: IdentifyPage, dashboard: Dashboard, loop: Any, short: Scenario) -> None:
+    loaded = load_record(dashboard, loop, short)
     identified(page, loop)
     page.starter.uses[0].param.trigger("clicks")
     loop.finish(dashboard.store)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from html import escape
@@ -19,7 +19,7 @@ from wfsobs.app.downloads import Save
 from wfsobs.app.jobs import DONE, FAILED, RUNNING, BackgroundTask, Job, Tell
 from wfsobs.app.pages.parts import WIDE, LinkedFields, PageActions, Starter, box, html, legend, line, text
 from wfsobs.app.render import Row, macro, table
-from wfsobs.app.sources import SimulatedRecord, Source
+from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source
 from wfsobs.app.store import Store
 from wfsobs.app.style import look
 from wfsobs.app.views.plots import call, new_figure
@@ -336,6 +336,14 @@ class IdentifyPage(PageActions):
         """Take the model into the settings, for the filters alone: the record stays, be it loaded or simulated."""
         self._take(self.store.source or SimulatedRecord(self.store.scenario))
 
+    @property
+    def is_used(self) -> bool:
+        """Whether the settings are those of the model identified in the record shown."""
+        (result, record), shown = self._model_and_record(), self.run.result
+        if result is None or record is None or shown is None or not same_measurements(record, shown.result.record):
+            return False
+        return result.scenario(self.store.scenario) == self.store.scenario
+
     def simulate(self) -> None:
         """Take the model into the settings, and simulate it in place of the record."""
         self._take(None)
@@ -406,6 +414,47 @@ class IdentifyPage(PageActions):
                 self.stale.param.update(
                     object=REPLACED if replaced else EARLIER, visible=not same_measurements(record, of.record)
                 )
+
+
+NEXT = "Next: identify noise, turbulence and vibration peaks in this record, as prior knowledge of the observers."
+IDENTIFIED = "The observers use what was identified in this record."
+
+
+class Suggestion:
+    """The line above the first results of a loaded record: its button identifies it and has the filters use the model."""
+
+    def __init__(self, store: Store, make_page: Callable[[], IdentifyPage]):
+        self.store, self._make_page = store, make_page
+        self.page: IdentifyPage | None = None
+        self._waits = False  # for a model that is to be used once it is there
+        self.words = html()
+        self.button = pmui.Button(label="Identify", icon="troubleshoot", size="small", margin=0)
+        self.view = pn.FlexBox(self.words, self.button, gap="8px 12px", align_items="center", visible=False, **WIDE)
+        self.words.sizing_mode = None
+        self.button.on_click(self._identify)
+        store.param.watch(self._refresh, ["source", "scenario"])
+        store.run.param.watch(self._refresh, "state")
+
+    def _identify(self, _event: object) -> None:
+        if self.page is None:
+            self.page = self._make_page()
+            self.page.work.param.watch(self._refresh, ["state", "progress", "message"])
+        self.page.start()
+        self._waits = self.page.work.state == RUNNING
+        self._refresh()
+
+    def _refresh(self, *_: object) -> None:
+        work = self.page.work if self.page else None
+        if work and self.page and self._waits and work.state != RUNNING:
+            self._waits = False
+            if work.state == DONE:
+                self.page.tell_filters()
+        running, used = bool(work and work.state == RUNNING), bool(self.page and self.page.is_used)
+        said = IDENTIFIED if used else work.line("Identifying") if work and running else (work and work.message) or NEXT
+        with pn.io.hold():
+            self.words.object = f'<p class="text" role="status">{escape(said)}</p>'
+            self.button.param.update(visible=not used, disabled=running or self.store.run.state != DONE)
+            self.view.visible = isinstance(self.store.source, LoadedRecord)
 
 
 def _number(label: str, value: float) -> pmui.TextInput:

@@ -16,9 +16,10 @@ from wfsobs.app.display import Display
 from wfsobs.app.pages.campaign import CampaignPage
 from wfsobs.app.pages.closed_loop import ClosedLoopPage
 from wfsobs.app.pages.figures import Figures
-from wfsobs.app.pages.identify import IdentifyPage
+from wfsobs.app.pages.identify import IdentifyPage, Suggestion
 from wfsobs.app.pages.live import LivePage
 from wfsobs.app.pages.model import ModelPage
+from wfsobs.app.pages.parts import WIDE
 from wfsobs.app.pages.sweep import SweepPage
 from wfsobs.app.pages.sweep_views import report_part
 from wfsobs.app.pages.tune import TunePage
@@ -88,11 +89,12 @@ class Pages(param.Parameterized):
         }
         if store.session.service.campaign is not None:
             self._makers[CAMPAIGN] = lambda: CampaignPage(store, display, explored)
+        self.suggestion = Suggestion(store, self._identify_page)
         known = {title: name for title, name in TITLES.items() if name == EXPLORE or name in self._makers}
         self.param["current"].objects = [*known.values()]
         self.by_name: dict[str, Page] = {EXPLORE: explore}
         self.rooms = {
-            EXPLORE: explore.view(),
+            EXPLORE: pn.Column(self.suggestion.view, explore.view(), **WIDE),
             **{name: pn.Column(visible=False, sizing_mode="stretch_width", margin=0) for name in self._makers},
         }
         self.switch = pmui.RadioButtonGroup.from_param(
@@ -107,6 +109,11 @@ class Pages(param.Parameterized):
         assert isinstance(page, SweepPage)
         page.choose(path)  # before the page is sent: a field that the browser is about to make may miss a change
         self.current = SWEEP
+
+    def _identify_page(self) -> IdentifyPage:
+        page = self._page_of(IDENTIFY)
+        assert isinstance(page, IdentifyPage)
+        return page
 
     def shown_beside(self, result: Result) -> dict[str, Any]:
         """Return what a report has of the last sweep, and of the runs that a result is compared with; None for nothing."""
