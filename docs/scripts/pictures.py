@@ -97,6 +97,7 @@ if __name__ == "__main__":
         browser = p.chromium.launch(executable_path=os.environ.get("CHROMIUM") or "/usr/bin/chromium", args=["--no-sandbox"])
         for name in chosen:
             page = browser.new_page()
+            page.add_init_script("localStorage.setItem('wfsobs-tour', 'offered')")
             page.set_default_timeout(SLOW)
             take(page, address, PICTURES[name], ROOT / "docs" / f"{name}.png")
             page.close()

@@ -6,7 +6,9 @@ import re
 from typing import Any
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Browser, Page, expect
+
+from wfsobs.observers import OBSERVERS
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +85,31 @@ def test_help_and_tour_by_keyboard(wide: Page) -> None:
     expect(page.get_by_role("combobox", name="Find a setting")).to_be_focused()
     page.keyboard.press("?")
     expect(sheet).to_be_hidden()
+
+
+def test_the_tour_is_offered_once_and_observers_are_described(browser: Browser, server: Any) -> None:
+    """To a browser that was not here before; pointing at a card and its focus say what the observer is."""
+    context = browser.new_context(viewport={"width": 1280, "height": 720})
+    page = context.new_page()
+    page.goto(server.url)
+    offer = page.get_by_role("dialog", name="Tour offer")
+    offer.get_by_role("button", name="Take the tour").click()
+    expect(page.get_by_role("dialog", name="Tour", exact=True)).to_contain_text("1 of 5")
+    page.keyboard.press("Escape")
+    expect(page.get_by_role("dialog", name="Tour")).to_have_count(0)
+    for name in ("kf-lgs", "gpr-online"):
+        card = page.locator(f'.card[data-name="{name}"]').last
+        card.hover()
+        about = page.locator(".hint .about").last
+        expect(about).to_have_text(f"{OBSERVERS[name].label}: {OBSERVERS[name].help}.")
+        page.mouse.move(0, 0)
+        expect(about).to_have_text("")
+        card.focus()
+        expect(about).to_have_text(f"{OBSERVERS[name].label}: {OBSERVERS[name].help}.")
+    page.reload()
+    expect(page.locator("p.verdict").first).to_be_visible()
+    assert page.evaluate("localStorage.getItem('wfsobs-tour')") == "offered"
+    context.close()
 
 
 PAINTED = """async () => {

@@ -8,6 +8,8 @@ from types import MappingProxyType
 from markupsafe import Markup, escape
 
 from wfsobs.app.render import macro
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.observers import OBSERVERS
 
 KF, GPR, LGS, NGS, BOUND, NEEDS, LAG, STREHL, RELATIVE, RMS_ERROR, REAL_TIME, STATED = (
     "KF",
@@ -59,6 +61,16 @@ TERMS: Mapping[str, str] = MappingProxyType(
         STREHL: "Peak intensity over that of an image without error, from the residual of the simulated modes; at most 1.",
     }
 )
+
+
+def describe(name: str) -> str:
+    """Write what an observer or a controller is in one sentence, that of its registry; nothing of what is neither.
+
+    >>> describe("persistence"), describe("bound")
+    ('Persistence: the newest measurement taken for the turbulence.', '')
+    """
+    it = OBSERVERS.get(name) or CONTROLLERS.get(name)
+    return f"{it.label}: {it.help}." if it and it.help else ""
 
 
 def term(name: str, words: str = "") -> Markup:

@@ -39,6 +39,7 @@ export function render({model, el}) {
   sheet.addEventListener("beforetoggle", () => { fill(); paint(sheet) })
   sheet.addEventListener("toggle", (event) => { if (event.newState === "open") sheet.querySelector("button").focus() })
 
+  if (isFirst()) setTimeout(() => offer(el), 2000)
   const stop = new AbortController()
   document.addEventListener("keydown", (event) => {
     const at = event.composedPath()[0]
@@ -60,6 +61,31 @@ function deep(selector, root = document) {
     if (below) return below
   }
   return null
+}
+
+// Whether nobody has been here with this browser, as far as it tells.
+function isFirst() {
+  try {
+    return localStorage.getItem("wfsobs-tour") === null
+  } catch {
+    return false
+  }
+}
+
+// Offer the tour, once: it goes with the next click beside it.
+function offer(el) {
+  if (!el.isConnected) return
+  localStorage.setItem("wfsobs-tour", "offered")
+  const note = Object.assign(document.createElement("div"), {className: "tour offer", popover: "auto"})
+  note.setAttribute("role", "dialog")
+  note.setAttribute("aria-label", "Tour offer")
+  const button = (words, act) => Object.assign(document.createElement("button"), {type: "button", textContent: words, onclick: act})
+  const line = Object.assign(document.createElement("p"), {textContent: "New here? Five steps show what is where."})
+  note.append(line, button("Take the tour", () => { note.hidePopover(); tour(el) }), button("Not now", () => note.hidePopover()))
+  note.ontoggle = (event) => { if (event.newState === "closed") note.remove() }
+  el.append(note)
+  note.showPopover()
+  paint(note)
 }
 
 // Show the stops of the tour one by one, each with what it is about in a ring.

@@ -265,7 +265,7 @@ function card(target, name) {
   const inUnit = (um) => number(um * data.states[shown.state].scale[shown.unit])
   const missing = name === "truth" ? "" : drawn ? "no truth" : "no result"
   return {
-    name, label: loop ? "Recorded loop" : look.label, colour: loop ? "transparent" : look[dark ? "dark" : "light"], dash: look.dash,
+    name, label: loop ? "Recorded loop" : look.label, colour: loop ? "transparent" : look[dark ? "dark" : "light"], dash: look.dash, about: loop ? "" : look.about,
     value: row ? number(value * data.states[shown.state].scale[shown.unit]) : "–",
     unit: row ? data.units[shown.unit] : "", note: row ? (known && name === "truth" ? "rms" : own(row) || relative) : missing,
     range: interval ? `mean ${interval.map(inUnit).join(" – ")}` : undefined,

@@ -53,6 +53,7 @@ export function render({model, el}) {
     card.type = "button"
     card.className = hidden.includes(item.name) ? "card minor" : "card"  // until it is drawn again: a click moves no card
     card.dataset.name = item.name
+    card.dataset.about = item.about ?? ""
     card.style.setProperty("--colour", item.colour)
     part(card, "line", "").innerHTML = line(item)
     part(card, "name", item.label)
@@ -93,7 +94,7 @@ export function render({model, el}) {
       const shown = !hidden.includes(card.dataset.name)
       const label = card.querySelector(".name").textContent
       card.setAttribute("aria-pressed", shown)
-      card.title = `${shown ? "Hide" : "Show"} ${label}; double click or S: ${label} alone`
+      card.title = `${card.dataset.about ? `${card.dataset.about} ` : ""}${shown ? "Hide" : "Show"} ${label}; double click or S: ${label} alone`
     }
     const n = cards.filter((it) => !hidden.includes(it.dataset.name)).length
     count.textContent = n < cards.length ? `${n} of ${cards.length} lines shown` : ""
@@ -128,6 +129,15 @@ export function render({model, el}) {
     it.popoverTargetElement = definition
     hint.append(definition)
   }
+
+  // What an observer is, of the card that is pointed at or has the focus.
+  const about = document.createElement("span")
+  about.className = "about"
+  hint.append(about)
+  const tell = (event) => { about.textContent = event.target.closest(".card")?.dataset.about ?? "" }
+  strip.onpointerover = tell
+  strip.addEventListener("focusin", tell)
+  strip.onpointerleave = () => { about.textContent = "" }
 
   model.on("items", draw)
   const follow = () => {

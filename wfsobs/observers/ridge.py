@@ -159,7 +159,7 @@ RIDGE_30 = Observer(
     "30-tap predictor",
     (VIBRATION,),
     ridge_30,
-    help="plain least squares on 30 measurements z: the honest baseline",
+    help="least squares on the last 30 measurements: the plain baseline",
     prior=(Training, OfflineBands),
     needs=("training",),
     linear=True,

@@ -90,7 +90,7 @@ class Grid:
 
 
 POINTS = 1_250_000
-"""Points of all lines of all states together, spectra included: what fits into 4 MB with Bokeh."""
+"""Points of all lines of all states together, spectra included: three states stay below 4 MB with Bokeh."""
 
 SPECTRUM, SPECTRUM_BINS = 400, 100
 """Points of a spectrum that are kept as they are (up to 200 Hz), and pairs of extremes of those above."""

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 
 from wfsobs import __version__
 from wfsobs.app.display import NO_ANGLE, UNITS, per_micrometre
+from wfsobs.app.glossary import describe
 from wfsobs.app.pages.sweep_views import SweepLines
 from wfsobs.app.render import render
 from wfsobs.app.report.data import Report, State, unpack, window_of
@@ -142,7 +143,13 @@ def _data(report: Report) -> dict[str, Any]:
     states = [_state(state, pool) for state in report.states]
     return {
         "looks": {
-            name: {"label": look(name).label, "light": look(name).light, "dark": look(name).dark, "dash": look(name).dash}
+            name: {
+                "label": look(name).label,
+                "light": look(name).light,
+                "dark": look(name).dark,
+                "dash": look(name).dash,
+                "about": describe(name),
+            }
             for name in _line_names()
         },
         "hidden": {

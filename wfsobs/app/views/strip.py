@@ -9,7 +9,7 @@ import param
 
 from wfsobs.app.component import Component
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.glossary import RELATIVE, TERMS
+from wfsobs.app.glossary import RELATIVE, TERMS, describe
 from wfsobs.app.jobs import RUNNING, BackgroundTask
 from wfsobs.app.render import NOTHING, change, number
 from wfsobs.app.seeds import SeedRuns
@@ -26,7 +26,7 @@ MAIN = "Show the main ones"
 class Cards(Component):
     """The cards in the browser; a click on one hides or shows its line, a double click shows it alone."""
 
-    items = param.List([], doc="{name, label, colour, dash, value, unit, note, range, compared} of every card.")
+    items = param.List([], doc="{name, label, colour, dash, about, value, unit, note, range, compared} of every card.")
     hidden_lines = param.List([], doc="Names of the cards whose lines are hidden.")
     last_arrival = param.Integer(0, doc="Number of the last click that has arrived, and all before it.")
     terms = param.Dict({}, doc="Word that stands on the cards -> what it means.")
@@ -156,6 +156,7 @@ class Strip:
             "label": it.label,
             "colour": it.colour(self.display.dark),
             "dash": list(it.dash),
+            "about": describe(name),
             "note": note,
             "range": "",
             "value": NOTHING if value is None else number(value),

@@ -28,7 +28,7 @@ GP_BOTH = Observer(
     "GP on both sensors",
     TARGETS,
     _FILTERS.run,
-    help="that of `gp-lgs` on both sensors; not in the paper",
+    help="Gaussian process in time on both sensors; not in the paper",
     prior=(Noise, LgsError, LgsStars, Lines),
     settings=GP,
     needs=NGS,

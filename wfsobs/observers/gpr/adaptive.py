@@ -82,7 +82,7 @@ GPR_ADAPTIVE = Observer(
     "Adaptive GPR",
     (VIBRATION,),
     gpr_adaptive,
-    help="no prior knowledge: inputs, kernel and targets learnt from the last 8 s, every 0.75 s; not in the paper",
+    help="Gaussian process regression that learns inputs, kernel and targets from the last 8 s; not in the paper",
     settings=ADAPTIVE,
     tunable=Tunable(("adaptive.window", "adaptive.depth"), ("adaptive.interval",)),
     weight=50.0,

@@ -175,7 +175,7 @@ GPR_ONLINE = Observer(
     "Online GPR",
     (VIBRATION,),
     gpr_online,
-    help="retrained at every step on the last windows",
+    help="Gaussian process regression retrained at every step on the last windows",
     prior=(OnlineBands,),
     settings=Section("gpr_online", "Online GPR", OnlineGpr),
     asks=standardised_parts,

@@ -152,7 +152,7 @@ KF_ADAPTIVE = Observer(
     "Adaptive KF",
     TARGETS,
     kf_adaptive,
-    help="noise, turbulence and peaks re-identified from the last 4 s, twice a second; not in the paper",
+    help="Kalman filter that identifies noise, turbulence and peaks in the last 4 s, twice a second; not in the paper",
     settings=ADAPTIVE,
     takes_missing=True,
     tunable=Tunable(("adaptive.window",), ("adaptive.interval",)),  # a shorter interval costs time, which no error shows

@@ -58,7 +58,7 @@ KF_ASTERISM = Observer(
     "Asterism KF",
     TARGETS,
     kf_asterism,
-    help="every mode from each LGS by itself in all modes and the NGS, for frozen flow; not in the paper",
+    help="Kalman filter on each LGS by itself in all modes and the NGS, for frozen flow; not in the paper",
     prior=(Lines, Asterism),
     settings=PEAKS,
     needs=("y_stars", "y_ngs", "ratio"),

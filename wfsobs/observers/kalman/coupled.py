@@ -234,7 +234,7 @@ KF_COUPLED = Observer(
     "Coupled KF",
     TARGETS,
     kf_coupled,
-    help="every mode from the measurements of all, for frozen flow of two modes or more; not in the paper",
+    help="Kalman filter on the LGS of all modes together, for frozen flow; not in the paper",
     prior=(Lines, Flow),
     settings=PEAKS,
     linear=True,

@@ -63,7 +63,7 @@ KF_MULTI = Observer(
     "Multi-peak KF",
     TARGETS,
     kf_multi,
-    help="every line of the scenario in its model, turbulence of order 2 or 3; not in the paper",
+    help="Kalman filter on the LGS with every vibration peak in its model; not in the paper",
     prior=(Lines, LgsStars),
     settings=PEAKS,
     linear=True,

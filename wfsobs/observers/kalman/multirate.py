@@ -205,7 +205,7 @@ MULTIRATE = Observer(
     "Multi-rate KF",
     (TURBULENCE,),
     multirate,
-    help="LGS at every step, NGS at every n-th, two gains",
+    help="Kalman filter on the LGS at every step and the NGS at every n-th, two gains",
     prior=(NoiselessModel, LgsStars),
     asks=matched_noise,
     settings=RATES,

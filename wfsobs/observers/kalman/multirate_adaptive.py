@@ -136,7 +136,7 @@ MULTIRATE_ADAPTIVE = Observer(
     "Adaptive multi-rate KF",
     TARGETS,
     multirate_adaptive,
-    help="both sensors; noises, turbulence, peaks and the error of the LGS identified from windows that grow; not in the paper",
+    help="Kalman filter on both sensors that identifies noise, turbulence, peaks and LGS error as it runs; not in the paper",
     settings=ADAPTIVE,
     needs=NGS,
     takes_missing=True,

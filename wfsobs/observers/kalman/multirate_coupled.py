@@ -56,7 +56,7 @@ MULTIRATE_COUPLED = Observer(
     "Coupled multi-rate KF",
     TARGETS,
     multirate_coupled,
-    help="every mode from the LGS together and the NGS, of all modes, for frozen flow; not in the paper",
+    help="Kalman filter on both sensors in all modes together, for frozen flow; not in the paper",
     prior=(Lines, FlowOfBoth),
     settings=PEAKS,
     needs=NGS,

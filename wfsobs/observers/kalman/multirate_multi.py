@@ -48,7 +48,7 @@ MULTIRATE_MULTI = Observer(
     "Multi-rate multi-peak KF",
     TARGETS,
     _FILTERS.run,
-    help="both sensors, every line of the scenario in the model; not in the paper",
+    help="Kalman filter on both sensors with every vibration peak in its model; not in the paper",
     prior=(Noise, LgsStars, Lines, Beams),
     settings=PEAKS,
     needs=NGS,

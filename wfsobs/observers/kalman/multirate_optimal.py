@@ -149,7 +149,7 @@ MULTIRATE_OPTIMAL = Observer(
     "Optimal multi-rate KF",
     TARGETS,
     _FILTERS.run,
-    help="periodic gains, frames as the means that they are; not in the paper",
+    help="Kalman filter on both sensors with periodic gains, NGS frames as means; not in the paper",
     prior=(NoiselessModel, LgsError, LgsStars),
     asks=matched_noise,
     settings=RATES,
