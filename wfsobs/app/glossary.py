@@ -63,10 +63,10 @@ TERMS: Mapping[str, str] = MappingProxyType(
 )
 
 
-def describe(name: str) -> str:
+def sentence_on(name: str) -> str:
     """Write what an observer or a controller is in one sentence, that of its registry; nothing of what is neither.
 
-    >>> describe("persistence"), describe("bound")
+    >>> sentence_on("persistence"), sentence_on("bound")
     ('Persistence: the newest measurement taken for the turbulence.', '')
     """
     it = OBSERVERS.get(name) or CONTROLLERS.get(name)

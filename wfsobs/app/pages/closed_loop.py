@@ -17,7 +17,7 @@ from markupsafe import Markup
 from wfsobs.app.copies import LOOP, CopiedTask
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.downloads import Save, residuals_csv, residuals_npz, table_csv
-from wfsobs.app.glossary import NEEDS, STREHL, TERMS, describe
+from wfsobs.app.glossary import NEEDS, STREHL, TERMS, sentence_on
 from wfsobs.app.jobs import CANCELLED, FAILED, RUNNING, BackgroundTask, Job
 from wfsobs.app.loop_work import LoopResults, compute, cost, seconds
 from wfsobs.app.pages.parts import (
@@ -517,7 +517,7 @@ class ClosedLoopPage(PageActions):
                     "label": it.label,
                     "colour": it.colour(self.display.dark),
                     "dash": list(it.dash),
-                    "about": describe(name),
+                    "about": sentence_on(name),
                     "note": note,
                     "value": value,
                     "unit": unit,

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from wfsobs import __version__
 from wfsobs.app.display import NO_ANGLE, UNITS, per_micrometre
-from wfsobs.app.glossary import describe
+from wfsobs.app.glossary import sentence_on
 from wfsobs.app.pages.sweep_views import SweepLines
 from wfsobs.app.render import render
 from wfsobs.app.report.data import Report, State, unpack, window_of
@@ -148,7 +148,7 @@ def _data(report: Report) -> dict[str, Any]:
                 "light": look(name).light,
                 "dark": look(name).dark,
                 "dash": look(name).dash,
-                "about": describe(name),
+                "about": sentence_on(name),
             }
             for name in _line_names()
         },

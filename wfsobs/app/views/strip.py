@@ -9,7 +9,7 @@ import param
 
 from wfsobs.app.component import Component
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.glossary import RELATIVE, TERMS, describe
+from wfsobs.app.glossary import RELATIVE, TERMS, sentence_on
 from wfsobs.app.jobs import RUNNING, BackgroundTask
 from wfsobs.app.render import NOTHING, change, number
 from wfsobs.app.seeds import SeedRuns
@@ -156,7 +156,7 @@ class Strip:
             "label": it.label,
             "colour": it.colour(self.display.dark),
             "dash": list(it.dash),
-            "about": describe(name),
+            "about": sentence_on(name),
             "note": note,
             "range": "",
             "value": NOTHING if value is None else number(value),
