@@ -96,9 +96,9 @@ def columns(dashboard: Dashboard, loop: Any, short: Scenario, tmp_path: Path, mo
     text = "\n".join([",".join(names.values()), *(",".join(map(repr, row)) for row in table)])
     upload, content = dashboard.upload, text.encode()
     upload.handle({"action": "part", "name": "odd.csv", "index": 0, "count": 1, "data": base64.b64encode(content).decode()})
-    loop.until(lambda: upload.form is not None and upload.form.visible)
+    loop.until(lambda: upload.form is not None and upload.form.view.visible)
     for role, name in names.items():
-        upload.form._handle_msg({"column": name, "role": role})
+        upload.form.choices[role].value = name
     upload.fields.rate.value = "1000"
     loop.until(lambda: upload._preview is not None)
     upload.confirm()

@@ -190,19 +190,17 @@ def test_columns_of_other_names(dashboard: Dashboard, loop: Any, short: Scenario
     previewed(dashboard, loop, content)
     loop.until(lambda: not dashboard.upload.picker.message)
     form = dashboard.upload.form
-    assert form is not None and form.visible and form in dashboard.upload.room.objects
+    assert form is not None and form.view.visible and form.view in dashboard.upload.room.objects
     wanted = {own.removesuffix("_um"): name for name, own in NAMES.items()}
     wanted |= {f"y_ngs/{mode}": f"y_ngs/{mode}_um" for mode in ("tip", "tilt")}  # names of a record suggest what they say
     assert form.roles == wanted
     assert "750 steps at 500 Hz" in dashboard.upload.content.text.object
 
-    form._handle_msg({"column": "wfs_y", "role": "y_lgs/tip"})
+    form.choices["y_lgs/tip"].value = "wfs_y"
     loop.until(lambda: "has the modes tip, tilt; y_lgs has tip" in dashboard.upload.picker.message)
     assert form.roles["y_lgs/tip"] == "wfs_y" and "y_lgs/tilt" not in form.roles and dashboard.upload.use.disabled
-    form._handle_msg({"column": "wfs_x", "role": "y_lgs/tilt"})
+    form.choices["y_lgs/tilt"].value = "wfs_x"
     loop.until(lambda: not dashboard.upload.picker.message)
-    form._handle_msg({"column": "nothing", "role": "time"})
-    form._handle_msg({"column": "wfs_x", "role": "nothing"})
     assert form.roles == wanted | {"y_lgs/tip": "wfs_y", "y_lgs/tilt": "wfs_x"}
     dashboard.upload.confirm()
     loop.finish(dashboard.store)
@@ -210,9 +208,9 @@ def test_columns_of_other_names(dashboard: Dashboard, loop: Any, short: Scenario
     shown = dashboard.store.run.result.result.record
     np.testing.assert_array_equal(shown.y_lgs, record.y_lgs[:, ::-1])
     assert "--column y_lgs/tip=wfs_y" in dashboard.actions.toolbar.command
-    assert "columns={" in dashboard.actions.toolbar.python and not form.visible
+    assert "columns={" in dashboard.actions.toolbar.python and not form.view.visible
     previewed(dashboard, loop, file_of(short))
-    assert not form.visible and dashboard.upload._preview is not None, "the next file has names of its own"
+    assert not form.view.visible and dashboard.upload._preview is not None, "the next file has names of its own"
 
 
 def test_the_data_propose_sign_and_delay(dashboard: Dashboard, loop: Any, short: Scenario) -> None:

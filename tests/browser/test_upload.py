@@ -83,8 +83,9 @@ def test_a_dropped_file_whose_columns_are_said_what_they_are(page: Page) -> None
     )
     expect(page.get_by_text("odd.csv: has no y_lgs").first).to_be_visible()
     for name, label in zip("abcd", ("measurement, tip", "measurement, tilt", "command, tip", "command, tilt"), strict=True):
-        page.get_by_label(f"Meaning of {name}", exact=True).select_option(label=label)
-        expect(page.get_by_label(f"Meaning of {name}", exact=True).locator("option:checked")).to_have_text(label)
+        page.get_by_role("combobox", name=label.capitalize(), exact=True).click()
+        page.get_by_role("option", name=re.compile(f"^{name}: ")).click()
+        expect(page.get_by_role("combobox", name=label.capitalize(), exact=True)).to_have_text(re.compile(f"^{name}: "))
     expect(page.get_by_text("odd.csv: has no dt and no time").first).to_be_visible()
     page.get_by_label("Rate [Hz]").fill("1000")
     page.get_by_label("Rate [Hz]").press("Enter")

@@ -17,14 +17,12 @@ import panel_material_ui as pmui
 import param
 from bokeh.models import ColumnDataSource
 
-from wfsobs.app.component import Component
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING, BackgroundTask, Job
 from wfsobs.app.picker import PartialFile, Picker, too_large
 from wfsobs.app.session_file import SUFFIX
 from wfsobs.app.sources import fit_to_record
 from wfsobs.app.store import RecordPlace, Store
-from wfsobs.app.style import asset
 from wfsobs.app.views.plots import new_figure, send
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
@@ -152,32 +150,46 @@ HINT = (
 )
 
 
-class ColumnForm(Component):
-    """The form in the browser: columns and roles down, messages {column, role} up."""
+class ColumnForm:
+    """A list per role, of the columns that may have it."""
 
-    columns = param.Dict({}, doc="Name of a column -> its values in a few words.")
-    roles = param.Dict({}, doc="Role -> name of the column that has it.")
-    labels = param.Dict(ROLES, doc="Role -> what it is called.")
-    hint = param.String(HINT, doc="What to do.")
+    def __init__(self, on_change: Callable[[], None]):
+        """Make the lists. on_change : called after every choice."""
+        self._on_change = on_change
+        self._fills = False
+        self.choices = {role: _select(label.capitalize(), {"–": ""}) for role, label in ROLES.items()}
+        for choice in self.choices.values():
+            choice.param.watch(self._choose, "value")
+        self.view = pn.Column(
+            pn.pane.HTML(f"<p>{HINT}</p>", margin=0),
+            pn.FlexBox(*self.choices.values(), gap="8px", margin=0),
+            sizing_mode="stretch_width",
+            margin=(4, 0),
+        )
 
-    _esm = asset("columns.js")
-    _stylesheets = [asset("columns.css")]
-
-    def __init__(self, on_change: Callable[[], None], **params: Any):
-        self.on_change = on_change
-        super().__init__(self._take, **params)
+    @property
+    def roles(self) -> dict[str, str]:
+        """Role -> name of the column that has it."""
+        return {role: choice.value for role, choice in self.choices.items() if choice.value}
 
     def show(self, columns: Mapping[str, str], roles: Mapping[str, str]) -> None:
-        """Show the columns of another file."""
-        self.param.update(columns=dict(columns), roles=dict(roles))
+        """Offer the columns of another file (name -> its values in a few words). roles : role -> the one that has it."""
+        options = {"–": "", **{f"{name}: {values}" if values else name: name for name, values in columns.items()}}
+        self._fills = True
+        for role, choice in self.choices.items():
+            choice.param.update(options=options, value=roles.get(role, ""))
+        self._fills = False
 
-    def _take(self, data: dict[str, Any]) -> None:
-        column, role = (str(data.get(key, "")) for key in ("column", "role"))
-        if column not in self.columns or (role and role not in self.labels):
+    def _choose(self, event: param.parameterized.Event) -> None:
+        """Take the column away from the role that had it."""
+        if self._fills:
             return
-        roles = {r: name for r, name in self.roles.items() if name != column and r != role}
-        self.roles = {**roles, **({role: column} if role else {})}
-        self.on_change()
+        self._fills = True
+        for choice in self.choices.values():
+            if choice is not event.obj and choice.value == event.new:
+                choice.value = ""
+        self._fills = False
+        self._on_change()
 
 
 class Upload:
@@ -345,10 +357,10 @@ class Upload:
     def _ask(self, preview: ColumnsPreview) -> None:
         """Ask which column is what; read the file at once if its names tell enough."""
         if self.form is None:
-            self.form = ColumnForm(self.look, sizing_mode="stretch_width", margin=(4, 0))
+            self.form = ColumnForm(self.look)
             self.room.clear()
         self.form.show(preview.columns, preview.roles)
-        self.form.visible = True
+        self.form.view.visible = True
         self._show(RecordError(preview.why))
         if any(role.startswith("y_lgs/") for role in preview.roles) and any(role.startswith("u/") for role in preview.roles):
             self.look()
@@ -357,7 +369,7 @@ class Upload:
         if not len(self.room):
             self.room[:] = [
                 self.content.text,
-                *([self.form] if self.form is not None else []),
+                *([self.form.view] if self.form is not None else []),
                 pn.FlexBox(*self.fields.widgets, self.take, gap="8px", align_items="center", margin=0),
                 pn.pane.Bokeh(self.content.figure, sizing_mode="stretch_width", margin=0),
                 pn.FlexBox(self.use, self.drop, self.missing, align_items="center", margin=0),
@@ -392,7 +404,7 @@ class Upload:
         self._parcel.drop()
         self._entitle()
         if self.form is not None:
-            self.form.visible = False
+            self.form.view.visible = False
             self.form.show({}, {})
         self.reading.cancel()
         self.room.visible = False
