@@ -103,7 +103,7 @@ def test_a_campaign_is_followed_and_opened(dashboard: Dashboard, loop: Any, plan
     of_states = [[(s["state"], s["title"].rpartition(": ")[2]) for s in row] for row in page.map.grid["cells"]]
     assert of_states[0] == [("left-out", "left out by the fields Only …")] * 2, "not as if they were to be run yet"
     assert {state for state, _ in of_states[1]} <= {"open", "decided"}
-    page.map._handle_msg({"load": 3})
+    page.map._handle_msg({"action": "load", "key": "3"})
     opened = plan.cells[3].scenario().replace({"run.seed": 7})
     assert dashboard.store.scenario == opened and dashboard.pages.current == EXPLORE
     for nothing in (-1, 4):

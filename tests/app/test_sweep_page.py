@@ -117,7 +117,7 @@ def test_colours_and_shades(page: SweepPage, dashboard: Dashboard) -> None:
 def a_cell_is_loaded_and_undone(page: SweepPage, dashboard: Dashboard, loop: Any) -> None:
     store = dashboard.store
     before = store.scenario
-    page.maps["vibration"]._handle_msg({"load": 3})
+    page.maps["vibration"]._handle_msg({"action": "load", "key": "3"})
     assert store.scenario == before.replace({WIND: 20.0, RATIO: 10}) and dashboard.pages.current == EXPLORE
     loop.finish(store)
     assert store.run.result is not None and store.run.result.scenario == store.scenario
@@ -128,7 +128,12 @@ def a_cell_is_loaded_and_undone(page: SweepPage, dashboard: Dashboard, loop: Any
     store.undo()
     store.undo()
     assert store.scenario == before and not page.stale.visible
-    for nonsense in ({"load": 99}, {"load": -1}, {"load": "3"}, {}, None):
+    for nonsense in (
+        *({"action": "load", "key": key} for key in ("99", "-1", "x", "", None, 3.5)),
+        {"action": "star", "key": "3"},
+        {},
+        None,
+    ):
         page.maps["vibration"]._handle_msg(nonsense)
     assert store.scenario == before
 

@@ -11,8 +11,6 @@ import numpy as np
 import panel as pn
 import panel_material_ui as pmui
 import param
-from bokeh.models import ColumnDataSource, FixedTicker, Range1d
-from bokeh.plotting import figure
 
 from wfsobs.app.controls.status import Status
 from wfsobs.app.copies import CAMPAIGN, EXPLORED, CopiedTask
@@ -20,12 +18,11 @@ from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs import BATCH, FAILED, RUNNING, BackgroundTask, Job
 from wfsobs.app.pages.parts import WIDE, LinkedFields, LinkedLater, PageActions, box, html, legend, line, text
 from wfsobs.app.pages.sweep import SweepMap, line_of
-from wfsobs.app.pages.sweep_views import DECIDED, FULL_MARGIN, GROUNDS, LEFT_OUT, OPEN, WAITING, axis_title, ink_on, mix
+from wfsobs.app.pages.sweep_views import DECIDED, LEFT_OUT, OPEN, WAITING, SweepLines, axis_title, square, verdict_text
 from wfsobs.app.render import NOTHING, Row, number, table
 from wfsobs.app.report.sections import value_of
 from wfsobs.app.store import Store
 from wfsobs.app.style import look, swatch
-from wfsobs.app.views.plots import add_line, call, new_figure
 from wfsobs.campaign.axes import SCENARIO, PlanAxis, plan_axes
 from wfsobs.campaign.errors import CampaignErrors
 from wfsobs.campaign.follow import CampaignFolder, CampaignState
@@ -188,92 +185,43 @@ def winners_grid(view: CampaignView, x: PlanAxis, y: PlanAxis | None, display: D
 
 def _square(view: CampaignView, cells: list[int] | None, where: str, display: Display, key: dict[str, str]) -> dict[str, Any]:
     """Describe one square: the scenario that it opens, its colour and what it says."""
-    ground = GROUNDS[display.dark]
     errors = view.errors
     verdict = None if not cells else errors.winners.get(cells[0]) if len(cells) == 1 else errors.verdict(cells)
     if not cells or verdict is None:
         said = "no such scenario" if cells is None else "no result yet" if cells else "left out by the fields Only …"
-        square = {
-            "index": cells[0] if cells else -1,
-            "state": WAITING if cells else LEFT_OUT,
-            "text": "",
-            "title": f"{where}: {said}",
-        }
-        return {**square, "ground": ground, "stripe": ground, "ink": ""}
+        return square(cells[0] if cells else -1, WAITING if cells else LEFT_OUT, f"{where}: {said}", "", display.dark)
     best, decided = verdict.best, verdict.is_decided
+    margin = verdict.margin if np.isfinite(verdict.margin) else None
     text = number(best.rms * view.scale(display))
     said = f"{where}: {name_label(best.name)} {text} {display.unit_label}"
-    if np.isfinite(verdict.margin):
-        said += f", {number(100 * verdict.margin, 2)} % before the next"
-    if verdict.ties:
-        said += f"; statistically equal to {', '.join(map(name_label, verdict.ties))}"
-    elif not decided and np.isfinite(verdict.margin):
-        said += "; too few results to tell"
-    if len(cells) > 1:
-        said += f"; {len(cells)} scenarios, opens the first"
-    else:
-        said += f"; {int(errors.count[cells[0]].max())} seeds"
-    colour = look(best.name).colour(display.dark)
-    key[name_label(best.name)] = colour
-    margin = verdict.margin if np.isfinite(verdict.margin) else 0.0
-    fill = mix(colour, ground, 0.35 + 0.65 * min(1.0, max(0.0, margin) / FULL_MARGIN) if decided else 0.12)
+    said += verdict_text(margin, map(name_label, verdict.ties), decided or margin is None, "results")
+    several = f"{len(cells)} scenarios, opens the first" if len(cells) > 1 else f"{int(errors.count[cells[0]].max())} seeds"
+    key[name_label(best.name)] = look(best.name).colour(display.dark)
+    return square(cells[0], DECIDED if decided else OPEN, f"{said}; {several}", text, display.dark, best.name, margin)
+
+
+def slice_part(view: CampaignView, axis: PlanAxis, names: Sequence[str], display: Display) -> dict[str, Any]:
+    """Describe the errors over one condition as `SweepLines` draws them: over several scenarios of a value the geometric mean."""
+    x, bins, errors = axis.positions, axis.of_cell[view.cells], {}
+    for name in names:
+        if name not in view.errors.names:
+            continue
+        values = view.errors.rms[view.cells, view.errors.names.index(name)]
+        good = np.isfinite(values) & (values > 0)
+        count, total = (np.bincount(bins[good], of, minlength=len(x)) for of in (None, np.log(values[good])))
+        known = count > 0
+        y = np.full(len(x), np.nan)
+        y[known] = view.scale(display) * np.exp(total[known] / count[known])
+        errors[name] = y, np.full(len(x), np.nan), np.full(len(x), np.nan)
+    across = axis_name(axis, view.base)
     return {
-        "index": cells[0],
-        "state": DECIDED if decided else OPEN,
-        "text": text,
-        "title": said,
-        "ground": fill,
-        "stripe": mix(colour, ground, 0.28),
-        "ink": ink_on(fill),
+        "title": f"Error over {across}, {view.target}, {view.mode}",
+        "across": across,
+        "up": f"rms error, {view.mode} [{display.unit_label}]",
+        "values": x,
+        "texts": None if axis.is_numeric else value_names(axis),
+        "errors": errors,
     }
-
-
-class Slice:
-    """Errors over one condition: a line per observer and bound; made for a condition."""
-
-    def __init__(self, axis: PlanAxis, base: Scenario):
-        self.axis, x = axis, axis.positions
-        room = 0.03 * float(np.ptp(x))
-        self.figure: figure = new_figure(
-            x_range=Range1d(start=float(x.min()) - room, end=float(x.max()) + room), y_range=Range1d(start=0.0, end=1.0)
-        )
-        self.figure.xaxis.axis_label = axis_name(axis, base)
-        if not axis.is_numeric:
-            self.figure.xaxis.ticker = FixedTicker(ticks=x.tolist())
-            self.figure.xaxis.major_label_overrides = dict(zip(x.tolist(), value_names(axis), strict=True))
-        self.sources: dict[str, ColumnDataSource] = {}
-        self._glyphs: dict[str, Any] = {}
-
-    def draw(self, view: CampaignView, names: Sequence[str], display: Display) -> None:
-        """Send the errors of some names: over several scenarios of a value the geometric mean."""
-        rms, x = view.errors.rms, self.axis.positions
-        bins = self.axis.of_cell[view.cells]
-        highest = [0.0]
-        call(self.figure, f"Error over {axis_name(self.axis, view.base)}, {view.target}, {view.mode}")
-        for name in {*self.sources, *names}:
-            y = np.full(len(x), np.nan)
-            if name in names and name in view.errors.names:
-                values = rms[view.cells, view.errors.names.index(name)]
-                good = np.isfinite(values) & (values > 0)
-                count = np.bincount(bins[good], minlength=len(x))
-                total = np.bincount(bins[good], np.log(values[good]), minlength=len(x))
-                y[count > 0] = view.scale(display) * np.exp(total[count > 0] / count[count > 0])
-                highest.append(float(np.nanmax(y, initial=0.0)))
-            self._line(name).data = {"x": x, "y": y}
-        top = 1.08 * max(highest) or 1.0
-        self.figure.y_range.update(start=0.0, end=top, reset_start=0.0, reset_end=top)
-        self.figure.yaxis.axis_label = f"rms error, {view.mode} [{display.unit_label}]"
-        for name, (curve, dots) in self._glyphs.items():
-            colour = look(name).colour(display.dark)
-            curve.glyph.line_color = colour
-            dots.glyph.update(line_color=colour, fill_color=colour)
-
-    def _line(self, name: str) -> ColumnDataSource:
-        if name not in self.sources:
-            source = self.sources[name] = ColumnDataSource({"x": [], "y": []})
-            line = add_line(self.figure, name, source)
-            self._glyphs[name] = line, self.figure.scatter("x", "y", source=source, size=5)
-        return self.sources[name]
 
 
 PERIOD = 5000
@@ -305,9 +253,10 @@ class CampaignPage(PageActions):
         self.failure = html()
         self.room = pn.Column(**WIDE, stylesheets=[":host { gap: 10px; }"])
         self.table, self.legend = html(), html()
-        self.map = SweepMap(self.load, grid={}, **WIDE)
+        self.map = SweepMap(self.load, **WIDE)
         self.pane = pn.Column(**WIDE)
-        self.slice: Slice | None = None
+        self.slice: SweepLines | None = None
+        self._sliced: tuple[str, ...] = ()
         self.axes: dict[str, PlanAxis] = {}
         self.filters: dict[str, Any] = {}
         self.link = self._fields = LinkedLater()
@@ -475,13 +424,13 @@ class CampaignPage(PageActions):
                 return
             x = self.axes[self.across.value]
             y = self.axes[self.down.value] if self.down.value not in (NONE, self.across.value) else None
-            self.map.grid = winners_grid(view, x, y, self.display)
+            self.map.draw(winners_grid(view, x, y, self.display))
             self._draw_slice(view, x)
 
     def _draw_slice(self, view: CampaignView, x: PlanAxis) -> None:
-        if self.slice is None or self.slice.axis is not x:
-            self.slice = Slice(x, self.base)
+        part = slice_part(view, x, self.lines.value, self.display)
+        if self.slice is None or self._sliced != (x.path, *part["errors"]):
+            self.slice, self._sliced = SweepLines(part), (x.path, *part["errors"])
             self.pane[:] = [pn.pane.Bokeh(self.slice.figure, **WIDE)]
-        self.slice.draw(view, self.lines.value, self.display)
-        drawn = [name for name in self.lines.value if name in view.errors.names]
-        self.legend.object = legend({name: name_label(name) for name in drawn}, self.display.dark)
+        self.slice.draw(part, self.display.dark)
+        self.legend.object = legend({name: name_label(name) for name in part["errors"]}, self.display.dark)

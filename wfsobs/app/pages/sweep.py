@@ -24,6 +24,7 @@ from wfsobs.app.jobs import BATCH, CANCELLED, DONE, FAILED, RUNNING, BackgroundT
 from wfsobs.app.limits import Limits
 from wfsobs.app.pages.parts import TALL, WIDE, LinkedFields, PageActions, Starter, box, html, legend, line, text
 from wfsobs.app.pages.sweep_views import SweepLines, axis_title, legend_of_shades, line_part, map_grid, parameter_of
+from wfsobs.app.render import render
 from wfsobs.app.seeds import SeedScores
 from wfsobs.app.service import Session
 from wfsobs.app.store import Store
@@ -259,19 +260,23 @@ REDRAW = 0.3
 class SweepMap(Component):
     """The map in the browser; a click on a cell asks for its scenario."""
 
-    grid = param.Dict({}, doc="Title, names of the axes and their values, cells row by row, and the key of the colours.")
+    html = param.String("", doc="What is in it.")
 
-    _esm = asset("sweep.js")
+    _esm = asset("patch.js") + asset("markup.js") + asset("sweep.js")
     _stylesheets = [asset("sweep.css")]
 
     def __init__(self, load: Callable[[int], None], **params: Any):
         """Make the map. load : takes the number of a cell."""
-        self._load = load
+        self._load, self.grid = load, dict[str, Any]()
         super().__init__(self._take, **params)
 
+    def draw(self, grid: dict[str, Any]) -> None:
+        """Show a map: title, names of the axes and their values, cells row by row, and the key of the colours."""
+        self.grid, self.html = grid, render("map.html", **grid)
+
     def _take(self, data: dict[str, Any]) -> None:
-        if isinstance(cell := data.get("load"), int):
-            self._load(cell)
+        if data.get("action") == "load" and (cell := str(data.get("key"))).isdecimal():
+            self._load(int(cell))
 
 
 class SweepPage(PageActions):
@@ -297,7 +302,7 @@ class SweepPage(PageActions):
             over=over, values=values, second=second, second_values=more, seeds=self.seeds, observers=self.observers
         )
         self.estimate = html()
-        self.maps = {target: SweepMap(self.load, grid={}, **WIDE) for target in SCORED}
+        self.maps = {target: SweepMap(self.load, **WIDE) for target in SCORED}
         self.lines: dict[str, SweepLines] = {}
         self.panes = {target: pn.Column(**WIDE) for target in SCORED}
         self.legends = {target: html() for target in SCORED}
@@ -451,7 +456,7 @@ class SweepPage(PageActions):
         single = len(results.sweep.axes) == 1
         with pn.io.hold():
             for target in SCORED:
-                self.maps[target].grid = map_grid(results, target, self.display)
+                self.maps[target].draw(map_grid(results, target, self.display))
                 if single:
                     self._draw_lines(results, target)
                 self.panes[target].visible = self.legends[target].visible = single

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 import param
+from bokeh.colors import RGB
 from bokeh.models import ColumnDataSource, FixedTicker, Range1d
 from bokeh.plotting import figure
 
@@ -51,7 +52,6 @@ class SweepLines:
             y_range=Range1d(start=0.0, end=1.0),
             x_axis_type="log" if logarithmic else "linear",
         )
-        call(self.figure, part["title"])
         self.figure.xaxis.axis_label = part["across"]
         if texts is not None:
             self.figure.xaxis.ticker = FixedTicker(ticks=x.tolist())
@@ -68,6 +68,7 @@ class SweepLines:
 
     def draw(self, part: Mapping[str, Any], dark: bool = False) -> None:
         """Send the errors of a part with the same values, in the colours of light or dark mode."""
+        call(self.figure, part["title"])
         x = np.array(part["values"], dtype=float)
         all_errors = {name: np.array(errors, dtype=float) for name, errors in part["errors"].items()}
         drawn = [name for name, (y, _, _) in all_errors.items() if np.isfinite(y).any()]
@@ -196,34 +197,36 @@ def _report_cells(row: dict[str, Any]) -> list[str]:
 
 
 def _cell(results: SweepResults, cell: int, target: str, display: Display) -> dict[str, Any]:
-    best, ground = results.winner(cell, target, display.mode), GROUNDS[display.dark]
+    best = results.winner(cell, target, display.mode)
     where = ", ".join(f"{setting_name(path)} {value_of(value)}" for path, value in results.sweep.cells[cell].items())
     if best is None:
         reason = results.failures.get(cell, "")
         state, text = (FAILED, "×") if reason else (WAITING, "")
-        title = f"{where}: {reason or 'not run yet'}"
-        return {"index": cell, "state": state, "text": text, "title": title, "ground": ground, "stripe": ground, "ink": ""}
-    unit = per_micrometre(display.unit, results.sweep.value(cell, "telescope.diameter"))
-    margin = 0.0 if best.margin is None else best.margin
-    said = f"{where}: {row_label(best.name)} {number(best.rms * unit)} {display.unit_label}"
-    if best.margin is not None:
-        said += f", {100 * best.margin:.0f} % before the next"
-    if best.ties:
-        said += f"; statistically equal to {', '.join(map(row_label, best.ties))}"
-    elif not best.is_significant:
-        said += "; too few seeds to tell"
+        return square(cell, state, f"{where}: {reason or 'not run yet'}", text, display.dark)
+    error = number(best.rms * per_micrometre(display.unit, results.sweep.value(cell, "telescope.diameter")))
+    said = f"{where}: {row_label(best.name)} {error} {display.unit_label}"
+    said += verdict_text(best.margin, map(row_label, best.ties), best.is_significant, "seeds")
     said += f"; {best.seeds} {'seed' if best.seeds == 1 else 'seeds'}"
-    colour, decided = look(best.name).colour(display.dark), best.is_significant
-    fill = mix(colour, ground, 0.35 + 0.65 * min(1.0, margin / FULL_MARGIN) if decided else 0.12)
-    return {
-        "index": cell,
-        "state": DECIDED if decided else OPEN,
-        "text": number(best.rms * unit),
-        "title": said,
-        "ground": fill,
-        "stripe": mix(colour, ground, 0.28),
-        "ink": ink_on(fill),
-    }
+    return square(cell, DECIDED if best.is_significant else OPEN, said, error, display.dark, best.name, best.margin)
+
+
+def verdict_text(margin: float | None, ties: Iterable[str], decided: bool, few: str) -> str:
+    """Say how far the best is before the next; few : what there is too little of where that is not decided."""
+    said = "" if margin is None else f", {100 * margin:.0f} % before the next"
+    tied = ", ".join(ties)
+    return said + (f"; statistically equal to {tied}" if tied else "" if decided else f"; too few {few} to tell")
+
+
+def square(
+    index: int, state: str, title: str, text: str, dark: bool, best: str = "", margin: float | None = None
+) -> dict[str, Any]:
+    """Describe a square of a map: the scenario that it opens, what it says, and in its colour the best and its margin."""
+    ground = fill = stripe = GROUNDS[dark]
+    if best:
+        colour, full = look(best).colour(dark), min(1.0, max(0.0, margin or 0.0) / FULL_MARGIN)
+        fill, stripe = mix(colour, ground, 0.35 + 0.65 * full if state == DECIDED else 0.12), mix(colour, ground, 0.28)
+    ink = ink_on(fill) if best else ""
+    return {"index": index, "state": state, "text": text, "title": title, "ground": fill, "stripe": stripe, "ink": ink}
 
 
 def mix(colour: str, ground: str, share: float) -> str:
@@ -232,7 +235,8 @@ def mix(colour: str, ground: str, share: float) -> str:
     >>> mix("#FF0000", "#FFFFFF", 0.5)
     '#ff8080'
     """
-    parts = [share * a + (1.0 - share) * b for a, b in zip(_channels(colour), _channels(ground), strict=True)]
+    one, other = RGB.from_hex_string(colour), RGB.from_hex_string(ground)
+    parts = [share * getattr(one, c) + (1.0 - share) * getattr(other, c) for c in "rgb"]
     return "#" + "".join(f"{round(part):02x}" for part in parts)
 
 
@@ -242,13 +246,7 @@ def ink_on(ground: str) -> str:
     >>> ink_on("#ffffff"), ink_on("#003de6")
     ('#000000', '#ffffff')
     """
-    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in (v / 255 for v in _channels(ground))]
-    luminance = 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
-    return "#000000" if (luminance + 0.05) / 0.05 > 1.05 / (luminance + 0.05) else "#ffffff"
-
-
-def _channels(colour: str) -> list[int]:
-    return [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+    return "#000000" if RGB.from_hex_string(ground).luminance > 0.179 else "#ffffff"
 
 
 def legend_of_shades() -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 import param
 
-from wfsobs.app.compared import LETTERS
+from wfsobs.app.compared import LETTERS, ComparedRun
 from wfsobs.app.component import Component
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.display import Display, per_micrometre
@@ -15,7 +15,7 @@ from wfsobs.app.downloads import Save, TooLarge
 from wfsobs.app.history import History
 from wfsobs.app.jobs import DONE, FAILED, RUNNING, BackgroundTask, Job
 from wfsobs.app.picker import LARGEST, PART, PartialFile, too_large
-from wfsobs.app.render import number
+from wfsobs.app.render import number, render
 from wfsobs.app.session_file import SUFFIX, HistoryEntry, SessionError, read_session, write_session
 from wfsobs.app.style import asset, look
 from wfsobs.evaluation.evidence import rank_observers
@@ -28,19 +28,15 @@ FILE = f"session{SUFFIX}"
 
 
 class Sheet(Component):
-    """The sheet in the browser; it asks by messages {action, key, ...}, and has rows only while it is open."""
+    """The sheet in the browser; it asks by messages {action, key, name, on}, and has contents only while it is open."""
 
     open = param.Boolean(False, doc="Whether it is seen.")
     dark = param.Boolean(False, doc="Dark mode.")
-    rows = param.List([], doc="A dictionary per result, newest first.")
-    room = param.Boolean(True, doc="Whether another result can be compared.")
-    message = param.String("", doc="What was done or refused, in one line.")
-    undo = param.Boolean(False, doc="Whether a result was deleted that can come back.")
-    suffix = param.String(SUFFIX, doc="How the names of session files end.")
+    html = param.String("", doc="What is in it.")
     largest = param.Integer(LARGEST, doc="The largest file that is sent [bytes].")
     part = param.Integer(PART, doc="How much is sent at a time [bytes].")
 
-    _esm = asset("patch.js") + asset("parts.js") + asset("history.js")
+    _esm = asset("patch.js") + asset("markup.js") + asset("parts.js") + asset("history.js")
     _stylesheets = [asset("history.css")]
 
 
@@ -52,7 +48,8 @@ class HistorySheet:
         self.history, self.display, self._show = history, history.display, show
         self.sheet: Sheet | None = None
         self._parcel = PartialFile()
-        self._name = ""
+        self._name = self.message = ""
+        self.rows, self._starred = list[dict[str, Any]](), False
         self.saving, self.reading = BackgroundTask(history.store.session), BackgroundTask(history.store.session)
         self.saving.param.watch(self._save, ["state", "place"])
         self.reading.param.watch(self._open, ["state", "place"])
@@ -67,7 +64,8 @@ class HistorySheet:
 
     def close(self) -> None:
         """Close the sheet, which needs no rows then."""
-        self._sheet().param.update(open=False, rows=[])
+        self.rows = []
+        self._sheet().param.update(open=False, html="")
 
     def handle(self, msg: dict[str, Any]) -> None:
         """Do what a message of the sheet says."""
@@ -80,6 +78,7 @@ class HistorySheet:
             "restore": lambda: history.restore(key),
             "delete": lambda: history.delete(key),
             "undelete": history.undelete,
+            "filter": lambda: self._show_starred(msg.get("on") is True),
             "save": self.save,
             "large": lambda: self._say(too_large(safe_name(str(msg.get("name", ""))))),
             "part": lambda: self._take(msg),
@@ -135,27 +134,36 @@ class HistorySheet:
         return self.sheet
 
     def _say(self, line: str) -> None:
-        self._sheet().message = name_settings(line)
+        self.message = name_settings(line)
+        self._refresh()
+
+    def _show_starred(self, alone: bool) -> None:
+        self._starred = alone
+        self._refresh()
 
     def _refresh(self, *_: object) -> None:
         sheet = self._sheet()
         if sheet.open:
             runs = {run.key: run for run in self.display.compared_runs}
-            sheet.param.update(
-                rows=[self._row(entry, runs[entry.key].letter if entry.key in runs else "") for entry in self.history.entries],
+            self.rows = [self._row(entry, runs.get(entry.key)) for entry in self.history.entries]
+            html = render(
+                "history.html",
+                rows=[row for row in self.rows if row["star"] or not self._starred],
+                starred=self._starred,
                 room=len(runs) < len(LETTERS),
                 undo=self.history.can_undelete,
-                dark=self.display.dark,
+                message=self.message,
+                suffix=SUFFIX,
             )
+            sheet.param.update(html=html, dark=self.display.dark)
 
-    def _row(self, entry: HistoryEntry, letter: str) -> dict[str, Any]:
-        run = next((run for run in self.display.compared_runs if run.key == entry.key), None)
+    def _row(self, entry: HistoryEntry, run: ComparedRun | None) -> dict[str, Any]:
         return {
             "key": entry.key,
             "name": entry.name,
             "time": entry.time,
             "star": entry.star,
-            "letter": letter,
+            "letter": run.letter if run else "",
             "current": entry.key == self.history.current,
             "restorable": entry.is_restorable,
             "what": f"Record {entry.record}" if entry.record else "",
