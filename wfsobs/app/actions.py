@@ -13,7 +13,7 @@ from wfsobs.app.copies import EXPLORED, to_command, to_python
 from wfsobs.app.downloads import Save, TooLarge, data_csv, data_npz
 from wfsobs.app.jobs import DONE, FAILED, RUNNING, BackgroundTask, Job
 from wfsobs.app.pages.pages import Pages
-from wfsobs.app.pages.parts import PageActions
+from wfsobs.app.pages.parts import Page
 from wfsobs.app.report.export import LIMIT, ReportError, make
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.share import FILE, Link, from_file, from_query, name_record, to_file, to_query
@@ -71,13 +71,12 @@ class Actions:
     def attach(self, pages: Pages, seeds: SeedRuns) -> None:
         """Watch the pages: the one that is shown says what is copied and saved; seeds : what a report says of further seeds."""
         self._pages, self._seeds = pages, seeds
-        self._watched_pages: set[str] = set()
         pages.param.watch(self._turn, "current")
 
     def follow_view(self, state: ViewState) -> None:
         """Keep the view in the address, behind settings that wait for theirs: an entry of the browser's history has both."""
         self._view = state
-        state.param.watch(lambda event: (self._refresh(), self.toolbar.param.update(view=event.new)), "query")
+        state.param.watch(lambda event: (self._refresh(), self.toolbar.param.update(view=event.new)), "query", onlychanged=False)
 
     def open_view(self, query: str) -> None:
         """Bring the page to the view of an address, and name what cannot be taken."""
@@ -85,17 +84,11 @@ class Actions:
             self.toolbar.notes = [*self.toolbar.notes, *(f"Not used from the link: {line}" for line in refused)]
 
     @property
-    def _offers(self) -> PageActions | None:
-        page = self._pages and self._pages.by_name.get(self._pages.current)
-        return page if isinstance(page, PageActions) else None
+    def _offers(self) -> Page | None:
+        return self._pages.page if self._pages else None
 
     def _turn(self, _event: object) -> None:
-        page = self._offers
-        if page is not None and self._pages is not None and self._pages.current not in self._watched_pages:
-            self._watched_pages.add(self._pages.current)
-            for field in page.inputs:
-                field.param.watch(self._refresh, "value")
-        self.toolbar.saves = [*page.saves()] if page else []
+        self.toolbar.saves = [*self._offers.saves()] if self._offers else []
         self._refresh()
 
     def handle(self, msg: dict[str, Any]) -> None:

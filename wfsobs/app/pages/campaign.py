@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import panel as pn
 import panel_material_ui as pmui
-import param
 
 from wfsobs.app.controls.status import Status
 from wfsobs.app.copies import CAMPAIGN, EXPLORED, CopiedTask
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs import BATCH, FAILED, RUNNING, BackgroundTask, Job
-from wfsobs.app.pages.parts import WIDE, LinkedFields, LinkedLater, PageActions, box, html, legend, line, text
+from wfsobs.app.pages.parts import WIDE, LinkedFields, LinkedLater, Page, box, boxes, html, legend, line, text
 from wfsobs.app.pages.sweep import SweepMap, line_of
 from wfsobs.app.pages.sweep_views import DECIDED, LEFT_OUT, OPEN, WAITING, SweepLines, axis_title, square, verdict_text
 from wfsobs.app.render import NOTHING, Row, number, table
@@ -236,22 +235,17 @@ SHADES = (
 )
 
 
-class CopiedInput(param.Parameterized):
-    """What the copies of the page are made of, for those who watch its fields: it has them only once there are results."""
-
-    value = param.Parameter(EXPLORED)
-
-
-class CampaignPage(PageActions):
+class CampaignPage(Page):
     """The page. It reads; only the command line of the server names the folder."""
 
     def __init__(self, store: Store, display: Display, explore: Callable[[], None]):
         """Make the page. explore : turns to the page that shows a scenario."""
-        self.store, self.display, self._explore = store, display, explore
+        super().__init__(store, display)
+        self._explore = explore
         self.work = CampaignTask(store.session)
         self.status = Status(label="Progress of the campaign", sizing_mode="stretch_width", margin=(4, 0))
         self.failure = html()
-        self.room = pn.Column(**WIDE, stylesheets=[":host { gap: 10px; }"])
+        self.room = boxes()
         self.table, self.legend = html(), html()
         self.map = SweepMap(self.load, **WIDE)
         self.pane = pn.Column(**WIDE)
@@ -260,24 +254,20 @@ class CampaignPage(PageActions):
         self.axes: dict[str, PlanAxis] = {}
         self.filters: dict[str, Any] = {}
         self.link = self._fields = LinkedLater()
-        self.copy_input = CopiedInput()
-        self.inputs = [self.copy_input]
-        self.visible, self._targets = False, list[str]()
+        self._targets = list[str]()
         self.work.param.watch(self._take, ["state", "result"])
         self.work.param.watch(self._say, ["state", "progress", "place", "message"])
-        display.param.watch(lambda _: self.draw(), ["mode", "unit", "dark"])
         self._callback = pn.state.add_periodic_callback(self.tick, PERIOD, start=False) if pn.state.curdoc else None
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""
-        return pn.Column(box("Campaign", self.status, self.failure), self.room, **WIDE, stylesheets=[":host { gap: 10px; }"])
+        return boxes(box("Campaign", self.status, self.failure), self.room)
 
     def show(self, visible: bool) -> None:
         """Look at the folder, and again and again while the page is shown and the campaign goes on."""
-        self.visible = visible
+        super().show(visible)
         if visible:
             self.work.look()
-            self.draw()
         self._pace()
 
     @property
@@ -323,7 +313,7 @@ class CampaignPage(PageActions):
         state = self.work.campaign
         if state is not None:
             self._make(state)
-            self.draw()
+            self.redraw()
             self._pace()
 
     def _refuse(self, why: str) -> None:
@@ -372,10 +362,10 @@ class CampaignPage(PageActions):
         )
         only = {f"only.{path}": field for path, field in self.filters.items()}
         linked = {"target": self.target, "across": self.across, "down": self.down, **only, "lines": self.lines}
-        if refused := self._fields.make(LinkedFields(**linked)):
+        if refused := self._fields.make(LinkedFields(linked)):
             self._refuse(f"Not used from the link: {', '.join(refused)}")
         for field in linked.values():
-            field.param.watch(lambda _: self.draw(), "value")
+            field.param.watch(self.redraw, "value")
         fields = [line(self.target, self.across, self.down), line(*self.filters.values())] if self.axes else [line(self.target)]
         self.room[:] = [box("Conditions", *fields), box("Observers", self.table)]
         if self.axes:
@@ -410,22 +400,21 @@ class CampaignPage(PageActions):
     def draw(self) -> None:
         """Send the picture; only aggregates leave the server."""
         state = self.work.campaign
-        if not self.visible or state is None or not self._targets:
+        if state is None or not self._targets:
             return
-        with pn.io.hold():
-            view, self.copy_input.value = self.view_of(state), self.task
-            for part in self.room.objects[2:]:
-                part.visible = view is not None
-            if view is None:  # the fields stay, to choose something else
-                self.table.object = "<p>No scenario has all of these values.</p>"
-                return
-            self.table.object = standings_html(view, self.display)
-            if not self.axes:
-                return
-            x = self.axes[self.across.value]
-            y = self.axes[self.down.value] if self.down.value not in (NONE, self.across.value) else None
-            self.map.draw(winners_grid(view, x, y, self.display))
-            self._draw_slice(view, x)
+        view = self.view_of(state)
+        for part in self.room.objects[2:]:
+            part.visible = view is not None
+        if view is None:  # the fields stay, to choose something else
+            self.table.object = "<p>No scenario has all of these values.</p>"
+            return
+        self.table.object = standings_html(view, self.display)
+        if not self.axes:
+            return
+        x = self.axes[self.across.value]
+        y = self.axes[self.down.value] if self.down.value not in (NONE, self.across.value) else None
+        self.map.draw(winners_grid(view, x, y, self.display))
+        self._draw_slice(view, x)
 
     def _draw_slice(self, view: CampaignView, x: PlanAxis) -> None:
         part = slice_part(view, x, self.lines.value, self.display)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from html import escape
 from typing import Any
@@ -16,7 +16,7 @@ from markupsafe import Markup
 
 from wfsobs.app.copies import LOOP, CopiedTask
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.downloads import Save, residuals_csv, residuals_npz, table_csv
+from wfsobs.app.downloads import residuals_csv, residuals_npz, table_csv
 from wfsobs.app.glossary import NEEDS, STREHL, TERMS, sentence_on
 from wfsobs.app.jobs import CANCELLED, FAILED, RUNNING, BackgroundTask, Job
 from wfsobs.app.loop_work import LoopResults, compute, cost, seconds
@@ -27,8 +27,9 @@ from wfsobs.app.pages.parts import (
     TALL,
     WIDE,
     LinkedLines,
-    PageActions,
+    Page,
     box,
+    boxes,
     figure_with_caption,
     html,
     text,
@@ -337,20 +338,35 @@ ABOUT = (
 )
 
 
-class ClosedLoopPage(PageActions):
+FILES: Mapping[str, tuple[str, Callable[[LoopResults], bytes]]] = {
+    "Controllers as CSV": ("wfsobs-controllers.csv", lambda shown: table_csv(shown.rows)),
+    "Residuals as CSV": ("wfsobs-residuals.csv", residuals_csv),
+    "Residuals as NPZ": ("wfsobs-residuals.npz", residuals_npz),
+}
+"""The table of `wfsobs loop --json`, and the residuals."""
+
+
+class ClosedLoopPage(Page):
     """The page; computed anew when the results change, while it is visible."""
 
+    files = FILES
+
     def __init__(self, store: Store, display: Display):
-        self.store, self.run, self.display = store, store.run, display
-        run = store.run
+        super().__init__(store, display, "mode", "unit")
         self.work = BackgroundTask(store.session, title="Closed loop")
-        self.visible, self._of = False, object()
+        self._of = object()
         self._rooms = list[pn.viewable.Viewable]()
         self.note, self.table, self.margins = html(), html(), html()
         terms = {STREHL: TERMS[STREHL]}
         self.cards = Cards(items=[], hidden_lines=[], terms=terms, main=MAIN, sizing_mode="stretch_width", margin=0)
         self.cards.on_main, self._main, self._is_chosen = self._show_main, list[str](), False
-        self.link = LinkedLines(self.cards, CONTROLLERS, lambda: self._is_chosen, self._show_main)
+        self.link = LinkedLines(
+            "hide",
+            CONTROLLERS,
+            lambda: self.cards.hidden_lines if self._is_chosen else None,
+            self._hide,
+            lambda act: self.cards.param.watch(act, "hidden_lines"),
+        )
         self.trace, self.zoom = Trace(FIRST_S), Trace(ZOOM_S)
         self.spectrum, self.response, self.nyquist = LoopSpectrum(), Response(), Nyquist()
         self.room = figure_with_caption("Rejection and noise transfer", self.response.figure, tall=True)
@@ -360,9 +376,8 @@ class ClosedLoopPage(PageActions):
         self._edit()
         self._figures = (self.trace, self.zoom, self.spectrum, self.response, self.nyquist)
         self.work.param.watch(self._say, ["state", "place", "message"])
-        self.work.param.watch(self._redraw, "result")
-        run.param.watch(self._follow, ["result", "state"])
-        display.param.watch(self._redraw, ["mode", "unit"])
+        self.work.param.watch(self.redraw, "result")
+        self.run.param.watch(self.follow, ["result", "state"])
         display.param.watch(self._restyle, "dark")
         self.cards.param.watch(self._choose, "hidden_lines")
 
@@ -389,12 +404,8 @@ class ClosedLoopPage(PageActions):
         )
         parts = (self._switch(), figures, box("Controllers", self.table), box("Stability", stability))
         self._rooms = [pn.Column(part, **WIDE) for part in parts]  # a grid by its own style is shown even where it is not visible
-        return pn.Column(
-            box("Residual in closed loop", text(INTRO), self.note, self.cards, *self._rooms[:2]),
-            *self._rooms[2:],
-            **WIDE,
-            stylesheets=[":host { gap: 10px; }"],
-        )
+        residual = box("Residual in closed loop", text(INTRO), self.note, self.cards, *self._rooms[:2])
+        return boxes(residual, *self._rooms[2:])
 
     def _switch(self) -> pn.FlexBox:
         edit = pmui.Checkbox.from_param(self.display.param.editing, size="small", margin=0, stylesheets=[SMALL_LABEL])
@@ -408,29 +419,12 @@ class ClosedLoopPage(PageActions):
             for room, handle in zip((self.room, self.stability), self.editor.handles, strict=True):
                 room.append(handle.layer)
 
-    def show(self, visible: bool) -> None:
-        """Compute what has changed meanwhile, and go on while visible."""
-        self.visible = visible
-        self._follow()
-        self._redraw()  # mode or unit may have changed
-
     @property
     def task(self) -> CopiedTask:
         """To close the loop."""
         return CopiedTask(LOOP)
 
-    def saves(self) -> Mapping[str, Save | None]:
-        """Offer the table of `wfsobs loop --json`, and the residuals."""
-        shown = self.results
-        if shown is None:
-            return {"Controllers as CSV": None, "Residuals as CSV": None, "Residuals as NPZ": None}
-        return {
-            "Controllers as CSV": Save("wfsobs-controllers.csv", "text/csv", lambda: table_csv(shown.rows)),
-            "Residuals as CSV": Save("wfsobs-residuals.csv", "text/csv", lambda: residuals_csv(shown)),
-            "Residuals as NPZ": Save("wfsobs-residuals.npz", "application/octet-stream", lambda: residuals_npz(shown)),
-        }
-
-    def _follow(self, *_: object) -> None:
+    def follow(self, *_: object) -> None:
         """Start the loop of the results shown, once their run is over; stop where the page is hidden."""
         of = self.run.result
         if not self.visible:
@@ -442,6 +436,11 @@ class ClosedLoopPage(PageActions):
             return
         self._of = of
         self.work.start(Job("loop", partial(compute, of, memo=self.store.session.service.memo), cost=cost(of.scenario)))
+
+    @property
+    def finding(self) -> LoopResults | None:
+        """What can be saved."""
+        return self.results
 
     @property
     def results(self) -> LoopResults | None:
@@ -456,18 +455,18 @@ class ClosedLoopPage(PageActions):
         for room in (self.cards, *self._rooms):  # of other results
             room.visible = work.state != FAILED
 
-    def _redraw(self, *_: object) -> None:
+    def draw(self) -> None:
+        """Draw what every controller leaves."""
         shown = self.results
-        if shown is None or not self.visible or self.display.column >= len(shown.result.scenario.modes):
+        if shown is None or self.display.column >= len(shown.result.scenario.modes):
             return
-        with pn.io.hold():
-            for drawn in self._figures:
-                drawn.draw(shown, self.display)
-            if not self._is_chosen:
-                self._show_main()
-            self._restyle()
-            if self.editor is not None:
-                self.editor.follow()
+        for drawn in self._figures:
+            drawn.draw(shown, self.display)
+        if not self._is_chosen:
+            self._show_main()
+        self._restyle()
+        if self.editor is not None:
+            self.editor.follow()
 
     def _restyle(self, *_: object) -> None:
         with pn.io.hold():
@@ -484,6 +483,12 @@ class ClosedLoopPage(PageActions):
         """Keep to the lines that a visitor has chosen."""
         self._is_chosen = self.cards.hidden_lines != self._main
         self._restyle()
+
+    def _hide(self, names: list[str] | None) -> None:
+        if names is None:
+            self._show_main()
+        else:
+            self.cards.hidden_lines = names
 
     def _show_main(self) -> None:
         """Show the few lines that matter: the references, and the best two of the mode."""

@@ -19,6 +19,7 @@ from wfsobs.app.pages.parts import (
     SMALL_LABEL,
     TALL,
     WIDE,
+    Page,
     box,
     group,
     zoom_buttons,
@@ -58,7 +59,7 @@ ZOOMS: Mapping[str, float | None] = MappingProxyType({"Whole record": None, "2 s
 MARKS = macro("marks", PEAKS, MODEL)
 
 
-class Explore:
+class Explore(Page):
     """The page; its figures rest while it is hidden."""
 
     def __init__(self, history: History, seeds: SeedRuns | None = None):

@@ -11,8 +11,9 @@ from bokeh.models import BoxAnnotation, ColumnDataSource, DataRange1d, GlyphRend
 from bokeh.plotting import figure
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.jobs import BackgroundTask
+from wfsobs.app.pages.parts import WIDE, Page, boxes, html
 from wfsobs.app.render import number
+from wfsobs.app.store import Store
 from wfsobs.app.style import asset, look, swatch
 from wfsobs.app.views.plots import call, envelope, envelope_times, new_figure
 from wfsobs.app.views.table import find
@@ -91,35 +92,23 @@ FIGURES = (
 )
 
 
-class Figures:
+class Figures(Page):
     """The page; redrawn with the results and the unit while it is visible."""
 
-    def __init__(self, run: BackgroundTask, display: Display):
-        self.run, self.display = run, display
-        self.visible = False
+    def __init__(self, store: Store, display: Display):
+        super().__init__(store, display, "unit", "dark")
         self.sheets = [_Sheet(it) for it in FIGURES]
-        run.param.watch(self._refresh, "result")
-        display.param.watch(self._refresh, ["unit", "dark"])
+        self.run.param.watch(self.redraw, "result")
 
     def view(self) -> pn.Column:
         """Return the figures, one below the other."""
-        return pn.Column(
-            *(sheet.view() for sheet in self.sheets), sizing_mode="stretch_width", margin=0, stylesheets=[":host { gap: 10px; }"]
-        )
+        return boxes(*(sheet.view() for sheet in self.sheets))
 
-    def show(self, visible: bool) -> None:
-        """Draw what has come meanwhile, and go on while visible."""
-        behind = visible and not self.visible
-        self.visible = visible
-        if behind:
-            self._refresh()
-
-    def _refresh(self, *_: object) -> None:
-        shown = self.run.result
-        if self.visible and shown is not None:
-            with pn.io.hold():
-                for sheet in self.sheets:
-                    sheet.draw(shown, self.display)
+    def draw(self) -> None:
+        """Draw every figure."""
+        if (shown := self.run.result) is not None:
+            for sheet in self.sheets:
+                sheet.draw(shown, self.display)
 
 
 class _Sheet:
@@ -129,14 +118,12 @@ class _Sheet:
         self.figure = figure
         self.names = (*figure.observers, TRUTH)  # the reference on top
         self.plots = [_PlotLines(plot, self.names, figure) for plot in figure.plots]
-        sheet = [asset("style.css")]
-        self.head = pn.pane.HTML("", sizing_mode="stretch_width", margin=0, stylesheets=sheet)
-        self.caption = pn.pane.HTML("", sizing_mode="stretch_width", margin=0, stylesheets=sheet)
+        self.head, self.caption = html(), html()
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""
-        panes = [pn.pane.Bokeh(drawn.figure, sizing_mode="stretch_width", margin=0) for drawn in self.plots]
-        return pn.Column(self.head, *panes, self.caption, sizing_mode="stretch_width", margin=0, stylesheets=[asset("box.css")])
+        panes = [pn.pane.Bokeh(drawn.figure, **WIDE) for drawn in self.plots]
+        return pn.Column(self.head, *panes, self.caption, **WIDE, stylesheets=[asset("box.css")])
 
     def draw(self, results: RunResults, display: Display) -> None:
         """Every plot and the texts."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from html import escape
@@ -15,9 +15,21 @@ from bokeh.models import ColumnDataSource, HoverTool, Range1d
 from wfsobs.app.controls.fields import parse_number
 from wfsobs.app.copies import IDENTIFY, CopiedTask
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.downloads import Save
 from wfsobs.app.jobs import DONE, FAILED, RUNNING, BackgroundTask, Job, Tell
-from wfsobs.app.pages.parts import WIDE, LinkedFields, PageActions, Starter, box, html, legend, line, text
+from wfsobs.app.pages.parts import (
+    WIDE,
+    LinkedFields,
+    Page,
+    Starter,
+    box,
+    boxes,
+    html,
+    legend,
+    line,
+    number_field,
+    read_number,
+    text,
+)
 from wfsobs.app.render import Row, macro, table
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source
 from wfsobs.app.store import Store
@@ -37,7 +49,6 @@ from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
-from wfsobs.settings.parameters import hint
 from wfsobs.spectral.periodogram import fast_length, periodogram, periodogram_frequencies, taper
 from wfsobs.spectral.search import LOWEST
 from wfsobs.typing import Array
@@ -271,50 +282,51 @@ REPLACED = (
 )
 
 
-class IdentifyPage(PageActions):
+def model_toml(found: tuple[Identification, Record, Scenario]) -> bytes:
+    """Write the model as `wfsobs identify --out` does."""
+    result, record, scenario = found
+    return identification_toml(result, result.scenario(as_stated(record, scenario))).encode()
+
+
+FILES = {"Model as TOML": ("wfsobs-model.toml", model_toml)}
+
+
+class IdentifyPage(Page):
     """The page. The measured spectrum follows the results shown while it is visible; the model comes when asked for."""
 
+    files = FILES
+
     def __init__(self, store: Store, display: Display):
-        self.store, self.run, self.display = store, store.run, display
+        super().__init__(store, display)
         self.work = BackgroundTask(store.session, title="Identification")
         self.starter = Starter(
             self.work, "Identify the record", "Progress of the identification", uses=("Filters only", "As a new simulation")
         )
-        self.level, self.lowest = _number("Level", LEVEL), _number("Lowest peak [Hz]", LOWEST)
-        self.inputs = (self.level, self.lowest)
-        self.link = LinkedFields(level=self.level, lowest=self.lowest)
+        self.level, self.lowest = number_field("Level", LEVEL, 120), number_field("Lowest peak [Hz]", LOWEST, 120)
+        self.link = LinkedFields({"level": self.level, "lowest": self.lowest})
         self.figure = SpectrumFigure()
         self.legend, self.table, self.verdict, self.note = html(), html(), html(), html()
         self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
         self.of: RecordSpectrum | None = None
         self.measuring = BackgroundTask(store.session)
         self._scenario: Scenario | None = None
-        self.visible, self._spectrum = False, object()
+        self._spectrum = object()
         self.starter.start.on_click(lambda _event: self.start())
         filters, simulation = self.starter.uses
         filters.on_click(lambda _event: self.tell_filters())
         simulation.on_click(lambda _event: self.simulate())
-        self.work.param.watch(self._redraw, "result")
+        self.work.param.watch(self.redraw, "result")
         self.measuring.param.watch(self._land, ["state", "place"])
-        self.run.param.watch(self._follow, ["result", "state"])
-        display.param.watch(self._redraw, ["mode", "unit", "dark"])
+        self.run.param.watch(self.follow, ["result", "state"])
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""
         row = line(self.level, self.lowest, *self.starter.view())
-        return pn.Column(
+        return boxes(
             box("Identification", text(INTRO), row, self.starter.status, self.stale, self.verdict),
             box("Spectrum", self.legend, self.note, pn.pane.Bokeh(self.figure.figure, **WIDE)),
             box("Model", self.table, text(ABOUT)),
-            **WIDE,
-            stylesheets=[":host { gap: 10px; }"],
         )
-
-    def show(self, visible: bool) -> None:
-        """Draw what has changed meanwhile, and go on while visible."""
-        self.visible = visible
-        self._follow()
-        self._redraw()  # mode, unit or theme may have changed
 
     def start(self) -> None:
         """Identify the record shown."""
@@ -323,7 +335,7 @@ class IdentifyPage(PageActions):
             self.work.refuse("There is no record yet.")
             return
         try:
-            level, lowest = _read(self.level, 1e-9, 0.5), _read(self.lowest, 1e-3, 1e4)
+            level, lowest = read_number(self.level, 1e-9, 0.5), read_number(self.lowest, 1e-3, 1e4)
             cost = seconds(of.result.record)
             self.store.limits.check_seconds(cost, "identification")
         except SettingError as error:
@@ -355,13 +367,10 @@ class IdentifyPage(PageActions):
             IDENTIFY, {"level": parse_number(str(self.level.value)), "lowest": parse_number(str(self.lowest.value))}
         )
 
-    def saves(self) -> Mapping[str, Save | None]:
-        """Offer the model as `wfsobs identify --out` writes it."""
-        result, record = self._model_and_record()
-        if result is None or record is None:
-            return {"Model as TOML": None}
-        text = identification_toml(result, result.scenario(as_stated(record, self.store.scenario)))
-        return {"Model as TOML": Save("wfsobs-model.toml", "application/toml", text.encode)}
+    @property
+    def finding(self) -> tuple[Identification, Record, Scenario] | None:
+        """The model, the record from which it was identified, and the settings that it is of."""
+        return None if self.work.result is None else (*self.work.result, self.store.scenario)
 
     def _take(self, source: Source | None) -> None:
         result, _ = self._model_and_record()
@@ -372,9 +381,9 @@ class IdentifyPage(PageActions):
                 self.work.refuse(str(error))
             else:
                 self._scenario = self.store.scenario if source is None else None
-                self._redraw()
+                self.redraw()
 
-    def _follow(self, *_: object) -> None:
+    def follow(self, *_: object) -> None:
         """Measure the record shown, once its run is over."""
         of = self.run.result
         if not self.visible or of is None or self.run.state == RUNNING or of is self._spectrum:
@@ -389,31 +398,29 @@ class IdentifyPage(PageActions):
         said = f'<p class="failure">No spectrum: {escape(task.message)}</p>' if task.state == FAILED else ""
         self.note.object = f'<p class="text">{task.line()}</p>' if task.place else said
         if task.state != RUNNING:
-            self._redraw()
+            self.redraw()
 
     def _model_and_record(self) -> tuple[Identification, Record] | tuple[None, None]:
         """Return the model and the record from which it was identified."""
         return self.work.result or (None, None)
 
-    def _redraw(self, *_: object) -> None:
+    def draw(self) -> None:
+        """Draw the spectrum, and the model of it where there is one."""
         of, shown = self.of, self.run.result
-        if not self.visible or of is None or shown is None or self.display.column >= of.mean.shape[1]:
+        if of is None or shown is None or self.display.column >= of.mean.shape[1]:
             return
         diameter, column = shown.scenario.telescope.diameter, self.display.column
         result, record = self._model_and_record()
         mode = result.modes[column] if result and column < len(result.modes) else None
-        with pn.io.hold():
-            self.legend.object = legend(NAMES, self.display.dark)
-            self.figure.draw_measured(of, self.display, diameter)
-            self.figure.draw_fit(mode, fitted_spectrum(mode, result) if mode and result else None, self.display, diameter)
-            self.figure.restyle(self.display.dark)
-            if result and record:
-                self.verdict.object = verdict_html(result)
-                self.table.object = identification_html(mode, self.display, diameter) if mode else ""
-                replaced = self.store.source is None and self._scenario == self.store.scenario
-                self.stale.param.update(
-                    object=REPLACED if replaced else EARLIER, visible=not same_measurements(record, of.record)
-                )
+        self.legend.object = legend(NAMES, self.display.dark)
+        self.figure.draw_measured(of, self.display, diameter)
+        self.figure.draw_fit(mode, fitted_spectrum(mode, result) if mode and result else None, self.display, diameter)
+        self.figure.restyle(self.display.dark)
+        if result and record:
+            self.verdict.object = verdict_html(result)
+            self.table.object = identification_html(mode, self.display, diameter) if mode else ""
+            replaced = self.store.source is None and self._scenario == self.store.scenario
+            self.stale.param.update(object=REPLACED if replaced else EARLIER, visible=not same_measurements(record, of.record))
 
 
 NEXT = "Next: identify noise, turbulence and vibration peaks in this record, as prior knowledge of the observers."
@@ -455,17 +462,3 @@ class Suggestion:
             self.words.object = f'<p class="text" role="status">{escape(said)}</p>'
             self.button.param.update(visible=not used, disabled=running or self.store.run.state != DONE)
             self.view.visible = isinstance(self.store.source, LoadedRecord)
-
-
-def _number(label: str, value: float) -> pmui.TextInput:
-    return pmui.TextInput(label=label, value=f"{value:g}", size="small", width=120, margin=0)
-
-
-def _read(field: pmui.TextInput, low: float, high: float) -> float:
-    """Read a number that was typed. Raises SettingError."""
-    value = parse_number(str(field.value))
-    if isinstance(value, str) or not low <= value <= high:
-        raise SettingError(
-            f"{field.label} = {str(field.value)[:40]!r}: takes a number from {low:g} to {high:g}{hint(str(field.value))}"
-        )
-    return float(value)

@@ -18,7 +18,15 @@ from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL, Disp
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs import FAILED, IDLE, RUNNING
 from wfsobs.app.live_work import LiveOrder, LiveTask, record_saves
-from wfsobs.app.pages.live_controls import LiveControls, control_html, events_html, live_html, peaks_html, status_line
+from wfsobs.app.pages.live_controls import (
+    LOOP_FIELDS,
+    LiveControls,
+    control_html,
+    events_html,
+    live_html,
+    peaks_html,
+    status_line,
+)
 from wfsobs.app.pages.live_figures import (
     MEASUREMENT,
     LatencyHistogram,
@@ -30,7 +38,7 @@ from wfsobs.app.pages.live_figures import (
     Waterfall,
     live_text,
 )
-from wfsobs.app.pages.parts import HALVES, WIDE, PageActions, box, figure_with_caption, group, legend, line, text
+from wfsobs.app.pages.parts import HALVES, WIDE, Page, box, boxes, figure_with_caption, group, legend, line, text
 from wfsobs.app.service import Post
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
@@ -216,8 +224,6 @@ class LiveRoom:
         self.editor.turn_to(target if loop.source.name == SIMULATION and target in TARGETS else None)
 
 
-APART = ":host { gap: 10px; }"
-"""Style of boxes one below the other."""
 LOOK_BACK = 120.0
 """What a recording has of the time before it [s]."""
 INTRO = (
@@ -226,19 +232,18 @@ INTRO = (
 )
 
 
-class LivePage(PageActions):
+class LivePage(Page):
     """The page. Nothing runs before it is asked for."""
 
     def __init__(self, store: Store, display: Display):
-        self.store, self.display = store, display
+        super().__init__(store, display, "mode", "unit", "dark", "show", "spectrum", "editing")
         self.work = LiveTask(store.session)
         self.controls = c = LiveControls()
-        self.inputs = (c.running, c.controllers, c.speed, c.target, c.window)
-        self.buttons = c.buttons
+        self.buttons, self.link = c.buttons, c.link
         self.intro, self.status = text(INTRO), live_text()
-        self.room = pn.Column(**WIDE, visible=False, stylesheets=[APART])
+        self.room = boxes()
+        self.room.visible = False
         self.pulse = Pulse(width=0, height=0, margin=0)
-        self.visible = False
         self.picture: LiveRoom | None = None
         self._known_loop: LiveLoop | None = None
         self._beat = Beat(store.session.post, self.tick) if pn.state.curdoc else None
@@ -268,23 +273,11 @@ class LivePage(PageActions):
         self.work.param.watch(self._say, ["state", "place", "message", "latest"])
         self.store.param.watch(self._follow, "scenario")
         for field in (c.window, c.target, c.lines, c.waterfall):
-            field.param.watch(lambda _: self.draw(), "value")
-        self.display.param.watch(lambda _: self.draw(), ["mode", "unit", "dark", "show", "spectrum", "editing"])
+            field.param.watch(self.redraw, "value")
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""
-        return pn.Column(
-            box(
-                "Live loop",
-                self.intro,
-                *self.controls.view(),
-                self.status,
-                self.pulse,
-            ),
-            self.room,
-            **WIDE,
-            stylesheets=[APART],
-        )
+        return boxes(box("Live loop", self.intro, *self.controls.view(), self.status, self.pulse), self.room)
 
     def show(self, visible: bool) -> None:
         """Draw while visible; the loop goes on when the page is left."""
@@ -322,18 +315,9 @@ class LivePage(PageActions):
         """To run the loop."""
         return CopiedTask(LIVE, {"order": self._order()})
 
-    def link_fields(self) -> dict[str, str]:
-        """Return what of the loop a link has beside the settings."""
-        return self.controls.link_fields()
-
-    def open_link(self, fields: Mapping[str, str]) -> list[str]:
-        """Choose what a link has; return a line for each field refused. A loop that runs is left alone."""
-        return self.controls.open_link(fields, runs=self.loop is not None)
-
-    def follow_link(self, act: Callable[..., object]) -> None:
-        """Call a function after every change of what a link has."""
-        for field in self.inputs:
-            field.param.watch(act, "value")
+    def open_link(self, texts: Mapping[str, str]) -> list[str]:
+        """Choose what an address has. A loop that runs is left alone."""
+        return self.controls.link.open(texts, leave=LOOP_FIELDS if self.loop else ())
 
     @property
     def loop(self) -> LiveLoop | None:

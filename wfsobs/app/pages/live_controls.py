@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
 from math import inf, isnan
 from typing import Any
@@ -14,7 +14,7 @@ from markupsafe import Markup
 
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.pages.live_figures import MEASUREMENT
-from wfsobs.app.pages.parts import WIDE, line
+from wfsobs.app.pages.parts import WIDE, LinkedFields, line
 from wfsobs.app.render import NOTHING, Row, number, table
 from wfsobs.app.style import look, swatch
 from wfsobs.closed_loop.run import strehl
@@ -31,7 +31,6 @@ from wfsobs.live.view import LiveEvent, LiveView
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import TOTAL
-from wfsobs.settings.group import SettingError
 from wfsobs.typing import Array
 
 SHOWN_EVENTS = 8
@@ -188,8 +187,8 @@ FIRST = ("kf-lgs", "kf-multi", "multirate", "multirate-multi", "gpr-online")
 """Observers that run first: as many as two cores keep up with beside the page."""
 MAIN = ("kf-multi", "multirate-multi", "gpr-online")
 """Observers whose lines are shown first."""
-RUNNING, CONTROLLERS, SPEED, ERRORS, WINDOW = "observers", "controllers", "speed", "errors", "window"
-"""Fields of a link."""
+LOOP_FIELDS = ("observers", "controllers", "speed")
+"""Fields of a link that are of the loop; the others are of the page."""
 APART: dict[str, Any] = {**WIDE, "margin": (10, 0, 4, 0)}
 """As wide as the page, its label clear of the row above."""
 BUTTONS = {
@@ -233,18 +232,22 @@ class LiveControls:
         self.waterfall = pmui.Select(label="Waterfall of", options=waterfall, value=MEASUREMENT, width=260, **select)
         self.lines = pmui.MultiChoice(label="Lines", options=self.running.options, value=list(MAIN), **APART)
 
+        linked = {"errors": self.target, "window": self.window}
+        linked |= {"observers": self.running, "controllers": self.controllers, "speed": self.speed}
+        self.link = LinkedFields(linked, {"speed": lambda text: self._offer_speed(speed_of(text))})
+
     def tell(self, loop: LiveLoop) -> None:
         """Show what runs."""
         self.running.value = loop.board.active()
-        self._choose_speed(loop.speed)
+        self._offer_speed(loop.speed)
+        self.speed.value = loop.speed
         self.lines.value = choose_lines(self.lines.value, [name for name in self.running.value if has_error(name, loop.source)])
         self.controllers.value = [name for name in SEATS if name in loop.controllers]
         self._allow(loop.source)
 
-    def _choose_speed(self, speed: float) -> None:
-        """Choose a speed, also one that is not among the usual ones."""
+    def _offer_speed(self, speed: float) -> None:
+        """Have a speed among the usual ones."""
         self.speed.options = dict(sorted({**SPEEDS, f"{speed:g} ×": speed}.items(), key=lambda one: one[1]))
-        self.speed.value = speed
 
     @property
     def names_to_design(self) -> list[str] | None:
@@ -279,42 +282,6 @@ class LiveControls:
             self.running,
         ]
 
-    def link_fields(self) -> dict[str, str]:
-        """Return what of the loop differs from what is usual, as a link has it."""
-        chosen = {RUNNING: (self.running.value, FIRST), CONTROLLERS: (self.controllers.value, USUAL)}
-        fields = {name: ",".join(now) for name, (now, usual) in chosen.items() if tuple(now) != tuple(usual)}
-        fields |= {} if self.speed.value == 1.0 else {SPEED: f"{self.speed.value:g}"}
-        return fields | {name: _text(field.value) for name, field, usual in self._choices if field.value != usual}
-
-    @property
-    def _choices(self) -> list[tuple[str, Any, Any]]:
-        """Fields that take one of a list: name in a link, field, what is usual."""
-        errors = [] if self.target.disabled else [(ERRORS, self.target, TARGETS[0])]
-        return [*errors, (WINDOW, self.window, 5.0)]
-
-    def open_link(self, fields: Mapping[str, str], *, runs: bool) -> list[str]:
-        """Choose what a link has, or what is usual; return a line for each field refused. runs : a loop, which is left alone."""
-        known_fields = (RUNNING, CONTROLLERS, SPEED, ERRORS, WINDOW)
-        refused = [f"{name}: there is no such part of a view" for name in fields if name not in known_fields]
-        for name, select, usual in self._choices:
-            of = {_text(value): value for value in select.options.values()}
-            select.value = of.get(text := fields.get(name, _text(usual)), usual)
-            refused += [] if text in of else [f"{name} = {text[:80]}: takes one of {', '.join(of)}"]
-        return refused if runs else [*refused, *self._open_loop(fields)]
-
-    def _open_loop(self, fields: Mapping[str, str]) -> list[str]:
-        refused = []
-        for name, field, usual in ((RUNNING, self.running, FIRST), (CONTROLLERS, self.controllers, USUAL)):
-            names, known = fields[name].split(",") if fields.get(name) else [], set(field.options.values())
-            field.value = [one for one in names if one in known] if name in fields else list(usual)
-            refused += [f"{name} = {one[:80]}: there is none of that name" for one in names if one not in known]
-        try:
-            self._choose_speed(speed_of(fields.get(SPEED, "1")))
-        except SettingError as error:
-            refused.append(str(error))
-            self._choose_speed(1.0)
-        return refused
-
 
 def choose_lines(choice: Sequence[str], running: Sequence[str]) -> list[str]:
     """Return whose lines are shown: those of the choice that run, others for those that do not, and the adaptive ones.
@@ -326,7 +293,3 @@ def choose_lines(choice: Sequence[str], running: Sequence[str]) -> list[str]:
     spare = [name for name in dict.fromkeys((*FIRST, *running)) if name in running and name not in (*kept, *ADAPTIVE)]
     adaptive = [name for name in ADAPTIVE if name in running and name not in kept]
     return [*kept, *spare[: len(choice) - len(kept)], *adaptive]
-
-
-def _text(value: str | float) -> str:
-    return value if isinstance(value, str) else f"{value:g}"

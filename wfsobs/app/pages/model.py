@@ -5,6 +5,7 @@ from __future__ import annotations
 import panel as pn
 
 from wfsobs.app.display import Display
+from wfsobs.app.pages.parts import WIDE, Page
 from wfsobs.app.render import render, short
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, swatch
@@ -13,32 +14,23 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.typing import Array
 
 
-class ModelPage:
+class ModelPage(Page):
     """The page; follows the settings and the mode while it is visible."""
 
     def __init__(self, store: Store, display: Display):
-        self.store, self.display = store, display
-        self.visible = False
-        self.pane = pn.pane.HTML("", sizing_mode="stretch_width", margin=0, stylesheets=[asset("style.css"), asset("model.css")])
-        store.param.watch(self._refresh, "scenario")
-        display.param.watch(self._refresh, ["mode", "dark"])
+        super().__init__(store, display, "mode", "dark")
+        self.pane = pn.pane.HTML("", **WIDE, stylesheets=[asset("style.css"), asset("model.css")])
+        store.param.watch(self.redraw, "scenario")
 
     def view(self) -> pn.pane.HTML:
         """Return the contents of the page."""
         return self.pane
 
-    def show(self, visible: bool) -> None:
-        """Write what has changed meanwhile, and go on while visible."""
-        behind = visible and not self.visible
-        self.visible = visible
-        if behind:
-            self._refresh()
-
-    def _refresh(self, *_: object) -> None:
-        if self.visible:
-            scenario = self.store.scenario
-            mode = min(self.display.column, len(scenario.modes) - 1)
-            self.pane.object = model_html(describe(scenario, mode), self.display.dark)
+    def draw(self) -> None:
+        """Write the equations."""
+        scenario = self.store.scenario
+        mode = min(self.display.column, len(scenario.modes) - 1)
+        self.pane.object = model_html(describe(scenario, mode), self.display.dark)
 
 
 def model_html(it: Description, dark: bool) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any
 
 import panel as pn
 import panel_material_ui as pmui
@@ -19,7 +19,7 @@ from wfsobs.app.pages.figures import Figures
 from wfsobs.app.pages.identify import IdentifyPage, Suggestion
 from wfsobs.app.pages.live import LivePage
 from wfsobs.app.pages.model import ModelPage
-from wfsobs.app.pages.parts import WIDE
+from wfsobs.app.pages.parts import WIDE, Page
 from wfsobs.app.pages.sweep import SweepPage
 from wfsobs.app.pages.sweep_views import report_part
 from wfsobs.app.pages.tune import TunePage
@@ -59,16 +59,6 @@ TABS = {
 """Pages on the dark bar at the top."""
 
 
-class Page(Protocol):
-    """What a page beside the first must be able to do."""
-
-    def view(self) -> Any:
-        """Return the contents of the page."""
-
-    def show(self, visible: bool) -> None:
-        """Bring it up to date, and keep it so while it is visible."""
-
-
 class Pages(param.Parameterized):
     """The first page, and others that are made when they are wanted."""
 
@@ -84,7 +74,7 @@ class Pages(param.Parameterized):
             SWEEP: lambda: SweepPage(store, display, explored),
             LOOP: lambda: ClosedLoopPage(store, display),
             LIVE: lambda: LivePage(store, display),
-            FIGURES: lambda: Figures(store.run, display),
+            FIGURES: lambda: Figures(store, display),
             MODEL: lambda: ModelPage(store, display),
         }
         if store.session.service.campaign is not None:
@@ -102,6 +92,11 @@ class Pages(param.Parameterized):
         )
         self.view = pn.Column(*self.rooms.values(), sizing_mode="stretch_width", margin=0)
         self.param.watch(self._turn, "current")
+
+    @property
+    def page(self) -> Page:
+        """The page that is shown."""
+        return self.by_name[self.current]
 
     def sweep_over(self, path: str) -> None:
         """Turn to the error over one setting."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from html import escape
 from types import MappingProxyType
 from typing import Any, Protocol
@@ -12,21 +13,22 @@ import panel_material_ui as pmui
 from bokeh.plotting import figure
 
 from wfsobs.app.controls.field import SOON
+from wfsobs.app.controls.fields import parse_number
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.controls.status import Status
 from wfsobs.app.copies import EXPLORED, CopiedTask
 from wfsobs.app.display import Display
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs import CANCELLED, DONE, IDLE, RUNNING, BackgroundTask
+from wfsobs.app.store import Store
 from wfsobs.app.style import HEARD, asset, swatch
 from wfsobs.app.views.plots import call
-
-HIDE = "hide"
-"""Name of the lines that are hidden."""
+from wfsobs.settings.errors import SettingError
+from wfsobs.settings.parameters import hint
 
 
 class LinkPart(Protocol):
-    """A part of a page as texts by name."""
+    """A part of a view as texts by name."""
 
     def texts(self) -> dict[str, str]:
         """Return what differs from a fresh page."""
@@ -36,36 +38,76 @@ class LinkPart(Protocol):
         """Take texts, for the rest what a fresh page has; return a line for each that is refused."""
         ...
 
-    def watch(self, act: Callable[..., object]) -> None:
+    def watch(self, act: Callable[..., object], /) -> object:
         """Call a function after every change."""
 
 
 class LinkedFields:
-    """Fields that hold a text or several each; what they hold when this is made is that of a fresh page."""
+    """Fields and switches that hold a text, a number or several texts; what they hold when this is made is that of a fresh page.
 
-    def __init__(self, **fields: Any):
-        self._fields, self._fresh = fields, {name: _text(field) for name, field in fields.items()}
+    What is disabled has no part in a view.
+
+    Parameters
+    ----------
+    fields : dict
+        Name -> a field, or an object and the name of its parameter.
+    offers : dict
+        Name -> a function that has a field offer a text, if there is such a choice. Raises SettingError.
+    """
+
+    def __init__(self, fields: Mapping[str, Any], offers: Mapping[str, Callable[[str], object]] = MappingProxyType({})):
+        self._offers = offers
+        self._fields = {name: field if isinstance(field, tuple) else (field, "value") for name, field in fields.items()}
+        self.fresh = {name: _text(getattr(*field)) for name, field in self._fields.items()}
 
     def texts(self) -> dict[str, str]:
         """Return the texts that differ from those of a fresh page."""
-        return {name: text for name, field in self._fields.items() if (text := _text(field)) != self._fresh[name]}
+        now = {name: _text(getattr(*field)) for name, field in self._enabled()}
+        return {name: text for name, text in now.items() if text != self.fresh[name]}
 
-    def open(self, texts: Mapping[str, str]) -> list[str]:
-        """Fill in texts in the order of the fields, of which one may change the next."""
+    def open(self, texts: Mapping[str, str], leave: Collection[str] = ()) -> list[str]:
+        """Fill in texts in the order of the fields, of which one may change the next; but for those to be left alone."""
         refused = not_known(name for name in texts if name not in self._fields)
-        for name, field in self._fields.items():
-            text, several = texts.get(name, self._fresh[name]), isinstance(field.value, list)
-            wanted = text.split(",") if several and text else [] if several else [text]
-            if set(wanted) <= set(known := _choices(field) or wanted):
-                field.value = wanted if several else text
-            else:
-                refused.append(f"{name} = {text[:80]}: takes {'some' if several else 'one'} of {', '.join(known)}"[:300])
+        for name, (of, attribute) in self._enabled():
+            if name not in leave:
+                lines = self._fill_in(name, of, attribute, texts.get(name, self.fresh[name]))
+                if lines and not isinstance(getattr(of, attribute), list):
+                    self._fill_in(name, of, attribute, self.fresh[name])
+                refused += lines
         return refused
 
     def watch(self, act: Callable[..., object]) -> None:
         """Call a function after every change."""
-        for field in self._fields.values():
-            field.param.watch(act, "value")
+        for of, attribute in self._fields.values():
+            of.param.watch(act, attribute)
+
+    def _enabled(self) -> Iterator[tuple[str, tuple[Any, str]]]:
+        return (item for item in self._fields.items() if not getattr(item[1][0], "disabled", False))
+
+    def _fill_in(self, name: str, of: Any, attribute: str, text: str) -> list[str]:
+        if name in self._offers:
+            try:
+                self._offers[name](text)
+            except SettingError as error:
+                return [str(error)]
+        now, parameter = getattr(of, attribute), of.param[attribute]
+        options = getattr(of, "options", []) if attribute == "value" else getattr(parameter, "objects", [])
+        known = {_text(value): value for value in (options.values() if isinstance(options, dict) else options)}
+        said = f"{name} = {text[:80]}: takes "
+        if isinstance(now, list):
+            names = text.split(",") if text else []
+            setattr(of, attribute, [known[one] for one in names if one in known])
+            return [f"{name} = {one[:80]}: there is none of that name" for one in names if one not in known]
+        if known and text not in known:
+            return [f"{said}one of {', '.join(known)}"[:300]]
+        value: Any = known.get(text, text)
+        if isinstance(now, int):
+            low, high = parameter.bounds
+            if not text.isdecimal() or not low <= int(text) <= high:
+                return [f"{said}a whole number from {low} to {high}"]
+            value = int(text)
+        setattr(of, attribute, value)
+        return []
 
 
 class LinkedLater:
@@ -104,29 +146,44 @@ class LinkedLater:
 
 
 class LinkedLines:
-    """The lines that a visitor has hidden on the cards of a page."""
+    """The lines that a visitor has hidden.
 
-    def __init__(self, cards: Any, names: Collection[str], is_chosen: Callable[[], bool], show_main: Callable[[], None]):
-        """Make it. names : of all lines; is_chosen : whether a visitor has chosen; show_main : shows what a fresh page does."""
-        self._cards, self._names, self._is_chosen, self._show_main = cards, names, is_chosen, show_main
+    Parameters
+    ----------
+    name : str
+        In an address.
+    known : Collection
+        Names of all lines.
+    hidden : callable
+        Returns the names of those hidden, None where a fresh page's are.
+    hide : callable
+        Hides lines; for None those of a fresh page.
+    watch : callable
+        Has a function called when other lines are hidden.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        known: Collection[str],
+        hidden: Callable[[], Iterable[str] | None],
+        hide: Callable[[list[str] | None], object],
+        watch: Callable[[Callable[..., object]], object],
+    ):
+        self.name, self._known, self._hidden, self._hide, self.watch = name, known, hidden, hide, watch
 
     def texts(self) -> dict[str, str]:
         """Return the lines that are hidden, where a visitor has chosen."""
-        return {HIDE: ",".join(self._cards.hidden_lines)} if self._is_chosen() else {}
+        hidden = self._hidden()
+        return {} if hidden is None else {self.name: ",".join(hidden)}
 
     def open(self, texts: Mapping[str, str]) -> list[str]:
         """Hide lines."""
-        refused, hidden = not_known(name for name in texts if name != HIDE), texts.get(HIDE)
-        if hidden is None:
-            self._show_main()
-            return refused
-        names = hidden.split(",") if hidden else []
-        self._cards.hidden_lines = [name for name in names if name in self._names]
-        return [*refused, *(f"{HIDE} = {name[:80]}: no line of that name" for name in names if name not in self._names)]
-
-    def watch(self, act: Callable[..., object]) -> None:
-        """Call a function when other lines are hidden."""
-        self._cards.param.watch(act, "hidden_lines")
+        text = texts.get(self.name)
+        names = text.split(",") if text else []
+        self._hide(None if text is None else [name for name in names if name in self._known])
+        refused = [f"{self.name} = {name[:80]}: no line of that name" for name in names if name not in self._known]
+        return [*not_known(name for name in texts if name != self.name), *refused]
 
 
 def not_known(names: Iterable[str]) -> list[str]:
@@ -134,47 +191,81 @@ def not_known(names: Iterable[str]) -> list[str]:
     return [f"{name}: there is no such part of a view" for name in names]
 
 
-def _text(field: Any) -> str:
+def _text(value: Any) -> str:
     """Return what a field holds as one text."""
-    return ",".join(field.value) if isinstance(field.value, list) else field.value
+    return ",".join(value) if isinstance(value, list) else f"{value:g}" if isinstance(value, (int, float)) else value
 
 
-def _choices(field: Any) -> list[str]:
-    """Return the texts that a field offers; none where it takes any."""
-    options = getattr(field, "options", [])
-    return list(options.values() if isinstance(options, dict) else options)
+class Page:
+    """A page of the main area: what it does with the record, what of it an address has, and what it has found.
 
+    Attributes
+    ----------
+    link : LinkPart
+        What of it the address has.
+    files : dict
+        Entry of the menu -> name of a file, and how it is written of what the page has found.
+    visible : bool
+        Whether it is seen; what is not is not drawn.
+    """
 
-class PageActions:
-    """What a page has for the row of actions: what it does, to be copied, and what it has found, to be saved."""
+    link: LinkPart = LinkedFields({})
+    files: Mapping[str, tuple[str, Callable[[Any], bytes]]] = MappingProxyType({})
+    visible = False
 
-    inputs: Sequence[Any] = ()
-    """Fields that the task depends on."""
+    def __init__(self, store: Store, display: Display, *switches: str):
+        """Make it. switches : of the display, after whose changes it is drawn; by default mode, unit and theme."""
+        self.store, self.run, self.display = store, store.run, display
+        display.param.watch(self.redraw, [*switches] or ["mode", "unit", "dark"])
 
-    link: LinkPart | None = None
-    """What of the page the address has."""
+    def view(self) -> Any:
+        """Return the contents of the page."""
+        raise NotImplementedError
+
+    def show(self, visible: bool) -> None:
+        """Bring it up to date, and keep it so while it is visible."""
+        self.visible = visible
+        self.follow()
+        self.redraw()  # what is shown, and how, may have changed
+
+    def follow(self, *_: object) -> None:
+        """Begin what is to be computed of what is shown now."""
+
+    def redraw(self, *_: object) -> None:
+        """Draw what has come, as one message, where it is seen."""
+        if self.visible:
+            with pn.io.hold():
+                self.draw()
+
+    def draw(self) -> object:
+        """Draw what has come."""
+
+    def open_link(self, texts: Mapping[str, str]) -> list[str]:
+        """Take what an address has of the page; return a line for each text refused."""
+        return self.link.open(texts)
 
     @property
     def task(self) -> CopiedTask:
-        """What the page does with the record."""
+        """What the page does with the record, to be copied."""
         return EXPLORED
+
+    @property
+    def finding(self) -> Any:
+        """What of it can be saved; None for nothing yet."""
+        return None
 
     def saves(self) -> Mapping[str, Save | None]:
         """Offer what can be saved, by its name in the menu; None where it is not there yet."""
-        return {}
+        found = self.finding
+        return {
+            what: None if found is None else Save(name, KINDS.get(name.rpartition(".")[2], BYTES), partial(write, found))
+            for what, (name, write) in self.files.items()
+        }
 
-    def link_fields(self) -> dict[str, str]:
-        """Return what of the page the address has beside the settings: name -> text."""
-        return self.link.texts() if self.link else {}
 
-    def open_link(self, fields: Mapping[str, str]) -> list[str]:
-        """Fill in what an address has, the rest as on a fresh page; return a line for each field refused."""
-        return self.link.open(fields) if self.link else not_known(fields)
-
-    def follow_link(self, act: Callable[..., object]) -> None:
-        """Call a function after every change of what the address has."""
-        if self.link:
-            self.link.watch(act)
+BYTES = "application/octet-stream"
+KINDS = {"csv": "text/csv", "toml": "application/toml"}
+"""Ending of a file -> its type, if it is not BYTES."""
 
 
 WIDE: Mapping[str, Any] = MappingProxyType({"sizing_mode": "stretch_width", "margin": 0})
@@ -221,6 +312,26 @@ def zoom_buttons(zoom: Callable[[float | None], None], stretches: Mapping[str, f
 def box(title: str, *content: Any, about: str = "") -> pn.Column:
     """Lay out a part of a page under its title; about : what is in it, in a few words."""
     return pn.Column(heading(title, about), *content, **WIDE, stylesheets=[asset("box.css")])
+
+
+def boxes(*parts: Any) -> pn.Column:
+    """Lay out boxes one below the other."""
+    return pn.Column(*parts, **WIDE, stylesheets=[":host { gap: 10px; }"])
+
+
+def number_field(label: str, value: float, width: int) -> pmui.TextInput:
+    """Make a field for a number."""
+    return pmui.TextInput(label=label, value=f"{value:g}", size="small", width=width, margin=0)
+
+
+def read_number(field: pmui.TextInput, low: float, high: float, *, whole: bool = False) -> Any:
+    """Read a number that was typed. Raises SettingError."""
+    text = str(field.value)
+    value = parse_number(text)
+    if isinstance(value, str) or (whole and not isinstance(value, int)) or not low <= value <= high:
+        what = "whole number" if whole else "number"
+        raise SettingError(f"{field.label} = {text[:40]!r}: takes a {what} from {low:g} to {high:g}{hint(text)}")
+    return value
 
 
 def line(*parts: Any) -> pn.FlexBox:

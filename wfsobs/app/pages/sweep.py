@@ -15,14 +15,28 @@ import param
 
 from wfsobs.app.cache import key_of
 from wfsobs.app.component import Component
-from wfsobs.app.controls.fields import number_text, parse_number
+from wfsobs.app.controls.fields import number_text
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.copies import SWEEP, CopiedTask
 from wfsobs.app.display import Display
-from wfsobs.app.downloads import Save, table_csv
+from wfsobs.app.downloads import table_csv
 from wfsobs.app.jobs import BATCH, CANCELLED, DONE, FAILED, RUNNING, BackgroundTask, Job, Tell
 from wfsobs.app.limits import Limits
-from wfsobs.app.pages.parts import TALL, WIDE, LinkedFields, PageActions, Starter, box, html, legend, line, text
+from wfsobs.app.pages.parts import (
+    TALL,
+    WIDE,
+    LinkedFields,
+    Page,
+    Starter,
+    box,
+    boxes,
+    html,
+    legend,
+    line,
+    number_field,
+    read_number,
+    text,
+)
 from wfsobs.app.pages.sweep_views import SweepLines, axis_title, legend_of_shades, line_part, map_grid, parameter_of
 from wfsobs.app.render import render
 from wfsobs.app.seeds import SeedScores
@@ -279,12 +293,18 @@ class SweepMap(Component):
             self._load(int(cell))
 
 
-class SweepPage(PageActions):
+FILES = {"Sweep as CSV": ("wfsobs-sweep.csv", table_csv)}
+
+
+class SweepPage(Page):
     """The page. Nothing is run before it is asked for."""
+
+    files = FILES
 
     def __init__(self, store: Store, display: Display, explore: Callable[[], None]):
         """Make the page. explore : turns to the page that shows a scenario."""
-        self.store, self.display, self._explore = store, display, explore
+        super().__init__(store, display)
+        self._explore = explore
         self.work = SweepTask(store.session)
         self.starter = Starter(self.work, "Run the sweep", "Progress of the sweep", self._so_far, uses=())
         names = sweep_settings(store.scenario)
@@ -294,13 +314,19 @@ class SweepPage(PageActions):
             AxisFields(store, ("and over", "Values of the second"), {"no second setting": NONE, **names}, second, more),
         )
         self.settings, self.values = [axis.select for axis in self.axes], [axis.values for axis in self.axes]
-        self.seeds = pmui.TextInput(label="Seeds of each", value=str(SEEDS), size="small", width=120, margin=0)
+        self.seeds = number_field("Seeds of each", SEEDS, 120)
         self.observers = pmui.Select(label="Observers", options=OBSERVERS_OF, value=QUICK, size="small", width=290, margin=0)
-        self.inputs = (*self.settings, *self.values, self.seeds, self.observers)
-        (over, second), (values, more) = self.settings, self.values
-        self.link = LinkedFields(
-            over=over, values=values, second=second, second_values=more, seeds=self.seeds, observers=self.observers
-        )
+        first_axis, second_axis = self.axes
+        linked = {
+            "over": first_axis.select,
+            "values": first_axis.values,
+            "second": second_axis.select,
+            "second_values": second_axis.values,
+            "seeds": self.seeds,
+            "observers": self.observers,
+        }
+        # a setting of a list is not among the choices until it is asked for
+        self.link = LinkedFields(linked, {"over": first_axis.offer, "second": second_axis.offer})
         self.estimate = html()
         self.maps = {target: SweepMap(self.load, **WIDE) for target in SCORED}
         self.lines: dict[str, SweepLines] = {}
@@ -309,36 +335,24 @@ class SweepPage(PageActions):
         self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
         self.boxes = [box(target_title(target), self.legends[target], self.panes[target], self.maps[target]) for target in SCORED]
         self.shades = text(f"{legend_of_shades()} Click a cell to load its scenario in Explore.")
-        self.visible, self._draw_time = False, 0.0
+        self._draw_time = 0.0
         for part in (*self.boxes, self.shades):
             part.visible = False
         self._watch()
 
     def _watch(self) -> None:
         self.starter.start.on_click(lambda _event: self.start())
-        for field in self.inputs:
-            field.param.watch(self._estimate, "value")
+        self.link.watch(self.follow)
         self.work.param.watch(self._take, ["state", "result"])
-        self.store.param.watch(self._follow, ["scenario", "source"])
-        self.display.param.watch(self._redraw, ["mode", "unit", "dark"])
+        self.store.param.watch(self._compare, ["scenario", "source"])
+        self.store.param.watch(self.follow, ["scenario", "source"])
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""
         row = line(*(field for pair in zip(self.settings, self.values, strict=True) for field in pair))
         more = line(self.seeds, self.observers, *self.starter.view())
-        return pn.Column(
-            box("Sweep", text(INTRO), row, more, self.estimate, self.starter.status, self.stale),
-            *self.boxes,
-            self.shades,
-            **WIDE,
-            stylesheets=[":host { gap: 10px; }"],
-        )
-
-    def show(self, visible: bool) -> None:
-        """Draw what has come meanwhile, and go on while visible."""
-        self.visible = visible
-        self._estimate()
-        self._redraw()
+        sweep = box("Sweep", text(INTRO), row, more, self.estimate, self.starter.status, self.stale)
+        return boxes(sweep, *self.boxes, self.shades)
 
     def choose(self, path: str) -> None:
         """Prepare the error over one setting, by its path."""
@@ -348,20 +362,12 @@ class SweepPage(PageActions):
                 second.choose(NONE)
                 first.choose(path)
 
-    def open_link(self, fields: Mapping[str, str]) -> list[str]:
-        """Fill in what an address has; a setting of a list is not among the choices until it is asked for."""
-        for axis, name in zip(self.axes, ("over", "second"), strict=True):
-            axis.offer(fields.get(name, NONE))
-        return super().open_link(fields)
-
     def plan(self) -> Sweep:
         """Return the sweep that the fields describe. Raises SettingError."""
         if self.store.source is not None:
             raise SettingError("A sweep simulates the settings: go back to the simulation first")
         axes = [read_axis(path, values) for path, values in self._axes()]
-        seeds = parse_number(str(self.seeds.value))
-        if not isinstance(seeds, int):
-            raise SettingError(f"Seeds of each = {str(seeds)[:40]!r}: takes a whole number from 1 to {MOST_SEEDS}")
+        seeds = read_number(self.seeds, 1, MOST_SEEDS, whole=True)
         sweep = plan_sweep(self.store.scenario, axes, seeds, self._observers())
         for cell in sweep.edge:
             self.store.limits.check(sweep.scenario(cell))
@@ -410,16 +416,12 @@ class SweepPage(PageActions):
         over = [f"{path}={values}" for path, values in self._axes()]
         return CopiedTask(SWEEP, {"over": over, "seeds": self.seeds.value, "observer": self._observers() or []})
 
-    def saves(self) -> Mapping[str, Save | None]:
-        """Offer the errors of all cells, as `wfsobs sweep --csv` writes them."""
-        known = self.results and self.results.rows()
-        return {"Sweep as CSV": Save("wfsobs-sweep.csv", "text/csv", lambda: table_csv(known)) if known else None}
+    @property
+    def finding(self) -> list[dict[str, Any]] | None:
+        """The errors of all cells, as `wfsobs sweep --csv` writes them."""
+        return (self.results and self.results.rows()) or None
 
-    def _follow(self, *_: object) -> None:
-        self._compare()
-        self._estimate()
-
-    def _estimate(self, *_: object) -> None:
+    def follow(self, *_: object) -> None:
         """Say what would be run, or why it cannot be."""
         if not self.visible:
             return
@@ -446,23 +448,22 @@ class SweepPage(PageActions):
     def _take(self, *_: object) -> None:
         """Draw what has come, not too often."""
         if self.work.state != RUNNING or monotonic() - self._draw_time >= REDRAW:
-            self._redraw()
+            self.redraw()
 
-    def _redraw(self, *_: object) -> None:
-        results = self.results
-        if not self.visible or results is None:
+    def draw(self) -> None:
+        """Draw the map, and the errors over one setting."""
+        if (results := self.results) is None:
             return
         self._draw_time = monotonic()
         single = len(results.sweep.axes) == 1
-        with pn.io.hold():
-            for target in SCORED:
-                self.maps[target].draw(map_grid(results, target, self.display))
-                if single:
-                    self._draw_lines(results, target)
-                self.panes[target].visible = self.legends[target].visible = single
-            for part in (*self.boxes, self.shades):
-                part.visible = True
-            self._compare()
+        for target in SCORED:
+            self.maps[target].draw(map_grid(results, target, self.display))
+            if single:
+                self._draw_lines(results, target)
+            self.panes[target].visible = self.legends[target].visible = single
+        for part in (*self.boxes, self.shades):
+            part.visible = True
+        self._compare()
 
     def _draw_lines(self, results: SweepResults, target: str) -> None:
         part = line_part(results, target, self.display)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from html import escape
 from itertools import groupby
@@ -19,9 +19,22 @@ from wfsobs.app.controls.fields import parse_number
 from wfsobs.app.controls.names import setting_name
 from wfsobs.app.copies import TUNE, CopiedTask
 from wfsobs.app.display import NO_ANGLE, UNITS, Display, per_micrometre
-from wfsobs.app.downloads import Save, table_csv
+from wfsobs.app.downloads import table_csv
 from wfsobs.app.jobs import BATCH, INTERVAL, RUNNING, BackgroundTask, Job, Tell
-from wfsobs.app.pages.parts import WIDE, LinkedFields, PageActions, Starter, box, html, legend, line, text
+from wfsobs.app.pages.parts import (
+    WIDE,
+    LinkedFields,
+    Page,
+    Starter,
+    box,
+    boxes,
+    html,
+    legend,
+    line,
+    number_field,
+    read_number,
+    text,
+)
 from wfsobs.app.render import NOTHING, Row, change, macro, number, table
 from wfsobs.app.store import Store
 from wfsobs.app.style import look
@@ -36,7 +49,6 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.settings.errors import SettingError
-from wfsobs.settings.parameters import hint
 from wfsobs.tuning import Evaluation, Stage, TuningResult, tune
 from wfsobs.tuning.judge import Errors
 from wfsobs.tuning.records import MEASURES, NEXT, REFERENCE, TRUTH, judged_by
@@ -219,17 +231,28 @@ START = "gpr-online"
 COLUMNS: tuple[str, ...] = ("section", "name", "before", "after")
 
 
-class TunePage(PageActions):
+FILES: Mapping[str, tuple[str, Callable[[TuningResult], bytes]]] = {
+    "Tuning table as CSV": (
+        "wfsobs-tuning.csv",
+        lambda tuned: table_csv([dict(zip(COLUMNS, row, strict=True)) for row in tuning_rows(tuned)]),
+    ),
+    "Tuned settings as TOML": ("wfsobs-tuned.toml", lambda tuned: tuning_toml(tuned).encode()),
+}
+"""Errors in [um]; the settings as `wfsobs tune --out` writes them."""
+
+
+class TunePage(Page):
     """The page. Nothing is computed before it is asked for."""
 
+    files = FILES
+
     def __init__(self, store: Store, display: Display):
-        self.store, self.run, self.display = store, store.run, display
+        super().__init__(store, display, "unit", "dark")
         self.work = BackgroundTask(store.session, title="Tuning")
         self.starter = Starter(self.work, "Start tuning", "Progress of the tuning", self._so_far)
         self.observer = pmui.Select(label="Observer", options=choices(), value=START, size="small", width=250, margin=0)
         self.target = pmui.Select(label="Error of", options=[], size="small", width=130, margin=0)
-        self.evaluations = pmui.TextInput(label="Evaluations", value=str(EVALUATIONS), size="small", width=110, margin=0)
-        self.inputs = (self.observer, self.target, self.evaluations)
+        self.evaluations = number_field("Evaluations", EVALUATIONS, 110)
         self.figure = HistoryFigure()
         self.measure = MEASURES[TRUTH]
         self.search_space, self.legend, self.table = html(), html(), html()
@@ -237,31 +260,19 @@ class TunePage(PageActions):
         self.outcome = box("Before and after", self.table)
         self.history.visible = self.outcome.visible = False
         self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
-        self.visible = False
         self.starter.start.on_click(lambda _event: self.start())
         self.starter.uses[0].on_click(lambda _event: self.use())
         self.observer.param.watch(self._choose, "value")
-        self.work.param.watch(self._redraw, ["latest", "result"])
+        self.work.param.watch(self.redraw, ["latest", "result"])
         store.param.watch(self._compare, "scenario")
-        display.param.watch(self._redraw, ["unit", "dark"])
         self._choose()
-        self.link = LinkedFields(observer=self.observer, target=self.target, evaluations=self.evaluations)
+        self.link = LinkedFields({"observer": self.observer, "target": self.target, "evaluations": self.evaluations})
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""
         row = line(self.observer, self.target, self.evaluations, *self.starter.view())
-        return pn.Column(
-            box("Tuning", text(INTRO), row, self.search_space, self.starter.status, self.stale),
-            self.history,
-            self.outcome,
-            **WIDE,
-            stylesheets=[":host { gap: 10px; }"],
-        )
-
-    def show(self, visible: bool) -> None:
-        """Draw what has come meanwhile, and go on while visible."""
-        self.visible = visible
-        self._redraw()
+        tuning = box("Tuning", text(INTRO), row, self.search_space, self.starter.status, self.stale)
+        return boxes(tuning, self.history, self.outcome)
 
     def start(self) -> None:
         """Tune the chosen observer."""
@@ -270,7 +281,7 @@ class TunePage(PageActions):
             self.work.refuse("There is no record yet.")
             return
         try:
-            evaluations = _whole(self.evaluations, MOST)
+            evaluations = read_number(self.evaluations, 1, MOST, whole=True)
             cost = seconds(of, scenario, observer, evaluations)
             self.store.limits.check_seconds(cost, "tuning")
             self.measure = minimised_measure(of, observer, target)
@@ -282,8 +293,7 @@ class TunePage(PageActions):
 
     def use(self) -> None:
         """Take what was tuned into the settings, and leave the others as they are by now."""
-        tuned = self._tuning_result()
-        if tuned is not None:
+        if (tuned := self.finding) is not None:
             try:
                 self.store.replace(changed_settings(tuned.scenario, tuned.before.scenario))
             except SettingError as error:
@@ -295,15 +305,10 @@ class TunePage(PageActions):
         evaluations = parse_number(str(self.evaluations.value))
         return CopiedTask(TUNE, {"observer": self.observer.value, "target": self.target.value, "evaluations": evaluations})
 
-    def saves(self) -> Mapping[str, Save | None]:
-        """Offer the table, errors in [um], and the settings as `wfsobs tune --out` writes them."""
-        if (tuned := self._tuning_result()) is None:
-            return {"Tuning table as CSV": None, "Tuned settings as TOML": None}
-        table = [dict(zip(COLUMNS, row, strict=True)) for row in tuning_rows(tuned)]
-        return {
-            "Tuning table as CSV": Save("wfsobs-tuning.csv", "text/csv", lambda: table_csv(table)),
-            "Tuned settings as TOML": Save("wfsobs-tuned.toml", "application/toml", tuning_toml(tuned).encode),
-        }
+    @property
+    def finding(self) -> TuningResult | None:
+        """The last tuning."""
+        return self.work.result
 
     def _choose(self, *_: object) -> None:
         """Offer what the observer estimates, and say what is searched."""
@@ -313,18 +318,15 @@ class TunePage(PageActions):
         names = ", ".join(map(setting_name, OBSERVERS[name].tunable.usual))
         self.search_space.object = f'<p class="text">Searched: {escape(names)}.</p>'
 
-    def _tuning_result(self) -> TuningResult | None:
-        return self.work.result
-
     def _history(self) -> tuple[Evaluation, ...]:
         """Of the tuning under way, or of the last one."""
         if self.work.state == RUNNING:
             return self.work.latest or ()
-        tuned = self._tuning_result()
+        tuned = self.finding
         return tuned.history if tuned else self.work.latest or ()
 
     def _scale(self) -> tuple[str, float]:
-        return unit_for(self._tuning_result(), self.display), self.store.scenario.telescope.diameter
+        return unit_for(self.finding, self.display), self.store.scenario.telescope.diameter
 
     def _so_far(self) -> str:
         """Describe what the search has reached."""
@@ -335,30 +337,18 @@ class TunePage(PageActions):
         first, best = (number(per_micrometre(unit, diameter) * x) for x in (history[0].rms, best_so_far(history)[-1]))
         return f" · {len(history)} evaluations, best {best} {UNITS[unit]}, {first} {UNITS[unit]} before"
 
-    def _redraw(self, *_: object) -> None:
-        if not self.visible:
-            return
-        tuned, (unit, diameter) = self._tuning_result(), self._scale()
-        with pn.io.hold():
-            self.legend.object = legend(LEGEND, self.display.dark)
-            self.figure.draw(self._history(), self.measure, unit, diameter)
-            self.figure.restyle(self.display.dark)
-            self.history.visible, self.outcome.visible = bool(self._history()), tuned is not None
-            if tuned is not None:
-                self.table.object = tuning_html(tuned, self.display, diameter)
+    def draw(self) -> None:
+        """Draw how it went, and what came of it."""
+        tuned, (unit, diameter) = self.finding, self._scale()
+        self.legend.object = legend(LEGEND, self.display.dark)
+        self.figure.draw(self._history(), self.measure, unit, diameter)
+        self.figure.restyle(self.display.dark)
+        self.history.visible, self.outcome.visible = bool(self._history()), tuned is not None
+        if tuned is not None:
+            self.table.object = tuning_html(tuned, self.display, diameter)
         self._compare()
 
     def _compare(self, *_: Any) -> None:
         """Whether the settings are still those that were tuned, before or after."""
-        tuned, now = self._tuning_result(), self.store.scenario
+        tuned, now = self.finding, self.store.scenario
         self.stale.visible = tuned is not None and now not in (tuned.before.scenario, tuned.scenario)
-
-
-def _whole(field: pmui.TextInput, most: int) -> int:
-    """Read a whole number that was typed. Raises SettingError."""
-    value = parse_number(str(field.value))
-    if not isinstance(value, int) or not 1 <= value <= most:
-        raise SettingError(
-            f"{field.label} = {str(field.value)[:40]!r}: takes a whole number from 1 to {most}{hint(str(field.value))}"
-        )
-    return value
