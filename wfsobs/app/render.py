@@ -105,4 +105,4 @@ ENVIRONMENT = Environment(
     lstrip_blocks=True,
 )
 ENVIRONMENT.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-ENVIRONMENT.filters.update(number=number, short=short, matrix=matrix, tex=tex)
+ENVIRONMENT.filters.update(number=number, short=short, matrix=matrix, tex=tex, py=repr)
