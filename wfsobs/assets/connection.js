@@ -54,13 +54,14 @@ function finishTyping() {
 
 // The path of the setting that a component, or what holds its data, stands for; or nothing.
 function settingOf(model) {
-  const of = model?.data ? model : [...model?.document?._all_models.values() ?? []].find((it) => it.data === model)
+  const of = model?.data ? model : [...model?.document?.all_models ?? []].find((it) => it.data === model)
   return of?.tags.find((tag) => tag.startsWith?.(TAG))?.slice(TAG.length)
 }
 
 class Link {
   constructor(doc) {
     Object.assign(this, {doc, state: "connected", asked: 0, unsent: [], kept: new Set(), away: false, socket: null, connection: null, refused: 0, wait: 0, ticks: 0})
+    doc.replace_with_json = (json) => this.replace(json)
     doc.on_change((event) => this.changed(event))
     doc.on_event("connection_lost", (_, event) => this.lost(event.connection.deref()))
     window.addEventListener("offline", () => {
@@ -133,29 +134,29 @@ class Link {
     const link = this
     // A socket that is not open yet throws, and nobody else hears of the change then; one that is open takes it before what was kept.
     if (!Object.hasOwn(connection, "send")) {
-      const {send} = connection
+      const {send, send_with_reply: ask} = connection
+      connection.send_with_reply = async function (message) {
+        const reply = await ask.call(this, message)
+        link.buffers = reply.buffers
+        return reply
+      }
       connection.send = function (message) {
         if (!link.away || message.msgtype() !== "PATCH-DOC") send.call(this, message)
       }
     }
-    connection._repull_session_doc = async function (resolve, reject) {
-      try {
-        const {doc_json, buffers} = await this._pull_doc_json()
-        if (!JSON.stringify(doc_json).includes(link.session)) throw new Error("another session")
-        const {document} = this.session
-        finishTyping()
-        document.constructor.from_json(doc_json, [], buffers).destructively_move(document)
-        document._new_models.clear() // the server has them
-        link.away = false
-        link.kept = new Set(link.unsent) // what comes now is sent as ever
-        resolve(this.session)
-      } catch (error) {
-        if (error.message === "another session") link.end()
-        reject(error)
-      }
-    }
     this.turn(navigator.onLine ? "lost" : "offline")
     this.retry()
+  }
+
+  // The document as the server has it: Bokeh 3.9 would leave out the buffers that came with it, which hold its arrays.
+  replace(json) {
+    if (!JSON.stringify(json).includes(this.session)) return this.end()
+    const {doc} = this
+    finishTyping()
+    doc.constructor.from_json(json, [], this.buffers).destructively_move(doc)
+    doc.create_json_patch([]) // no model is new to the server
+    this.away = false
+    this.kept = new Set(this.unsent) // what comes now is sent as ever
   }
 
   async retry() {

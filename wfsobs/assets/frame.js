@@ -30,9 +30,9 @@ function themes(model) {
 }
 
 // A text is brought to what it is to say, where Panel would draw all of it anew: a table may get numbers while one reads in it.
-function patchTexts(doc) {
-  const kind = [...doc._all_models.values()].find((it) => it.type === "panel.models.markup.HTML")?.default_view.prototype
-  if (!kind || kind.patched) return
+function patchTexts() {
+  const kind = Bokeh.Models.get("panel.models.markup.HTML").prototype.default_view.prototype
+  if (kind.patched) return
   const set = kind.set_html
   kind.patched = true
   kind.set_html = function (html) {
@@ -86,10 +86,13 @@ layOutOnceAFrame()
 function placePartsOnce() {
   const sheet = Bokeh.require("core/dom").InlineStyleSheet.prototype
   if (sheet.writesOnChange) return
-  const write = sheet._update
+  const {replace} = sheet
   sheet.writesOnChange = true
-  sheet._update = function (css) {
-    if (css !== this.el.textContent) write.call(this, css)
+  sheet.replace = function (...rules) {
+    const asked = JSON.stringify(rules)
+    if (asked === this.asked && this.css === this.written) return
+    replace.apply(this, rules)
+    Object.assign(this, {asked, written: this.css})
   }
   Bokeh.Models.get("GlyphRenderer").prototype.default_view.prototype.update_position = function () {
     this.position.replace(":host { display: none; }")
@@ -148,7 +151,7 @@ function tellDrawn(model) {
 // In a narrow window the drawer lies over the page: its style hides it until it has been closed here, and is opened.
 const NARROW = "(max-width: 999.95px)"
 function closeDrawer(doc) {
-  const page = [...doc._all_models.values()].find((it) => it.data?.attributes && "sidebar_open" in it.data.attributes)
+  const page = [...doc.all_models].find((it) => it.data?.attributes && "sidebar_open" in it.data.attributes)
   const allow = () => document.documentElement.style.setProperty("--wfsobs-drawer", "visible")
   if (!page || !matchMedia(NARROW).matches) return allow()
   page.data.sidebar_open = false
@@ -157,7 +160,7 @@ function closeDrawer(doc) {
 
 export function render({model, view, el}) {
   closeDrawer(view.model.document)
-  patchTexts(view.model.document)
+  patchTexts()
   themes(model)
   tellDrawn(model)
   const fade = () => {
