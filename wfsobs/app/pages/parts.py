@@ -12,7 +12,6 @@ import panel as pn
 import panel_material_ui as pmui
 from bokeh.plotting import figure
 
-from wfsobs.app.controls.field import SOON
 from wfsobs.app.controls.fields import parse_number
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.controls.status import Status
@@ -385,11 +384,9 @@ HALVES = grid_style("minmax(0, 1fr) minmax(0, 1fr)")
 
 def group(display: Display, name: str, options: Any) -> pmui.RadioButtonGroup:
     """Make the buttons of one switch of the display."""
-    widget = pmui.RadioButtonGroup.from_param(
+    return pmui.RadioButtonGroup.from_param(
         display.param[name], options=options, size="small", margin=0, variant="outlined", stylesheets=[HEARD]
     )
-    widget._debounce = SOON  # type: ignore[misc]
-    return widget
 
 
 def legend(names: Mapping[str, str], dark: bool) -> str:

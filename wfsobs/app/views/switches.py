@@ -11,7 +11,6 @@ from markupsafe import Markup
 
 from wfsobs.app.change_names import name_of_difference
 from wfsobs.app.compared import ComparedRun
-from wfsobs.app.controls.field import SOON
 from wfsobs.app.display import UNITS, Display, short_name
 from wfsobs.app.history import History
 from wfsobs.app.jobs import FAILED, BackgroundTask
@@ -91,7 +90,6 @@ class UnitSwitch:
             variant="outlined",
             stylesheets=[HEARD],
         )
-        self.buttons._debounce = SOON  # type: ignore[misc]
         self.note = pn.pane.HTML(NO_MAS, visible=False, margin=0)
         self.buttons.param.watch(self._on_choice, "value")
         display.param.watch(self._follow, ["mode", "unit"])
