@@ -8,12 +8,11 @@ from typing import Any
 import pytest
 
 from tests.app.test_session_history import WIND, change, quick
+from wfsobs.app import history as module
 from wfsobs.app.display import Display
-from wfsobs.app.history import History
+from wfsobs.app.history import History, HistorySheet, Sheet
 from wfsobs.app.picker import LARGEST
 from wfsobs.app.session_file import SUFFIX, read_session
-from wfsobs.app.views import history_sheet as module
-from wfsobs.app.views.history_sheet import HistorySheet, Sheet
 
 
 @pytest.fixture

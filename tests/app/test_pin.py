@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wfsobs.app.change_names import differences, name_of_difference
-from wfsobs.app.compared import thin_lines
+from wfsobs.app.compared import differences, name_of_difference, thin_lines
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.render import change, number
 from wfsobs.app.style import observers_of

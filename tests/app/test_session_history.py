@@ -9,8 +9,7 @@ import pytest
 
 from wfsobs.app import history as module
 from wfsobs.app.cache import size_of
-from wfsobs.app.change_names import name_of_change
-from wfsobs.app.compared import LETTERS, ComparedRun
+from wfsobs.app.compared import LETTERS, ComparedRun, name_of_change
 from wfsobs.app.display import Display
 from wfsobs.app.history import History
 from wfsobs.app.limits import NONE, Limits

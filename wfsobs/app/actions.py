@@ -12,7 +12,7 @@ from wfsobs.app.component import Component
 from wfsobs.app.copies import EXPLORED, to_command, to_python
 from wfsobs.app.downloads import Save, TooLarge, data_csv, data_npz
 from wfsobs.app.jobs import DONE, FAILED, RUNNING, BackgroundTask, Job
-from wfsobs.app.pages.pages import Pages
+from wfsobs.app.pages.pages import Pages, ViewState
 from wfsobs.app.pages.parts import Page
 from wfsobs.app.report.export import LIMIT, ReportError, make
 from wfsobs.app.seeds import SeedRuns
@@ -20,7 +20,6 @@ from wfsobs.app.share import FILE, Link, from_file, from_query, name_record, to_
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, labels
-from wfsobs.app.view_state import ViewState
 from wfsobs.app.views.plots import AFTERWARDS_MS, once
 from wfsobs.app.work import RunResults
 from wfsobs.settings.errors import SettingError

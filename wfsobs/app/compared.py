@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import param
 from numpy.typing import NDArray
 
+from wfsobs.app.controls.names import preset_title, setting_name
 from wfsobs.app.render import NOTHING, change, number
+from wfsobs.app.sources import LoadedRecord, Source, Step, give_same_record
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.plots import envelope, envelope_times
 from wfsobs.app.work import TRUTH, Key, RunResults, SignalAndError
@@ -18,6 +22,127 @@ from wfsobs.evaluation.scores import Score
 from wfsobs.observers.base import TARGETS
 from wfsobs.result import Result
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.configfile import reference_preset
+from wfsobs.settings.group import Group, holds_groups
+from wfsobs.settings.parameters import unit_of
+
+NAMED = 3
+"""How many differing settings are written out."""
+
+SAME = "the same settings"
+
+
+def name_of_change(before: Step | None, now: Step) -> str:
+    """Name a result by what changed against the one before; the first by its preset."""
+    scenario, preset, source = now
+    words: list[str] = []
+    if before is None or preset != before[1]:
+        words.append(f"Preset {preset_title(preset)}")
+        base = reference_preset(preset)
+    else:
+        base = before[0]
+    if not give_same_record(source, before[2] if before else None):
+        words.append(_name_of_record(source))
+    if isinstance(source, LoadedRecord) and before is not None and words:  # it brings its rate and length with it
+        return ", ".join(words)
+    changed = differences(base, scenario)
+    return ", ".join([*words, *([join_differences(changed)] if changed else [])]) or SAME
+
+
+def _name_of_record(source: Source | None) -> str:
+    if source is None:
+        return "Simulation of the settings"
+    return f"Record {source.name}" if isinstance(source, LoadedRecord) else "Simulation kept"
+
+
+def differences(before: Scenario, now: Scenario) -> list[str]:
+    """List the differences between two scenarios, one setting each, in words.
+
+    >>> differences(Scenario(), Scenario().replace({"turbulence.wind_speed": 20}))
+    ['Wind speed V₀ 15 → 20 m/s']
+    >>> peaks = Scenario().vibration.peaks
+    >>> differences(Scenario(), Scenario().replace({"vibration.peaks": peaks[1:]}))
+    ['Peak 1 removed']
+    """
+    tree = now.difference(before)
+    labels = Counter(str(p.label) for _, _, p in now.walk())
+    return _differences(before, now, tree, labels)
+
+
+def _differences(
+    before: Group, now: Group, tree: Mapping[str, Any], labels: Counter[str], path: str = "", above: str = ""
+) -> list[str]:
+    out: list[str] = []
+    for name in tree:
+        p, old, new = now.settings()[name], getattr(before, name), getattr(now, name)
+        if isinstance(new, Group):
+            out += _differences(old, new, tree[name], labels, f"{path}{name}.", str(p.label))
+            continue
+        if isinstance(p, param.List) and holds_groups(p):
+            out += _item_changes(f"{path}{name}", str(p.label), old, new)
+            continue
+        label = f"{above}: {p.label}" if labels[str(p.label)] > 1 else str(p.label)
+        out.append(f"{label} {_change(p, old, new)}")
+    return out
+
+
+def _item_changes(path: str, label: str, old: list[Group], new: list[Group]) -> list[str]:
+    """Name the one item of a list that came, went or changed, and its settings that did; else only that the list changed."""
+    items = [[item.to_dict() for item in of] for of in (old, new)]
+    longer, shorter = sorted(items, key=len, reverse=True)
+    if len(longer) == len(shorter) + 1:
+        at = next((i for i in range(len(longer)) if [*longer[:i], *longer[i + 1 :]] == shorter), None)
+        if at is not None:
+            return [f"{setting_name(f'{path}.{at}')} {'added' if len(new) > len(old) else 'removed'}"]
+    elsewhere = [i for i, (a, b) in enumerate(zip(*items, strict=False)) if a != b]
+    if len(longer) != len(shorter) or len(elsewhere) != 1:
+        return [f"{label} changed"]
+    at = elsewhere[0]
+    was, is_now, settings = _flat(items[0][at]), _flat(items[1][at]), new[at].settings()
+    return [
+        f"{setting_name(f'{path}.{at}.{key}')} {_change(settings[key.partition('.')[0]], was[key], is_now[key])}"
+        for key in was
+        if key in is_now and was[key] != is_now[key]
+    ] or [f"{label} changed"]
+
+
+def _flat(item: Mapping[str, Any]) -> dict[str, Any]:
+    """Spread lists of numbers over keys of their own, rms.0 and so on."""
+    return {
+        (f"{key}.{i}" if isinstance(value, list) else key): part
+        for key, value in item.items()
+        for i, part in enumerate(value if isinstance(value, list) else [value])
+    }
+
+
+def _change(p: param.Parameter, old: Any, new: Any) -> str:
+    """Two values of a setting; of lists only that they differ."""
+    if isinstance(new, list):
+        return "changed"
+    if isinstance(new, bool) or not isinstance(new, (int, float)):
+        return f"{_word(old)} → {_word(new)}"
+    unit = unit_of(p).replace("um", "µm")
+    return f"{old:.6g} → {new:.6g} {unit}".rstrip()
+
+
+def _word(value: Any) -> str:
+    return {True: "on", False: "off"}[value] if isinstance(value, bool) else str(value)
+
+
+def name_of_difference(before: Scenario, now: Scenario) -> str:
+    """Name what has changed since a run by the settings in which the present one differs."""
+    return join_differences(differences(before, now)) or SAME
+
+
+def join_differences(words: Sequence[str]) -> str:
+    """Write the first few differences out and count the others.
+
+    >>> join_differences(["a", "b", "c", "d"])
+    'a, b, c and 1 more'
+    """
+    more = f" and {len(words) - NAMED} more" if len(words) > NAMED else ""
+    return ", ".join(words[:NAMED]) + more
+
 
 Array = NDArray[np.float64]
 

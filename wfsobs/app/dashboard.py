@@ -19,18 +19,16 @@ from wfsobs.app.controls.panel import Controls
 from wfsobs.app.controls.status import waiting_text
 from wfsobs.app.display import Display
 from wfsobs.app.help import Help
-from wfsobs.app.history import History
+from wfsobs.app.history import History, HistorySheet, session_save
 from wfsobs.app.jobs import FAILED
 from wfsobs.app.pages.explore import Explore
-from wfsobs.app.pages.pages import EXPLORE, LIVE, Pages
+from wfsobs.app.pages.pages import EXPLORE, LIVE, Pages, ViewState
 from wfsobs.app.pages.parts import ON_ONE_LINE, WIDE
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import Post, Session
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, labels, theme
 from wfsobs.app.upload import Upload
-from wfsobs.app.view_state import ViewState
-from wfsobs.app.views.history_sheet import HistorySheet, session_save
 from wfsobs.app.views.main_lines import effect_line
 from wfsobs.app.views.switches import ModeSwitch, UnitSwitch
 from wfsobs.scenario import Scenario

@@ -44,10 +44,9 @@ from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.limits import NONE, PUBLIC, Limits
 from wfsobs.app.live_work import LiveOrder, live_counts, share_loop
 from wfsobs.app.logs import event, to_stream
-from wfsobs.app.pages.pages import LIVE
+from wfsobs.app.pages.pages import LIVE, PAGE, PREFIX
 from wfsobs.app.service import Full, Post, Service, Session
 from wfsobs.app.share import LONGEST, has_settings
-from wfsobs.app.view_state import PAGE, PREFIX
 from wfsobs.app.work import one_blas_thread
 from wfsobs.campaign.follow import CampaignFolder
 from wfsobs.live.paced import prefer

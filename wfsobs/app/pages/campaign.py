@@ -17,7 +17,7 @@ from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs import BATCH, FAILED, RUNNING, BackgroundTask, Job
 from wfsobs.app.pages.parts import WIDE, LinkedFields, LinkedLater, Page, box, boxes, html, legend, line, text
 from wfsobs.app.pages.sweep import SweepMap, line_of
-from wfsobs.app.pages.sweep_views import DECIDED, LEFT_OUT, OPEN, WAITING, SweepLines, axis_title, square, verdict_text
+from wfsobs.app.pages.sweep_views import DECIDED, LEFT_OUT, OPEN, WAITING, SweepLines, axis_title, map_square, verdict_text
 from wfsobs.app.render import NOTHING, Row, number, table
 from wfsobs.app.report.sections import value_of
 from wfsobs.app.store import Store
@@ -188,7 +188,7 @@ def _square(view: CampaignView, cells: list[int] | None, where: str, display: Di
     verdict = None if not cells else errors.winners.get(cells[0]) if len(cells) == 1 else errors.verdict(cells)
     if not cells or verdict is None:
         said = "no such scenario" if cells is None else "no result yet" if cells else "left out by the fields Only …"
-        return square(cells[0] if cells else -1, WAITING if cells else LEFT_OUT, f"{where}: {said}", "", display.dark)
+        return map_square(cells[0] if cells else -1, WAITING if cells else LEFT_OUT, f"{where}: {said}", "", display.dark)
     best, decided = verdict.best, verdict.is_decided
     margin = verdict.margin if np.isfinite(verdict.margin) else None
     text = number(best.rms * view.scale(display))
@@ -196,7 +196,7 @@ def _square(view: CampaignView, cells: list[int] | None, where: str, display: Di
     said += verdict_text(margin, map(name_label, verdict.ties), decided or margin is None, "results")
     several = f"{len(cells)} scenarios, opens the first" if len(cells) > 1 else f"{int(errors.count[cells[0]].max())} seeds"
     key[name_label(best.name)] = look(best.name).colour(display.dark)
-    return square(cells[0], DECIDED if decided else OPEN, f"{said}; {several}", text, display.dark, best.name, margin)
+    return map_square(cells[0], DECIDED if decided else OPEN, f"{said}; {several}", text, display.dark, best.name, margin)
 
 
 def slice_part(view: CampaignView, axis: PlanAxis, names: Sequence[str], display: Display) -> dict[str, Any]:
@@ -250,7 +250,7 @@ class CampaignPage(Page):
         self.map = SweepMap(self.load, **WIDE)
         self.pane = pn.Column(**WIDE)
         self.slice: SweepLines | None = None
-        self._sliced: tuple[str, ...] = ()
+        self._slice_of: tuple[str, ...] = ()
         self.axes: dict[str, PlanAxis] = {}
         self.filters: dict[str, Any] = {}
         self.link = self._fields = LinkedLater()
@@ -418,8 +418,8 @@ class CampaignPage(Page):
 
     def _draw_slice(self, view: CampaignView, x: PlanAxis) -> None:
         part = slice_part(view, x, self.lines.value, self.display)
-        if self.slice is None or self._sliced != (x.path, *part["errors"]):
-            self.slice, self._sliced = SweepLines(part), (x.path, *part["errors"])
+        if self.slice is None or self._slice_of != (x.path, *part["errors"]):
+            self.slice, self._slice_of = SweepLines(part), (x.path, *part["errors"])
             self.pane[:] = [pn.pane.Bokeh(self.slice.figure, **WIDE)]
         self.slice.draw(part, self.display.dark)
         self.legend.object = legend({name: name_label(name) for name in part["errors"]}, self.display.dark)

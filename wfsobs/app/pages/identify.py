@@ -282,9 +282,9 @@ REPLACED = (
 )
 
 
-def model_toml(found: tuple[Identification, Record, Scenario]) -> bytes:
+def model_toml(finding: tuple[Identification, Record, Scenario]) -> bytes:
     """Write the model as `wfsobs identify --out` does."""
-    result, record, scenario = found
+    result, record, scenario = finding
     return identification_toml(result, result.scenario(as_stated(record, scenario))).encode()
 
 

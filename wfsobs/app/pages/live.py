@@ -12,7 +12,7 @@ import panel as pn
 import panel_material_ui as pmui
 import param
 
-from wfsobs.app.change_names import name_of_difference
+from wfsobs.app.compared import name_of_difference
 from wfsobs.app.copies import LIVE, CopiedTask
 from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL, Display, per_micrometre
 from wfsobs.app.downloads import Save

@@ -61,13 +61,13 @@ class LinkedFields:
 
     def texts(self) -> dict[str, str]:
         """Return the texts that differ from those of a fresh page."""
-        now = {name: _text(getattr(*field)) for name, field in self._enabled()}
+        now = {name: _text(getattr(*field)) for name, field in self._active_fields()}
         return {name: text for name, text in now.items() if text != self.fresh[name]}
 
     def open(self, texts: Mapping[str, str], leave: Collection[str] = ()) -> list[str]:
         """Fill in texts in the order of the fields, of which one may change the next; but for those to be left alone."""
         refused = not_known(name for name in texts if name not in self._fields)
-        for name, (of, attribute) in self._enabled():
+        for name, (of, attribute) in self._active_fields():
             if name not in leave:
                 lines = self._fill_in(name, of, attribute, texts.get(name, self.fresh[name]))
                 if lines and not isinstance(getattr(of, attribute), list):
@@ -80,7 +80,7 @@ class LinkedFields:
         for of, attribute in self._fields.values():
             of.param.watch(act, attribute)
 
-    def _enabled(self) -> Iterator[tuple[str, tuple[Any, str]]]:
+    def _active_fields(self) -> Iterator[tuple[str, tuple[Any, str]]]:
         return (item for item in self._fields.items() if not getattr(item[1][0], "disabled", False))
 
     def _fill_in(self, name: str, of: Any, attribute: str, text: str) -> list[str]:
@@ -151,9 +151,9 @@ class LinkedLines:
     ----------
     name : str
         In an address.
-    known : Collection
+    lines : Collection
         Names of all lines.
-    hidden : callable
+    choice : callable
         Returns the names of those hidden, None where a fresh page's are.
     hide : callable
         Hides lines; for None those of a fresh page.
@@ -164,24 +164,24 @@ class LinkedLines:
     def __init__(
         self,
         name: str,
-        known: Collection[str],
-        hidden: Callable[[], Iterable[str] | None],
+        lines: Collection[str],
+        choice: Callable[[], Iterable[str] | None],
         hide: Callable[[list[str] | None], object],
         watch: Callable[[Callable[..., object]], object],
     ):
-        self.name, self._known, self._hidden, self._hide, self.watch = name, known, hidden, hide, watch
+        self.name, self._lines, self._choice, self._hide, self.watch = name, lines, choice, hide, watch
 
     def texts(self) -> dict[str, str]:
         """Return the lines that are hidden, where a visitor has chosen."""
-        hidden = self._hidden()
+        hidden = self._choice()
         return {} if hidden is None else {self.name: ",".join(hidden)}
 
     def open(self, texts: Mapping[str, str]) -> list[str]:
         """Hide lines."""
         text = texts.get(self.name)
         names = text.split(",") if text else []
-        self._hide(None if text is None else [name for name in names if name in self._known])
-        refused = [f"{self.name} = {name[:80]}: no line of that name" for name in names if name not in self._known]
+        self._hide(None if text is None else [name for name in names if name in self._lines])
+        refused = [f"{self.name} = {name[:80]}: no line of that name" for name in names if name not in self._lines]
         return [*not_known(name for name in texts if name != self.name), *refused]
 
 

@@ -202,22 +202,22 @@ def _cell(results: SweepResults, cell: int, target: str, display: Display) -> di
     if best is None:
         reason = results.failures.get(cell, "")
         state, text = (FAILED, "×") if reason else (WAITING, "")
-        return square(cell, state, f"{where}: {reason or 'not run yet'}", text, display.dark)
+        return map_square(cell, state, f"{where}: {reason or 'not run yet'}", text, display.dark)
     error = number(best.rms * per_micrometre(display.unit, results.sweep.value(cell, "telescope.diameter")))
     said = f"{where}: {row_label(best.name)} {error} {display.unit_label}"
     said += verdict_text(best.margin, map(row_label, best.ties), best.is_significant, "seeds")
     said += f"; {best.seeds} {'seed' if best.seeds == 1 else 'seeds'}"
-    return square(cell, DECIDED if best.is_significant else OPEN, said, error, display.dark, best.name, best.margin)
+    return map_square(cell, DECIDED if best.is_significant else OPEN, said, error, display.dark, best.name, best.margin)
 
 
-def verdict_text(margin: float | None, ties: Iterable[str], decided: bool, few: str) -> str:
+def verdict_text(margin: float | None, ties: Iterable[str], is_decided: bool, few: str) -> str:
     """Say how far the best is before the next; few : what there is too little of where that is not decided."""
     said = "" if margin is None else f", {100 * margin:.0f} % before the next"
     tied = ", ".join(ties)
-    return said + (f"; statistically equal to {tied}" if tied else "" if decided else f"; too few {few} to tell")
+    return said + (f"; statistically equal to {tied}" if tied else "" if is_decided else f"; too few {few} to tell")
 
 
-def square(
+def map_square(
     index: int, state: str, title: str, text: str, dark: bool, best: str = "", margin: float | None = None
 ) -> dict[str, Any]:
     """Describe a square of a map: the scenario that it opens, what it says, and in its colour the best and its margin."""

@@ -9,8 +9,7 @@ import panel as pn
 import panel_material_ui as pmui
 from markupsafe import Markup
 
-from wfsobs.app.change_names import name_of_difference
-from wfsobs.app.compared import ComparedRun
+from wfsobs.app.compared import ComparedRun, name_of_difference
 from wfsobs.app.display import UNITS, Display, short_name
 from wfsobs.app.history import History
 from wfsobs.app.jobs import FAILED, BackgroundTask
