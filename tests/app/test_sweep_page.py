@@ -238,7 +238,7 @@ def test_what_cannot_be_run_is_said_in_one_line(page: SweepPage, dashboard: Dash
         (page.values[0], "5:500:3", "Wind speed V₀ = 252.5: takes a number from 0.1 to 100 m/s"),
         (page.values[1], "", "Exposure ratio n: takes values, such as 5:20:4 or 5,10,20"),
         (page.seeds, "many", "Seeds of each = 'many': takes a whole number from 1 to 100"),
-        (page.seeds, "0", "seeds = 0: takes a whole number from 1 to 100"),
+        (page.seeds, "0", "Seeds of each = '0': takes a whole number from 1 to 100"),
     ):
         before = field.value
         field.value = text
