@@ -39,6 +39,7 @@ BACK, STAY = "Back to the simulation", "Stay with the simulation"
 
 TEMPLATE_NAME, SAMPLE_NAME = "wfsobs-template.csv", "wfsobs-sample.csv"
 SILENT = "from the file"
+TEXT = {"font-size": "13px"}
 
 
 class UploadFields:
@@ -108,7 +109,7 @@ class PreviewView:
     """The text and the figure of a preview."""
 
     def __init__(self) -> None:
-        self.text = pn.pane.HTML("", sizing_mode="stretch_width", margin=(4, 0))
+        self.text = pn.pane.HTML("", sizing_mode="stretch_width", margin=(4, 0), styles=TEXT)
         self.figure = new_figure(x_axis_type="log", y_axis_type="log")
         self.figure.name = "Spectrum of the record"
         self.figure.xaxis.axis_label, self.figure.yaxis.axis_label = "frequency [Hz]", "PSD of z [µm²/Hz]"
@@ -157,11 +158,11 @@ class ColumnForm:
         """Make the lists. on_change : called after every choice."""
         self._on_change = on_change
         self._fills = False
-        self.choices = {role: _select(label.capitalize(), {"–": ""}) for role, label in ROLES.items()}
+        self.choices = {role: _select(label[0].upper() + label[1:], {"–": ""}) for role, label in ROLES.items()}
         for choice in self.choices.values():
             choice.param.watch(self._choose, "value")
         self.view = pn.Column(
-            pn.pane.HTML(f"<p>{HINT}</p>", margin=0),
+            pn.pane.HTML(f"<p>{HINT}</p>", margin=0, styles=TEXT),
             pn.FlexBox(*self.choices.values(), gap="8px", margin=0),
             sizing_mode="stretch_width",
             margin=(4, 0),
