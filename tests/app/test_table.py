@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from wfsobs.app.display import Display
@@ -17,7 +18,18 @@ def test_lines_are_true_for_the_simulation_of_the_settings_and_given_for_a_loade
     table = Table(store.run, Display())
     store.start()
     loop.until(lambda: store.run.state == DONE)
-    assert "model, true peaks" in table.pane.object and "given peaks" not in table.pane.object
+    assert "Prior knowledge: peak frequencies<" in table.pane.object and "given peak" not in table.pane.object
     store.run_on(LoadedRecord(simulate(store.scenario), "mine", "key"), store.scenario)
     loop.until(lambda: store.run.state == DONE and store.run.result.is_recorded)
-    assert "model, given peaks" in table.pane.object and "true peaks" not in table.pane.object
+    assert "Prior knowledge: given peak frequencies<" in table.pane.object and ": peak freq" not in table.pane.object
+
+
+def test_every_dash_has_a_reason_and_no_number_an_exponent(make_store: Any, loop: Any) -> None:
+    store: Store = make_store()
+    table = Table(store.run, Display())
+    assert table.html().count("–") == len(re.findall('<span title="[^"]+">–</span>', table.html())) > 20
+    store.start()
+    loop.until(lambda: store.run.state == DONE)
+    html = table.html()
+    assert html.count("–") == len(re.findall('<span title="[^"]+">–</span>', html)) + html.count('" title="where')
+    assert not re.search(r"\de[-−]\d", html)

@@ -74,7 +74,7 @@ def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: 
         (s.observer, s.target, s.mode, s.rms) for s in expected.scores
     ]
     table = dashboard.explore.table.html()
-    assert "one step ahead: the record has no truth" in table and "Recorded loop, residual" in table and "Relative error" in table
+    assert "one step ahead: the record has no truth" in table and "Residual, tip, what the recorded loop left" in table
     assert "nan" not in table
     line = dashboard.explore.traces.traces["vibration"].source.data
     assert np.isfinite(line["kf-lgs"]).all() and np.isnan(line["truth"]).all()
@@ -84,7 +84,7 @@ def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: 
     cards = dashboard.explore.strips["vibration"].items()
     notes, values = ({card["name"]: card[key] for card in cards} for key in ("note", "value"))
     found = {s.observer: number(1e3 * s.rms) for s in expected.scores if s.mode == "tip"}
-    assert cards[0]["label"] == "Recorded loop" and notes["truth"].endswith("× z, residual") and values["truth"] == found["loop"]
+    assert cards[0]["label"] == "Recorded loop" and re.fullmatch(r"\d\.\d+", notes["truth"]) and values["truth"] == found["loop"]
     assert values["kf-lgs"] == found["kf-lgs"] and values["gpr-online"] == "–"
     dashboard.history.compare(dashboard.history.current)
     pinned = dashboard.explore.table.html()
@@ -92,7 +92,8 @@ def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: 
     assert len(rows) == len(found) and all('"range">+0.0 %</span>' in row for row in rows)
     least = min(x.rms for x in expected.scores if x.mode == "tip")
     assert pinned.count("tag smallest") == sum(x.rms == least for x in expected.scores if x.mode == "tip")
-    assert re.fullmatch(r"\d\.\d\d × z, next z", notes["kf-lgs"]) and notes["gpr-online"] == "no truth"
+    assert dashboard.explore.strips["vibration"].cards.heads["value"] == "Prediction error [nm]"
+    assert re.fullmatch(r"\d\.\d+", notes["kf-lgs"]) and notes["gpr-online"] == "no truth"
     assert notes["butterworth-ol"] in ("no result", "no truth")
     dashboard.display.show = "error"  # there is none, and nothing breaks
     stated = {s.observer: number(1e3 * s.calibration.sd) for s in expected.scores if s.mode == "tip" and s.calibration}

@@ -234,7 +234,10 @@ class TestNumbers:
             for s in dashboard.store.run.result.result.scores
             if (s.observer, s.target, s.mode) == ("gpr-online", "vibration", "tip")
         )
-        assert cards["gpr-online"]["value"] == number(1e3 * score.rms) and cards["gpr-online"]["unit"] == "nm"
+        assert cards["gpr-online"]["value"] == number(1e3 * score.rms)
+        low, high = score.interval or (0.0, 0.0)
+        assert float(cards["gpr-online"]["half"]) == pytest.approx(500.0 * (high - low), abs=0.051)
+        assert dashboard.explore.strips["vibration"].cards.heads["value"] == "RMS error [nm]"
         assert cards["gpr-online"]["colour"] == look("gpr-online").light
         assert cards[TRUTH]["value"] == number(1e3 * score.truth_rms)
         assert "zero" not in cards
@@ -335,16 +338,17 @@ def test_the_verdict_stays_dimmed_until_the_next_one(dashboard: Dashboard, loop:
     """What is below it does not move: its place is never empty, and what it says is marked as that of the run before."""
     line = dashboard.explore.verdicts["vibration"]
     said = line.pane.object
-    assert said.startswith('<p class="verdict"><strong>Vibration, tip.</strong> ')
+    assert said.startswith('<h2 class="title">Vibration, tip</h2>')
     dashboard.store.change("turbulence.wind_speed", 30)
     assert line.pane.object == said.replace('"verdict"', '"verdict before"', 1)
     loop.finish(dashboard.store)
-    assert line.pane.object.startswith('<p class="verdict"><strong>Vibration, tip.</strong> ') and line.pane.object != said
+    assert line.pane.object.startswith('<h2 class="title">Vibration, tip</h2>') and line.pane.object != said
     dashboard.store.change("turbulence.wind_speed", 20)
     dashboard.display.mode = "tilt"
-    assert line.pane.object == '<p class="verdict before"></p>', "nothing is known of another mode yet"
+    assert '<p class="verdict before"></p>' not in line.pane.object
+    assert '<p class="verdict"></p>' in line.pane.object, "nothing is known of another mode yet"
     loop.finish(dashboard.store)
-    assert "Vibration, tilt.</strong> " in line.pane.object
+    assert ">Vibration, tilt</h2>" in line.pane.object and "Without prior knowledge: " in line.pane.object
 
 
 def test_a_record_without_truth_leaves_no_choice_but_its_signals(dashboard: Dashboard, loop: Any, short: Scenario) -> None:

@@ -22,7 +22,7 @@ from playwright.sync_api import Browser, Locator, Page, expect
 import wfsobs
 from tests.browser.conftest import PATIENCE
 from wfsobs.app.display import UNITS, per_micrometre
-from wfsobs.app.render import number
+from wfsobs.app.render import hundredths, number
 from wfsobs.app.report.page import STEP
 from wfsobs.app.style import TERM_COLOURS
 from wfsobs.app.work import TRUTH
@@ -151,12 +151,11 @@ def test_every_state_shows_the_numbers_of_its_run(open_report: Any) -> None:
                 key = f"{row['target']}/{row['observer']}"
                 cells = [re.sub(r"^(smallest|worse than zero) ", "", cell) for cell in table[key]]
                 assert cells[0].startswith(row_label(row["observer"]))
-                error, truth = number(row["rms_um"] * scale), number(row["truth_rms_um"] * scale)
+                error = number(row["rms_um"] * scale)
                 ends = " – ".join(number(x * scale) for x in row["interval_um"] or ())
                 spread = f"{ends} " if row["observer"] == "bound" else ""
-                assert cells[1:4] == [spread + error, truth, number(row["normalised_rms"])]
-                lag = "–" if row["lag_s"] is None else f"{1e3 * row['lag_s']:z.2f}".replace("-", "−")
-                assert cells[4:6] == [row["needs"], lag]
+                assert cells[1:3] == [spread + error, hundredths(row["normalised_rms"])]
+                assert cells[3] == ("–" if row["lag_s"] is None else hundredths(1e3 * row["lag_s"]))
                 assert cards.get(key, f"{error} {written}") == f"{error} {written}"
             assert set(cards) - {f"{target}/{TRUTH}" for target in TARGETS} <= set(table)
             assert page.locator("#table .unit").first.text_content() == written
@@ -332,9 +331,10 @@ def test_opens_with_the_verdict_and_the_errors_of_the_main_lines(open_report: An
     few = shown.count()
     assert few < page.locator("#cards-vibration .card").count()
     assert not line(page, "trace-vibration", "butterworth-cl")["visible"]
-    page.locator("#cards-vibration").get_by_role("button", name="Show all").click()
+    page.locator("#cards-vibration").get_by_role("button", name=re.compile("^All ")).click()
+    page.locator("#cards-vibration").get_by_role("button", name="Show all lines").click()
     assert line(page, "trace-vibration", "butterworth-cl")["visible"]
-    page.locator("#cards-vibration").get_by_role("button", name="Show the main ones").click()
+    page.locator("#cards-vibration").get_by_role("button", name="Main observers").click()
     expect(shown).to_have_count(few)
 
 

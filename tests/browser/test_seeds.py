@@ -25,12 +25,12 @@ def test_seeds_give_intervals_and_go_with_the_settings(open_page: Any, server: A
     row = page.locator('tr[data-target="vibration"][data-observer="kf-lgs"]')
     expect(row.locator("td").first).to_contain_text(re.compile(r"\d – \d"))
     expect(row.locator(".range")).to_have_attribute("title", re.compile("3 seeds$"))
-    expect(page.locator('.card[data-name="kf-lgs"]').first).to_contain_text(re.compile(r"\d – \d"))
-    expect(page.locator("p.verdict").first).to_contain_text("over 3 seeds")
+    expect(page.locator('.card[data-name="kf-lgs"] .half').first).to_have_attribute("title", re.compile("3 seeds$"))
+    expect(page.get_by_role("heading", name="Vibration, tip, over 3 seeds")).to_be_visible()
     set_seeds(page, 1)
     expect(page.locator(".seeds")).to_have_text("one record")
     expect(row.locator(".range")).to_have_count(0)
-    expect(page.locator("p.verdict").first).not_to_contain_text("over 3 seeds")
+    expect(page.get_by_role("heading", name="Vibration, tip", exact=True)).to_be_visible()
 
 
 def test_what_one_is_at_stays_when_seeds_come(open_page: Any, server: Any) -> None:
@@ -48,7 +48,7 @@ def test_what_one_is_at_stays_when_seeds_come(open_page: Any, server: Any) -> No
     expect(page.locator('tr[data-target="vibration"][data-observer="kf-lgs"] .range')).to_have_attribute(
         "title", re.compile("3 seeds$")
     )
-    expect(card).to_contain_text(re.compile(r"\d – \d"))
+    expect(card.locator(".half")).to_have_attribute("title", re.compile("3 seeds$"))
     assert card.evaluate("card => card.same")
     expect(definition).to_be_visible()
     expect(word).to_be_focused()
@@ -68,19 +68,27 @@ def test_what_is_being_typed_stays_when_what_was_typed_before_is_taken(open_page
     page.wait_for_function("() => location.search.includes('vibration.peaks=6.5,0.0123,')")
 
 
-def test_the_error_budget_is_drawn_when_it_is_asked_for(open_page: Any, server: Any) -> None:
+def test_the_error_budgets_stand_beside_the_verdict(open_page: Any, server: Any) -> None:
     page: Page = open_page(url=server.url + QUICK)
-    figure = page.locator("[aria-label='Error budget, vibration']")
-    expect(figure).to_have_count(0)
-    page.get_by_label("Show error budget").check()
-    expect(figure).to_be_visible()
-    expect(page.get_by_text("Lines not modelled")).to_be_visible()
-    simulate = page.get_by_role("button", name="By simulation")
-    simulate.click()
-    page.get_by_role("button", name="Stop simulations").click()
-    expect(page.get_by_text("Nonlinear observers need a simulation:")).to_be_visible()
-    simulate.click()
-    expect(page.get_by_text("averaged over all orders of switching")).to_be_visible()
-    expect(simulate).to_be_hidden()
-    page.get_by_label("Show error budget").uncheck()
-    expect(figure).to_be_hidden()
+    strip = page.locator(".strip").nth(1)
+    bars = strip.locator(".bar[role=img]").filter(visible=True)
+    expect(bars.first).to_have_attribute("aria-label", re.compile(r"^Noise \d+ %, Lag \d+ %, Unmodelled peaks \d+ %"))
+    expect(strip.locator(".card[data-name=gpr-online] .bar")).to_have_attribute("aria-label", re.compile("^Noise "))
+    few = strip.locator(".card").filter(visible=True).count()
+    expect(strip.locator(".card[data-name=ridge]")).to_be_hidden()
+    page.get_by_role("button", name=re.compile(r"^All \d+ observers$")).nth(1).click()
+    expect(page.get_by_role("button", name="Main observers")).to_be_focused()
+    expect(strip.locator(".card[data-name=ridge]")).to_be_visible()
+    expect(strip.locator(".card[data-name=gpr-offline] .bar")).to_have_attribute("aria-label", re.compile("^Noise "))
+    page.keyboard.press("Enter")
+    expect(strip.locator(".card").filter(visible=True)).to_have_count(few)
+
+
+def test_a_change_shows_its_effect_beside_the_errors(open_page: Any, server: Any) -> None:
+    page: Page = open_page(url=server.url + QUICK)
+    change = page.locator(".card[data-name=kf-lgs] .change").first
+    expect(change).to_have_text("")
+    cell = page.locator('input[data-cell="0.frequency"]')
+    cell.fill("9")
+    page.keyboard.press("Enter")
+    expect(change).to_have_text(re.compile(r"^([+−]\d+\.\d+|0)$"))

@@ -90,10 +90,8 @@ def test_errors_have_the_interval_over_seeds_and_the_best_is_significant(short: 
     it = parse(page(report, MADE))
     table = next(t for t in it.tables if "RMS error [nm]" in t[0])
     start = next(i for i, row in enumerate(table) if row[0].startswith("Vibration, tilt"))
-    rows = takewhile(lambda row: len(row) > 1, table[start + 1 :])  # up to the next heading
-    cells = {row[0].removesuffix(AT_LIMIT).strip(): row[1].split() for row in rows}
-    means = [float(cell[-1]) for name, cell in cells.items() if name in map(row_label, names)]
-    assert means == sorted(means)
+    rows = takewhile(lambda row: not row[0].startswith("Turbulence"), table[start + 1 :])  # up to the next target
+    cells = {row[0].removesuffix(AT_LIMIT).strip(): row[1].split() for row in rows if len(row) > 1}
     leaders = evidence.leaders("vibration", "tilt")
     for name in names:
         interval = evidence.interval((name, "vibration", "tilt"))

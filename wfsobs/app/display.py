@@ -10,7 +10,7 @@ from types import MappingProxyType
 import param
 
 from wfsobs.app.compared import ComparedRun, DrawnLines
-from wfsobs.app.glossary import LAG, NEEDS, REAL_TIME, RELATIVE, RMS_ERROR, STATED, TERMS
+from wfsobs.app.glossary import LAG, REAL_TIME, RELATIVE, RMS_ERROR, STATED, TERMS
 from wfsobs.sensors.modes import HIGHEST_ORDER, TIP_TILT, Mode, modes_up_to
 from wfsobs.settings.parameters import unit_of
 
@@ -71,9 +71,7 @@ def score_columns(unit: str, base: str = "truth", compared_columns: Mapping[str,
         "Observer": "",
         f"RMS error [{unit}]": TERMS[RMS_ERROR] if base == "truth" else of_z,
         **compared_columns,
-        f"RMS {base} [{unit}]": "Error of an estimate of zero",
         "Relative error": TERMS[RELATIVE] if base == "truth" else "Error over RMS of z; above 1 worse than zero",
-        "Prior knowledge": TERMS[NEEDS],
         "Lag [ms]": TERMS[LAG],
         "Time per step [µs]": "Computing time per step and mode",
         "Real-time factor": TERMS[REAL_TIME],
@@ -102,7 +100,6 @@ class Display(param.Parameterized):
     spectrum = param.Selector(default=PSD, objects=[PSD, CUMULATIVE], label="Spectrum")
     window_spectra = param.Boolean(False, label="Spectra of the window", doc="Spectra of the stretch of time in view alone.")
     editing = param.Boolean(False, label="Edit on the figure", doc="Handles on the spectra, and what theory predicts.")
-    best_first = param.Boolean(True, label="Best first", doc="Sort the observers of the table by their error.")
     compared_runs: list[ComparedRun] = param.List([], item_type=ComparedRun, doc="The runs to compare with, by their letters.")  # type: ignore
 
     @property

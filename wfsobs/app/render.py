@@ -29,6 +29,15 @@ def number(value: float | None, digits: int = 3) -> str:
     return (f"{value:.0f}" if "e" in text else text.rstrip(".")).replace("-", "−")
 
 
+def hundredths(value: float | None) -> str:
+    """Write a number of a table with three digits, but none beyond the second decimal.
+
+    >>> hundredths(7.7e-6), hundredths(0.0349), hundredths(12.345)
+    ('0.00', '0.03', '12.3')
+    """
+    return number(value) if value is None or abs(value) >= 1.0 else f"{value:z.2f}".replace("-", "−")
+
+
 def short(x: float, digits: int = 5) -> str:
     """Write a number with some digits, without zeros at its end.
 
@@ -37,6 +46,16 @@ def short(x: float, digits: int = 5) -> str:
     """
     written = number(float(x), digits)
     return written.rstrip("0").rstrip(".") if "." in written and "e" not in written else written
+
+
+def with_decimals_of(like: str, x: float, sign: str = "") -> str:
+    """Write a number with as many decimals as one that `number` has written; sign : "+" to write that as well.
+
+    >>> with_decimals_of("14.7", 0.89), with_decimals_of("14.7", -0.66, "+"), with_decimals_of("14.7", 0.01, "+")
+    ('0.9', '−0.7', '0')
+    """
+    text = f"{x:{sign}z.{0 if 'e' in like else len(like.partition('.')[2])}f}".replace("-", "−")
+    return "0" if sign and not text.strip("+0.") else text
 
 
 def change(before: float, now: float | None) -> str:
@@ -58,6 +77,11 @@ def render(template: str, **values: Any) -> str:
 def macro(name: str, *values: Any) -> Markup:
     """Fill a macro of `macros.html`: a piece that goes into other templates as it is."""
     return getattr(ENVIRONMENT.get_template("macros.html").module, name)(*values)
+
+
+def missing(why: str) -> Markup:
+    """Write a dash in place of a number, with the reason why there is none."""
+    return macro("missing", why)
 
 
 class Row(NamedTuple):
@@ -105,4 +129,4 @@ ENVIRONMENT = Environment(
     lstrip_blocks=True,
 )
 ENVIRONMENT.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-ENVIRONMENT.filters.update(number=number, short=short, matrix=matrix, tex=tex, py=repr)
+ENVIRONMENT.filters.update(number=number, hundredths=hundredths, short=short, matrix=matrix, tex=tex, py=repr)

@@ -4,7 +4,7 @@ const STOPS = [ // where, what is said of it
   [["[role=combobox][aria-haspopup=listbox]", "[aria-label='Open drawer']"],
    "Start from a preset, or change a setting: when a slider is released the comparison runs again. The list and the search have every setting."],
   [["p.verdict"], "The result in words: which observer has the smallest error, how far it is from the smallest possible error, and which ones do harm."],
-  [[".strip"], "One card per observer, with its RMS error. Click a card to hide or show its line, double-click it to see the line alone."],
+  [[".strip"], "The observers that the verdict names, with their RMS errors and what these are made of. Click a row to hide or show its line, double-click it to see the line alone."],
   [["[role=figure]"], "The error over time and its spectrum. Drag over a stretch to zoom; the switches above show signals, other modes and units."],
   [["[aria-label='Share']"], "The address of the page has what you have changed: share it, save data and figures, or make a report of everything."],
 ]

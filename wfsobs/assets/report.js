@@ -230,11 +230,12 @@ function zoom(figure, state) {
 // ------------------------------------------------------------------ cards and table
 
 function cards(target) {
-  const watchers = {items: [], hidden_lines: [], last_arrival: []}
+  const watchers = {items: [], heads: [], legend: [], hidden_lines: [], last_arrival: []}
   const model = {
-    items: [], terms: {},  // the report has a section of them
-    main: "Show the main ones", hidden_lines: hidden[target], last_arrival: 0,
-    send_msg({main, hidden: names = data.hidden[target], number: asked = model.last_arrival}) {
+    items: [], terms: {}, heads: {}, legend: [], kind: "observers",  // the report has a section of terms
+    hidden_lines: hidden[target], last_arrival: 0,
+    send_msg({all, main, hidden: names = data.hidden[target], number: asked = model.last_arrival}) {
+      if (all) return
       hidden[target] = names
       Object.assign(model, {hidden_lines: names, last_arrival: asked})
       if (main) watchers.hidden_lines.forEach((f) => f())
@@ -262,13 +263,14 @@ function card(target, name) {
   const base = loop ? " × z, residual" : known ? "" : " × z, next z"
   const relative = row && row.normalised_rms !== null ? `${base ? "" : "relative error "}${row.normalised_rms.toFixed(2)}${base}` : ""
   const interval = data.states[shown.state].intervals[`${name}/${target}/${shown.mode}`]
-  const inUnit = (um) => number(um * data.states[shown.state].scale[shown.unit])
+  const half = interval && (interval[1] - interval[0]) / 2 * data.states[shown.state].scale[shown.unit]
   const missing = name === "truth" ? "" : drawn ? "no truth" : "no result"
   return {
     name, label: loop ? "Recorded loop" : look.label, colour: loop ? "transparent" : look[dark ? "dark" : "light"], dash: look.dash, about: loop ? "" : look.about,
     value: row ? number(value * data.states[shown.state].scale[shown.unit]) : "–",
     unit: row ? data.units[shown.unit] : "", note: row ? (known && name === "truth" ? "rms" : own(row) || relative) : missing,
-    range: interval ? `mean ${interval.map(inUnit).join(" – ")}` : undefined,
+    half: half && number(half, 2), meaning: "where the mean error over seeds lies, at 95 % confidence",
+    main: !data.hidden[target].includes(name),
   }
 }
 

@@ -11,6 +11,7 @@ import numpy as np
 from wfsobs.campaign.sweep import Sweep
 from wfsobs.evaluation.evidence import FEWEST, Evidence, Key, gather_evidence
 from wfsobs.evaluation.scores import BOUNDS, Score
+from wfsobs.evaluation.verdict import Verdict, contenders
 from wfsobs.pipeline import observe
 from wfsobs.progress import QUIET, Watch
 from wfsobs.settings.errors import SettingError
@@ -111,6 +112,14 @@ class SweepResults:
         errors = [evidence.mean((name, target, mode)) or 0.0 for name in ranked[:2]]
         margin = max(errors[1] / errors[0] - 1.0, 0.0) if len(errors) > 1 and errors[0] > 0 else None
         return Winner(ranked[0], errors[0], margin, evidence.leaders(target, mode)[1:], evidence.n_seeds)
+
+    def verdict(self, cell: int, target: str, mode: str) -> Verdict | None:
+        """Return the verdict on a cell, without what does harm; None where nothing is known."""
+        evidence, scores = self.evidence.get(cell), self.scores.get(cell)
+        if evidence is None or not scores or not evidence.ranking(target, mode):
+            return None
+        places = contenders(self.sweep.scenario(cell), evidence, scores[0], target, mode)
+        return Verdict(target, mode, places, 0, (), evidence.n_seeds)
 
     def error(self, cell: int, key: Key) -> tuple[float, float, float] | None:
         """Return the mean error of an observer over the seeds of a cell, and the interval of that mean [um].

@@ -44,7 +44,7 @@ LAG, MISMATCH = "lag", "mismatch"
 TERMS = {
     NOISE: "Noise",
     LAG: "Lag",
-    LINES: "Lines not modelled",
+    LINES: "Unmodelled peaks",
     MISMATCH: "Model mismatch",
     CONE: "Cone effect and aliasing",
 }

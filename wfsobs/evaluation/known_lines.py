@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from wfsobs.evaluation.scores import BOUNDS, LOOP
 from wfsobs.observers import OBSERVERS
-from wfsobs.prior import Bands, Lines, Model, Part, Training, asks_for
+from wfsobs.prior import TRUE, Bands, Lines, Model, Part, PriorSource, Training, asks_for
 from wfsobs.priors_from.scenario import modelled_peak
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.disturbance import vibration_lines
@@ -30,6 +31,25 @@ def prior_knowledge(observer: str) -> str:
     ('peaks', 'one peak', 'nothing')
     """
     return next((kind for part, kind in _KINDS if asks_for(part, OBSERVERS[observer].prior)), NOTHING)
+
+
+def group_by_knowledge(names: Iterable[str], source: PriorSource = TRUE) -> dict[str, list[str]]:
+    """Group rows of a table by what they know before they measure: title -> rows, which keep their order.
+
+    source : where the prior of the observers comes from
+
+    >>> group_by_knowledge(["bound", "multirate-multi", "kf-multi", "kf-adaptive"])
+    {'Prior knowledge: none': ['kf-adaptive'], 'Prior knowledge: peak frequencies': ['multirate-multi', 'kf-multi'], \
+'Theoretical limit, from the true spectra': ['bound']}
+    """
+    peaks = "peak frequencies" if source == TRUE else f"{source} peak frequencies"
+    known = {NOTHING: "none", PEAKS: peaks, ONE_PEAK: "one peak", BANDS: "frequency bands", TRAINED: "training data"}
+    titles = {LOOP: "Recorded loop", **dict.fromkeys(BOUNDS, "Theoretical limit, from the true spectra")}
+    groups: dict[str, list[str]] = {f"Prior knowledge: {words}": [] for words in known.values()}
+    for name in names:
+        title = titles.get(name) or f"Prior knowledge: {known[prior_knowledge(name)]}"
+        groups.setdefault(title, []).append(name)
+    return {title: of for title, of in groups.items() if of}
 
 
 def given_lines(scenario: Scenario, observer: str, column: int) -> Sequence[float]:

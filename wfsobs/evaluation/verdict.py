@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -133,26 +133,14 @@ def verdict(
     budgets    : error budgets of the record, from which it is said why an observer does harm (`explain_harm`)
     """
     found, truth = evidence or gather_evidence([scores]), None if target == PREDICTION else record.truth(target)
-    ranked, leaders = found.ranking(target, mode), found.leaders(target, mode)
+    ranked = found.ranking(target, mode)
     if not ranked or (truth is None and target != PREDICTION) or not found.truths[ranked[0], target, mode].mean() > 0:
         return None
     column = [m.name for m in scenario.modes].index(mode)
     lines = () if simulation is None else tuple(line[0] for line in vibration_lines(simulation, column))
     of = {s.observer: s for s in scores if (s.target, s.mode) == (target, mode)}
-    limits = {name: (s.rms, name) for name, s in of.items() if name in BOUNDS}
+    places = {place.observer: place for place in contenders(scenario, found, scores, target, mode, lines)}
     given = {name: given_lines(scenario, name, column) for name in ranked}
-    places = {
-        name: Contender(
-            name,
-            float(found.errors[name, target, mode].mean()),
-            found.interval((name, target, mode)),
-            name in leaders,
-            prior_knowledge(name),
-            min(int(is_near(np.array(lines), given[name]).sum()), len(given[name])) if lines else len(given[name]),
-            limits.get(JOINT_BOUNDS.get(name, BOUND_BOTH)),
-        )
-        for name in ranked
-    }
     causes = {b.observer: _largest_term(b) for b in budgets if (b.target, b.mode) == (target, mode) and b.terms}
     values = {e.observer: e.values[:, column] for e in estimates if e.target == target}
     harms = (
@@ -169,6 +157,25 @@ def verdict(
         )
     )
     return Verdict(target, mode, tuple(places.values()), len(lines), tuple(harms), found.n_seeds)
+
+
+def contenders(
+    scenario: Scenario, evidence: Evidence, scores: Iterable[Score], target: str, mode: str, lines: Sequence[float] = ()
+) -> tuple[Contender, ...]:
+    """Return the observers that can be the best, the smallest error first.
+
+    scores : of one record, which have the bounds;  lines : frequencies of the vibration [Hz], empty where they are not known
+    """
+    column = [m.name for m in scenario.modes].index(mode)
+    bounds = {s.observer: s.rms for s in scores if (s.target, s.mode) == (target, mode) and s.observer in BOUNDS}
+    leaders, out = evidence.leaders(target, mode), []
+    for name in evidence.ranking(target, mode):
+        given, bound = given_lines(scenario, name, column), JOINT_BOUNDS.get(name, BOUND_BOTH)
+        n_peaks = min(int(is_near(np.array(lines), given).sum()), len(given)) if lines else len(given)
+        mean, interval = float(evidence.errors[name, target, mode].mean()), evidence.interval((name, target, mode))
+        limit = (bounds[bound], bound) if bound in bounds else None
+        out.append(Contender(name, mean, interval, name in leaders, prior_knowledge(name), n_peaks, limit))
+    return tuple(out)
 
 
 def _largest_term(budget: Budget) -> tuple[str, float]:

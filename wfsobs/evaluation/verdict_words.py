@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -86,6 +87,27 @@ def verdict_sentences(it: Verdict, scale: float, unit: str) -> list[str]:
     others = [f"{_with_size(place, scale, unit)}." for place in named if place.observer not in harmful]
     lead = f"{target_title(it.target)}, {it.mode}{over}. {' '.join(parts)}"
     return [lead, *([" ".join(others)] if others else []), *harm_sentences(it, scale, unit)]
+
+
+def sentence_of_several(verdicts: Sequence[Verdict], scales: Sequence[float], unit: str) -> str:
+    """Write who is best in how many of several scenarios, without prior knowledge and with known peak frequencies.
+
+    scales : from micrometres to the unit, of every verdict
+    """
+    parts = []
+    for kind in (NOTHING, PEAKS):
+        best = [(place, scale) for it, scale in zip(verdicts, scales, strict=True) if (place := it.best_with(kind))]
+        if best:
+            counts = Counter(row_label(place.observer) for place, _ in best).most_common()
+            errors = [place.rms * scale for place, scale in best]
+            n_equal = sum(place.above_limit == 0.0 for place, _ in best)
+            parts.append(
+                f"{HEADINGS[kind]}: smallest error of "
+                f"{', '.join(f'{name} in {n}' for name, n in counts)} of {len(best)} scenarios"
+                f", {_format_number(min(errors))} to {_format_number(max(errors))} {unit}"
+                f"{f', at the theoretical limit in {n_equal}' if n_equal else ''}."
+            )
+    return " ".join(parts)
 
 
 def _heading(place: Contender, lines: int) -> str:

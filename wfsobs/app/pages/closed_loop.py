@@ -40,7 +40,7 @@ from wfsobs.app.store import Store
 from wfsobs.app.style import look, swatch
 from wfsobs.app.views.gain_editor import GainEditor, plane
 from wfsobs.app.views.plots import add_line, envelope, envelope_times, new_figure, on_settle, restyle
-from wfsobs.app.views.strip import MAIN, Cards
+from wfsobs.app.views.strip import Cards
 from wfsobs.app.views.table import SMALLEST
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label
 from wfsobs.control.controllers import CONTROLLERS
@@ -357,8 +357,7 @@ class ClosedLoopPage(Page):
         self._of = object()
         self._rooms = list[pn.viewable.Viewable]()
         self.note, self.table, self.margins = html(), html(), html()
-        terms = {STREHL: TERMS[STREHL]}
-        self.cards = Cards(items=[], hidden_lines=[], terms=terms, main=MAIN, sizing_mode="stretch_width", margin=0)
+        self.cards = Cards(kind="controllers", terms={STREHL: TERMS[STREHL]})
         self.cards.on_main, self._main, self._is_chosen = self._show_main, list[str](), False
         self.link = LinkedLines(
             "hide",
@@ -526,6 +525,7 @@ class ClosedLoopPage(Page):
                     "note": note,
                     "value": value,
                     "unit": unit,
+                    "main": name not in self._main,
                 }
             )
         return out

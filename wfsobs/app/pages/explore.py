@@ -9,7 +9,7 @@ from types import MappingProxyType
 import panel as pn
 import panel_material_ui as pmui
 
-from wfsobs.app.causes import Causes
+from wfsobs.app.budgets import Budgets
 from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL
 from wfsobs.app.history import History
 from wfsobs.app.pages.parts import (
@@ -21,13 +21,13 @@ from wfsobs.app.pages.parts import (
     WIDE,
     Page,
     box,
+    grid_style,
     group,
     zoom_buttons,
 )
 from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset
-from wfsobs.app.views.budget import BudgetView
 from wfsobs.app.views.main_lines import MainLines
 from wfsobs.app.views.plots import call
 from wfsobs.app.views.spectra import MODEL, PEAKS, SpectraFigures
@@ -42,6 +42,7 @@ from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.theory import Theory
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION
 
+HEAD = grid_style("minmax(0, 2fr) minmax(0, 3fr)")
 ABOUT: Mapping[str, str] = MappingProxyType(
     {
         TURBULENCE: "Atmospheric tip/tilt, estimated from the guide stars",
@@ -71,9 +72,11 @@ class Explore(Page):
         self.lines = MainLines(run, display, seeds)
         self.traces = Traces(run, display)
         self.spectra = SpectraFigures(run, display, self.traces.x_range)
-        self.strips = {target: Strip(target, run, display, seeds) for target in TARGETS}
-        causes = Causes(seeds.store, display) if seeds else None
-        self.verdicts = {target: VerdictLine(target, run, display, seeds, causes) for target in TARGETS}
+        self.budgets = Budgets(seeds.store, self.lines.names, seeds) if seeds else None
+        self.strips = {target: Strip(target, run, display, seeds, self.lines, self.budgets) for target in TARGETS}
+        self.verdicts = {
+            target: VerdictLine(target, run, display, seeds, self.budgets, about=ABOUT[target]) for target in TARGETS
+        }
         axes = self.traces.x_range, self.spectra.x_range
         self.stretches = {target: Stretch(target, run, display, *axes, self.traces.chosen_window) for target in TARGETS}
         self.table = Table(run, display, seeds)
@@ -82,14 +85,12 @@ class Explore(Page):
         self._later: list[tuple[pn.Column, pn.pane.Bokeh]] = []
         self.editors: dict[str, SpectrumEditor] = {}
         display.param.watch(self._edit, "editing")
-        self.budget = BudgetView(seeds.store, display) if seeds else None
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""
         return pn.Column(
             *(self._section(target) for target in TARGETS),
             box("RMS errors", self._above_table(), self.table.pane),
-            *([box("Error budget", *self.budget.view())] if self.budget else []),
             **WIDE,
             stylesheets=[GAP],
         )
@@ -129,10 +130,7 @@ class Explore(Page):
 
     def _above_table(self) -> pn.FlexBox:
         seeds = SeedSwitch(self.seeds).view() if self.seeds else []
-        return pn.FlexBox(self._best_first(), *seeds, gap="4px 16px", align_items="center", **WIDE)
-
-    def _best_first(self) -> pmui.Checkbox:
-        return pmui.Checkbox.from_param(self.display.param.best_first, size="small", margin=(0, 0, 4, 0))
+        return pn.FlexBox(*seeds, gap="4px 16px", align_items="center", **WIDE)
 
     def _section(self, target: str) -> pn.Column:
         """Lay out the strip and the two figures of one target."""
@@ -141,6 +139,7 @@ class Explore(Page):
         cards = self.strips[target].cards
         cards.param.watch(lambda event: self._hide(target, event.new), "hidden_lines")
         cards.on_main = lambda: self.lines.reset(target)
+        cards.on_all = self.budgets.ask_for_all if self.budgets else lambda: None
         marks = MARKS if target == VIBRATION else ""
         traces, self.rooms[target] = (
             self._room(target, *parts)
@@ -153,10 +152,8 @@ class Explore(Page):
         window = [self._tick("window_spectra")] if target == TARGETS[0] else []
         below = pn.Row(self.stretches[target].pane, *window, **WIDE, stylesheets=[WRAPPED])
         self.stretches[target].pane.styles = {"flex": "1 1 240px"}
-        parts = self.verdicts[target].pane, cards, figures, below
-        for part in parts[:2]:
-            part.stylesheets = [*part.stylesheets, BELOW_FIGURES]
-        return box(target.capitalize(), *parts, about=ABOUT[target])
+        head = pn.Column(self.verdicts[target].pane, cards, **WIDE, stylesheets=[HEAD, BELOW_FIGURES])
+        return pn.Column(head, figures, below, **WIDE, stylesheets=[asset("box.css")])
 
     def _room(self, target: str, caption: pn.pane.HTML, pane: pn.pane.Bokeh) -> pn.Column:
         """Lay out a figure; those of the first target stand there at once, the others have their room."""

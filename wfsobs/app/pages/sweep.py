@@ -37,7 +37,15 @@ from wfsobs.app.pages.parts import (
     read_number,
     text,
 )
-from wfsobs.app.pages.sweep_views import SweepLines, axis_title, legend_of_shades, line_part, map_grid, parameter_of
+from wfsobs.app.pages.sweep_views import (
+    SweepLines,
+    axis_title,
+    legend_of_shades,
+    line_part,
+    map_grid,
+    parameter_of,
+    verdict_of_sweep,
+)
 from wfsobs.app.render import render
 from wfsobs.app.seeds import SeedScores
 from wfsobs.app.service import Session
@@ -333,7 +341,11 @@ class SweepPage(Page):
         self.panes = {target: pn.Column(**WIDE) for target in SCORED}
         self.legends = {target: html() for target in SCORED}
         self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
-        self.boxes = [box(target_title(target), self.legends[target], self.panes[target], self.maps[target]) for target in SCORED]
+        self.verdicts = {target: html() for target in SCORED}
+        self.boxes = [
+            box(target_title(target), self.verdicts[target], self.legends[target], self.panes[target], self.maps[target])
+            for target in SCORED
+        ]
         self.shades = text(f"{legend_of_shades()} Click a cell to load its scenario in Explore.")
         self._draw_time = 0.0
         for part in (*self.boxes, self.shades):
@@ -458,6 +470,7 @@ class SweepPage(Page):
         single = len(results.sweep.axes) == 1
         for target in SCORED:
             self.maps[target].draw(map_grid(results, target, self.display))
+            self.verdicts[target].object = f'<p class="text">{escape(verdict_of_sweep(results, target, self.display))}</p>'
             if single:
                 self._draw_lines(results, target)
             self.panes[target].visible = self.legends[target].visible = single

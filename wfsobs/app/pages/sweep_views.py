@@ -21,6 +21,7 @@ from wfsobs.campaign.sweep_results import SweepResults
 from wfsobs.evaluation.evidence import FEWEST
 from wfsobs.evaluation.rows import row_label
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH
+from wfsobs.evaluation.verdict_words import sentence_of_several
 from wfsobs.scenario import Scenario
 from wfsobs.settings.parameters import Reals, unit_of
 from wfsobs.typing import Array
@@ -144,6 +145,17 @@ def map_grid(results: SweepResults, target: str, display: Display) -> dict[str, 
         "cells": [[_cell(results, i * count + j, target, display) for i in range(len(x.values))] for j in reversed(range(count))],
         "key": [[look(name).colour(display.dark), look(name).label] for name in names],
     }
+
+
+def verdict_of_sweep(results: SweepResults, target: str, display: Display) -> str:
+    """Write who is best, of a single scenario with the limit and its reasons, of several in how many."""
+    sweep = results.sweep
+    found = {cell: results.verdict(cell, target, display.mode) for cell in range(len(sweep.cells))}
+    verdicts = {cell: it for cell, it in found.items() if it is not None}
+    scales = [per_micrometre(display.unit, sweep.value(cell, "telescope.diameter")) for cell in verdicts]
+    if len(sweep.cells) == 1 and verdicts:
+        return " ".join(verdicts[0].sentences(scales[0], display.unit_label))
+    return sentence_of_several([*verdicts.values()], scales, display.unit_label)
 
 
 def line_part(results: SweepResults, target: str, display: Display) -> dict[str, Any]:

@@ -207,10 +207,7 @@ def state_of(result: Result, states: int = 1, *, is_simulated: bool = True, evid
             for mode in names
             if (found := _verdict(result, target, mode, scenario if is_simulated else None, evidence, budgets)) is not None
         ],
-        {
-            target: main_observers(result.scores, target, names[0], evidence.leaders(target, names[0]) if evidence else ())
-            for target in TARGETS
-        },
+        {target: main_observers(result.scores, target, names[0], evidence) for target in TARGETS},
     )
 
 

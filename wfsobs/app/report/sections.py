@@ -18,6 +18,7 @@ from wfsobs.bench.measure import machine
 from wfsobs.closed_loop.rows import NOT_APPLICABLE, label
 from wfsobs.evaluation.budget import TERMS
 from wfsobs.evaluation.evidence import rank_observers
+from wfsobs.evaluation.known_lines import group_by_knowledge
 from wfsobs.evaluation.rows import (
     TIME,
     Row,
@@ -30,18 +31,19 @@ from wfsobs.evaluation.rows import (
     scored_interval,
     target_title,
 )
-from wfsobs.evaluation.scores import BOUND, BOUNDS, RESIDUAL
+from wfsobs.evaluation.scores import BOUND, BOUNDS, PREDICTION, RESIDUAL
+from wfsobs.prior import GIVEN, IDENTIFIED, TRUE
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings, format_value, reference_preset, to_toml
 
 
 def state_table(state: State, name: str) -> dict[str, Any]:
-    """Collect what the table of a state shows: a group per target and mode, best first, and what is missing."""
+    """Collect what the table of a state shows: groups by target, mode and prior knowledge, best first, and what is missing."""
     groups = [list(rows) for _, rows in groupby(sorted(state.rows, key=_order(state.rows)), _group)]
     return {
         "name": name,
         "columns": score_columns("nm", "z" if any(row["target"] == RESIDUAL for row in state.rows) else "truth"),
-        "groups": [_body(rows, state.grid.dt, state.seeds) for rows in groups],
+        "groups": [body for rows in groups for body in _bodies(rows, state.grid.dt, state.seeds)],
         "reasons": state.reasons,
     }
 
@@ -56,7 +58,8 @@ def _order(rows: list[Row]):
     return lambda row: (groups.index(_group(row)), row["apart"], row["rms_um"])
 
 
-def _body(rows: list[Row], dt: float, seeds: Mapping[str, Any]) -> dict[str, Any]:
+def _bodies(rows: list[Row], dt: float, seeds: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Collect a target and mode: its title, and the rows of every kind of prior knowledge."""
     target, mode = _group(rows[0])
     marks = _marks(rows, seeds.get("leaders", {}).get(f"{target}/{mode}", []))
     bounds = {row["observer"]: row["rms_um"] for row in rows if row["observer"] in BOUNDS}
@@ -66,27 +69,34 @@ def _body(rows: list[Row], dt: float, seeds: Mapping[str, Any]) -> dict[str, Any
         if above_bound(row["rms_um"], row["interval_um"], bounds.get(own_bound(row["observer"]) or "")) == 0.0
     }
     over_seeds = f"{OVER_SEEDS}, {seeds.get('count', 1)} seeds"
-    return {
-        "target": target,
-        "mode": mode,
-        "title": ", ".join((target_title(target), mode, *filter(None, [scored_interval(rows)]))),
-        "rows": [
-            {
-                **row,
-                "label": row_label(row["observer"]),
-                "looks_ahead": is_non_causal(row["observer"]),
-                "stretch": own_interval(row),
-                "mark": marks.get(row["observer"]),
-                "at_limit": row["observer"] in limits and AT_LIMIT,
-                "interval": row["interval_um"] if seeds or row["observer"] in BOUNDS else None,
-                "meaning": IN_MOST if row["observer"] in BOUNDS else over_seeds,
-                "lag": NOTHING if row["lag_s"] is None else f"{1e3 * row['lag_s']:z.2f}".replace("-", "−"),
-                "time": row[TIME],
-                "factor": None if row[TIME] is None else 1e-6 * row[TIME] / dt,
-            }
-            for row in rows
-        ],
+    words = {word for row in rows for word in row["needs"].split()}
+    source = IDENTIFIED if IDENTIFIED in words else GIVEN if GIVEN in words else TRUE
+    cells = {
+        row["observer"]: {
+            **row,
+            "label": row_label(row["observer"]),
+            "looks_ahead": is_non_causal(row["observer"]),
+            "stretch": own_interval(row),
+            "mark": marks.get(row["observer"]),
+            "at_limit": row["observer"] in limits and AT_LIMIT,
+            "interval": row["interval_um"] if seeds or row["observer"] in BOUNDS else None,
+            "meaning": IN_MOST if row["observer"] in BOUNDS else over_seeds,
+            "lag": None if row["lag_s"] is None else 1e3 * row["lag_s"],
+            "time": row[TIME],
+            "factor": None if row[TIME] is None else 1e-6 * row[TIME] / dt,
+        }
+        for row in rows
     }
+    title = ", ".join((target_title(target), mode, *filter(None, [scored_interval(rows)])))
+    place = {"target": target, "mode": mode}
+    size = next(row["truth_rms_um"] for row in rows)
+    return [
+        {**place, "title": title, "of": "z" if target in (PREDICTION, RESIDUAL) else "truth", "size": size, "rows": []},
+        *(
+            {**place, "title": group, "rows": [cells[name] for name in names]}
+            for group, names in group_by_knowledge(cells, source).items()
+        ),
+    ]
 
 
 def _marks(rows: list[Row], leaders: Sequence[str]) -> dict[str, str]:

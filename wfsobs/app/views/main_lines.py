@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +12,7 @@ from wfsobs.app.jobs import RUNNING, BackgroundTask
 from wfsobs.app.render import number
 from wfsobs.app.style import look, observers_of
 from wfsobs.app.work import RunResults
-from wfsobs.evaluation.evidence import rank_observers
+from wfsobs.evaluation.evidence import Evidence, rank_observers
 from wfsobs.evaluation.known_lines import NOTHING, PEAKS, prior_knowledge
 from wfsobs.evaluation.rows import can_be_best
 from wfsobs.evaluation.scores import PREDICTION, Score
@@ -25,19 +25,20 @@ REFERENCES = ("kf-lgs", "gpr-online")
 """The two that the paper compares: always shown."""
 
 
-def main_observers(scores: Iterable[Score], target: str, mode: str, leaders: Sequence[str] = ()) -> list[str]:
+def main_observers(scores: Iterable[Score], target: str, mode: str, evidence: Evidence | None = None) -> list[str]:
     """List the observers of a target that matter: those that the verdict names.
 
     These are the references, the best of all that can be compared, the best without prior knowledge and the best with known
-    peak frequencies. leaders : the best over several seeds, of which the first is that of the verdict.
+    peak frequencies. evidence : errors over several seeds, whose means count then.
 
     Without truth the best are those that predict the next measurement best. All, where there is no score at all.
     """
     drawn = observers_of(target)
-    of_mode = [s for s in scores if s.mode == mode and s.observer in drawn and can_be_best(s.observer, s.apart)]
+    rows = [s for s in scores if s.mode == mode and s.observer in drawn and can_be_best(s.observer, s.apart)]
+    of_mode = [evidence.over_seeds(s) for s in rows] if evidence else rows
     rivals = [s for s in of_mode if s.target == target] or [s for s in of_mode if s.target == PREDICTION]
     ranked = rank_observers({s.observer: s.rms for s in rivals})
-    best = [*leaders[:1], *ranked[:1]]
+    best = ranked[:1]
     for kind in (NOTHING, PEAKS):
         best += [name for name in ranked if prior_knowledge(name) == kind][:1]
     return [name for name in drawn if name in best or name in REFERENCES] if best else drawn
@@ -91,6 +92,11 @@ class MainLines:
         """Return the hidden lines of the targets where the visitor has chosen."""
         return {target: self.display.hidden_lines.get(target, []) for target in TARGETS if target in self._chosen_targets}
 
+    def names(self, target: str) -> list[str]:
+        """List the observers of a target that matter (`main_observers`)."""
+        results, evidence = self.run.result, self.seeds.evidence if self.seeds else None
+        return main_observers(results.result.scores if results else (), target, self.display.mode, evidence)
+
     def reset(self, target: str) -> None:
         """Show those that matter again."""
         self._chosen_targets.discard(target)
@@ -105,10 +111,8 @@ class MainLines:
         if results is None:
             return
         hidden, named = dict(self.display.hidden_lines), {}
-        evidence = self.seeds.evidence if self.seeds else None
         for target in TARGETS:
-            leaders = evidence.leaders(target, self.display.mode) if evidence else ()
-            named[target] = main_observers(results.result.scores, target, self.display.mode, leaders)
+            named[target] = self.names(target)
             if target not in self._chosen_targets:
                 hidden[target] = [name for name in observers_of(target) if name not in named[target]]
         if (hidden, named) != (self.display.hidden_lines, self.display.named_lines):

@@ -1,48 +1,73 @@
-"""The strip above a target's figures: a card per observer with its number, which is the legend as well."""
+"""The table above a target's figures: a row per observer with its error and what that is made of, which is the legend as well."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from math import sqrt
 from typing import Any
 
 import param
 
+from wfsobs.app.budgets import Budgets
 from wfsobs.app.component import Component
-from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.display import OVER_SEEDS, Display, per_micrometre
 from wfsobs.app.glossary import RELATIVE, TERMS, sentence_on
-from wfsobs.app.jobs import RUNNING, BackgroundTask
-from wfsobs.app.render import NOTHING, change, number
+from wfsobs.app.jobs import DONE, RUNNING, BackgroundTask
+from wfsobs.app.render import NOTHING, change, number, with_decimals_of
 from wfsobs.app.seeds import SeedRuns
-from wfsobs.app.style import asset, look, observers_of
+from wfsobs.app.style import TERM_COLOURS, asset, look, observers_of
+from wfsobs.app.views.main_lines import REFERENCES, MainLines
 from wfsobs.app.views.table import find
 from wfsobs.app.work import TRUTH, RunResults
+from wfsobs.evaluation.budget import TERMS as BUDGET_TERMS
+from wfsobs.evaluation.evidence import Evidence, gather_evidence
 from wfsobs.evaluation.rows import NOT_OBSERVERS, own_interval, score_rows
 from wfsobs.evaluation.scores import LOOP, PREDICTION, RESIDUAL, Score
 from wfsobs.priors_from.selection import usual_observers
 
-MAIN = "Show the main ones"
+HEADS = {"note": RELATIVE, "change": "Change", "bar": "Error budget"}
+"""Headings beside that of the errors."""
+
+LEAST = 0.01
+"""Share of an error from which on the legend has a cause."""
+
+LIMIT = "theoretical limit"
+
+
+@dataclass(frozen=True)
+class RunErrors:
+    """Results, and the errors of all their seeds that have been known."""
+
+    results: RunResults | None = None
+    errors: Evidence = field(default_factory=lambda: gather_evidence([]))
 
 
 class Cards(Component):
-    """The cards in the browser; a click on one hides or shows its line, a double click shows it alone."""
+    """A row per line in the browser; a click on one hides or shows its line, a double click shows it alone."""
 
-    items = param.List([], doc="{name, label, colour, dash, about, value, unit, note, range, compared} of every card.")
-    hidden_lines = param.List([], doc="Names of the cards whose lines are hidden.")
+    items = param.List([], doc="{name, label, colour, dash, value, unit, half, note, ...} of every row, as `Strip` makes them.")
+    heads = param.Dict({}, doc="Headings of the columns value, note, change and bar; a row of them if there are any.")
+    legend = param.List([], doc="(colour, label) of the pieces of bars.")
+    hidden_lines = param.List([], doc="Names of the rows whose lines are hidden.")
     last_arrival = param.Integer(0, doc="Number of the last click that has arrived, and all before it.")
-    terms = param.Dict({}, doc="Word that stands on the cards -> what it means.")
-    main = param.String("", doc="What the button is called that shows the lines that matter; none if empty.")
+    terms = param.Dict({}, doc="Heading -> what it means.")
+    kind = param.String("observers", doc="What the rows are of.")
 
     _esm = asset("patch.js") + asset("strip.js")
     _stylesheets = [asset("style.css"), asset("strip.css")]
 
     def __init__(self, **params: Any):
         self.on_main: Callable[[], None] = lambda: None
-        super().__init__(self._take, **params)
+        self.on_all: Callable[[], None] = lambda: None
+        super().__init__(self._take, sizing_mode="stretch_width", margin=0, **params)
 
     def _take(self, data: dict[str, Any]) -> None:
-        """Take a click: the names to hide, or the wish for the main lines."""
+        """Take a click: the names to hide, or the wish for the main rows or all."""
         if data.get("main"):
             self.on_main()
+        elif data.get("all"):
+            self.on_all()
         elif isinstance(names := data.get("hidden"), list):
             number = data.get("number")
             self.param.update(
@@ -52,27 +77,59 @@ class Cards(Component):
 
 
 class Strip:
-    """The cards of one target, in step with the results and the switches."""
+    """The rows of one target, in step with the results and the switches.
 
-    def __init__(self, target: str, run: BackgroundTask, display: Display, seeds: SeedRuns | None = None):
-        self.target, self.run, self.display, self.seeds = target, run, display, seeds
-        self.cards = Cards(
-            items=self.items(), main=MAIN, terms={RELATIVE: TERMS[RELATIVE]}, sizing_mode="stretch_width", margin=0
-        )
-        run.param.watch(self._refresh, "result")
-        run.param.watch(self._say_state, "state")
+    lines   : which of them are the main ones
+    budgets : what the errors are made of
+    """
+
+    def __init__(
+        self,
+        target: str,
+        run: BackgroundTask,
+        display: Display,
+        seeds: SeedRuns | None = None,
+        lines: MainLines | None = None,
+        budgets: Budgets | None = None,
+    ):
+        self.target, self.run, self.display, self.seeds, self.budgets = target, run, display, seeds, budgets
+        self.lines = lines or MainLines(run, display, seeds)
+        self._now = self._before = RunErrors()
+        self.cards = Cards(items=self.items(), terms={HEADS["note"]: TERMS[RELATIVE]})
+        self._refresh()
+        run.param.watch(self._follow, ["result", "state"])
         if seeds is not None:
-            seeds.param.watch(self._refresh, "evidence")
+            seeds.param.watch(self._follow, "evidence")
+        if budgets is not None:
+            budgets.param.watch(self._refresh, "by_observer")
         display.param.watch(self._refresh, ["mode", "unit", "dark", "compared_runs"])
         display.param.watch(self._hide, "hidden_lines")
 
-    def _say_state(self, *_: object) -> None:
-        """Whether a run goes on is said on cards without a number alone."""
-        if any(card["value"] == NOTHING for card in self.cards.items):
-            self._refresh()
+    def _follow(self, *_: object) -> None:
+        """Keep what was shown before, so that the change from there can be shown."""
+        if (results := self.run.result) is not None and self.run.state == DONE:
+            known = (self.seeds and self.seeds.evidence) or gather_evidence([results.result.scores])
+            if results is not self._now.results:
+                self._before = self._now
+            elif known.n_seeds < self._now.errors.n_seeds:  # gone with the settings, which have changed
+                known = self._now.errors
+            self._now = RunErrors(results, known)
+        self._refresh()
 
     def _refresh(self, *_: object) -> None:
-        self.cards.items = self.items()
+        items = self.items()
+        unit, shown = self.display.unit_label, self.run.result
+        error = "RMS error" if shown is None or shown.values(TRUTH, self.target) is not None else "Prediction error"
+        terms = {part[3] for item in items if item["main"] for part in item["parts"] if part[1] >= LEAST}
+        heads = HEADS | {"value": f"{error} [{unit}]"}
+        heads["change"] *= any(item["change"] for item in items)
+        heads["bar"] *= bool(terms)
+        limit = [["currentColor", LIMIT]] * any(item["limit"] for item in items)
+        self.cards.param.update(
+            items=items,
+            heads=heads,
+            legend=[[TERM_COLOURS[name], label] for name, label in BUDGET_TERMS.items() if name in terms] + limit,
+        )
 
     def _hide(self, *_: object) -> None:
         self.cards.hidden_lines = self.display.hidden_lines.get(self.target, [])
@@ -82,8 +139,11 @@ class Strip:
         shown = self.run.result
         runs = usual_observers(shown.scenario, shown.result.record) if shown else observers_of(self.target)
         observers = [self._observer(name, shown) for name in observers_of(self.target) if name in runs]
-        cards = [self._truth(shown), *observers]
-        return [card | {"compared": self._compared_rows(card["name"], shown)} for card in cards]
+        main = (TRUTH, *(self.lines.names(self.target) if shown and shown.result.scores else REFERENCES))
+        return [
+            card | {"compared": self._compared_rows(card["name"], shown), "main": card["name"] in main}
+            for card in (self._truth(shown), *observers)
+        ]
 
     def _compared_rows(self, name: str, results: RunResults | None) -> list[list[str]]:
         """Write letter, value and change from there in per cent of every compared run."""
@@ -116,23 +176,55 @@ class Strip:
                 return self._without_truth(name, results)
             waiting = self.run.state == RUNNING
             return self._card(name, None, "computing …" if waiting else "no result")
-        evidence = self.seeds.evidence if self.seeds else None
-        if evidence is None or score.apart:
-            return self._score_fields(name, score, results, "truth")
-        mean = evidence.over_seeds(score)
-        ends = " – ".join(number(self._in_unit(x, results)) for x in mean.interval or ())
-        return self._score_fields(name, mean, results, "truth") | {"range": ends and f"mean {ends}"}
+        return self._score_fields(name, score, results) | self._budget_fields(score, results)
 
-    def _score_fields(self, name: str, score: Score, results: RunResults, base: str) -> dict[str, Any]:
-        relative = f"{score.normalised_rms:.2f}" if score.normalised_rms is not None else ""
-        if relative:
-            relative = f"relative error {relative}" if base == "truth" else f"{relative} × {base}"
-        return self._card(name, self._in_unit(score.rms, results), own_interval(score_rows([score], None)[0]) or relative)
+    def _mean(self, score: Score) -> Score:
+        """Return a score with its mean over the seeds, where there are several."""
+        evidence = self.seeds.evidence if self.seeds else None
+        return evidence.over_seeds(score) if evidence else score
+
+    def _score_fields(self, name: str, score: Score, results: RunResults) -> dict[str, Any]:
+        mean, own = self._mean(score), own_interval(score_rows([score], None)[0])
+        fields = self._card(name, self._in_unit(mean.rms, results), own or number(mean.normalised_rms, 2))
+        if mean.interval is not None:
+            half = self._in_unit(0.5 * (mean.interval[1] - mean.interval[0]), results)
+            evidence = self.seeds.evidence if self.seeds else None
+            meaning = f"{OVER_SEEDS}, {f'{evidence.n_seeds} seeds' if evidence else 'from one record'}"
+            fields |= {"half": with_decimals_of(fields["value"], half), "meaning": meaning}
+        change = self._change(score)
+        return fields | {
+            "change": "" if change is None else with_decimals_of(fields["value"], self._in_unit(change, results), "+")
+        }
+
+    def _budget_fields(self, score: Score, results: RunResults) -> dict[str, Any]:
+        """Describe the bar: as long as the error, in pieces by their shares of its square; and the limit."""
+        it = self.budgets.budget(score.observer, self.target, self.display.mode) if self.budgets else None
+        if it is None or not it.terms:
+            return {}
+        whole = sum(max(part, 0.0) for part in it.terms.values())
+        percent = {name: f"{round(100.0 * part / it.total)} %".replace("-", "−") for name, part in it.terms.items()}
+        return {
+            "parts": [
+                [TERM_COLOURS[name], max(part, 0.0) / whole, f"{BUDGET_TERMS[name]} {percent[name]}", name]
+                for name, part in it.terms.items()
+            ],
+            "size": self._in_unit(self._mean(score).rms, results),
+            "limit": self._in_unit(sqrt(it.bound or 0.0), results),
+        }
+
+    def _change(self, score: Score) -> float | None:
+        """Return the change of the error from the result before [um], over the seeds that both have."""
+        key = score.observer, score.target, score.mode
+        before, now = (of.errors.errors.get(key) for of in (self._before, self._now))
+        if before is None or now is None or self.run.result is not self._now.results:
+            return None
+        n = min(before.size, now.size)
+        return float((now[:n] - before[:n]).mean())
 
     def _without_truth(self, name: str, results: RunResults) -> dict[str, Any]:
         """How well the next measurement is predicted, by whoever says what it will be."""
         score = find(results, name, PREDICTION, self.display.mode)
-        return self._score_fields(name, score, results, "z, next z") if score else self._card(name, None, "no truth")
+        return self._score_fields(name, score, results) if score else self._card(name, None, "no truth")
 
     def _truth(self, results: RunResults | None) -> dict[str, Any]:
         of = (self.target, self.display.mode)
@@ -140,11 +232,11 @@ class Strip:
         if results is None or not scores:
             left = find(results, LOOP, RESIDUAL, self.display.mode) if results else None
             return self._loop(left, results) if results and left else self._card(TRUTH, None, "")
-        return self._card(TRUTH, self._in_unit(scores[0].truth_rms, results), "rms")
+        return self._card(TRUTH, self._in_unit(self._mean(scores[0]).truth_rms, results), "rms")
 
     def _loop(self, left: Score, results: RunResults) -> dict[str, Any]:
         """Describe the recorded loop's residual, in the place of the truth, which has no line either."""
-        return self._score_fields(TRUTH, left, results, "z, residual") | {"label": NOT_OBSERVERS[LOOP], "colour": "transparent"}
+        return self._score_fields(TRUTH, left, results) | {"label": NOT_OBSERVERS[LOOP], "colour": "transparent"}
 
     def _in_unit(self, value: float, results: RunResults) -> float:
         return value * per_micrometre(self.display.unit, results.scenario.telescope.diameter)
@@ -158,7 +250,11 @@ class Strip:
             "dash": list(it.dash),
             "about": sentence_on(name),
             "note": note,
-            "range": "",
             "value": NOTHING if value is None else number(value),
-            "unit": "" if value is None else self.display.unit_label,
+            "unit": "",
+            "half": "",
+            "change": "",
+            "parts": [],
+            "size": 0.0,
+            "limit": 0.0,
         }

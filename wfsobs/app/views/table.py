@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import panel as pn
 from markupsafe import Markup
@@ -12,12 +12,13 @@ from wfsobs.app.compared import ComparedRun
 from wfsobs.app.display import AT_LIMIT, IN_MOST, OVER_SEEDS, Display, per_micrometre, score_columns
 from wfsobs.app.glossary import BOUND as TERM_OF_BOUND
 from wfsobs.app.glossary import term
-from wfsobs.app.jobs import BackgroundTask
-from wfsobs.app.render import NOTHING, Row, change, macro, number, table
+from wfsobs.app.jobs import DONE, BackgroundTask
+from wfsobs.app.render import Row, change, hundredths, macro, missing, number, table
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset, observers_of, swatch
 from wfsobs.app.work import RunResults
 from wfsobs.evaluation.evidence import rank_observers
+from wfsobs.evaluation.known_lines import group_by_knowledge
 from wfsobs.evaluation.rows import (
     NOT_OBSERVERS,
     at_bound,
@@ -25,13 +26,13 @@ from wfsobs.evaluation.rows import (
     is_non_causal,
     own_interval,
     row_label,
-    row_needs,
     score_rows,
     scored_interval,
     target_title,
 )
-from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS, LOOP, RESIDUAL, SCORED, Score
+from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS, LOOP, PREDICTION, RESIDUAL, SCORED, Score
 from wfsobs.observers import OBSERVERS
+from wfsobs.prior import TRUE
 from wfsobs.priors_from.selection import is_usual
 from wfsobs.result import Failure
 
@@ -59,18 +60,18 @@ class Table:
     def __init__(self, run: BackgroundTask, display: Display, seeds: SeedRuns | None = None):
         self.run, self.display, self.seeds = run, display, seeds
         self.pane = pn.pane.HTML(self.html(), sizing_mode="stretch_width", margin=0, stylesheets=[asset("style.css")])
-        run.param.watch(self._refresh, "result")
+        run.param.watch(self._refresh, ["result", "state"])
         if seeds is not None:
             seeds.param.watch(self._refresh, "evidence")
-        display.param.watch(self._refresh, ["mode", "unit", "dark", "best_first", "compared_runs"])
+        display.param.watch(self._refresh, ["mode", "unit", "dark", "compared_runs"])
 
     def _refresh(self, *_: object) -> None:
         self.pane.object = self.html()
 
     def html(self) -> str:
         """Write the table."""
-        groups = self._truthless() or [self._target(target) for target in SCORED]
         shown = self.run.result
+        groups = [group for target in self._targets() for group in self._target(target)]
         left_out = lines_of_failures(shown.result.failures) if shown else []
         return f"{table('RMS errors', self._columns(), groups)}{macro('texts', 'failure', left_out)}"
 
@@ -81,57 +82,55 @@ class Table:
             f"{run.letter} [{unit}]": f"RMS error in {run.name}, and the change from there to the result shown"
             for run in self.display.compared_runs
         }
-        return score_columns(unit, "z" if self._without_truth() else "truth", compared)
+        return score_columns(unit, "truth" if self._targets() == SCORED else "z", compared)
 
-    def _without_truth(self) -> list[Score]:
-        """Select the scores of a record without truth, of the mode shown."""
+    def _targets(self) -> tuple[str, ...]:
+        """List what errors are of: without truth, of predictions of the next measurement, and what the recorded loop left."""
         shown = self.run.result
-        scores = [s for s in shown.result.scores if s.mode == self.display.mode] if shown else []
-        return scores if any(s.target == RESIDUAL for s in scores) else []
+        without = shown is not None and any((s.target, s.mode) == (RESIDUAL, self.display.mode) for s in shown.result.scores)
+        return (PREDICTION, RESIDUAL) if without else SCORED
 
-    def _truthless(self) -> list[tuple[str, list[Row]]]:
-        """List the rows of a record without truth: predictions of the next measurement, and what the recorded loop left."""
-        scores, shown = self._without_truth(), self.run.result
-        if not scores or shown is None:
-            return []
-        if self.display.best_first:
-            scores.sort(key=lambda s: (s.target == RESIDUAL, s.apart, s.rms))
-        best = min((s.rms for s in scores if can_be_best(s.observer, s.apart)), default=None)
-        scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
-        found = []
-        for score in scores:
-            is_best = score.rms == best and can_be_best(score.observer, score.apart)
-            cells = [
-                (SMALLEST if is_best else "") + number(score.rms * scale),
-                *self._compared_cells(score.observer, score.target, score),
-                number(score.truth_rms * scale),
-                number(score.normalised_rms),
-                row_needs(score.observer, source=shown.result.prior_source),
-                NOTHING,
-                *_times(score, shown.result.record.dt),
-                _own_sd(score, scale),
+    def _target(self, target: str) -> list[tuple[str, list[Row]]]:
+        """List the rows of a target under its title, a group per kind of prior knowledge, the smallest error first."""
+        shown = self.run.result
+        if target in SCORED:
+            names = [
+                name
+                for name in (*observers_of(target, with_zero=True), *BOUNDS)
+                if not shown or name in BOUNDS or is_usual(OBSERVERS[name], shown.result.scenario, shown.result.record)
             ]
-            head = "Recorded loop, residual" if score.observer == LOOP else self._head(score.observer) + _own(score)
-            found.append(Row(head, cells, {"observer": score.observer, "target": score.target}))
-        return [(f"Next measurement z, {self.display.mode}{_stretch(scores)}, one step ahead: the record has no truth", found)]
-
-    def _target(self, target: str) -> tuple[str, list[Row]]:
-        """List the rows of a target, best first if asked for, those without a score last."""
-        shown = self.run.result
-        scores = {
-            name: self._score(name, target)
-            for name in (*observers_of(target, with_zero=True), *BOUNDS)
-            if not shown or name in BOUNDS or is_usual(OBSERVERS[name], shown.result.scenario, shown.result.record)
-        }
+        else:
+            of_mode = [s for s in shown.result.scores if s.mode == self.display.mode] if shown else []
+            names = [s.observer for s in of_mode if s.target == target]
+        scores = {name: self._score(name, target) for name in names}
         for name in set(BOUNDS).difference(COMMON_BOUNDS):  # only where stars differ, or modes are coupled
-            if not scores[name]:
-                del scores[name]
-        marks, limits = self._marks(target, scores), {key[0] for key in at_bound(filter(None, scores.values()))}
-        order = list(scores.items())
-        if self.display.best_first:
-            order.sort(key=lambda item: (item[1].apart, item[1].rms) if item[1] else (True, math.inf))
-        title = f"{target_title(target)}, {self.display.mode}{_stretch([s for s in scores.values() if s])}"
-        return title, [self._row(name, target, score, marks.get(name, Markup()), name in limits) for name, score in order]
+            if not scores.get(name):
+                scores.pop(name, None)
+        known = [s for s in scores.values() if s]
+        marks, limits = self._marks(target, scores), {key[0] for key in at_bound(known)}
+        order = sorted(scores, key=lambda name: (it.apart, it.rms) if (it := scores[name]) else (True, math.inf))
+        groups = group_by_knowledge(order, shown.result.prior_source if shown else TRUE)
+        rows = {
+            title: [self._row(name, target, scores[name], marks.get(name, Markup()), name in limits) for name in of]
+            for title, of in groups.items()
+        }
+        return [(self._title(target, known), []), *rows.items()]
+
+    def _title(self, target: str, scores: Sequence[Score]) -> str:
+        """Write the title of a target: what it is, over which stretch, and how large."""
+        shown, parts = self.run.result, [target_title(target), self.display.mode]
+        if target in (PREDICTION, RESIDUAL):
+            title = "one step ahead: the record has no truth" if target == PREDICTION else "what the recorded loop left"
+            parts = [{PREDICTION: "Next measurement z", RESIDUAL: "Residual"}[target], self.display.mode, title]
+        own = [s for s in scores if not s.apart]
+        if shown and own:
+            scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
+            of = "truth" if target in SCORED else "z"
+            parts += [
+                scored_interval(score_rows(own, None)),
+                f"rms of {of} {number(own[0].truth_rms * scale)} {self.display.unit_label}",
+            ]
+        return ", ".join(filter(None, parts))
 
     def _score(self, name: str, target: str) -> Score | None:
         """Find a score, with the mean over the seeds where there are several."""
@@ -157,20 +156,20 @@ class Table:
     def _row(self, name: str, target: str, score: Score | None, mark: Markup, at_limit: bool) -> Row:
         shown = self.run.result
         compared = self._compared_cells(name, target, find(shown, name, target, self.display.mode) if shown else None)
-        needs = row_needs(name, source=shown.result.prior_source) if shown else row_needs(name)
-        cells = [NOTHING, *compared, *[NOTHING] * 2, needs, *[NOTHING] * 4]
-        if shown and score:
+        if shown is None or score is None:
+            why = "no error: it has no estimate" if shown and self.run.state == DONE else "not computed yet"
+            cells = [missing(why), *compared, *[missing(why)] * 5]
+        else:
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
             cells = [
                 # The number last, so that numbers stand below each other.
                 self._interval(score, scale) + " " + mark + number(score.rms * scale),
                 *compared,
-                number(score.truth_rms * scale),
-                (ABOVE if (score.normalised_rms or 0.0) > 1.0 else "") + number(score.normalised_rms),
-                needs,
-                NOTHING if score.lag is None else f"{1e3 * score.lag:z.2f}".replace("-", "−"),
+                (ABOVE if target in SCORED and (score.normalised_rms or 0.0) > 1.0 else "")
+                + _or_why(score.normalised_rms, "z is 0"),
+                _or_why(None if score.lag is None else 1e3 * score.lag, _no_lag(score)),
                 *_times(score, shown.result.record.dt),
-                _own_sd(score, scale),
+                missing("it predicts no sigma") if score.calibration is None else number(score.calibration.sd * scale),
             ]
         head = self._head(name) + macro("note", "looks ahead" if is_non_causal(name) else "") + _own(score)
         head += macro("note", AT_LIMIT if at_limit else "")
@@ -178,7 +177,11 @@ class Table:
 
     def _head(self, name: str) -> Markup:
         label = row_label(name)
-        return swatch(name, self.display.dark) + (term(TERM_OF_BOUND, label) if name in BOUNDS else label)
+        return (
+            Markup() + label
+            if name == LOOP
+            else swatch(name, self.display.dark) + (term(TERM_OF_BOUND, label) if name in BOUNDS else label)
+        )
 
     def _compared_cells(self, name: str, target: str, score: Score | None) -> list[str]:
         """Write the error in every compared run, and the change from there."""
@@ -187,15 +190,9 @@ class Table:
     def _compared_cell(self, run: ComparedRun, name: str, target: str, score: Score | None) -> str:
         before = run.score(name, target, self.display.mode)
         if before is None:
-            return NOTHING
+            return missing(f"{run.name} does not have it")
         scale = per_micrometre(self.display.unit, run.scenario.telescope.diameter)
         return macro("change", change(before.rms, score.rms if score else None)) + number(before.rms * scale)
-
-
-def _stretch(scores: list[Score]) -> str:
-    """Write the stretch over which comparable rows were scored, for the end of a heading."""
-    stretch = scored_interval(score_rows(scores, None))
-    return f", {stretch}" if stretch else ""
 
 
 def _own(score: Score | None) -> Markup:
@@ -203,13 +200,19 @@ def _own(score: Score | None) -> Markup:
     return macro("note", own_interval(score_rows([score], None)[0]) if score and score.apart else "")
 
 
-def _own_sd(score: Score, scale: float) -> str:
-    """Write the standard deviation that an observer states, where it states one."""
-    return NOTHING if score.calibration is None else number(score.calibration.sd * scale)
+def _no_lag(score: Score) -> str:
+    """Say why an error has no lag."""
+    if score.observer in BOUNDS:
+        return "a limit has none"
+    return "not compared with a truth" if score.target in (PREDICTION, RESIDUAL) else "estimate or truth is constant"
+
+
+def _or_why(value: float | None, why: str) -> Markup | str:
+    return missing(why) if value is None else hundredths(value)
 
 
 def _times(score: Score, dt: float) -> list[str]:
     """Time per step [us], and over the step of the loop."""
     if score.observer in NOT_OBSERVERS:
-        return [NOTHING] * 2
-    return [number(1e6 * score.seconds_per_step), number(score.seconds_per_step / dt, 2)]
+        return [missing("nothing is computed")] * 2
+    return [hundredths(1e6 * score.seconds_per_step), hundredths(score.seconds_per_step / dt)]

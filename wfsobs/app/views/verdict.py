@@ -5,14 +5,17 @@ from __future__ import annotations
 from html import escape
 
 import panel as pn
+from markupsafe import Markup
 
-from wfsobs.app.causes import Causes
+from wfsobs.app.budgets import Budgets
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.glossary import BOUND, explain_first
 from wfsobs.app.jobs import DONE, IDLE, RUNNING, BackgroundTask
+from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset
-from wfsobs.app.work import TRUTH
+from wfsobs.app.work import TRUTH, RunResults
+from wfsobs.evaluation.rows import target_title
 from wfsobs.evaluation.scores import PREDICTION
 from wfsobs.evaluation.verdict import verdict
 from wfsobs.observers.base import TARGETS
@@ -29,33 +32,42 @@ class VerdictLine:
         run: BackgroundTask,
         display: Display,
         seeds: SeedRuns | None = None,
-        causes: Causes | None = None,
+        budgets: Budgets | None = None,
+        about: str = "",
     ):
-        self.target, self.run, self.display, self.seeds, self.causes = target, run, display, seeds, causes
-        self._sentence: tuple[tuple[str, str], str] = ("", ""), ""
+        """Make the pane. about : what the target is, for who comes first to the page."""
+        self.target, self.run, self.display, self.seeds, self.budgets = target, run, display, seeds, budgets
+        self.about = about
+        self._text: tuple[tuple[str, str], tuple[str, str]] = ("", ""), ("", "")
         self.pane = pn.pane.HTML(self.html(), sizing_mode="stretch_width", margin=0, stylesheets=[asset("style.css")])
         run.param.watch(self._refresh, ["result", "state"])
         if seeds is not None:
             seeds.param.watch(self._refresh, "evidence")
-        if causes is not None:
-            causes.param.watch(self._refresh, "budgets")
+        if budgets is not None:
+            budgets.param.watch(self._refresh, "by_observer")
         display.param.watch(self._refresh, ["mode", "unit"])
 
     def _refresh(self, *_: object) -> None:
         self.pane.object = self.html()
 
     def html(self) -> str:
-        """Return the sentences; while observers are at work those before, dimmed; without a truth what there is instead."""
-        shown, of = self.run.result, (self.display.mode, self.display.unit)
+        """Return the title and the sentences; while observers are at work those before, dimmed; without a truth what there is."""
+        title, text, kind = f"{target_title(self.target)}, {self.display.mode}", "", "verdict"
+        of = (self.display.mode, self.display.unit)
         if self.run.state in (IDLE, RUNNING):
-            before, text = self._sentence
-            return _paragraph(text if before == of else "", "verdict before")
-        if shown is None or self.run.state != DONE:
-            return ""
-        it = shown.result
-        has_truth = shown.values(TRUTH, self.target) is not None
+            before, known = self._text
+            (title, text), kind = (known, "verdict before") if before == of else ((title, ""), kind)
+        elif self.run.result is not None and self.run.state == DONE:
+            title, text = self._sentences(self.run.result, title)
+            self._text = of, (title, text)
+        return str(macro("verdict", title, self.about, Markup(text), kind))
+
+    def _sentences(self, results: RunResults, title: str) -> tuple[str, str]:
+        """Return the title and what stands below it as HTML."""
+        has_truth = results.values(TRUTH, self.target) is not None
         if not has_truth and self.target != TARGETS[0]:
-            return _paragraph(NO_TRUTH, "verdict")
+            return title, NO_TRUTH
+        it = results.result
         found = verdict(
             it.scenario,
             it.record,
@@ -63,23 +75,14 @@ class VerdictLine:
             it.scores,
             self.target if has_truth else PREDICTION,
             self.display.mode,
-            simulation=shown.simulation,
+            simulation=results.simulation,
             evidence=self.seeds.evidence if self.seeds else None,
-            budgets=self.causes.budgets if self.causes else (),
+            budgets=[budget for of in self.budgets.by_observer.values() for budget in of] if self.budgets else (),
         )
         if found is None:
-            return "" if has_truth else _paragraph(NO_TRUTH, "verdict")
-        scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
+            return title, "" if has_truth else NO_TRUTH
+        scale = per_micrometre(self.display.unit, results.scenario.telescope.diameter)
         lead, *others = found.sentences(scale, self.display.unit_label)
         head, _, first = lead.partition(". ")
-        lines = [f"<strong>{escape(head)}.</strong> {explain_first(first, 'theoretical limit', BOUND)}", escape(" ".join(others))]
-        if not has_truth:
-            lines.append(NO_TRUTH)
-        text = "<br>".join(filter(None, lines)).replace(" %", "&nbsp;%")
-        self._sentence = of, text
-        return _paragraph(text, "verdict")
-
-
-def _paragraph(text: str, kind: str) -> str:
-    """Write what has its room before it comes, so that the figures below do not move."""
-    return f'<p class="{kind}">{text}</p>'
+        lines = [explain_first(first, "theoretical limit", BOUND), escape(" ".join(others)), "" if has_truth else NO_TRUTH]
+        return head, "<br>".join(filter(None, lines)).replace(" %", "&nbsp;%")
