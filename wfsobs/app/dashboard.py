@@ -18,7 +18,7 @@ from wfsobs.app.controls.names import name_settings
 from wfsobs.app.controls.panel import Controls
 from wfsobs.app.controls.status import waiting_text
 from wfsobs.app.display import Display
-from wfsobs.app.help import Help
+from wfsobs.app.glossary import Help
 from wfsobs.app.history import History, HistorySheet, session_save
 from wfsobs.app.jobs import FAILED
 from wfsobs.app.pages.explore import Explore

@@ -13,8 +13,7 @@ import panel as pn
 import panel_material_ui as pmui
 import param
 
-from wfsobs.app.controls.field import ROOM, TAG, Field, idle_html
-from wfsobs.app.controls.fields import make_field
+from wfsobs.app.controls.fields import ROOM, TAG, Field, idle_html, make_field
 from wfsobs.app.controls.names import preset_line, preset_title, setting_name
 from wfsobs.app.controls.rows import RowEditor
 from wfsobs.app.controls.search import Search

@@ -9,8 +9,7 @@ import panel as pn
 import param
 
 from wfsobs.app.component import Component
-from wfsobs.app.controls.field import TAG, idle_html
-from wfsobs.app.controls.fields import parse_number, short_number
+from wfsobs.app.controls.fields import TAG, idle_html, parse_number, short_number
 from wfsobs.app.controls.names import column_of, name_settings
 from wfsobs.app.display import unit_text
 from wfsobs.app.store import Store
