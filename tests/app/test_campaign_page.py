@@ -153,7 +153,7 @@ def cells_of(page: CampaignPage, name: str) -> dict[str, str]:
     headings = re.findall(r"<th scope=col>(?:<button[^>]*>)?([^<]*)", page.table.object)
     row = re.search(rf'<tr data-name="{name}">.*</tr>', page.table.object)
     assert row is not None
-    return dict(zip(headings[1:], re.findall(r"<td>(.*?)</td>", row[0]), strict=True))
+    return dict(zip(headings[1:], re.findall(r"<td[^>]*>(.*?)</td>", row[0]), strict=True))
 
 
 def test_what_is_tied_was_tested(dashboard: Dashboard, loop: Any) -> None:

@@ -49,7 +49,7 @@ def row(table: str, section: str, name: str) -> list[str]:
     """The cells of a row of the table."""
     pattern = rf'<tr data-section="{section}"><th scope=row>(?:<b>)?{re.escape(name)}(?:</b>)?</th>(.*?)</tr>'
     (found,) = re.findall(pattern, table)
-    return re.findall("<td>(.*?)</td>", found)
+    return re.findall("<td[^>]*>(.*?)</td>", found)
 
 
 def test_it_shows_what_the_core_finds(page: TunePage, dashboard: Dashboard, loop: Any) -> None:

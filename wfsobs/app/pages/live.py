@@ -38,7 +38,7 @@ from wfsobs.app.pages.live_figures import (
     Waterfall,
     live_text,
 )
-from wfsobs.app.pages.parts import HALVES, WIDE, Page, box, boxes, figure_with_caption, group, legend, line, text
+from wfsobs.app.pages.parts import HALVES, WIDE, Page, box, boxes, example, figure_with_caption, group, legend, line, text
 from wfsobs.app.service import Post
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
@@ -277,7 +277,9 @@ class LivePage(Page):
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""
-        return boxes(box("Live loop", self.intro, *self.controls.view(), self.status, self.pulse), self.room)
+        return boxes(
+            box("Live loop", self.intro, *self.controls.view(), self.status, self.pulse), example("live", self.room), self.room
+        )
 
     def show(self, visible: bool) -> None:
         """Draw while visible; the loop goes on when the page is left."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from html import escape
+from math import sin
 from types import MappingProxyType
 from typing import Any, Protocol
 
@@ -296,6 +297,51 @@ def html(content: str = "") -> pn.pane.HTML:
 def text(content: str) -> pn.pane.HTML:
     """Make a paragraph."""
     return html(f'<p class="text">{escape(content)}</p>')
+
+
+STEPS = ((30, 14), (70, 40), (100, 62), (160, 76), (210, 96), (390, 104), (570, 104))
+
+
+def _wave(k: int) -> str:
+    points = ((30 + 6 * i, (22 - 7 * k) * (sin(0.31 * i + k) + sin((0.83 + 0.1 * k) * i))) for i in range(91))
+    return " ".join(f"{x},{60 + y:.0f}" for x, y in points)
+
+
+EXAMPLES: Mapping[str, tuple[str, str]] = MappingProxyType(
+    {
+        "tune": (
+            "Example: the smallest error found so far, over the evaluations",
+            f'<path d="M30 14{"".join(f"H{x}V{y}" for x, y in STEPS)}"/>'
+            + "".join(f'<circle cx="{x}" cy="{y}" r="3"/>' for x, y in STEPS[:-1]),
+        ),
+        "sweep": (
+            "Example: the best observer of every combination of two settings",
+            "".join(
+                f'<rect x="{40 + 108 * i}" y="{8 + 28 * j}" width="102" height="23" class="{"abc"[(2 * i + 3 * j) // 7]}"/>'
+                for i in range(5)
+                for j in range(4)
+            ),
+        ),
+        "live": (
+            "Example: the errors of the last seconds",
+            "".join(f'<polyline class="{name}" points="{_wave(k)}"/>' for k, name in enumerate("abc")),
+        ),
+    }
+)
+"""What a page shows before it has results: caption and drawing."""
+
+
+def example(name: str, results: Any) -> pn.pane.HTML:
+    """Draw an example of the results of a page, until they are visible themselves."""
+    caption, drawing = EXAMPLES[name]
+    frame = '<path class="frame" d="M30 4v116h550"/>'
+    pane = html(
+        f'<figure class="example"><svg viewBox="0 0 600 124" role="img" aria-label="{caption}">{frame}{drawing}</svg>'
+        f"<figcaption>{caption}</figcaption></figure>"
+    )
+    pane.visible = not results.visible
+    results.param.watch(lambda event: setattr(pane, "visible", not event.new), "visible")
+    return pane
 
 
 def zoom_buttons(zoom: Callable[[float | None], None], stretches: Mapping[str, float | None]) -> list[pmui.Button]:

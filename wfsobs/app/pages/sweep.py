@@ -30,6 +30,7 @@ from wfsobs.app.pages.parts import (
     Starter,
     box,
     boxes,
+    example,
     html,
     legend,
     line,
@@ -364,7 +365,7 @@ class SweepPage(Page):
         row = line(*(field for pair in zip(self.settings, self.values, strict=True) for field in pair))
         more = line(self.seeds, self.observers, *self.starter.view())
         sweep = box("Sweep", text(INTRO), row, more, self.estimate, self.starter.status, self.stale)
-        return boxes(sweep, *self.boxes, self.shades)
+        return boxes(sweep, example("sweep", self.boxes[0]), *self.boxes, self.shades)
 
     def choose(self, path: str) -> None:
         """Prepare the error over one setting, by its path."""

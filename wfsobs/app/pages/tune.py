@@ -28,6 +28,7 @@ from wfsobs.app.pages.parts import (
     Starter,
     box,
     boxes,
+    example,
     html,
     legend,
     line,
@@ -272,7 +273,7 @@ class TunePage(Page):
         """Return the contents of the page."""
         row = line(self.observer, self.target, self.evaluations, *self.starter.view())
         tuning = box("Tuning", text(INTRO), row, self.search_space, self.starter.status, self.stale)
-        return boxes(tuning, self.history, self.outcome)
+        return boxes(tuning, example("tune", self.history), self.history, self.outcome)
 
     def start(self) -> None:
         """Tune the chosen observer."""
