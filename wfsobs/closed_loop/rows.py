@@ -7,13 +7,20 @@ from dataclasses import replace
 from math import degrees, log10
 from typing import Any
 
+import numpy as np
+
 from wfsobs.closed_loop.run import ClosedLoop, residual_rms, strehl
 from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.evaluation.evidence import means_differ
+from wfsobs.evaluation.known_lines import SPECTRA, knowledge_of
 from wfsobs.evaluation.rows import NOT_OBSERVERS, Row
-from wfsobs.evaluation.scores import BOUNDS
+from wfsobs.evaluation.samples import batch_means, rms_interval
+from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS
+from wfsobs.evaluation.verdict import Contender, Verdict
 from wfsobs.prior import TRUE, PriorSource, Spectra, words_for
 from wfsobs.priors_from.controllers import own_settings
 from wfsobs.scenario import Scenario
+from wfsobs.signal.welch import rms
 from wfsobs.units import micrometres_per
 
 LIMITED = "theory and margins are not applicable: a limit of the mirror acts, and the loop is no longer linear"
@@ -84,6 +91,40 @@ def rows(result: ClosedLoop, seed: int | None, *, source: PriorSource = TRUE) ->
     for bound, left in plan.bounds.items():
         out += [row(bound, spectra, mode, True, left) for mode in range(len(modes))]
     return out
+
+
+def loop_verdict(result: ClosedLoop, mode: str) -> Verdict | None:
+    """Return the verdict on the controllers by their residuals in one mode, with the limit; None where none ran.
+
+    The intervals and which residuals do not differ significantly from the least are by the scatter within the record.
+    """
+    column = [m.name for m in result.scenario.modes].index(mode)
+    first = round(result.design.start / result.record.dt)
+    left = {
+        o.controller: o.residual[first:, column] for o in result.outcomes if o.residual is not None and o.controller != "none"
+    }
+    if not left:
+        return None
+    squares = batch_means(np.column_stack([*left.values()]) ** 2)
+    errors = np.array([rms(of) for of in left.values()])
+    best = int(np.argmin(errors))
+    worse = means_differ(squares, in_order=True)[best]
+    bounds = result.design.bounds
+    limit = (bounds[BOUND_BOTH][column], BOUND_BOTH) if BOUND_BOTH in bounds else None
+    places = [
+        Contender(
+            name,
+            float(errors[i]),
+            rms_interval(float(errors[i]), squares[:, i : i + 1]),
+            not worse[i],
+            SPECTRA if "spectra" in controller_needs(name, result.scenario) else knowledge_of(CONTROLLERS[name].prior),
+            0,
+            limit,
+            label(name),
+        )
+        for i, name in enumerate(left)
+    ]
+    return Verdict("residual", mode, tuple(sorted(places, key=lambda place: place.rms)), 0, ())
 
 
 def controller_needs(controller: str, scenario: Scenario, *, source: PriorSource = TRUE) -> str:

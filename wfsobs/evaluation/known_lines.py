@@ -18,8 +18,8 @@ HALF_WIDTH = 1.5
 """What counts as at a line [Hz] to either side, three bins of a spectrum with 0.5 Hz."""
 
 
-PEAKS, ONE_PEAK, TRAINED, BANDS, NOTHING = "peaks", "one peak", "training data", "bands", "nothing"
-"""Kinds of prior knowledge: the frequencies of peaks, a model with one, training data, frequency bands, and none."""
+PEAKS, ONE_PEAK, TRAINED, BANDS, SPECTRA, NOTHING = "peaks", "one peak", "training data", "bands", "spectra", "nothing"
+"""Kinds of prior knowledge: the frequencies of peaks, a model with one, training data, frequency bands, the spectra, and none."""
 
 _KINDS: tuple[tuple[Part, str], ...] = ((Lines, PEAKS), (Model, ONE_PEAK), (Training, TRAINED), (Bands, BANDS))
 
@@ -30,7 +30,12 @@ def prior_knowledge(observer: str) -> str:
     >>> prior_knowledge("kf-multi"), prior_knowledge("kf-lgs"), prior_knowledge("kf-adaptive")
     ('peaks', 'one peak', 'nothing')
     """
-    return next((kind for part, kind in _KINDS if asks_for(part, OBSERVERS[observer].prior)), NOTHING)
+    return knowledge_of(OBSERVERS[observer].prior)
+
+
+def knowledge_of(prior: Iterable[Part]) -> str:
+    """Return which kind of prior knowledge these parts of a prior are."""
+    return next((kind for part, kind in _KINDS if asks_for(part, prior)), NOTHING)
 
 
 def group_by_knowledge(names: Iterable[str], source: PriorSource = TRUE) -> dict[str, list[str]]:

@@ -37,6 +37,7 @@ class Contender:
     knowledge     : of `prior_knowledge`
     n_peaks       : peaks in its model: of those of the vibration where they are known
     limit         : the least error possible [um], and of which row of BOUNDS; None where it is not known
+    label         : what it is called, where it is a controller
     """
 
     observer: str
@@ -46,6 +47,7 @@ class Contender:
     knowledge: str
     n_peaks: int
     limit: tuple[float, str] | None = None
+    label: str = ""
 
     @property
     def above_limit(self) -> float | None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wfsobs.evaluation.budget import CONE, LAG, LINES, MISMATCH, NOISE
-from wfsobs.evaluation.known_lines import BANDS, NOTHING, ONE_PEAK, PEAKS, TRAINED
+from wfsobs.evaluation.known_lines import BANDS, NOTHING, ONE_PEAK, PEAKS, SPECTRA, TRAINED
 from wfsobs.evaluation.rows import row_label, target_title
 from wfsobs.evaluation.scores import BOUND_ASTERISM, BOUND_BOTH, BOUND_BOTH_MODES, BOUND_MODES
 
@@ -22,11 +22,12 @@ HEADINGS = {
     ONE_PEAK: "With one known peak",
     TRAINED: "With training data",
     BANDS: "With known frequency bands",
+    SPECTRA: "With known spectra",
 }
 """Kinds of prior knowledge, as the beginning of a sentence."""
 
-ALWAYS = ("gpr-online", "kf-lgs")
-"""Observers that are named whatever their error: the subject of the paper, and what it is compared with."""
+ALWAYS = ("gpr-online", "kf-lgs", "integrator", "integrator+gpr-online", "lqg-kf-lgs")
+"""Observers and controllers that are named whatever their error: the subject of the paper, and what it is compared with."""
 
 MOST = 3
 """Observers that are named as equal to the best; the table has all."""
@@ -63,6 +64,7 @@ def knowledge_clause(place: Contender, lines: int, several: bool = False) -> str
         ONE_PEAK: f"{model} {'one' if n else 'none'}{of} peak{'s' * bool(of)}",
         TRAINED: f"{they} {have} training data",
         BANDS: f"{they} {know} the frequency bands",
+        SPECTRA: f"{they} {know} the spectra",
         NOTHING: f"{they} {have} no prior knowledge",
     }[place.knowledge]
 
@@ -76,7 +78,7 @@ def verdict_sentences(it: Verdict, scale: float, unit: str) -> list[str]:
     chosen.setdefault(it.best.observer, it.best)
     named = [place for place in it.places if place.observer in ALWAYS and place.observer not in chosen]
     harmful = {harm.observer for harm in it.harms}
-    equal = [name for name in it.ties if name not in chosen]
+    equal = [_label(place) for place in it.places[1:] if place.is_tie and place.observer not in chosen]
     parts = []
     for place in chosen.values():
         notes = [_to_limit(place)] if place is it.best else ["statistically equal to the best"] if place.is_tie else []
@@ -120,7 +122,11 @@ def _heading(place: Contender, lines: int) -> str:
 def _with_size(place: Contender, scale: float, unit: str) -> str:
     """Write an observer and its error with the interval of that."""
     half = 0.5 * (place.interval[1] - place.interval[0]) * scale if place.interval else None
-    return f"{row_label(place.observer)} {_format_number(place.rms * scale, half)} {unit}"
+    return f"{_label(place)} {_format_number(place.rms * scale, half)} {unit}"
+
+
+def _label(place: Contender) -> str:
+    return place.label or row_label(place.observer)
 
 
 def _to_limit(place: Contender) -> str:
@@ -168,14 +174,14 @@ def _reason(it: Verdict, harms: Sequence[Harm], their: str, models: str) -> str:
     return f"; {100.0 * share:.0f} % of {their} error lies {where}" if it.lines else ""
 
 
-def _join_labels(observers: Sequence[str], most: int | None = None) -> str:
+def _join_labels(labels: Sequence[str], most: int) -> str:
     """Labels as a person lists them, the first of more than `most`.
 
-    >>> _join_labels(["kf-lgs", "ridge", "kf-multi"]), _join_labels(["kf-lgs", "ridge", "kf-multi"], 1)
+    >>> _join_labels(["LGS KF", "Ridge", "Multi-peak KF"], 3), _join_labels(["LGS KF", "Ridge", "Multi-peak KF"], 1)
     ('LGS KF, Ridge and Multi-peak KF', 'LGS KF and 2 others')
     """
-    names = [row_label(observer) for observer in observers]
-    if most is not None and len(names) > most + 1:
+    names = list(labels)
+    if len(names) > most + 1:
         names[most:] = [f"{len(names) - most} others"]
     return _join(names)
 

@@ -42,7 +42,7 @@ from wfsobs.app.views.gain_editor import GainEditor, plane
 from wfsobs.app.views.plots import add_line, envelope, envelope_times, new_figure, on_settle, restyle
 from wfsobs.app.views.strip import Cards
 from wfsobs.app.views.table import SMALLEST
-from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label
+from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label, loop_verdict
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import Row as Score
 from wfsobs.evaluation.scores import BOUNDS
@@ -277,6 +277,14 @@ def loop_html(results: LoopResults, display: Display) -> str:
     return f"{table('Controllers', columns, [('', body)])}{limits_note(rows)}{failures}"
 
 
+def loop_verdict_html(results: LoopResults, display: Display) -> str:
+    """Write the controllers with the smallest residual by prior knowledge, and the limit."""
+    found = loop_verdict(results.result, display.mode)
+    scale = per_micrometre(display.unit, results.result.scenario.telescope.diameter)
+    said = " ".join(found.sentences(scale, display.unit_label)) if found else ""
+    return f'<p class="verdict">{escape(said)}</p>' if said else ""
+
+
 def limits_note(rows: Sequence[Score]) -> str:
     """Why some of the rows have no theory and no margins; nothing where no limit of the mirror acts."""
     return f"<p>{NOT_APPLICABLE}: {LIMITED}</p>" if any(r["limited"] for r in rows) else ""
@@ -356,7 +364,7 @@ class ClosedLoopPage(Page):
         self.work = BackgroundTask(store.session, title="Closed loop")
         self._of = object()
         self._rooms = list[pn.viewable.Viewable]()
-        self.note, self.table, self.margins = html(), html(), html()
+        self.note, self.verdict, self.table, self.margins = html(), html(), html(), html()
         self.cards = Cards(kind="controllers", terms={STREHL: TERMS[STREHL]})
         self.cards.on_main, self._main, self._is_chosen = self._show_main, list[str](), False
         self.link = LinkedLines(
@@ -403,7 +411,7 @@ class ClosedLoopPage(Page):
         )
         parts = (self._switch(), figures, box("Controllers", self.table), box("Stability", stability))
         self._rooms = [pn.Column(part, **WIDE) for part in parts]  # a grid by its own style is shown even where it is not visible
-        residual = box("Residual in closed loop", text(INTRO), self.note, self.cards, *self._rooms[:2])
+        residual = box("Residual in closed loop", text(INTRO), self.note, self.verdict, self.cards, *self._rooms[:2])
         return boxes(residual, *self._rooms[2:])
 
     def _switch(self) -> pn.FlexBox:
@@ -474,6 +482,7 @@ class ClosedLoopPage(Page):
             for drawn in (self.trace, self.zoom, self.spectrum):
                 drawn.fit(self.cards.hidden_lines)
             if self.results is not None:
+                self.verdict.object = loop_verdict_html(self.results, self.display)
                 self.table.object = loop_html(self.results, self.display)
                 self.margins.object = margins_html(self.results, self.display)
                 self.cards.items = self._items(self.results)

@@ -1,0 +1,31 @@
+"""The verdict on controllers says what the table of their residuals says."""
+
+from __future__ import annotations
+
+import pytest
+
+from wfsobs import PRESETS, close_loop
+from wfsobs.closed_loop.rows import loop_verdict, rows
+from wfsobs.evaluation.scores import BOUND_BOTH
+
+
+def test_the_verdict_is_the_least_residual_of_each_kind_of_prior_knowledge_and_the_limit() -> None:
+    result = close_loop(PRESETS["paper"]().replace({"run.duration": 3.0}))
+    for mode in ("tip", "tilt"):
+        table = {r["controller"]: r["residual_rms_nm"] for r in rows(result, 1) if r["mode"] == mode}
+        found = loop_verdict(result, mode)
+        assert found is not None
+        ran = {name: left for name, left in table.items() if left is not None and name != "none" and not name.startswith("bound")}
+        # The same samples: rounding.
+        assert [(p.observer, 1e3 * p.rms) for p in found.places] == [
+            (name, pytest.approx(ran[name], rel=1e-9)) for name in sorted(ran, key=lambda name: ran[name])
+        ]
+        peaks = found.best_with("peaks")
+        assert peaks is not None and peaks.observer == min(("lqg-kf-multi", "lqg-multirate-multi"), key=lambda name: ran[name])
+        assert found.best_with("spectra").observer == "integrator" and found.best_with("nothing") is None  # type: ignore[union-attr]
+        limit = found.best.limit
+        assert limit is not None and 1e3 * limit[0] == pytest.approx(table[BOUND_BOTH], rel=1e-9)
+        lead, *others = found.sentences()
+        assert lead.startswith(f"Residual, {mode}. ") and "the theoretical limit using LGS and NGS" in lead
+        for label in ("Integrator", "LQG, LGS KF"):
+            assert label in " ".join([lead, *others])
