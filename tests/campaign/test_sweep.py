@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,9 @@ import wfsobs
 from wfsobs.campaign.sweep import EACH_RUN, EACH_STEP, MOST_CELLS, parse_axis, plan_sweep
 from wfsobs.campaign.sweep_results import SweepResults, run_sweep
 from wfsobs.cli import main
+from wfsobs.evaluation.rows import row_label
 from wfsobs.evaluation.scores import BOUND, Score
+from wfsobs.evaluation.verdict_words import sentence_of_several
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 
@@ -171,3 +174,19 @@ def test_command_line(results: SweepResults, tmp_path: Path) -> None:
     assert best is not None and f"{1e3 * best.rms:.2f}" in done.stdout
     refused = CliRunner().invoke(main, ["sweep", "--over", "run.duration=2:1:2"])
     assert refused.exit_code == 2 and refused.stderr.count("\n") == 1
+
+
+def test_the_verdict_on_a_cell_is_its_winner_and_that_on_all_counts_them(results: SweepResults) -> None:
+    cells = range(len(results.sweep.cells))
+    for target in ("turbulence", "vibration"):
+        verdicts = [it for cell in cells if (it := results.verdict(cell, target, "tip")) is not None]
+        winners = [it for cell in cells if (it := results.winner(cell, target, "tip")) is not None]
+        assert [it.best.observer for it in verdicts] == [it.name for it in winners] and len(verdicts) == len(cells)
+        said = sentence_of_several(verdicts, [1e3] * len(cells), "nm")
+        for kind, heading in (("nothing", "Without prior knowledge"), ("peaks", "With known peak frequencies")):
+            best = [place for it in verdicts if (place := it.best_with(kind))]
+            counts = re.search(rf"{heading}: smallest error of (.*?) of (\d+) scenarios", said)
+            assert (counts is None) == (not best)
+            if counts:
+                assert sum(map(int, re.findall(r" in (\d+)", counts[1]))) == int(counts[2]) == len(best)
+                assert f"{row_label(best[0].observer)} in " in counts[1]
