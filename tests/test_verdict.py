@@ -285,3 +285,53 @@ def test_slow_errors_do_not_feign_a_difference(seconds: float) -> None:
         found += differs(0.8 * shared + 0.6 * one, 0.8 * shared + 0.6 * other)
     # Never more than the level; a test that never says so would be of no use.
     assert 0.005 < found / 400 < LEVEL + 4.0 * np.sqrt(LEVEL * (1.0 - LEVEL) / 400)
+
+
+PAPER = PRESETS["paper"]().replace({"run.duration": 3.0, "run.warm_up": 0.5})
+DOZEN = {
+    "calm": PAPER.replace({"turbulence.wind_speed": 3.0}),
+    "windy": PAPER.replace({"turbulence.wind_speed": 40.0}),
+    "good seeing": PAPER.replace({"turbulence.r0": 0.3}),
+    "bad seeing": PAPER.replace({"turbulence.r0": 0.06}),
+    "fast NGS": PAPER.replace({"sensors.exposure_ratio": 2}),
+    "slow NGS": PAPER.replace({"sensors.exposure_ratio": 20}),
+    "noisy LGS": PAPER.replace({"sensors.lgs_noise": 0.1}),
+    "noisy NGS": PAPER.replace({"sensors.ngs_noise": 0.1}),
+    "no slow error of the LGS": PAPER.replace({"sensors.lgs_low_frequency_rms": 0.0}),
+    "large slow error of the LGS": PAPER.replace({"sensors.lgs_low_frequency_rms": 0.5}),
+    "no peaks": PAPER.replace({"vibration.peaks": []}),
+    "three peaks": PAPER.replace({"vibration.peaks": [peak.to_dict() for peak in PAPER.vibration.peaks][:3]}),
+    "another seed": PAPER.replace({"run.seed": 99}),
+}
+
+
+@pytest.mark.parametrize("name", DOZEN)
+def test_in_a_dozen_scenarios_the_verdict_is_that_of_the_table(name: str) -> None:
+    scenario = DOZEN[name]
+    result = run(scenario, observers=("kf-lgs", "kf-multi", "multirate-multi", "persistence", "ridge", "zero"))
+    for target in ("turbulence", "vibration"):
+        of = {s.observer: s for s in result.scores if (s.target, s.mode) == (target, "tip")}
+        found = verdict(scenario, result.record, result.estimates, result.scores, target, "tip", simulation=scenario)
+        if found is None:  # there is nothing to estimate
+            assert target == "vibration" and not scenario.vibration.peaks
+            continue
+        said = " ".join(found.sentences())
+        rivals = {n: s.rms for n, s in of.items() if can_be_best(n, s.apart) and n != "zero"}
+        for kind, heading in (("nothing", "Without prior knowledge"), ("peaks", "With known peak frequencies")):
+            errors = {n: x for n, x in rivals.items() if prior_knowledge(n) == kind}
+            if not errors:
+                assert heading not in said
+                continue
+            match = re.search(rf"{heading}: (.*?) ([\d.]+)(?: ± [\d.]+)? nm", said)
+            # Three digits; of two that are the same to a thousandth the first in the tables is named.
+            assert match and float(match[2]) == pytest.approx(1e3 * min(errors.values()), rel=6e-3)
+            assert match[1] in {row_label(n) for n, x in errors.items() if x <= 1.001 * min(errors.values())}
+        assert row_label("kf-lgs") in said, "always named"
+        for harm in found.harms:
+            assert of[harm.observer].rms >= of[harm.observer].truth_rms
+        assert ("than assuming no" in said) == any(x >= of["zero"].rms for x in rivals.values())
+        above = found.best.above_limit
+        if above is not None and above != 0.0 and round(100 * above):
+            assert f"{abs(round(100 * above))} % {'above' if above > 0 else 'below'} the theoretical limit" in said
+        elif above == 0.0:
+            assert "at the theoretical limit" in said
