@@ -148,3 +148,32 @@ def test_a_heading_says_what_differs(phone: Page) -> None:
     page.get_by_role("textbox", name="m/s").fill("20")
     page.get_by_role("textbox", name="m/s").press("Enter")
     expect(page.get_by_role("button", name=re.compile("Turbulence · 1 changed"))).to_be_visible()
+
+
+FIRST_FIGURE = """() => {
+  const tops = []
+  const look = (root) => { for (const it of root.querySelectorAll("*")) {
+    const box = it.getBoundingClientRect()
+    if (it.localName === "canvas" && box.height > 100) tops.push(box.top)
+    if (it.shadowRoot) look(it.shadowRoot)
+  } }
+  look(document)
+  return Math.min(...tops)
+}"""
+
+
+@pytest.mark.parametrize(("width", "height", "lowest"), [(1280, 720, 430), (390, 844, 700)], ids=["laptop", "phone"])
+def test_the_first_figure_begins_in_the_first_window(open_page: Any, width: int, height: int, lowest: int) -> None:
+    assert open_page(width, height).evaluate(FIRST_FIGURE) < lowest
+
+
+def test_a_logarithmic_slider_says_its_value(wide: Page) -> None:
+    page = wide
+    slider = page.get_by_role("slider", name=re.compile("Length scale"))
+    expect(slider).to_have_attribute("aria-valuetext", "300")
+    slider.focus()
+    page.keyboard.press("ArrowLeft")  # a hundredth of a decade
+    expect(slider).to_have_attribute("aria-valuetext", "293")
+    expect(page.get_by_role("textbox", name=re.compile("Length scale"))).to_have_value("293")
+    page.get_by_role("button", name="Undo", exact=True).click()
+    expect(slider).to_have_attribute("aria-valuetext", "300")
