@@ -85,6 +85,7 @@ _COMPONENTS = {
     # Above the line of its mark: beside it is the box with the number that is being changed.
     "MuiTooltip": {
         "styleOverrides": {
+            "popper": {"pointerEvents": "none !important"},  # it would keep the pointer from the button that it covers
             "tooltipPlacementRight": {"transform": "translateY(calc(-50% - 12px)) !important"},
             "arrow": {"display": "none"},
         }
