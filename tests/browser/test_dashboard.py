@@ -202,9 +202,9 @@ def test_figures_take_the_height_of_the_window(wide: Page) -> None:
     figure = page.get_by_role("figure", name="Turbulence time trace")
     height = "box => box.getBoundingClientRect().height"
     # What is left of the window below what stands above it, of which a line of text is the caption's.
-    page.wait_for_function(f"([it]) => Math.abs(({height})(it) - 565) < 30", arg=[figure.element_handle()])
+    page.wait_for_function(f"([it]) => Math.abs(({height})(it) - 620) < 30", arg=[figure.element_handle()])
     page.set_viewport_size({"width": 1400, "height": 700})
-    page.wait_for_function(f"([it]) => Math.abs(({height})(it) - 265) < 30", arg=[figure.element_handle()])
+    page.wait_for_function(f"([it]) => Math.abs(({height})(it) - 350) < 30", arg=[figure.element_handle()])
     page.set_viewport_size({"width": 1400, "height": 1000})
 
 

@@ -387,7 +387,7 @@ def line(*parts: Any) -> pn.FlexBox:
 SMALL_LABEL = ".MuiFormControlLabel-label.MuiTypography-root { font-size: 0.8125rem; }"
 """As large as that of the buttons beside it."""
 
-HEIGHT = "clamp(230px, min(100vh - 415px, 60vh), 640px)"
+HEIGHT = "clamp(230px, min(100vh - 330px, 64vh), 640px)"
 """Of a figure: what a window has room for below what stands above the first one."""
 
 TALL: Mapping[str, Any] = MappingProxyType(
