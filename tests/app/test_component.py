@@ -42,6 +42,7 @@ def test_an_event_after_a_change_on_its_way_may_change_figures(caplog: pytest.Lo
                 page.document.add_root(where)
 
         await page.with_document_locked(build)
+        pn_state._on_load(page.document)  # it has been drawn
         pn_state._change_callbacks[page.document] = {"one": change}
         await page.with_document_locked(lambda: setter._server_event(page.document, DataEvent(None, {"start": 3.0})))
         for _ in range(1000):  # as many turns of the loop as the answer takes

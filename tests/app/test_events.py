@@ -68,6 +68,7 @@ def the_marks_are_those_of_the_scenario(dashboard: Dashboard) -> None:
 
 def test_only_what_counts_is_in_the_drawer(make_store: Callable[..., Store]) -> None:
     controls = Controls(make_store())
+    controls.view()  # has what is at hand
     for topic in ("events", "vibration", "turbulence"):
         controls.open_topic(topic)
     table, store = controls.lists["events"].table, controls.store

@@ -163,4 +163,4 @@ def test_a_stream_by_its_address(served: Any) -> None:
 
 def test_what_is_said_of_a_record_needs_one() -> None:
     done = CliRunner().invoke(main, ["live", "--sha256", "ab", "--headless"])
-    assert done.exit_code and "what is said of a record is of that of --replay" in done.output
+    assert done.exit_code and "options of a record need --replay" in done.output

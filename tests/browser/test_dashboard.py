@@ -239,18 +239,19 @@ def test_peaks_are_added_removed_and_edited(open_page: Any) -> None:
     cells = page.locator('[data-cell$=".frequency"]')
     n = len(PRESETS["paper"]().vibration.peaks)
     expect(cells).to_have_count(n)
-    truth = row(page, "kf-lgs", "vibration")[1]
+    before = rms(page, "kf-lgs", "vibration")
     page.get_by_role("button", name="+ Add peak").click()
     expect(cells).to_have_count(n + 1)
     cell = page.locator(f'input[data-cell="{n}.rms.0"]')
     expect(cell).to_have_value("0.01")
     cell.fill("0.05")
     cell.press("Enter")
-    truth_cell = page.locator('tr[data-observer="kf-lgs"][data-target="vibration"] td').nth(1)
-    expect(truth_cell).to_have_text(re.compile(r"^[45]\d\.\d$"))
+    error = page.locator('tr[data-observer="kf-lgs"][data-target="vibration"] td').first
+    expect(error).to_have_text(other_than(before))
+    assert float(rms(page, "kf-lgs", "vibration")) > float(before) + 10.0  # a filter of one peak does not know this one
     page.get_by_role("button", name=f"Remove peak {n + 1}").click()
     expect(cells).to_have_count(n)
-    expect(truth_cell).to_have_text(truth)
+    expect(error).to_have_text(re.compile(rf"^{re.escape(before)}\b|\s{re.escape(before)}$"))
     finished(page)
 
 
@@ -283,15 +284,14 @@ def test_a_double_click_shows_a_line_alone(open_page: Any) -> None:
     few = [name for name in pressed if name != "truth"]  # which has no error
     page.wait_for_function(f"few => few.every((name) => ({VISIBLE})().includes(name))", arg=few)
     few = page.evaluate(VISIBLE)
-    assert set(few) <= set(pressed)
-    expect(vibration_card(page, "Offline GPR")).to_have_attribute("aria-pressed", "false")
+    assert set(few) <= set(pressed) and "gpr-offline" not in few
     for card in page.locator(".card[data-name=kf-lgs]").all():
         card.dblclick()
     page.wait_for_function(f"() => ({VISIBLE})().join() === 'kf-lgs'")
     expect(vibration_card(page, "Online GPR")).to_have_attribute("aria-pressed", "false")
     page.keyboard.press("s")  # the card has the focus
     page.wait_for_function(f"() => ({VISIBLE})().includes('gpr-online')")
-    expect(vibration_card(page, "Offline GPR")).to_have_attribute("aria-pressed", "false")  # those before, not all
+    assert "gpr-offline" not in page.evaluate(VISIBLE)  # those before, not all
     card = vibration_card(page, "LGS KF")
     for pressed in ("false", "true"):  # alone, and those before again
         card.dblclick()

@@ -167,8 +167,8 @@ def test_the_first_figure_begins_in_the_first_window(open_page: Any, width: int,
     assert open_page(width, height).evaluate(FIRST_FIGURE) < lowest
 
 
-def test_a_logarithmic_slider_says_its_value(wide: Page) -> None:
-    page = wide
+def test_a_logarithmic_slider_says_its_value(open_page: Any) -> None:
+    page = open_page()
     slider = page.get_by_role("slider", name=re.compile("Length scale"))
     expect(slider).to_have_attribute("aria-valuetext", "300")
     slider.focus()

@@ -129,7 +129,7 @@ def test_pin_and_compare(open_page: Any) -> None:
     box.fill("30")
     box.press("Enter")
     expect(legend).to_contain_text("Wind speed V₀ 15 → 30 m/s")
-    expect(page.get_by_role("columnheader", name="A [nm]")).to_be_visible()
+    expect(page.get_by_role("columnheader", name="A [nm]", exact=True)).to_be_visible()
     row = page.locator('tr[data-observer="kf-lgs"][data-target="turbulence"] td')
     expect(row.nth(1)).to_have_text(re.compile(r"^(?!\+0\.0 %)[+−]\d.* %\s+\d.*$"))  # nor a dash, of one at work
     value, compared = (text.split() for text in row.all_inner_texts()[:2])
@@ -139,5 +139,5 @@ def test_pin_and_compare(open_page: Any) -> None:
     card = page.get_by_role("button", name=re.compile("^LGS")).first.locator(".compared")
     expect(card).to_have_text(f"A{before}{change} %")
     page.get_by_role("button", name="Unpin: compare with no other run").click()
-    expect(page.get_by_role("columnheader", name="A [nm]")).to_have_count(0)
+    expect(page.get_by_role("columnheader", name="A [nm]", exact=True)).to_have_count(0)
     page.wait_for_function(f"({PINNED})().every(n => n === 0)")

@@ -262,7 +262,9 @@ def test_the_lists_of_other_pages_open_by_keyboard(open_page: Any) -> None:
     until(page, "File")
     until(page, "Vibration", most=30)
     press(page, "Enter")
-    until(page, "peaks")  # where the vibration comes from
+    source = page.get_by_role("combobox", name="Source").first  # where the vibration comes from
+    source.focus()
+    expect(source).to_be_focused()
     press(page, "Enter")
     assert chosen(page)["name"] == "peaks"
     press(page, "Escape")
