@@ -139,7 +139,7 @@ BELOW = """([upper, lower]) => {
 @pytest.mark.parametrize("width", [1400, 390], ids=["wide", "phone"])
 def test_boxes_that_are_higher_than_the_window_do_not_overlap(open_page: Any, server: Any, width: int) -> None:
     page = open_page(width, 600, url=server.url + QUICK)
-    for upper, lower in (("Turbulence spectrum", "Vibration"), ("Vibration spectrum", "RMS errors")):
+    for upper, lower in (("Turbulence spectrum", "Vibration, tip"), ("Vibration spectrum", "RMS errors")):
         page.wait_for_function(BELOW, arg=[upper, lower])
     page.get_by_role("button", name="Closed loop", exact=True).click()
     for upper, lower in (("Residual, zoomed", "Controllers"), ("Rejection and noise transfer", "Controllers")):
