@@ -183,12 +183,12 @@ def test_a_cut_line_comes_back_to_the_same_session(page: Page, cable: Cable) -> 
     peak(page).fill("6.5")
     peak(page).press("Enter")
     page.get_by_role("button", name="+ Add peak").click()
-    peaks = page.locator('input[data-cell$=".frequency"]').count()
+    peaks = page.locator('[data-cell$=".frequency"]').count()
     cable.mend()
     connected_again(page)
     page.wait_for_function("() => location.search.includes('turbulence.wind_speed=22')")
     page.wait_for_function("() => location.search.includes('vibration.peaks=6.5,')")
-    expect(page.locator('input[data-cell$=".frequency"]')).to_have_count(peaks + 1)
+    expect(page.locator('[data-cell$=".frequency"]')).to_have_count(peaks + 1)
     expect(page.get_by_role("status").filter(has_text="Compared with")).to_contain_text(
         "Wind speed V₀ 15 → 22 m/s"
     )  # the same session: its pinned run is there
@@ -197,7 +197,7 @@ def test_a_cut_line_comes_back_to_the_same_session(page: Page, cable: Cable) -> 
 
 def test_what_is_changed_while_the_line_comes_back_counts_once(page: Page, cable: Cable) -> None:
     expect(peak(page)).to_be_visible()  # the table of peaks follows the page
-    peaks = page.locator('input[data-cell$=".frequency"]').count()
+    peaks = page.locator('[data-cell$=".frequency"]').count()
     cable.cut()
     expect(banner(page, "connection to the server is lost")).to_be_visible()
     cable.mend(quick=False)
@@ -210,7 +210,7 @@ def test_what_is_changed_while_the_line_comes_back_counts_once(page: Page, cable
     cable.quick.set()
     connected_again(page)
     page.wait_for_function("() => location.search.includes('vibration.peaks=6.5,0.02,')")
-    expect(page.locator('input[data-cell$=".frequency"]')).to_have_count(peaks + 1)
+    expect(page.locator('[data-cell$=".frequency"]')).to_have_count(peaks + 1)
     expect(damping).to_have_value("0.02")
     done(page)
 
