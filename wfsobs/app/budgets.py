@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import param
 
@@ -36,7 +36,7 @@ class Budgets(param.Parameterized):
     seeds : which change the main ones
     """
 
-    by_observer: Mapping[str, Sequence[Budget]] = param.Dict({}, doc="Observer -> its budgets, as far as they are known.")  # type: ignore[assignment]
+    by_observer = param.Dict({}, doc="Observer -> its budgets (a sequence of Budget), as far as they are known.")
     every = param.Boolean(False, doc="Whether observers that are not linear have theirs too, though they are not main ones.")
 
     def __init__(self, store: Store, main: Callable[[str], Collection[str]], seeds: SeedRuns | None = None):

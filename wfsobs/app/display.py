@@ -100,7 +100,7 @@ class Display(param.Parameterized):
     spectrum = param.Selector(default=PSD, objects=[PSD, CUMULATIVE], label="Spectrum")
     window_spectra = param.Boolean(False, label="Spectra of the window", doc="Spectra of the stretch of time in view alone.")
     editing = param.Boolean(False, label="Edit on the figure", doc="Handles on the spectra, and what theory predicts.")
-    compared_runs: list[ComparedRun] = param.List([], item_type=ComparedRun, doc="The runs to compare with, by their letters.")  # type: ignore
+    compared_runs = param.List([], item_type=ComparedRun, doc="The runs to compare with, by their letters.")
 
     @property
     def column(self) -> int:

@@ -52,7 +52,7 @@ AFTER_DRAWING = 1
 class History(param.Parameterized):
     """The entries, newest first, in step with the store; and the runs of the display that are compared."""
 
-    entries: list[HistoryEntry] = param.List([], doc="Every result, newest first.")  # type: ignore
+    entries = param.List([], item_type=HistoryEntry, doc="Every result, newest first.")
     current = param.String("", doc="Key of the entry shown.")
     note = param.String("", doc="What was done or refused, in one line.")
     can_undelete = param.Boolean(False, doc="Whether an entry was deleted that can come back.")

@@ -13,7 +13,7 @@ from wfsobs.settings.errors import SettingError
 from wfsobs.telemetry.records import save_arrays
 from wfsobs_arena.definition import Arena, add_records, load_arena
 from wfsobs_arena.entries import find_entries
-from wfsobs_arena.results import need_jinja, tables, write_results
+from wfsobs_arena.results import tables, write_results
 from wfsobs_arena.run import run_arena
 from wfsobs_arena.tracks import TRACKS
 
@@ -65,7 +65,6 @@ def run(
     out: str, entries: tuple[str, ...], files: tuple[str, ...], tracks: tuple[str, ...], seeds: int | None, quick: bool
 ) -> None:
     """Run what is missing, and write results.json and index.html."""
-    need_jinja()
     found = add_records(load_arena(seeds=seeds, quick=quick), [Path(file) for file in files])
     found = _select_tracks(found, tracks)
     folder = Path(out)

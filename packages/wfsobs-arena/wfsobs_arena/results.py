@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
-from importlib.util import find_spec
 from math import pi, sqrt
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from wfsobs import __version__
 from wfsobs.campaign.keys import PHYSICS_VERSION
@@ -19,7 +19,6 @@ from wfsobs.observers.base import Observer
 from wfsobs.prior import IDENTIFIED, TRUE
 from wfsobs.priors_from.controllers import own_settings
 from wfsobs.scenario import Scenario
-from wfsobs.settings.errors import SettingError
 from wfsobs_arena.cases import Case
 from wfsobs_arena.challengers import CHALLENGERS
 from wfsobs_arena.definition import Arena
@@ -131,16 +130,8 @@ def source_of(entry_id: str) -> str:
     return CHALLENGERS[entry_id].source if entry_id in CHALLENGERS else ""
 
 
-def need_jinja() -> None:
-    """Raise SettingError where Jinja2 is not installed."""
-    if find_spec("jinja2") is None:
-        raise SettingError('the page of the arena needs Jinja2: pip install "wfsobs[campaign]"')
-
-
 def write_results(values: Table, folder: Path) -> None:
     """Write results.json and index.html. Raises OSError."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
     text = json.dumps(values, indent=1) + "\n"
     write_whole(folder / "results.json", lambda file: file.write(text.encode()))
     environment = Environment(
