@@ -1,4 +1,4 @@
-"""Computations of the server: a job for all who want it, the line before the processors, and what a session shows of one."""
+"""Computations of the server: jobs that sessions share, their queue, and the state of a job in a session."""
 
 from __future__ import annotations
 
@@ -30,27 +30,27 @@ log = logging.getLogger(__name__)
 RUNNING, DONE, CANCELLED, FAILED = "running", "done", "cancelled", "failed"
 
 CLICK, BATCH, IDLE_TIME = 0, 1, 2
-"""Priorities: somebody waits for the answer to a click; a search or a long run takes its time anyway; what nobody has asked for
-is done while there is nothing else, and begins again after all else."""
+"""Priorities: answers to clicks; searches and long runs; computations without a request, which run while the queue is empty and
+start again after all other jobs."""
 
 LONG = 5.0
-"""A job that takes longer is no click [s]."""
+"""Maximum cost of a job with the priority of a click [s]."""
 
 INTERVAL = 0.15
-"""Least time between two reports of progress [s]."""
+"""Minimum time between two reports of progress [s]."""
 
 Tell = Callable[..., None]
-"""Told by the work, by keyword: `latest`, how far it is, or `result`, what there is of the result."""
+"""Reports of the work, by keyword: `latest`, its progress, or `result`, the result so far."""
 
 Work = Callable[[Watch, Tell], Any]
-"""What is to be done -> its result."""
+"""(watch, tell) -> result."""
 
 Listener = Callable[[Mapping[str, Any]], None]
-"""Told what has changed, from any thread: state, place, progress, latest, result, message. Must not wait."""
+"""Receives changes of state, place, progress, latest, result and message, from any thread. Must not block."""
 
 
 class Job:
-    """One computation for all who listen to it; it goes on as long as somebody does.
+    """A computation, shared by its listeners; it stops when the last of them leaves.
 
     kind       : what it is called in the log
     key        : names its result, where sessions may share it
@@ -92,12 +92,12 @@ class Job:
 
     @property
     def owner(self) -> Hashable:
-        """Who has listened longest."""
+        """Owner of the oldest listener."""
         with self._lock:
             return next(iter(self._listeners.values()), None)
 
     def join(self, owner: Hashable, listener: Listener) -> bool:
-        """One more who wants the result, told at once what is known; false where the job has been given up."""
+        """Add a listener, which receives the present state at once; return False where the job has been cancelled."""
         with self._lock:
             if self._is_unwanted:
                 return False
@@ -107,21 +107,21 @@ class Job:
             return True
 
     def leave(self, listener: Listener) -> bool:
-        """One less; whether nobody is left, and the job told to stop."""
+        """Remove a listener; return whether it was the last one, so that the job stops."""
         with self._lock:
             self._listeners.pop(listener, None)
             self._is_unwanted = not self._listeners
             return self._is_unwanted
 
     def tell(self, **news: Any) -> None:
-        """Tell all who listen."""
+        """Notify all listeners."""
         with self._lock:
             self._state |= news
             for listener in [*self._listeners]:
                 listener(news)
 
     def tell_place(self, place: int) -> None:
-        """Its place in the line may have changed."""
+        """Notify the listeners of the place in the queue, if it has changed."""
         if self._state.get("place", 0) != place:
             self.tell(place=place)
 
@@ -217,30 +217,30 @@ class BackgroundTask(param.Parameterized):
         self._leave: Callable[[], None] = _nothing
 
     def start(self, job: Job) -> None:
-        """Have a job done, in place of the one before."""
+        """Start a job; it supersedes the one before."""
         generation = self._supersede()
         self.param.update(state=RUNNING, progress=0.0, place=0, message="", latest=None)
         self._leave = self.session.submit(job, partial(self._hear, generation), self._leave)
 
     def cancel(self) -> None:
-        """Stop, or leave the line; what has been delivered stays."""
+        """Stop, or leave the queue; results so far are kept."""
         if self.state == RUNNING:
             self.close()
             self.param.update(state=CANCELLED)
 
     def refuse(self, why: str) -> None:
-        """Say in one line why it is not even begun."""
+        """Fail with a reason in one line, without a job."""
         self.close()
         self.param.update(state=FAILED, message=why)
 
     def close(self) -> None:
-        """Hear no more of it."""
+        """Leave the job; later news of it is ignored."""
         self._supersede()
         before, self._leave = self._leave, _nothing
         before()
 
     def line(self, doing: str = "Running") -> str:
-        """How it is going, while it is."""
+        """Return place in the queue or progress in one line."""
         return f"Waiting: position {self.place}" if self.place else f"{doing}, {int(100 * self.progress)} %"
 
     def _announce(self, *_: object) -> None:
@@ -255,7 +255,7 @@ class BackgroundTask(param.Parameterized):
             return self._generation
 
     def _hear(self, generation: int, news: Mapping[str, Any]) -> None:
-        """In any thread."""
+        """Receive news of the job; from any thread."""
         with self._lock:
             if generation != self._generation:
                 return
@@ -282,7 +282,7 @@ def _nothing() -> None:
 
 
 PATIENCE = 60.0
-"""A sweep that has waited longer goes like a click [s], so that its turn comes."""
+"""Waiting time after which a sweep has the priority of a click [s]."""
 
 REST = 1.0
 """Time left to the page and the browser before a job for idle time [s]."""
@@ -381,18 +381,18 @@ class JobQueue:
 
     @property
     def length(self) -> int:
-        """How many wait."""
+        """Number of waiting jobs."""
         with self._change:
             return len(self._waiting)
 
     @property
     def running(self) -> int:
-        """How many are being done."""
+        """Number of running jobs."""
         with self._change:
             return len(self._running)
 
     def close(self, timeout: float) -> bool:
-        """Start nothing any more, and wait [s] for what is being done; whether all of that has ended."""
+        """Start no further job, and wait [s] for the running ones; return whether all have ended."""
         with self._change:
             self.closing = True
             for job in [*self._waiting]:
@@ -425,7 +425,7 @@ class JobQueue:
                 release_memory()
 
     def _next(self) -> Job | None:
-        """Take the first job of the line; None when there will be no more."""
+        """Take the first job of the queue; None after `close`."""
         with self._change:
             while not self.closing:
                 job, rest = next(filter(self._has_room, self._line()), None), 0.0
@@ -444,7 +444,7 @@ class JobQueue:
             return None
 
     def _line(self) -> list[Job]:
-        """Who waits, in the order of their turns."""
+        """Return the waiting jobs, in the order of their turns."""
         late = monotonic() - PATIENCE
 
         def place(job: Job) -> tuple[int, int]:
@@ -462,7 +462,7 @@ class JobQueue:
         return [job for job in (*self._running, *self._waiting) if job.priority != IDLE_TIME]
 
     def is_busy(self) -> bool:
-        """Whether somebody waits for a job."""
+        """Whether a requested job waits."""
         return bool(self._requests)
 
     def _tell_places(self) -> None:

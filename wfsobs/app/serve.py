@@ -128,7 +128,7 @@ class Poster:
                 self._loop.call_soon_threadsafe(self._schedule, function)
 
     def deliver(self) -> None:
-        """Run what has been posted so far, before anybody is told of the page: results that are known go with it."""
+        """Run what has been posted so far, before the page is sent: known results are part of it."""
         with self._lock:
             if not self._waiting:
                 return
@@ -166,20 +166,20 @@ def error_page(error: Exception) -> pn.Column:
 
 
 QUIET = 2.0
-"""How long nobody must have wanted anything before a page is made [s]: it keeps the thread of all pages for half a second."""
+"""Idle time of the server before a page is made in advance [s]: making one blocks all pages for half a second."""
 
 EVERY = 0.5
 """How often to look whether a page can be made [s]."""
 
 FRESH = 86_400.0
-"""A page that has waited longer is made anew [s]: its token expires."""
+"""Maximum age of a page made in advance [s]: its token expires."""
 
 NEXT: ContextVar[Session | None] = ContextVar("NEXT", default=None)
 """The session whose page is being made before its visitor comes."""
 
 
 class NextPage(Handler):
-    """The page of the next visitor who asks for the address alone; made while the server has nothing else to do.
+    """The page of the next visitor of the address without a query, made while the server is idle.
 
     A handler of the application, which the server tells of the context that makes its sessions.
     """
@@ -203,7 +203,7 @@ class NextPage(Handler):
         self._looks.start()
 
     async def look(self) -> None:
-        """Make a page if there is none, and nobody wants anything."""
+        """Make a page if there is none and the server is idle."""
         if self._page and monotonic() - self._page[2] > FRESH:
             self._let_go()
         if self._page is None and not self.service.full and self.service.quiet_seconds > QUIET:
@@ -217,7 +217,7 @@ class NextPage(Handler):
         return self._let_go()
 
     def _let_go(self) -> ServerSession:
-        """Hold the page no more; it ends as all pages do if nobody connects to it."""
+        """Release the page; without a connection it expires as all pages do."""
         assert self._page is not None
         session = self._page[1]
         self._page = None
@@ -241,13 +241,13 @@ class NextPage(Handler):
 
 
 class PageHandler(DocHandler):
-    """The page: turns visitors away who are too many, and takes no session's name and no endless query from an address."""
+    """The page: refuses visitors beyond the limit, session names in addresses, and queries that are too long."""
 
     service: Service
     next_page: NextPage
 
     async def get_session(self) -> ServerSession:
-        """Return the page that is ready where the address asks for nothing else, or make one."""
+        """Return the page made in advance, if the address has no query, or make one."""
         self.service.note_wish()
         page = None if self.request.arguments else self.next_page.take()
         if page is not None:
@@ -303,7 +303,7 @@ class Liveness(RequestHandler):
 
 
 def full_html(line: str) -> str:
-    """Write the page for a visitor for whom there is no room."""
+    """Return the page for visitors beyond the limit."""
     return f"<!doctype html><title>wfsobs</title><h1>wfsobs is full</h1><p>{escape(line)}</p>"
 
 
@@ -374,7 +374,7 @@ PAINTS = -5
 
 
 def serve(options: Options, live: LiveOrder | None = None) -> None:
-    """Serve the dashboard at http://address:port/prefix until told to stop by SIGINT or SIGTERM. Raises OSError, SettingError.
+    """Serve the dashboard at http://address:port/prefix until SIGINT or SIGTERM. Raises OSError, SettingError.
 
     live : a loop that runs until then, and that every page opens with; where it cannot go on the server ends with exit status 2
     """
