@@ -206,7 +206,7 @@ class TestNamesAndGrey:
         dashboard.store.change("turbulence.wind_speed", 25.0)
         loop.finish(dashboard.store)
         html = dashboard.controls.fields["turbulence.wind_speed"].view[-1].object
-        target, old, new = re.fullmatch(r"(\w+), .*: ([\d.]+) → ([\d.]+) nm", html).groups()
+        target, old, new = re.fullmatch(r"(\w+), .*: ([\d.]+) → ([\d.]+) nm on this record", html).groups()
         after = dashboard.store.run.result.result.scores
         pairs = {
             (number(1e3 * a.rms), number(1e3 * b.rms))

@@ -45,9 +45,9 @@ def main_observers(scores: Iterable[Score], target: str, mode: str, evidence: Ev
 
 
 def effect_line(display: Display, before: RunResults, now: RunResults) -> str:
-    """Write how the error of the best observer without prior knowledge has changed, of the target where it did most.
+    """Write the change of the record's error of the best observer without prior knowledge, for the target with the largest.
 
-    Nothing where it did not, or there is no such error of either run.
+    Empty where it did not change, or where either run has no such error.
     """
     found: list[tuple[float, str]] = []
     scale = per_micrometre(display.unit, now.scenario.telescope.diameter)
@@ -65,7 +65,8 @@ def effect_line(display: Display, before: RunResults, now: RunResults) -> str:
         best = next((name for name in rank_observers(new) if name in old and name in observers_of(target)), None)
         if best is not None and new[best] != old[best]:
             errors = f"{number(scale * old[best])} → {number(scale * new[best])} {display.unit_label}"
-            found.append((abs(np.log(new[best] / old[best])), f"{target.capitalize()}, {look(best).label}: {errors}"))
+            line = f"{target.capitalize()}, {look(best).label}: {errors} on this record"
+            found.append((abs(np.log(new[best] / old[best])), line))
     return max(found)[1] if found else ""
 
 
