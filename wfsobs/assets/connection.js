@@ -150,7 +150,10 @@ class Link {
 
   // The document as the server has it: Bokeh 3.9 would leave out the buffers that came with it, which hold its arrays.
   replace(json) {
-    if (!JSON.stringify(json).includes(this.session)) return this.end()
+    if (!JSON.stringify(json).includes(this.session)) {
+      this.end()
+      throw new Error("another session")  // so that Bokeh does not take it for connected
+    }
     const {doc} = this
     finishTyping()
     doc.constructor.from_json(json, [], this.buffers).destructively_move(doc)
