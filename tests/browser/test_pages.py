@@ -137,7 +137,7 @@ def test_pin_and_compare(open_page: Any) -> None:
     assert pinned == before
     assert abs(float(change.replace("−", "-")) - 100 * (float(value[-1]) / float(pinned) - 1)) < 1
     card = page.get_by_role("button", name=re.compile("^LGS")).first.locator(".compared")
-    expect(card).to_have_text(f"A{before}{change} %")
+    expect(card).to_have_text(f"{before} {change} %")
     page.get_by_role("button", name="Unpin: compare with no other run").click()
     expect(page.get_by_role("columnheader", name="A [nm]", exact=True)).to_have_count(0)
     page.wait_for_function(f"({PINNED})().every(n => n === 0)")
