@@ -69,7 +69,7 @@ def test_what_is_being_typed_stays_when_what_was_typed_before_is_taken(open_page
 
 
 def test_the_error_budgets_stand_beside_the_verdict(open_page: Any, server: Any) -> None:
-    page: Page = open_page(url=server.url + QUICK)
+    page: Page = open_page(url=server.url + QUICK, seeds=2)
     strip = page.locator(".strip").nth(1)
     bars = strip.locator(".bar[role=img]").filter(visible=True)
     expect(bars.first).to_have_attribute("aria-label", re.compile(r"^Noise \d+ %, Lag \d+ %, Unmodelled peaks \d+ %"))

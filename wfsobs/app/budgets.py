@@ -33,7 +33,7 @@ class Budgets(param.Parameterized):
     """The budgets of linear observers and of the main ones; of all others too once they are asked for.
 
     main  : returns the main observers of a target
-    seeds : which change the main ones
+    seeds : which change the main ones; where one record is enough, nothing else runs in idle time
     """
 
     by_observer = param.Dict({}, doc="Observer -> its budgets (a sequence of Budget), as far as they are known.")
@@ -41,7 +41,7 @@ class Budgets(param.Parameterized):
 
     def __init__(self, store: Store, main: Callable[[str], Collection[str]], seeds: SeedRuns | None = None):
         super().__init__()
-        self.store, self.run, self.main = store, store.run, main
+        self.store, self.run, self.main, self.seeds = store, store.run, main, seeds
         self.task = BackgroundTask(store.session)
         self._of: RunResults | None = None
         self._budgets: ByObserver = {}
@@ -49,7 +49,7 @@ class Budgets(param.Parameterized):
         self.run.param.watch(self._follow, ["state", "result"])
         self.param.watch(self._follow, "every")
         if seeds is not None:
-            seeds.param.watch(self._follow, "evidence")
+            seeds.param.watch(self._follow, ["evidence", "count"])
         self.task.param.watch(self._take, ["latest", "state"])
 
     def budget(self, observer: str, target: str, mode: str) -> Budget | None:
@@ -81,7 +81,8 @@ class Budgets(param.Parameterized):
     def _order(self, results: RunResults) -> list[str]:
         """List the observers that are to have a budget, the main ones and the quick ones first."""
         ran, each = {e.observer for e in results.result.estimates}, part_seconds(results.scenario)
-        main = {name for target in TARGETS for name in self.main(target)}
+        is_one_record = self.seeds is not None and self.seeds.count == 1
+        main = set() if is_one_record else {name for target in TARGETS for name in self.main(target)}
         seconds = {o.id: 0.0 if o.linear else RUNS * each.get(o.id, LIGHT) for o in OBSERVERS.values() if o.id in ran}
         most = min(PATIENCE, self.store.limits.seconds)
         wanted = [name for name, of in seconds.items() if of == 0.0 or (of <= most and (self.every or name in main))]
