@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Locator, Page, expect
 
-from tests.browser.conftest import DONE, SETTINGS, finished
+from tests.browser.conftest import DONE, SETTINGS, eventually, finished
 
 
 def test_a_loop_that_is_changed_while_it_runs(open_page: Any, server: Any) -> None:
@@ -186,9 +186,10 @@ def test_errors_of_both_targets_together(running: Page) -> None:
 
     # five seconds behind the start, at which filters settle; the table is of the second before at most
     expect(page.get_by_text(re.compile(r"real time · (8|9|\d\d+)\.\d s ·"))).to_be_visible()
-    bounds, filters = known("Theoretical limit, LGS and NGS"), [known(name) for name in ("Multi-peak", "Multi-rate multi-peak")]
-    # of the bound of endless records, which both are near to; five seconds scatter by a few per cent
-    assert all(0.8 * bounds < rms < 1.3 * bounds for rms in filters)
+    bound = known("Theoretical limit, LGS and NGS")
+    for name in ("Multi-peak", "Multi-rate multi-peak"):
+        # Near the bound of endless records: five seconds scatter by a few per cent, more where a busy machine starts slowly.
+        eventually(page, lambda name=name: 0.8 * bound < known(name) < 1.3 * bound)
     expect(of("Online GPR")).to_have_text("–")
     page.get_by_role("combobox", name="Errors of").click()
     page.get_by_role("option", name="Turbulence", exact=True).click()
