@@ -18,6 +18,15 @@ QUICK = (
 )
 
 
+def hang_up(end: socket.socket) -> None:
+    """Close the connection at once: `close` would wait for the thread that reads from it."""
+    try:
+        end.shutdown(socket.SHUT_RDWR)
+    except OSError:
+        pass
+    end.close()
+
+
 class Cable:
     """What lies between browser and server, and can be cut."""
 
@@ -57,16 +66,13 @@ class Cable:
         except OSError:
             pass
         for end in (one, other):
-            end.close()
+            hang_up(end)
 
     def cut(self) -> None:
         with self.lock:
             self.whole = False
             for end in self.ends:
-                try:
-                    end.shutdown(socket.SHUT_RDWR)
-                except OSError:
-                    continue
+                hang_up(end)
             self.ends = []
 
     def mend(self, quick: bool = True) -> None:
