@@ -58,6 +58,12 @@ function settingOf(model) {
   return of?.tags.find((tag) => tag.startsWith?.(TAG))?.slice(TAG.length)
 }
 
+// Whether the settings are drawn: a line below one that comes while it is being drawn is not seen.
+function areSettingsDrawn() {
+  const fields = [...Bokeh.index.query((it) => it.model.tags?.some((tag) => tag.startsWith?.(TAG)))]
+  return fields.length > 0 && fields.every((it) => it.has_finished())
+}
+
 class Link {
   constructor(doc) {
     Object.assign(this, {doc, state: "connected", asked: 0, unsent: [], kept: new Set(), away: false, socket: null, connection: null, refused: 0, wait: 0, ticks: 0})
@@ -215,7 +221,7 @@ class Link {
   // Once the page is drawn for the first time: what the server changes before then is not seen.
   deliver() {
     this.ready ||= this.doc.is_idle
-    if (!this.ready || !this.due) return
+    if (!this.ready || !this.due || !areSettingsDrawn()) return
     this.due = false
     this.unsent = this.unsent.filter((it) => it.number > this.model.last_arrival)
     this.send(this.unsent.filter((it) => this.kept.has(it)))
