@@ -10,7 +10,7 @@ import pytest
 
 from wfsobs.app.compared import differences, name_of_difference, thin_lines
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.render import change, number
+from wfsobs.app.render import change, hundredths, number
 from wfsobs.app.style import observers_of
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.known_lines import group_by_knowledge
@@ -165,7 +165,7 @@ class TestTable:
 
     def test_real_time_factor(self, dashboard: Dashboard) -> None:
         score = next(s for s in dashboard.store.run.result.result.scores if s.observer == "gpr-online" and s.mode == "tip")
-        shown = f"<td>{number(1e6 * score.seconds_per_step)}</td><td>{number(1e3 * score.seconds_per_step, 2)}</td>"
+        shown = f"<td>{hundredths(1e6 * score.seconds_per_step)}</td><td>{hundredths(1e3 * score.seconds_per_step)}</td>"
         assert shown in dashboard.explore.table.pane.object
 
 

@@ -82,7 +82,7 @@ class Link {
   // What is drawn of the document is there, for the first time or anew.
   attach(model, draw) {
     const again = this.model !== undefined
-    Object.assign(this, {model, draw, session: model.session})
+    Object.assign(this, {model, draw, session: model.session, arrived: model.last_arrival})
     model.on("last_arrival", () => this.answered(model.last_arrival))
     if (!again) this.restore()
     this.connection = null
@@ -120,7 +120,7 @@ class Link {
 
   answered(number) {
     this.ticks = 0
-    this.unsent = this.unsent.filter((it) => it.number > number)
+    if (!this.due) this.unsent = this.unsent.filter((it) => it.number > number)
     this.keep()
     if (["offline", "silent"].includes(this.state)) this.turn("connected")
   }
@@ -223,7 +223,7 @@ class Link {
     this.ready ||= this.doc.is_idle
     if (!this.ready || !this.due || !areSettingsDrawn()) return
     this.due = false
-    this.unsent = this.unsent.filter((it) => it.number > this.model.last_arrival)
+    this.unsent = this.unsent.filter((it) => it.number > this.arrived)
     this.send(this.unsent.filter((it) => this.kept.has(it)))
   }
 
