@@ -9,7 +9,7 @@ import psutil
 import pytest
 from distributed import Client
 
-from tests.campaign.test_run import COMMAND, ENVIRONMENT, SHORT_BATCHES, TINY
+from tests.campaign.test_run import BATCHES, COMMAND, ENVIRONMENT, RUNS, SEEDS, SHORT_BATCHES, TINY
 
 
 class Cluster:
@@ -49,7 +49,7 @@ def cluster(tmp_path):
     made.end()
 
 
-def start_campaign(cluster, tmp_path, seeds=40):
+def start_campaign(cluster, tmp_path, seeds=SEEDS):
     """Start a campaign of batches of two runs; return its process, the plan and its folder."""
     plan, out = tmp_path / "plan.toml", tmp_path / "out"
     plan.write_text(TINY.format(seeds=seeds), encoding="utf-8")
@@ -85,10 +85,10 @@ def test_a_worker_that_dies_changes_nothing(cluster, tmp_path):
     wait_for_batch(running, out)
     worker = max(psutil.Process(nannies[0].pid).children(recursive=True), key=lambda p: p.memory_info().rss)  # not its tracker
     worker.kill()
-    assert running.poll() is None and len(list(out.glob("rows/*.parquet"))) < 40
+    assert running.poll() is None and len(list(out.glob("rows/*.parquet"))) < BATCHES
     _, said = running.communicate(timeout=200)
     assert running.returncode == 0, said
-    assert b"80 of 80 runs are done" in said
+    assert f"{RUNS} of {RUNS} runs are done".encode() in said
     assert is_as_undisturbed(plan, out, tmp_path / "alone")
 
 
@@ -105,7 +105,7 @@ def test_a_scheduler_that_is_started_again_changes_nothing(cluster, tmp_path):
     cluster.start_worker()  # the first one ended with its scheduler
     _, said = running.communicate(timeout=200)
     assert running.returncode == 0, said
-    assert b"80 of 80 runs are done, 80 of them now; workers or their scheduler were lost" in said
+    assert f"{RUNS} of {RUNS} runs are done, {RUNS} of them now; workers or their scheduler were lost".encode() in said
     assert b"Traceback" not in said and b"ERROR" not in said
     assert is_as_undisturbed(plan, out, tmp_path / "alone")
 

@@ -34,6 +34,11 @@ if __name__ == "__main__":
 """
 """The command line with batches of two runs, so that there is something to disturb."""
 
+SEEDS = 16
+RUNS = 2 * SEEDS
+BATCHES = RUNS // 2
+"""Of the short ones."""
+
 COMMAND = [sys.executable, "-m", "wfsobs"]
 ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
 
@@ -41,7 +46,7 @@ ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
 @pytest.fixture(scope="module")
 def plan(tmp_path_factory):
     path = tmp_path_factory.mktemp("plan") / "tiny.toml"
-    path.write_text(TINY.format(seeds=40), encoding="utf-8")
+    path.write_text(TINY.format(seeds=SEEDS), encoding="utf-8")
     return path
 
 
@@ -56,7 +61,7 @@ def campaign(*arguments, check=True):
 @pytest.fixture(scope="module")
 def undisturbed(plan, tmp_path_factory):
     out = tmp_path_factory.mktemp("undisturbed")
-    assert "80 of 80 runs are done, 80 of them now" in campaign("run", plan, "--out", out, "--workers", 2).stderr
+    assert f"{RUNS} of {RUNS} runs are done, {RUNS} of them now" in campaign("run", plan, "--out", out, "--workers", 2).stderr
     return out
 
 
@@ -73,7 +78,7 @@ def test_rows_are_those_of_a_run_of_the_library(undisturbed):
 
 
 def test_what_is_done_is_not_done_again(plan, undisturbed):
-    assert "80 of 80 runs are done, 0 of them now" in campaign("run", plan, "--out", undisturbed).stderr
+    assert f"{RUNS} of {RUNS} runs are done, 0 of them now" in campaign("run", plan, "--out", undisturbed).stderr
 
 
 def test_shares_make_up_the_whole(plan, undisturbed, tmp_path):
@@ -101,7 +106,7 @@ def test_killed_workers_and_a_killed_campaign_change_nothing(plan, undisturbed, 
     process.communicate()
     _, alive = psutil.wait_procs(workers, timeout=60)
     assert not alive, "workers do not outlive the campaign"
-    assert 0 < len(list(tmp_path.glob("rows/*.parquet"))) < 40
+    assert 0 < len(list(tmp_path.glob("rows/*.parquet"))) < BATCHES
     for victim in (0, 1):
         process, workers = start_short(plan, tmp_path)
         workers[victim].kill()
@@ -109,7 +114,7 @@ def test_killed_workers_and_a_killed_campaign_change_nothing(plan, undisturbed, 
             time.sleep(0.2)
             process.kill()
         _, said = process.communicate(timeout=200)
-    assert process.returncode == 0 and b"80 of 80 runs are done" in said and b"workers or their scheduler were lost" in said
+    assert process.returncode == 0 and f"{RUNS} of {RUNS} runs are done".encode() in said and b"workers or their scheduler were lost" in said
     assert campaign("table", tmp_path, "--csv").stdout == campaign("table", undisturbed, "--csv").stdout
 
 
@@ -179,7 +184,7 @@ def test_the_file_for_data_frames_has_the_settings(undisturbed, tmp_path):
     assert wind == {0: 5, 1: 10} and table.num_rows == len(read_results(undisturbed))
 
 
-@pytest.mark.parametrize("size", [20, 80])
+@pytest.mark.parametrize("size", [RUNS // 4, RUNS])
 def test_the_bytes_of_a_plan_are_those_that_are_written(plan, undisturbed, tmp_path, size):
     """The same rows as undisturbed, in files of `size` runs: what a key and a row take scatters with their digits."""
     from wfsobs.campaign.plan import load_plan
@@ -187,17 +192,17 @@ def test_the_bytes_of_a_plan_are_those_that_are_written(plan, undisturbed, tmp_p
 
     rows = read_results(undisturbed, provenance=True).sort_by([("cell", "ascending"), ("seed", "ascending")]).to_pylist()
     (tmp_path / ROWS).mkdir()
-    of_run = len(rows) // 80
-    for start in range(0, 80, size):
+    of_run = len(rows) // RUNS
+    for start in range(0, RUNS, size):
         write_batch(tmp_path, rows[start * of_run : (start + size) * of_run], {})
     files = batch_files(tmp_path)
-    assert len(files) == 80 // size
+    assert len(files) == RUNS // size
     written = sum(path.stat().st_size for path in files)
     assert 0.7 < stored_bytes(load_plan(plan), len(files)) / written < 1.4
 
 
 def test_the_plan_says_how_much_it_is(plan):
     said = campaign("plan", plan).stdout
-    assert "Tiny: 2 scenarios x 40 seeds = 80 runs" in said and "turbulence.wind_speed: 5, 10" in said
-    # in each of 80 runs 2 modes; turbulence, vibration and both of kf-lgs and two bounds, turbulence alone of persistence
-    assert f"{80 * 2 * (3 * 3 + 1)} rows" in said
+    assert f"Tiny: 2 scenarios x {SEEDS} seeds = {RUNS} runs" in said and "turbulence.wind_speed: 5, 10" in said
+    # in each run 2 modes; turbulence, vibration and both of kf-lgs and two bounds, turbulence alone of persistence
+    assert f"{RUNS * 2 * (3 * 3 + 1)} rows" in said
