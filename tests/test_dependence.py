@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from collections import Counter
 from collections.abc import Collection
 from functools import partial
 from typing import Any
@@ -174,19 +175,26 @@ def test_what_is_known_is_what_a_whole_run_gives() -> None:
 
 @pytest.mark.parametrize("preset", ["ut4", "higher-orders"])
 def test_no_setting_of_a_preset_changes_an_estimate_that_is_known(preset: str) -> None:
-    """Of the observers that a change may reach, those that do not run again have what a run of their own gives, bit by bit."""
+    """Of the observers that a change may reach, those that do not run again have what a run of their own gives, bit by bit.
+
+    Of the changes that may reach the same observers, the first two are made.
+    """
     base = PRESETS[preset]().replace({**QUICK, "run.duration": 0.4})
     memo, idle = Memo(), idle_settings(base)
     record = simulate_once(base, memo)
     names = [name for name in usual_observers(base, record) if not OBSERVERS[name].slow]
     kept = list(each_estimate(record, base, observers=names, memo=RecordMemo(memo, record)))
     changes = {path: s for path, s in changes_of(base).items() if record_settings(s) == record_settings(base)}
-    told = 0
+    told, made = 0, Counter[frozenset[str]]()
     for path, changed in changes.items():
         if why_idle_at(path, idle):
             continue  # test_record_priors_and_bounds_stay
-        now, reached = simulate_once(changed, memo), observers_reached(base, changed)
+        reached = observers_reached(base, changed)
         assert reached is not None, path
+        made[frozenset(reached)] += 1
+        if made[frozenset(reached)] > 2:
+            continue
+        now = simulate_once(changed, memo)
         known = RecordMemo(memo, now)
         found = estimates(now, changed, sorted(reached.intersection(names)), known)
         recalled, told = sorted(known.known_observers), told + len(known.known_observers)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wfsobs.evaluation.description import describe
 from wfsobs.progress import Watch
 from wfsobs.scenario.presets import PRESETS
 
@@ -33,5 +32,5 @@ def test_a_call_that_goes_up_is_found_and_one_that_goes_down_is_not(script: Any)
         ((caller, callee, times),) = [j for j in script.jumps(script.traced(watch.check)) if j[0].room == "progress"]
         assert (callee.room, times) == ("scenario", 1)
         assert caller.name == "progress.py:Watch.check" and callee.name.endswith("validate")
-    down = script.traced(lambda: describe(scenario, 0))
+    down = script.traced(scenario.validate)
     assert down and script.jumps(down) == []

@@ -220,6 +220,6 @@ class TestNamesAndGrey:
         dashboard.store.change("sensors.exposure_ratio", 4)
         loop.finish(dashboard.store)
         assert len(dashboard.controls.fields["turbulence.wind_speed"].view) == 1, "of the last change alone"
-        dashboard.store.choose("ut4")
+        dashboard.store.replace({"turbulence.wind_speed": 20.0, "sensors.exposure_ratio": 5})
         loop.finish(dashboard.store)
         assert len(dashboard.controls.fields["sensors.exposure_ratio"].view) == 1, "several settings at once"

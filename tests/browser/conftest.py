@@ -259,6 +259,10 @@ ANSWERED = """() => {
 }"""
 
 
+CHANGED = """() => [...new URLSearchParams(location.search).keys()].some((it) => !it.startsWith("view."))"""
+"""Whether the link has settings."""
+
+
 def answered(page: Page) -> None:
     """Wait until the server has done what the page has told it so far."""
     page.wait_for_function(ANSWERED, polling=50)

@@ -14,15 +14,43 @@ from wfsobs.observers import OBSERVERS
 @pytest.fixture(scope="module")
 def wide(open_shared: Any) -> Page:
     """A page for the tests below, in this order."""
-    return open_shared()
+    return open_shared(1280, 720)
 
 
 @pytest.fixture(scope="module")
 def phone(open_shared: Any) -> Page:
-    """As `wide`, with the drawer open."""
-    page = open_shared(390, 844)
-    page.get_by_role("button", name="Open drawer").click()
-    return page
+    """As `wide`."""
+    return open_shared(390, 844)
+
+
+FIRST_FIGURE = """() => {
+  const tops = []
+  const look = (root) => { for (const it of root.querySelectorAll("*")) {
+    const box = it.getBoundingClientRect()
+    if (it.localName === "canvas" && box.height > 100) tops.push(box.top)
+    if (it.shadowRoot) look(it.shadowRoot)
+  } }
+  look(document)
+  return Math.min(...tops)
+}"""
+
+
+@pytest.mark.parametrize(("name", "lowest"), [("wide", 430), ("phone", 700)])
+def test_the_first_figure_begins_in_the_first_window(request: pytest.FixtureRequest, name: str, lowest: int) -> None:
+    assert request.getfixturevalue(name).evaluate(FIRST_FIGURE) < lowest
+
+
+def test_a_logarithmic_slider_says_its_value(wide: Page) -> None:
+    page = wide
+    slider = page.get_by_role("slider", name=re.compile("Length scale"))
+    expect(slider).to_have_attribute("aria-valuetext", "300")
+    slider.focus()
+    page.keyboard.press("ArrowLeft")  # a hundredth of a decade
+    expect(slider).to_have_attribute("aria-valuetext", "293")
+    expect(page.get_by_role("textbox", name=re.compile("Length scale"))).to_have_value("293")
+    page.get_by_role("button", name="Undo", exact=True).click()
+    expect(slider).to_have_attribute("aria-valuetext", "300")
+    page.set_viewport_size({"width": 1400, "height": 1000})
 
 
 def test_a_setting_is_found_and_gets_the_focus(wide: Page) -> None:
@@ -145,35 +173,7 @@ def test_run_and_status_stay_in_sight(wide: Page) -> None:
 
 def test_a_heading_says_what_differs(phone: Page) -> None:
     page = phone
+    page.get_by_role("button", name="Open drawer").click()
     page.get_by_role("textbox", name="m/s").fill("20")
     page.get_by_role("textbox", name="m/s").press("Enter")
     expect(page.get_by_role("button", name=re.compile("Turbulence · 1 changed"))).to_be_visible()
-
-
-FIRST_FIGURE = """() => {
-  const tops = []
-  const look = (root) => { for (const it of root.querySelectorAll("*")) {
-    const box = it.getBoundingClientRect()
-    if (it.localName === "canvas" && box.height > 100) tops.push(box.top)
-    if (it.shadowRoot) look(it.shadowRoot)
-  } }
-  look(document)
-  return Math.min(...tops)
-}"""
-
-
-@pytest.mark.parametrize(("width", "height", "lowest"), [(1280, 720, 430), (390, 844, 700)], ids=["laptop", "phone"])
-def test_the_first_figure_begins_in_the_first_window(open_page: Any, width: int, height: int, lowest: int) -> None:
-    assert open_page(width, height).evaluate(FIRST_FIGURE) < lowest
-
-
-def test_a_logarithmic_slider_says_its_value(open_page: Any) -> None:
-    page = open_page()
-    slider = page.get_by_role("slider", name=re.compile("Length scale"))
-    expect(slider).to_have_attribute("aria-valuetext", "300")
-    slider.focus()
-    page.keyboard.press("ArrowLeft")  # a hundredth of a decade
-    expect(slider).to_have_attribute("aria-valuetext", "293")
-    expect(page.get_by_role("textbox", name=re.compile("Length scale"))).to_have_value("293")
-    page.get_by_role("button", name="Undo", exact=True).click()
-    expect(slider).to_have_attribute("aria-valuetext", "300")

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Locator, Page, expect
 
-from tests.browser.conftest import answered, finished
+from tests.browser.conftest import CHANGED, answered, finished
 from wfsobs.app.style import asset
 
 STANDS = "47.44 Hz, 7.90 nm rms, damping 0.004"
@@ -40,10 +40,6 @@ def opened(open_shared: Any) -> Page:
     expect(page.get_by_role("slider", name="Peak 15", exact=True)).to_have_count(0)
     page.get_by_role("checkbox", name="Edit on the figure").check()
     return page
-
-
-CHANGED = """() => [...new URLSearchParams(location.search).keys()].some((it) => !it.startsWith("view."))"""
-"""Whether the link has settings."""
 
 
 @pytest.fixture

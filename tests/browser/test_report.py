@@ -9,6 +9,7 @@ import sys
 import time
 import zlib
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib.resources import files
 from itertools import product
 from pathlib import Path
@@ -75,8 +76,8 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture
-def open_report(browser: Browser, report: Path) -> Iterator[Callable[..., Page]]:
+@contextmanager
+def opening(browser: Browser, report: Path) -> Iterator[Callable[..., Page]]:
     """A function that opens the report from disk with the network off; a request or an error on the console fails."""
     faults: list[str] = []
     allowed: list[str] = []
@@ -103,6 +104,37 @@ def open_report(browser: Browser, report: Path) -> Iterator[Callable[..., Page]]
     assert [fault for fault in faults if not any(text in fault for text in allowed)] == []
 
 
+@pytest.fixture
+def open_report(browser: Browser, report: Path) -> Iterator[Callable[..., Page]]:
+    """As `opening`, for the pages of one test."""
+    with opening(browser, report) as open_it:
+        yield open_it
+
+
+@pytest.fixture(scope="module")
+def opened(browser: Browser, report: Path) -> Iterator[Page]:
+    """A report that the tests below share."""
+    with opening(browser, report) as open_it:
+        yield open_it()
+
+
+RESET = """() => {
+  for (const it of document.querySelectorAll("input[type=radio]")) if (it.defaultChecked && !it.checked) it.click()
+  for (const it of document.querySelectorAll("select")) {
+    it.selectedIndex = 0
+    it.dispatchEvent(new Event("change", {bubbles: true}))
+  }
+}"""
+
+
+@pytest.fixture
+def page(opened: Page) -> Iterator[Page]:
+    """That report as it opens."""
+    yield opened
+    opened.evaluate(RESET)
+    slide(opened, *START)
+
+
 def choose(page: Page, name: str) -> None:
     page.get_by_role("radio", name=name, exact=True).check(force=True)
 
@@ -127,8 +159,7 @@ def scenario(speed: float, gain: float) -> wfsobs.Scenario:
     return wfsobs.PRESETS["paper"]().replace({**SETTINGS, "turbulence.wind_speed": speed, "loop.gain": gain})
 
 
-def test_every_state_shows_the_numbers_of_its_run(open_report: Any) -> None:
-    page = open_report()
+def test_every_state_shows_the_numbers_of_its_run(page: Page) -> None:
     diameter = scenario(5, 0.2).telescope.diameter
     for (i, speed), (j, gain) in product(enumerate(SPEEDS), enumerate(GAINS)):
         slide(page, i, j)
@@ -161,8 +192,7 @@ def test_every_state_shows_the_numbers_of_its_run(open_report: Any) -> None:
             assert page.locator("#table .unit").first.text_content() == written
 
 
-def test_lines_follow_the_switches(open_report: Any) -> None:
-    page = open_report()
+def test_lines_follow_the_switches(page: Page) -> None:
     result = wfsobs.run(scenario(SPEEDS[0], GAINS[0]))
     estimate, truth = result.estimate("kf-lgs", "vibration"), result.record.vibration
     assert estimate is not None and truth is not None
@@ -199,8 +229,7 @@ def test_lines_follow_the_switches(open_report: Any) -> None:
     np.testing.assert_allclose(summed["y"], total[at] * mas, rtol=1.2e-3)
 
 
-def test_errors_over_a_setting(open_report: Any) -> None:
-    page = open_report()
+def test_errors_over_a_setting(page: Page) -> None:
     rows = [state["rows"] for state in json.loads(page.locator("#rows").text_content())]
 
     def error(state: int, mode: str) -> float:
@@ -216,12 +245,13 @@ def test_errors_over_a_setting(open_report: Any) -> None:
     drawn = line(page, "sweep-vibration", "kf-lgs")
     assert drawn["x"] == list(GAINS) and drawn["y"] == pytest.approx([error(0, "tilt"), error(1, "tilt")])
     assert drawn["label"] == "rms error, tilt [nm]"
-    page.locator('#cards-vibration [data-name="kf-lgs"]').click()
+    card = page.locator('#cards-vibration [data-name="kf-lgs"]')
+    card.click()
     assert not line(page, "sweep-vibration", "kf-lgs")["visible"]
+    card.click()
 
 
-def test_a_card_hides_its_line(open_report: Any) -> None:
-    page = open_report()
+def test_a_card_hides_its_line(page: Page) -> None:
     card = page.locator('#cards-vibration [data-name="kf-lgs"]')
     canvas = page.locator("#trace-vibration")
     page.mouse.move(0, 0)
@@ -243,8 +273,7 @@ def test_a_card_hides_its_line(open_report: Any) -> None:
     expect(card).to_be_focused()
 
 
-def test_time_windows(open_report: Any) -> None:
-    page = open_report()
+def test_time_windows(page: Page) -> None:
     assert line(page, "trace-turbulence", "truth")["range"] == [0, 2]
     choose(page, "0.5 s")
     assert line(page, "trace-turbulence", "truth")["range"] == line(page, "trace-vibration", "truth")["range"] == [0.75, 1.25]
@@ -261,10 +290,12 @@ def test_time_windows(open_report: Any) -> None:
         f"() => {{ const [a, b] = ({LINE})(['trace-turbulence', 'truth']).range; return 0.4 < a && a < 1 && 1 < b && b < 1.5 }}"
     )
     page.wait_for_function(zoomed)  # a drag zooms both
+    choose(page, "0.5 s")
+    choose(page, "Whole record")
+    assert line(page, "trace-turbulence", "truth")["range"] == [0, 2]
 
 
-def test_by_keyboard(open_report: Any) -> None:
-    page = open_report()
+def test_by_keyboard(page: Page) -> None:
     slider = page.get_by_role("slider", name=re.compile("Wind speed"))
     expect(slider).to_have_attribute("aria-valuetext", str(SPEEDS[START[0]]))
     before = page.evaluate(TABLE)
@@ -318,8 +349,7 @@ def test_accessible_and_no_wider_than_the_window(open_report: Any, width: int, s
     page.wait_for_function(follows, arg=colour[scheme])
 
 
-def test_opens_with_the_verdict_and_the_errors_of_the_main_lines(open_report: Any) -> None:
-    page = open_report()
+def test_opens_with_the_verdict_and_the_errors_of_the_main_lines(page: Page) -> None:
     expect(page.locator(".box h2").first).to_have_text("Verdict")
     best = page.locator("p.verdict").filter(visible=True)
     expect(best).to_have_text([re.compile(r"^Turbulence, tip\. "), re.compile(r"^Vibration, tip\. ")])

@@ -114,7 +114,11 @@ def test_killed_workers_and_a_killed_campaign_change_nothing(plan, undisturbed, 
             time.sleep(0.2)
             process.kill()
         _, said = process.communicate(timeout=200)
-    assert process.returncode == 0 and f"{RUNS} of {RUNS} runs are done".encode() in said and b"workers or their scheduler were lost" in said
+    assert (
+        process.returncode == 0
+        and f"{RUNS} of {RUNS} runs are done".encode() in said
+        and b"workers or their scheduler were lost" in said
+    )
     assert campaign("table", tmp_path, "--csv").stdout == campaign("table", undisturbed, "--csv").stdout
 
 

@@ -79,7 +79,8 @@ function openList(event) {
 function markItems(at, tries = 600) {
   const box = at.closest?.(LIST)
   if (!box || !tries) return
-  const items = [...box.getRootNode().querySelectorAll("ul[role=listbox] > li")]
+  const isOpen = box.getAttribute("aria-expanded") === "true"  // else the list may be one that is fading
+  const items = isOpen ? [...box.getRootNode().querySelectorAll("ul[role=listbox] > li")] : []
   for (const item of items) {
     const chosen = item.textContent === box.textContent
     item.setAttribute("role", "option")
