@@ -83,7 +83,7 @@ container-check:  ## run the steps of the Dockerfile in an empty environment, wi
 	scripts/prove_dockerfile.sh "$(PYTHON)"
 
 bench: $(BENCH)  ## time the observers, and compare them with other libraries
-	$(BIN)/wfsobs bench
+	$(BIN)/python -m benchmarks
 
 docs: $(DOCS)  ## build this documentation in build/site, the tutorials run again (TUTORIALS=shown: as they are)
 	PYTHONPATH=. TUTORIALS=$(TUTORIALS) $(VENV)-docs/bin/properdocs build --strict --quiet --config-file mkdocs.yml

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from benchmarks.libraries import LIBRARIES
 from tests.records import ON_PAPER
-from wfsobs import bench, cli
-from wfsobs.bench import external, textbook
-from wfsobs.bench.measure import OURS, max_error, measure_time, row, with_ratios
-from wfsobs.bench.sizes import Sizes
+from wfsobs import cli
+from wfsobs.bench import tasks, textbook
+from wfsobs.bench.measure import OURS, Row, max_error, measure_time, row, with_ratios
+from wfsobs.bench.tasks import Sizes
+from wfsobs.cli.bench import bench
 from wfsobs.observers.gpr.kernels import SquaredExponential
 from wfsobs.observers.gpr.online import predict_sliding
 from wfsobs.observers.gpr.trained import train
@@ -73,19 +75,19 @@ REQUIRED = {
 
 
 @pytest.fixture(scope="module")
-def printed() -> list[bench.Row]:
+def printed() -> list[Row]:
     """What the command prints, of every variant and library."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bench, "QUICK", TINY)
-        done = CliRunner().invoke(cli.main, ["bench", "--json"])
+        patch.setattr(tasks, "QUICK", TINY)
+        done = CliRunner().invoke(bench, ["--json"], obj=LIBRARIES)
     assert done.exit_code == 0
     return json.loads(done.stdout)
 
 
 @pytest.fixture(scope="module")
-def rows(printed: list[bench.Row]) -> list[bench.Row]:
+def rows(printed: list[Row]) -> list[Row]:
     """Those that need no other library."""
-    return [r for r in printed if r["variant"] not in external.LIBRARIES]
+    return [r for r in printed if r["variant"] not in LIBRARIES]
 
 
 def test_every_task_has_its_variants(rows):
@@ -123,7 +125,7 @@ def test_every_version_computes_the_same(rows):
 def test_stream_percentile_needs_enough_steps(rows):
     assert all(r["p999_us"] is None for r in rows)  # a percentile of 359 steps would be their largest
     longer = Sizes(settings={**TINY.settings, "gpr_online.training_size": 8}, duration=1.1, repeats=1, textbook_steps=3)
-    ours, other = next(t for t in bench.tasks.TASKS if t.run.__name__ == "online_stream").run(longer, ())
+    ours, other = tasks.online_stream(longer)
     assert ours["p999_us"] >= ours["per_step_us"] > ours["ready_us"] > 0
     assert other["p999_us"] is None
 
@@ -190,7 +192,7 @@ def test_timed_is_a_median_of_repeats():
 
 
 def test_libraries_compute_the_same(printed):
-    found = [r for r in printed if r["variant"] in external.LIBRARIES]
+    found = [r for r in printed if r["variant"] in LIBRARIES]
     assert {(r["task"], r["variant"]) for r in found} == {
         ("online-gpr-record", "scikit-learn"),
         ("offline-gpr-train", "scikit-learn"),
@@ -208,8 +210,11 @@ def test_command_prints_rows(printed):
 
 def test_command_prints_a_table(monkeypatch, rows):
     asked = []
-    monkeypatch.setattr(bench, "measure_all", lambda sizes, progress: asked.append(sizes) or rows)
+    monkeypatch.setattr(tasks, "measure_all", lambda sizes, progress: asked.append(sizes) or rows)
     done = CliRunner().invoke(cli.main, ["bench", "--full"])
-    assert done.exit_code == 0 and asked == [bench.FULL]
+    assert done.exit_code == 0 and asked == [tasks.FULL]
+    assert done.stderr == (
+        "wfsobs: bench: without scikit-learn, filterpy and statsmodels; python -m benchmarks, in the repository, has them\n"
+    )
     assert sum(line.startswith("| ") for line in done.stdout.splitlines()) == len(rows) + 1
     assert all(text in done.stdout for text in (*REQUIRED, "us / step", "numpy", "cores"))

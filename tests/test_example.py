@@ -152,8 +152,7 @@ def test_the_dashboard_has_its_settings_its_colour_and_its_report(python: Run) -
 REGISTERED = """
 import sys
 from types import SimpleNamespace
-from wfsobs.bench.sizes import Sizes
-from wfsobs.bench.tasks import each_observer
+from wfsobs.bench.tasks import Sizes, each_observer
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.testing import check_controller, check_observer
@@ -162,7 +161,7 @@ check_observer(OBSERVERS["low-pass"])
 check_controller(CONTROLLERS["fixed-gain"])
 sizes = Sizes({"gpr_online.training_size": 20, "gpr_offline.training_size": 20, "adaptive.window": 0.2, "run.warm_up": 0.1},
               duration=0.5, repeats=1)
-assert [r["size"] for r in each_observer(sizes, ())][-1] == "low-pass, 0.5 s, 2 modes"
+assert [r["size"] for r in each_observer(sizes)][-1] == "low-pass, 0.5 s, 2 modes"
 sys.path.insert(0, SCRIPTS)
 import reference, settings_table
 assert "## Low-pass (`low-pass`)\\n\\nThe slow part of z." in reference.observers()

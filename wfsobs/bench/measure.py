@@ -34,6 +34,8 @@ What does not apply is None.
 OURS = "ours"
 ENOUGH = 0.25
 """Quick work is repeated for about this long [s]."""
+ENOUGH_FOR_P999 = 1000
+"""Steps below which a 99.9th percentile says nothing."""
 
 T = TypeVar("T")
 

@@ -8,16 +8,15 @@ see the same machine. Garbage collection is off while they run, BLAS has one thr
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from time import perf_counter, sleep
 from typing import NamedTuple
 
 import numpy as np
 
-from wfsobs.bench.gpr import ENOUGH_FOR_P999
-from wfsobs.bench.measure import OURS, Row, row
-from wfsobs.bench.sizes import Sizes
+from wfsobs.bench.measure import ENOUGH_FOR_P999
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.record import Record
@@ -32,6 +31,10 @@ WARM = 50
 """Steps before the first that counts."""
 STATES = 84
 """Numbers in the state of the reference step: two modes of 42."""
+SHARE = 0.999
+"""Share of the frames that must be done in time."""
+RATES = (4000, 3000, 2000, 1500, 1000, 800, 500, 250, 100, 50)
+"""Rates [Hz] of which the highest is told that is held."""
 
 Step = Callable[[int], object]
 
@@ -158,26 +161,40 @@ def step_of(name: str, scenario: Scenario, record: Record) -> Step:
     return observe
 
 
-def steps(sizes: Sizes, _libraries: Collection[str]) -> Iterator[Row]:
-    """Time the step of every observer and controller with two modes, beside the reference."""
-    scenario = sizes.scenario(sizes.duration)
-    record = simulate(scenario)
-    for name in (*OBSERVERS, *CONTROLLERS):
-        try:
-            step = step_of(name, scenario, record)
-        except ValueError:
-            continue
-        settle = scenario.gpr_online.depth + scenario.gpr_online.training_size if "gpr" in name else 0
-        for k in range(settle):
-            step(k)
-        n = sizes.step_count
-        alone = [back_to_back(one, n) for one in (step, reference_step())]
-        yield from _rows(f"{name}, 2 modes, back to back", alone)
-        yield from _rows(
-            f"{name}, 2 modes, {RATE:g} Hz", run_paced((step, reference_step()), max(round(sizes.paced_duration * RATE / 2), 1))
-        )
+@dataclass(frozen=True)
+class RealTime:
+    """Timings of one observer or controller at a rate.
+
+    alone     : its steps back to back
+    step      : its steps at the rate
+    reference : the reference step in the same run
+    """
+
+    name: str
+    rate: float
+    alone: Latency
+    step: Latency
+    reference: Latency
+
+    @property
+    def late_share(self) -> float:
+        """Share of the frames that are not done before the next is due."""
+        return float(np.mean(self._completion > 1.0 / self.rate))
+
+    @property
+    def highest_rate(self) -> float:
+        """Highest of `RATES` [Hz] at which at least `SHARE` of these frames would be done before the next is due; 0 for none."""
+        return max((rate for rate in RATES if np.mean(self._completion <= 1.0 / rate) >= SHARE), default=0)
+
+    @property
+    def _completion(self) -> np.ndarray:
+        return self.step.late + self.step.seconds
 
 
-def _rows(size: str, latencies: list[Latency]) -> Iterator[Row]:
-    for variant, one in zip((OURS, "reference"), latencies, strict=True):
-        yield row("step", size, variant, float(one.seconds.sum()), len(one.seconds), **one.percentiles())
+def measure_realtime(name: str, scenario: Scenario, rate: float, seconds: float) -> RealTime:
+    """Run the steps of an observer or controller for so long [s] at a rate [Hz]. Raises ValueError where it has none."""
+    step = step_of(name, scenario, simulate(scenario))
+    n = max(round(seconds * rate / 2), 1)
+    alone = back_to_back(step, min(n, 5000))
+    own, reference = run_paced((step, reference_step()), n, rate)
+    return RealTime(name, rate, alone, own, reference)

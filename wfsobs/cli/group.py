@@ -21,7 +21,7 @@ class Place(NamedTuple):
 
 COMMANDS = {
     "attach": Place("attach", "Run an observer on the streams of a running loop, in shared memory or by ZeroMQ."),
-    "bench": Place("bench", "Time the observers beside textbook versions, and other libraries if installed."),
+    "bench": Place("bench", "Time the observers beside textbook versions."),
     "campaign": Place("campaign", "Run many scenarios and seeds, on many processes or machines."),
     "design": Place("design", "Write a controller for a program elsewhere: C99 with a test, arrays, python-control."),
     "export": Place("export", "Write a report: one HTML file with figures and numbers that opens without a network."),

@@ -11,7 +11,7 @@ from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from wfsobs.bench.measure import machine
-from wfsobs.bench.realtime import SHARE, RealTime, measure_realtime
+from wfsobs.bench.steps import SHARE, RealTime, measure_realtime
 from wfsobs.cli.options import scenario_options
 from wfsobs.cli.show import show_table
 from wfsobs.observers.step_checks import StepError
