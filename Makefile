@@ -60,12 +60,13 @@ test-peer-%: $(VENV)-%/.made-$(PINS)
 setup: $(TEST)  ## install all that the tests need, the browser included
 	@scripts/need_browser.sh $(VENV)
 
-check: $(TEST)  ## ruff, pyright, names, the walls between the rooms, and calls that go up
+check: $(TEST)  ## ruff, pyright, names, the walls between the rooms, circles, and calls that go up
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/python scripts/check_names.py
 	$(BIN)/pyright
 	$(BIN)/lint-imports --no-logo --no-cache
+	$(BIN)/python scripts/count_circles.py
 	$(BIN)/python scripts/count_jumps.py
 
 wheel: $(TEST)  ## build dist/*.tar.gz, and from it dist/*.whl

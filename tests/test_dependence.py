@@ -15,13 +15,13 @@ import pytest
 from tests.records import ON_PAPER
 from wfsobs.dependence import Memo, RecordMemo, digest, observers_reached, record_digest, simulate_once
 from wfsobs.evaluation.record_bounds import record_bounds
+from wfsobs.evaluation.result import Failure
 from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.estimates import Estimate
 from wfsobs.priors_from.scenario import prior_and_settings
 from wfsobs.priors_from.selection import usual_observers
 from wfsobs.record import Record
-from wfsobs.result import Failure
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.idle import idle_settings, used_settings, why_idle_at
 from wfsobs.scenario.presets import PRESETS

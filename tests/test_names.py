@@ -1,4 +1,4 @@
-"""The check of names, `scripts/check_names.py`: what it finds in a small package that breaks its rules."""
+"""The checks of names and of circles, `scripts/check_names.py` and `count_circles.py`: what they find in a small package."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ import pytest
 
 @pytest.fixture(scope="module")
 def check() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("check_names", Path(__file__).parents[1] / "scripts" / "check_names.py")
+    return script("check_names")
+
+
+def script(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, Path(__file__).parents[1] / "scripts" / f"{name}.py")
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -43,8 +47,9 @@ def test_participles_are_found_wherever_a_name_is_given(check: ModuleType, tmp_p
 def test_long_modules_are_found(check: ModuleType, tmp_path: Path) -> None:
     for name, length in (("long", check.LONGEST + 1), ("whole", check.LONGEST)):
         (tmp_path / f"{name}.py").write_text("\n" * length, encoding="utf-8")
-    (found,) = check.faults(tmp_path)
+    (found,) = check.long_modules(tmp_path)
     assert f"{tmp_path.name}/long.py: {check.LONGEST + 1} lines" in found, "and none of what is just within it"
+    assert check.faults(tmp_path) == []
 
 
 def test_one_name_in_two_modules_is_found(check: ModuleType, tmp_path: Path) -> None:
@@ -56,3 +61,20 @@ def test_one_name_in_two_modules_is_found(check: ModuleType, tmp_path: Path) -> 
 def test_examples_of_the_check(check: ModuleType) -> None:
     results = doctest.testmod(check)
     assert results.attempted >= 2 and results.failed == 0
+
+
+def test_modules_in_a_circle_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An import for types alone and one inside a function close it; `d` is imported by all, and imports none."""
+    sources = {
+        "__init__": "",
+        "a": "from circular.b import B\nfrom circular import d",
+        "b": "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from circular.c import C",
+        "c": "def f():\n    import circular.a, circular.d",
+        "d": "",
+    }
+    (tmp_path / "circular").mkdir()
+    for name, source in sources.items():
+        (tmp_path / "circular" / f"{name}.py").write_text(source, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    found = script("count_circles").circles("circular")
+    assert found == [["circular.a", "circular.b", "circular.c"]]

@@ -12,6 +12,7 @@ from tests.records import ON_PAPER
 from wfsobs import PRESETS, Record, Scenario, SettingError, observe, run, simulate
 from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.bound_both import bound_rms_of_both
+from wfsobs.evaluation.result import Failure
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, BOUNDS, COMMON_BOUNDS, LOOP, PREDICTION, RESIDUAL, SCORED
 from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
@@ -19,7 +20,6 @@ from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import Estimate
 from wfsobs.pipeline import as_stated
 from wfsobs.progress import Cancelled, Watch
-from wfsobs.result import Failure
 from wfsobs.signal.welch import rms
 
 

@@ -13,7 +13,7 @@ import pytest
 import wfsobs
 from wfsobs.observers import BUILT_IN, OBSERVERS
 from wfsobs.observers.base import Observer
-from wfsobs.registry import RegistrationError, Registry, register, sections
+from wfsobs.registry import RegistrationError, Registry, sections
 from wfsobs.scenario import Scenario
 from wfsobs.settings import Group, Real, Section
 
@@ -71,7 +71,7 @@ def test_what_is_refused(entry: Any, reason: str) -> None:
 
 def test_the_same_again_changes_nothing() -> None:
     before = dict(OBSERVERS)
-    register(ZERO)
+    wfsobs.register(ZERO)
     assert dict(OBSERVERS) == before
 
 

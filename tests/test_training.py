@@ -14,6 +14,7 @@ from click.testing import CliRunner
 from wfsobs.cli import main
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.run import closed_loop
+from wfsobs.evaluation.result import Result
 from wfsobs.identification import Identification, identify
 from wfsobs.identification.report import identification_toml
 from wfsobs.observers import OBSERVERS
@@ -22,7 +23,6 @@ from wfsobs.prior import Lines
 from wfsobs.priors_from.identification import prior_of, told_by
 from wfsobs.priors_from.training import with_training
 from wfsobs.record import Record, Training
-from wfsobs.result import Result
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate

@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 from wfsobs.evaluation.budget import error_budget
 from wfsobs.evaluation.evidence import LEVEL, means_differ
 from wfsobs.evaluation.known_lines import NOTHING, PEAKS, prior_knowledge
+from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.rows import can_be_best, row_label, target_title
 from wfsobs.evaluation.samples import BATCHES, batch_means
 from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS, PREDICTION
@@ -19,7 +20,6 @@ from wfsobs.evaluation.verdict import explain_harm, verdict
 from wfsobs.evaluation.verdict_words import HEADINGS
 from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import observe, run
-from wfsobs.result import Result
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.disturbance import vibration_lines
 from wfsobs.simulation.loop import simulate

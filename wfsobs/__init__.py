@@ -12,26 +12,27 @@ The names below are imported when they are first used: `import wfsobs` alone tak
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from wfsobs.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from wfsobs.app.report.export import export
     from wfsobs.closed_loop.run import close_loop
     from wfsobs.evaluation.budget import error_budget
+    from wfsobs.evaluation.result import Result
     from wfsobs.evaluation.scores import score
     from wfsobs.identification.identification import identify
     from wfsobs.identification.kernels import fit_kernels
     from wfsobs.pipeline import observe, run
     from wfsobs.record import Record, RecordError
-    from wfsobs.registry import register
-    from wfsobs.result import Result
     from wfsobs.scenario import Scenario
     from wfsobs.scenario.presets import PRESETS
+    from wfsobs.scenario.scenario import register
     from wfsobs.settings.errors import SettingError
     from wfsobs.simulation.loop import simulate
     from wfsobs.stepping import design
     from wfsobs.telemetry.records import load
     from wfsobs.tuning.tuning import tune
 
-__version__ = "0.2.0"
 
 _HOMES = {
     "export": "app.report.export",
@@ -41,12 +42,12 @@ _HOMES = {
     "score": "evaluation.scores",
     "fit_kernels": "identification.kernels",
     "identify": "identification.identification",
-    "Result": "result",
+    "Result": "evaluation.result",
     "observe": "pipeline",
     "run": "pipeline",
     "Record": "record",
     "RecordError": "record",
-    "register": "registry",
+    "register": "scenario.scenario",
     "Scenario": "scenario",
     "PRESETS": "scenario.presets",
     "SettingError": "settings.errors",

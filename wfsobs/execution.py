@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from time import perf_counter
 
 from wfsobs.dependence import RecordMemo
+from wfsobs.evaluation.result import Failure
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
 from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimate, Estimates
@@ -13,7 +14,6 @@ from wfsobs.priors_from.scenario import PriorParts, arguments, prior_and_setting
 from wfsobs.priors_from.selection import usual_observers
 from wfsobs.progress import QUIET, Watch, detach_watch
 from wfsobs.record import Record
-from wfsobs.result import Failure
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.idle import used_settings
 from wfsobs.settings.errors import SettingError

@@ -10,6 +10,7 @@ import numpy as np
 
 from wfsobs.dependence import RecordMemo
 from wfsobs.evaluation.record_bounds import Bound, bound_scores, record_bounds
+from wfsobs.evaluation.result import Failure, Result
 from wfsobs.evaluation.scores import SCORED, Derive, make_anew, score
 from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
@@ -20,7 +21,6 @@ from wfsobs.priors_from.scenario import as_sampled
 from wfsobs.priors_from.training import trained_until, with_training
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record
-from wfsobs.result import Failure, Result
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array

@@ -1,7 +1,7 @@
 """Observers and controllers by id: those of wfsobs, those of installed packages, and those that a script registers.
 
 A package declares its own by entry points of the groups "wfsobs.observers" and "wfsobs.controllers", which are read when a
-registry is first used. Higher rooms are named by strings: nothing is imported before it is used.
+registry is first used. The tree of all settings, a room above, announces itself: the settings of entries must fit it.
 """
 
 from __future__ import annotations
@@ -9,8 +9,6 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Iterable, Iterator, Mapping, MutableMapping
-from functools import cache
-from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from threading import RLock
 from typing import Any, Protocol, TypeVar
@@ -25,13 +23,14 @@ log = logging.getLogger(__name__)
 OBSERVERS, CONTROLLERS = "wfsobs.observers", "wfsobs.controllers"
 """Groups of entry points."""
 
-HOMES = {OBSERVERS: ("wfsobs.observers", "OBSERVERS"), CONTROLLERS: ("wfsobs.control.controllers", "CONTROLLERS")}
-"""Group -> module and name of its registry."""
-
 ID = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 GROUP_NAME = re.compile(r"[a-z][a-z0-9_]*")
 
 _SECTIONS: dict[str, Section] = {}
+_REGISTRIES: dict[str, Registry[Any]] = {}
+"""Group of entry points -> its registry, once that is imported."""
+_TREES: list[type[Group]] = []
+"""The tree of all settings, once that is imported."""
 _LOCK = RLock()
 """One for all registries: a package that is imported for one may read the others."""
 
@@ -78,6 +77,8 @@ class Registry(MutableMapping[str, E]):
         self._complete, self._reading = False, False
         for entry in built_in:
             self._put(entry)
+        self._built_in = frozenset(self._entries)
+        _REGISTRIES.setdefault(group, self)
 
     def add(self, entry: E) -> None:
         """Register an entry; the same one again changes nothing. Raises RegistrationError."""
@@ -86,7 +87,8 @@ class Registry(MutableMapping[str, E]):
             if self._entries.get(entry.id) is not entry:
                 self._check(entry)
                 self._put(entry)
-                _scenario().settings()  # those made before have its settings from now on, too
+                for tree in _TREES:
+                    tree.settings()  # those made before have its settings from now on, too
 
     def complete(self) -> None:
         """Load the entries of installed packages, once; one that cannot be used is logged and left out."""
@@ -104,12 +106,22 @@ class Registry(MutableMapping[str, E]):
         try:
             entry = point.load()
             if not isinstance(entry, self.kind):
-                raise RegistrationError(f"takes a wfsobs {self.kind.__name__}, not {_kind(entry)}")
+                raise RegistrationError(f"takes a wfsobs {self.kind.__name__}, not {kind_of(entry)}")
             self.add(entry)
         except (Exception, SystemExit) as error:
             what = str(error) if isinstance(error, RegistrationError) else f"{type(error).__name__}: {error}"
             package = f" of {point.dist.name}" if point.dist else ""
             log.warning("wfsobs: %s %s%s is left out: %s", self._word, point.value, package, " ".join(what.split()))
+
+    def review(self) -> None:
+        """Check the entries of packages again; one that cannot be used is logged and left out."""
+        for id_, entry in list(self._entries.items()):
+            try:
+                if id_ not in self._built_in:
+                    _check_settings(entry, f"{self._word} {id_!r}")
+            except RegistrationError as error:
+                del self._entries[id_]
+                log.warning("wfsobs: %s is left out", error)
 
     def _put(self, entry: E) -> None:
         self._entries[entry.id] = entry
@@ -127,8 +139,7 @@ class Registry(MutableMapping[str, E]):
             raise RegistrationError(f"{where}: the id is taken, by a row of the tables")
         if entry.label in (other.label for other in self._entries.values()):
             raise RegistrationError(f"{where}: the label {entry.label!r} is taken")
-        for own in _settings(entry):
-            _check_settings(own, where)
+        _check_settings(entry, where)
 
     @property
     def _word(self) -> str:
@@ -155,49 +166,18 @@ class Registry(MutableMapping[str, E]):
         return len(self._entries)
 
 
-def register(entry: Any) -> None:
-    """Register an observer or a controller, beside those of wfsobs.
-
-    An installed package declares its own by an entry point instead, which other processes see as well.
-
-    Parameters
-    ----------
-    entry : Observer or Controller
-        What to register; the same one again changes nothing.
-
-    Raises
-    ------
-    RegistrationError
-        An id or a group of settings is taken or has forbidden characters, or `entry` is neither.
-    """
-    for group in HOMES:
-        registry = _registry(group)
-        if isinstance(entry, registry.kind):
-            registry.add(entry)
-            return
-    raise RegistrationError(f"register: takes an Observer or a Controller, not {_kind(entry)}")
-
-
 def sections() -> Mapping[str, Section]:
-    """Return the groups of settings of observers and controllers, by name, in the order of the registries."""
-    _registry(OBSERVERS).complete()
-    if _is_installed(CONTROLLERS):  # else none has to be imported: those of wfsobs bring no settings
-        _registry(CONTROLLERS).complete()
+    """Return the groups of settings of what is in the registries that are imported, by name, in their order."""
+    for registry in _REGISTRIES.values():
+        registry.complete()
     return dict(_SECTIONS)
 
 
-@cache
-def _is_installed(group: str) -> bool:
-    return bool(entry_points(group=group))
-
-
-def _registry(group: str) -> Registry[Any]:
-    module, name = HOMES[group]
-    return getattr(import_module(module), name)
-
-
-def _scenario() -> Any:
-    return import_module("wfsobs.scenario").Scenario
+def announce(tree: type[Group]) -> None:
+    """Have the settings of entries fit the tree of all settings; those of packages that do not are logged and left out."""
+    _TREES.append(tree)
+    for registry in _REGISTRIES.values():
+        registry.review()
 
 
 def _settings(entry: Entry) -> tuple[Any, ...]:
@@ -208,23 +188,25 @@ def _settings(entry: Entry) -> tuple[Any, ...]:
     return own if isinstance(own, tuple) and not isinstance(own, Section) else (own,)
 
 
-def _check_settings(own: Any, where: str) -> None:
-    """Raise RegistrationError where a scenario cannot have these settings."""
-    if isinstance(own, str) and own in _scenario().settings():
-        return
-    if isinstance(own, str):
-        raise RegistrationError(f"{where}: settings {own!r}: no scenario has such a group")
-    if not isinstance(own, Section) or not (isinstance(own.group, type) and issubclass(own.group, Group)):
-        raise RegistrationError(f"{where}: settings takes a Section of a Group, not {_kind(own)}")
-    if not GROUP_NAME.fullmatch(own.name):
-        raise RegistrationError(f"{where}: settings {own.name!r}: a name takes lower-case letters, digits and underscores")
-    if _SECTIONS.get(own.name, own) != own or (own.name not in _SECTIONS and hasattr(_scenario(), own.name)):
-        raise RegistrationError(f"{where}: settings {own.name!r}: the name is taken")
-    for name, p in own.group.settings().items():
-        low, high = getattr(p, "bounds", None) or (None, None)
-        if isinstance(p, param.Number) and (low is None or high is None):
-            raise RegistrationError(f"{where}: settings {own.name}.{name}: a number takes bounds, lowest and highest")
+def _check_settings(entry: Entry, where: str) -> None:
+    """Raise RegistrationError where the tree of all settings cannot have those of an entry."""
+    for own in _settings(entry):
+        if isinstance(own, str):
+            if any(own not in tree.settings() for tree in _TREES):
+                raise RegistrationError(f"{where}: settings {own!r}: no scenario has such a group")
+            continue
+        if not isinstance(own, Section) or not (isinstance(own.group, type) and issubclass(own.group, Group)):
+            raise RegistrationError(f"{where}: settings takes a Section of a Group, not {kind_of(own)}")
+        if not GROUP_NAME.fullmatch(own.name):
+            raise RegistrationError(f"{where}: settings {own.name!r}: a name takes lower-case letters, digits and underscores")
+        if _SECTIONS.get(own.name, own) != own or (own.name not in _SECTIONS and any(hasattr(t, own.name) for t in _TREES)):
+            raise RegistrationError(f"{where}: settings {own.name!r}: the name is taken")
+        for name, p in own.group.settings().items():
+            low, high = getattr(p, "bounds", None) or (None, None)
+            if isinstance(p, param.Number) and (low is None or high is None):
+                raise RegistrationError(f"{where}: settings {own.name}.{name}: a number takes bounds, lowest and highest")
 
 
-def _kind(value: Any) -> str:
+def kind_of(value: Any) -> str:
+    """Return what a value is, for a message."""
     return f"the class {value.__name__}" if isinstance(value, type) else f"a {type(value).__name__}"

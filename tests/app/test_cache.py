@@ -18,9 +18,9 @@ from wfsobs.app.jobs import CANCELLED, FAILED, RUNNING, Tell
 from wfsobs.app.limits import NONE
 from wfsobs.app.service import Service
 from wfsobs.app.work import RunResults, SignalAndError, compute
+from wfsobs.evaluation.result import Result
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record
-from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 

@@ -14,8 +14,8 @@ from wfsobs.app.controls.panel import AT_HAND, Controls
 from wfsobs.app.controls.status import status_of
 from wfsobs.app.display import label_of, unit_text
 from wfsobs.app.work import RunResults
+from wfsobs.evaluation.result import Result
 from wfsobs.record import Record
-from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 

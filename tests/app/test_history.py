@@ -12,8 +12,8 @@ from wfsobs.app.jobs import DONE
 from wfsobs.app.store import STEPS_BACK, Store
 from wfsobs.app.work import RunResults
 from wfsobs.cost import run_seconds
+from wfsobs.evaluation.result import Result
 from wfsobs.record import Record
-from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 

@@ -18,11 +18,11 @@ from tests.app.test_copies import in_shell
 from wfsobs.app.copies import LIVE as LIVE_TASK
 from wfsobs.app.copies import CopiedTask, to_command, to_python
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.live_work import LiveOrder
 from wfsobs.app.pages.live import LivePage
 from wfsobs.app.pages.pages import LIVE
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.cli import main
+from wfsobs.live.loop import LiveOrder
 from wfsobs.live.replay import Replay
 from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.observers.base import TARGETS

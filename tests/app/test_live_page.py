@@ -13,22 +13,22 @@ import numpy as np
 import pytest
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.jobs import FAILED, IDLE, RUNNING, Job
+from wfsobs.app.jobs import FAILED, RUNNING, Job
 from wfsobs.app.limits import NONE
-from wfsobs.app.live_work import LiveOrder, record_saves
+from wfsobs.app.live_work import record_saves
 from wfsobs.app.pages.live import LivePage
 from wfsobs.app.pages.live_controls import events_html, peaks_html, ranking
 from wfsobs.app.pages.live_figures import LiveMarks
 from wfsobs.app.pages.pages import EXPLORE, LIVE
 from wfsobs.app.render import number
 from wfsobs.app.serve import opens_on_live
-from wfsobs.app.service import Service
+from wfsobs.app.service import IDLE, Service
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.views.plots import new_figure
 from wfsobs.live.board import NEXT
 from wfsobs.live.finding import Finding, PeakFinding
-from wfsobs.live.loop import LiveLoop
+from wfsobs.live.loop import LiveLoop, LiveOrder
 from wfsobs.live.peaks import Change
 from wfsobs.live.recording import Recorder
 from wfsobs.live.ring import Ring

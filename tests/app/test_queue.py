@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from wfsobs.app import jobs as module
 from wfsobs.app.cache import Cache
 from wfsobs.app.controls.status import status_of
-from wfsobs.app.jobs import BATCH, CANCELLED, CLICK, DONE, FAILED, LONG, RUNNING, BackgroundTask, Job, JobQueue
+from wfsobs.app.jobs import BATCH, CANCELLED, CLICK, DONE, FAILED, LONG, RUNNING, Job, JobQueue
 from wfsobs.app.limits import NONE
-from wfsobs.app.service import Service
+from wfsobs.app.service import BackgroundTask, Service
 from wfsobs.progress import Watch
 
 WAIT = 60.0

@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.service import Session
-from wfsobs.app.share import NamedRecord, from_query, to_query
+from wfsobs.app.share import from_query, to_query
+from wfsobs.app.sources import NamedRecord
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate

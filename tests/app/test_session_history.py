@@ -18,9 +18,9 @@ from wfsobs.app.session_file import HistoryEntry
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source
 from wfsobs.app.store import Store
 from wfsobs.app.work import RunResults
+from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.scores import Score
 from wfsobs.record import Record
-from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 

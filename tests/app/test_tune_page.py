@@ -12,12 +12,13 @@ import pytest
 
 from wfsobs.app.controls.names import setting_name
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING, BackgroundTask
+from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.limits import Limits
 from wfsobs.app.pages.pages import TUNE
 from wfsobs.app.pages.parts import Starter
 from wfsobs.app.pages.tune import TunePage, best_so_far, choices, seconds, unit_for
 from wfsobs.app.render import number
+from wfsobs.app.service import BackgroundTask
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario

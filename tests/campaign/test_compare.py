@@ -8,8 +8,7 @@ import pytest
 from scipy.stats import binom, ttest_rel
 
 from wfsobs.campaign.compare import LEVEL, Comparison, compare, paired_difference
-from wfsobs.campaign.plan import parse_plan
-from wfsobs.campaign.stopping import Stop, looks, wanted_seeds
+from wfsobs.campaign.plan import Stop, looks, parse_plan, wanted_seeds
 from wfsobs.campaign.store import ROWS, BatchIndex, schema, write_batch
 from wfsobs.evaluation.rows import can_be_best
 from wfsobs.observers import OBSERVERS
@@ -152,7 +151,7 @@ class Counted:
 def test_as_many_rows_are_held_whatever_the_number_of_scenarios(tmp_path, monkeypatch):
     """Counted, and by tracemalloc, which sees numpy and Python; the memory of a process has libraries and freed pages in it."""
     seeds, held, peaks = 16, [], []
-    monkeypatch.setattr("wfsobs.campaign.stopping.HELD", 10 * 2 * seeds)  # ten scenarios of two observers
+    monkeypatch.setattr("wfsobs.campaign.plan.HELD", 10 * 2 * seeds)  # ten scenarios of two observers
     for n_cells in (20, 160):
         winds = ", ".join(str(5 + i / 10) for i in range(n_cells))
         text = f'observers = ["kf-lgs", "kf-multi"]\n[grid]\nturbulence.wind_speed = [{winds}]\n[stop]\nfirst = 4\n'
@@ -173,9 +172,9 @@ def test_as_many_rows_are_held_whatever_the_number_of_scenarios(tmp_path, monkey
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
         held.append(max(index.held))
-        monkeypatch.setattr("wfsobs.campaign.stopping.HELD", 10**9)
+        monkeypatch.setattr("wfsobs.campaign.plan.HELD", 10**9)
         assert np.array_equal(found, wanted_seeds(plan, everything, index))
-        monkeypatch.setattr("wfsobs.campaign.stopping.HELD", 10 * 2 * seeds)
+        monkeypatch.setattr("wfsobs.campaign.plan.HELD", 10 * 2 * seeds)
     assert held == [10 * 2 * seeds] * 2
     # all at once would be eight times as much; what waits for the collector of cycles is left to chance, some ten kB of 70
     assert 0.5 < peaks[1] / peaks[0] < 2.0

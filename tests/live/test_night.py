@@ -5,8 +5,8 @@ import pytest
 
 from tests.live.in_process import LoopInProcess
 from tests.live.test_programme import Maker
+from wfsobs.live.loop import Shadow
 from wfsobs.live.programme import Programme
-from wfsobs.live.shadow import Shadow
 from wfsobs.live.simulated import SimulatedFrames
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.stepping import sampling_of
@@ -45,7 +45,7 @@ class Night(LoopInProcess):
 
 @pytest.fixture
 def night(monkeypatch):
-    monkeypatch.setattr("wfsobs.live.shadow.MINUTE", 60.0 / FASTER)
+    monkeypatch.setattr("wfsobs.live.loop.MINUTE", 60.0 / FASTER)
     night = Night()
     yield night
     night.release()

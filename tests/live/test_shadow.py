@@ -12,8 +12,8 @@ import wfsobs
 from tests.live.in_process import LoopInProcess
 from tests.live.test_sources import Inbox
 from wfsobs.live.attached import StreamFrames, StreamSource
+from wfsobs.live.loop import Shadow, append_line
 from wfsobs.live.paced import Desk
-from wfsobs.live.shadow import Shadow, append_line
 from wfsobs.scenario.presets import paper
 from wfsobs.streams.shared_image import SharedImage
 
@@ -54,7 +54,7 @@ class Loop(LoopInProcess):
 
 @pytest.fixture
 def loop(tmp_path, monkeypatch):
-    monkeypatch.setattr("wfsobs.live.shadow.MINUTE", float(SPAN))
+    monkeypatch.setattr("wfsobs.live.loop.MINUTE", float(SPAN))
     loop = Loop(tmp_path)
     yield loop
     loop.release()
@@ -92,7 +92,7 @@ def test_a_night_with_a_peak_noise_and_lost_frames(loop):
 
 
 def test_what_takes_longer_than_a_minute_to_identify_is_waited_for(loop, monkeypatch):
-    monkeypatch.setattr("wfsobs.live.shadow.MINUTE", 1.0)
+    monkeypatch.setattr("wfsobs.live.loop.MINUTE", 1.0)
     loop.shadow, begun = Shadow(loop.say, loop), []
 
     def begin(*_, then):

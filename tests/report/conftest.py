@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
+from wfsobs.evaluation.result import Result
 from wfsobs.pipeline import run
-from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 

@@ -11,7 +11,7 @@ import pytest
 from wfsobs.app.compared import ComparedRun, comparison_of
 from wfsobs.app.report.data import Report, pack, state_of, unpack
 from wfsobs.app.report.page import page
-from wfsobs.result import Result
+from wfsobs.evaluation.result import Result
 
 
 def test_errors_and_changes_of_every_run(result: Result, parse: Any) -> None:

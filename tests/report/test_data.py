@@ -15,8 +15,8 @@ from wfsobs.app.report.data import Grid, Report, bins_for, pack, state_of, unpac
 from wfsobs.app.report.page import DECADES, LEVELS, STEP, Pool, encode
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.error_spectra import cumulative_rms
+from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.rows import score_rows
-from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.grid import Variation
 from wfsobs.signal.welch import welch_psd

@@ -12,8 +12,8 @@ from wfsobs.app.report.data import Report, pack, state_of, unpack
 from wfsobs.app.report.page import page
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label
 from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.scores import COMMON_BOUNDS
-from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 
 MADE = datetime(2024, 1, 2, tzinfo=UTC)

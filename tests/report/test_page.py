@@ -23,11 +23,11 @@ from wfsobs.app.render import hundredths, number
 from wfsobs.app.report.data import Grid, Report, pack, state_of, unpack
 from wfsobs.app.report.page import page
 from wfsobs.app.report.sections import FILE, LONGEST, command_of
+from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.rows import TIME, is_non_causal, row_label, scored_interval, target_title
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import observe, run
-from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import from_toml, scenario_from
 from wfsobs.scenario.grid import Variation, parse_variation, scenarios

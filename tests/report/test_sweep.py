@@ -15,8 +15,8 @@ from wfsobs.app.report.data import Report, pack, state_of, unpack
 from wfsobs.app.report.page import page
 from wfsobs.campaign.sweep import parse_axis, plan_sweep
 from wfsobs.campaign.sweep_results import SweepResults
+from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.scores import Score
-from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 
 

@@ -11,11 +11,12 @@ import param
 from wfsobs.app.component import Component
 from wfsobs.app.copies import EXPLORED, to_command, to_python
 from wfsobs.app.downloads import Save, TooLarge, data_csv, data_npz
-from wfsobs.app.jobs import DONE, FAILED, RUNNING, BackgroundTask, Job
+from wfsobs.app.jobs import DONE, FAILED, RUNNING, Job
 from wfsobs.app.pages.pages import Pages, ViewState
 from wfsobs.app.pages.parts import Page
 from wfsobs.app.report.export import LIMIT, ReportError, make
 from wfsobs.app.seeds import SeedRuns
+from wfsobs.app.service import BackgroundTask
 from wfsobs.app.share import FILE, Link, from_file, from_query, name_record, to_file, to_query
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord
 from wfsobs.app.store import Store

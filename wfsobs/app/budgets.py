@@ -6,8 +6,9 @@ from collections.abc import Callable, Collection, Sequence
 
 import param
 
-from wfsobs.app.jobs import DONE, IDLE_TIME, BackgroundTask, Job
+from wfsobs.app.jobs import DONE, IDLE_TIME, Job
 from wfsobs.app.seeds import SeedRuns
+from wfsobs.app.service import BackgroundTask
 from wfsobs.app.store import Store
 from wfsobs.app.work import RunResults
 from wfsobs.cost import part_seconds, run_seconds

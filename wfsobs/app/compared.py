@@ -17,10 +17,10 @@ from wfsobs.app.sources import LoadedRecord, Source, Step, give_same_record
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.plots import envelope, envelope_times
 from wfsobs.app.work import TRUTH, Key, RunResults, SignalAndError
+from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.rows import row_label, target_title
 from wfsobs.evaluation.scores import Score
 from wfsobs.observers.base import TARGETS
-from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import reference_preset
 from wfsobs.settings.group import Group, holds_groups

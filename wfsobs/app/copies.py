@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from wfsobs.app.live_work import LiveOrder
 from wfsobs.app.render import render
 from wfsobs.app.share import FILE, LONGEST, changes
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source
+from wfsobs.live.loop import LiveOrder
 from wfsobs.scenario import Scenario, configfile
 
 

@@ -17,10 +17,10 @@ from wfsobs.app.component import Component
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.downloads import Save, TooLarge
-from wfsobs.app.jobs import DONE, FAILED, RUNNING, BackgroundTask, Job
+from wfsobs.app.jobs import DONE, FAILED, RUNNING, Job
 from wfsobs.app.picker import LARGEST, PART, PartialFile, too_large
 from wfsobs.app.render import number, render
-from wfsobs.app.service import run_key
+from wfsobs.app.service import BackgroundTask, run_key
 from wfsobs.app.session_file import (
     LONGEST_NAME,
     MOST,

@@ -9,17 +9,18 @@ import numpy as np
 import param
 
 from wfsobs.app.cache import size_of
-from wfsobs.app.jobs import DONE, IDLE_TIME, BackgroundTask, Job, Tell
+from wfsobs.app.jobs import DONE, IDLE_TIME, Job, Tell
+from wfsobs.app.service import BackgroundTask
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source
 from wfsobs.app.store import Store
 from wfsobs.app.work import RunResults
 from wfsobs.cost import run_seconds
 from wfsobs.dependence import Memo, RecordMemo, simulate_once
 from wfsobs.evaluation.evidence import FEWEST, Evidence, gather_evidence
+from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.scores import Score
 from wfsobs.pipeline import observe
 from wfsobs.progress import Watch
-from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 

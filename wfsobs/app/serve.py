@@ -42,13 +42,14 @@ from tornado.web import OutputTransform, RequestHandler
 
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.limits import NONE, PUBLIC, Limits
-from wfsobs.app.live_work import LiveOrder, live_counts, share_loop
+from wfsobs.app.live_work import live_counts, share_loop
 from wfsobs.app.logs import event, to_stream
 from wfsobs.app.pages.pages import LIVE, PAGE, PREFIX
 from wfsobs.app.service import Full, Post, Service, Session
 from wfsobs.app.share import LONGEST, has_settings
 from wfsobs.app.work import one_blas_thread
 from wfsobs.campaign.follow import CampaignFolder
+from wfsobs.live.loop import LiveOrder
 from wfsobs.live.paced import prefer
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.errors import SettingError

@@ -6,7 +6,7 @@ import gc
 import itertools
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from math import isfinite
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import param
 
 from wfsobs.app.cache import Cache, key_of
-from wfsobs.app.jobs import IDLE_TIME, BackgroundTask, Job, JobQueue, Listener, Tell, Work, release_memory
+from wfsobs.app.jobs import CANCELLED, DONE, FAILED, IDLE_TIME, RUNNING, Job, JobQueue, Listener, Tell, Work, release_memory
 from wfsobs.app.limits import Limits
 from wfsobs.app.logs import event
 from wfsobs.app.sources import Source
@@ -28,9 +28,8 @@ from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 
 if TYPE_CHECKING:
-    from wfsobs.app.live_work import LiveOrder
     from wfsobs.campaign.follow import CampaignFolder
-    from wfsobs.live.loop import LiveLoop
+    from wfsobs.live.loop import LiveLoop, LiveOrder
 
 Compute = Callable[[Scenario, Watch, Tell, Source | None], RunResults]
 Post = Callable[[Callable[[], None]], None]
@@ -209,3 +208,99 @@ class Session(param.Parameterized):
 def run_key(scenario: Scenario, source: Source | None) -> str:
     """Name the results of settings on what they run on."""
     return key_of(scenario, source.key if source else "")
+
+
+IDLE = "idle"
+
+
+class BackgroundTask(param.Parameterized):
+    """The state of one job of a session.
+
+    Starting another supersedes the one before: it is left, and nothing of it lands any more, however late it comes.
+    What is told of a job is gathered and lands in one `param.update` on the session's thread. Where its result is to be
+    `drawn_first`, that it is done lands a moment later. A task with a `title` is named at the top of the page while
+    it goes on.
+    """
+
+    state = param.Selector(default=IDLE, objects=[IDLE, RUNNING, DONE, CANCELLED, FAILED])
+    progress = param.Number(0.0, bounds=(0.0, 1.0), doc="Fraction done.")
+    place = param.Integer(0, doc="Place in the line of jobs, from 1; 0 when it is being done.")
+    message = param.String("", doc="Why it failed, in one line.")
+    latest = param.Parameter(None, doc="What the work has told of itself so far.")
+    result = param.Parameter(None, doc="The latest result, in parts where it comes in parts.")
+
+    def __init__(self, session: Session, drawn_first: bool = False, title: str = ""):
+        super().__init__()
+        self.session, self._drawn_first, self._title = session, drawn_first, title
+        if title:
+            self.param.watch(self._announce, ["state", "progress", "place"])
+        session.tasks.append(self)
+        self._lock = threading.Lock()
+        self._generation = 0
+        self._news: dict[str, Any] = {}
+        self._is_posted = False
+        self._leave: Callable[[], None] = _nothing
+
+    def start(self, job: Job) -> None:
+        """Start a job; it supersedes the one before."""
+        generation = self._supersede()
+        self.param.update(state=RUNNING, progress=0.0, place=0, message="", latest=None)
+        self._leave = self.session.submit(job, partial(self._hear, generation), self._leave)
+
+    def cancel(self) -> None:
+        """Stop, or leave the queue; results so far are kept."""
+        if self.state == RUNNING:
+            self.close()
+            self.param.update(state=CANCELLED)
+
+    def refuse(self, why: str) -> None:
+        """Fail with a reason in one line, without a job."""
+        self.close()
+        self.param.update(state=FAILED, message=why)
+
+    def close(self) -> None:
+        """Leave the job; later news of it is ignored."""
+        self._supersede()
+        before, self._leave = self._leave, _nothing
+        before()
+
+    def line(self, doing: str = "Running") -> str:
+        """Return place in the queue or progress in one line."""
+        return f"Waiting: position {self.place}" if self.place else f"{doing}, {int(100 * self.progress)} %"
+
+    def _announce(self, *_: object) -> None:
+        others = {title: line for title, line in self.session.doing.items() if title != self._title}
+        own = {self._title: (self.progress, self.line(self._title))} if self.state == RUNNING else {}
+        self.session.doing = {**others, **own}
+
+    def _supersede(self) -> int:
+        with self._lock:
+            self._generation += 1
+            self._news = {}
+            return self._generation
+
+    def _hear(self, generation: int, news: Mapping[str, Any]) -> None:
+        """Receive news of the job; from any thread."""
+        with self._lock:
+            if generation != self._generation:
+                return
+            self._news |= news
+            if self._is_posted:
+                return
+            self._is_posted = True
+        self.session.post(self._land)
+
+    def _land(self) -> None:
+        with self._lock:
+            news, self._news, self._is_posted = self._news, {}, False
+            if self._drawn_first and news.get("state") == DONE and "result" in news:
+                self._news, self._is_posted = {"state": news.pop("state")}, True
+            again = self._is_posted
+        if news:
+            self.param.update(**news)
+        if again:
+            self.session.post(self._land)
+
+
+def _nothing() -> None:
+    return None

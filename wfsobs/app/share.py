@@ -18,7 +18,7 @@ import param
 
 from wfsobs.app.controls.fields import parse_number
 from wfsobs.app.session_file import SessionError, read_declaration
-from wfsobs.app.sources import LoadedRecord, Source
+from wfsobs.app.sources import LoadedRecord, NamedRecord, Source
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.configfile import from_toml, parse_toml, reference_preset, to_toml
 from wfsobs.scenario.presets import PRESETS
@@ -42,23 +42,6 @@ STATEMENTS: dict[str, tuple[str, Callable[[str], Any], str]] = {
     "trust": ("trust", lambda text: bool(("False", "True").index(text)), "takes True"),
 }
 """Field -> part of the declaration, its reading, what it takes."""
-
-
-@dataclass(frozen=True)
-class NamedRecord:
-    """A record that a link is of; sha256 : of its file, in hexadecimal digits."""
-
-    name: str
-    sha256: str
-    declaration: DeclaredFormat
-
-    def line(self, other: str = "", digest: str = "") -> str:
-        """Ask for the file. other, digest : name and SHA-256 of a file that is another one."""
-        line = (
-            f"This link is of the record {self.name} (SHA-256 {self.sha256[:12]}…): drop that file here, or load it, to see it; "
-            "until then the simulation of these settings is shown."
-        )
-        return line + (f" {other} is another file: its SHA-256 is {digest[:12]}…" if other else "")
 
 
 def name_record(source: Source | None) -> NamedRecord | None:

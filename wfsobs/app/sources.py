@@ -100,3 +100,20 @@ def fit_to_record(record: Record, scenario: Scenario) -> Scenario:
         "run.warm_up": min(scenario.run.warm_up, 0.2 * duration),
     }
     return as_stated(record, scenario).replace(changes)
+
+
+@dataclass(frozen=True)
+class NamedRecord:
+    """A record that a link is of; sha256 : of its file, in hexadecimal digits."""
+
+    name: str
+    sha256: str
+    declaration: DeclaredFormat
+
+    def line(self, other: str = "", digest: str = "") -> str:
+        """Ask for the file. other, digest : name and SHA-256 of a file that is another one."""
+        line = (
+            f"This link is of the record {self.name} (SHA-256 {self.sha256[:12]}…): drop that file here, or load it, to see it; "
+            "until then the simulation of these settings is shown."
+        )
+        return line + (f" {other} is another file: its SHA-256 is {digest[:12]}…" if other else "")

@@ -12,8 +12,8 @@ import panel as pn
 import param
 from param.parameterized import batch_call_watchers
 
-from wfsobs.app.jobs import DONE, IDLE, BackgroundTask
-from wfsobs.app.service import Post, Session
+from wfsobs.app.jobs import DONE
+from wfsobs.app.service import IDLE, BackgroundTask, Post, Session
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, Step, fit_to_record, give_same_record, record_key
 from wfsobs.cost import rerun_seconds, run_seconds
 from wfsobs.scenario import Scenario
@@ -24,7 +24,7 @@ from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.preview import Preview
 
 if TYPE_CHECKING:
-    from wfsobs.app.share import NamedRecord
+    from wfsobs.app.sources import NamedRecord
 
 AFTER_FIT = ("telescope.radial_order", "run.warm_up")
 """Settings that follow a record, and may be changed afterwards."""

@@ -18,8 +18,9 @@ import param
 from bokeh.models import ColumnDataSource
 
 from wfsobs.app.controls.names import name_settings
-from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING, BackgroundTask, Job
+from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING, Job
 from wfsobs.app.picker import PartialFile, Picker, too_large
+from wfsobs.app.service import BackgroundTask
 from wfsobs.app.session_file import SUFFIX
 from wfsobs.app.sources import fit_to_record
 from wfsobs.app.store import RecordPlace, Store

@@ -22,6 +22,7 @@ from wfsobs.app.sources import Source
 from wfsobs.dependence import Memo, RecordMemo, digest, simulate_once
 from wfsobs.evaluation.error_spectra import spectra
 from wfsobs.evaluation.record_bounds import Bound, joint_observers, record_bounds
+from wfsobs.evaluation.result import Failure, Result
 from wfsobs.evaluation.rows import NO_ESTIMATE
 from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
@@ -32,7 +33,6 @@ from wfsobs.prior import GIVEN, TRUE
 from wfsobs.priors_from.selection import usual_observers
 from wfsobs.progress import Watch
 from wfsobs.record import Record
-from wfsobs.result import Failure, Result
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import record_settings
 

@@ -7,11 +7,11 @@ import json
 import sys
 from functools import cache
 
-from wfsobs import __version__
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import NOT_OBSERVERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
+from wfsobs.version import __version__
 
 PHYSICS_VERSION = 6
 """Number of the simulation and its numerics: rises with every change that moves results (tests/campaign/test_physics.py)."""

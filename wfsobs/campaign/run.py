@@ -10,10 +10,9 @@ from time import sleep
 
 import numpy as np
 
-from wfsobs.campaign.plan import Campaign, Cell
+from wfsobs.campaign.plan import Campaign, Cell, wanted_seeds
 from wfsobs.campaign.pools import Workers
 from wfsobs.campaign.state import finished_runs, open_folder, remove_leftovers
-from wfsobs.campaign.stopping import wanted_seeds
 from wfsobs.campaign.store import BatchIndex
 from wfsobs.campaign.work import Batch, Summary, wfsobs_batch
 from wfsobs.cost import run_seconds

@@ -22,12 +22,12 @@ from wfsobs.closed_loop.design import Design, design
 from wfsobs.closed_loop.rows import rows as loop_rows
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.evaluation.record_bounds import Bound, record_bounds
+from wfsobs.evaluation.result import Failure
 from wfsobs.evaluation.rows import TIME, score_rows
 from wfsobs.execution import each_estimate
 from wfsobs.observers.estimates import Estimate
 from wfsobs.pipeline import collect
 from wfsobs.record import Record
-from wfsobs.result import Failure
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.loop import simulate

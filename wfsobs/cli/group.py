@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import click
 from threadpoolctl import threadpool_limits
 
-from wfsobs import __version__
+from wfsobs.version import __version__
 
 
 class Place(NamedTuple):

@@ -127,7 +127,7 @@ def live(
         check_slot(name)
     try:
         from wfsobs.app import serve as server
-        from wfsobs.app.live_work import LiveOrder
+        from wfsobs.live.loop import LiveOrder
     except ModuleNotFoundError as error:
         raise SettingError(f"live: the page needs {error.name}; install wfsobs with its extra: wfsobs[app]") from None
     addresses = {"in": stream, "modes": modes, "ngs": ngs, "ngs-modes": ngs_modes, "ngs-lag": ngs_lag or None, "unit": unit}

@@ -10,8 +10,8 @@ import numpy as np
 from rich.table import Table
 
 from wfsobs.evaluation.recovery import PooledRms, Recovery, recovery, running_rms
+from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.rows import Row, row_label
-from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 

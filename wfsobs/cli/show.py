@@ -16,12 +16,12 @@ from wfsobs.cli.recovery_tables import OverTime
 from wfsobs.cli.tables import score_table
 from wfsobs.evaluation.budget import Budget, budget_row, error_budget
 from wfsobs.evaluation.evidence import Evidence
+from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.rows import TIME, Row
 from wfsobs.evaluation.scores import PREDICTION
 from wfsobs.evaluation.verdict import explain_harm, verdict
 from wfsobs.observers.base import TARGETS
 from wfsobs.progress import Watch
-from wfsobs.result import Result
 
 
 def show(all_rows: list[Row], as_json: bool) -> None:

@@ -33,6 +33,7 @@ from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import rows as loop_rows
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.evaluation.evidence import FEWEST, gather_evidence
+from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.rows import Row, score_rows
 from wfsobs.files import check_writable
 from wfsobs.observers import OBSERVERS
@@ -41,7 +42,6 @@ from wfsobs.pipeline import observe as observe_record
 from wfsobs.prior import GIVEN
 from wfsobs.priors_from.training import trained_until, with_training
 from wfsobs.progress import Watch
-from wfsobs.result import Result
 from wfsobs.scenario import configfile
 from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.loop import simulate

@@ -37,7 +37,7 @@ from wfsobs.simulation.sensing import OpenLoop
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:
-    from wfsobs.result import Result
+    from wfsobs.evaluation.result import Result
 
 LAG, MISMATCH = "lag", "mismatch"
 

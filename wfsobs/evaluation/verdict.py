@@ -25,7 +25,7 @@ from wfsobs.simulation.disturbance import vibration_lines
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:
-    from wfsobs.result import Result
+    from wfsobs.evaluation.result import Result
 
 
 @dataclass(frozen=True)

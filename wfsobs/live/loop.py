@@ -3,24 +3,83 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from threading import Event, Lock, Thread
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from weakref import ReferenceType, finalize, ref
 
+from wfsobs.live.alarms import Alarms
 from wfsobs.live.board import SLOTS
 from wfsobs.live.checks import check_slot, check_speed
 from wfsobs.live.control_process import ControlView
+from wfsobs.live.finding import Finding, identify_frames
 from wfsobs.live.processes import LiveProcesses
 from wfsobs.live.programme import Programme, scenario_on
 from wfsobs.live.recording import Recorder
-from wfsobs.live.shadow import MINUTE, Shadow, append_line
-from wfsobs.live.source import SIMULATION, LiveSource
+from wfsobs.live.source import SIMULATION, STREAM, LiveSource
 from wfsobs.live.view import LiveEvent, LiveView, SharedView, read_view
 from wfsobs.live.workshop import Workshop
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.configfile import to_toml
 from wfsobs.settings.group import SettingError
 from wfsobs.stepping import sampling_of
+from wfsobs.telemetry.records import save_record
+
+if TYPE_CHECKING:
+    from wfsobs.live.loop import LiveLoop
+    from wfsobs.live.processes import LiveProcesses
+
+SECOND, MINUTE = 1.0, 60.0
+
+
+class Shadow:
+    """Called by its loop a few times a second."""
+
+    def __init__(self, say: Callable[[str], None], processes: LiveProcesses):
+        """Say : receives one line; processes : of its loop."""
+        self._alarms, self._processes = Alarms(say), processes
+        self._next_second, self._next_minute = SECOND, MINUTE
+        self._identification: Future[Finding] | None = None
+
+    def __call__(self, loop: LiveLoop) -> None:
+        """Judge what has come since the last call."""
+        now = loop.newest * loop.sampling.dt
+        if now >= self._next_second:
+            self._next_second = now + SECOND
+            first, frames = self._processes.frames(SECOND)
+            self._alarms.look_at(frames, first, loop.sampling.ratio)
+            for view, observers in self._processes.views(SECOND):
+                both = [name for name in observers if len(OBSERVERS[name].targets) == len(TARGETS)]
+                self._alarms.judge(view, both)
+        if now >= self._next_minute:
+            self._next_minute = now + MINUTE
+            if self._identification is None or self._identification.done():  # many peaks may take more than a minute
+                self._identification = self._identify(loop)
+
+    def _identify(self, loop: LiveLoop) -> Future[Finding] | None:
+        """Have the last minute identified and compared; return what is found in time, None where nothing has come."""
+        try:
+            record = loop.recorder.look_back(MINUTE, loop.scenario)
+        except SettingError:
+            return None
+
+        def take(finding: Finding) -> None:
+            loop.workshop.keep(finding)
+            self._alarms.compare(finding)
+
+        return loop.workshop.do(identify_frames, record, loop.scenario.to_dict(), then=take)
+
+
+def append_line(path: str, seconds: float, line: str) -> None:
+    """Append a line to a log: the time in UTC, that of the loop, what has happened. Raises OSError."""
+    with open(path, "a", encoding="utf-8") as file:
+        file.write(f"{datetime.now(UTC).isoformat(timespec='milliseconds')} {seconds:.3f} {line}\n")
+
 
 TICK = 0.2
 """Pause between two looks at the processes [s]."""
@@ -248,3 +307,46 @@ def _keep(loop: ReferenceType[LiveLoop], is_over: Event) -> None:
         live.tend()
         pause = TICK / max(1.0, live.speed)
         del live
+
+
+@dataclass(frozen=True)
+class LiveOrder:
+    """A loop that is to run.
+
+    source    : of the frames
+    scenario  : what the observers are told
+    observers : ids of those that run from the start
+    speed     : 1 is real time
+    controllers : ids of those that run beside it
+    key       : names the loop, where all pages watch the same
+    record_file : where all its frames go when it ends; none if empty
+    log_file  : to which events and alarms are appended; none if empty
+    preset    : where the settings started; none if empty
+    options   : of `wfsobs live`, that name a stream
+    """
+
+    source: LiveSource
+    scenario: Scenario
+    observers: Sequence[str]
+    speed: float = 1.0
+    controllers: Sequence[str] = ()
+    key: str = ""
+    record_file: str = ""
+    log_file: str = ""
+    preset: str = ""
+    options: Sequence[str] = ()
+
+    def begin(self, loop: LiveLoop) -> None:
+        """Begin what runs beside it, to record and to raise alarms: always of a stream or of events."""
+        for name in self.controllers:
+            loop.control(name, True)
+        if self.log_file or self.source.name == STREAM or loop.programme.scenario.events:
+            loop.watch(self.log_file)
+        if self.record_file:
+            loop.recorder.start()
+
+    def end(self, loop: LiveLoop) -> None:
+        """Write what has been recorded. Raises OSError."""
+        record = loop.recorder.stop(loop.scenario) if self.record_file else None
+        if record is not None:
+            save_record(self.record_file, record, to_toml(loop.scenario))

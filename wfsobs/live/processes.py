@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnContext
 from multiprocessing.process import BaseProcess
 from signal import Signals
-from threading import Event, RLock
+from threading import Event, Lock, RLock
+from typing import Any
 
 from wfsobs.live.board import CREWS, Board, crew_of
 from wfsobs.live.control_process import ControlProcess
 from wfsobs.live.delivery import Delivery
 from wfsobs.live.observing import CrewProcess, Site
-from wfsobs.live.paced import Command
+from wfsobs.live.paced import Command, enter_process
 from wfsobs.live.ring import LiveFrame
 from wfsobs.live.rows import Rows, Tracker
-from wfsobs.live.source import LiveSource, SourceProcess, take_all
+from wfsobs.live.source import LiveSource, SourceProcess, end_process, take_all
 from wfsobs.live.view import LiveView, last_frames, read_view
-from wfsobs.live.workshop import SideProcess
 from wfsobs.scenario import Scenario
 
 
@@ -161,3 +165,67 @@ class LiveProcesses:
 def _cause(status: int) -> str:
     """Return what has ended a process of this exit status."""
     return f"an error, exit status {status}" if status > 0 else f"signal {-status} ({Signals(-status).name})"
+
+
+class SideProcess:
+    """A process at low priority that computes one thing after the other; it begins with the first.
+
+    Parameters
+    ----------
+    context : SpawnContext
+        By which it is made.
+
+    Attributes
+    ----------
+    process : BaseProcess or None
+        It, once it has begun.
+    """
+
+    def __init__(self, context: SpawnContext):
+        self.process: BaseProcess | None = None
+        self._context, self._lock, self._asker = context, Lock(), ThreadPoolExecutor(1, "wfsobs-live-side")
+        self._pipe, self._theirs = context.Pipe()
+        self._has_ended = False
+
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Have a function computed; return the result to come, which is cancelled where all has ended."""
+        with self._lock:
+            if self._has_ended:
+                (ended := Future[Any]()).cancel()
+                return ended
+            if self.process is None:
+                self.process = self._context.Process(target=compute, args=(self._theirs,), name="the designs", daemon=True)
+                self.process.start()
+                self._theirs.close()
+            return self._asker.submit(self._ask, function, arguments)
+
+    def _ask(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+        """Return the result of a function. Raises what it raises, and EOFError where the process has ended."""
+        try:
+            self._pipe.send((function, arguments))
+            answer = self._pipe.recv()
+        except OSError:
+            raise EOFError from None
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    def stop(self) -> None:
+        """End it."""
+        with self._lock:
+            self._has_ended = True
+            self._asker.shutdown(wait=False, cancel_futures=True)
+            if self.process is not None:
+                end_process(self.process)
+
+
+def compute(pipe: Connection) -> None:
+    """Answer (function, arguments) with the result, or the exception, until the process is ended."""
+    enter_process(10)
+    while True:
+        function, arguments = pipe.recv()
+        try:
+            answer = function(*arguments)
+        except Exception as error:
+            answer = error
+        pipe.send(answer)

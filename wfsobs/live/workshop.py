@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnContext
-from multiprocessing.process import BaseProcess
-from threading import Lock
+from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from wfsobs.control.step import StepController
 from wfsobs.live.checks import check_slot, make_design
 from wfsobs.live.finding import Bounds, Finding, bounds_of, identify_frames
-from wfsobs.live.paced import enter_process
 from wfsobs.live.peaks import Change
-from wfsobs.live.source import end_process
 from wfsobs.observers.step import StepObserver
 from wfsobs.record import Record, Sampling
 from wfsobs.scenario import Scenario
@@ -111,67 +105,3 @@ class Workshop:
             self._processes.tell_controllers({"controller": design.id, "design": design})
         else:
             self._processes.tell_observers({"observer": design.id, "design": design})
-
-
-class SideProcess:
-    """A process at low priority that computes one thing after the other; it begins with the first.
-
-    Parameters
-    ----------
-    context : SpawnContext
-        By which it is made.
-
-    Attributes
-    ----------
-    process : BaseProcess or None
-        It, once it has begun.
-    """
-
-    def __init__(self, context: SpawnContext):
-        self.process: BaseProcess | None = None
-        self._context, self._lock, self._asker = context, Lock(), ThreadPoolExecutor(1, "wfsobs-live-side")
-        self._pipe, self._theirs = context.Pipe()
-        self._has_ended = False
-
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """Have a function computed; return the result to come, which is cancelled where all has ended."""
-        with self._lock:
-            if self._has_ended:
-                (ended := Future[Any]()).cancel()
-                return ended
-            if self.process is None:
-                self.process = self._context.Process(target=compute, args=(self._theirs,), name="the designs", daemon=True)
-                self.process.start()
-                self._theirs.close()
-            return self._asker.submit(self._ask, function, arguments)
-
-    def _ask(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
-        """Return the result of a function. Raises what it raises, and EOFError where the process has ended."""
-        try:
-            self._pipe.send((function, arguments))
-            answer = self._pipe.recv()
-        except OSError:
-            raise EOFError from None
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
-
-    def stop(self) -> None:
-        """End it."""
-        with self._lock:
-            self._has_ended = True
-            self._asker.shutdown(wait=False, cancel_futures=True)
-            if self.process is not None:
-                end_process(self.process)
-
-
-def compute(pipe: Connection) -> None:
-    """Answer (function, arguments) with the result, or the exception, until the process is ended."""
-    enter_process(10)
-    while True:
-        function, arguments = pipe.recv()
-        try:
-            answer = function(*arguments)
-        except Exception as error:
-            answer = error
-        pipe.send(answer)

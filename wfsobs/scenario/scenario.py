@@ -7,18 +7,18 @@ Large Telescopes". Wavefronts are Noll-normalised Zernike coefficients in microm
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache, lru_cache
+from importlib.metadata import entry_points
 from itertools import pairwise
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import param
 
-from wfsobs.registry import sections
+from wfsobs import registry
 from wfsobs.scenario.groups.atmosphere import PsdTable, Telescope, Turbulence
 from wfsobs.scenario.groups.control import Control
 from wfsobs.scenario.groups.events import FRAMES, LASER, PEAK, WIND, Event
-from wfsobs.scenario.groups.priors import Butterworth, Kalman
 from wfsobs.scenario.groups.run import Loop, Run
 from wfsobs.scenario.groups.sensors import Sensors
 from wfsobs.scenario.groups.vibration import Vibration
@@ -28,6 +28,7 @@ from wfsobs.sensors.modes import Mode, modes_up_to
 from wfsobs.settings.errors import SettingError
 from wfsobs.settings.group import Group
 from wfsobs.settings.parameters import declared_settings
+from wfsobs.settings.priors import Butterworth, Kalman
 from wfsobs.settings.sections import Section, section
 
 if TYPE_CHECKING:
@@ -91,7 +92,14 @@ class Scenario(Group):
     @classmethod
     def settings(cls) -> dict[str, param.Parameter]:
         """Name -> param.Parameter of every setting; the groups that observers and controllers bring along before `control`."""
-        return cls._with(tuple(sections().values()))
+        from wfsobs.observers import OBSERVERS  # late, as what is in it takes its time
+
+        OBSERVERS.complete()
+        if _has_controllers():  # else they are not imported: those of wfsobs bring no settings
+            from wfsobs.control.controllers import CONTROLLERS
+
+            CONTROLLERS.complete()
+        return cls._with(tuple(registry.sections().values()))
 
     @classmethod
     @lru_cache(maxsize=4)
@@ -217,6 +225,41 @@ class Scenario(Group):
                     f"turbulence.layers.{i}.wind_factor = {layer.wind_factor:g}: it takes {crossing:.3g} s to "
                     f"cross the aperture, at most {SLOWEST / self.sensors.lgs_rate:.3g} s at this LGS rate"
                 )
+
+
+registry.announce(Scenario)
+
+
+@cache
+def _has_controllers() -> bool:
+    """Return whether an installed package has controllers."""
+    return bool(entry_points(group=registry.CONTROLLERS))
+
+
+def register(entry: Any) -> None:
+    """Register an observer or a controller, beside those of wfsobs.
+
+    An installed package declares its own by an entry point instead, which other processes see as well.
+
+    Parameters
+    ----------
+    entry : Observer or Controller
+        What to register; the same one again changes nothing.
+
+    Raises
+    ------
+    RegistrationError
+        An id or a group of settings is taken or has forbidden characters, or `entry` is neither.
+    """
+    from wfsobs.control.controllers import CONTROLLERS
+    from wfsobs.observers import OBSERVERS
+
+    if isinstance(entry, OBSERVERS.kind):
+        OBSERVERS.add(entry)
+    elif isinstance(entry, CONTROLLERS.kind):
+        CONTROLLERS.add(entry)
+    else:
+        raise registry.RegistrationError(f"register: takes an Observer or a Controller, not {registry.kind_of(entry)}")
 
 
 def _validate_psd(psd: PsdTable, group: str) -> None:

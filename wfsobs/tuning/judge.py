@@ -7,6 +7,7 @@ from math import isfinite
 
 import numpy as np
 
+from wfsobs.evaluation.result import Failure
 from wfsobs.evaluation.scores import PREDICTION, supervised_scores, unsupervised_scores
 from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
@@ -14,7 +15,6 @@ from wfsobs.observers.base import TARGETS, VIBRATION
 from wfsobs.observers.estimates import Estimate
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError
-from wfsobs.result import Failure
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 

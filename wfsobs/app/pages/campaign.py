@@ -14,12 +14,13 @@ import panel_material_ui as pmui
 from wfsobs.app.controls.status import Status
 from wfsobs.app.copies import CAMPAIGN, EXPLORED, CopiedTask
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.jobs import BATCH, FAILED, RUNNING, BackgroundTask, Job
+from wfsobs.app.jobs import BATCH, FAILED, RUNNING, Job
 from wfsobs.app.pages.parts import WIDE, LinkedFields, LinkedLater, Page, box, boxes, html, legend, line, text
 from wfsobs.app.pages.sweep import SweepMap, line_of
 from wfsobs.app.pages.sweep_views import DECIDED, LEFT_OUT, OPEN, WAITING, SweepLines, axis_title, map_square, verdict_text
 from wfsobs.app.render import NOTHING, Row, number, table
 from wfsobs.app.report.sections import value_of
+from wfsobs.app.service import BackgroundTask
 from wfsobs.app.store import Store
 from wfsobs.app.style import look, swatch
 from wfsobs.campaign.axes import SCENARIO, PlanAxis, plan_axes

@@ -18,7 +18,7 @@ from wfsobs.app.copies import LOOP, CopiedTask
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.downloads import residuals_csv, residuals_npz, table_csv
 from wfsobs.app.glossary import NEEDS, STREHL, TERMS, sentence_on
-from wfsobs.app.jobs import CANCELLED, FAILED, RUNNING, BackgroundTask, Job
+from wfsobs.app.jobs import CANCELLED, FAILED, RUNNING, Job
 from wfsobs.app.loop_work import LoopResults, compute, cost, seconds
 from wfsobs.app.pages.parts import (
     EDITED,
@@ -36,6 +36,7 @@ from wfsobs.app.pages.parts import (
     zoom_buttons,
 )
 from wfsobs.app.render import NOTHING, Row, macro, number, table
+from wfsobs.app.service import BackgroundTask
 from wfsobs.app.store import Store
 from wfsobs.app.style import look, swatch
 from wfsobs.app.views.gain_editor import GainEditor, plane

@@ -15,7 +15,7 @@ from bokeh.models import ColumnDataSource, HoverTool, Range1d
 from wfsobs.app.controls.fields import parse_number
 from wfsobs.app.copies import IDENTIFY, CopiedTask
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.jobs import DONE, FAILED, RUNNING, BackgroundTask, Job, Tell
+from wfsobs.app.jobs import DONE, FAILED, RUNNING, Job, Tell
 from wfsobs.app.pages.parts import (
     WIDE,
     LinkedFields,
@@ -31,6 +31,7 @@ from wfsobs.app.pages.parts import (
     text,
 )
 from wfsobs.app.render import Row, macro, table
+from wfsobs.app.service import BackgroundTask
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source
 from wfsobs.app.store import Store
 from wfsobs.app.style import look

@@ -16,8 +16,8 @@ from wfsobs.app.compared import name_of_difference
 from wfsobs.app.copies import LIVE, CopiedTask
 from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL, Display, per_micrometre
 from wfsobs.app.downloads import Save
-from wfsobs.app.jobs import FAILED, IDLE, RUNNING
-from wfsobs.app.live_work import LiveOrder, LiveTask, record_saves
+from wfsobs.app.jobs import FAILED, RUNNING
+from wfsobs.app.live_work import LiveTask, record_saves
 from wfsobs.app.pages.live_controls import (
     LOOP_FIELDS,
     LiveControls,
@@ -39,7 +39,7 @@ from wfsobs.app.pages.live_figures import (
     live_text,
 )
 from wfsobs.app.pages.parts import HALVES, WIDE, Page, box, boxes, example, figure_with_caption, group, legend, line, text
-from wfsobs.app.service import Post
+from wfsobs.app.service import IDLE, Post
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.style import look
@@ -50,7 +50,7 @@ from wfsobs.evaluation.theory import Theory
 from wfsobs.live.board import NEXT
 from wfsobs.live.checks import can_control, can_run
 from wfsobs.live.finding import Bounds
-from wfsobs.live.loop import LiveLoop
+from wfsobs.live.loop import LiveLoop, LiveOrder
 from wfsobs.live.replay import Replay
 from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.live.source import SIMULATION

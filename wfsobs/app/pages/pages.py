@@ -31,8 +31,8 @@ from wfsobs.app.views.main_lines import MainLines
 from wfsobs.app.views.plots import on_settle
 from wfsobs.app.views.traces import Traces
 from wfsobs.app.work import TRUTH
+from wfsobs.evaluation.result import Result
 from wfsobs.observers.base import TARGETS
-from wfsobs.result import Result
 
 EXPLORE, IDENTIFY, TUNE, SWEEP, LOOP, LIVE = "explore", "identify", "tune", "sweep", "loop", "live"
 CAMPAIGN, FIGURES, MODEL = "campaign", "figures", "model"

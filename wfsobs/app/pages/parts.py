@@ -19,7 +19,8 @@ from wfsobs.app.controls.status import Status
 from wfsobs.app.copies import EXPLORED, CopiedTask
 from wfsobs.app.display import Display
 from wfsobs.app.downloads import Save
-from wfsobs.app.jobs import CANCELLED, DONE, IDLE, RUNNING, BackgroundTask
+from wfsobs.app.jobs import CANCELLED, DONE, RUNNING
+from wfsobs.app.service import IDLE, BackgroundTask
 from wfsobs.app.store import Store
 from wfsobs.app.style import HEARD, asset, swatch
 from wfsobs.app.views.plots import call

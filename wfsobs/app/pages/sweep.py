@@ -20,7 +20,7 @@ from wfsobs.app.controls.names import name_settings
 from wfsobs.app.copies import SWEEP, CopiedTask
 from wfsobs.app.display import Display
 from wfsobs.app.downloads import table_csv
-from wfsobs.app.jobs import BATCH, CANCELLED, DONE, FAILED, RUNNING, BackgroundTask, Job, Tell
+from wfsobs.app.jobs import BATCH, CANCELLED, DONE, FAILED, RUNNING, Job, Tell
 from wfsobs.app.limits import Limits
 from wfsobs.app.pages.parts import (
     TALL,
@@ -49,7 +49,7 @@ from wfsobs.app.pages.sweep_views import (
 )
 from wfsobs.app.render import render
 from wfsobs.app.seeds import SeedScores
-from wfsobs.app.service import Session
+from wfsobs.app.service import BackgroundTask, Session
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, look
 from wfsobs.campaign.sweep import MOST_SEEDS, SEED, Sweep, parse_axis, plan_sweep

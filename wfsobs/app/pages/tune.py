@@ -20,7 +20,7 @@ from wfsobs.app.controls.names import setting_name
 from wfsobs.app.copies import TUNE, CopiedTask
 from wfsobs.app.display import NO_ANGLE, UNITS, Display, per_micrometre
 from wfsobs.app.downloads import table_csv
-from wfsobs.app.jobs import BATCH, INTERVAL, RUNNING, BackgroundTask, Job, Tell
+from wfsobs.app.jobs import BATCH, INTERVAL, RUNNING, Job, Tell
 from wfsobs.app.pages.parts import (
     WIDE,
     LinkedFields,
@@ -37,6 +37,7 @@ from wfsobs.app.pages.parts import (
     text,
 )
 from wfsobs.app.render import NOTHING, Row, change, macro, number, table
+from wfsobs.app.service import BackgroundTask
 from wfsobs.app.store import Store
 from wfsobs.app.style import look
 from wfsobs.app.views.plots import call, new_figure

@@ -23,13 +23,13 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.budget import Budget, budget_row, error_budget
 from wfsobs.evaluation.error_spectra import cumulative_rms, spectra
 from wfsobs.evaluation.evidence import Evidence
+from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.rows import Row, score_rows
 from wfsobs.evaluation.scores import SCORED
 from wfsobs.evaluation.verdict import Verdict, verdict
 from wfsobs.observers.base import TARGETS
 from wfsobs.priors_from.selection import usual_observers
 from wfsobs.record import RecordError
-from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import from_toml, to_toml
 from wfsobs.scenario.grid import Variation

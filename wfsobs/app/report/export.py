@@ -12,15 +12,14 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
 
-import wfsobs
 from wfsobs.app.report.data import Report, pack, state_of
 from wfsobs.app.report.page import page
 from wfsobs.app.work import RunResults
 from wfsobs.evaluation.evidence import Evidence, gather_evidence
+from wfsobs.evaluation.result import Result
 from wfsobs.files import check_writable, write_whole
 from wfsobs.pipeline import run
 from wfsobs.progress import QUIET, Watch
-from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.grid import Variation, scenarios
 
@@ -117,7 +116,7 @@ def make(
     """
     state = state_of(results.result, is_simulated=not results.is_recorded, evidence=evidence)
     content = pack(Report(preset, results.scenario, (), (state,), results.is_recorded, command, sweep, comparison))
-    root = str(Path(wfsobs.__file__).parents[1])
+    root = str(Path(__file__).parents[3])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))}
     # A file, not a pipe: what a pipe has not taken when `communicate` times out is never sent.
     with TemporaryFile() as packet:

@@ -22,7 +22,6 @@ from bokeh.util.paths import bokehjs_path
 from markupsafe import Markup
 from numpy.typing import ArrayLike
 
-from wfsobs import __version__
 from wfsobs.app.display import NO_ANGLE, UNITS, per_micrometre
 from wfsobs.app.glossary import sentence_on
 from wfsobs.app.pages.sweep_views import SweepLines
@@ -50,6 +49,7 @@ from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, VIBRATION
 from wfsobs.sensors.modes import TIP_TILT
+from wfsobs.version import __version__
 
 START = 'document.documentElement.classList.add("js")'
 """Run before anything is drawn: what is for scripts alone may show."""

@@ -9,7 +9,6 @@ from datetime import datetime
 from itertools import groupby
 from typing import Any
 
-from wfsobs import __version__
 from wfsobs.app.display import AT_LIMIT, IN_MOST, OVER_SEEDS, label_of, score_columns
 from wfsobs.app.render import NOTHING, number
 from wfsobs.app.report.data import Report, State, window_of
@@ -35,6 +34,7 @@ from wfsobs.evaluation.scores import BOUND, BOUNDS, PREDICTION, RESIDUAL
 from wfsobs.prior import GIVEN, IDENTIFIED, TRUE
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings, format_value, reference_preset, to_toml
+from wfsobs.version import __version__
 
 
 def state_table(state: State, name: str) -> dict[str, Any]:

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.jobs import RUNNING, BackgroundTask
+from wfsobs.app.jobs import RUNNING
 from wfsobs.app.render import number
+from wfsobs.app.service import BackgroundTask
 from wfsobs.app.style import look, observers_of
 from wfsobs.app.work import RunResults
 from wfsobs.evaluation.evidence import Evidence, rank_observers

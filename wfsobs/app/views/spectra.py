@@ -8,7 +8,7 @@ import numpy as np
 from bokeh.models import ColumnDataSource, HoverTool, Range1d, UnionRenderers, VSpan
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.jobs import BackgroundTask
+from wfsobs.app.service import BackgroundTask
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.plots import (
     MODEL,

@@ -13,9 +13,10 @@ from wfsobs.app.budgets import Budgets
 from wfsobs.app.component import Component
 from wfsobs.app.display import OVER_SEEDS, Display, per_micrometre
 from wfsobs.app.glossary import RELATIVE, TERMS, sentence_on
-from wfsobs.app.jobs import DONE, RUNNING, BackgroundTask
+from wfsobs.app.jobs import DONE, RUNNING
 from wfsobs.app.render import NOTHING, change, number, with_decimals_of
 from wfsobs.app.seeds import SeedRuns
+from wfsobs.app.service import BackgroundTask
 from wfsobs.app.style import TERM_COLOURS, asset, look, observers_of
 from wfsobs.app.views.main_lines import REFERENCES, MainLines
 from wfsobs.app.views.table import find

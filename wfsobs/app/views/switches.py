@@ -12,9 +12,10 @@ from markupsafe import Markup
 from wfsobs.app.compared import ComparedRun, name_of_difference
 from wfsobs.app.display import UNITS, Display, short_name
 from wfsobs.app.history import History
-from wfsobs.app.jobs import FAILED, BackgroundTask
+from wfsobs.app.jobs import FAILED
 from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
+from wfsobs.app.service import BackgroundTask
 from wfsobs.app.style import HEARD, asset, run_swatch
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import TIP_TILT, Mode

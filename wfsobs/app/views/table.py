@@ -12,13 +12,15 @@ from wfsobs.app.compared import ComparedRun
 from wfsobs.app.display import AT_LIMIT, IN_MOST, OVER_SEEDS, Display, per_micrometre, score_columns
 from wfsobs.app.glossary import BOUND as TERM_OF_BOUND
 from wfsobs.app.glossary import term
-from wfsobs.app.jobs import DONE, BackgroundTask
+from wfsobs.app.jobs import DONE
 from wfsobs.app.render import Row, change, hundredths, macro, missing, number, table
 from wfsobs.app.seeds import SeedRuns
+from wfsobs.app.service import BackgroundTask
 from wfsobs.app.style import asset, observers_of, swatch
 from wfsobs.app.work import RunResults
 from wfsobs.evaluation.evidence import rank_observers
 from wfsobs.evaluation.known_lines import group_by_knowledge
+from wfsobs.evaluation.result import Failure
 from wfsobs.evaluation.rows import (
     NOT_OBSERVERS,
     at_bound,
@@ -34,7 +36,6 @@ from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS, LOOP, PREDICTION, RE
 from wfsobs.observers import OBSERVERS
 from wfsobs.prior import TRUE
 from wfsobs.priors_from.selection import is_usual
-from wfsobs.result import Failure
 
 BEST, TIED, ABOVE = macro("tag", "best", "best"), macro("tag", "tied", "tied"), macro("tag", "above", "worse than zero")
 SMALLEST = macro("tag", "smallest", "smallest")

@@ -12,8 +12,8 @@ from bokeh.models import Range1d
 from bokeh.plotting import figure
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.jobs import BackgroundTask
 from wfsobs.app.render import number
+from wfsobs.app.service import BackgroundTask
 from wfsobs.app.style import asset, look, observers_of, swatch
 from wfsobs.app.views.plots import FigureLines, on_settle, zoom_of
 from wfsobs.app.work import TRUTH, RunResults

@@ -12,7 +12,7 @@ from bokeh.plotting import figure
 from numpy.typing import NDArray
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.jobs import BackgroundTask
+from wfsobs.app.service import BackgroundTask
 from wfsobs.app.style import look, observers_of
 from wfsobs.app.views.plots import (
     ComparedLines,

@@ -10,9 +10,10 @@ from markupsafe import Markup
 from wfsobs.app.budgets import Budgets
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.glossary import BOUND, explain_first
-from wfsobs.app.jobs import DONE, IDLE, RUNNING, BackgroundTask
+from wfsobs.app.jobs import DONE, RUNNING
 from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
+from wfsobs.app.service import IDLE, BackgroundTask
 from wfsobs.app.style import asset
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.rows import target_title

@@ -32,7 +32,7 @@ from wfsobs.signal.stepping import Gain, GainCycle
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:
-    from wfsobs.scenario.groups.priors import Kalman
+    from wfsobs.settings.priors import Kalman
 
 NGS = ("y_ngs", "ratio")
 """Fields that a record with NGS frames has."""

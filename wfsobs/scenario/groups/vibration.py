@@ -9,10 +9,8 @@ import param
 from wfsobs.scenario.groups.atmosphere import PsdTable
 from wfsobs.settings.group import Group
 from wfsobs.settings.parameters import Real, Reals
+from wfsobs.settings.priors import PAPER_PEAK_HZ
 from wfsobs.settings.sections import section
-
-PAPER_PEAK_HZ = 47.4969
-"""Dominant natural frequency of VLT UT4 (paper, Table 2)."""
 
 
 class Peak(Group):

@@ -39,7 +39,7 @@ FORMATS = (
     Format((".npz",), npz.read, npz.write),
     Format((".csv", ".txt"), csv.read, csv.write),
     Format((".aot.fits",), aot.read, aot.write),
-    Format((".fits", ".fit", ".fts"), fits.read, fits.write),  # reads AOT as well, which says so inside
+    Format((".fits", ".fit", ".fts"), aot.read_fits, fits.write),
 )
 
 

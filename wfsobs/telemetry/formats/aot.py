@@ -17,11 +17,13 @@ import numpy as np
 
 from wfsobs.record import DELAY, RecordError
 from wfsobs.telemetry.formats.contents import NUMBERS, Contents, FileColumns, TooLargeError, numbers_and_texts
-from wfsobs.telemetry.formats.fits import open_fits, read_whole
+from wfsobs.telemetry.formats.fits import open_fits, read_whole, tables_and_images
 from wfsobs.typing import Array
 
 PREFIX = "WFSOBS-"
 """Prefix of the names of images and metadata written here."""
+KEYWORD = "AOT-VERS"
+"""In the header of an AOT file."""
 
 
 def _aotpy() -> Any:
@@ -41,7 +43,7 @@ def read(file: IO[bytes], most: int) -> FileColumns:
     with open_fits(file, most) as hdus:  # checks the sizes
         for hdu in hdus[1:]:
             _check_lists(hdu, most)
-    from aotpy.io.fits._file import AOTFITSErrorLevel
+    from aotpy.io.fits import AOTFITSErrorLevel
 
     critical = AOTFITSErrorLevel.CRITICAL
     try:
@@ -53,6 +55,14 @@ def read(file: IO[bytes], most: int) -> FileColumns:
         raise
     except Exception as error:  # of many kinds, by what a file lacks
         raise RecordError(f"not an AOT file that aotpy can read: {' '.join(str(error).split())[:200]}") from None
+
+
+def read_fits(file: IO[bytes], most: int) -> FileColumns:
+    """Read the tables and images of a FITS file, or an AOT file, which says so inside. Raises RecordError, TooLargeError."""
+    with open_fits(file, most) as hdus:
+        if KEYWORD not in hdus[0].header:
+            return tables_and_images(hdus)
+    return read(file, most)
 
 
 def _check_lists(hdu: Any, most: int) -> None:

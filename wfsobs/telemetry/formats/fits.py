@@ -36,9 +36,6 @@ KEYWORDS = {"dt": "DT", "ratio": "RATIO", "delay": "DELAY", "command_sign": "CMD
 EXACT = "DTEXACT"
 """The time step as text: a number in a header has sixteen digits, one less than needed."""
 
-AOT = "AOT-VERS"
-"""Keyword of an AOT file."""
-
 DAMAGED = "damaged, or not a FITS file of tables and images"
 MOST_HDUS = 200
 
@@ -50,16 +47,6 @@ def astropy_fits() -> Any:
     except ModuleNotFoundError:
         raise RecordError("FITS files need astropy; install wfsobs with its extra: wfsobs[fits]") from None
     return fits
-
-
-def read(file: IO[bytes], most: int) -> FileColumns:
-    """Read the tables and images of a FITS file, or an AOT file. Raises RecordError, TooLargeError."""
-    with open_fits(file, most) as hdus:
-        if AOT not in hdus[0].header:
-            return _columns(hdus)
-    from wfsobs.telemetry.formats import aot
-
-    return aot.read(file, most)
 
 
 @contextmanager
@@ -111,7 +98,8 @@ def _check_sizes(hdus: HDUList, length: int, most: int) -> None:
             raise RecordError("ends before its data do")
 
 
-def _columns(hdus: HDUList) -> FileColumns:
+def tables_and_images(hdus: HDUList) -> FileColumns:
+    """Read the tables and images of a file. Raises RecordError."""
     fits = astropy_fits()
     out = FileColumns()
     for number, hdu in enumerate(hdus):

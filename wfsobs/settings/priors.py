@@ -6,9 +6,11 @@ from types import MappingProxyType
 
 import param
 
-from wfsobs.scenario.groups.vibration import PAPER_PEAK_HZ
 from wfsobs.settings.group import Group
 from wfsobs.settings.parameters import Real, Reals, Whole
+
+PAPER_PEAK_HZ = 47.4969
+"""Dominant natural frequency of VLT UT4 (paper, Table 2)."""
 
 
 class Kalman(Group):
