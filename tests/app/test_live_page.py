@@ -25,16 +25,18 @@ from wfsobs.app.serve import opens_on_live
 from wfsobs.app.service import IDLE, Service
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
+from wfsobs.app.style import look
 from wfsobs.app.views.plots import new_figure
 from wfsobs.live.board import NEXT
 from wfsobs.live.finding import Finding, PeakFinding
 from wfsobs.live.loop import LiveLoop, LiveOrder
+from wfsobs.live.paced import ALARM, LiveEvent
 from wfsobs.live.peaks import Change
 from wfsobs.live.recording import Recorder
 from wfsobs.live.ring import Ring
 from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.live.spectrum_of_minute import MinuteSpectrum
-from wfsobs.live.view import SHARED, LiveEvent, SharedView
+from wfsobs.live.view import SHARED, SharedView
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -317,8 +319,24 @@ def test_the_table_of_peaks_says_how_far_each_has_moved() -> None:
 
 
 def test_alarms_stand_out_in_the_list_of_events() -> None:
-    html = events_html([LiveEvent(1000, "wind 20 m/s"), LiveEvent(2000, "ALARM noise up: 3 < 4")], 1e-3)
+    html = events_html([LiveEvent(1000, "wind 20 m/s"), LiveEvent(2000, "noise up", detail=": 3 < 4", kind=ALARM)], 1e-3)
     assert "<li>2.00 s: <strong>ALARM noise up: 3 &lt; 4</strong></li><li>1.00 s: wind 20 m/s</li>" in html
+
+
+@pytest.mark.parametrize("name", ["kf-multi", "lqg-kf-multi", "none"])
+@pytest.mark.parametrize(
+    ("what", "kind", "line"),
+    [
+        ("{} off", "", "NAME off"),
+        ("error of {} up", ALARM, "ALARM error of NAME up: 3 nm"),
+        ("over: error of {}", "", "over: error of NAME"),
+        ("identified for {}", "", "identified for NAME: 3 nm"),
+    ],
+)
+def test_events_name_what_runs_as_the_page_does_and_as_the_log_does(name: str, what: str, kind: str, line: str) -> None:
+    event = LiveEvent(0, what, name, ": 3 nm" if "3 nm" in line else "", kind=kind)
+    assert event.line == line.replace("NAME", name)
+    assert line.replace("NAME", look(name).label) in events_html([event], 1e-3)
 
 
 def test_words_of_events_in_the_traces_do_not_cover_each_other() -> None:

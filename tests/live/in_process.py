@@ -4,12 +4,18 @@ import queue
 from types import SimpleNamespace
 
 from wfsobs.live.board import Board
-from wfsobs.live.crew import trace_width
-from wfsobs.live.observing import Order, made_crew
+from wfsobs.live.crew import Site, trace_width
+from wfsobs.live.observing import made_crew
+from wfsobs.live.paced import LiveEvent
 from wfsobs.live.recording import Recorder
 from wfsobs.live.ring import Ring
 from wfsobs.live.rows import Rows
 from wfsobs.live.view import last_frames, read_view
+
+
+def keep_lines(lines):
+    """Return what keeps the lines of the events that it receives."""
+    return lambda what, **fields: lines.append(LiveEvent(0, what, **fields).line)
 
 
 class LoopInProcess:
@@ -18,12 +24,12 @@ class LoopInProcess:
     def __init__(self, scenario, sampling, is_simulated):
         self.scenario, self.sampling, self.news = scenario, sampling, queue.Queue()
         self.ring, self.board, self.traces = Ring(2), Board(2), Rows(trace_width(2), 4096)
-        order = Order(scenario.to_dict(), ("kf-multi",), sampling, 0, False, "", "", "", None, self.news)
-        self.crew, self.count = made_crew(order, self.board), 0
+        site = Site(scenario.to_dict(), sampling, "", "", self.news)
+        self.crew, self.count = made_crew(site, self.board, 0, ("kf-multi",)), 0
         self.recorder = Recorder(self.ring, sampling, self.say, is_simulated)
         self.workshop = SimpleNamespace(do=lambda function, *given, then: then(function(*given)), keep=lambda finding: None)
 
-    def say(self, line):
+    def say(self, what, **fields):
         raise NotImplementedError
 
     @property

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests.live.in_process import keep_lines
 from wfsobs.live.alarms import FEWEST, Alarms, noise_of
 from wfsobs.live.board import SLOTS
 from wfsobs.live.crew import slot_width, trace_width
@@ -38,7 +39,7 @@ def test_noise_is_that_of_third_differences():
 
 def test_an_alarm_is_told_once_and_when_it_is_over():
     said = []
-    alarms = Alarms(said.append)
+    alarms = Alarms(keep_lines(said))
     for k in range(FEWEST + 2):
         look(alarms, second(0.02, seed=k))
     assert said == []
@@ -61,7 +62,7 @@ def test_an_alarm_is_told_once_and_when_it_is_over():
 
 def test_ngs_frames_that_were_due_are_missing():
     said = []
-    alarms = Alarms(said.append)
+    alarms = Alarms(keep_lines(said))
     ngs = np.full((1000, 2), np.nan)
     ngs[3::10] = 0.1  # the first frame has the number 7
     for lost in (0, 2, 0):
@@ -79,7 +80,7 @@ def test_what_varies_from_second_to_second_may_vary():
     """After errors of 1, 2 and 3 in turn one of 4 is usual; after 2 alone it is an alarm."""
     for errors, is_alarm in (([0.01, 0.02, 0.03] * 7, False), ([0.02] * 21, True)):
         said = []
-        alarms = Alarms(said.append)
+        alarms = Alarms(keep_lines(said))
         for k, error in enumerate([*errors, 0.04]):
             alarms.judge(second(1e-6, error=error, seed=k), ["kf-multi"])
         assert bool(said) == is_alarm

@@ -10,8 +10,7 @@ import pytest
 import wfsobs
 from wfsobs.closed_loop.design import design as design_laws
 from wfsobs.closed_loop.run import closed_loop, residual_rms
-from wfsobs.live.control_crew import SEATS, ControlCrew, row_width
-from wfsobs.live.control_process import ControlView
+from wfsobs.live.control_crew import SEATS, ControlCrew, ControlView, row_width
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.ring import LiveFrame
 from wfsobs.live.simulated import SimulatedLoop
@@ -36,7 +35,7 @@ def crew_of(scenario, names, said=None):
     record = wfsobs.simulate(scenario)
     crew = ControlCrew(record.sampling, round(scenario.run.warm_up / record.dt), (said or queue.Queue()).put)
     for name in names:
-        crew.follow({"controller": name, "design": wfsobs.design(name, scenario)}, 0)
+        crew.follow({"id": name, "design": wfsobs.design(name, scenario)}, 0)
     return crew, record
 
 
@@ -107,17 +106,17 @@ def test_controllers_come_and_go_and_take_over():
     crew, record = crew_of(scenario, ("lqg-kf-multi",), said)
     frames = list(frames_of(record))
     rows = [crew.take(frames[k], k).copy() for k in range(503)]
-    crew.follow({"controller": "integrator", "design": wfsobs.design("integrator", scenario)}, 503)
-    crew.follow({"controller": "lqg-kf-multi", "design": wfsobs.design("lqg-kf-multi", scenario)}, 503)
+    crew.follow({"id": "integrator", "design": wfsobs.design("integrator", scenario)}, 503)
+    crew.follow({"id": "lqg-kf-multi", "design": wfsobs.design("lqg-kf-multi", scenario)}, 503)
     rows += [crew.take(frames[k], k).copy() for k in range(503, 900)]
-    crew.follow({"controller": "lqg-kf-multi", "design": None}, 900)
+    crew.follow({"id": "lqg-kf-multi", "design": None}, 900)
     rows += [crew.take(frames[k], k).copy() for k in range(900, 1000)]
     view = ControlView(0, record.dt, np.array(rows))
     assert np.isnan(view.residual("integrator")[:505]).all() and not np.isnan(view.residual("integrator")[505:]).any()
     batch = closed_loop(record, design_laws(scenario, ["lqg-kf-multi"])).outcomes[0]
     np.testing.assert_allclose(view.residual("lqg-kf-multi")[:900], batch.residual[:900], rtol=0, atol=1e-9)
     assert np.isnan(view.residual("lqg-kf-multi")[900:]).all()
-    assert [line for _, line in list(said.queue)] == [
+    assert [event.line for event in said.queue] == [
         "lqg-kf-multi on", "lqg-kf-multi has a new design", "integrator on", "lqg-kf-multi off",
     ]  # fmt: skip
     assert not crew.is_idle and row_width(2) == 1 + 5 * len(SEATS)

@@ -115,7 +115,7 @@ def test_a_process_beside_the_loop_that_is_killed_is_named_too(loop, name):
     wait(loop.failure)
     assert loop.failure() == f"live: the process of {name} ({pid}) was ended by signal 9 (SIGKILL)"
     for _ in range(100):  # no more than a pipe holds waits for the one that is gone
-        loop._processes.tell_controllers({"controller": "none", "design": bytes(4096)})
+        loop._processes.tell_controllers({"id": "none", "design": bytes(4096)})
     wait_for([loop._processes.workshop.submit(abs, -1)])
     pids = loop._processes.pids
     loop.stop()

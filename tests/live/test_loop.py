@@ -20,10 +20,10 @@ import wfsobs
 from wfsobs.live import simulated
 from wfsobs.live.blocks import Block
 from wfsobs.live.board import Board
-from wfsobs.live.crew import trace_width
+from wfsobs.live.crew import Site, trace_width
 from wfsobs.live.delivery import Delivery, merged_rows
 from wfsobs.live.loop import TICK, LiveLoop, _keep
-from wfsobs.live.observing import POLL, REST, Order, Pause, made_crew
+from wfsobs.live.observing import POLL, REST, Pause, made_crew
 from wfsobs.live.paced import Pace
 from wfsobs.live.ring import LiveFrame, Ring
 from wfsobs.live.rows import Rows
@@ -169,8 +169,8 @@ class Stage:
         self.ring, self.board = Ring(2), Board(2)
         self.traces = Rows(trace_width(2), 4096)
         settings = scenario.to_dict()
-        order = Order(settings, names, record.sampling, 0, False, "", "", "", None, self.said)
-        self.crew, self.number = made_crew(order, self.board), 0
+        site = Site(settings, record.sampling, "", "", self.said)
+        self.crew, self.number = made_crew(site, self.board, 0, names), 0
 
     def run(self, n):
         r = self.record
@@ -227,7 +227,7 @@ def test_a_new_design_goes_on_without_a_bump(stage):
     for one in (live, other):
         one.run(1003)
     for name in names:
-        live.crew.follow({"observer": name, "design": wfsobs.design(name, paper())}, 1003)
+        live.crew.follow({"id": name, "design": wfsobs.design(name, paper())}, 1003)
     for one in (live, other):
         one.run(500)
     for name in names:
@@ -241,8 +241,8 @@ def test_a_new_design_goes_on_without_a_bump(stage):
 def test_observers_come_and_go(stage):
     live = stage(("kf-lgs",))
     live.run(1003)
-    live.crew.follow({"observer": "multirate", "design": wfsobs.design("multirate", paper())}, 1003)
-    live.crew.follow({"observer": "kf-lgs", "design": None}, 1003)
+    live.crew.follow({"id": "multirate", "design": wfsobs.design("multirate", paper())}, 1003)
+    live.crew.follow({"id": "kf-lgs", "design": None}, 1003)
     live.run(900)
     assert live.board.active() == ["multirate"] and live.board["multirate"].since[0] == 1005
     view = live.view(2.0)
@@ -253,7 +253,7 @@ def test_observers_come_and_go(stage):
     for k in range(1005, 1903):
         alone.update(live.record.z[k], live.record.z_ngs[k] if k > 1005 and k % 5 == 0 else None)
     assert view.estimate("multirate", "turbulence")[-1] == pytest.approx(alone.predict(0)[0], rel=1e-12)
-    assert [line for _, line in list(live.said.queue)] == ["kf-lgs off", "multirate on"]
+    assert [event.line for event in live.said.queue] == ["kf-lgs off", "multirate on"]
 
 
 def test_a_live_loop_from_start_to_stop():

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests.live.in_process import keep_lines
 from wfsobs import PRESETS, simulate
 from wfsobs.live.alarms import Alarms
 from wfsobs.live.finding import identify_frames
@@ -17,7 +18,7 @@ PART = 20_000
 def test_a_line_that_jumps_in_the_midst_is_told_as_moved(seed, at):
     scenario = PRESETS["peak-jump"]().replace({"run.duration": 60.0, "run.seed": seed, "events.0.start": at})
     record, said = simulate(scenario), []
-    alarms = Alarms(said.append)
+    alarms = Alarms(keep_lines(said))
     for first in range(0, 60_000, PART):
         part = slice(first, first + PART)
         frames = LiveFrame(0.0, record.z[part], record.z_ngs[part], *[np.full((PART, 2), np.nan)] * 3)

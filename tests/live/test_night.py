@@ -6,6 +6,7 @@ import pytest
 from tests.live.in_process import LoopInProcess
 from tests.live.test_programme import Maker
 from wfsobs.live.loop import Shadow
+from wfsobs.live.paced import LiveEvent
 from wfsobs.live.programme import Programme
 from wfsobs.live.simulated import SimulatedFrames
 from wfsobs.scenario.presets import PRESETS
@@ -38,9 +39,9 @@ class Night(LoopInProcess):
             self.ring.write(np.concatenate(([0.0], source.next_row(k))))
             self.observe()
 
-    def say(self, line):
-        if line:
-            self.lines.append((self.newest * self.sampling.dt, line))
+    def say(self, what, **fields):
+        if what:
+            self.lines.append((self.newest * self.sampling.dt, LiveEvent(self.newest, what, **fields).line))
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from tests.live.in_process import keep_lines
 from wfsobs.live.alarms import Alarms
 from wfsobs.live.finding import Finding, PeakFinding
 from wfsobs.live.peaks import Change, distinct_peaks, has_risen, peak_changes
@@ -35,7 +36,7 @@ def minute(*there, found=None, level=1.0):
 def told(*minutes):
     """Return the alarms of each minute."""
     said, out = [], []
-    alarms = Alarms(said.append)
+    alarms = Alarms(keep_lines(said))
     for one in minutes:
         alarms.compare(one)
         out.append([line.removeprefix("ALARM ") for line in said])
@@ -145,7 +146,7 @@ def test_a_line_in_pieces_is_one_peak_and_a_faint_one_is_none():
     assert found[1].frequency_std == pytest.approx(np.sqrt(power @ own / power.sum()), rel=1e-12)
     other = (17.2, 3e-3)
     assert peak_changes([minute(other, (50.5, 3e-2)), whole]) == []  # a minute does not resolve the difference
-    assert peak_changes([minute(other, (47.5, 3e-2)), whole]) == ["peak moved from 47.50 to 50.51 Hz"]
+    assert peak_changes([minute(other, (47.5, 3e-2)), whole]) == [("peak moved from 47.50 to 50.51 Hz", "")]
 
 
 def test_what_is_known_of_the_first_minute():

@@ -8,7 +8,8 @@ import pytest
 import wfsobs
 from wfsobs.live.blocks import endless_blocks
 from wfsobs.live.board import Board
-from wfsobs.live.observing import Order, made_crew
+from wfsobs.live.crew import Site
+from wfsobs.live.observing import made_crew
 from wfsobs.live.programme import STAIR, Programme
 from wfsobs.live.recording import record_of
 from wfsobs.live.ring import LiveFrame
@@ -148,8 +149,8 @@ def test_live_numbers_are_those_of_the_recording():
     frames = SimulatedFrames(told, maker)
     programme = Programme(scenario, lambda command: frames.take(maker.tell(command), 0))
     try:
-        order = Order(told.to_dict(), names, wfsobs.stepping.sampling_of(told), 0, False, "", "", "", None, queue.Queue())
-        crew = made_crew(order, board)
+        site = Site(told.to_dict(), wfsobs.stepping.sampling_of(told), "", "", queue.Queue())
+        crew = made_crew(site, board, 0, names)
         for k in range(4000):
             if k % 200 == 0:
                 programme.play(k * told.dt)

@@ -13,7 +13,7 @@ from tests.live.in_process import LoopInProcess
 from tests.live.test_sources import Inbox
 from wfsobs.live.attached import StreamFrames, StreamSource
 from wfsobs.live.loop import Shadow, append_line
-from wfsobs.live.paced import Desk
+from wfsobs.live.paced import Desk, LiveEvent
 from wfsobs.scenario.presets import paper
 from wfsobs.streams.shared_image import SharedImage
 
@@ -35,8 +35,8 @@ class Loop(LoopInProcess):
         self.stream._follow_commands()
         self.shadow = Shadow(self.say, self)
 
-    def say(self, line):
-        append_line(str(self.log), self.newest * self.sampling.dt, line)
+    def say(self, what, **fields):
+        append_line(str(self.log), self.newest * self.sampling.dt, LiveEvent(self.newest, what, **fields).line)
 
     def send(self, z, is_lost):
         self.image.write(z)

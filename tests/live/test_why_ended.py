@@ -8,20 +8,26 @@ import pytest
 
 from wfsobs.live.follow import _drain
 from wfsobs.live.loop import LiveLoop
-from wfsobs.live.view import LiveEvent
+from wfsobs.live.paced import FAILURE, LiveEvent
 from wfsobs.settings.group import SettingError
 
 
 @pytest.mark.parametrize(
-    ("lines", "reason"),
+    ("events", "reason"),
     [
-        (["kf-ngs: needs NGS frames", "/dev/shm/a.im.shm: no frame for 0.1 s"], "kf-ngs: needs NGS frames"),
-        (["recording on", "the record has ended"], "the record has ended"),
+        (
+            [
+                LiveEvent(0, "kf-ngs: needs NGS frames", kind=FAILURE),
+                LiveEvent(0, "no frame for 0.1 s", origin="/dev/shm/a.im.shm"),
+            ],
+            "kf-ngs: needs NGS frames",
+        ),
+        ([LiveEvent(0, "recording on"), LiveEvent(0, "the record has ended")], "the record has ended"),
         ([], "the processes of the loop have ended"),
     ],
 )
-def test_the_reason_is_that_of_an_observer_whatever_a_source_says_afterwards(lines, reason):
-    loop: Any = SimpleNamespace(events=deque(LiveEvent(0, line) for line in lines))
+def test_the_reason_is_that_of_an_observer_whatever_a_source_says_afterwards(events, reason):
+    loop: Any = SimpleNamespace(events=deque(events))
     loop._processes = SimpleNamespace(failure=str, observers_are_alive=False)
     loop.tend = lambda: None
     assert LiveLoop.failure(loop) == reason

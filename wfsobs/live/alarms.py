@@ -9,13 +9,12 @@ import numpy as np
 
 from wfsobs.live.board import NEXT
 from wfsobs.live.finding import Finding
+from wfsobs.live.paced import ALARM
 from wfsobs.live.peaks import peak_changes
 from wfsobs.live.ring import LiveFrame
 from wfsobs.live.view import LiveView
 from wfsobs.typing import Array
 
-ALARM = "ALARM"
-"""How the line of an alarm begins."""
 MISSING = 0.01
 """Part of the frames of a second that may be missing."""
 RISE, SPREADS = 1.5, 6.0
@@ -37,13 +36,13 @@ class Alarms:
     Parameters
     ----------
     say : callable
-        Receives one line.
+        Receives the fields of an event but its frame.
     """
 
-    def __init__(self, say: Callable[[str], None]):
+    def __init__(self, say: Callable[..., None]):
         self._say = say
-        self._history: dict[str, list[float]] = {}
-        self._active: set[str] = set()
+        self._history: dict[tuple[str, str], list[float]] = {}
+        self._active: set[tuple[str, str]] = set()
         self._findings: list[Finding] = []
 
     def look_at(self, frames: LiveFrame, first: int, ratio: int | None) -> None:
@@ -67,13 +66,13 @@ class Alarms:
     def judge(self, second: LiveView, observers: Sequence[str]) -> None:
         """Judge what observers of both targets have expected of a second of frames."""
         for name in observers:
-            self._judge(f"error of {name}", float(np.sqrt(np.mean(second.rms(name, NEXT) ** 2))))
+            self._judge("error of {}", float(np.sqrt(np.mean(second.rms(name, NEXT) ** 2))), name)
 
     def compare(self, finding: Finding) -> None:
         """Judge an identification against those before."""
         self._findings = [*self._findings[-3:], finding]
-        for row in peak_changes(self._findings):
-            self._say(f"{ALARM} {row}")
+        for what, detail in peak_changes(self._findings):
+            self._say(what, detail=detail, kind=ALARM)
 
     def _miss(self, sensor: str, due: Array) -> None:
         """Judge what has come of the measurements that were due, (n, n_modes)."""
@@ -81,27 +80,28 @@ class Alarms:
             missing = float(np.isnan(due).any(axis=1).mean())
             self._set(f"{sensor} frames missing", missing > MISSING, f"{missing:.1%} of {sensor} frames missing")
 
-    def _judge(self, what: str, value: float) -> None:
-        """Judge a number by what it has been so far; while it is raised it does not count."""
+    def _judge(self, what: str, value: float, about: str = "") -> None:
+        """Judge a number, of an observer if `about` it, by what it has been so far; while it is raised it does not count."""
         if isnan(value):
             return
-        history = self._history.setdefault(what, [])
+        history = self._history.setdefault((what, about), [])
         usual = float(np.median(history)) if len(history) >= FEWEST else value
         spread = NORMAL * float(np.median(np.abs(np.subtract(history, usual)))) if history else 0.0
         rise = max((RISE - 1.0) * usual, SPREADS * spread)
-        is_active = value > usual + rise * (CALM if what in self._active else 1.0)
-        self._set(what, is_active, f"{what} up: {1e3 * value:.1f} nm, it was {1e3 * usual:.1f} nm")
+        is_active = value > usual + rise * (CALM if (what, about) in self._active else 1.0)
+        self._set(what, is_active, f"{what} up", about, f": {1e3 * value:.1f} nm, it was {1e3 * usual:.1f} nm")
         if not is_active:
             history.append(value)
             del history[:-HISTORY]
 
-    def _set(self, what: str, is_active: bool, line: str) -> None:
-        if is_active and what not in self._active:
-            self._active.add(what)
-            self._say(f"{ALARM} {line}")
-        elif not is_active and what in self._active:
-            self._active.discard(what)
-            self._say(f"over: {what}")
+    def _set(self, what: str, is_active: bool, now: str, about: str = "", detail: str = "") -> None:
+        key = what, about
+        if is_active and key not in self._active:
+            self._active.add(key)
+            self._say(now, about=about, detail=detail, kind=ALARM)
+        elif not is_active and key in self._active:
+            self._active.discard(key)
+            self._say(f"over: {what}", about=about)
 
 
 def noise_of(z: Array) -> float:

@@ -222,4 +222,4 @@ class StreamFrames:
         self._spells[line] = now
 
     def _say(self, line: str) -> None:
-        self._desk.say(self._ring.count, f"{self._source.path}: {line}")
+        self._desk.say(self._ring.count, line, self._source.path)

@@ -1,18 +1,31 @@
-"""Controllers beside a live loop: what each would have left of the same disturbance."""
+"""Controllers beside a live loop: what each would have left of the same disturbance, and the last seconds of it."""
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from time import sleep
 
 import numpy as np
 
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.step import StepController
-from wfsobs.live.paced import Command
-from wfsobs.live.ring import LiveFrame
-from wfsobs.observers.step_checks import StepError
+from wfsobs.live.crew import ROOM, Crew, Site, warm_up_of
+from wfsobs.live.paced import LiveEvent, enter_process
+from wfsobs.live.ring import CAPACITY, LiveFrame, Ring
+from wfsobs.live.rows import Rows
+from wfsobs.live.view import rms_of_known
 from wfsobs.record import Sampling
 from wfsobs.typing import Array
+
+LOOK = 0.05
+"""Pause between two looks at the ring [s]: nobody waits for a residual."""
+BATCH = 200
+"""Frames between two looks at the commands."""
+NICENESS = 5
+"""Of the process: observers go first."""
 
 SEATS = tuple(c.id for c in CONTROLLERS.values() if c.predict is None or c.step_predict is not None)
 """Controllers that run frame by frame; each has its place in a row."""
@@ -31,27 +44,15 @@ def seat_width(n_modes: int) -> int:
     return 2 * n_modes + 1
 
 
-class ControlCrew:
-    """The controllers of one process.
+class ControlCrew(Crew[StepController, StepController]):
+    """The controllers of one process."""
 
-    Parameters
-    ----------
-    sampling : Sampling
-        Modes, step and NGS ratio of the source.
-    warm_up : int
-        Frames of a controller before the first that counts.
-    say : callable
-        Receives (number of the frame, one line) about what happens.
-    """
-
-    def __init__(self, sampling: Sampling, warm_up: int, say: Callable[[tuple[int, str]], None]):
+    def __init__(self, sampling: Sampling, warm_up: int, say: Callable[[LiveEvent], None]):
+        super().__init__(sampling, warm_up, say)
         m = sampling.n_modes
-        self.ratio, self._warm_up, self._say = sampling.ratio or 1, warm_up, say
         self._row = np.full(row_width(m), np.nan)
         seats = self._row[1:].reshape(len(SEATS), seat_width(m))
         self._left, self._squares, self._counts = seats[:, :m], seats[:, m:-1], seats[:, -1]  # views of the row
-        self._active: dict[str, StepController] = {}
-        self._waiting: dict[str, StepController] = {}
 
     @property
     def is_idle(self) -> bool:
@@ -60,10 +61,7 @@ class ControlCrew:
 
     def take(self, frame: LiveFrame, number: int) -> Array:
         """Have every controller take a frame; return the row of what they leave."""
-        if self._waiting and number % self.ratio == 0:
-            for name, controller in self._waiting.items():
-                self._start(name, controller, number)
-            self._waiting.clear()
+        self._start_waiting(number)
         ngs = None if np.isnan(frame.ngs[0]) else frame.ngs
         disturbance = frame.turbulence + frame.vibration
         self._row[0] = number
@@ -85,32 +83,79 @@ class ControlCrew:
         for controller in self._active.values():
             controller.reset()
 
-    def follow(self, command: Command, number: int) -> None:
-        """Switch a controller off, or a new design on, which goes on where the one before is."""
-        name, controller = command["controller"], command["design"]
-        if controller is None:
-            self._waiting.pop(name, None)
-            if self._active.pop(name, None) is not None:
-                self._clear(name, np.nan)
-                self._say((number, f"{name} off"))
-        elif (before := self._active.get(name)) is None:
-            self._waiting[name] = controller
-        else:
-            try:
-                controller.take_over(before)
-            except StepError as error:
-                self._waiting[name] = controller
-                self._say((number, f"{error}: restarted"))
-            else:
-                self._active[name] = controller
-                self._say((number, f"{name} has a new design"))
+    def start(self, name: str, design: StepController, number: int) -> None:
+        """Let a controller run from a frame on."""
+        self._fill(name, 0.0)
+        self._active[name] = design
 
-    def _start(self, name: str, controller: StepController, number: int) -> None:
-        self._clear(name, 0.0)
-        self._active[name] = controller
-        self._say((number, f"{name} on"))
+    def _swap(self, name: str, member: StepController, design: StepController) -> None:
+        design.take_over(member)
+        self._active[name] = design
 
-    def _clear(self, name: str, value: float) -> None:
+    def _clear(self, name: str, member: StepController) -> None:
+        self._fill(name, np.nan)
+
+    def _fill(self, name: str, value: float) -> None:
         seat = SEATS.index(name)
         self._left[seat] = np.nan
         self._squares[seat] = self._counts[seat] = value
+
+
+@dataclass(frozen=True)
+class ControlView:
+    """What controllers leave of consecutive frames.
+
+    Attributes
+    ----------
+    first : int
+        Number of the first one.
+    dt : float
+        Time between two [s].
+    """
+
+    first: int
+    dt: float
+    _rows: Array
+
+    def residual(self, controller: str) -> Array:
+        """Return what a controller leaves, (n, n_modes) [um]; NaN while it is off. Without truth, what its sensor would see."""
+        own = self._of(controller)
+        return own[:, : own.shape[1] // 2]
+
+    def rms(self, controller: str) -> Array:
+        """Return the rms of the residual, (n_modes,) [um]; NaN where there is none."""
+        return rms_of_known(self.residual(controller))
+
+    def rms_since_start(self, controller: str) -> Array:
+        """Return the rms of the residual after the warm-up of the controller, (n_modes,) [um]; NaN where there is none."""
+        own = self._of(controller)
+        m = own.shape[1] // 2
+        if not len(own) or not own[-1, -1] > 0:
+            return np.full(m, np.nan)
+        return np.sqrt(own[-1, m:-1] / own[-1, -1])
+
+    def _of(self, controller: str) -> Array:
+        width = (self._rows.shape[1] - 1) // len(SEATS)
+        at = 1 + SEATS.index(controller) * width
+        return self._rows[:, at : at + width]
+
+
+def control_frames(site: Site, rows_name: str, inbox: Connection) -> None:
+    """Follow a ring until the process is ended; it may lag behind the frames."""
+    enter_process(NICENESS)
+    sampling = site.sampling
+    ring, rows = Ring(sampling.n_modes, site.ring_name), Rows(row_width(sampling.n_modes), ROOM, rows_name)
+    crew = ControlCrew(sampling, warm_up_of(site), site.news.put)
+    gc.freeze()
+    while True:
+        while inbox.poll():
+            crew.follow(inbox.recv(), rows.count)
+        newest = ring.count
+        if crew.is_idle or newest - rows.count > CAPACITY - BATCH:
+            crew.reset()
+            rows.skip_to(-(-newest // crew.ratio) * crew.ratio)
+        stop = min(newest, rows.count + BATCH)
+        while rows.count < stop and (frame := ring.read(rows.count)) is not None:
+            rows.write(crew.take(frame, rows.count))
+        if rows.count >= newest:
+            sleep(LOOK)

@@ -1,15 +1,18 @@
-"""The observers that follow in one process: each takes every frame, all are scored together."""
+"""What runs beside a live loop, frame by frame: crews, and those of observers."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from multiprocessing.queues import Queue
 from time import monotonic
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from wfsobs.latencies import EDGES
 from wfsobs.live.board import NEXT, SCORED, SLOTS, Board
-from wfsobs.live.paced import Command
+from wfsobs.live.paced import Command, LiveEvent
 from wfsobs.live.ring import LiveFrame
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.step import StepObserver
@@ -17,8 +20,13 @@ from wfsobs.observers.step_checks import StepError
 from wfsobs.record import Sampling
 from wfsobs.typing import Array
 
+D = TypeVar("D")
+M = TypeVar("M")
+
 TRUTHS = (*TARGETS, NEXT)
 """What errors are against; that of both targets together is the sum of theirs."""
+ROOM = 1 << 14
+"""Rows of estimates or residuals that are kept: a quarter of a minute at 1 kHz."""
 COUNTED = 64
 """Frames that are counted together at most."""
 
@@ -31,6 +39,86 @@ def trace_width(n_modes: int) -> int:
 def slot_width(n_modes: int) -> int:
     """Return the width of what one observer has in a row: the time of its step [s], and an estimate of every target [um]."""
     return 1 + len(TARGETS) * n_modes
+
+
+@dataclass(frozen=True)
+class Site:
+    """What the processes of crews have in common.
+
+    settings : of the scenario that observers and controllers are told of
+    sampling : modes, step and NGS ratio of the source
+    ring_name, board_name : shared memory
+    news     : events
+    """
+
+    settings: Mapping[str, Any]
+    sampling: Sampling
+    ring_name: str
+    board_name: str
+    news: Queue[LiveEvent]
+
+
+def warm_up_of(site: Site) -> int:
+    """Return the frames of an observer or a controller before the first that counts."""
+    return round(site.settings["run"]["warm_up"] / site.sampling.dt)
+
+
+class Crew(Generic[D, M]):
+    """What runs in one process: designs D, as the members M of the crew.
+
+    Parameters
+    ----------
+    sampling : Sampling
+        Modes, step and NGS ratio of the source.
+    warm_up : int
+        Frames of a member before the first that counts.
+    say : callable
+        Receives events.
+    """
+
+    def __init__(self, sampling: Sampling, warm_up: int, say: Callable[[LiveEvent], None]):
+        self.ratio, self._warm_up, self._say = sampling.ratio or 1, warm_up, say
+        self._active: dict[str, M] = {}
+        self._waiting: dict[str, D] = {}
+
+    def follow(self, command: Command, number: int) -> None:
+        """Switch a member off, or a new design on, which goes on where the one before is."""
+        name, design = command["id"], command["design"]
+        if design is None:
+            self._waiting.pop(name, None)
+            if (member := self._active.pop(name, None)) is not None:
+                self._clear(name, member)
+                self._say(LiveEvent(number, "{} off", name))
+        elif (member := self._active.get(name)) is None:
+            self._waiting[name] = design
+        else:
+            try:
+                self._swap(name, member, design)
+            except StepError as error:
+                self._waiting[name] = design
+                self._say(LiveEvent(number, f"{error}: restarted"))
+            else:
+                self._say(LiveEvent(number, "{} has a new design", name))
+
+    def _start_waiting(self, number: int) -> None:
+        """Start those that wait for an NGS frame."""
+        if self._waiting and number % self.ratio == 0:
+            for name, design in self._waiting.items():
+                self.start(name, design, number)
+                self._say(LiveEvent(number, "{} on", name))
+            self._waiting.clear()
+
+    def start(self, name: str, design: D, number: int) -> None:
+        """Let a design follow from a frame on."""
+        raise NotImplementedError
+
+    def _swap(self, name: str, member: M, design: D) -> None:
+        """Have a design go on where a member is. Raises StepError."""
+        raise NotImplementedError
+
+    def _clear(self, name: str, member: M) -> None:
+        """Clear what one had that is off."""
+        raise NotImplementedError
 
 
 class Follower:
@@ -58,8 +146,8 @@ class Follower:
             out[:] = observer.predict(0, target)[0]
 
 
-class Crew:
-    """The observers that follow in one process.
+class ObserverCrew(Crew[StepObserver, Follower]):
+    """The observers that follow in one process: each takes every frame, all are scored together.
 
     Parameters
     ----------
@@ -72,29 +160,24 @@ class Crew:
     place : int
         Of the crew in CREWS.
     say : callable
-        Receives (number of the frame, one line) about what happens.
+        Receives events.
     """
 
-    def __init__(self, sampling: Sampling, warm_up: int, board: Board, place: int, say: Callable[[tuple[int, str]], None]):
+    def __init__(self, sampling: Sampling, warm_up: int, board: Board, place: int, say: Callable[[LiveEvent], None]):
+        super().__init__(sampling, warm_up, say)
         n, m = len(SLOTS), sampling.n_modes
-        self._dt, self.ratio, self._warm_up = sampling.dt, sampling.ratio or 1, warm_up
-        self._board, self._place, self._say = board, place, say
+        self._dt, self._board, self._place = sampling.dt, board, place
         self._row = np.full(trace_width(m), np.nan)
         slots = self._row[2:].reshape(n, slot_width(m))
         self._times, self._estimates = slots[:, 0], slots[:, 1:].reshape(n, len(TARGETS), m)  # views of the row
         self._rows, self._truth, self._waits = np.empty((COUNTED, *slots.shape)), np.empty((COUNTED, len(TRUTHS), m)), 0
         self._next, self._running = np.full((n, m), np.nan), np.empty(0, dtype=np.intp)
-        self._active: dict[str, Follower] = {}
-        self._waiting: dict[str, StepObserver] = {}
 
     def take(self, frame: LiveFrame, number: int) -> Array:
         """Have every observer take a frame; return the row of their estimates. `settle` follows once that is written."""
         if self._waits == COUNTED:
             self.count()
-        if self._waiting and number % self.ratio == 0:
-            for name, observer in self._waiting.items():
-                self.start(name, observer, number)
-            self._waiting.clear()
+        self._start_waiting(number)
         ngs = None if np.isnan(frame.ngs[0]) else frame.ngs
         before = monotonic()
         for follower in self._active.values():
@@ -159,42 +242,27 @@ class Crew:
     def follow(self, command: Command, number: int) -> None:
         """Switch an observer off, or a new design on, which goes on where the one before is."""
         self.count()
-        name, observer = command["observer"], command["design"]
-        if observer is None:
-            self._waiting.pop(name, None)
-            if (follower := self._active.pop(name, None)) is not None:
-                self._estimates[follower.slot] = self._times[follower.slot] = np.nan
-                self._next[follower.slot] = np.nan
-                self._board[name].since[0] = -1
-                self._list_running()
-                self._say((number, f"{name} off"))
-        elif (follower := self._active.get(name)) is None:
-            self._waiting[name] = observer
-        else:
-            self._swap(follower, observer, number)
+        super().follow(command, number)
 
-    def _swap(self, follower: Follower, observer: StepObserver, number: int) -> None:
-        try:
-            observer.take_over(follower.observer)
-        except StepError as error:
-            self._waiting[observer.id] = observer
-            self._say((number, f"{error}: restarted"))
-        else:
-            follower.observer = observer
-            self._say((number, f"{observer.id} has a new design"))
+    def _clear(self, name: str, member: Follower) -> None:
+        self._estimates[member.slot] = self._times[member.slot] = self._next[member.slot] = np.nan
+        self._board[name].since[0] = -1
+        self._list_running()
 
-    def start(self, name: str, observer: StepObserver, number: int) -> None:
+    def _swap(self, name: str, member: Follower, design: StepObserver) -> None:
+        design.take_over(member.observer)
+        member.observer = design
+
+    def start(self, name: str, design: StepObserver, number: int) -> None:
         """Let an observer follow from a frame on."""
         self.count()
         counts, slot = self._board[name], SLOTS.index(name)
         counts.clear()
         counts.since[0] = number
         self._next[slot] = np.nan
-        self._active[name] = Follower(observer, slot, self._estimates[slot])
+        self._active[name] = Follower(design, slot, self._estimates[slot])
         self._active = {slot: self._active[slot] for slot in SLOTS if slot in self._active}
         self._list_running()
-        if number:
-            self._say((number, f"{name} on"))
 
     def _list_running(self) -> None:
         self._running = np.array([follower.slot for follower in self._active.values()], dtype=np.intp)

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any
 from weakref import ReferenceType, finalize, ref
 
 from wfsobs.live.alarms import Alarms
-from wfsobs.live.board import SLOTS
 from wfsobs.live.checks import check_slot, check_speed
-from wfsobs.live.control_process import ControlView
+from wfsobs.live.control_crew import ControlView
 from wfsobs.live.finding import Finding, identify_frames
+from wfsobs.live.paced import FAILURE, LiveEvent
 from wfsobs.live.processes import LiveProcesses
 from wfsobs.live.programme import Programme, scenario_on
 from wfsobs.live.recording import Recorder
 from wfsobs.live.source import SIMULATION, STREAM, LiveSource
-from wfsobs.live.view import LiveEvent, LiveView, SharedView, read_view
+from wfsobs.live.view import LiveView, SharedView, read_view
 from wfsobs.live.workshop import Workshop
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
@@ -40,8 +40,8 @@ SECOND, MINUTE = 1.0, 60.0
 class Shadow:
     """Called by its loop a few times a second."""
 
-    def __init__(self, say: Callable[[str], None], processes: LiveProcesses):
-        """Say : receives one line; processes : of its loop."""
+    def __init__(self, say: Callable[..., None], processes: LiveProcesses):
+        """Say : receives the fields of an event but its frame; processes : of its loop."""
         self._alarms, self._processes = Alarms(say), processes
         self._next_second, self._next_minute = SECOND, MINUTE
         self._identification: Future[Finding] | None = None
@@ -217,7 +217,7 @@ class LiveLoop:
         if on:
             self.redesign([observer])
         else:
-            self._processes.tell_observers({"observer": observer, "design": None})
+            self._processes.tell_observers({"id": observer, "design": None})
 
     def control(self, controller: str, on: bool) -> None:
         """Switch a controller beside the loop off, or on with a design for the present settings. Raises SettingError."""
@@ -227,7 +227,7 @@ class LiveLoop:
             self.redesign([controller])
         else:
             self.controllers.discard(controller)
-            self._processes.tell_controllers({"controller": controller, "design": None})
+            self._processes.tell_controllers({"id": controller, "design": None})
 
     def redesign(self, names: Sequence[str] | None = None, *, scenario: Scenario | None = None) -> None:
         """Design observers and controllers anew beside the loop; each goes on where the one before is.
@@ -250,12 +250,14 @@ class LiveLoop:
         """Return the ids of the observers and controllers that run."""
         return [*self.board.active(), *sorted(self.controllers)]
 
-    def say(self, line: str, frame: int | None = None) -> None:
-        """Add a line to the list of events."""
-        event = LiveEvent(self.newest if frame is None else frame, line)
+    def say(self, what: str, **fields: str) -> None:
+        """Add an event of the newest frame; fields : further ones of `LiveEvent`."""
+        self._add(LiveEvent(self.newest, what, **fields))
+
+    def _add(self, event: LiveEvent) -> None:
         self.events.append(event)
         if self._log_file:
-            append_line(self._log_file, event.frame * self.sampling.dt, line)
+            append_line(self._log_file, event.frame * self.sampling.dt, event.line)
 
     def watch(self, log_file: str = "") -> None:
         """Raise alarms from now on; append them, and all events, to a file."""
@@ -267,8 +269,7 @@ class LiveLoop:
 
     def control_view(self, seconds: float) -> ControlView | None:
         """Return what the controllers leave of the last so many seconds that they have taken; None before the first one."""
-        controllers = self._processes.controllers
-        return None if controllers is None else controllers.view(seconds)
+        return self._processes.control_view(seconds)
 
     def tend(self) -> None:
         """Look after the processes; called a few times a second."""
@@ -277,8 +278,8 @@ class LiveLoop:
                 self._has_begun = True
                 self.feed.tell({"play": True})
             self.programme.play(self.newest * self.sampling.dt)
-            for number, line in self._processes.news():
-                self.say(line, number)
+            for event in self._processes.news():
+                self._add(event)
             self.delivery.collect()
             self.recorder.collect()
             if self._shadow is not None:
@@ -289,9 +290,8 @@ class LiveLoop:
         if (line := self._processes.failure()) or self._processes.observers_are_alive:
             return line
         self.tend()
-        lines = [event.line for event in self.events]
-        of_observers = [line for line in lines if line.split(":")[0] in SLOTS]
-        return next(iter((*of_observers, *lines[-1:])), "the processes of the loop have ended")
+        events = [*(event for event in self.events if event.kind == FAILURE), *list(self.events)[-1:]]
+        return events[0].line if events else "the processes of the loop have ended"
 
     def stop(self) -> None:
         """End the processes and give the memory back."""

@@ -34,6 +34,50 @@ SOURCE = 4
 Command = Mapping[str, Any]
 """What a process of a live loop is told: one word and what belongs to it."""
 
+ALARM, FAILURE = "ALARM", "failure"
+"""Kinds of events: something is not as it was; observers cannot follow."""
+
+
+class LiveEvent(NamedTuple):
+    """An event of a live loop.
+
+    Attributes
+    ----------
+    frame : int
+        Number of the first frame of it.
+    what : str
+        What has happened, in a few words; "{}" stands for `about`.
+    about : str
+        Id of the observer or controller that it is about.
+    detail : str
+        Numbers that follow, with the punctuation before them.
+    origin : str
+        Path or address of the stream that it is of.
+    kind : str
+        ALARM, FAILURE or "".
+    """
+
+    frame: int
+    what: str
+    about: str = ""
+    detail: str = ""
+    origin: str = ""
+    kind: str = ""
+
+    def words(self, name: str) -> str:
+        """Return what has happened, with a name for `about`."""
+        words = self.what.replace("{}", name) if self.about else self.what
+        return f"{ALARM} {words}" if self.kind == ALARM else words
+
+    def text(self, name: str) -> str:
+        """Return all of it in one line, with a name for `about`."""
+        return f"{self.origin}: {self.words(name)}{self.detail}" if self.origin else self.words(name) + self.detail
+
+    @property
+    def line(self) -> str:
+        """All of it in one line."""
+        return self.text(self.about)
+
 
 @dataclass(frozen=True)
 class Desk:
@@ -41,7 +85,7 @@ class Desk:
 
     ring_name, n_modes : of the ring that it writes
     inbox : commands
-    news  : (number of the frame, one line)
+    news  : events
     speed : at the start, 1 is real time
     n_frames : after which it ends; None for no end
     """
@@ -49,13 +93,13 @@ class Desk:
     ring_name: str
     n_modes: int
     inbox: Connection
-    news: Queue[tuple[int, str]]
+    news: Queue[LiveEvent]
     speed: float
     n_frames: int | None
 
-    def say(self, number: int, line: str) -> None:
+    def say(self, number: int, what: str, origin: str = "") -> None:
         """Tell what happens from a frame on."""
-        self.news.put((number, line))
+        self.news.put(LiveEvent(number, what, origin=origin))
 
 
 class Staff(NamedTuple):

@@ -68,8 +68,8 @@ class Change:
         self.losses = [peak for peak in known if peak not in was and has_risen(peak, now, before)]
 
 
-def peak_changes(findings: Sequence[Finding]) -> list[str]:
-    """Say which peaks are new, have moved or are gone in the last of up to four minutes, one after the other.
+def peak_changes(findings: Sequence[Finding]) -> list[tuple[str, str]]:
+    """Say which peaks are new, have moved or are gone in the last of up to four minutes, and a detail of each.
 
     A line that moves in the midst of a minute is two peaks in that minute: one is new. In the next one the other is gone, and has
     moved to it.
@@ -81,11 +81,11 @@ def peak_changes(findings: Sequence[Finding]) -> list[str]:
         if (origin := moves.get(peak, last.drifts.get(peak))) is not None:
             was = origin if before is None else before.same.get(origin, origin)
             origin = min(origin, was, key=lambda one: one.frequency_std)  # the rest of a line that has jumped is known less well
-            lines.append(f"peak moved from {origin.frequency:.2f} to {peak.frequency:.2f} Hz")
+            lines.append((f"peak moved from {origin.frequency:.2f} to {peak.frequency:.2f} Hz", ""))
         elif peak in last.new:
-            lines.append(f"new peak at {peak.frequency:.2f} Hz, {1e3 * peak.rms:.1f} nm")
+            lines.append((f"new peak at {peak.frequency:.2f} Hz", f", {1e3 * peak.rms:.1f} nm"))
     lost = [peak for peak in last.losses if peak not in moves.values()]
-    return [*lines, *(f"peak at {peak.frequency:.2f} Hz is gone" for peak in lost)]
+    return [*lines, *((f"peak at {peak.frequency:.2f} Hz is gone", "") for peak in lost)]
 
 
 def moves_of(last: Change, before: Change | None = None) -> dict[PeakFinding, PeakFinding]:

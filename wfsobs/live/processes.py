@@ -13,15 +13,56 @@ from threading import Event, Lock, RLock
 from typing import Any
 
 from wfsobs.live.board import CREWS, Board, crew_of
-from wfsobs.live.control_process import ControlProcess
-from wfsobs.live.delivery import Delivery
-from wfsobs.live.observing import CrewProcess, Site
-from wfsobs.live.paced import Command, enter_process
+from wfsobs.live.control_crew import ControlView, control_frames, row_width
+from wfsobs.live.crew import ROOM, Site, trace_width
+from wfsobs.live.delivery import Delivery, merged_rows
+from wfsobs.live.observing import observe_frames
+from wfsobs.live.paced import Command, LiveEvent, enter_process
 from wfsobs.live.ring import LiveFrame
 from wfsobs.live.rows import Rows, Tracker
-from wfsobs.live.source import LiveSource, SourceProcess, end_process, take_all
+from wfsobs.live.source import LiveSource, SourceProcess, end_process, send_command, take_all
 from wfsobs.live.view import LiveView, last_frames, read_view
 from wfsobs.scenario import Scenario
+
+
+class CrewProcess:
+    """A process that follows the frames: observers or controllers.
+
+    Parameters
+    ----------
+    context : SpawnContext
+        By which it is made.
+    name : str
+        For people.
+    width : int
+        Of a row of what it writes.
+    work : callable
+        Receives site, name of the rows, inbox, and what else is given.
+    site : Site
+        Where.
+
+    Attributes
+    ----------
+    rows : Rows
+        Its estimates or residuals.
+    process : BaseProcess
+        It.
+    """
+
+    def __init__(self, context: SpawnContext, name: str, width: int, work: Callable[..., None], site: Site, *more: object):
+        self.rows = Rows(width, ROOM)
+        inbox, self._outbox = context.Pipe(duplex=False)
+        self.process = context.Process(target=work, args=(site, self.rows.name, inbox, *more), name=name, daemon=True)
+        self.process.start()
+
+    def tell(self, command: Command) -> None:
+        """Give it a command."""
+        send_command(self._outbox, command)
+
+    def stop(self) -> None:
+        """End it and give the memory back."""
+        end_process(self.process)
+        self.rows.release()
 
 
 class LiveProcesses:
@@ -48,7 +89,7 @@ class LiveProcesses:
         What is counted of the observers.
     delivery : Delivery
         What is counted of the frames.
-    controllers : ControlProcess or None
+    controllers : CrewProcess or None
         Begun with the first controller.
     workshop : SideProcess
         For what is made beside them.
@@ -61,11 +102,11 @@ class LiveProcesses:
     ):
         self._context, self._tracker = get_context("spawn"), Tracker()
         self.feed, self.is_over, self._lock = SourceProcess(source, speed, n_frames), Event(), RLock()
-        self.board, self._news = Board(source.sampling.n_modes), self._context.Queue()
-        self._site = Site(scenario.to_dict(), source.sampling, self.feed.ring, self.board, self._news)
-        self._warm_up = scenario.run.warm_up
+        self.board, news = Board(source.sampling.n_modes), self._context.Queue()
+        self._site = Site(scenario.to_dict(), source.sampling, self.feed.ring.name, self.board.name, news)
         self.crews: dict[int, CrewProcess] = {}
-        self.controllers: ControlProcess | None = None
+        self._late: set[int] = set()
+        self.controllers: CrewProcess | None = None
         for place in range(len(CREWS)):
             own = tuple(name for name in observers if crew_of(name) == place)
             if own or not place:
@@ -74,15 +115,22 @@ class LiveProcesses:
         self.workshop = SideProcess(self._context)
 
     def _start_crew(self, place: int, observers: tuple[str, ...], *, joins_late: bool = False) -> None:
-        self.crews[place] = CrewProcess(self._context, self._site, observers, place, joins_late)
+        if joins_late:
+            self._late.add(place)
+        name, width = f"the observers ({CREWS[place]})", trace_width(self._site.sampling.n_modes)
+        self.crews[place] = CrewProcess(self._context, name, width, observe_frames, self._site, place, observers, joins_late)
+
+    def _parts(self) -> dict[int, CrewProcess]:
+        """Return the crews without which no frame is taken by all: those that began late once they are ready."""
+        return {k: crew for k, crew in list(self.crews.items()) if self.board.is_ready[k] or k not in self._late}
 
     def traces(self) -> list[Rows]:
         """Return the estimates of the crews that take part."""
-        return [crew.traces for crew in list(self.crews.values()) if crew.takes_part]
+        return [crew.rows for crew in self._parts().values()]
 
     def count(self) -> int:
         """Return the number of the first frame that a crew which takes part has not counted."""
-        return min(int(self.board.progress[place]) for place, crew in list(self.crews.items()) if crew.takes_part)
+        return min(int(self.board.progress[place]) for place in self._parts())
 
     def frames(self, seconds: float) -> tuple[int, LiveFrame]:
         """Return the number of the first of the last so many seconds of frames that the source has sent, and these frames."""
@@ -94,17 +142,25 @@ class LiveProcesses:
         """Return the last so many seconds that each process of observers has taken, and the ids of its observers that run."""
         ring, dt, running = self.feed.ring, self._site.sampling.dt, self.board.active()
         crews = [(crew, [name for name in running if crew_of(name) == place]) for place, crew in list(self.crews.items())]
-        return [(read_view(ring, [crew.traces], dt, seconds), names) for crew, names in crews if names]
+        return [(read_view(ring, [crew.rows], dt, seconds), names) for crew, names in crews if names]
+
+    def control_view(self, seconds: float) -> ControlView | None:
+        """Return what the controllers leave of the last so many seconds that they have taken; None before the first one."""
+        if self.controllers is None:
+            return None
+        rows, dt = self.controllers.rows, self._site.sampling.dt
+        first, stop = last_frames(rows.count, dt, seconds)
+        return ControlView(first, dt, merged_rows([rows], first, stop))
 
     @property
     def are_ready(self) -> bool:
         """Whether the observers that take part are ready for the first frame."""
-        return all(crew.is_ready for crew in list(self.crews.values()) if crew.takes_part)
+        return all(self.board.is_ready[place] for place in self._parts())
 
     @property
     def observers_are_alive(self) -> bool:
         """Whether the observers take what comes."""
-        return not self.is_over.is_set() and all(crew.is_alive for crew in list(self.crews.values()))
+        return not self.is_over.is_set() and all(crew.process.is_alive() for crew in list(self.crews.values()))
 
     @property
     def processes(self) -> list[BaseProcess]:
@@ -127,7 +183,7 @@ class LiveProcesses:
 
     def tell_observers(self, command: Command) -> None:
         """Give a command to the crew of the observer that it is about, which begins with its first one."""
-        place = crew_of(command["observer"])
+        place = crew_of(command["id"])
         with self._lock:
             if self.is_over.is_set() or (place not in self.crews and command["design"] is None):
                 return
@@ -141,13 +197,13 @@ class LiveProcesses:
             if self.is_over.is_set() or (self.controllers is None and command["design"] is None):
                 return
             if self.controllers is None:
-                site = self._site
-                self.controllers = ControlProcess(self._context, site.sampling, self._warm_up, site.ring, site.news)
+                width = row_width(self._site.sampling.n_modes)
+                self.controllers = CrewProcess(self._context, "the controllers", width, control_frames, self._site)
             self.controllers.tell(command)
 
-    def news(self) -> list[tuple[int, str]]:
-        """Return what they have said since the last call: number of the frame, one line."""
-        return [*self.feed.news(), *take_all(self._news)]
+    def news(self) -> list[LiveEvent]:
+        """Return the events since the last call."""
+        return [*self.feed.news(), *take_all(self._site.news)]
 
     def release(self) -> None:
         """End the processes and give the memory back."""

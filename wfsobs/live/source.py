@@ -12,7 +12,7 @@ from multiprocessing.queues import Queue
 from queue import Empty
 from typing import Protocol
 
-from wfsobs.live.paced import Command, Desk, Staff
+from wfsobs.live.paced import Command, Desk, LiveEvent, Staff
 from wfsobs.live.ring import Ring
 from wfsobs.record import Sampling
 
@@ -80,8 +80,8 @@ class SourceProcess:
         for pipe in (*self._staff.outboxes, self._outbox) if command.get("is_new") else (self._outbox,):
             send_command(pipe, command)
 
-    def news(self) -> list[tuple[int, str]]:
-        """Return what it has said since the last call: number of the frame, one line."""
+    def news(self) -> list[LiveEvent]:
+        """Return the events since the last call."""
         return take_all(self._news)
 
     @property
@@ -102,7 +102,7 @@ def send_command(outbox: Connection, command: Command) -> None:
         outbox.send(command)
 
 
-def take_all(queue: Queue[tuple[int, str]]) -> list[tuple[int, str]]:
+def take_all(queue: Queue[LiveEvent]) -> list[LiveEvent]:
     """Return all that is in a queue."""
     out = []
     while True:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import monotonic
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -20,13 +20,6 @@ from wfsobs.typing import Array
 
 SHARED = 0.16
 """For how long pages share what is read of a loop: from a multiple of it to the next one [s]."""
-
-
-class LiveEvent(NamedTuple):
-    """What has happened: number of the first frame of it, and one line."""
-
-    frame: int
-    line: str
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ class Workshop:
     sampling : Sampling
         Of the loop.
     say : callable
-        Receives one line about what happens.
+        Receives the fields of an event but its frame.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Workshop:
         What the last identification has found, beside the one before.
     """
 
-    def __init__(self, processes: LiveProcesses, sampling: Sampling, say: Callable[[str], None]):
+    def __init__(self, processes: LiveProcesses, sampling: Sampling, say: Callable[..., None]):
         self._processes, self._sampling, self._say = processes, sampling, say
         self.change: Change | None = None
         self._findings: list[Finding] = []
@@ -83,16 +83,17 @@ class Workshop:
 
     def identify(self, record: Record, scenario: Scenario, names: Sequence[str]) -> None:
         """Identify a record, and design observers and controllers for what is found."""
-        whose = f" for {names[0]}" if len(names) == 1 else ""
+        whose, about = (" for {}", names[0]) if len(names) == 1 else ("", "")
 
         def take(finding: Finding) -> None:
             self.keep(finding)
             peaks = ", ".join(f"{p.frequency:.1f} Hz" for p in finding.peaks)
-            self._say(f"identified{whose}: {len(finding.peaks)} peaks" + (f" at {peaks}" if peaks else ""))
+            detail = f": {len(finding.peaks)} peaks" + (f" at {peaks}" if peaks else "")
+            self._say(f"identified{whose}", about=about, detail=detail)
             if names:
                 self.redesign(names, Scenario.from_dict(finding.settings))
 
-        self._say(f"identifying the last {record.n_steps * record.dt:.0f} s{whose}")
+        self._say(f"identifying the last {record.n_steps * record.dt:.0f} s{whose}", about=about)
         self.do(identify_frames, record, scenario.to_dict(), then=take)
 
     def keep(self, finding: Finding) -> None:
@@ -102,6 +103,6 @@ class Workshop:
 
     def _deliver(self, design: StepObserver | StepController) -> None:
         if isinstance(design, StepController):
-            self._processes.tell_controllers({"controller": design.id, "design": design})
+            self._processes.tell_controllers({"id": design.id, "design": design})
         else:
-            self._processes.tell_observers({"observer": design.id, "design": design})
+            self._processes.tell_observers({"id": design.id, "design": design})

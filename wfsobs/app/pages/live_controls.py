@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Sequence
 from html import escape
 from math import inf, isnan
@@ -19,15 +18,15 @@ from wfsobs.app.render import NOTHING, Row, number, table
 from wfsobs.app.style import look, swatch
 from wfsobs.closed_loop.run import strehl
 from wfsobs.evaluation.rows import row_label, target_title
-from wfsobs.live.alarms import ALARM
 from wfsobs.live.board import ADAPTIVE, NEXT, SCORED, SLOTS
 from wfsobs.live.checks import has_error, speed_of
 from wfsobs.live.control_crew import SEATS, USUAL
 from wfsobs.live.finding import Bounds, PeakFinding
 from wfsobs.live.loop import LiveLoop
+from wfsobs.live.paced import ALARM, LiveEvent
 from wfsobs.live.peaks import Change, moves_of
 from wfsobs.live.source import SIMULATION, STREAM, LiveSource
-from wfsobs.live.view import LiveEvent, LiveView
+from wfsobs.live.view import LiveView
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import TOTAL
@@ -36,10 +35,6 @@ from wfsobs.typing import Array
 SHOWN_EVENTS = 8
 FAR_BEHIND = 2.0
 """Beyond this the observers do not catch up by themselves [s]."""
-WHAT_RUNS = re.compile(
-    r"^\S+(?= (?:on|off|has a new design)$)|(?<=error of )\S+(?= up|$)|(?<=identified for )\S+(?=:)|(?<= s for )\S+$"
-)
-"""The id of an observer or a controller in an event."""
 QUANTITIES = {"Next measurement" if target == NEXT else target_title(target): target for target in (*TARGETS, TOTAL, NEXT)}
 """What errors are shown of."""
 
@@ -168,14 +163,14 @@ def status_line(loop: LiveLoop, view: LiveView) -> str:
 def events_html(events: Iterable[LiveEvent], dt: float) -> str:
     """List the latest events, by time, the last one first."""
     latest = sorted(list(events)[-SHOWN_EVENTS:], key=lambda event: event.frame)[::-1]  # some are told late
-    lines = [f"<li>{event.frame * dt:.2f} s: {_event_html(event.line)}</li>" for event in latest]
+    lines = [f"<li>{event.frame * dt:.2f} s: {_event_html(event)}</li>" for event in latest]
     return f'<ul class="text" aria-label="Events">{"".join(lines)}</ul>' if lines else ""
 
 
-def _event_html(line: str) -> str:
+def _event_html(event: LiveEvent) -> str:
     """Write an event; an alarm stands out, and what runs has the name that it has everywhere on the page."""
-    line = WHAT_RUNS.sub(lambda found: look(found[0]).label, line)
-    return f"<strong>{escape(line)}</strong>" if line.startswith(ALARM) else escape(line)
+    line = escape(event.text(look(event.about).label if event.about else ""))
+    return f"<strong>{line}</strong>" if event.kind == ALARM else line
 
 
 SPEEDS = {f"{speed:g} ×": speed for speed in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)}

@@ -29,12 +29,12 @@ from wfsobs.evaluation.error_spectra import cumulative_rms
 from wfsobs.evaluation.recovery import trailing_rms
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.latencies import EDGES
-from wfsobs.live.alarms import ALARM
 from wfsobs.live.board import SLOTS, Board
-from wfsobs.live.control_process import ControlView
+from wfsobs.live.control_crew import ControlView
 from wfsobs.live.finding import Bounds
+from wfsobs.live.paced import LiveEvent
 from wfsobs.live.spectrum_of_minute import bridge_missing
-from wfsobs.live.view import LiveEvent, LiveView
+from wfsobs.live.view import LiveView
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import welch_psd
 from wfsobs.typing import Array
@@ -183,28 +183,23 @@ class LiveMarks:
         times, lines, written = [], [], -np.inf
         for event in sorted(events):
             times.append(event.frame * dt)
-            lines.append(short_line(event.line) if times[-1] - written > close else "")
+            lines.append(short_line(event) if times[-1] - written > close else "")
             written = times[-1] if lines[-1] else written
         marks: dict[str, Any] = {"x": times, "line": lines}
         if marks != self._source.data:
             self._source.data = marks
 
 
-def short_line(line: str) -> str:
+def short_line(event: LiveEvent) -> str:
     """Return what of an event there is room for in a figure; all of it is in the list of events.
 
-    >>> short_line("ALARM error of kf-lgs up: 29.7 nm, it was 19.6 nm"), short_line("over: error of kf-lgs")
-    ('ALARM error of kf-lgs up', 'over: error of kf-lgs')
-    >>> short_line("peak from 47.50 to 50.50 Hz, 30.0 nm")
-    'peak from 47.50 to 50.50 Hz'
-    >>> short_line("/dev/shm/aol1_modevalOL.im.shm: no frame for 0.1 s")
+    >>> short_line(LiveEvent(0, "error of {} up", "kf-lgs", ": 29.7 nm, it was 19.6 nm", kind="ALARM"))
+    'ALARM error of kf-lgs up'
+    >>> short_line(LiveEvent(0, "no frame for 0.1 s", origin="/dev/shm/aol1_modevalOL.im.shm"))
     'no frame for 0.1 s'
     """
-    if len(line) <= ROOM:
-        return line
-    head, _, tail = line.rpartition(": ")
-    parts = [head if line.startswith(ALARM) else tail, line.rpartition(", ")[0]]
-    return next((part for part in parts if 0 < len(part) <= ROOM), line[: ROOM - 1] + "…")
+    words = event.words(event.about)
+    return next((part for part in (event.line, words) if len(part) <= ROOM), words[: ROOM - 1] + "…")
 
 
 class RollingTraces(LiveFigure):
