@@ -13,6 +13,7 @@ import sys
 import threading
 from collections import Counter
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import NamedTuple
@@ -68,9 +69,15 @@ def traced(what: Callable[[], object]) -> Counter[tuple[Place, Place]]:
     return calls
 
 
+@cache
+def floors_of_rooms() -> dict[str, int]:
+    """The floor of every room, from the imports of all modules."""
+    return rooms.floors(rooms.plan().imports)
+
+
 def jumps(calls: Counter[tuple[Place, Place]]) -> list[tuple[Place, Place, int]]:
     """Those calls that go up."""
-    floors = rooms.floors(rooms.plan().imports)
+    floors = floors_of_rooms()
     return sorted((a, b, n) for (a, b), n in calls.items() if floors[a.room] < floors[b.room])
 
 

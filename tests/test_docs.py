@@ -43,9 +43,9 @@ COMMANDS = [p for p in PAGES if p.parent.name != "tutorials" and p.stem != "read
 """Pages whose commands stand alone; those of the others go with their code."""
 SHORT = (
     "--set",
-    "run.duration=2",
+    "run.duration=1.2",
     "--set",
-    "run.warm_up=0.5",
+    "run.warm_up=0.3",
     "--set",
     "events=[]",
     "--set",

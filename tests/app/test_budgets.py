@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from tests.app.conftest import compute_once
 from wfsobs.app.budgets import Budgets
 from wfsobs.app.display import Display
 from wfsobs.app.render import number
@@ -41,7 +42,7 @@ class Page:
 
 @pytest.fixture
 def page(make_store: Any) -> Page:
-    return Page(make_store())
+    return Page(make_store(compute_once))
 
 
 def test_terms_add_up_to_the_scores_in_every_mode(page: Page, loop: Any) -> None:

@@ -35,6 +35,8 @@ FLAGS = [
     "--disable-sync",
 ]
 SEEDS = "view.seeds="
+QUICK = "?run.duration=2&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.5"
+"""Settings of a short record: what one test has had run, a server knows for the next."""
 CLOSED_MID_UPDATE = (
     "WebSocketClosedError",
     "StreamClosedError",

@@ -11,11 +11,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.browser.conftest import PATIENCE, finished, leave
-
-QUICK = (
-    "?run.duration=2&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.5&view.seeds=1"
-)
+from tests.browser.conftest import PATIENCE, QUICK, finished, leave, with_seeds
 
 
 def hang_up(end: socket.socket) -> None:
@@ -135,7 +131,7 @@ def page(contexts: Any, cable: Cable, host: Host) -> Iterator[Page]:
     page.set_viewport_size({"width": 1400, "height": 1000})
     page.set_default_timeout(PATIENCE)
     page.add_init_script(f"({ALERTS})()")
-    page.goto(f"http://localhost:{cable.port}/{QUICK}")
+    page.goto(with_seeds(f"http://localhost:{cable.port}/{QUICK}", 1))
     finished(page)
     yield page
     leave(page)

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 from playwright.sync_api import Locator, Page, expect
 
-from tests.browser.conftest import DONE, SETTINGS, eventually, finished
+from tests.browser.conftest import DONE, QUICK, SETTINGS, eventually, finished
 
 
 def test_a_loop_that_is_changed_while_it_runs(open_page: Any, server: Any) -> None:
-    page = open_page(url=server.url + "?run.duration=1&run.warm_up=0.2&gpr_online.training_size=40&gpr_offline.training_size=40")
+    page = open_page(url=server.url + QUICK + "&view.live.observers=kf-multi,multirate-multi")
     page.get_by_role("button", name="Live", exact=True).click()
     page.get_by_role("button", name="Start", exact=True).click()
     expect(page.get_by_text(re.compile(r"^Running at 1 × real time · [1-9]"))).to_be_visible()
@@ -32,10 +32,7 @@ def test_a_loop_that_is_changed_while_it_runs(open_page: Any, server: Any) -> No
     expect(page.get_by_role("button", name="Start", exact=True)).to_be_enabled()
 
 
-QUICK = (
-    "?run.duration=1&run.warm_up=0.2&gpr_online.training_size=40&gpr_offline.training_size=40&view.page=live"
-    "&view.live.observers=kf-multi,multirate-multi,gpr-online&view.live.controllers=integrator"
-)
+LIVE = QUICK + "&view.page=live&view.live.observers=kf-multi,multirate-multi,gpr-online&view.live.controllers=integrator"
 """Few beside the page: those whose lines are shown first."""
 
 
@@ -52,7 +49,7 @@ def stop(page: Page) -> None:
 
 
 def test_a_page_that_opens_on_live_runs_nothing_until_another_page_needs_it(open_page: Any, server: Any) -> None:
-    page = open_page(url=server.url + QUICK + "&view.mode=tilt&view.live.speed=0.3", wait=False)
+    page = open_page(url=server.url + LIVE + "&view.mode=tilt&view.live.speed=0.3", wait=False)
     begin(page)
     expect(page.get_by_text(re.compile("^Running at 0.3 × real time"))).to_be_visible()
     expect(page.get_by_role("combobox", name="Speed")).to_have_text("0.3 ×")
@@ -72,7 +69,7 @@ def test_a_page_that_opens_on_live_runs_nothing_until_another_page_needs_it(open
 @pytest.fixture(scope="module")
 def running(open_shared: Any, server: Any) -> Iterator[Page]:
     """A page with a loop that runs, for all tests below."""
-    page = open_shared(url=server.url + QUICK, wait=False)
+    page = open_shared(url=server.url + LIVE, wait=False)
     begin(page)
     yield page
     stop(page)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Locator, Page, expect
 
-QUICK = "?run.duration=2&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.5"
+from tests.browser.conftest import QUICK
 
 
 def place(it: Locator) -> tuple[float, float]:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.browser.conftest import carded
+from tests.browser.conftest import QUICK, carded
 from wfsobs.observers.base import TARGETS
 
 MODELS = "[...Bokeh.index.roots[0].model.document._all_models.values()]"
@@ -99,8 +99,8 @@ def test_the_model(wide: Page) -> None:
     expect(coefficient).to_have_count(0)
 
 
-def test_by_keyboard_on_a_phone(open_page: Any) -> None:
-    page = open_page(390, 844)
+def test_by_keyboard_on_a_phone(open_page: Any, server: Any) -> None:
+    page = open_page(390, 844, url=server.url + QUICK)
     expect(page.get_by_role("button", name="Open drawer")).to_be_visible()
     button = page.get_by_role("button", name="Model", exact=True)
     button.focus()
@@ -113,12 +113,12 @@ def test_by_keyboard_on_a_phone(open_page: Any) -> None:
     no_wider_than(page, 390)
 
 
-def test_pin_and_compare(open_page: Any) -> None:
-    page = open_page()
+def test_pin_and_compare(open_page: Any, server: Any) -> None:
+    page = open_page(url=server.url + QUICK)
     before = cells(page, "kf-lgs", "turbulence")[0].split()[-1]
     page.get_by_role("button", name="Pin this run to compare others with it").click()
     legend = page.get_by_role("status").filter(has_text="Compared with, faint in the figures")
-    expect(legend).to_contain_text("Preset Paper since then: the same settings")
+    expect(legend).to_contain_text("since then: the same settings")
     for i in range(2):
         page.get_by_role("button", name=re.compile("^All .* observers$")).first.click()
         page.get_by_role("button", name="Show all lines").nth(i).click()

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.browser.conftest import CHANGED, answered, carded
+from tests.browser.conftest import CHANGED, QUICK, answered, carded
 
 ALLOWED: Mapping[str, tuple[str, int, str]] = MappingProxyType(
     {
@@ -98,8 +98,8 @@ def focused(page: Page, key: str = "Tab") -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("width", [1400, 390], ids=["wide", "phone"])
-def test_accessibility(open_page: Any, width: int) -> None:
-    page = open_page(width, 900)
+def test_accessibility(open_page: Any, server: Any, width: int) -> None:
+    page = open_page(width, 900, url=server.url + QUICK)
     page.evaluate(files("axe_playwright_python").joinpath("axe.min.js").read_text(encoding="utf-8"))
     accessible(page)
     fits(page, width)
@@ -141,9 +141,6 @@ def test_boxes_that_are_higher_than_the_window_do_not_overlap(open_page: Any, se
     page.get_by_role("button", name="Closed loop", exact=True).click()
     for upper, lower in (("Residual, zoomed", "Controllers"), ("Rejection and noise transfer", "Controllers")):
         page.wait_for_function(BELOW, arg=[upper, lower])
-
-
-QUICK = "?run.duration=1&run.warm_up=0.2&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.3"
 
 
 def accessible(page: Page) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 from playwright.sync_api import Page, expect
 
-QUICK = "?run.duration=2.0&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.5"
+from tests.browser.conftest import QUICK
 
 
 def set_seeds(page: Page, count: int) -> None:

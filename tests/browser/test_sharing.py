@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 from playwright.sync_api import Download, Locator, Page, expect
 
+from tests.browser.conftest import QUICK
 from wfsobs.app.style import look
-
-SHORT = "run.duration=2&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.5"
 
 
 @pytest.fixture
@@ -23,7 +22,7 @@ def open_short(open_page: Any, server: Any) -> Callable[..., Page]:
     """The dashboard on a short record, by a link."""
 
     def open_it(more: str = "", **options: Any) -> Page:
-        return open_page(url=f"{server.url}?{SHORT}{more}", **options)
+        return open_page(url=f"{server.url}{QUICK}{more}", **options)
 
     return open_it
 
@@ -171,16 +170,18 @@ def test_menus_by_keyboard(open_short: Any) -> None:
     expect(button).to_be_focused()
 
 
-def test_back_and_reload_return_to_the_view(open_page: Any) -> None:
-    page = open_page(seeds=0)
+def test_back_and_reload_return_to_the_view(open_short: Any) -> None:
+    page = open_short()
+    start = page.evaluate("location.search")
     page.get_by_role("button", name="Tilt", exact=True).click()
     page.wait_for_function("location.search.includes('view.mode=tilt')")
+    tilt = page.evaluate("location.search")
     page.get_by_role("button", name="Model", exact=True).click()
     page.wait_for_function("location.search.includes('view.page=model')")
     expect(page.get_by_role("heading", name=re.compile("State space"))).to_be_visible()
     page.go_back()
     expect(page.get_by_role("heading", name="RMS errors")).to_be_visible()
-    page.wait_for_function("location.search === '?view.mode=tilt'")
+    page.wait_for_function("address => location.search === address", arg=tilt)
     page.get_by_role("button", name="Time window: 0.2 s").click()
     page.wait_for_function("location.search.includes('view.window=')")
     page.locator(".card[data-name=kf-lgs]").first.dblclick()
@@ -190,10 +191,10 @@ def test_back_and_reload_return_to_the_view(open_page: Any) -> None:
     page.reload()
     expect(page.get_by_role("button", name="Tilt", exact=True)).to_have_attribute("aria-pressed", "true")
     expect(page.locator(".card[data-name=kf-multi]").first).to_have_attribute("aria-pressed", "false")
-    expect(page.locator("p.stretch").first).to_contain_text(re.compile(r"5\.40 – 5\.60 s"))
+    expect(page.locator("p.stretch").first).to_contain_text(re.compile(r"1\.15 – 1\.35 s"))
     page.wait_for_function("address => location.search === address", arg=address)
     page.go_back()
-    page.wait_for_function("location.search === ''")
+    page.wait_for_function("address => location.search === address", arg=start)
     expect(page.get_by_role("button", name="Tip", exact=True)).to_have_attribute("aria-pressed", "true")
 
 
