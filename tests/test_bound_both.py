@@ -15,7 +15,7 @@ from wfsobs.evaluation.bound_both import bound_rms_of_both, least_errors_of_both
 from wfsobs.evaluation.record_bounds import record_bounds
 from wfsobs.evaluation.rows import can_be_best
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, COMMON_BOUNDS, SCORED
-from wfsobs.observers.kalman.multirate_optimal import optimal_cycle
+from wfsobs.observers.kalman.multirate import optimal_cycle
 from wfsobs.priors_from.scenario import kalman_model
 from wfsobs.priors_from.turbulence import measurement_noise
 from wfsobs.scenario import Scenario

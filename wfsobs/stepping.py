@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.missing import fill_missing
-from wfsobs.observers.step_checks import StepError
+from wfsobs.observers.step import StepError
 from wfsobs.prior import LgsStars, Part, Prior, Spectra, Training
 from wfsobs.priors_from.controllers import own_settings, plant_of
 from wfsobs.priors_from.identification import told_by

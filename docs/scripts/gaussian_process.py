@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import solve
 
 from wfsobs import PRESETS, observe, simulate
-from wfsobs.observers.gp.lgs import GaussianProcess, kernels_of
+from wfsobs.observers.gp.observers import GaussianProcess, kernels_of
 from wfsobs.observers.ridge import predict
 from wfsobs.prior import Lines
 from wfsobs.priors_from.scenario import prior_of

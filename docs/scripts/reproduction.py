@@ -18,7 +18,7 @@ import numpy as np
 import wfsobs
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.kalman.single import steady_filter
-from wfsobs.observers.kalman.spread import by_target
+from wfsobs.observers.kalman.step import by_target
 from wfsobs.priors_from.scenario import modelled_processes
 from wfsobs.priors_from.turbulence import measurement_noise
 from wfsobs.record import Record, Training

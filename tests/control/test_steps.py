@@ -12,7 +12,7 @@ import wfsobs
 from tests.records import short, third_of_pairs
 from wfsobs import PRESETS
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.observers.step_checks import StepError
+from wfsobs.observers.step import StepError
 from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario

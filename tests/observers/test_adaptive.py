@@ -11,16 +11,17 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from wfsobs.execution import run_observer
+from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman import window_model
-from wfsobs.observers.kalman.adaptive import filter_of
 from wfsobs.observers.kalman.single import steady_filter
-from wfsobs.observers.kalman.window_model import pack_spectrum, unpack_spectrum
+from wfsobs.observers.kalman.window_model import model_filter, pack_spectrum, unpack_spectrum
 from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import Record, RecordError, delay_signal
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.filter_covariance import RiccatiError
+from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.spectral.background import WORTH
 from wfsobs.spectral.densities import densities
@@ -50,6 +51,12 @@ def made(n: int, modes: int, seed: int, *vibration: Ar2) -> Record:
 
 def with_window(window: float, interval: float, **more: object) -> Scenario:
     return Scenario().replace({"adaptive.window": window, "adaptive.interval": interval, **more})
+
+
+def filter_of(spectrum: Spectrum) -> PeriodicFilter:
+    one = model_filter(spectrum)
+    assert one is not None
+    return one.gains.filter(one.rows(TARGETS))
 
 
 def rms(x: np.ndarray) -> float:

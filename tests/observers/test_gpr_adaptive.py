@@ -12,9 +12,18 @@ from tests.records import short
 from wfsobs import PRESETS, simulate
 from wfsobs.evaluation.calibration import calibration
 from wfsobs.execution import run_observer
-from wfsobs.observers.gpr.band_regression import RATIOS, factor_of, fit_bands, window_products
-from wfsobs.observers.gpr.learning import learn, nothing_learnt, standing, weight_covariance, whitener_of
-from wfsobs.observers.step_checks import StepError
+from wfsobs.observers.gpr.learning import (
+    RATIOS,
+    factor_of,
+    fit_bands,
+    learn,
+    nothing_learnt,
+    standing,
+    weight_covariance,
+    whitener_of,
+    window_products,
+)
+from wfsobs.observers.step import StepError
 from wfsobs.record import Record, RecordError, Sampling
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.periodic import PeriodicFilter

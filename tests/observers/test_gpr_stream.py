@@ -8,9 +8,8 @@ from wfsobs.execution import run_observer
 from wfsobs.observers.gpr import sliding_regression
 from wfsobs.observers.gpr.inputs import scale_of
 from wfsobs.observers.gpr.kernels import ConditionError, SquaredExponential
-from wfsobs.observers.gpr.online import predict_sliding
+from wfsobs.observers.gpr.online import OnlineGprStream, predict_sliding
 from wfsobs.observers.gpr.sliding_regression import ENOUGH, SlidingRegression
-from wfsobs.observers.gpr.stream import OnlineGprStream
 from wfsobs.priors_from.scenario import bands_of
 from wfsobs.scenario.presets import paper
 from wfsobs.simulation.loop import simulate

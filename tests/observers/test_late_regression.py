@@ -12,7 +12,7 @@ from wfsobs.control.prediction import VibrationPredictor, of_z
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.gpr.inputs import Scale, window_signals
 from wfsobs.observers.gpr.kernels import SquaredExponential
-from wfsobs.observers.gpr.late_regression import LateRegression
+from wfsobs.observers.gpr.sliding_regression import LateRegression
 from wfsobs.priors_from.scenario import bands_of
 from wfsobs.scenario import Scenario
 from wfsobs.typing import Array

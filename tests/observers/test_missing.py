@@ -15,10 +15,8 @@ from wfsobs import PRESETS
 from wfsobs.evaluation.calibration import half_width
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.gp.lgs import kernels_of, measured_late, sampled_model
-from wfsobs.observers.kalman.multirate import multirate_noise
-from wfsobs.observers.kalman.multirate_multi import every_peak_model
-from wfsobs.observers.kalman.multirate_optimal import optimal_model
+from wfsobs.observers.gp.observers import kernels_of, measured_late, sampled_model
+from wfsobs.observers.kalman.multirate import every_peak_model, multirate_noise, optimal_model
 from wfsobs.priors_from.scenario import arguments, observer_settings, prior_of
 from wfsobs.record import Measurements, Record
 from wfsobs.scenario import Scenario

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import pi
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,11 +13,8 @@ from wfsobs.evaluation.calibration import calibration
 from wfsobs.execution import run_observer
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import TOTAL
-from wfsobs.observers.kalman import multirate_adaptive
-from wfsobs.observers.kalman.adaptive import Adaptive
-from wfsobs.observers.kalman.both_gaps import behind_gaps, identify_both_with_gaps
-from wfsobs.observers.kalman.both_window import BothModel, Lengths, both_lengths, identify_both
-from wfsobs.observers.kalman.multirate_adaptive import next_length, window_start
+from wfsobs.observers.kalman import adaptive
+from wfsobs.observers.kalman.window_model import Adaptive, Lengths, WindowModel, behind_gaps, identify_window, window_lengths
 from wfsobs.record import RecordError
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
@@ -31,19 +29,26 @@ LGS, NGS = 0.014, 0.010
 SHORT, LONGEST = Lengths(4000, 30_000, 500, 1, RATIO), 30_000
 
 
-def sensors(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """z and NGS frames of the same turbulence, the first with an error of its own."""
+def sensors(n: int, seed: int) -> np.ndarray:
+    """z and NGS frames, (n, 2), of the same turbulence, the first with an error of its own."""
     rng = np.random.default_rng(seed)
     phi = TURBULENCE.sample(n, rng)
-    z = phi + ERROR.sample(n, rng) + LGS * rng.standard_normal(n)
-    return z, phi.reshape(-1, RATIO).mean(axis=1) + NGS * rng.standard_normal(n // RATIO)
+    v = np.column_stack([phi + ERROR.sample(n, rng) + LGS * rng.standard_normal(n), np.zeros(n)])
+    v[RATIO - 1 :: RATIO, 1] = phi.reshape(-1, RATIO).mean(axis=1) + NGS * rng.standard_normal(n // RATIO)
+    return v
+
+
+def identify(v: np.ndarray, last: WindowModel) -> tuple[WindowModel, np.ndarray]:
+    found = identify_window(v, DT, Adaptive(), last, SHORT)
+    assert found is not None
+    return found
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_noises_and_the_error_of_the_lgs_are_told_apart(seed: int) -> None:
     """20 s: the noise of 20 000 samples is known to 0.5 %, that of 4000 frames by a difference of 1.4 times its variance to
     1.6 %; four of these. The error: its density at 1 to 3 Hz, of 40 bins, to 16 %, three of these."""
-    model = identify_both(*sensors(20_000, seed), DT, Adaptive(), BothModel())
+    model, _ = identify(sensors(20_000, seed), WindowModel())
     assert model.spectrum is not None and model.error is not None and model.error.turbulence is not None
     assert model.spectrum.noise == pytest.approx(LGS, rel=0.02)
     assert model.ngs == pytest.approx(NGS, rel=0.065)
@@ -177,13 +182,13 @@ def test_filters_that_learn_are_about_as_sure_as_they_may_be(preset: str) -> Non
 def windows_of(monkeypatch: pytest.MonkeyPatch, **changes: object) -> list[int]:
     """Lengths [steps] of the windows of one mode, 20 s of `peak-jump` after these changes."""
     seen: list[int] = []
-    real = multirate_adaptive.identify_both
+    real = adaptive.identify_window
 
-    def identify(z: np.ndarray, *rest: object) -> BothModel:
-        seen.append(len(z))
-        return real(z, *rest)
+    def count(v: np.ndarray, *rest: Any) -> tuple[WindowModel, np.ndarray] | None:
+        seen.append(len(v))
+        return real(v, *rest)
 
-    monkeypatch.setattr(multirate_adaptive, "identify_both", identify)
+    monkeypatch.setattr(adaptive, "identify_window", count)
     scenario = PRESETS["peak-jump"]().replace({"run.duration": 20.0, **changes})
     run_observer("multirate-adaptive", simulate(scenario), scenario)
     return seen[: len(seen) // 2]
@@ -202,12 +207,12 @@ def test_a_jump_makes_the_window_short_again(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_windows_by_hand() -> None:
     """Shortest window 4 s, longest 30 s, checks every 0.5 s: three tenths more, from 8 s on 0.16, in whole checks."""
-    assert [next_length(n, SHORT) for n in (4000, 7500, 8000, 30_000)] == [1000, 2000, 1000, 4500]
-    assert window_start(4001, 0, SHORT) == 1 and window_start(20_001, 0, SHORT) == 1, "grows"
-    assert window_start(40_001, 0, SHORT) == 10_001, "the longest"
-    assert window_start(20_001, 19_501, SHORT) == 16_001, "the shortest, although some of it is before the change"
-    assert window_start(30_001, 19_501, SHORT) == 19_501, "grows from the change on"
-    assert [both_lengths(Adaptive(), DT, 5, delay).first for delay in (0, 1, 2, 6, 7)] == [1, 1, 6, 6, 11], "after a frame"
+    assert [SHORT.next_length(n) for n in (4000, 7500, 8000, 30_000)] == [1000, 2000, 1000, 4500]
+    assert SHORT.window_start(4001, 0) == 1 and SHORT.window_start(20_001, 0) == 1, "grows"
+    assert SHORT.window_start(40_001, 0) == 10_001, "the longest"
+    assert SHORT.window_start(20_001, 19_501) == 16_001, "the shortest, although some of it is before the change"
+    assert SHORT.window_start(30_001, 19_501) == 19_501, "grows from the change on"
+    assert [window_lengths(Adaptive(), DT, 5, delay).first for delay in (0, 1, 2, 6, 7)] == [1, 1, 6, 6, 11], "after a frame"
 
 
 def test_too_short_a_window_or_record() -> None:
@@ -223,16 +228,11 @@ def test_too_short_a_window_or_record() -> None:
 def test_noises_and_error_where_measurements_are_missing() -> None:
     """A third of the samples and of the frames lost at random: as without (above), of two thirds as many numbers; noise counted
     as if none were missing would be 18 % too low."""
-    z, frames = sensors(20_000, 1)
-    rng = np.random.default_rng(5)
-    v = np.column_stack([z, np.zeros(len(z))])
-    v[RATIO - 1 :: RATIO, 1] = frames
-    last = identify_both(z[:4000], frames[:800], DT, Adaptive(), BothModel())
-    v[rng.random(len(z)) < 1 / 3, 0] = np.nan
-    v[RATIO - 1 :: RATIO, 1][rng.random(len(frames)) < 1 / 3] = np.nan
-    found = identify_both_with_gaps(v, RATIO, DT, Adaptive(), last)
-    assert found is not None
-    model, whole = found
+    v, rng = sensors(20_000, 1), np.random.default_rng(5)
+    last, _ = identify(v[:4000], WindowModel())
+    v[rng.random(len(v)) < 1 / 3, 0] = np.nan
+    v[RATIO - 1 :: RATIO, 1][rng.random(len(v) // RATIO) < 1 / 3] = np.nan
+    model, whole = identify(v, last)
     assert np.isfinite(whole).all() and model.spectrum is not None
     there = ~np.isnan(v)
     np.testing.assert_allclose(whole[there], v[there], rtol=0, atol=1e-11)

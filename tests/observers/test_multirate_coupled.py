@@ -17,7 +17,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.asterism_model import AsterismModel
 from wfsobs.observers.kalman.coupled import CoupledModel
-from wfsobs.observers.kalman.multirate_coupled import INDEPENDENT, coupled_model
+from wfsobs.observers.kalman.joint import INDEPENDENT, coupled_model
 from wfsobs.pipeline import observe, run
 from wfsobs.prior import Flow, FlowOfBoth, Lines
 from wfsobs.priors_from.scenario import arguments, prior_of

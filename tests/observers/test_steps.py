@@ -22,7 +22,7 @@ from wfsobs.observers.base import Observer
 from wfsobs.observers.gpr.offline import training_targets
 from wfsobs.observers.kalman.step import matrix_power
 from wfsobs.observers.missing import fill_missing
-from wfsobs.observers.step_checks import StepError
+from wfsobs.observers.step import StepError
 from wfsobs.prior import Bands, Lines, Model, Prior, Training
 from wfsobs.priors_from.controllers import own_settings
 from wfsobs.priors_from.scenario import arguments, kalman_model, observer_settings, prior_of

@@ -26,8 +26,7 @@ from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.gpr.inputs import window_signals
 from wfsobs.observers.gpr.kernels import SquaredExponential
 from wfsobs.observers.gpr.offline import training_targets
-from wfsobs.observers.gpr.online import gpr_online, kernel_of
-from wfsobs.observers.gpr.stream import OnlineGprStream
+from wfsobs.observers.gpr.online import OnlineGprStream, gpr_online, kernel_of
 from wfsobs.observers.gpr.trained import train
 from wfsobs.observers.kalman.adaptive import adapt
 from wfsobs.observers.kalman.multirate import multirate_filter, multirate_noise

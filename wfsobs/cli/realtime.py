@@ -14,7 +14,7 @@ from wfsobs.bench.measure import machine
 from wfsobs.bench.steps import SHARE, RealTime, measure_realtime
 from wfsobs.cli.options import scenario_options
 from wfsobs.cli.show import show_table
-from wfsobs.observers.step_checks import StepError
+from wfsobs.observers.step import StepError
 from wfsobs.scenario import configfile
 from wfsobs.settings.group import SettingError
 

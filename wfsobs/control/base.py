@@ -27,7 +27,7 @@ from wfsobs.control.step_laws import KalmanLaws, StepPredict, VibrationAhead, st
 from wfsobs.observers.base import NOTHING, PLAIN, Look
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
-from wfsobs.observers.step_checks import StepError
+from wfsobs.observers.step import StepError
 from wfsobs.prior import TRUE, Bands, Part, Prior, PriorSource, ask_nothing, asks_for, words_for
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, Sampling, hold_last

@@ -19,9 +19,14 @@ from wfsobs.control.law import Law, steady_law
 from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean
-from wfsobs.observers.kalman.multirate import MultiRateFilter, filter_of_gains, multirate_mode, multirate_noise
-from wfsobs.observers.kalman.multirate_multi import every_peak_model
-from wfsobs.observers.kalman.multirate_optimal import Cycle, optimal_model
+from wfsobs.observers.kalman.multirate import (
+    Cycle,
+    MultiRateFilter,
+    every_peak_model,
+    multirate_mode,
+    multirate_noise,
+    optimal_model,
+)
 from wfsobs.observers.kalman.single import steady_mode
 from wfsobs.prior import Prior
 from wfsobs.signal.gap_gains import ONE, SensorMean
@@ -48,7 +53,7 @@ def _rows_of(model: DisturbanceModel, mirror: Mirror) -> Array:
 
 def lqg_of(model: DisturbanceModel, noise: float, mirror: Mirror, mean: SensorMean = ONE) -> Law:
     """LQG on the LGS with any model; noise [um] of a measurement, the mean over all LGS. Raises RiccatiError."""
-    found, row = steady_mode(model, noise)._replace(mean=mean), _rows_of(model, mirror)
+    found, row = steady_mode(model, noise, mean), _rows_of(model, mirror)
     return replace(steady_law(found.gains.filter(row)), gains=found.gains, row=row[0], filter=found)
 
 
@@ -85,13 +90,13 @@ def lqg_multirate_multi(prior: Prior, mode: int, plant: Plant, settings: Any) ->
 
 def _optimal(cycle: Cycle, prior: Prior, mode: int, mirror: Mirror) -> Law:
     row = command_rows(cycle.steps[0][0], cycle.rows.sum(axis=0), mirror)
-    return _two_sensors(cycle.filter()._replace(mean=lgs_mean(prior, mode, cycle.has_lgs_error)), row)
+    return _two_sensors(cycle.filter(lgs_mean(prior, mode, cycle.has_lgs_error)), row)
 
 
 def _two_sensors(mode_filter: ModeFilter, row: Array) -> Law:
-    filter_ = filter_of_gains(mode_filter.gains, row)
-    run = partial(_run_first, filter_)
-    return Law(filter_.cycle, run, first=filter_.first, gains=mode_filter.gains, row=row[0], filter=mode_filter)
+    filter_, gains = MultiRateFilter(mode_filter.gains, row), mode_filter.gains
+    run, first = partial(_run_first, filter_), gains.first and gains.first.filter_step(row)
+    return Law(filter_.cycle, run, first=first, gains=gains, row=row[0], filter=mode_filter)
 
 
 def _run_first(filter_: MultiRateFilter, z: Array) -> Array:

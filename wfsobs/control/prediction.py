@@ -12,14 +12,12 @@ from typing import Any, TypeVar
 import numpy as np
 
 from wfsobs.control.mirror import Mirror, Plant
-from wfsobs.observers.gpr.inputs import Scale, StreamingInputs, scale_of, scales_of, training_signals, window_signals
-from wfsobs.observers.gpr.late_regression import LateRegression
+from wfsobs.observers.gpr.inputs import Scale, StreamingInputs, Windows, scale_of, scales_of, training_signals, window_signals
 from wfsobs.observers.gpr.offline import OfflineEstimator, OfflineGpr, training_targets
-from wfsobs.observers.gpr.online import OnlineGpr, kernel_of
-from wfsobs.observers.gpr.online_step import OnlineEstimator
+from wfsobs.observers.gpr.online import OnlineEstimator, OnlineGpr, kernel_of
+from wfsobs.observers.gpr.sliding_regression import LateRegression
 from wfsobs.observers.gpr.trained import TrainedGpr, train
 from wfsobs.observers.per_mode import over_modes
-from wfsobs.observers.windows import Windows
 from wfsobs.prior import Bands, Prior
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, Sampling

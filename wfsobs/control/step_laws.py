@@ -10,9 +10,7 @@ import numpy as np
 from wfsobs.control.law import Law
 from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.observers.kalman.step import KalmanEstimator
-from wfsobs.observers.kalman.with_gaps import each_frame
-from wfsobs.observers.step import Estimator
-from wfsobs.observers.step_checks import StepError
+from wfsobs.observers.step import Estimator, StepError, each_frame
 from wfsobs.prior import Bands, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
@@ -110,7 +108,7 @@ class KalmanLaws:
     def run(self, measurements: Measurements, watch: Watch) -> Array:
         """Return the commands over a record with gaps, (n_steps, n_modes) [um]. Raises Cancelled."""
         none = np.zeros(len(self.laws))
-        return np.array([self.command(*frame, none) for frame in each_frame(self.filters, measurements, watch)])
+        return np.array([self.command(z, ngs, none) for z, ngs, _ in each_frame(self.filters, measurements, watch)])
 
     def tell(self, command: Array, forward: Array) -> None:
         """Take no notice: z holds none of the commands."""

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wfsobs.observers.kalman.multirate import MultiRate, multirate_filter, multirate_noise
-from wfsobs.observers.kalman.multirate_optimal import optimal_filter, optimal_model
+from wfsobs.observers.kalman.multirate import MultiRate, multirate_filter, multirate_noise, optimal_filter, optimal_model
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.prior import Model, Prior
 from wfsobs.priors_from.scenario import model_of

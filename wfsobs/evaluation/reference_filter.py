@@ -14,8 +14,7 @@ import numpy as np
 
 from wfsobs.evaluation.known_lines import is_near
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.kalman.multirate_multi import beam_model
-from wfsobs.observers.kalman.multirate_optimal import estimated_cycle, optimal_filter
+from wfsobs.observers.kalman.multirate import beam_model, estimated_cycle, optimal_filter
 from wfsobs.observers.kalman.single import MIN_NOISE, steady_filter
 from wfsobs.prior import Beams, Line, Lines
 from wfsobs.priors_from.turbulence import beams_of, modelled_turbulence

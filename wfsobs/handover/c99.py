@@ -16,7 +16,7 @@ import numpy as np
 from wfsobs.files import write_whole
 from wfsobs.handover.linear import LinearDesign
 from wfsobs.handover.vectors import Vectors
-from wfsobs.observers.step_checks import StepError
+from wfsobs.observers.step import StepError
 from wfsobs.signal.gap_gains import GapGains
 from wfsobs.signal.riccati import Step
 from wfsobs.signal.stepping import Gain, GainCycle

@@ -15,8 +15,7 @@ from wfsobs.live.board import NEXT, SCORED, SLOTS, Board
 from wfsobs.live.paced import Command, LiveEvent
 from wfsobs.live.ring import LiveFrame
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.step import StepObserver
-from wfsobs.observers.step_checks import StepError
+from wfsobs.observers.step import StepError, StepObserver
 from wfsobs.record import Sampling
 from wfsobs.typing import Array
 

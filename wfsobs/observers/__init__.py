@@ -5,21 +5,15 @@ from __future__ import annotations
 from wfsobs import registry
 from wfsobs.observers.base import Observer
 from wfsobs.observers.baselines import BUTTERWORTH_CL, BUTTERWORTH_OL, PERSISTENCE, ZERO
-from wfsobs.observers.gp.both import GP_BOTH
-from wfsobs.observers.gp.lgs import GP_LGS
+from wfsobs.observers.gp.observers import GP_BOTH, GP_LGS
 from wfsobs.observers.gpr.adaptive import GPR_ADAPTIVE
 from wfsobs.observers.gpr.offline import GPR_OFFLINE
 from wfsobs.observers.gpr.online import GPR_ONLINE
-from wfsobs.observers.kalman.adaptive import KF_ADAPTIVE
-from wfsobs.observers.kalman.asterism import KF_ASTERISM
+from wfsobs.observers.kalman.adaptive import KF_ADAPTIVE, MULTIRATE_ADAPTIVE
 from wfsobs.observers.kalman.coupled import KF_COUPLED
-from wfsobs.observers.kalman.multi import KF_MULTI
-from wfsobs.observers.kalman.multirate import MULTIRATE
-from wfsobs.observers.kalman.multirate_adaptive import MULTIRATE_ADAPTIVE
-from wfsobs.observers.kalman.multirate_coupled import MULTIRATE_COUPLED
-from wfsobs.observers.kalman.multirate_multi import MULTIRATE_MULTI
-from wfsobs.observers.kalman.multirate_optimal import MULTIRATE_OPTIMAL
-from wfsobs.observers.kalman.single import KF_LGS, KF_NGS
+from wfsobs.observers.kalman.joint import KF_ASTERISM, MULTIRATE_COUPLED
+from wfsobs.observers.kalman.multirate import MULTIRATE, MULTIRATE_MULTI, MULTIRATE_OPTIMAL
+from wfsobs.observers.kalman.single import KF_LGS, KF_MULTI, KF_NGS
 from wfsobs.observers.ridge import RIDGE, RIDGE_30
 from wfsobs.registry import Registry
 

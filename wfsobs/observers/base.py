@@ -10,18 +10,17 @@ from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, NamedTuple
 
+from wfsobs.observers.estimates import TARGETS as TARGETS
+from wfsobs.observers.estimates import TURBULENCE as TURBULENCE
+from wfsobs.observers.estimates import VIBRATION as VIBRATION
 from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
-from wfsobs.observers.step import MakeEstimator, StepObserver
-from wfsobs.observers.step_checks import StepError
+from wfsobs.observers.step import MakeEstimator, StepError, StepObserver, run_frames
 from wfsobs.prior import TRUE, Part, Prior, PriorSource, ask_nothing, words_for
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, Record, Sampling, hold_last
 from wfsobs.settings import Group, Section
 from wfsobs.typing import Array
-
-TURBULENCE, VIBRATION = "turbulence", "vibration"
-TARGETS = (TURBULENCE, VIBRATION)
 
 SLOW = 50.0
 """Weight of an observer for which no other waits: those that learn during the run."""
@@ -82,10 +81,10 @@ class Observer:
         For tables and files, and for people.
     targets : tuple of str
         What it estimates, of "turbulence" and "vibration".
-    run : callable
+    run : callable or None
         (measurements, prior, settings, watch) -> {target: (n_steps, n_modes) [um]}, NaN without an estimate; no measurement is
         missing, unless it takes that.
-        `Estimates` where it has a standard deviation.
+        `Estimates` where it has a standard deviation. None for one that is its estimator of `step`, driven over the record.
     help : str
         One line of description.
     prior : tuple
@@ -123,7 +122,7 @@ class Observer:
     id: str
     label: str
     targets: tuple[str, ...]
-    run: Callable[[Measurements, Prior, Any, Watch], dict[str, Array]]
+    run: Callable[[Measurements, Prior, Any, Watch], dict[str, Array]] | None = None
     _: KW_ONLY
     help: str = ""
     prior: tuple[Part, ...] = ()
@@ -187,7 +186,7 @@ class Observer:
             given = replace(measurements, u=hold_last(measurements.u))
         else:
             given = fill_missing(measurements, prior, getattr(settings, "line_width", LINE_WIDTH))
-        found = self.run(given, prior, settings, watch)
+        found = self.run(given, prior, settings, watch) if self.run else run_design(self, given, prior, settings, watch)
         return found if isinstance(found, Estimates) else Estimates(found)
 
     def design(self, prior: Prior, settings: Group | None, sampling: Sampling, horizon: float = 0.0) -> StepObserver:
@@ -243,3 +242,15 @@ class Observer:
     def needs_text(self, *, source: PriorSource = TRUE) -> str:
         """Return what it has to be told beside measurements, for people; source : where its prior comes from."""
         return ", ".join(words_for(self.prior, source=source)) or NOTHING
+
+
+def run_design(observer: Observer, measurements: Measurements, prior: Prior, settings: Any, watch: Watch) -> Estimates:
+    """Run the estimator of an observer over a record: all steps at once where it can, else frame by frame."""
+    if observer.step is None:
+        raise StepError(f"{observer.id}: has neither a run nor a step")
+    estimator = observer.step(prior, settings, measurements.sampling, 0.0)
+    run = getattr(estimator, "run", None)
+    found = run(measurements, watch) if run else run_frames(estimator, observer.targets, measurements, watch)
+    if observer.targets == TARGETS:
+        return found
+    return Estimates(*({target: x[target] for target in observer.targets if target in x} for x in (found, found.sd)))

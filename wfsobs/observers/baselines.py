@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Look, Observer, Tunable
-from wfsobs.observers.step_checks import StepError
+from wfsobs.observers.step import StepError
 from wfsobs.prior import Bands, OfflineBands, OnlineBands, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling

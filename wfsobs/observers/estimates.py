@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 
 from wfsobs.typing import Array
 
+TURBULENCE, VIBRATION = "turbulence", "vibration"
+TARGETS = (TURBULENCE, VIBRATION)
+
 TOTAL, NEXT_Z = "total", "next z"
 """Of the standard deviations: the sum of turbulence and vibration, and the next measurement, as the sum predicts it."""
 
@@ -27,6 +30,11 @@ class Estimates(dict[str, Array]):
     def __init__(self, values: Mapping[str, Array], sd: Mapping[str, Array] | None = None):
         super().__init__(values)
         self.sd = dict(sd or {})
+
+
+def by_name(x: Array) -> dict[str, Array]:
+    """Return the columns of x (n, 2 to 4, n_modes) by what they are: targets, and of standard deviations TOTAL and NEXT_Z."""
+    return {name: x[:, i] for i, name in zip(range(x.shape[1]), (*TARGETS, TOTAL, NEXT_Z), strict=False)}
 
 
 @dataclass(frozen=True)

@@ -7,21 +7,24 @@ then is this with lambda = (sigma_n l / sigma_SE)^2 and a free constant.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import solve
 
 from wfsobs.observers.base import VIBRATION, Look, Observer, Tunable
-from wfsobs.observers.gpr.inputs import scale_of, scales_of, training_signals, tunable, window_signals
+from wfsobs.observers.estimates import Estimates
+from wfsobs.observers.gpr.inputs import Windows, scales_of, training_signals, tunable
 from wfsobs.observers.gpr.kernels import sliding_products, square_from_band
 from wfsobs.observers.gpr.offline import OFFLINE, OfflineGpr, training_targets
-from wfsobs.observers.per_mode import over_modes
-from wfsobs.observers.step_checks import whole_frames
-from wfsobs.observers.windows import LinearPredictor, Windows
+from wfsobs.observers.step import whole_frames
 from wfsobs.prior import OfflineBands, Prior, Training
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, Sampling, pseudo_open_loop
 from wfsobs.signal.linalg import eliminate, solve_rows
+from wfsobs.signal.stepping import Saved
 from wfsobs.typing import Array
 
 TAPS = 30
@@ -79,6 +82,69 @@ def predict(signals: Array, weights: Array, constant: float) -> Array:
     return out
 
 
+class LinearPredictor:
+    """A linear predictor of all modes. One of the vibration h frames ahead is trained for that h, so it has no other horizon.
+
+    Parameters
+    ----------
+    windows : Windows
+        What it looks at.
+    fits : sequence of tuple
+        Weights (depth, channels), the newest sample first, and constant, one per mode.
+    horizon : float
+        Frames ahead that it was trained for.
+    """
+
+    def __init__(self, windows: Windows, fits: Sequence[tuple[Array, float]], horizon: float):
+        self.windows, self.horizon, self.needs_command, self.fits = windows, horizon, windows.needs_command, fits
+        channels = fits[0][0].shape[1]
+        self._weights = np.concatenate([weights[::-1].T for weights, _ in fits])  # as the window: (n_modes * channels, depth)
+        self._starts = np.arange(0, len(self._weights), channels)
+        self._constants = np.array([constant for _, constant in fits])
+        self._mean, self._sd = np.full(len(fits), np.nan), np.full(len(fits), np.nan)
+
+    def run(self, measurements: Measurements, watch: Watch) -> Estimates:
+        """Run over a record, all steps at once."""
+        columns = []
+        for mode, fitted in enumerate(self.fits):
+            watch.step(mode / len(self.fits))
+            columns.append(predict(self.windows.channels(measurements, mode), *fitted))
+        return Estimates({VIBRATION: np.column_stack(columns)})
+
+    def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
+        """Take a frame."""
+        self.windows.push(z, u)
+
+    def predict(self, frames: float, target: str) -> tuple[Array, Array]:
+        """Return the mean of the vibration; NaN before the first full window."""
+        if self.windows.is_full:
+            parts = np.einsum("ij,ij->i", self._weights, self.windows.window)
+            np.add.reduceat(parts, self._starts, out=self._mean)
+            self._mean += self._constants
+        else:
+            self._mean[...] = np.nan
+        return self._mean, self._sd
+
+    def settle(self) -> None:
+        """Have nothing left to do."""
+
+    def reset(self) -> None:
+        """Set the state back to the start."""
+        self.windows.reset()
+
+    def save(self) -> Saved:
+        """Return a copy of the state."""
+        return self.windows.save()
+
+    def load(self, state: Mapping[str, Array]) -> None:
+        """Take over a state."""
+        self.windows.load(state)
+
+    def take_over(self, old: Any) -> None:
+        """Go on with the samples of another design."""
+        self.windows.take_over(old.windows)
+
+
 def fit_ridge(prior: Prior, g: OfflineGpr, mode: int, dt: float, delay: int, horizon: int = 0) -> tuple[Array, float]:
     """Fit the linear limit of the offline GPR of one mode to the vibration `horizon` frames ahead, as `fit`."""
     training, bands = prior.training, prior.bands
@@ -88,21 +154,8 @@ def fit_ridge(prior: Prior, g: OfflineGpr, mode: int, dt: float, delay: int, hor
     return fit(signals, targets, g.depth, g.training_size, (g.noise_std * g.length_scale / g.signal_std) ** 2)
 
 
-def ridge(measurements: Measurements, prior: Prior, settings: OfflineGpr, watch: Watch) -> dict[str, Array]:
-    """Run the linear limit of the offline GPR: its windows, its training size, its penalty."""
-    g, dt, delay = settings, measurements.dt, measurements.delay
-
-    def one(mode: int, watch: Watch) -> Array:
-        watch.check()
-        scale = scale_of(g, prior.training, delay, mode)
-        fitted = fit_ridge(prior, g, mode, dt, delay)
-        return predict(window_signals(g, measurements.y_lgs, measurements.u, measurements.z, mode, dt, scale), *fitted)
-
-    return {VIBRATION: over_modes(measurements.n_modes, one, watch)}
-
-
-def step_ridge(prior: Prior, settings: OfflineGpr, sampling: Sampling, horizon: float) -> LinearPredictor:
-    """Return `ridge`, one frame at a time."""
+def ridge(prior: Prior, settings: OfflineGpr, sampling: Sampling, horizon: float) -> LinearPredictor:
+    """Return the linear limit of the offline GPR: its windows, its training size, its penalty."""
     g, ahead, modes = settings, whole_frames(horizon, "ridge"), range(sampling.n_modes)
     fits = [fit_ridge(prior, g, mode, sampling.dt, sampling.delay, ahead) for mode in modes]
     return LinearPredictor(Windows(g, sampling, g.depth, scales_of(g, prior.training, sampling)), fits, ahead)
@@ -118,17 +171,8 @@ def fit_30(prior: Prior, mode: int, dt: float, delay: int, horizon: int = 0) -> 
     return fit(z, targets, TAPS, m, PLAIN * m * float(np.mean(z**2)))
 
 
-def ridge_30(measurements: Measurements, prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
-    """Plain least squares on the last 30 measurements z, over all of the training record."""
-    columns = []
-    for mode in range(measurements.n_modes):
-        watch.step(mode / measurements.n_modes)
-        columns.append(predict(measurements.z[:, [mode]], *fit_30(prior, mode, measurements.dt, measurements.delay)))
-    return {VIBRATION: np.column_stack(columns)}
-
-
-def step_ridge_30(prior: Prior, _settings: None, sampling: Sampling, horizon: float) -> LinearPredictor:
-    """Return `ridge_30`, one frame at a time."""
+def ridge_30(prior: Prior, _settings: None, sampling: Sampling, horizon: float) -> LinearPredictor:
+    """Return plain least squares on the last 30 measurements z, over all of the training record."""
     ahead = whole_frames(horizon, "ridge-30")
     fits = [fit_30(prior, mode, sampling.dt, sampling.delay, ahead) for mode in range(sampling.n_modes)]
     return LinearPredictor(Windows(None, sampling, TAPS), fits, ahead)
@@ -138,7 +182,6 @@ RIDGE = Observer(
     "ridge",
     "Ridge",
     (VIBRATION,),
-    ridge,
     help="linear limit of the offline GPR: what its kernel becomes for a long length scale",
     prior=(Training, OfflineBands),
     settings=OFFLINE,
@@ -151,19 +194,18 @@ RIDGE = Observer(
         ("gpr_offline.length_scale", *tunable("gpr_offline"), "butterworth.bandwidth_offline", "butterworth.order"),
     ),
     look=Look("Ridge", "#757E9A", "#9A97BE", (4, 2)),
-    step=step_ridge,
+    step=ridge,
 )
 
 RIDGE_30 = Observer(
     "ridge-30",
     "30-tap predictor",
     (VIBRATION,),
-    ridge_30,
     help="least squares on the last 30 measurements: the plain baseline",
     prior=(Training, OfflineBands),
     needs=("training",),
     linear=True,
     tunable=Tunable(("butterworth.bandwidth_offline",), ("butterworth.order",)),
     look=Look("30-tap predictor", "#3E4E6C", "#C8A299", (2, 3)),
-    step=step_ridge_30,
+    step=ridge_30,
 )

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from wfsobs.observers.gpr.offline import OfflineGpr
     from wfsobs.observers.gpr.online import OnlineGpr
     from wfsobs.observers.kalman.adaptive import Adaptive
-    from wfsobs.observers.kalman.multi import MultiPeak
     from wfsobs.observers.kalman.multirate import MultiRate
+    from wfsobs.observers.kalman.single import MultiPeak
 
 HIGHEST = 0.9
 """Maximum height of a layer over that of the laser guide stars: in a higher one the beam nearly vanishes."""

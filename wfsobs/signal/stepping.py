@@ -84,6 +84,14 @@ class GainCycle:
         """Return the filter of the steps that repeat, with these outputs (p, n) of x_hat[k]."""
         return PeriodicFilter([step.filter_step(outputs) for step in self.steps])
 
+    def run(self, outputs: Array, v: Array) -> Array:
+        """Return outputs (p, n) of x_hat at every step of a record v (n_steps, m) from rest, (n_steps, p)."""
+        cycle = self.filter(outputs)
+        if self.first is None:
+            return cycle.run(v[:, :, None])[:, :, 0]
+        _, G, _, J = self.first.filter_step(outputs)
+        return np.vstack([J @ v[0], cycle.run(v[1:, :, None], (G @ v[0])[:, None])[:, :, 0]])
+
     def estimator(self) -> Recursion:
         """Return the recursion of x_hat, which is its state after a step; it has no outputs of its own."""
         n, m = self.steps[0].L.shape

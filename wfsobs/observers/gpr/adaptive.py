@@ -8,59 +8,176 @@ is a fixed filter of the whitened measurements. It learns after the estimate of 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from wfsobs.observers.base import VIBRATION, Look, Observer, Tunable
 from wfsobs.observers.estimates import Estimates
-from wfsobs.observers.gpr.adaptive_step import AdaptiveGprEstimator, Schedule, schedule_of
-from wfsobs.observers.gpr.learning import learn, nothing_learnt
-from wfsobs.observers.kalman.adaptive import ADAPTIVE, Adaptive, identification_settings
-from wfsobs.observers.step_checks import whole_frames
+from wfsobs.observers.gpr.learning import Learnt, learn, nothing_learnt
+from wfsobs.observers.kalman.adaptive import identification_settings
+from wfsobs.observers.kalman.window_model import ADAPTIVE, Adaptive, pack_spectrum, unpack_spectrum, window_lengths
+from wfsobs.observers.step import StepError, run_frames, whole_frames
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, RecordError, Sampling
 from wfsobs.signal.periodic import PeriodicFilter
+from wfsobs.signal.stepping import Saved
 from wfsobs.spectral.quick import SHORTEST
 from wfsobs.typing import Array
 
+SLOWER = 1.5
+"""Time from learning to learning, over `adaptive.interval`: less often costs errors, more often processor time alone."""
 
-def gpr_adaptive(measurements: Measurements, _prior: Prior, settings: Adaptive, watch: Watch) -> Estimates:
-    """Run the regression over a record, one mode after the other; NaN until it has learnt once.
 
-    Raises RecordError for a record shorter than that, or a window of too few samples.
+class Schedule(NamedTuple):
+    """When it learns from what, all in steps.
+
+    first, interval : until the first time of learning, and from one to the next
+    longest         : maximum length of the identification window
+    depth           : of a window of the regression
     """
-    schedule = schedule_of(settings, measurements.dt)
-    needed = schedule.first + measurements.delay
-    if measurements.n_steps <= needed:
-        raise RecordError(f"the record has {measurements.n_steps} steps; half of adaptive.window and one more are {needed + 1}")
-    z = measurements.z[measurements.delay :]  # what the mirror did before the record is not known
-    columns = []
-    for mode in range(measurements.n_modes):
-        pieces = [np.full((2, measurements.delay + schedule.first), np.nan)]
-        for done, piece in _pieces(z[:, mode], measurements.dt, settings, schedule):
-            watch.step((mode + done) / measurements.n_modes)
-            pieces.append(piece)
-        columns.append(np.concatenate(pieces, axis=1))
-    values, sd = np.stack(columns, axis=-1)
-    return Estimates({VIBRATION: values}, {VIBRATION: sd})
+
+    first: int
+    interval: int
+    longest: int
+    depth: int
 
 
-def _pieces(z: Array, dt: float, settings: Adaptive, schedule: Schedule) -> Iterator[tuple[float, Array]]:
-    """Yield the fraction done, and estimates and standard deviations (2, steps) from one time of learning to the next."""
-    n, last = len(z), nothing_learnt(schedule.depth)
-    for now in range(schedule.first, n, schedule.interval):
-        start, stop = max(now - schedule.longest, 0), min(now + schedule.interval, n)
-        last = learn(z[start:now], dt, schedule.depth, settings.peak_count, settings.lowest, last)
-        x = PeriodicFilter([last.whitener]).run(
-            (z[start:stop] - last.mean)[:, None, None], since=now - start - schedule.depth + 1
-        )
-        yield now / n, np.array([np.convolve(x[:, 0, 0], last.weights, "valid"), np.full(stop - now, last.sd)])
+def schedule_of(settings: Adaptive, dt: float) -> Schedule:
+    """Return the schedule of settings. Raises RecordError for a window of too few samples."""
+    found = window_lengths(settings, dt)
+    found.check(settings, dt)
+    first = max(found.window // 2, SHORTEST)
+    return Schedule(first, round(SLOWER * found.interval), 2 * found.window, min(settings.depth, first // 4))
 
 
-def step_gpr_adaptive(_prior: Prior, settings: Adaptive, sampling: Sampling, horizon: float) -> AdaptiveGprEstimator:
-    """Return `gpr_adaptive`, one frame at a time, learning the vibration `horizon` frames ahead."""
+class AdaptiveGprEstimator:
+    """The regression of all modes, for the vibration now or `horizon` frames ahead. It learns in `settle`.
+
+    Raises StepError where the horizon leaves too few targets.
+    """
+
+    needs_command = False
+
+    def __init__(self, settings: Adaptive, sampling: Sampling, horizon: int = 0):
+        self.settings, self.sampling, self._ahead, self.horizon = settings, sampling, horizon, float(horizon)
+        self.schedule = schedule_of(settings, sampling.dt)
+        if horizon >= self.schedule.first // 4:
+            raise StepError(f"gpr-adaptive: {horizon} frames ahead: takes less than an eighth of adaptive.window")
+        n = sampling.n_modes
+        self._samples = np.zeros((n, 2 * self.schedule.longest))  # newest last; moved to the front at the end
+        self._recent = np.zeros((n, self.schedule.depth))  # whitened, in a ring
+        self._states = np.zeros((n, 4))  # of the whiteners: turbulence, and a background where there is one
+        self._mean, self._sd = np.full(n, np.nan), np.full(n, np.nan)
+        self.reset()
+
+    def reset(self) -> None:
+        """Set the state back to the start."""
+        self._end = self.count = 0
+        self._pending = False
+        self.learnt = [nothing_learnt(self.schedule.depth)] * self.sampling.n_modes
+        self._whiteners = [one.whitener for one in self.learnt]
+        self._recent[...], self._states[...], self._mean[...], self._sd[...] = 0.0, 0.0, np.nan, np.nan
+
+    def run(self, measurements: Measurements, watch: Watch) -> Estimates:
+        """Run over a record, frame by frame. Raises RecordError for one in which it cannot learn once."""
+        needed = self.schedule.first + measurements.delay
+        if measurements.n_steps <= needed:
+            raise RecordError(
+                f"the record has {measurements.n_steps} steps; half of adaptive.window and one more are {needed + 1}"
+            )
+        return run_frames(self, (VIBRATION,), measurements, watch)
+
+    def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
+        """Take a frame; those of the mirror's first delay are left out: what it did before is not known."""
+        self.settle()
+        self.count += 1
+        if self.count <= self.sampling.delay:
+            return
+        if self._end == self._samples.shape[1]:
+            self._samples[:, : self.schedule.longest] = self._samples[:, -self.schedule.longest :]
+            self._end = self.schedule.longest
+        self._samples[:, self._end] = z
+        self._end += 1
+        since = self.count - self.sampling.delay - self.schedule.first
+        if since > 0:
+            self._estimate(z)
+        self._pending = since >= 0 and since % self.schedule.interval == 0
+
+    def _estimate(self, z: Array) -> None:
+        """Whiten the samples z (n_modes,), and put their windows through the weights."""
+        self._recent[:, 1:] = self._recent[:, :-1].copy()
+        for mode, (one, (F, G, H, J)) in enumerate(zip(self.learnt, self._whiteners, strict=True)):
+            state, value = self._states[mode, : len(F)], z[mode] - one.mean
+            self._recent[mode, 0] = H[0] @ state + J[0, 0] * value
+            state[...] = F @ state + G[:, 0] * value
+            self._mean[mode], self._sd[mode] = one.weights @ self._recent[mode], one.sd
+
+    def settle(self) -> None:
+        """Learn, where the last frame ended an interval; estimates of the next frames are of it."""
+        if not self._pending:
+            return
+        self._pending = False
+        size = min(self.count - self.sampling.delay, self.schedule.longest)
+        for mode, last in enumerate(self.learnt):
+            z = self._samples[mode, self._end - size : self._end]
+            s = self.settings
+            one = learn(z, self.sampling.dt, self.schedule.depth, s.peak_count, s.lowest, last, self._ahead)
+            self.learnt[mode], self._whiteners[mode] = one, one.whitener
+            self._whiten_past(mode, z - one.mean)
+
+    def _whiten_past(self, mode: int, z: Array) -> None:
+        """Take the new whitener of a mode through its window z (n,), from rest."""
+        F, G, H, J = self._whiteners[mode]
+        out = PeriodicFilter([(F, G, np.vstack([H, F]), np.vstack([J, G]))]).run(z[:, None, None])[:, :, 0]
+        self._recent[mode] = out[: -self.schedule.depth - 1 : -1, 0]
+        self._states[mode, : len(F)] = out[-1, 1:]
+
+    def predict(self, frames: float, target: str) -> tuple[Array, Array]:
+        """Return mean and standard deviation of the vibration; NaN before it has learnt once."""
+        return self._mean, self._sd
+
+    def save(self) -> Saved:
+        """Return a copy of the state: the window, what was learnt, and the states of the whiteners."""
+        self.settle()
+        size, rows = min(self._end, self.schedule.longest), self.settings.peak_count + 2
+        samples = np.zeros((len(self._mean), self.schedule.longest))
+        samples[:, self.schedule.longest - size :] = self._samples[:, self._end - size : self._end]
+        return {
+            "samples": samples,
+            "spectra": np.array([pack_spectrum(one.fit, rows) for one in self.learnt]),
+            "weights": np.array([one.weights for one in self.learnt]),
+            "means": np.array([[one.mean, one.sd] for one in self.learnt]),
+            "recent": self._recent.copy(),
+            "states": self._states.copy(),
+            "estimates": np.array([self._mean, self._sd]),
+            "count": np.array(self.count),
+        }
+
+    def load(self, state: Mapping[str, Array]) -> None:
+        """Take over a state."""
+        self.count, self._end, self._pending = int(state["count"]), self.schedule.longest, False
+        size = min(max(self.count - self.sampling.delay, 0), self.schedule.longest)
+        self._samples[:, self._end - size : self._end] = state["samples"][:, self._end - size :]
+        packed = zip(state["spectra"], state["means"].tolist(), state["weights"], strict=True)
+        self.learnt = [
+            Learnt(unpack_spectrum(table, self.sampling.dt), mean, weights.copy(), sd) for table, (mean, sd), weights in packed
+        ]
+        self._whiteners = [one.whitener for one in self.learnt]
+        self._recent[...], self._states[...] = state["recent"], state["states"]
+        self._mean[...], self._sd[...] = state["estimates"]
+
+    def take_over(self, old: Any) -> None:
+        """Go on from another design with the same windows, number of peaks and horizon. Raises StepError."""
+        if (old.schedule, old.settings.peak_count, old.horizon) != (self.schedule, self.settings.peak_count, self.horizon):
+            raise StepError("the designs have other windows, another number of peaks or horizon")
+        self.load(old.save())
+
+
+def gpr_adaptive(_prior: Prior, settings: Adaptive, sampling: Sampling, horizon: float) -> AdaptiveGprEstimator:
+    """Return the regression of the vibration `horizon` frames ahead. Raises RecordError for a window of too few samples."""
     return AdaptiveGprEstimator(settings, sampling, whole_frames(horizon, "gpr-adaptive"))
 
 
@@ -81,13 +198,12 @@ GPR_ADAPTIVE = Observer(
     "gpr-adaptive",
     "Adaptive GPR",
     (VIBRATION,),
-    gpr_adaptive,
     help="Gaussian process regression that learns inputs, kernel and targets from the last 8 s; not in the paper",
     settings=ADAPTIVE,
     tunable=Tunable(("adaptive.window", "adaptive.depth"), ("adaptive.interval",)),
     weight=50.0,
     seconds=seconds,
     look=Look("Adaptive GPR", "#01734F", "#7AFED9", (20, 2, 2, 2), width=1.8),
-    step=step_gpr_adaptive,
+    step=gpr_adaptive,
     counts=_settings_used,
 )

@@ -14,12 +14,11 @@ import numpy as np
 from wfsobs.observers.base import VIBRATION, Look, Observer, Tunable
 from wfsobs.observers.baselines import open_loop_reference
 from wfsobs.observers.estimates import Estimates
-from wfsobs.observers.gpr.inputs import Gpr, scale_of, scales_of, training_signals, tunable, window_signals
+from wfsobs.observers.gpr.inputs import Gpr, Windows, scale_of, scales_of, training_signals, tunable, window_signals
 from wfsobs.observers.gpr.online import kernel_of
 from wfsobs.observers.gpr.trained import TrainedGpr, train
 from wfsobs.observers.per_mode import over_modes, turns
-from wfsobs.observers.step_checks import whole_frames
-from wfsobs.observers.windows import Windows
+from wfsobs.observers.step import whole_frames
 from wfsobs.prior import Bands, OfflineBands, Prior
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import DELAY, Measurements, RecordError, Sampling, Training, pseudo_open_loop

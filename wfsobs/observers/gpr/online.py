@@ -6,24 +6,26 @@ causal Butterworth bank on z, of which value j + 1 belongs to step j and is know
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
 from wfsobs.observers.base import VIBRATION, Look, Observer, Tunable
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.estimates import Estimates
-from wfsobs.observers.gpr.inputs import Gpr, scale_of, scales_of, tunable, window_signals
+from wfsobs.observers.gpr.inputs import Gpr, Scale, StreamingInputs, Windows, scale_of, scales_of, tunable, window_signals
 from wfsobs.observers.gpr.kernels import SquaredExponential, band, check_condition, square_from_band
-from wfsobs.observers.gpr.online_step import OnlineEstimator
 from wfsobs.observers.gpr.sliding import finish, run_lengths, slide
+from wfsobs.observers.gpr.sliding_regression import LateRegression, SlidingRegression
 from wfsobs.observers.per_mode import over_modes, turns
-from wfsobs.observers.step_checks import whole_frames
-from wfsobs.observers.windows import Windows
+from wfsobs.observers.step import StepError, whole_frames
 from wfsobs.prior import Bands, OnlineBands, Part, Prior, Training
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, Sampling, Signals
 from wfsobs.settings import Real, Section, Whole
+from wfsobs.signal.bandpass import StreamingBank, bandpass_bank, bank_recursion
+from wfsobs.signal.stepping import FilterBank, Saved, load_parts, save_parts
 from wfsobs.typing import Array
 
 
@@ -150,6 +152,92 @@ def _whole_run(
     return S, f
 
 
+class OnlineEstimator:
+    """Online GPR of all modes one frame at a time, for the vibration now or a number of frames ahead.
+
+    The target of a window is the vibration h frames later as the causal bank on z gives it, one frame late: at step k that of
+    window k - 1 - h is known. What it learns from a frame it learns in `settle`, after the estimate.
+
+    Parameters
+    ----------
+    windows : Windows
+        The channels of a sample; of depth 1.
+    bands : Bands
+        Of the bank that gives the targets.
+    sampling : Sampling
+        Of the loop.
+    depth, m : int
+        Samples in a window, windows in the training set.
+    kernel : SquaredExponential
+        The covariance.
+    weights : Array
+        Of the vibration now, one frame ahead and so on in what it learns; fewer than m.
+    """
+
+    def __init__(
+        self, windows: Windows, bands: Bands, sampling: Sampling, depth: int, m: int, kernel: SquaredExponential, weights: Array
+    ):
+        self.windows, self.weights, self.needs_command = windows, weights, windows.needs_command
+        self.horizon = float(len(weights) - 1)
+        self._band_signals = np.zeros((len(weights), sampling.n_modes))  # oldest first
+        self._size = depth, m, 2 if windows.needs_command else 1, kernel
+        bank = bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, sampling.dt)
+        self.bank = FilterBank([bank_recursion(bank)] * sampling.n_modes)
+        self._mean, self._sd = np.full(sampling.n_modes, np.nan), np.full(sampling.n_modes, np.nan)
+        self._pending = False
+        self.regression = self._start()
+
+    def _start(self) -> SlidingRegression:
+        late, n = len(self.weights) - 1, len(self._mean)
+        return LateRegression(*self._size, late, n) if late else SlidingRegression(*self._size, n)
+
+    def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
+        """Take a frame."""
+        self.settle()
+        self._band_signals[:-1] = self._band_signals[1:].copy()
+        self._band_signals[-1] = self.bank.step(z[:, None])[:, 0]
+        targets = self.weights @ self._band_signals
+        samples = self.windows.push(z, u).reshape(len(z), -1)
+        self._mean[...] = self.regression.predict(samples, targets)
+        self._pending = True
+
+    def settle(self) -> None:
+        """Learn from the last frame. Raises ConditionError where the precision is not enough."""
+        if self._pending:
+            self._pending = False
+            self.regression.update()
+
+    def predict(self, frames: float, target: str) -> tuple[Array, Array]:
+        """Return the mean of the vibration; NaN until the training set is full."""
+        return self._mean, self._sd
+
+    def reset(self) -> None:
+        """Set the state back to the start."""
+        self.windows.reset()
+        self.bank.reset()
+        self.regression, self._pending = self._start(), False
+        self._mean[...], self._band_signals[...] = np.nan, 0.0
+
+    def save(self) -> Saved:
+        """Return a copy of the state."""
+        self.settle()
+        parts = {"windows": self.windows, "bank": self.bank}
+        own = {"mean": self._mean.copy(), "filtered": self._band_signals.copy()}
+        return save_parts(parts) | own | self.regression.save()
+
+    def load(self, state: Mapping[str, Array]) -> None:
+        """Take over a state."""
+        load_parts({"windows": self.windows, "bank": self.bank}, state)
+        self._mean[...], self._band_signals[...], self._pending = state["mean"], state["filtered"], False
+        self.regression.load(state)
+
+    def take_over(self, old: Any) -> None:
+        """Go on from a design with the same windows, training set, kernel and horizon. Raises StepError."""
+        if old._size != self._size or not np.array_equal(old.weights, self.weights) or old.bank.x.shape != self.bank.x.shape:
+            raise StepError("the designs have other windows, training sets, kernels or horizons: one of them has to learn anew")
+        self.load(old.save())
+
+
 def step_gpr_online(prior: Prior, settings: OnlineGpr, sampling: Sampling, horizon: float) -> OnlineEstimator:
     """Return the online GPR, one frame at a time, learning the vibration `horizon` frames ahead."""
     g = settings
@@ -157,6 +245,59 @@ def step_gpr_online(prior: Prior, settings: OnlineGpr, sampling: Sampling, horiz
     windows = Windows(g, sampling, 1, scales_of(g, prior.training, sampling))
     ahead = whole_frames(horizon, "gpr-online")
     return OnlineEstimator(windows, prior.bands, sampling, g.depth, g.training_size, kernel_of(g), np.eye(ahead + 1)[-1])
+
+
+class OnlineGprStream:
+    """The online GPR of one mode, one sample at a time, as a control loop calls it.
+
+    >>> settings = OnlineGpr(training_size=3, depth=2)
+    >>> stream = OnlineGprStream(settings, Bands((47.7,), 3.0, 2.0, 1), dt=1e-3)
+    >>> [bool(np.isnan(stream.step(y, u=0.0))) for y in (0.0, 0.1, 0.0, -0.1, 0.0)]
+    [True, True, True, True, False]
+    """
+
+    def __init__(self, settings: OnlineGpr, bands: Bands, dt: float, scale: Scale | None = None):
+        """dt: step [s]; scale: of standardised inputs, from `inputs.scale_of`."""
+        g = settings
+        self._inputs, self._streaming_inputs = g.inputs, StreamingInputs(g, dt, scale)
+        self._bank = StreamingBank(bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, dt))
+        self._regression = SlidingRegression(g.depth, g.training_size, 1 if g.inputs == "z" else 2, kernel_of(g))
+        self._u = (0.0, 0.0)  # u[k-1], u[k-2]
+        self._now: float | None = None
+        self._pending = False
+
+    def estimate(self, y: float, u: float | None = None) -> float:
+        """Estimate the vibration at this step [um] from its LGS measurement y [um].
+
+        And from its command u [um], unless the windows are of z. NaN until the training set is full. `update` must follow.
+        """
+        if self._pending:
+            raise RuntimeError("estimate was called twice without update")
+        z = y - self._u[1]
+        if self._inputs == "z":
+            sample = np.array([z])
+        elif u is None:
+            raise ValueError("windows of u and y need the command of this step")
+        else:
+            sample = np.array([u, y])
+        self._now, self._pending = u, True
+        target = np.array([self._bank.push(z)])
+        return float(self._regression.predict(self._streaming_inputs.step(sample)[None], target)[0])
+
+    def update(self, u: float | None = None) -> None:
+        """Learn from the last sample. u: its command [um], where `estimate` was not told."""
+        u = self._now if u is None else u
+        if u is None or not self._pending:
+            raise ValueError("update needs the command u, and an estimate before it")
+        self._regression.update()
+        self._bank.settle()
+        self._u, self._pending = (u, self._u[0]), False
+
+    def step(self, y: float, u: float) -> float:
+        """`estimate`, then `update`."""
+        value = self.estimate(y, u)
+        self.update()
+        return value
 
 
 def standardised_parts(settings: Gpr) -> tuple[Part, ...]:

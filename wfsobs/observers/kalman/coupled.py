@@ -1,7 +1,7 @@
 """The coupled filter: every mode of frozen flow is estimated from the measurements of all modes.
 
 The wind carries what one mode measures into another, and the LGS see through their narrower beams as one mode what is several.
-The states of the independent filters of `kalman.multi`, one per mode, and running means of every measurement over 0, 3, 9, ...
+The states of the independent filters of `kf-multi`, one per mode, and running means of every measurement over 0, 3, 9, ...
 243 steps are put together by the weights of least variance under the matrix of spectra in the prior (`signal.joint_states`).
 Longer means gain a little in an endless record, and lose more in its first seconds. Since the estimates of the independent
 filters are among what is weighed, it is no worse than they are where it is told the truth.
@@ -18,9 +18,9 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Look, Observer, Tunable
-from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimates
+from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimates, by_name
 from wfsobs.observers.kalman.mode_filter import ModeFilter
-from wfsobs.observers.kalman.multi import PEAKS, MultiPeak, independent_filters, vibration_used
+from wfsobs.observers.kalman.single import PEAKS, MultiPeak, independent_filters, vibration_used
 from wfsobs.observers.kalman.step import KalmanEstimator, matrix_power
 from wfsobs.prior import Flow, Lines, Prior
 from wfsobs.progress import Watch
@@ -145,26 +145,6 @@ def _with_means(one: ModeFilter, means: StateFilter) -> StateFilter:
     return StateFilter(block_diag(reduced, means.F), np.concatenate([step.L[:, 0], means.G]))
 
 
-def kf_coupled(measurements: Measurements, prior: Prior, settings: MultiPeak, watch: Watch) -> Estimates:
-    """Run the filter on the LGS measurements of all modes, at every fast step."""
-    model, z = CoupledModel(prior, settings), measurements.z
-    weights = np.vstack([model.plan(0.0, target)[0] for target in TARGETS])
-    out, start = np.zeros((len(z), len(weights))), 0
-    for mode, one in enumerate(model.filters):
-        watch.step(mode / model.n_modes)
-        rows = weights[:, start : start + len(one.model.A)]
-        out += one.gains.filter(rows).run(z[:, None, mode, None])[:, :, 0]
-        start += rows.shape[1]
-    F, G = model.means.F, model.means.G[:, None]
-    means = PeriodicFilter([(F, G, F, G)]).run(z[:, None], np.repeat(z[:1], len(F), axis=0))  # z was always what it is first
-    out += means.reshape(len(z), -1) @ weights[:, start:].T
-    sd = {name: model.plan(0.0, name)[1] for name in (*TARGETS, TOTAL)} | {NEXT_Z: model.next_z_sd()}
-    turbulence, vibration = np.split(out, 2, axis=1)
-    return Estimates(
-        {TURBULENCE: turbulence, VIBRATION: vibration}, {name: np.broadcast_to(spread, z.shape) for name, spread in sd.items()}
-    )
-
-
 class CoupledEstimator:
     """The filter one frame at a time: the independent filters, the means, and the weights of both.
 
@@ -201,6 +181,23 @@ class CoupledEstimator:
         weights, sd = self._plans[frames, target]
         return weights @ np.concatenate([self.kalman.bank.x[self._is_state], self.means.ravel()]), sd
 
+    def run(self, measurements: Measurements, watch: Watch) -> Estimates:
+        """Run the filter over a record without gaps from rest, all steps at once."""
+        model, z = self.model, measurements.z
+        weights = np.vstack([model.plan(0.0, target)[0] for target in TARGETS])
+        out, start = np.zeros((len(z), len(weights))), 0
+        for mode, one in enumerate(model.filters):
+            watch.step(mode / model.n_modes)
+            rows = weights[:, start : start + len(one.model.A)]
+            out += one.gains.run(rows, z[:, mode, None])
+            start += rows.shape[1]
+        F, G = model.means.F, model.means.G[:, None]
+        means = PeriodicFilter([(F, G, F, G)]).run(z[:, None], np.repeat(z[:1], len(F), axis=0))  # z was always what it is first
+        out += means.reshape(len(z), -1) @ weights[:, start:].T
+        sd = {name: model.plan(0.0, name)[1] for name in (*TARGETS, TOTAL)} | {NEXT_Z: model.next_z_sd()}
+        values = by_name(out.reshape(len(z), 2, -1))
+        return Estimates(values, {name: np.broadcast_to(spread, z.shape) for name, spread in sd.items()})
+
     def settle(self) -> None:
         """Have nothing left to do."""
 
@@ -224,7 +221,7 @@ class CoupledEstimator:
         self.means[...], self._is_first = old.means, old._is_first
 
 
-def step_kf_coupled(prior: Prior, settings: MultiPeak, _sampling: Sampling, _horizon: float) -> CoupledEstimator:
+def kf_coupled(prior: Prior, settings: MultiPeak, _sampling: Sampling, _horizon: float) -> CoupledEstimator:
     """Return the filter one frame at a time."""
     return CoupledEstimator(CoupledModel(prior, settings))
 
@@ -233,7 +230,6 @@ KF_COUPLED = Observer(
     "kf-coupled",
     "Coupled KF",
     TARGETS,
-    kf_coupled,
     help="Kalman filter on the LGS of all modes together, for frozen flow; not in the paper",
     prior=(Lines, Flow),
     settings=PEAKS,
@@ -242,6 +238,6 @@ KF_COUPLED = Observer(
     weight=2.0,
     tunable=Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
     look=Look("Coupled", "#D35312", "#D48F4D", (10, 2, 2, 2)),
-    step=step_kf_coupled,
+    step=kf_coupled,
     counts=vibration_used,
 )

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wfsobs.observers.base import TARGETS
+from wfsobs.observers.estimates import TARGETS
 from wfsobs.prior import Prior
 from wfsobs.signal.filter_covariance import lyapunov
 from wfsobs.signal.gap_gains import ONE, GapGains, SensorMean
@@ -45,6 +45,11 @@ class ModeFilter(NamedTuple):
     def stated_errors(self) -> StatedErrors:
         """Return the standard deviations of its errors by its own model."""
         return StatedErrors(self)
+
+    def innovation_variances(self) -> list[float]:
+        """Return the variance of z less its prediction at every step that repeats [um^2]."""
+        before = zip(self.posterior[-1:] + self.posterior[:-1], self.cycle[-1:] + self.cycle[:-1], self.cycle, strict=True)
+        return [float(C[0] @ (A @ P @ A.T + Q) @ C[0] + R[0, 0]) for P, (A, _, Q, _), (_, C, _, R) in before]
 
     def steady_sd(self) -> Array:
         """Return `StatedErrors.sd` of every step that repeats, (steps, 4) [um]."""

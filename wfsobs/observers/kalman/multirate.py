@@ -1,4 +1,6 @@
-"""The paper's multi-rate Kalman filter: LGS at every step, NGS at every n-th (section 2.2.1).
+"""Multi-rate Kalman filters: LGS at every step, NGS at every n-th.
+
+The paper's, `multirate` (section 2.2.1):
 
     x_pred[k+1] = A x_hat[k]
     x_hat[k] = x_pred[k] + L_j (z_j[k] - C_j x_pred[k])        (eq. 11)
@@ -6,32 +8,44 @@
 with two steady-state gains: L_LGS from C_LGS and r_LGS, and L_LGS^NGS from both rows with diag(r_LGS, r_NGS), as if
 both came at every step. The paper prints the predictor gain K; the correction of a state that is already
 predicted takes the filter gain L. An NGS frame counts as a measurement of phi_dist[k-1], like the LGS.
+
+The optimal one, `multirate-optimal`: periodic gains, and the NGS frame modelled as the mean that it is. To the state of the
+disturbance model come the mean of what the running NGS frame has seen so far,
+
+    frame[k+1] = (frame[k], or 0 if a frame has just been read) + phi_dist[k] / n,
+
+so that z_ngs[k] = frame[k] + noise at k = n, 2n, ..., and (an option) the slow AR(2) error of the LGS mean. The gains solve
+the periodic Riccati equation of the n steps. Optimal for its model only.
+
+With every peak, `multirate-multi`: one AR(2) per line of the vibration, and turbulence in the beams of target and LGS as sums of
+independent processes: in both, in the target's alone, in that of the LGS alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 import param
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
-from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean
-from wfsobs.observers.kalman.single import MODEL, NGS
-from wfsobs.observers.kalman.spread import by_target
+from wfsobs.observers.kalman.single import MODEL, NGS, PEAKS, MultiPeak, vibration_used
 from wfsobs.observers.kalman.step import KalmanEstimator
-from wfsobs.observers.kalman.with_gaps import run_frames
-from wfsobs.prior import LgsStars, Model, Noise, NoiselessModel, Part, Prior
-from wfsobs.progress import Watch
-from wfsobs.record import Measurements, Sampling
+from wfsobs.prior import Beams, LgsError, LgsStars, Lines, Model, Noise, NoiselessModel, Part, Prior
+from wfsobs.record import Sampling
 from wfsobs.settings import Group, Real, Section
-from wfsobs.signal.filter_covariance import posteriors_of_gains
-from wfsobs.signal.periodic import FilterStep, PeriodicFilter
-from wfsobs.signal.riccati import steady_state
-from wfsobs.signal.statespace import DisturbanceModel
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3
+from wfsobs.signal.filter_covariance import Step, posteriors_of_gains
+from wfsobs.signal.gap_gains import ONE, SensorMean
+from wfsobs.signal.periodic import PeriodicFilter
+from wfsobs.signal.riccati import SteadyState, periodic_steady_state, steady_state
+from wfsobs.signal.statespace import DisturbanceModel, blocks_along_diagonal, disturbance_model
 from wfsobs.signal.stepping import Gain, GainCycle
 from wfsobs.typing import Array
 
@@ -91,25 +105,20 @@ def matched_noise(settings: MultiRate) -> tuple[Part, ...]:
     return () if settings.measurement_noise == "manual" else (Noise,)
 
 
-@dataclass(frozen=True)
-class MultiRateFilter:
-    """first: (F, G, H, J) of step 0, which has no NGS frame; cycle: the steps from k = 1 on, the frame last."""
+class MultiRateFilter(NamedTuple):
+    """A filter with these gains, whose step 0 has no NGS frame, and outputs (p, n) of the state."""
 
-    first: FilterStep
-    cycle: PeriodicFilter
+    gains: GainCycle
+    outputs: Array
+
+    @property
+    def cycle(self) -> PeriodicFilter:
+        """The steps from k = 1 on, the frame last."""
+        return self.gains.filter(self.outputs)
 
     def run(self, z: Array) -> Array:
-        """Filter z (n_steps, 2) = (z_lgs, z_ngs), any number where there is no frame; (n_steps, n_targets)."""
-        _, G, _, J = self.first
-        start = z[0] * [1.0, 0.0]
-        rest = self.cycle.run(z[1:, :, None], (G @ start)[:, None])[:, :, 0]
-        return np.vstack([J @ start, rest])
-
-
-def filter_of_gains(gains: GainCycle, outputs: Array) -> MultiRateFilter:
-    """Return the filter with these outputs (p, n) of the state."""
-    assert gains.first is not None
-    return MultiRateFilter(gains.first.filter_step(outputs), gains.filter(outputs))
+        """Filter z (n_steps, 2) = (z_lgs, z_ngs), any number where there is no frame; (n_steps, p)."""
+        return self.gains.run(self.outputs, z)
 
 
 def multirate_gains(model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float) -> GainCycle:
@@ -139,43 +148,13 @@ def multirate_filter(
     outputs : rows of the state x_hat[k] to return, (p, n); every target by default. Raises UnstableCycle.
     """
     gains = multirate_gains(model, ratio, lgs_noise, ngs_noise)
-    return filter_of_gains(gains, model.output_rows(TARGETS) if outputs is None else outputs)
+    return MultiRateFilter(gains, model.output_rows(TARGETS) if outputs is None else outputs)
 
 
 def multirate_posteriors(model: DisturbanceModel, gains: GainCycle, lgs_noise: float, ngs_noise: float) -> list[Array]:
     """Return the covariances after the measurement at steps 1 ... n, by the model that the gains are of."""
     R = np.diag([lgs_noise**2, ngs_noise**2])
     return posteriors_of_gains([(A, C, model.Q, R) for A, C, _ in gains.steps], [step.L for step in gains.steps])
-
-
-def run_modes(measurements: Measurements, modes: Sequence[ModeFilter], watch: Watch) -> Estimates:
-    """Run the filters of all modes on both sensors."""
-    n, z_ngs = measurements.ratio, measurements.z_ngs
-    assert n is not None
-    if measurements.lgs_stars is not None or np.isnan(measurements.z).any() or np.isnan(z_ngs[n::n]).any():
-        return run_frames(KalmanEstimator(modes), measurements, watch)
-    z = np.stack([measurements.z, np.nan_to_num(z_ngs)], axis=1)
-    columns, sd = [], []
-    for mode, one in enumerate(modes):
-        watch.step(mode / measurements.n_modes)
-        rows = one.rows(TARGETS)
-        columns.append(filter_of_gains(one.gains, rows).run(z[:, :, mode]))
-        sd.append(one.steady_sd())
-    return by_target(columns, sd, first=1)
-
-
-def multirate(measurements: Measurements, prior: Prior, settings: MultiRate, watch: Watch) -> Estimates:
-    """Run the multi-rate filter over a record, for turbulence."""
-    assert measurements.ratio is not None
-    both = run_modes(measurements, _filters(prior, settings, measurements.ratio), watch)
-    return Estimates({TURBULENCE: both[TURBULENCE]}, {TURBULENCE: both.sd[TURBULENCE]})
-
-
-def _filters(prior: Prior, settings: MultiRate, ratio: int) -> list[ModeFilter]:
-    """Return the filters of all modes."""
-    noises = noise_used(prior, settings)
-    found = [multirate_mode(one.disturbance(), ratio, *noise) for one, noise in zip(prior.model, noises, strict=True)]
-    return [one._replace(mean=lgs_mean(prior, mode)) for mode, one in enumerate(found)]
 
 
 def multirate_mode(model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float) -> ModeFilter:
@@ -194,17 +173,18 @@ def noise_used(prior: Prior, settings: MultiRate) -> list[tuple[float, float]]:
     return [multirate_noise(settings, prior.noise_of(mode)) for mode in range(len(prior.model))]
 
 
-def step_multirate(prior: Prior, settings: MultiRate, sampling: Sampling, _horizon: float) -> KalmanEstimator:
-    """Return the filters of all modes, one frame at a time."""
+def multirate(prior: Prior, settings: MultiRate, sampling: Sampling, _horizon: float) -> KalmanEstimator:
+    """Return the paper's multi-rate filters of all modes, for turbulence."""
     assert sampling.ratio is not None
-    return KalmanEstimator(_filters(prior, settings, sampling.ratio))
+    noises = noise_used(prior, settings)
+    found = [multirate_mode(one.disturbance(), sampling.ratio, *noise) for one, noise in zip(prior.model, noises, strict=True)]
+    return KalmanEstimator([one._replace(mean=lgs_mean(prior, mode)) for mode, one in enumerate(found)])
 
 
 MULTIRATE = Observer(
     "multirate",
     "Multi-rate KF",
     (TURBULENCE,),
-    multirate,
     help="Kalman filter on the LGS at every step and the NGS at every n-th, two gains",
     prior=(NoiselessModel, LgsStars),
     asks=matched_noise,
@@ -215,6 +195,152 @@ MULTIRATE = Observer(
     sensors=("lgs", "ngs"),
     tunable=TUNABLE,
     look=Look("Multi-rate KF", "#E31FFF", "#7E75C8", (10, 2, 2, 2)),
-    step=step_multirate,
+    step=multirate,
     counts=noise_used,
+)
+
+
+def optimal_cycle(
+    model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float, lgs_error: Sequence[Ar2 | Ar3] = ()
+) -> list[Step]:
+    """Return (A, C, Q, R) of the steps k = 1 ... n, the NGS frame at the last; noises as standard deviations [um].
+
+    State (disturbance model, slow LGS errors if any, frame). C has two rows at every step, LGS and NGS; where there is no
+    frame the second is zero. Steps without a frame are one and the same.
+    """
+    A0, C0, Q0 = model.A, model.C, model.Q
+    now = sum(model.outputs.values()) / ratio
+    if lgs_error:
+        error = disturbance_model(lgs_error, ())
+        A0, Q0 = blocks_along_diagonal([A0, error.A]), blocks_along_diagonal([Q0, error.Q])
+        C0, now = np.append(C0, error.C), np.append(now, np.zeros(len(error.A)))
+    n = len(A0)
+    R = np.diag([lgs_noise**2, ngs_noise**2])
+    Q = np.zeros((n + 1, n + 1))
+    Q[:n, :n] = Q0
+
+    def step(frame: bool) -> Step:
+        A, C = np.zeros((n + 1, n + 1)), np.zeros((2, n + 1))
+        A[:n, :n], A[n, :n], A[n, n] = A0, now, float(not frame)
+        C[0, :n], C[1, n] = C0, float(frame)
+        return A, C, Q, R
+
+    return [*([step(False)] * (ratio - 1)), step(True)]
+
+
+def optimal_gains(cycle: list[Step]) -> tuple[GainCycle, list[SteadyState]]:
+    """Return the gains of a cycle, and its covariances at steps 1 ... n.
+
+    Step 0, before the first frame, measures the LGS alone and starts the frame anew.
+    """
+    states = periodic_steady_state(cycle)
+    A, C, _, R = cycle[-1]
+    alone = C * [[1.0], [0.0]]
+    L = np.linalg.solve(alone @ states[-1].P @ alone.T + R, alone @ states[-1].P).T
+    steps = [Gain(A, C, s.L) for (A, C, _, _), s in zip(cycle, states, strict=True)]
+    return GainCycle(steps, Gain(A, alone, L)), states
+
+
+def optimal_filter(cycle: list[Step], outputs: Array) -> tuple[MultiRateFilter, list[SteadyState]]:
+    """Return the filter of `optimal_gains` and the covariances; outputs (p, n_states) rows of the state."""
+    gains, states = optimal_gains(cycle)
+    return MultiRateFilter(gains, outputs), states
+
+
+class Cycle(NamedTuple):
+    """What is estimated in one mode.
+
+    steps : (A, C, Q, R) of the steps;  rows : of the state per target
+    model : of the disturbance alone;  has_lgs_error : whether the slow error of the LGS is among the states
+    """
+
+    steps: list[Step]
+    rows: Array
+    model: DisturbanceModel
+    has_lgs_error: bool = False
+
+    def filter(self, mean: SensorMean = ONE) -> ModeFilter:
+        """Return the optimal filter; mean : the LGS whose mean it measures."""
+        gains, states = optimal_gains(self.steps)
+        return ModeFilter(self.model, gains, tuple(state.posterior for state in states), tuple(self.steps), mean)
+
+
+def optimal_model(settings: MultiRate, prior: Prior, mode: int, ratio: int, model: DisturbanceModel | None = None) -> Cycle:
+    """Return the cycle of one mode; model: of the disturbance, by default that of one peak."""
+    model = model or prior.model[mode].disturbance()
+    error = [prior.lgs_error[mode].process] if settings.model_lgs_error else []
+    return estimated_cycle(model, ratio, *multirate_noise(settings, prior.noise_of(mode)), error)
+
+
+def estimated_cycle(
+    model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float, lgs_error: Sequence[Ar2 | Ar3]
+) -> Cycle:
+    """Return `optimal_cycle` with the rows of all targets."""
+    steps = optimal_cycle(model, ratio, lgs_noise, ngs_noise, lgs_error)
+    rows = model.output_rows(TARGETS)
+    return Cycle(steps, np.hstack([rows, np.zeros((len(rows), len(steps[0][0]) - rows.shape[1]))]), model, bool(lgs_error))
+
+
+def optimal_filters(
+    cycle_of: Callable[[Any, Prior, int, int], Cycle], prior: Prior, settings: Any, sampling: Sampling, _horizon: float
+) -> KalmanEstimator:
+    """Return the optimal filters of all modes; cycle_of : (settings, prior, mode, ratio) -> the cycle of that mode."""
+    assert sampling.ratio is not None
+    found = [cycle_of(settings, prior, mode, sampling.ratio) for mode in range(sampling.n_modes)]
+    return KalmanEstimator([one.filter(lgs_mean(prior, mode, one.has_lgs_error)) for mode, one in enumerate(found)])
+
+
+MULTIRATE_OPTIMAL = Observer(
+    "multirate-optimal",
+    "Optimal multi-rate KF",
+    TARGETS,
+    help="Kalman filter on both sensors with periodic gains, NGS frames as means; not in the paper",
+    prior=(NoiselessModel, LgsError, LgsStars),
+    asks=matched_noise,
+    settings=RATES,
+    needs=NGS,
+    linear=True,
+    takes_missing=True,
+    sensors=("lgs", "ngs"),
+    tunable=TUNABLE,
+    look=Look("Opt. multi-rate", "#5718C1", "#B848F9", (3, 2)),
+    step=partial(optimal_filters, optimal_model),
+)
+
+
+def every_peak_model(rates: MultiRate, peaks: MultiPeak, prior: Prior, mode: int, ratio: int) -> Cycle:
+    """Return the cycle of one mode with every peak of the vibration in its model."""
+    beams = prior.beams[mode]
+    error = beams.lgs if rates.model_lgs_error else ()
+    noises = multirate_noise(rates, prior.noise_of(mode))
+    return estimated_cycle(beam_model(beams, prior.lines[mode].vibration(peaks.line_width)), ratio, *noises, error)
+
+
+def beam_model(beams: Beams, vibration: Sequence[Ar2]) -> DisturbanceModel:
+    """Return the model of the target's disturbance, measured as the LGS see it but for what they see alone."""
+    turbulence = (*beams.common, *beams.target)
+    model = disturbance_model(turbulence, vibration)
+    gains = [*[beams.gain] * len(beams.common), *[0.0] * len(beams.target), *[beams.line_gain] * len(vibration)]
+    poles = [3 if isinstance(process, Ar3) else 2 for process in (*turbulence, *vibration)]
+    return replace(model, C=model.C * np.repeat(gains, poles))
+
+
+MULTIRATE_MULTI = Observer(
+    "multirate-multi",
+    "Multi-rate multi-peak KF",
+    TARGETS,
+    help="Kalman filter on both sensors with every vibration peak in its model; not in the paper",
+    prior=(Noise, LgsStars, Lines, Beams),
+    settings=PEAKS,
+    needs=NGS,
+    linear=True,
+    takes_missing=True,
+    sensors=("lgs", "ngs"),
+    tunable=Tunable(
+        ("multipeak.line_width", "kalman.lgs_noise", "kalman.ngs_noise"),
+        ("multipeak.turbulence_order", "kalman.turbulence_rms"),
+    ),
+    look=Look("Multi-rate multi-peak", "#AB64CF", "#F26FF3", (16, 3, 3, 3)),
+    step=partial(optimal_filters, partial(every_peak_model, MultiRate())),
+    counts=vibration_used,
 )

@@ -4,6 +4,9 @@
 
 with the filter gain L = P C' (C P C' + R)^-1; the paper's eq. 9 is the predictor form with K = A L, which uses
 y up to k - 1. Here phi_hat[k] uses y[k] too, like the GPR. The mirror's part is known and taken off before.
+
+`kf-multi` is the same filter with one AR(2) per line of the vibration, which the paper expects to help (its conclusion), and, as
+an option, turbulence of third order.
 """
 
 from __future__ import annotations
@@ -15,16 +18,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
-from wfsobs.observers.estimates import Estimates
-from wfsobs.observers.kalman.frame_step import FrameEstimator
 from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean
-from wfsobs.observers.kalman.spread import FrameErrors, by_target
-from wfsobs.observers.kalman.step import KalmanEstimator
-from wfsobs.observers.kalman.with_gaps import run_frames
-from wfsobs.prior import LgsModel, LgsStars, Model, NgsModel, Prior
-from wfsobs.progress import Watch
-from wfsobs.record import Measurements, Sampling
+from wfsobs.observers.kalman.step import FrameErrors, FrameEstimator, KalmanEstimator
+from wfsobs.prior import LgsModel, LgsStars, Lines, Model, NgsModel, Prior
+from wfsobs.record import Sampling
+from wfsobs.settings import Group, Real, Section, Whole
 from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.gap_gains import ONE, SensorMean
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.riccati import SteadyState, steady_state
 from wfsobs.signal.statespace import DisturbanceModel
@@ -59,77 +59,32 @@ def steady_filter(model: DisturbanceModel, noise: float, outputs: Array | None =
     return gains.filter(model.output_rows(TARGETS) if outputs is None else outputs), steady
 
 
-def kf_lgs(measurements: Measurements, prior: Prior, _settings: None, watch: Watch) -> Estimates:
-    """Run the Kalman filter on the LGS measurement, at every fast step."""
-    return run_steady(measurements, _lgs_filters(prior), watch)
-
-
-def _lgs_filters(prior: Prior) -> list[ModeFilter]:
+def kf_lgs(prior: Prior, _settings: None, _sampling: Sampling, _horizon: float) -> KalmanEstimator:
+    """Return the Kalman filters of all modes on the LGS measurement, at every fast step."""
     found = enumerate(prior.model)
-    return [steady_mode(one.disturbance(), one.lgs_noise)._replace(mean=lgs_mean(prior, mode)) for mode, one in found]
+    return KalmanEstimator([steady_mode(one.disturbance(), one.lgs_noise, lgs_mean(prior, mode)) for mode, one in found])
 
 
-def run_steady(measurements: Measurements, modes: Sequence[ModeFilter], watch: Watch) -> Estimates:
-    """Run the filters of all modes on z."""
-    z, columns, sd = measurements.z, [], []
-    if np.isnan(z).any() or measurements.lgs_stars is not None:
-        return run_frames(KalmanEstimator(modes), measurements, watch)
-    for mode, one in enumerate(modes):
-        watch.step(mode / measurements.n_modes)
-        rows = one.rows(TARGETS)
-        columns.append(one.gains.filter(rows).run(z[:, None, mode, None])[:, :, 0])
-        sd.append(one.steady_sd())
-    return by_target(columns, sd)
+def steady_mode(
+    model: DisturbanceModel, noise: float, mean: SensorMean = ONE, full: DisturbanceModel | None = None
+) -> ModeFilter:
+    """Return the steady-state filter of a mode.
 
-
-def step_kf_lgs(prior: Prior, _settings: None, _sampling: Sampling, _horizon: float) -> KalmanEstimator:
-    """Return the filters of all modes, one frame at a time."""
-    return KalmanEstimator(_lgs_filters(prior))
-
-
-def steady_mode(model: DisturbanceModel, noise: float) -> ModeFilter:
-    """Return the steady-state filter of a mode; noise [um]."""
-    return seen_mode(model, model, noise)
-
-
-def seen_mode(model: DisturbanceModel, full: DisturbanceModel, noise: float) -> ModeFilter:
-    """Return the steady-state filter of a mode with more states behind those of its disturbance; noise [um]."""
+    model : of the disturbance;  noise : of a measurement [um];  mean : the LGS whose mean it measures
+    full  : the model with more states behind those of the disturbance, by default none
+    """
+    full = full or model
     gains, steady = steady_gains(full, noise)
     step = full.A, np.atleast_2d(full.C), full.Q, np.array([[noise**2]])
-    return ModeFilter(model, gains, (steady.posterior,), (step,))
+    return ModeFilter(model, gains, (steady.posterior,), (step,), mean)
 
 
-def kf_ngs(measurements: Measurements, prior: Prior, settings: Kalman, watch: Watch) -> Estimates:
-    """Run the Kalman filter on NGS frames, with the coefficients for T_NGS.
+def kf_ngs(prior: Prior, settings: Kalman, sampling: Sampling, _horizon: float) -> FrameEstimator:
+    """Return the Kalman filters of all modes on NGS frames, with the coefficients for T_NGS.
 
     A frame at k = n i measures slow step i - 1 (fast steps k - n ... k - 1); the estimate is that of slow
     step i, the fast steps k ... k + n - 1. It is held over them, or propagated by the fast model.
     """
-    n = measurements.ratio
-    assert n is not None
-    frames, estimator = measurements.z_ngs[n::n], step_kf_ngs(prior, settings, measurements.sampling, 0.0)
-    if np.isnan(frames).any():
-        return run_frames(estimator, measurements, watch)
-    columns, sd = [], []
-    for mode, (model, one) in enumerate(zip(prior.model, estimator.modes, strict=True)):
-        watch.step(mode / measurements.n_modes)
-        pairs, spreads = one.model.pairs, np.empty((n, len(TARGETS)))
-        slow = one.gains.filter(pairs).run(frames[:, None, mode, None])[:, :, 0]  # of each process, slow steps i and i - 1
-        fast = np.full((measurements.n_steps, len(TARGETS)), np.nan)
-        for target, process in enumerate((model.turbulence, model.vibration)):
-            spread = between_frames(process, n, settings.ngs_between_frames)
-            pair = slice(2 * target, 2 * target + 2)
-            values = slow[:, pair] @ spread.T
-            fast[n:, target] = values.ravel()[: measurements.n_steps - n]
-            now, errors = estimator.truths[mode].outputs[TARGETS[target]], estimator.errors[mode]
-            spreads[:, target] = [errors.sd(now, weights @ pairs[pair], j) for j, weights in enumerate(spread)]
-        columns.append(fast)
-        sd.append(spreads)
-    return by_target(columns, sd, first=n)
-
-
-def step_kf_ngs(prior: Prior, settings: Kalman, sampling: Sampling, _horizon: float) -> FrameEstimator:
-    """Return the filters of all modes, one frame at a time."""
     assert sampling.ratio is not None
     n, how = sampling.ratio, settings.ngs_between_frames
     modes = [steady_mode(one.at(n * sampling.dt).disturbance(), one.ngs_noise) for one in prior.model]
@@ -176,7 +131,6 @@ KF_LGS = Observer(
     "kf-lgs",
     "LGS KF",
     TARGETS,
-    kf_lgs,
     help="steady-state Kalman filter on the LGS, one vibration peak in its model",
     prior=(LgsModel, LgsStars),
     linear=True,
@@ -184,14 +138,13 @@ KF_LGS = Observer(
     # The gain depends on the ratios of turbulence, vibration and noise. Turbulence tuned for vibration would be no turbulence.
     tunable=Tunable((*MODEL[:2], "kalman.vibration_rms"), ("kalman.turbulence_rms", "kalman.lgs_noise")),
     look=Look("LGS KF", "#FF6600", "#FF8533"),
-    step=step_kf_lgs,
+    step=kf_lgs,
 )
 
 KF_NGS = Observer(
     "kf-ngs",
     "NGS KF",
     (TURBULENCE,),
-    kf_ngs,
     help="steady-state Kalman filter on the NGS, its frames held or spread between them",
     prior=(NgsModel,),
     settings="kalman",
@@ -201,6 +154,58 @@ KF_NGS = Observer(
     sensors=("ngs",),
     tunable=Tunable(("kalman.turbulence_rms", "kalman.vibration_rms"), (*MODEL[:2], "kalman.ngs_noise")),
     look=Look("NGS KF", "#003DE6", "#7AA2FF", (8, 2)),
-    step=step_kf_ngs,
+    step=kf_ngs,
     counts=way_between,
+)
+
+
+class MultiPeak(Group):
+    """The Kalman filters with every peak of the scenario in their models."""
+
+    turbulence_order = Whole(
+        2,
+        bounds=(2, 3),
+        label="Order of the turbulence model",
+        doc="2: the AR(2) of the paper; 3: one more pole, fitted to the scenario's true spectrum.",
+    )
+    line_width = Real(
+        0.025,
+        bounds=(1e-4, 10.0),
+        softbounds=(0.005, 1.0),
+        label="Minimum line width",
+        doc="Minimum line width (FWHM) in the model [Hz]; the filter averages over its inverse.",
+    )
+
+
+def independent_filters(prior: Prior, settings: MultiPeak) -> list[ModeFilter]:
+    """Return the steady-state filters of all modes, each of its own."""
+    found = enumerate(prior.lines)
+    return [steady_mode(one.disturbance(settings.line_width), one.noise, lgs_mean(prior, mode)) for mode, one in found]
+
+
+def vibration_used(prior: Prior, settings: MultiPeak) -> list[list[Ar2]]:
+    """Return the vibration of every mode as it is modelled: a minimum below the width of every line is none."""
+    return [one.vibration(settings.line_width) for one in prior.lines]
+
+
+def kf_multi(prior: Prior, settings: MultiPeak, _sampling: Sampling, _horizon: float) -> KalmanEstimator:
+    """Return the Kalman filters of all modes with every peak, on the LGS measurement at every fast step."""
+    return KalmanEstimator(independent_filters(prior, settings))
+
+
+PEAKS = Section("multipeak", "Multi-peak Kalman filter", MultiPeak)
+
+KF_MULTI = Observer(
+    "kf-multi",
+    "Multi-peak KF",
+    TARGETS,
+    help="Kalman filter on the LGS with every vibration peak in its model; not in the paper",
+    prior=(Lines, LgsStars),
+    settings=PEAKS,
+    linear=True,
+    takes_missing=True,
+    tunable=Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
+    look=Look("Multi-peak", "#AE7D40", "#BA6A26", (14, 3)),
+    step=kf_multi,
+    counts=vibration_used,
 )

@@ -1,4 +1,4 @@
-"""Kalman filters one frame at a time: prediction by their model, any number of frames ahead, fractions included.
+"""Kalman filters of all modes: frame by frame, with gaps, and over a record at once where nothing is missing.
 
 A process of poles exp(s_i T) with the continuous-time s_i goes on for f frames by A^f, the matrix power. With S the covariance of
 the model and P that of the estimate after a measurement, the error of the prediction has the covariance
@@ -10,21 +10,132 @@ A measurement that is missing is NaN. Near it the gains are those of the covaria
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import fractional_matrix_power
+from scipy.linalg import block_diag, fractional_matrix_power
 
-from wfsobs.observers.base import TARGETS
-from wfsobs.observers.kalman.gap_bank import GapBank
+from wfsobs.observers.estimates import TARGETS, Estimates, by_name
 from wfsobs.observers.kalman.mode_filter import ModeFilter, StatedErrors
-from wfsobs.observers.step_checks import StepError
+from wfsobs.observers.step import StepError, run_frames, whole_frames
+from wfsobs.progress import Watch
+from wfsobs.record import Measurements
 from wfsobs.signal.filter_covariance import lyapunov
-from wfsobs.signal.gap_gains import GapGains
+from wfsobs.signal.gap_gains import GapGains, GapStep, SensorMean
 from wfsobs.signal.statespace import DisturbanceModel
-from wfsobs.signal.stepping import Saved
+from wfsobs.signal.stepping import FilterBank, Gain, GainCycle, Saved
 from wfsobs.typing import Array
+
+STEADY, OPEN, CLOSED = range(3)
+"""A mode after a step: in its steady state, near a gap, in the last step of that."""
+
+
+class GapBank(FilterBank):
+    """A bank of Kalman filters; NaN in `v` is a measurement that is missing.
+
+    Attributes
+    ----------
+    stars : int or None
+        Sensors that the first measurement of the next step is the mean over; None for all.
+
+    Parameters
+    ----------
+    gains : sequence of GainCycle
+        Of the modes, in their steady state.
+    make_gaps : callable
+        Mode -> its gains near gaps; called when there is one.
+    means : sequence of SensorMean
+        The sensors of the first measurement, by mode.
+    """
+
+    def __init__(self, gains: Sequence[GainCycle], make_gaps: Callable[[int], GapGains], means: Sequence[SensorMean]):
+        super().__init__([one.estimator() for one in gains])
+        self._sizes = [len(one.steps[0].A) for one in gains]
+        self.stars: int | None = None
+        self._all = [len(one.noise) for one in means]
+        self._beside = np.zeros((len(gains), max(len(one.A) for one in means)))  # states that the mean over all does not see
+        self._wide = [n + len(one.A) for n, one in zip(self._sizes, means, strict=True)]
+        self.has_first, self._repeat = gains[0].first is not None, len(gains[0].steps)
+        self._make_gaps = make_gaps
+        self._gaps: dict[int, GapGains] = {}
+        self.near: list[GapStep | None] = [None] * len(gains)
+        self.is_near = False
+
+    def advance(self) -> Array:
+        """Take the inputs that have been written to `v`, NaN where there is none."""
+        if self.is_near or self.stars is not None or np.isnan(self.v).any():
+            self._advance_near()
+            return self._e
+        return super().advance()
+
+    def _advance_near(self) -> None:
+        there, stars = (~np.isnan(self.v)).astype(int), self.stars
+        self.v[there == 0] = 0.0
+        is_first = self.has_first and self.phase == 0
+        if is_first:
+            there[:, 1:] = 0  # it has no NGS frame, and is the step of the cycle before the first one
+        others, j = [int(not is_first)] * (there.shape[1] - 1), (self.phase - self.has_first) % self._repeat
+        before, v = self.x.copy(), self.v.copy()
+        super().advance()
+        for mode, (n, seen) in enumerate(zip(self._sizes, there, strict=True)):
+            last, most, extra = self.near[mode], self._all[mode], self._wide[mode] - n
+            last = None if last is None or last.is_last else last
+            seen[0] *= most if stars is None else min(stars, most)
+            if last is None:
+                self._beside[mode] = 0.0
+                if seen.tolist() == [most, *others]:
+                    self.near[mode] = None
+                    continue
+            if mode not in self._gaps:
+                self._gaps[mode] = self._make_gaps(mode)
+            step = self.near[mode] = self._gaps[mode].after(last, j, tuple(seen.tolist()))
+            after = step.update @ np.concatenate([before[mode, :n], self._beside[mode, :extra], v[mode]])
+            self.x[mode, :n], self._beside[mode, :extra] = after[:n], after[n:]
+        self.is_near = any(one is not None for one in self.near)
+
+    @property
+    def last_in_cycle(self) -> int:
+        """Which step of the cycle came last."""
+        return (self.last - self.has_first) % self._repeat
+
+    def take_near(self, mode: int, old: GapBank | None) -> None:
+        """Go on near a gap as another bank, of the same model in this mode; None for a steady state."""
+        self.near[mode] = None if old is None else old.near[mode]
+        self._beside[mode] = 0.0 if old is None else old._beside[mode]
+        self.is_near = any(one is not None for one in self.near)
+
+    def reset(self) -> None:
+        """Set the state back to rest."""
+        super().reset()
+        self._settle()
+
+    def _settle(self) -> None:
+        self.near[:] = [None] * len(self.near)
+        self.is_near, self.stars = False, None
+        self._beside[...] = 0.0
+
+    def save(self) -> Saved:
+        """Return a copy of the state."""
+        n = max(self._wide)
+        kind, covariance = np.zeros(len(self.near), dtype=int), np.zeros((len(self.near), n, n))
+        for mode, step in enumerate(self.near):
+            if step is not None:
+                kind[mode] = CLOSED if step.is_last else OPEN
+                covariance[mode, : self._wide[mode], : self._wide[mode]] = step.posterior
+        beside = {"beside": self._beside.copy()} if self._beside.size else {}
+        return {**super().save(), "near": kind, "covariance": covariance, **beside}
+
+    def load(self, state: Mapping[str, Array]) -> None:
+        """Take over a state."""
+        super().load(state)
+        self._settle()
+        if self._beside.size:
+            self._beside[...] = state["beside"]
+        for mode, (kind, covariance) in enumerate(zip(state["near"], state["covariance"], strict=True)):
+            if kind != STEADY:
+                n = self._wide[mode]
+                self.near[mode], self.is_near = GapStep(covariance[:n, :n].copy(), np.zeros((n, 0)), kind == CLOSED), True
 
 
 class Plan(NamedTuple):
@@ -148,6 +259,21 @@ class KalmanEstimator(LinearEstimator):
                 sd[:, mode] = near.sd
         return (rows @ self._state)[:, :, 0].T, sd
 
+    def run(self, measurements: Measurements, watch: Watch) -> Estimates:
+        """Run the filters over a record from rest: all steps at once where no measurement is missing."""
+        z, n = measurements.z, measurements.ratio
+        z_ngs = measurements.z_ngs if self.uses_ngs else None
+        lost = np.isnan(z).any() or (z_ngs is not None and np.isnan(z_ngs[n::n]).any())
+        if lost or measurements.lgs_stars is not None:
+            return run_frames(self, TARGETS, measurements, watch)
+        v = z[:, None] if z_ngs is None else np.stack([z, np.nan_to_num(z_ngs)], axis=1)
+        columns, sd = [], []
+        for mode, one in enumerate(self.modes):
+            watch.step(mode / len(self.modes))
+            columns.append(one.gains.run(one.rows(TARGETS), v[:, :, mode]))
+            sd.append(one.steady_sd())
+        return by_target(columns, sd, first=int(self.bank.has_first))
+
     def _near_gap(self, plan: Plan, steady: Array, target: str) -> Array:
         """Return the standard deviations where some modes are near a gap."""
         out = steady.copy()
@@ -177,6 +303,201 @@ class KalmanEstimator(LinearEstimator):
             others = old.bank.x[mode, len(was.model.A) :]
             if rest.shape == others.shape:
                 rest[...] = others
+
+
+class FrameEstimator(LinearEstimator):
+    """Kalman filters on NGS frames, their estimates spread over the fast steps between them.
+
+    Parameters
+    ----------
+    modes : sequence of ModeFilter
+        The slow filters, one per mode.
+    truths : sequence of DisturbanceModel
+        The models at the fast step.
+    errors : sequence of FrameErrors
+        Of the slow filters.
+    spread : callable
+        (mode, target, fast steps since the frame) -> row of the slow filter's state.
+    holds : bool
+        Whether an estimate is held until the next frame, so that any fraction of a frame is defined.
+    """
+
+    uses_ngs = True
+
+    def __init__(
+        self,
+        modes: Sequence[ModeFilter],
+        truths: Sequence[DisturbanceModel],
+        errors: Sequence[FrameErrors],
+        spread: Callable[[int, str, int], Array],
+        holds: bool,
+    ):
+        super().__init__(modes)
+        self.truths, self.errors, self._spread, self._holds = truths, errors, spread, holds
+        self._since = -1
+        self._pairs = [one.steady for one in errors]
+        self._frame_plans: dict[tuple[int, float, str], Plan] = {}
+        self._unknown = np.full(len(self.modes), np.nan)
+
+    def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
+        """Take a frame."""
+        if ngs is not None:
+            self.bank.step(ngs[:, None])
+            self._since = 0
+            found = zip(self.errors, self._pairs, self.bank.near, strict=True)
+            self._pairs = [one.steady if near is None else one.after(S, near.update) for one, S, near in found]
+        elif self._since >= 0:
+            self._since += 1
+
+    def predict(self, frames: float, target: str) -> tuple[Array, Array]:
+        """Return the mean of the target; NaN before the first NGS frame."""
+        ahead = 0 if self._holds else whole_frames(frames, "an estimate between NGS frames")
+        since = max(self._since, 0)
+        one = self._frame_plans.get((since, frames, target)) or self._plan(since, frames, ahead, target)
+        np.matmul(one.rows, self._state, out=one.product)
+        if self._since < 0:
+            one.mean[...] = np.nan
+            return one.mean, self._unknown
+        return one.mean, self._sd(one.rows, since + frames, target, self._pairs) if self.bank.is_near else one.sd[0]
+
+    def estimate(self) -> tuple[Array, Array]:
+        """Return the estimates (2, n_modes) of the last frame, and their standard deviations, (2, n_modes)."""
+        values, sd = np.array([self.predict(0, target) for target in TARGETS]).swapaxes(0, 1)
+        return values, sd
+
+    def run(self, measurements: Measurements, watch: Watch) -> Estimates:
+        """Run the filters over a record from rest: all frames at once where none is missing."""
+        n, n_states = measurements.ratio, self.bank.x.shape[1]
+        assert n is not None
+        frames = measurements.z_ngs[n::n]
+        if np.isnan(frames).any():
+            return run_frames(self, TARGETS, measurements, watch)
+        plans = [[self._plan(since, 0.0, 0, target) for since in range(n)] for target in TARGETS]
+        rows = np.array([[one.rows[:, 0] for one in plan] for plan in plans])  # (targets, n, n_modes, n_states)
+        columns = []
+        for mode, one in enumerate(self.modes):
+            watch.step(mode / len(self.modes))
+            slow = one.gains.run(np.eye(n_states)[:, : len(one.model.A)], frames[:, mode, None])
+            fast = np.full((measurements.n_steps, len(TARGETS)), np.nan)
+            fast[n:] = (slow @ rows[:, :, mode].swapaxes(1, 2)).reshape(len(TARGETS), -1).T[: measurements.n_steps - n]
+            columns.append(fast)
+        sd = np.array([[one.sd[0] for one in plan] for plan in plans]).T
+        return by_target(columns, list(sd), first=n)
+
+    def _plan(self, since: int, frames: float, ahead: int, target: str) -> Plan:
+        n_modes, n = self.bank.x.shape
+        rows = [self._spread(mode, target, since + ahead) for mode in range(n_modes)]
+        self._frame_plans[since, frames, target] = out = plan(rows, n, np.zeros((1, n_modes)))
+        out.sd[0] = self._sd(out.rows, since + frames, target, [one.steady for one in self.errors])
+        return out
+
+    def _sd(self, rows: Array, since: float, target: str, pairs: Sequence[Array]) -> Array:
+        found = zip(self.errors, self.truths, self.modes, rows[:, 0], pairs, strict=True)
+        return np.array([one.sd(m.outputs[target], row[: len(f.model.A)], since, S) for one, m, f, row, S in found])
+
+    def reset(self) -> None:
+        """Set the state back to before the first NGS frame."""
+        super().reset()
+        self._since = -1
+        self._pairs = [one.steady for one in self.errors]
+
+    def save(self) -> Saved:
+        """Return a copy of the state."""
+        return {**super().save(), "since": np.array(self._since), "pairs": np.array(self._pairs)}
+
+    def load(self, state: Mapping[str, Array]) -> None:
+        """Take over a state."""
+        super().load(state)
+        self._since = int(state["since"])
+        self._pairs = list(np.array(state["pairs"]))
+
+    def take_over(self, old: Any) -> None:
+        """Go on from another design."""
+        super().take_over(old)
+        self._since = old._since
+        self._pairs = [
+            now.steady if near is None else was for now, was, near in zip(self.errors, old._pairs, self.bank.near, strict=True)
+        ]
+
+
+class FrameErrors:
+    """Errors of a filter that sees NGS frames alone, where its model is true at the fast step and a frame is the mean that it is.
+
+    The pair (state xi of the fast model with the running frame, estimate x_hat) after a frame goes on from frame to frame as
+
+        xi[i+1] = Phi xi[i] + w,    x_hat[i+1] = F x_hat[i] + L (c xi[i+1] + v).
+
+    Attributes
+    ----------
+    steady : Array
+        Its covariance, the same after every frame unless one is missing.
+
+    Parameters
+    ----------
+    model : DisturbanceModel
+        At the fast step.
+    slow : Gain
+        The filter of the frames.
+    ratio : int
+        Fast steps per frame.
+    noise : float
+        RMS of a frame's noise [um].
+    """
+
+    def __init__(self, model: DisturbanceModel, slow: Gain, ratio: int, noise: float):
+        n = len(model.A)
+        A, Q = block_diag(model.A, [[1.0]]), block_diag(model.Q, [[0.0]])
+        A[n, :n] = sum(model.outputs.values()) / ratio
+        Phi, W = np.diag([*np.ones(n), 0.0]), np.zeros_like(A)  # a frame that has been read starts anew
+        for _ in range(ratio):
+            Phi, W = A @ Phi, A @ W @ A.T + Q
+        self._A, self._Phi, self._W, self._noise = model.A, Phi, W, noise
+        self.steady = lyapunov(*self._map((np.eye(len(slow.L)) - slow.L @ slow.C) @ slow.A, slow.L))
+
+    def _map(self, F: Array, L: Array) -> tuple[Array, Array]:
+        """Return transition and drive of the pair; F (n, n), L (n, 1): x_hat[i+1] = F x_hat[i] + L z[i+1]."""
+        m, W = len(self._Phi), self._W
+        seen = np.vstack([np.eye(m), L @ np.eye(m)[-1:]])
+        transition = np.hstack([seen @ self._Phi, np.vstack([np.zeros((m, len(L))), F])])
+        return transition, seen @ W @ seen.T + block_diag(np.zeros_like(W), self._noise**2 * L @ L.T)
+
+    def after(self, S: Array, update: Array) -> Array:
+        """Return the covariance after a frame with another gain; update (n, n + 1): of x_hat and the frame."""
+        T, drive = self._map(update[:, :-1], update[:, -1:])
+        return T @ S @ T.T + drive
+
+    def sd(self, now: Array, row: Array, since: float, S: Array | None = None) -> float:
+        """Return the standard deviation of the estimate row x_hat of now x, that many fast steps after the frame [um].
+
+        S : covariance of the pair, by default the steady one
+        """
+        S, n, m = self.steady if S is None else S, len(self._A), len(self._Phi)
+        ahead = now @ matrix_power(self._A, since)
+        variance = now @ S[:n, :n] @ now - 2.0 * ahead @ S[:n, m:] @ row + row @ S[m:, m:] @ row
+        return float(np.sqrt(max(variance, 0.0)))
+
+
+def over_record(sd: Array, n_steps: int, first: int = 0) -> Array:
+    """Return numbers that repeat, (steps that repeat, n_modes), for every step of a record from `first` on, NaN before."""
+    if len(sd) == 1 and first == 0:
+        return np.broadcast_to(sd, (n_steps, sd.shape[1]))
+    out = np.full((n_steps, sd.shape[1]), np.nan)
+    left = max(n_steps - first, 0)
+    out[first:] = np.tile(sd, (-(-left // len(sd)), 1))[:left]
+    return out
+
+
+def by_target(columns: Sequence[Array], sd: Sequence[Array] = (), first: int = 0) -> Estimates:
+    """Return results per mode (n_steps, n_targets) by target.
+
+    sd : per mode (steps that repeat, 2 or 4), as of `by_name`, from step `first` on
+    """
+    values, n_steps = np.stack(columns, axis=-1), len(columns[0])
+    spreads = np.stack(sd, axis=-1) if len(sd) else None
+    return Estimates(
+        by_name(values),
+        None if spreads is None else {name: over_record(x, n_steps, first) for name, x in by_name(spreads).items()},
+    )
 
 
 def carry_state(new: DisturbanceModel, old: DisturbanceModel, x: Array) -> Array:

@@ -1,99 +1,183 @@
-"""The model of a window of measurements, for the adaptive Kalman filter: what has been identified, and as numbers to save."""
+"""The model of a window of measurements, of the LGS or of both sensors, for what identifies its model as it runs.
+
+With x the mean of phi over a frame, the NGS gives x + v and the mean of z over the same steps x + e + w / sqrt(n). Their
+difference holds what the LGS alone see, e, and both noises: its spectrum tells them. The spectrum of z, with e in it, tells the
+rest. e is taken for independent of phi.
+
+A window is identified from the samples that it has behind its last long gap, with missing ones replaced by their expectation.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.mode_filter import ModeFilter
+from wfsobs.observers.kalman.multirate import beam_model, estimated_cycle
 from wfsobs.observers.kalman.single import MIN_NOISE, steady_mode
+from wfsobs.prior import Beams
 from wfsobs.record import RecordError
+from wfsobs.settings import Group, Real, Section, Whole
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
-from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.spectral.missed import missed_rms
+from wfsobs.spectral.missing import MissingSamples
 from wfsobs.spectral.model import Spectrum
-from wfsobs.spectral.quick import SHORTEST, quick_spectrum, quick_spectrum_of_samples
+from wfsobs.spectral.periodogram import periodogram_frequencies
+from wfsobs.spectral.quick import SHORTEST, follow_spectrum, quick_spectrum, quick_spectrum_of_samples
 from wfsobs.typing import Array
 
-if TYPE_CHECKING:
-    from wfsobs.observers.kalman.adaptive import Adaptive
 
-STILL = PeriodicFilter([(np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((2, 1)), np.zeros((2, 1)))])
-"""The filter of white noise: nothing moves."""
+class Adaptive(Group):
+    """The Kalman filter whose model is re-identified all the time."""
 
+    window = Real(
+        4.0,
+        bounds=(0.1, 100.0),
+        softbounds=(0.5, 10.0),
+        step=0.5,
+        label="Window",
+        doc="Length of the identification window [s]. Peaks closer than two over it are one; a peak that moves is "
+        "followed after this time.",
+    )
+    longest = Real(
+        30.0,
+        bounds=(0.1, 1000.0),
+        softbounds=(4.0, 60.0),
+        step=1.0,
+        label="Longest window",
+        doc="Length to which the window of the multi-rate filter grows while the record is still [s].",
+    )
+    interval = Real(
+        0.5,
+        bounds=(0.01, 100.0),
+        softbounds=(0.1, 5.0),
+        step=0.1,
+        label="Interval",
+        doc="Time from one identification to the next [s].",
+    )
+    peak_count = Whole(
+        20,
+        bounds=(0, 60),
+        label="Maximum peaks",
+        doc="Maximum number of vibration peaks in the model of one mode; twice as many where the window has grown to twice.",
+    )
+    lowest = Real(
+        5.0,
+        bounds=(0.1, 1000.0),
+        softbounds=(1.0, 20.0),
+        step=0.5,
+        label="Minimum frequency",
+        doc="Minimum frequency of a peak [Hz]; at least 15 over the window.",
+    )
+    depth = Whole(
+        400,
+        bounds=(1, 2000),
+        label="Depth of the GPR",
+        doc="Samples in a window of the adaptive GPR; at most an eighth of the identification window.",
+    )
+
+
+ADAPTIVE = Section("adaptive", "Adaptive Kalman filter", Adaptive)
+
+GROWS, LATER = 0.3, 0.16
+"""Growth of a window to the next identification, over its length: at first, and from where its peaks may be twice as many."""
+TWICE = 2
+"""Growth of a window from which on its peaks may be twice as many."""
+FRAMES = 20
+"""Minimum NGS frames of a window."""
 LONG = 0.05
-"""Gap over the window from which on the samples before it are left out: what is far above noise is not known in it."""
+"""Gap over the shortest window from which on the samples before it are left out: what is far above noise is not known in it."""
 FEWEST, LEAST = 0.75, 0.5
-"""Minimum samples behind the last long gap, over the window; minimum measured share of them."""
+"""Minimum samples behind the last long gap, over the shortest window; minimum measured share of them."""
+NGS_SHARE = 0.1
+"""Minimum share of the NGS in the noise of the difference."""
+DECIMALS = 12
+"""Of a sample [um] of both sensors in a fit: it is then the same to the last bit, in whichever order sums were taken that filled
+a gap."""
 
 
-def lengths(settings: Adaptive, dt: float) -> tuple[int, int]:
-    """Return window and interval [steps]. Raises RecordError for a window of too few samples."""
-    window = round(settings.window / dt)
-    if window < SHORTEST:
-        raise RecordError(f"adaptive.window = {settings.window:g}: takes {SHORTEST * dt:g} s or more, {SHORTEST} samples")
-    return window, max(round(settings.interval / dt), 1)
+class Lengths(NamedTuple):
+    """Numbers of fast steps, whole NGS frames where there are any.
+
+    window, longest : shortest and longest window
+    interval : from check to check
+    first    : first step of a window
+    ratio    : steps per NGS frame; None without NGS
+    """
+
+    window: int
+    longest: int
+    interval: int
+    first: int
+    ratio: int | None = None
+
+    def next_length(self, window: int) -> int:
+        """Return the steps from an identification to the next one, if the record is still."""
+        if self.ratio is None:
+            return self.interval
+        grows = GROWS if window < TWICE * self.window else LATER
+        return max(int(grows * window) // self.interval, 1) * self.interval
+
+    def window_start(self, end: int, change: int) -> int:
+        """Return where the window begins that ends before step `end`; change : when the record was last not still."""
+        return max(min(max(change, end - self.longest), end - self.window), self.first)
+
+    def check(self, settings: Adaptive, dt: float) -> None:
+        """Raise RecordError for a window of too few samples."""
+        least, what = (SHORTEST, "samples") if self.ratio is None else (max(-(-SHORTEST // self.ratio), FRAMES), "NGS frames")
+        needed = least * (self.ratio or 1)
+        if self.window < needed:
+            raise RecordError(f"adaptive.window = {settings.window:g}: takes {needed * dt:g} s or more, {least} {what}")
+
+
+def window_lengths(settings: Adaptive, dt: float, ratio: int | None = None, delay: int = 0) -> Lengths:
+    """Return the lengths of windows: of the LGS they all have one, of both sensors they grow."""
+    n = ratio or 1
+    window, longest, interval = (round(seconds / dt / n) for seconds in (settings.window, settings.longest, settings.interval))
+    # After a frame; what the mirror did before the record is not known.
+    longest, first = (window, delay) if ratio is None else (max(longest, window), 1 + n * -(-max(delay - 1, 0) // n))
+    return Lengths(window * n, longest * n, max(interval, 1) * n, first, ratio)
 
 
 class WindowModel(NamedTuple):
-    """What has been identified last: the newest fit, and the spectrum that the filter in charge is of; None before the first.
+    """What has been identified last.
 
-    mode   : that filter; None where nothing moves
+    fit      : newest spectrum of z, from which the next is followed; None before the first
+    spectrum : of z without the error of the LGS, of which the filter in charge is; None before the first
+    filter   : the filter in charge; None where nothing moves
     hidden_rms : rms of the vibration that may be in the window and in none of its lines [um]
+    error, ngs : of both sensors, spectrum of their difference per frame, and rms of the noise of a frame [um]
     """
 
-    fit: Spectrum | None
-    spectrum: Spectrum | None
-    mode: ModeFilter | None
+    fit: Spectrum | None = None
+    spectrum: Spectrum | None = None
+    filter: ModeFilter | None = None
     hidden_rms: float = 0.0
-
-    @property
-    def filter(self) -> PeriodicFilter:
-        """The filter, z -> turbulence, vibration."""
-        return STILL if self.mode is None else self.mode.gains.filter(self.mode.model.output_rows(TARGETS))
+    error: Spectrum | None = None
+    ngs: float = 0.0
 
 
-NOT_YET = WindowModel(None, None, None)
+def sensor_samples(v: Array, ratio: int | None) -> list[Array]:
+    """Return the samples of each sensor in whole frames of v (n, 1 or 2): of the LGS, and NGS frames where there are any."""
+    return [v[:, 0]] if ratio is None else [v[:, 0], v[ratio - 1 :: ratio, 1]]
 
 
-def identify_window(z: Array, dt: float, settings: Adaptive, last: WindowModel) -> WindowModel:
-    """Identify the model of a window z (n,); where it or its filter cannot be found, the last filter stays."""
-    fit = last.fit
-    try:
-        with np.errstate(divide="raise", over="raise", invalid="raise"):
-            fit = quick_spectrum(z, dt, settings.peak_count, settings.lowest, fit)
-            return WindowModel(fit, fit, mode_of(fit), missed_rms(fit, z, settings.lowest))
-    except (ValueError, ArithmeticError):
-        return WindowModel(fit, last.spectrum, last.mode, last.hidden_rms)
+def behind_gaps(v: Array, lengths: Lengths, least: int) -> Array | None:
+    """Return the whole frames of v (n, 1 or 2) behind its last long gap; None if they are too few, or too few were measured.
 
-
-def identify_with_gaps(z: Array, dt: float, settings: Adaptive, last: WindowModel) -> tuple[WindowModel, Array] | None:
-    """Identify the model of a window z (n,), NaN where a sample is missing.
-
-    Returns
-    -------
-    tuple or None
-        The model and the samples behind the last long gap, with missing ones replaced by their expectation; None where they are
-        too few, or no filter can be found, and the one in charge goes on.
+    least : minimum number of steps where a model is in charge that holds, else FEWEST of the shortest window do
     """
-    n, z = len(z), z[last_long_gap(z, LONG * len(z)) :]
-    if len(z) < max(FEWEST * n, SHORTEST) or not is_enough(z):
-        return None
-    try:
-        with np.errstate(divide="raise", over="raise", invalid="raise"):
-            fit, whole = quick_spectrum_of_samples(z, dt, settings.peak_count, settings.lowest, last.fit)
-            return WindowModel(fit, fit, mode_of(fit), missed_rms(fit, whole, settings.lowest)), whole
-    except (ValueError, ArithmeticError):
-        return None
-
-
-def is_enough(z: Array) -> bool:
-    """Return whether as many samples as an identification takes are there, not NaN."""
-    return bool(np.isnan(z).mean() <= 1.0 - LEAST)
+    n = lengths.ratio or 1
+    steps = [1, n]
+    samples = sensor_samples(v, lengths.ratio)
+    start = max(step * last_long_gap(x, LONG * lengths.window / step) for x, step in zip(samples, steps, strict=False))
+    v = v[-(-start // n) * n :]
+    is_long = len(v) >= max(least, FEWEST * lengths.window, SHORTEST)
+    return v if is_long and all(np.isnan(x).mean() <= 1.0 - LEAST for x in sensor_samples(v, lengths.ratio)) else None
 
 
 def last_long_gap(z: Array, most: float) -> int:
@@ -103,12 +187,108 @@ def last_long_gap(z: Array, most: float) -> int:
     return int(ends[-1]) if ends.size else 0
 
 
-def mode_of(spectrum: Spectrum) -> ModeFilter | None:
-    """Return the steady-state filter of a spectrum, None where nothing moves. Raises ValueError where there is none."""
-    if not spectrum.processes:
+def identify_window(
+    v: Array, dt: float, settings: Adaptive, last: WindowModel, lengths: Lengths, least: int = 0
+) -> tuple[WindowModel, Array] | None:
+    """Identify the model of a window.
+
+    Parameters
+    ----------
+    v : Array
+        LGS measurements, and NGS frames at the end of each where there are any, (n, 1 or 2) [um]; NaN is missing.
+    dt : float
+        Step [s].
+    settings : Adaptive
+        Number of peaks, minimum frequency and length of a window.
+    last : WindowModel
+        Of the window before.
+    lengths : Lengths
+        Of windows.
+    least : int
+        Minimum number of steps behind a long gap, as in `behind_gaps`.
+
+    Returns
+    -------
+    tuple or None
+        The model, and v, or its end behind a long gap, with missing measurements replaced by their expectation. Where the model
+        or its filter cannot be found the last filter stays; None where measurements are missing, too.
+    """
+    found, lost = last, bool(np.isnan(v).any())
+    part = behind_gaps(v, lengths, least) if lost else v
+    if part is None:
         return None
-    model = disturbance_model(spectrum.continuum, spectrum.resonances)
-    return steady_mode(model, max(spectrum.noise, MIN_NOISE))
+    try:
+        with np.errstate(divide="raise", over="raise", invalid="raise"):
+            if lengths.ratio is None:
+                fit, z = _spectrum_of(part[:, 0], dt, settings.peak_count, settings, last.fit, lost)
+                found = last._replace(fit=fit)
+                return WindowModel(fit, fit, model_filter(fit), missed_rms(fit, z, settings.lowest)), z[:, None]
+            model, whole = _identify_both(np.round(part, DECIMALS), dt, lengths.ratio, settings, last)
+            return model, whole if lost else v
+    except (ValueError, ArithmeticError):
+        return None if lost else (found, v)
+
+
+def _identify_both(v: Array, dt: float, ratio: int, settings: Adaptive, last: WindowModel) -> tuple[WindowModel, Array]:
+    """Return the model of both sensors, and v without gaps. Raises ValueError and ArithmeticError."""
+    (seen, frames), before = sensor_samples(v, ratio), last.fit
+    lost = np.isnan(seen)
+    z = _fill_gaps(seen, dt, settings, last)
+    means = z.reshape(-1, ratio).mean(axis=1)
+    difference = np.where(lost.reshape(-1, ratio).all(axis=1), np.nan, means - frames)
+    error, difference = _spectrum_of(difference, dt * ratio, 0, settings, last.error, bool(np.isnan(difference).any()))
+    e, is_long = error_process(error, dt), len(z) * dt >= TWICE * settings.window
+    if before is None and e:  # of about the same corner: a guess that needs no search
+        before = Spectrum(error.noise, dt, replace(e[0], rms=float(z.std())))
+    most = settings.peak_count * (2 if is_long else 1)
+    spectrum = follow_spectrum(z, dt, most, settings.lowest, before, *e, long=is_long)
+    ngs = max(error.noise * np.sqrt(max(1.0 - spectrum.noise**2 / ratio / error.noise**2, NGS_SHARE)), MIN_NOISE)
+    spectrum = replace(spectrum, noise=spectrum.noise / np.sqrt(1.0 - lost.mean()))  # what was filled in has none
+    hidden = missed_rms(spectrum, z, settings.lowest)
+    found = WindowModel(spectrum, spectrum, model_filter(spectrum, error, ngs, ratio), hidden, error, ngs)
+    whole = np.column_stack([z, np.zeros(len(z))])
+    whole[ratio - 1 :: ratio, 1] = np.where(np.isnan(frames), means - difference, frames)
+    return found, whole
+
+
+def _fill_gaps(z: Array, dt: float, settings: Adaptive, last: WindowModel) -> Array:
+    """Return z with its missing samples replaced by their expectation for the last model."""
+    samples = MissingSamples(np.isnan(z), dt)
+    if not samples.any:
+        return z
+    if last.spectrum is None or last.error is None:
+        return quick_spectrum_of_samples(z, dt, settings.peak_count, settings.lowest, None)[1]
+    f, level = periodogram_frequencies(len(z), dt), np.nanmean(z)
+    S = last.spectrum.psd(f) + sum(e.psd(f) for e in error_process(last.error, dt))
+    return samples.fill(z - level, S) + level
+
+
+def _spectrum_of(x: Array, dt: float, most: int, settings: Adaptive, last: Spectrum | None, lost: bool) -> tuple[Spectrum, Array]:
+    """Return the spectrum of samples with at most so many lines, and the samples without gaps; lost : whether there are some."""
+    if lost:
+        return quick_spectrum_of_samples(x, dt, most, settings.lowest, last)
+    return quick_spectrum(x, dt, most, settings.lowest, last), x
+
+
+def error_process(error: Spectrum, dt: float) -> tuple[Ar2, ...]:
+    """Return what the LGS alone see as a process of the fast steps, if there is any."""
+    return (error.turbulence.at(dt),) if isinstance(error.turbulence, Ar2) else ()
+
+
+def model_filter(
+    spectrum: Spectrum, error: Spectrum | None = None, ngs: float = 0.0, ratio: int | None = None
+) -> ModeFilter | None:
+    """Return the filter of a model, None where nothing moves. Raises ValueError and ArithmeticError where there is none.
+
+    error, ngs, ratio : of both sensors, as in `WindowModel`
+    """
+    noise = max(spectrum.noise, MIN_NOISE)
+    if error is None or ratio is None:
+        model = disturbance_model(spectrum.continuum, spectrum.resonances) if spectrum.processes else None
+        return None if model is None else steady_mode(model, noise)
+    turbulence = () if spectrum.turbulence is None else (spectrum.turbulence,)
+    model = beam_model(Beams(turbulence), spectrum.resonances)
+    return estimated_cycle(model, ratio, noise, ngs, error_process(error, spectrum.dt)).filter()
 
 
 def pack_spectrum(spectrum: Spectrum | None, rows: int) -> Array:

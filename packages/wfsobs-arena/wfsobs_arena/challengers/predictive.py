@@ -25,7 +25,7 @@ from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.control.step import StepController
 from wfsobs.control.step_laws import StepLaw, push_row
 from wfsobs.observers.missing import bridges, fill_missing
-from wfsobs.observers.step_checks import StepError
+from wfsobs.observers.step import StepError
 from wfsobs.prior import Prior
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, Sampling

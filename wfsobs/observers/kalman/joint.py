@@ -1,4 +1,15 @@
-"""One filter of all modes on the LGS, each by itself or together, and on the NGS frames: its states, frame by frame.
+"""Filters of all modes together on the LGS and on the NGS frames: their states, frame by frame and over a record.
+
+`kf-asterism` takes every mode from each LGS by itself in all modes. LGS beside the axis see different turbulence, and each tells
+something that their mean does not. The prior `Asterism` has the spectra between the target, all modes in every beam and the NGS.
+The LGS are taken as their mean and orthonormal differences, whose noise is independent; vibration is in the mean and in the NGS
+alone. The states of the independent filters of `kf-multi` on the mean, running means of every measurement, and running means of
+the NGS frames are put together by the weights of least variance (`signal.joint_states`, `signal.frame_shares`); they repeat with
+the NGS frames.
+
+`multirate-coupled` has the mean of the LGS, or what `sensors.lgs_combination` makes of them, in the place of a single star: for
+LGS that see the same, and where a record or a loop has them together alone. Where modes tell nothing of one another there is
+nothing to couple, and the observer refuses. A measurement of which a mode is missing is none, and so is an NGS frame.
 
 The weights are those of the LGS that are there, of the NGS alone where none is, and what is stated of the errors is by them. They
 are made when a set of LGS first occurs. The states of one that is out go on with the measurements that the others predict for it,
@@ -14,12 +25,21 @@ from typing import Any
 
 import numpy as np
 
-from wfsobs.observers.kalman.asterism_filters import Beginning
-from wfsobs.observers.kalman.asterism_model import AsterismModel
-from wfsobs.observers.step_checks import StepError
+from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
+from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimates, by_name
+from wfsobs.observers.kalman.asterism_model import AsterismModel, Beginning
+from wfsobs.observers.kalman.single import NGS, PEAKS, MultiPeak, vibration_used
+from wfsobs.observers.step import StepError, run_frames
+from wfsobs.prior import Asterism, FlowOfBoth, Lines, Prior
+from wfsobs.progress import Watch
+from wfsobs.record import Measurements, Sampling
+from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.present_inputs import Present
 from wfsobs.signal.stepping import Saved
 from wfsobs.typing import Array
+
+INDEPENDENT = "the modes tell nothing of one another: `multirate-multi` estimates each by itself"
+"""Why there is no coupled filter."""
 
 PLANS = 64
 """Weights that are kept, of a target, a horizon and a set of LGS each; others are computed anew."""
@@ -143,9 +163,26 @@ class JointEstimator:
         weights, sd = self._now("plan", frames, target)
         return weights @ self.state(), sd
 
-    def next_z_sd(self) -> Array:
-        """Return the standard deviation of the next z less the sum of both estimates, (n_modes,) [um]."""
-        return self._now("next_z_sd")
+    def estimate(self) -> tuple[Array, Array]:
+        """Return the estimates of the last frame, (2, n_modes), and deviations of these, of TOTAL and NEXT_Z, (4, n_modes)."""
+        *values, (_, total) = (self.predict(0.0, name) for name in (*TARGETS, TOTAL))
+        return np.array([mean for mean, _ in values]), np.array([*(sd for _, sd in values), total, self._now("next_z_sd")])
+
+    def run(self, measurements: Measurements, watch: Watch) -> Estimates:
+        """Run the filter over a record from rest: all steps at once where nothing is missing."""
+        each = self._each_of(measurements)
+        frames = measurements.z_ngs[self.model.ratio :: self.model.ratio]
+        if np.isnan(each).any() or np.isnan(frames).any():
+            return run_frames(self, TARGETS, measurements, watch)
+        return _run_at_once(self.model, each, frames, watch)
+
+    def _each_of(self, measurements: Measurements) -> Array:
+        """Return what it takes of the LGS, (n_steps, n_lgs, n_modes) [um]: all of them together."""
+        return measurements.z[:, None]
+
+    def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
+        """Take a frame."""
+        self.advance_each(z[None], ngs)
 
     def state(self) -> Array:
         """Return all states in the order of the weights, (n_states,)."""
@@ -184,3 +221,114 @@ class JointEstimator:
 def _as_set(missing: Array) -> Present:
     """Return the LGS of which no mode is missing, from (n_lgs, n_modes)."""
     return tuple(not any(one) for one in missing)
+
+
+def _run_at_once(model: AsterismModel, each: Array, frames: Array, watch: Watch) -> Estimates:
+    """Return the estimates of a record without gaps."""
+    n, (steps, _, m) = model.ratio, each.shape
+    plans = {name: model.plan(0.0, name) for name in (*TARGETS, TOTAL)}
+    weights = np.concatenate([plans[name][0] for name in TARGETS], axis=1)
+    out, seen, at = np.zeros((steps, 2 * m)), np.einsum("ab,kbi->kai", model.basis, each), 0
+    phase = np.where(np.arange(steps) < n, n, np.arange(steps) % n)
+    of_phase = [np.flatnonzero(phase == p) for p in range(n + 1)]
+    for star in range(model.n_stars):
+        for mode, one in enumerate(model.fast):
+            watch.step((star * m + mode) / (model.n_stars * m))
+            x, own = _states(one, seen[:, star, mode]), slice(at, at + len(one.first))
+            for rows, steps_of in zip(weights[:, :, own], of_phase, strict=True):
+                out[steps_of] += x[steps_of] @ rows.T
+            at = own.stop
+    for mode, late in enumerate(model.slow):
+        x, own = _states(late, frames[:, mode]), slice(at, at + len(late.first))
+        for rows, steps_of in zip(weights[:-1, :, own], of_phase, strict=False):
+            out[steps_of] += x[steps_of // n - 1] @ rows.T
+        at = own.stop
+    sd = {name: spread[phase] for name, (_, spread) in plans.items()}
+    values = by_name(out.reshape(steps, 2, m))
+    return Estimates(values, sd | {NEXT_Z: model.next_z_sd((True,) * model.n_stars)[phase]})
+
+
+def _states(one: Beginning, y: Array) -> Array:
+    """Return the states after every measurement of y (n,), (n, n_states)."""
+    F, G = one.filter.F, one.filter.G[:, None]
+    if not len(y):
+        return np.empty((0, len(F)))
+    return PeriodicFilter([(F, G, F, G)]).run(y[:, None, None], one.first[:, None] * y[0])[:, :, 0]
+
+
+class AsterismEstimator(JointEstimator):
+    """The filter on every LGS by itself."""
+
+    _each: Array | None = None
+
+    @property
+    def each_shape(self) -> tuple[int, int]:
+        """Return (n_lgs, n_modes)."""
+        return self.x.shape[0], self.x.shape[1]
+
+    def see_each(self, each: Array) -> None:
+        """Take the measurement of every LGS in the next frame, (n_lgs, n_modes) [um]."""
+        self._each = each
+
+    def _each_of(self, measurements: Measurements) -> Array:
+        return measurements.z_stars
+
+    def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
+        """Take a frame."""
+        assert self._each is not None
+        self.advance_each(self._each, ngs)
+
+
+def coupled_model(prior: Prior, settings: MultiPeak, ratio: int | None) -> AsterismModel:
+    """Return the weights. Raises ValueError where the prior has no flow."""
+    if prior.asterism is None:
+        raise ValueError(INDEPENDENT)
+    return AsterismModel(prior, settings, ratio)
+
+
+def kf_asterism(prior: Prior, settings: MultiPeak, sampling: Sampling, _horizon: float) -> AsterismEstimator:
+    """Return the filter on every LGS by itself."""
+    return AsterismEstimator(AsterismModel(prior, settings, sampling.ratio))
+
+
+def multirate_coupled(prior: Prior, settings: MultiPeak, sampling: Sampling, _horizon: float) -> JointEstimator:
+    """Return the filter on all LGS together. Raises ValueError where the prior has no flow."""
+    return JointEstimator(coupled_model(prior, settings, sampling.ratio))
+
+
+KF_ASTERISM = Observer(
+    "kf-asterism",
+    "Asterism KF",
+    TARGETS,
+    help="Kalman filter on each LGS by itself in all modes and the NGS, for frozen flow; not in the paper",
+    prior=(Lines, Asterism),
+    settings=PEAKS,
+    needs=("y_stars", "y_ngs", "ratio"),
+    linear=True,
+    couples_modes=True,
+    sensors=("lgs", "ngs"),
+    weight=5.0,
+    tunable=Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
+    look=Look("Asterism", "#923222", "#F5B022", (8, 2, 2, 2)),
+    step=kf_asterism,
+    counts=vibration_used,
+)
+
+MULTIRATE_COUPLED = Observer(
+    "multirate-coupled",
+    "Coupled multi-rate KF",
+    TARGETS,
+    help="Kalman filter on both sensors in all modes together, for frozen flow; not in the paper",
+    prior=(Lines, FlowOfBoth),
+    settings=PEAKS,
+    needs=NGS,
+    linear=True,
+    couples_modes=True,
+    takes_missing=True,
+    sensors=("lgs", "ngs"),
+    weight=3.0,
+    tunable=Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
+    look=Look("Coupled, both", "#5343AF", "#9E6FA9", (10, 2, 4, 2)),
+    step=multirate_coupled,
+    counts=vibration_used,
+)

@@ -1,15 +1,19 @@
-"""Gaussian process regression in time on the LGS measurement: a sum of kernels, as a steady-state Kalman filter.
+"""Gaussian process regression in time, a sum of kernels: in the steady-state filter of the LGS and the optimal one of both.
 
 Turbulence is one kernel, every line of the vibration an oscillator, and the sensor's error may have a colour: a Matern 1/2
 background of its own, part of the measurement and of no target. The state has one element more, the sum one step ago, which is
 what a measurement sees:
 
     z[k] = f[k-1] + noise,    (x, f)[k+1] = (A x[k] + v, h x[k]).
+
+On both sensors the slow error of the LGS and the NGS frame as the mean that it is are states, as in `kalman.multirate`; a
+coloured background is an error of the LGS, and no part of what a frame is the mean of.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from math import pi, sqrt
 
 import numpy as np
@@ -17,15 +21,14 @@ import param
 from scipy.linalg import block_diag
 
 from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
-from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.gp.kernels import Kernel, Matern, Poles, Sho, SquaredExponentialInTime, Sum
-from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean
-from wfsobs.observers.kalman.single import run_steady, seen_mode
+from wfsobs.observers.kalman.mode_filter import lgs_mean
+from wfsobs.observers.kalman.multirate import Cycle, MultiRate, optimal_filters, optimal_model
+from wfsobs.observers.kalman.single import NGS, steady_mode
 from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.observers.missing import LINE_WIDTH
-from wfsobs.prior import LgsStars, Lines, Prior
-from wfsobs.progress import Watch
-from wfsobs.record import Measurements, Sampling
+from wfsobs.prior import LgsError, LgsStars, Lines, Noise, Prior
+from wfsobs.record import Sampling
 from wfsobs.settings import Group, Real, Section
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
@@ -115,30 +118,26 @@ def measured_late(model: DisturbanceModel) -> DisturbanceModel:
     return DisturbanceModel(A, np.eye(n + 1)[-1], block_diag(model.Q, [[0.0]]), outputs, np.pad(model.pairs, ((0, 0), (0, 1))))
 
 
-def filters_of(prior: Prior, settings: GaussianProcess) -> list[ModeFilter]:
-    """Return the steady-state filters of z of all modes."""
-    out = []
-    for mode, lines in enumerate(prior.lines):
-        model = sampled_model(kernels_of(lines, settings), lines.dt)
-        out.append(seen_mode(model, measured_late(model), lines.noise)._replace(mean=lgs_mean(prior, mode)))
-    return out
+def gp_lgs(prior: Prior, settings: GaussianProcess, _sampling: Sampling, _horizon: float) -> KalmanEstimator:
+    """Return the regressions of all modes on the LGS measurement, at every fast step."""
+    models = [sampled_model(kernels_of(lines, settings), lines.dt) for lines in prior.lines]
+    found = enumerate(zip(models, prior.lines, strict=True))
+    return KalmanEstimator(
+        [steady_mode(model, lines.noise, lgs_mean(prior, mode), measured_late(model)) for mode, (model, lines) in found]
+    )
 
 
-def gp_lgs(measurements: Measurements, prior: Prior, settings: GaussianProcess, watch: Watch) -> Estimates:
-    """Run the regression on the LGS measurement, at every fast step."""
-    return run_steady(measurements, filters_of(prior, settings), watch)
-
-
-def step_gp_lgs(prior: Prior, settings: GaussianProcess, _sampling: Sampling, _horizon: float) -> KalmanEstimator:
-    """Return the filters of all modes, one frame at a time."""
-    return KalmanEstimator(filters_of(prior, settings))
+def cycle_of(settings: GaussianProcess, prior: Prior, mode: int, ratio: int) -> Cycle:
+    """Return the cycle of one mode on both sensors."""
+    lines = prior.lines[mode]
+    model = sampled_model(kernels_of(lines, settings), lines.dt)
+    return optimal_model(MultiRate(), prior, mode, ratio, measured_late(model))._replace(model=model)
 
 
 GP_LGS = Observer(
     "gp-lgs",
     "GP in time",
     TARGETS,
-    gp_lgs,
     help="Gaussian process in time, a kernel for the turbulence and one per line, as a filter; not in the paper",
     prior=(Lines, LgsStars),
     settings=GP,
@@ -147,5 +146,22 @@ GP_LGS = Observer(
     takes_missing=True,
     tunable=Tunable(("gp.background_rms", "gp.background_scale"), ("kalman.lgs_noise", "kalman.turbulence_rms")),
     look=Look("GP in time", "#478B83", "#8EFAF0", (6, 2, 2, 2)),
-    step=step_gp_lgs,
+    step=gp_lgs,
+)
+
+GP_BOTH = Observer(
+    "gp-both",
+    "GP on both sensors",
+    TARGETS,
+    help="Gaussian process in time on both sensors; not in the paper",
+    prior=(Noise, LgsError, LgsStars, Lines),
+    settings=GP,
+    needs=NGS,
+    linear=True,
+    weight=2.0,
+    takes_missing=True,
+    sensors=("lgs", "ngs"),
+    tunable=Tunable(("gp.background_rms", "gp.background_scale"), ("kalman.lgs_noise", "kalman.ngs_noise")),
+    look=Look("GP, both", "#55A17F", "#03E49C", (6, 2, 2, 2, 2, 2)),
+    step=partial(optimal_filters, cycle_of),
 )
