@@ -224,7 +224,7 @@ def test_a_state_without_numbers_is_refused_and_leaves_the_old_one(name: str) ->
     state = observer.state_dict()
     observer.load_state_dict(state)  # NaN where nothing is known yet
     filled = {name: np.full(np.shape(x), np.nan) for name, x in state.items()}
-    own = {name for name in state if name.rpartition(".")[2] in ("x", "states", "covariance", "last", "past")}
+    own = {name for name in state if name.rpartition(".")[2] in ("x", "states", "covariance", "last", "commands")}
     for wrong in (
         filled,
         *({**state, one: filled[one]} for one in own),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,7 +15,7 @@ from wfsobs.prior import Bands, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.signal.bandpass import bandpass_bank, bank_recursion
-from wfsobs.signal.stepping import FilterBank, Recursion, Saved, Stateful
+from wfsobs.signal.stepping import FilterBank, Recursion, StateArrays, Stateful
 from wfsobs.typing import Array
 
 StepPredict = Callable[[Prior, Plant, Any, Sampling], Estimator]
@@ -42,13 +42,16 @@ class StepLaw(Stateful, Protocol):
         ...
 
 
-class LinearLaws:
+class LinearLaws(StateArrays):
     """Laws as filters of z."""
+
+    state_names = ("bank",)
 
     def __init__(self, laws: Sequence[Law]):
         self.laws = tuple(laws)
         self.bank = FilterBank([Recursion(law.cycle.steps, law.first) for law in laws])
         self._v = np.zeros((len(laws), laws[0].cycle.steps[0][1].shape[1]))
+        self.mark_start()
 
     def see_stars(self, count: int | None) -> None:
         """Take no notice: there is one gain."""
@@ -72,21 +75,11 @@ class LinearLaws:
             raise StepError("the laws have states of another size")
         self.bank.load(old.bank.save())
 
-    def reset(self) -> None:
-        """Set the state back to rest."""
-        self.bank.reset()
 
-    def save(self) -> Saved:
-        """Return a copy of the state."""
-        return self.bank.save()
-
-    def load(self, state: Mapping[str, Array]) -> None:
-        """Take over a state."""
-        self.bank.load(state)
-
-
-class KalmanLaws:
+class KalmanLaws(StateArrays):
     """Laws as rows of what Kalman filters estimate; a measurement that is missing, NaN, is none to them."""
+
+    state_names = ("filters",)
 
     def __init__(self, laws: Sequence[Law]):
         self.laws, known = tuple(laws), [law for law in laws if law.filter is not None and law.row is not None]
@@ -95,6 +88,7 @@ class KalmanLaws:
         for row, law in zip(self._rows, known, strict=True):
             assert law.row is not None
             row[: len(law.row)] = law.row
+        self.mark_start()
 
     def see_stars(self, count: int | None) -> None:
         """Take the LGS measurement of the next frame for the mean over so many stars; None for all."""
@@ -119,21 +113,11 @@ class KalmanLaws:
             raise StepError("the laws are of another kind")
         self.filters.take_over(old.filters)
 
-    def reset(self) -> None:
-        """Set the state back to rest."""
-        self.filters.reset()
 
-    def save(self) -> Saved:
-        """Return a copy of the state."""
-        return self.filters.save()
-
-    def load(self, state: Mapping[str, Array]) -> None:
-        """Take over a state."""
-        self.filters.load(state)
-
-
-class Integrators:
+class Integrators(StateArrays):
     """Integrators whose state are their own commands, so that a limit of the mirror stops them (anti-windup)."""
+
+    state_names = ("_own",)
 
     def __init__(self, laws: Sequence[Law], mirror: Mirror):
         self.laws = tuple(laws)
@@ -141,6 +125,7 @@ class Integrators:
         self._leak = np.array([law.leak for law in laws])
         self._taps = mirror.taps[1:]
         self._own = np.zeros((len(self._taps), len(laws)))  # newest first
+        self.mark_start()
 
     def see_stars(self, count: int | None) -> None:
         """Take no notice: there is one gain."""
@@ -158,18 +143,6 @@ class Integrators:
         if not isinstance(old, Integrators) or old._own.shape != self._own.shape:
             raise StepError("the laws are of another kind")
         self._own[...] = old._own
-
-    def reset(self) -> None:
-        """Set the state back to rest."""
-        self._own[...] = 0.0
-
-    def save(self) -> Saved:
-        """Return a copy of the state."""
-        return {"own": self._own.copy()}
-
-    def load(self, state: Mapping[str, Array]) -> None:
-        """Take over a state."""
-        self._own[...] = state["own"]
 
 
 def take_missing(laws: Sequence[Law]) -> bool:

@@ -7,18 +7,15 @@ causal, so its estimate of step k is what the filter gives at step k.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Look, Observer, Tunable
-from wfsobs.observers.step import StepError
+from wfsobs.observers.step import HeldEstimate, StepError
 from wfsobs.prior import Bands, OfflineBands, OnlineBands, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.signal.bandpass import bandpass_bank, bank_recursion, filter_causal, filter_zero_phase
-from wfsobs.signal.stepping import FilterBank, Saved
+from wfsobs.signal.stepping import FilterBank
 from wfsobs.typing import Array
 
 
@@ -60,82 +57,33 @@ def zero(measurements: Measurements, _prior: Prior, _settings: None, watch: Watc
     return {target: np.zeros_like(measurements.y_lgs) for target in TARGETS}
 
 
-class BankEstimator:
+class BankEstimator(HeldEstimate):
     """The causal band-passes of all modes, one frame at a time. They predict nothing."""
 
-    horizon, needs_command = 0.0, False
+    state_names = ("filters", "_mean")
 
     def __init__(self, bands: Bands, sampling: Sampling):
+        super().__init__(sampling.n_modes, 0.0, 0.0)
         bank = bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, sampling.dt)
         self.filters = FilterBank([bank_recursion(bank)] * sampling.n_modes)
-        self._mean, self._sd = np.zeros(sampling.n_modes), np.full(sampling.n_modes, np.nan)
+        self.mark_start()
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame."""
         self._mean[...] = self.filters.step(z[:, None])[:, 0]
 
-    def predict(self, frames: float, target: str) -> tuple[Array, Array]:
-        """Return the vibration of this frame."""
-        return self._mean, self._sd
 
-    def settle(self) -> None:
-        """Have nothing left to do."""
-
-    def reset(self) -> None:
-        """Set the state back to the start."""
-        self.filters.reset()
-        self._mean[...] = 0.0
-
-    def save(self) -> Saved:
-        """Return a copy of the state."""
-        return {**self.filters.save(), "mean": self._mean.copy()}
-
-    def load(self, state: Mapping[str, Array]) -> None:
-        """Take over a state."""
-        self.filters.load(state)
-        self._mean[...] = state["mean"]
-
-    def take_over(self, old: Any) -> None:
-        """Go on from band-passes of the same number and order. Raises StepError."""
-        if old.filters.x.shape != self.filters.x.shape:
-            raise StepError("the designs have another number of band-passes, or of another order")
-        self.load(old.save())
-
-
-class LastValue:
+class LastValue(HeldEstimate):
     """The last measurement times a factor, held for any number of frames."""
 
-    horizon, needs_command = None, False
-
     def __init__(self, sampling: Sampling, factor: float):
-        self._factor, self._mean, self._sd = factor, np.zeros(sampling.n_modes), np.full(sampling.n_modes, np.nan)
+        super().__init__(sampling.n_modes, None, 0.0)
+        self._factor = factor
+        self.mark_start()
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame."""
         np.multiply(z, self._factor, out=self._mean)
-
-    def predict(self, frames: float, target: str) -> tuple[Array, Array]:
-        """Return the value."""
-        return self._mean, self._sd
-
-    def settle(self) -> None:
-        """Have nothing left to do."""
-
-    def reset(self) -> None:
-        """Set the state back to the start."""
-        self._mean[...] = 0.0
-
-    def save(self) -> Saved:
-        """Return a copy of the state."""
-        return {"mean": self._mean.copy()}
-
-    def load(self, state: Mapping[str, Array]) -> None:
-        """Take over a state."""
-        self._mean[...] = state["mean"]
-
-    def take_over(self, old: Any) -> None:
-        """Go on from the last value."""
-        self.load(old.save())
 
 
 def step_butterworth_cl(prior: Prior, _settings: None, sampling: Sampling, horizon: float) -> BankEstimator:

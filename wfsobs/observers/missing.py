@@ -8,7 +8,7 @@ Only samples before a gap fill it, so estimates stay causal, and what has been f
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
@@ -18,7 +18,7 @@ from wfsobs.prior import Prior
 from wfsobs.record import Signals, delay_signal, frame_mean, hold_last
 from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.statespace import DisturbanceModel
-from wfsobs.signal.stepping import FilterBank, Gain, GainCycle, Saved
+from wfsobs.signal.stepping import FilterBank, Gain, GainCycle, StateArrays
 from wfsobs.typing import Array
 
 S = TypeVar("S", bound=Signals)
@@ -76,11 +76,13 @@ def predict_missing(z: Array, predictors: Sequence[Predictor]) -> Array:
     return np.array([bridge.complete(row) for row in z])
 
 
-class Bridge:
+class Bridge(StateArrays):
     """`predict_missing`, one frame at a time.
 
     gains : of the filters that predict, by mode; other modes hold their last value
     """
+
+    state_names = ("_last", "_bank")
 
     def __init__(self, n_modes: int, predictors: Sequence[Predictor] = ()):
         found = [(mode, gains) for mode, one in enumerate(predictors) if (gains := _gains(one)) is not None]
@@ -90,6 +92,7 @@ class Bridge:
         self._rows = expected_rows([gains for _, gains in found])
         self._last = np.zeros(n_modes)
         self._all_modes = len(found) == n_modes
+        self.mark_start()
 
     def complete(self, z: Array, is_whole: bool = False) -> Array:
         """Return z (n_modes,) [um] with its NaN replaced; z itself where it is known to have none."""
@@ -116,22 +119,6 @@ class Bridge:
         self._last[...] = old._last
         if self._bank is not None and old._bank is not None and self._bank.x.shape == old._bank.x.shape:
             self._bank.load(old._bank.save())
-
-    def reset(self) -> None:
-        """Set the state back to the start."""
-        self._last[...] = 0.0
-        if self._bank is not None:
-            self._bank.reset()
-
-    def save(self) -> Saved:
-        """Return a copy of the state."""
-        return {"last": self._last.copy()} | ({} if self._bank is None else self._bank.save())
-
-    def load(self, state: Mapping[str, Array]) -> None:
-        """Take over a state."""
-        self._last[...] = state["last"]
-        if self._bank is not None:
-            self._bank.load(state)
 
 
 def bridges(prior: Prior, n_modes: int, dt: float, ratio: int | None, line_width: float = LINE_WIDTH) -> tuple[Bridge, Bridge]:

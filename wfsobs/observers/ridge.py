@@ -7,7 +7,7 @@ then is this with lambda = (sigma_n l / sigma_SE)^2 and a free constant.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,12 +19,11 @@ from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.gpr.inputs import Windows, scales_of, training_signals, tunable
 from wfsobs.observers.gpr.kernels import sliding_products, square_from_band
 from wfsobs.observers.gpr.offline import OFFLINE, OfflineGpr, training_targets
-from wfsobs.observers.step import whole_frames
+from wfsobs.observers.step import HeldEstimate, whole_frames
 from wfsobs.prior import OfflineBands, Prior, Training
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, Sampling, pseudo_open_loop
 from wfsobs.signal.linalg import eliminate, solve_rows
-from wfsobs.signal.stepping import Saved
 from wfsobs.typing import Array
 
 TAPS = 30
@@ -82,7 +81,7 @@ def predict(signals: Array, weights: Array, constant: float) -> Array:
     return out
 
 
-class LinearPredictor:
+class LinearPredictor(HeldEstimate):
     """A linear predictor of all modes. One of the vibration h frames ahead is trained for that h, so it has no other horizon.
 
     Parameters
@@ -95,13 +94,16 @@ class LinearPredictor:
         Frames ahead that it was trained for.
     """
 
+    state_names = ("windows", "_mean")
+
     def __init__(self, windows: Windows, fits: Sequence[tuple[Array, float]], horizon: float):
-        self.windows, self.horizon, self.needs_command, self.fits = windows, horizon, windows.needs_command, fits
+        super().__init__(len(fits), horizon)
+        self.windows, self.needs_command, self.fits = windows, windows.needs_command, fits
         channels = fits[0][0].shape[1]
         self._weights = np.concatenate([weights[::-1].T for weights, _ in fits])  # as the window: (n_modes * channels, depth)
         self._starts = np.arange(0, len(self._weights), channels)
         self._constants = np.array([constant for _, constant in fits])
-        self._mean, self._sd = np.full(len(fits), np.nan), np.full(len(fits), np.nan)
+        self.mark_start()
 
     def run(self, measurements: Measurements, watch: Watch) -> Estimates:
         """Run over a record, all steps at once."""
@@ -114,35 +116,18 @@ class LinearPredictor:
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame."""
         self.windows.push(z, u)
+        self._estimate()
 
-    def predict(self, frames: float, target: str) -> tuple[Array, Array]:
-        """Return the mean of the vibration; NaN before the first full window."""
+    def _estimate(self) -> None:
         if self.windows.is_full:
             parts = np.einsum("ij,ij->i", self._weights, self.windows.window)
             np.add.reduceat(parts, self._starts, out=self._mean)
             self._mean += self._constants
-        else:
-            self._mean[...] = np.nan
-        return self._mean, self._sd
-
-    def settle(self) -> None:
-        """Have nothing left to do."""
-
-    def reset(self) -> None:
-        """Set the state back to the start."""
-        self.windows.reset()
-
-    def save(self) -> Saved:
-        """Return a copy of the state."""
-        return self.windows.save()
-
-    def load(self, state: Mapping[str, Array]) -> None:
-        """Take over a state."""
-        self.windows.load(state)
 
     def take_over(self, old: Any) -> None:
         """Go on with the samples of another design."""
         self.windows.take_over(old.windows)
+        self._estimate()
 
 
 def fit_ridge(prior: Prior, g: OfflineGpr, mode: int, dt: float, delay: int, horizon: int = 0) -> tuple[Array, float]:

@@ -21,7 +21,7 @@ from wfsobs.observers.missing import Bridge
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
-from wfsobs.signal.stepping import Stateful, load_parts, save_parts
+from wfsobs.signal.stepping import StateArrays, Stateful, load_parts, save_parts
 from wfsobs.typing import Array
 
 
@@ -65,6 +65,41 @@ class Estimator(Stateful, Protocol):
     def take_over(self, old: Any) -> None:
         """Go on from the state of another design of the same observer. Raises StepError."""
         ...
+
+
+class HeldEstimate(StateArrays):
+    """An estimator that makes its estimate in `advance`, for one horizon.
+
+    Parameters
+    ----------
+    n_modes : int
+        Number of modes.
+    horizon : float or None
+        Frames ahead that it predicts; None where it holds its estimate for any.
+    before : float
+        The mean before the first one [um].
+    """
+
+    state_names = ("_mean",)
+    needs_command = False
+
+    def __init__(self, n_modes: int, horizon: float | None, before: float = np.nan):
+        self.horizon = horizon
+        self._mean, self._sd = np.full(n_modes, before), np.full(n_modes, np.nan)
+
+    def predict(self, frames: float, target: str) -> tuple[Array, Array]:
+        """Return mean and standard deviation of the last frame."""
+        return self._mean, self._sd
+
+    def settle(self) -> None:
+        """No deferred work."""
+
+    def take_over(self, old: Any) -> None:
+        """Go on from another design with a state of the same shapes. Raises StepError."""
+        state = old.save()
+        if any(x.shape != state[name].shape for name, x in self.save().items()):
+            raise StepError("the designs have states of other shapes")
+        self.load(state)
 
 
 MakeEstimator = Callable[[Prior, Any, Sampling, float], Estimator]
@@ -280,7 +315,7 @@ class StepObserver:
         return check_frame(self.id, x, name, self.sampling.n_modes, self.frame)
 
 
-KNOWN = frozenset({"beside", "covariance", "frames", "held", "last", "mirror", "past", "sent", "states", "x"})
+KNOWN = frozenset({"beside", "commands", "covariance", "frames", "held_value", "last", "mirror", "sent", "states", "x"})
 """Parts of a state that hold finite numbers; others may have NaN where nothing is known yet."""
 
 

@@ -52,6 +52,87 @@ def load_parts(parts: Mapping[str, Stateful], state: Mapping[str, Array]) -> Non
         one.load({name.removeprefix(f"{part}."): x for name, x in state.items() if name.startswith(f"{part}.")})
 
 
+class StateArrays:
+    """A state of the attributes that `state_names` lists: arrays, numbers, and parts with a state of their own, or None.
+
+    `mark_start` ends the constructor: a reset goes back to what they are then.
+    """
+
+    state_names: tuple[str, ...] = ()
+
+    def mark_start(self) -> None:
+        """Keep the state as the one before the first step."""
+        self._start = self.save()
+
+    def reset(self) -> None:
+        """Set the state back to the start."""
+        self.load(self._start)
+
+    def save(self) -> Saved:
+        """Return a copy of the state."""
+        out: Saved = {}
+        for name in self.state_names:
+            value, key = getattr(self, name), name.lstrip("_")
+            if hasattr(value, "save"):
+                out |= save_parts({key: value})
+            elif value is not None:
+                out[key] = np.array(value)
+        return out
+
+    def load(self, state: Mapping[str, Array]) -> None:
+        """Take over a state of the same names and shapes."""
+        for name in self.state_names:
+            value, key = getattr(self, name), name.lstrip("_")
+            if hasattr(value, "load"):
+                load_parts({key: value}, state)
+            elif isinstance(value, np.ndarray):
+                value[...] = state[key]
+            elif value is not None:
+                setattr(self, name, type(value)(state[key]))
+
+
+class SampleHistory:
+    """The last samples of several channels, in one piece: moved to the front at the end of a longer array.
+
+    Parameters
+    ----------
+    n : int
+        Channels.
+    length : int
+        Samples that are kept.
+    """
+
+    def __init__(self, n: int, length: int):
+        self.length = length
+        self._samples, self._end = np.zeros((n, length + max(length, 64))), length
+
+    def push(self, x: Array) -> None:
+        """Take a sample (n,)."""
+        if self._end == self._samples.shape[1]:
+            self._samples[:, : self.length] = self._samples[:, -self.length :]
+            self._end = self.length
+        self._samples[:, self._end] = x
+        self._end += 1
+
+    def last(self, length: int) -> Array:
+        """Return the last samples, (n, length), the oldest first, zero where there was none: a view."""
+        return self._samples[:, self._end - length : self._end]
+
+    def reset(self) -> None:
+        """Set the state back to zeros."""
+        self._samples[...], self._end = 0.0, self.length
+
+    def save(self) -> Saved:
+        """Return a copy of the state."""
+        return {"newest": self.last(self.length).copy()}
+
+    def load(self, state: Mapping[str, Array]) -> None:
+        """Take over a state; of a longer or shorter history as much as there is room for."""
+        n = min(self.length, state["newest"].shape[1])
+        self.reset()
+        self._samples[:, self.length - n : self.length] = state["newest"][:, state["newest"].shape[1] - n :]
+
+
 class Gain(NamedTuple):
     """One step of a linear observer: measure with rows C (m, n) and filter gain L (n, m), then predict with A (n, n)."""
 

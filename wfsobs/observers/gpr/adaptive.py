@@ -18,12 +18,12 @@ from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.gpr.learning import Learnt, learn, nothing_learnt
 from wfsobs.observers.kalman.adaptive import identification_settings
 from wfsobs.observers.kalman.window_model import ADAPTIVE, Adaptive, pack_spectrum, unpack_spectrum, window_lengths
-from wfsobs.observers.step import StepError, run_frames, whole_frames
+from wfsobs.observers.step import HeldEstimate, StepError, run_frames, whole_frames
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, RecordError, Sampling
 from wfsobs.signal.periodic import PeriodicFilter
-from wfsobs.signal.stepping import Saved
+from wfsobs.signal.stepping import SampleHistory, Saved
 from wfsobs.spectral.quick import SHORTEST
 from wfsobs.typing import Array
 
@@ -53,33 +53,28 @@ def schedule_of(settings: Adaptive, dt: float) -> Schedule:
     return Schedule(first, round(SLOWER * found.interval), 2 * found.window, min(settings.depth, first // 4))
 
 
-class AdaptiveGprEstimator:
+class AdaptiveGprEstimator(HeldEstimate):
     """The regression of all modes, for the vibration now or `horizon` frames ahead. It learns in `settle`.
 
     Raises StepError where the horizon leaves too few targets.
     """
 
-    needs_command = False
+    state_names = ("_samples", "_recent", "_states", "_mean", "_sd", "count")
 
     def __init__(self, settings: Adaptive, sampling: Sampling, horizon: int = 0):
-        self.settings, self.sampling, self._ahead, self.horizon = settings, sampling, horizon, float(horizon)
+        super().__init__(sampling.n_modes, float(horizon))
+        self.settings, self.sampling, self._ahead = settings, sampling, horizon
         self.schedule = schedule_of(settings, sampling.dt)
         if horizon >= self.schedule.first // 4:
             raise StepError(f"gpr-adaptive: {horizon} frames ahead: takes less than an eighth of adaptive.window")
         n = sampling.n_modes
-        self._samples = np.zeros((n, 2 * self.schedule.longest))  # newest last; moved to the front at the end
+        self._samples = SampleHistory(n, self.schedule.longest)
         self._recent = np.zeros((n, self.schedule.depth))  # whitened, in a ring
         self._states = np.zeros((n, 4))  # of the whiteners: turbulence, and a background where there is one
-        self._mean, self._sd = np.full(n, np.nan), np.full(n, np.nan)
-        self.reset()
-
-    def reset(self) -> None:
-        """Set the state back to the start."""
-        self._end = self.count = 0
-        self._pending = False
-        self.learnt = [nothing_learnt(self.schedule.depth)] * self.sampling.n_modes
+        self.count, self._pending = 0, False
+        self.learnt = [nothing_learnt(self.schedule.depth)] * n
         self._whiteners = [one.whitener for one in self.learnt]
-        self._recent[...], self._states[...], self._mean[...], self._sd[...] = 0.0, 0.0, np.nan, np.nan
+        self.mark_start()
 
     def run(self, measurements: Measurements, watch: Watch) -> Estimates:
         """Run over a record, frame by frame. Raises RecordError for one in which it cannot learn once."""
@@ -96,11 +91,7 @@ class AdaptiveGprEstimator:
         self.count += 1
         if self.count <= self.sampling.delay:
             return
-        if self._end == self._samples.shape[1]:
-            self._samples[:, : self.schedule.longest] = self._samples[:, -self.schedule.longest :]
-            self._end = self.schedule.longest
-        self._samples[:, self._end] = z
-        self._end += 1
+        self._samples.push(z)
         since = self.count - self.sampling.delay - self.schedule.first
         if since > 0:
             self._estimate(z)
@@ -121,9 +112,8 @@ class AdaptiveGprEstimator:
             return
         self._pending = False
         size = min(self.count - self.sampling.delay, self.schedule.longest)
-        for mode, last in enumerate(self.learnt):
-            z = self._samples[mode, self._end - size : self._end]
-            s = self.settings
+        s = self.settings
+        for mode, (last, z) in enumerate(zip(self.learnt, self._samples.last(size), strict=True)):
             one = learn(z, self.sampling.dt, self.schedule.depth, s.peak_count, s.lowest, last, self._ahead)
             self.learnt[mode], self._whiteners[mode] = one, one.whitener
             self._whiten_past(mode, z - one.mean)
@@ -135,39 +125,25 @@ class AdaptiveGprEstimator:
         self._recent[mode] = out[: -self.schedule.depth - 1 : -1, 0]
         self._states[mode, : len(F)] = out[-1, 1:]
 
-    def predict(self, frames: float, target: str) -> tuple[Array, Array]:
-        """Return mean and standard deviation of the vibration; NaN before it has learnt once."""
-        return self._mean, self._sd
-
     def save(self) -> Saved:
         """Return a copy of the state: the window, what was learnt, and the states of the whiteners."""
         self.settle()
-        size, rows = min(self._end, self.schedule.longest), self.settings.peak_count + 2
-        samples = np.zeros((len(self._mean), self.schedule.longest))
-        samples[:, self.schedule.longest - size :] = self._samples[:, self._end - size : self._end]
-        return {
-            "samples": samples,
+        rows = self.settings.peak_count + 2
+        return super().save() | {
             "spectra": np.array([pack_spectrum(one.fit, rows) for one in self.learnt]),
             "weights": np.array([one.weights for one in self.learnt]),
             "means": np.array([[one.mean, one.sd] for one in self.learnt]),
-            "recent": self._recent.copy(),
-            "states": self._states.copy(),
-            "estimates": np.array([self._mean, self._sd]),
-            "count": np.array(self.count),
         }
 
     def load(self, state: Mapping[str, Array]) -> None:
         """Take over a state."""
-        self.count, self._end, self._pending = int(state["count"]), self.schedule.longest, False
-        size = min(max(self.count - self.sampling.delay, 0), self.schedule.longest)
-        self._samples[:, self._end - size : self._end] = state["samples"][:, self._end - size :]
+        super().load(state)
+        self._pending = False
         packed = zip(state["spectra"], state["means"].tolist(), state["weights"], strict=True)
         self.learnt = [
             Learnt(unpack_spectrum(table, self.sampling.dt), mean, weights.copy(), sd) for table, (mean, sd), weights in packed
         ]
         self._whiteners = [one.whitener for one in self.learnt]
-        self._recent[...], self._states[...] = state["recent"], state["states"]
-        self._mean[...], self._sd[...] = state["estimates"]
 
     def take_over(self, old: Any) -> None:
         """Go on from another design with the same windows, number of peaks and horizon. Raises StepError."""

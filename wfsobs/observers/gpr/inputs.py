@@ -7,7 +7,7 @@ from rest at the first sample, and the means and deviations are those of the tra
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from scipy.signal import butter, sosfilt, sosfilt_zi
 from wfsobs.observers.step import StepError
 from wfsobs.record import Measurements, RecordError, Sampling, Training, pseudo_open_loop
 from wfsobs.settings import Group, Real, Whole
-from wfsobs.signal.stepping import Saved
+from wfsobs.signal.stepping import SampleHistory, StateArrays
 from wfsobs.typing import Array
 
 
@@ -139,43 +139,30 @@ def _channels(settings: Gpr, y: Array, u: Array, z: Array, mode: int) -> Array:
     return z[:, [mode]] if settings.inputs == "z" else np.column_stack([u[:, mode], y[:, mode]])
 
 
-class StreamingInputs:
-    """`window_signals`, one sample at a time."""
+class StreamingInputs(StateArrays):
+    """`window_signals`, one sample at a time, of so many channels."""
 
-    def __init__(self, settings: Gpr, dt: float, scale: Scale | None = None):
+    state_names = ("_filter", "_is_started")
+
+    def __init__(self, settings: Gpr, dt: float, scale: Scale | None = None, channels: int = 1):
         if settings.inputs_filter == "standardised" and scale is None:
             raise ValueError("standardised inputs need their scale")
-        self._scale = scale
+        self._scale, self._is_started = scale, False
         self._sos = high_pass(settings.highpass, dt) if settings.inputs_filter == "high-pass" else None
-        self._state: Array | None = None
-
-    def reset(self) -> None:
-        """Set the state back to before the first sample."""
-        self._state = None
-
-    def save(self, channels: int) -> dict[str, Array]:
-        """Return a copy of the state, NaN before the first sample."""
-        if self._sos is None:
-            return {}
-        return {"inputs": np.full((len(self._sos), 2, channels), np.nan) if self._state is None else self._state.copy()}
-
-    def load(self, state: Mapping[str, Array]) -> None:
-        """Take over a state."""
-        if self._sos is not None:
-            self._state = None if np.isnan(state["inputs"]).any() else state["inputs"].copy()
+        self._filter = None if self._sos is None else np.zeros((len(self._sos), 2, channels))
+        self.mark_start()
 
     def step(self, sample: Array) -> Array:
         """Return the inputs (channels,) of this step's sample (channels,)."""
-        if self._sos is not None:
-            state = at_rest(self._sos, sample) if self._state is None else self._state
-            out, self._state = sosfilt(self._sos, sample[None], axis=0, zi=state)
+        if self._sos is not None and self._filter is not None:
+            start = self._filter if self._is_started else at_rest(self._sos, sample)
+            out, self._filter[...] = sosfilt(self._sos, sample[None], axis=0, zi=start)
+            self._is_started = True
             return out[0]
-        if self._scale is not None:
-            return (sample - self._scale.mean) / self._scale.std
-        return sample
+        return sample if self._scale is None else (sample - self._scale.mean) / self._scale.std
 
 
-class Windows:
+class Windows(StateArrays):
     """The channels of all modes, sample by sample, and the last of them.
 
     Parameters
@@ -190,6 +177,8 @@ class Windows:
         Of standardised inputs, one per mode; empty for others.
     """
 
+    state_names = ("_samples", "_commands", "_held_value", "count", "_inputs")
+
     def __init__(self, settings: Gpr | None, sampling: Sampling, depth: int, scales: Sequence[Scale] = ()):
         self._of_record = settings, sampling.dt, tuple(scales)
         self.needs_command = settings is not None and settings.inputs == "u-y"
@@ -198,12 +187,12 @@ class Windows:
         self._inputs = None
         if settings is not None and settings.inputs_filter != "raw":
             scale = Scale(*(np.concatenate(part) for part in zip(*scales, strict=True))) if scales else None
-            self._inputs = StreamingInputs(settings, sampling.dt, scale)
-        self._samples = np.zeros((n, 4 * depth))  # newest last; moved to the front at the end
-        self._end = depth
-        self._past = np.zeros((sampling.delay, sampling.n_modes))  # commands, newest first
+            self._inputs = StreamingInputs(settings, sampling.dt, scale, n)
+        self._samples = SampleHistory(n, depth)
+        self._commands = np.zeros((sampling.delay, sampling.n_modes))  # newest first
         self._held_value = np.zeros(sampling.n_modes)
         self._sample = np.zeros(n)
+        self.mark_start()
 
     @property
     def is_full(self) -> bool:
@@ -223,7 +212,7 @@ class Windows:
         sample = self._sample
         if self.needs_command:
             assert u is not None
-            held, past = self._held_value, self._past
+            held, past = self._held_value, self._commands
             np.copyto(held, u, where=~np.isnan(u))
             sample[::2] = held
             sample[1::2] = z + past[-1]
@@ -232,57 +221,23 @@ class Windows:
         else:
             sample[...] = z
         out = sample if self._inputs is None else self._inputs.step(sample)
-        if self._end == self._samples.shape[1]:
-            self._samples[:, : self.depth] = self._samples[:, -self.depth :]
-            self._end = self.depth
-        self._samples[:, self._end] = out
-        self._end += 1
+        self._samples.push(out)
         self.count += 1
         return out
 
     @property
     def window(self) -> Array:
         """The newest window, (n_modes * channels, depth), the oldest sample first; a view."""
-        return self._samples[:, self._end - self.depth : self._end]
-
-    def reset(self) -> None:
-        """Set the state back to the start."""
-        for x in (self._samples, self._past, self._held_value):
-            x[...] = 0.0
-        self.count, self._end = 0, self.depth
-        if self._inputs is not None:
-            self._inputs.reset()
-
-    def save(self) -> Saved:
-        """Return a copy of the state."""
-        more = {} if self._inputs is None else self._inputs.save(len(self._sample))
-        return {
-            "window": self.window.copy(),
-            "past": self._past.copy(),
-            "held": self._held_value.copy(),
-            "count": np.array(self.count),
-            **more,
-        }
-
-    def load(self, state: Mapping[str, Array]) -> None:
-        """Take over a state."""
-        self._end, self.count = self.depth, int(state["count"])
-        self._samples[:, : self.depth] = state["window"]
-        self._past[...], self._held_value[...] = state["past"], state["held"]
-        if self._inputs is not None:
-            self._inputs.load(state)
+        return self._samples.last(self.depth)
 
     def take_over(self, old: Windows) -> None:
         """Go on from other windows of the same channels; of longer ones, or of shorter ones that are then not full."""
-        if self._samples.shape[0] != old._samples.shape[0] or (self._inputs is None) != (old._inputs is None):
+        state, own = old.save(), self.save()
+        if state.keys() != own.keys() or len(state["samples.newest"]) != len(own["samples.newest"]):
             raise StepError("the designs have windows of other channels")
-        n = min(self.depth, old.depth)
-        self._end = self.depth
-        self._samples[:, self.depth - n : self.depth] = old.window[:, old.depth - n :]
-        self.count = min(old.count, n) if self.depth > old.depth else old.count
-        self._past[...], self._held_value[...] = old._past, old._held_value
-        if self._inputs is not None and old._inputs is not None:
-            self._inputs.load(old._inputs.save(len(self._sample)))
+        self.load(state)
+        if self.depth > old.depth:
+            self.count = min(old.count, old.depth)
 
 
 def tunable(group: str) -> tuple[str, ...]:

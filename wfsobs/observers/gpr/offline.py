@@ -6,7 +6,7 @@ window's last step; without a twin, that of its z. `trained` has the regression.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,12 +18,11 @@ from wfsobs.observers.gpr.inputs import Gpr, Windows, scale_of, scales_of, train
 from wfsobs.observers.gpr.online import kernel_of
 from wfsobs.observers.gpr.trained import TrainedGpr, train
 from wfsobs.observers.per_mode import over_modes, turns
-from wfsobs.observers.step import whole_frames
+from wfsobs.observers.step import HeldEstimate, whole_frames
 from wfsobs.prior import Bands, OfflineBands, Prior
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import DELAY, Measurements, RecordError, Sampling, Training, pseudo_open_loop
 from wfsobs.settings import Section
-from wfsobs.signal.stepping import Saved
 from wfsobs.typing import Array
 
 
@@ -82,12 +81,15 @@ def step_gpr_offline(prior: Prior, settings: OfflineGpr, sampling: Sampling, hor
     return OfflineEstimator(Windows(g, sampling, g.depth, scales_of(g, prior.training, sampling)), models, ahead)
 
 
-class OfflineEstimator:
+class OfflineEstimator(HeldEstimate):
     """Trained GPR of all modes, one frame at a time; `train_mode` made them for `horizon` frames ahead."""
 
+    state_names = ("windows", "_mean")
+
     def __init__(self, windows: Windows, models: Sequence[TrainedGpr], horizon: float | None):
-        self.windows, self.models, self.horizon, self.needs_command = windows, tuple(models), horizon, windows.needs_command
-        self._mean, self._sd = np.full(len(models), np.nan), np.full(len(models), np.nan)
+        super().__init__(len(models), horizon)
+        self.windows, self.models, self.needs_command = windows, tuple(models), windows.needs_command
+        self.mark_start()
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame."""
@@ -95,27 +97,6 @@ class OfflineEstimator:
         if self.windows.is_full:
             parts = np.split(self.windows.window, len(self.models))
             self._mean[...] = [model.predict_one(x) for model, x in zip(self.models, parts, strict=True)]
-
-    def predict(self, frames: float, target: str) -> tuple[Array, Array]:
-        """Return the mean of the vibration; NaN before the first full window."""
-        return self._mean, self._sd
-
-    def settle(self) -> None:
-        """Have nothing left to do."""
-
-    def reset(self) -> None:
-        """Set the state back to the start."""
-        self.windows.reset()
-        self._mean[...] = np.nan
-
-    def save(self) -> Saved:
-        """Return a copy of the state."""
-        return {**self.windows.save(), "mean": self._mean.copy()}
-
-    def load(self, state: Mapping[str, Array]) -> None:
-        """Take over a state."""
-        self.windows.load(state)
-        self._mean[...] = state["mean"]
 
     def take_over(self, old: Any) -> None:
         """Go on with the samples of another design."""

@@ -19,13 +19,13 @@ from wfsobs.observers.gpr.kernels import SquaredExponential, band, check_conditi
 from wfsobs.observers.gpr.sliding import finish, run_lengths, slide
 from wfsobs.observers.gpr.sliding_regression import LateRegression, SlidingRegression
 from wfsobs.observers.per_mode import over_modes, turns
-from wfsobs.observers.step import StepError, whole_frames
+from wfsobs.observers.step import HeldEstimate, StepError, whole_frames
 from wfsobs.prior import Bands, OnlineBands, Part, Prior, Training
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, Sampling, Signals
 from wfsobs.settings import Real, Section, Whole
 from wfsobs.signal.bandpass import StreamingBank, bandpass_bank, bank_recursion
-from wfsobs.signal.stepping import FilterBank, Saved, load_parts, save_parts
+from wfsobs.signal.stepping import FilterBank, Saved
 from wfsobs.typing import Array
 
 
@@ -152,7 +152,7 @@ def _whole_run(
     return S, f
 
 
-class OnlineEstimator:
+class OnlineEstimator(HeldEstimate):
     """Online GPR of all modes one frame at a time, for the vibration now or a number of frames ahead.
 
     The target of a window is the vibration h frames later as the causal bank on z gives it, one frame late: at step k that of
@@ -174,22 +174,19 @@ class OnlineEstimator:
         Of the vibration now, one frame ahead and so on in what it learns; fewer than m.
     """
 
+    state_names = ("windows", "bank", "_mean", "_band_signals", "regression")
+
     def __init__(
         self, windows: Windows, bands: Bands, sampling: Sampling, depth: int, m: int, kernel: SquaredExponential, weights: Array
     ):
+        super().__init__(sampling.n_modes, float(len(weights) - 1))
         self.windows, self.weights, self.needs_command = windows, weights, windows.needs_command
-        self.horizon = float(len(weights) - 1)
         self._band_signals = np.zeros((len(weights), sampling.n_modes))  # oldest first
         self._size = depth, m, 2 if windows.needs_command else 1, kernel
         bank = bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, sampling.dt)
         self.bank = FilterBank([bank_recursion(bank)] * sampling.n_modes)
-        self._mean, self._sd = np.full(sampling.n_modes, np.nan), np.full(sampling.n_modes, np.nan)
-        self._pending = False
-        self.regression = self._start()
-
-    def _start(self) -> SlidingRegression:
-        late, n = len(self.weights) - 1, len(self._mean)
-        return LateRegression(*self._size, late, n) if late else SlidingRegression(*self._size, n)
+        self._pending, late, n = False, len(weights) - 1, sampling.n_modes
+        self.regression = LateRegression(*self._size, late, n) if late else SlidingRegression(*self._size, n)
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame."""
@@ -207,29 +204,21 @@ class OnlineEstimator:
             self._pending = False
             self.regression.update()
 
-    def predict(self, frames: float, target: str) -> tuple[Array, Array]:
-        """Return the mean of the vibration; NaN until the training set is full."""
-        return self._mean, self._sd
-
     def reset(self) -> None:
         """Set the state back to the start."""
-        self.windows.reset()
-        self.bank.reset()
-        self.regression, self._pending = self._start(), False
-        self._mean[...], self._band_signals[...] = np.nan, 0.0
+        for part in (self.windows, self.bank, self.regression):
+            part.reset()
+        self._mean[...], self._band_signals[...], self._pending = np.nan, 0.0, False
 
     def save(self) -> Saved:
         """Return a copy of the state."""
         self.settle()
-        parts = {"windows": self.windows, "bank": self.bank}
-        own = {"mean": self._mean.copy(), "filtered": self._band_signals.copy()}
-        return save_parts(parts) | own | self.regression.save()
+        return super().save()
 
     def load(self, state: Mapping[str, Array]) -> None:
         """Take over a state."""
-        load_parts({"windows": self.windows, "bank": self.bank}, state)
-        self._mean[...], self._band_signals[...], self._pending = state["mean"], state["filtered"], False
-        self.regression.load(state)
+        super().load(state)
+        self._pending = False
 
     def take_over(self, old: Any) -> None:
         """Go on from a design with the same windows, training set, kernel and horizon. Raises StepError."""
@@ -259,7 +248,7 @@ class OnlineGprStream:
     def __init__(self, settings: OnlineGpr, bands: Bands, dt: float, scale: Scale | None = None):
         """dt: step [s]; scale: of standardised inputs, from `inputs.scale_of`."""
         g = settings
-        self._inputs, self._streaming_inputs = g.inputs, StreamingInputs(g, dt, scale)
+        self._inputs, self._streaming_inputs = g.inputs, StreamingInputs(g, dt, scale, 1 if g.inputs == "z" else 2)
         self._bank = StreamingBank(bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, dt))
         self._regression = SlidingRegression(g.depth, g.training_size, 1 if g.inputs == "z" else 2, kernel_of(g))
         self._u = (0.0, 0.0)  # u[k-1], u[k-2]

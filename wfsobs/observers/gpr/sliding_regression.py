@@ -48,23 +48,19 @@ class SlidingRegression:
 
     def __init__(self, depth: int, m: int, channels: int, kernel: SquaredExponential, n_modes: int = 1):
         self.depth, self.m, self.kernel, n = depth, m, kernel, n_modes
-        self.step = -1
         self._span = m + depth + 1
         self._history = np.zeros((n, 4 * self._span, channels))  # newest sample last, moved to the front at the end
-        self._end = self._span
         self._products = np.zeros((n, m + 1))  # <x_k, x_i> for i = k - m ... k
         renewed = min(-(-(m + 1) * WAITING // restart_interval(depth)), m + 1)
         self._renewal = np.add.outer(np.arange(renewed), np.arange(depth))  # samples of windows
-        self._points = kernel.points(np.zeros((n, m)))  # by slot, like everything below
-        self._newest = kernel.points(np.zeros((n, 1)))
-        self._kappa = np.zeros((n, m))
+        self._kappa = np.zeros((n, m))  # by slot, like everything below
         self._weights = np.zeros((n, 3, m))  # a without the newest target, b, N e_newest
         self._M, self._N = np.zeros((2, n, m, m))
         self._lower = [N.T for N in self._N]  # of which the lower triangle is kept; column-major views, as BLAS has them
         self._columns = np.zeros((n, 2 * WAITING, m))  # N is the one above, plus those of points that came, minus those that went
         self._signs = np.repeat([1.0, -1.0], WAITING)
         self._turns = (np.arange(n) * max(1, WAITING // n) - 1) % WAITING  # of WAITING steps: when the columns of a mode come in
-        self._last_target = np.zeros(n)
+        self.reset()
 
     @property
     def ready(self) -> bool:
@@ -86,6 +82,14 @@ class SlidingRegression:
         (a, b, h), last = over.transpose(1, 2, 0), self._last_target
         border = (self._newest.delta[:, 0] - b[0]) / (1.0 / self.kernel.variance + b[1])
         return a[0] + last * h[0] + border * (a[1] + last * h[1])
+
+    def reset(self) -> None:
+        """Set the state back to before the first sample."""
+        for name in SAVED:
+            getattr(self, f"_{name}")[...] = 0.0
+        self.step, self._end, n = -1, self._span, len(self._kappa)
+        self._points, self._newest = self.kernel.points(np.zeros((n, self.m))), self.kernel.points(np.zeros((n, 1)))
+        self._last_target = np.zeros(n)
 
     def save(self) -> Saved:
         """Return a copy of the state."""

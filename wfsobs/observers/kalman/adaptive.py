@@ -41,7 +41,7 @@ from wfsobs.observers.step import StepError, run_frames
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, RecordError, Sampling
-from wfsobs.signal.stepping import Saved
+from wfsobs.signal.stepping import SampleHistory, Saved, StateArrays
 from wfsobs.typing import Array
 
 STILL = 0.7, 1.4
@@ -220,7 +220,7 @@ class ModeWindow:
         n, model = 4 * (rows + len(TARGETS)) + 2, self.model
         states, covariance, phases, near = np.zeros(n), np.zeros((n, n)), np.zeros(2, int), np.array(STEADY)
         if self.kalman is not None:
-            one = self.kalman.save()
+            one = self.kalman.bank.save()
             order, phases, near = one["x"].shape[1], one["phase"], one["near"][0]
             states[:order], covariance[:order, :order] = one["x"][0], one["covariance"][0]
         return {
@@ -248,10 +248,10 @@ class ModeWindow:
         if kalman is not None:
             n = kalman.bank.x.shape[1]
             own = {"near": state["near"][None], "covariance": state["covariance"][None, :n, :n], "phase": state["phases"]}
-            kalman.load({"x": state["states"][None, :n], **own})
+            kalman.bank.load({"x": state["states"][None, :n], **own})
 
 
-class AdaptiveEstimator:
+class AdaptiveEstimator(StateArrays):
     """The adaptive filter of one sensor, or of both where the sampling has NGS frames that it uses.
 
     It identifies in `advance`, each mode when its window is due. Over a record without gaps it runs a filter over all steps to
@@ -266,21 +266,17 @@ class AdaptiveEstimator:
     """
 
     horizon, needs_command = None, False
+    state_names = ("_samples", "count")
 
     def __init__(self, settings: Adaptive, sampling: Sampling):
         self.settings, self.sampling = settings, sampling
         self.lengths = window_lengths(settings, sampling.dt, sampling.ratio, sampling.delay)
         self.lengths.check(settings, sampling.dt)
-        n_sensors = 1 if sampling.ratio is None else 2
-        # The oldest first; moved to the front at the end.
-        self._samples = np.zeros((sampling.n_modes, 2 * self.lengths.longest, n_sensors))
+        self._n_sensors = 1 if sampling.ratio is None else 2
+        self.count, self._samples = 0, SampleHistory(sampling.n_modes * self._n_sensors, self.lengths.longest)
+        self.windows = [ModeWindow(self.lengths) for _ in range(sampling.n_modes)]
         self._outputs: dict[tuple[float, str], Array] = {}
-        self.reset()
-
-    def reset(self) -> None:
-        """Set the state back to the start."""
-        self.count = self._end = 0
-        self.windows = [ModeWindow(self.lengths) for _ in range(self.sampling.n_modes)]
+        self.mark_start()
 
     def run(self, measurements: Measurements, watch: Watch) -> Estimates:
         """Run over a record. Raises RecordError for one that is shorter than a window."""
@@ -307,21 +303,15 @@ class AdaptiveEstimator:
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame."""
-        longest = self.lengths.longest
-        if self._end == self._samples.shape[1]:
-            self._samples[:, : longest - 1] = self._samples[:, 1 - longest :]
-            self._end = longest - 1
-        row = self._samples[:, self._end]
-        row[:, 0] = z
-        row[:, 1:] = 0.0 if ngs is None else ngs[:, None]
-        self._end += 1
+        row = z[:, None] if self._n_sensors == 1 else np.column_stack([z, np.zeros(len(z)) if ngs is None else ngs])
+        self._samples.push(row.ravel())
         self.count += 1
-        for v, window, samples in zip(row, self.windows, self._samples, strict=True):
+        for mode, (v, window) in enumerate(zip(row, self.windows, strict=True)):
             if window.kalman is not None:
                 window.advance(v, self.count)
             if self.count == window.due:
                 size = self.count - self.lengths.window_start(self.count, window.last_change)
-                seen = samples[self._end - size : self._end]
+                seen = self._samples.last(size)[self._n_sensors * mode : self._n_sensors * (mode + 1)].T
                 whole = window.identify(seen, self.sampling.dt, self.settings)
                 if whole is not None:
                     window.start(seen, whole)
@@ -339,23 +329,18 @@ class AdaptiveEstimator:
         return np.stack(values, axis=1), np.stack(sd, axis=1)
 
     def settle(self) -> None:
-        """Have nothing left to do."""
+        """No deferred work."""
 
     def save(self) -> Saved:
         """Return a copy of the state: the samples, what was found in them, and the states of the filters."""
-        size, rows = min(self._end, self.lengths.longest), len(self.windows[0].means) * self.settings.peak_count + 2
-        samples = np.zeros((len(self.windows), self.lengths.longest, self._samples.shape[2]))
-        samples[:, :size] = self._samples[:, self._end - size : self._end]
-        saved = [window.save(rows) for window in self.windows]
-        of_modes = {name: np.array([one[name] for one in saved]) for name in saved[0]}
-        return {"samples": samples, "counts": np.array([self.count, size]), **of_modes}
+        saved = [window.save(self._n_sensors * self.settings.peak_count + 2) for window in self.windows]
+        return super().save() | {name: np.array([one[name] for one in saved]) for name in saved[0]}
 
     def load(self, state: Mapping[str, Array]) -> None:
         """Take over a state."""
-        self.count, self._end = (int(i) for i in state["counts"])
-        self._samples[:, : self.lengths.longest] = state["samples"]
+        super().load(state)
         for mode, window in enumerate(self.windows):
-            window.load({name: x[mode] for name, x in state.items() if name not in ("samples", "counts")}, self.sampling.dt)
+            window.load({name: x[mode] for name, x in state.items() if np.ndim(x)}, self.sampling.dt)
 
     def take_over(self, old: Any) -> None:
         """Go on from another design with the same windows and as many peaks. Raises StepError."""

@@ -11,7 +11,6 @@ Where modes tell nothing of one another, the prior has no such matrix: there is 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -30,7 +29,7 @@ from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.joint_states import LeastVariance, StateFilter, real_product, running_means, shared_covariance
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.statespace import disturbance_model
-from wfsobs.signal.stepping import Saved
+from wfsobs.signal.stepping import StateArrays
 from wfsobs.typing import Array
 
 MEANS = running_means((0.0, 3.0, 9.0, 27.0, 81.0, 243.0))
@@ -145,7 +144,7 @@ def _with_means(one: ModeFilter, means: StateFilter) -> StateFilter:
     return StateFilter(block_diag(reduced, means.F), np.concatenate([step.L[:, 0], means.G]))
 
 
-class CoupledEstimator:
+class CoupledEstimator(StateArrays):
     """The filter one frame at a time: the independent filters, the means, and the weights of both.
 
     Attributes
@@ -158,6 +157,7 @@ class CoupledEstimator:
 
     horizon: float | None = None
     needs_command = False
+    state_names = ("kalman", "means", "_is_first")
 
     def __init__(self, model: CoupledModel):
         self.model, self.kalman = model, KalmanEstimator(model.filters)
@@ -166,6 +166,7 @@ class CoupledEstimator:
         self._is_first = True
         self._is_state = np.arange(self.kalman.bank.x.shape[1]) < sizes[:, None]
         self._plans: dict[tuple[float, str], tuple[Array, Array]] = {}
+        self.mark_start()
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame."""
@@ -199,21 +200,7 @@ class CoupledEstimator:
         return Estimates(values, {name: np.broadcast_to(spread, z.shape) for name, spread in sd.items()})
 
     def settle(self) -> None:
-        """Have nothing left to do."""
-
-    def reset(self) -> None:
-        """Set the state back to rest."""
-        self.kalman.reset()
-        self.means[...], self._is_first = 0.0, True
-
-    def save(self) -> Saved:
-        """Return a copy of the state."""
-        return {**self.kalman.save(), "means": self.means.copy(), "is_first": np.array(self._is_first)}
-
-    def load(self, state: Mapping[str, Array]) -> None:
-        """Take over a state."""
-        self.kalman.load(state)
-        self.means[...], self._is_first = state["means"], bool(state["is_first"])
+        """No deferred work."""
 
     def take_over(self, old: Any) -> None:
         """Go on from another design."""

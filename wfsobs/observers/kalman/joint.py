@@ -19,7 +19,7 @@ the frames before it; when the next comes, or after several, the filter of the f
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -35,7 +35,7 @@ from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.present_inputs import Present
-from wfsobs.signal.stepping import Saved
+from wfsobs.signal.stepping import StateArrays
 from wfsobs.typing import Array
 
 INDEPENDENT = "the modes tell nothing of one another: `multirate-multi` estimates each by itself"
@@ -72,7 +72,7 @@ class _Bank:
         return (self.F @ x[..., None])[..., 0] + self.G * y[..., None]
 
 
-class JointEstimator:
+class JointEstimator(StateArrays):
     """The filter one frame at a time.
 
     Attributes
@@ -91,6 +91,7 @@ class JointEstimator:
 
     horizon: float | None = None
     needs_command = False
+    state_names = ("x", "frames", "stand_in_frames", "phase", "present")
 
     def __init__(self, model: AsterismModel):
         self.model = model
@@ -103,8 +104,9 @@ class JointEstimator:
             return getattr(late(n_lost) if n_lost else model, name)(*details)
 
         self._of_model = lru_cache(PLANS)(compute)
-        self.present: Present = ()
-        self.reset()
+        self.present: Present = (True,) * model.n_stars
+        self.phase = FIRST
+        self.mark_start()
 
     def advance_each(self, each: Array, ngs: Array | None) -> None:
         """Take the measurement of every LGS, (n_lgs, n_modes) [um], and the NGS frame that is due; NaN is missing."""
@@ -189,27 +191,7 @@ class JointEstimator:
         return np.concatenate([self.x[:, self._fast.is_state].ravel(), self.frames[self._slow.is_state]])
 
     def settle(self) -> None:
-        """Have nothing left to do."""
-
-    def reset(self) -> None:
-        """Set the state back to rest."""
-        self.x[...], self.frames[...], self.stand_in_frames[...], self.phase = 0.0, 0.0, 0.0, FIRST
-        self.present = (True,) * self.model.n_stars
-
-    def save(self) -> Saved:
-        """Return a copy of the state."""
-        return {
-            "x": self.x.copy(),
-            "frames": self.frames.copy(),
-            "stand_in_frames": self.stand_in_frames.copy(),
-            "phase": np.array(self.phase),
-            "present": np.array(self.present, dtype=float),
-        }
-
-    def load(self, state: Mapping[str, Array]) -> None:
-        """Take over a state."""
-        self.x[...], self.frames[...], self.stand_in_frames[...] = state["x"], state["frames"], state["stand_in_frames"]
-        self.phase, self.present = int(state["phase"]), _as_set(state["present"][:, None] == 0.0)
+        """No deferred work."""
 
     def take_over(self, old: Any) -> None:
         """Go on from another design. Raises StepError where that has other states."""

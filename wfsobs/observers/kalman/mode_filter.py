@@ -49,7 +49,8 @@ class ModeFilter(NamedTuple):
     def innovation_variances(self) -> list[float]:
         """Return the variance of z less its prediction at every step that repeats [um^2]."""
         before = zip(self.posterior[-1:] + self.posterior[:-1], self.cycle[-1:] + self.cycle[:-1], self.cycle, strict=True)
-        return [float(C[0] @ (A @ P @ A.T + Q) @ C[0] + R[0, 0]) for P, (A, _, Q, _), (_, C, _, R) in before]
+        rows = [(C[0] @ A, C[0], P, Q, R[0, 0]) for P, (A, _, Q, _), (_, C, _, R) in before]
+        return [float(ahead @ P[: len(c), : len(c)] @ ahead + c @ Q @ c + r) for ahead, c, P, Q, r in rows]
 
     def steady_sd(self) -> Array:
         """Return `StatedErrors.sd` of every step that repeats, (steps, 4) [um]."""

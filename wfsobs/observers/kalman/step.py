@@ -10,7 +10,7 @@ A measurement that is missing is NaN. Near it the gains are those of the covaria
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,7 +24,7 @@ from wfsobs.record import Measurements
 from wfsobs.signal.filter_covariance import lyapunov
 from wfsobs.signal.gap_gains import GapGains, GapStep, SensorMean
 from wfsobs.signal.statespace import DisturbanceModel
-from wfsobs.signal.stepping import FilterBank, Gain, GainCycle, Saved
+from wfsobs.signal.stepping import FilterBank, Gain, GainCycle, Saved, StateArrays
 from wfsobs.typing import Array
 
 STEADY, OPEN, CLOSED = range(3)
@@ -159,19 +159,21 @@ def plan(rows: Sequence[Array], n: int, sd: Array) -> Plan:
     return Plan(padded, np.zeros(len(rows)), sd)
 
 
-class LinearEstimator:
+class LinearEstimator(StateArrays):
     """What Kalman filters share: a bank of filters in the state after the measurement, and rows of it per prediction."""
 
     horizon: float | None = None
     needs_command = False
+    state_names = ("bank",)
 
     def __init__(self, modes: Sequence[ModeFilter]):
         self.modes = tuple(modes)
         self.bank = GapBank([mode.gains for mode in modes], self._gaps, [mode.mean for mode in modes])
         self._of_equal: dict[bytes, GapGains] = {}
+        self.mark_start()
 
     @property
-    def _state(self) -> Array:
+    def _states(self) -> Array:
         return self.bank.x[:, :, None]
 
     def _gaps(self, mode: int) -> GapGains:
@@ -180,19 +182,7 @@ class LinearEstimator:
         return self._of_equal.setdefault(model, self._of_equal.get(model) or self.modes[mode].gaps())
 
     def settle(self) -> None:
-        """Have nothing left to do."""
-
-    def reset(self) -> None:
-        """Set the state back to rest."""
-        self.bank.reset()
-
-    def save(self) -> Saved:
-        """Return a copy of the state."""
-        return self.bank.save()
-
-    def load(self, state: Mapping[str, Array]) -> None:
-        """Take over a state."""
-        self.bank.load(state)
+        """No deferred work."""
 
     def take_over(self, old: Any) -> None:
         """Go on from another design."""
@@ -238,7 +228,7 @@ class KalmanEstimator(LinearEstimator):
     def predict(self, frames: float, target: str) -> tuple[Array, Array]:
         """Return (mean, sd) of the target."""
         one = self._plans.get((frames, target)) or self._plan(frames, target)
-        np.matmul(one.rows, self._state, out=one.product)
+        np.matmul(one.rows, self._states, out=one.product)
         sd = one.sd[self.bank.last]
         return one.mean, self._near_gap(one, sd, target) if self.bank.is_near else sd
 
@@ -257,7 +247,7 @@ class KalmanEstimator(LinearEstimator):
                 if near.sd is None:
                     near.sd = stated[mode].sd(near.posterior, j)
                 sd[:, mode] = near.sd
-        return (rows @ self._state)[:, :, 0].T, sd
+        return (rows @ self._states)[:, :, 0].T, sd
 
     def run(self, measurements: Measurements, watch: Watch) -> Estimates:
         """Run the filters over a record from rest: all steps at once where no measurement is missing."""
@@ -323,6 +313,7 @@ class FrameEstimator(LinearEstimator):
     """
 
     uses_ngs = True
+    state_names = ("bank", "_since", "_pairs")
 
     def __init__(
         self,
@@ -332,10 +323,10 @@ class FrameEstimator(LinearEstimator):
         spread: Callable[[int, str, int], Array],
         holds: bool,
     ):
+        self._since = -1
+        self._pairs = np.array([one.steady for one in errors])
         super().__init__(modes)
         self.truths, self.errors, self._spread, self._holds = truths, errors, spread, holds
-        self._since = -1
-        self._pairs = [one.steady for one in errors]
         self._frame_plans: dict[tuple[int, float, str], Plan] = {}
         self._unknown = np.full(len(self.modes), np.nan)
 
@@ -345,7 +336,7 @@ class FrameEstimator(LinearEstimator):
             self.bank.step(ngs[:, None])
             self._since = 0
             found = zip(self.errors, self._pairs, self.bank.near, strict=True)
-            self._pairs = [one.steady if near is None else one.after(S, near.update) for one, S, near in found]
+            self._pairs = np.array([one.steady if near is None else one.after(S, near.update) for one, S, near in found])
         elif self._since >= 0:
             self._since += 1
 
@@ -354,7 +345,7 @@ class FrameEstimator(LinearEstimator):
         ahead = 0 if self._holds else whole_frames(frames, "an estimate between NGS frames")
         since = max(self._since, 0)
         one = self._frame_plans.get((since, frames, target)) or self._plan(since, frames, ahead, target)
-        np.matmul(one.rows, self._state, out=one.product)
+        np.matmul(one.rows, self._states, out=one.product)
         if self._since < 0:
             one.mean[...] = np.nan
             return one.mean, self._unknown
@@ -391,33 +382,16 @@ class FrameEstimator(LinearEstimator):
         out.sd[0] = self._sd(out.rows, since + frames, target, [one.steady for one in self.errors])
         return out
 
-    def _sd(self, rows: Array, since: float, target: str, pairs: Sequence[Array]) -> Array:
+    def _sd(self, rows: Array, since: float, target: str, pairs: Iterable[Array]) -> Array:
         found = zip(self.errors, self.truths, self.modes, rows[:, 0], pairs, strict=True)
         return np.array([one.sd(m.outputs[target], row[: len(f.model.A)], since, S) for one, m, f, row, S in found])
-
-    def reset(self) -> None:
-        """Set the state back to before the first NGS frame."""
-        super().reset()
-        self._since = -1
-        self._pairs = [one.steady for one in self.errors]
-
-    def save(self) -> Saved:
-        """Return a copy of the state."""
-        return {**super().save(), "since": np.array(self._since), "pairs": np.array(self._pairs)}
-
-    def load(self, state: Mapping[str, Array]) -> None:
-        """Take over a state."""
-        super().load(state)
-        self._since = int(state["since"])
-        self._pairs = list(np.array(state["pairs"]))
 
     def take_over(self, old: Any) -> None:
         """Go on from another design."""
         super().take_over(old)
         self._since = old._since
-        self._pairs = [
-            now.steady if near is None else was for now, was, near in zip(self.errors, old._pairs, self.bank.near, strict=True)
-        ]
+        found = zip(self.errors, old._pairs, self.bank.near, strict=True)
+        self._pairs = np.array([now.steady if near is None else was for now, was, near in found])
 
 
 class FrameErrors:

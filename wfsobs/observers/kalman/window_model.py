@@ -223,7 +223,7 @@ def identify_window(
                 fit, z = _spectrum_of(part[:, 0], dt, settings.peak_count, settings, last.fit, lost)
                 found = last._replace(fit=fit)
                 return WindowModel(fit, fit, model_filter(fit), missed_rms(fit, z, settings.lowest)), z[:, None]
-            model, whole = _identify_both(np.round(part, DECIMALS), dt, lengths.ratio, settings, last)
+            model, whole = _identify_both(part, dt, lengths.ratio, settings, last)
             return model, whole if lost else v
     except (ValueError, ArithmeticError):
         return None if lost else (found, v)
@@ -231,8 +231,8 @@ def identify_window(
 
 def _identify_both(v: Array, dt: float, ratio: int, settings: Adaptive, last: WindowModel) -> tuple[WindowModel, Array]:
     """Return the model of both sensors, and v without gaps. Raises ValueError and ArithmeticError."""
-    (seen, frames), before = sensor_samples(v, ratio), last.fit
-    lost = np.isnan(seen)
+    seen, frames = (np.round(x, DECIMALS) for x in sensor_samples(v, ratio))
+    before, lost = last.fit, np.isnan(seen)
     z = _fill_gaps(seen, dt, settings, last)
     means = z.reshape(-1, ratio).mean(axis=1)
     difference = np.where(lost.reshape(-1, ratio).all(axis=1), np.nan, means - frames)
@@ -263,9 +263,11 @@ def _fill_gaps(z: Array, dt: float, settings: Adaptive, last: WindowModel) -> Ar
     return samples.fill(z - level, S) + level
 
 
-def _spectrum_of(x: Array, dt: float, most: int, settings: Adaptive, last: Spectrum | None, lost: bool) -> tuple[Spectrum, Array]:
-    """Return the spectrum of samples with at most so many lines, and the samples without gaps; lost : whether there are some."""
-    if lost:
+def _spectrum_of(
+    x: Array, dt: float, most: int, settings: Adaptive, last: Spectrum | None, has_gaps: bool
+) -> tuple[Spectrum, Array]:
+    """Return the spectrum of samples with at most so many lines, and the samples without gaps, if it has some."""
+    if has_gaps:
         return quick_spectrum_of_samples(x, dt, most, settings.lowest, last)
     return quick_spectrum(x, dt, most, settings.lowest, last), x
 
