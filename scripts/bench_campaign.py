@@ -33,8 +33,7 @@ from wfsobs.campaign.plan import Campaign, parse_plan
 from wfsobs.campaign.pools import DaskCluster, Processes, Workers
 from wfsobs.campaign.report import write_report
 from wfsobs.campaign.run import AHEAD
-from wfsobs.campaign.state import open_folder
-from wfsobs.campaign.store import write_batch
+from wfsobs.campaign.store import open_folder, write_batch
 from wfsobs.campaign.work import Batch, run_rows, wfsobs_batch
 
 TINY = """

@@ -19,8 +19,7 @@ from wfsobs.evaluation.scores import BOUND, BOUND_BOTH
 from wfsobs.identification import identify
 from wfsobs.observers import OBSERVERS
 from wfsobs.record import Record
-from wfsobs.scenario.groups.events import Event
-from wfsobs.scenario.timeline import phase_turns, shift, strength, turbulence_time
+from wfsobs.scenario.groups.events import Event, phase_turns, shift, strength, turbulence_time
 from wfsobs.signal.ar2 import Ar2, turbulence_corner
 from wfsobs.signal.spectrum import bin_frequencies, random_phase_signal
 from wfsobs.simulation.disturbance import make_disturbance

@@ -9,8 +9,7 @@ import pytest
 from scipy.signal import welch
 from scipy.special import j0, jv
 
-from wfsobs.atmosphere.frequency_grid import FrequencyGrid, fft_length
-from wfsobs.atmosphere.frozen_flow import View, frozen_flow, waves
+from wfsobs.atmosphere.frozen_flow import FrequencyGrid, View, fft_length, frozen_flow, waves
 from wfsobs.atmosphere.plane_waves import Footprint
 from wfsobs.atmosphere.von_karman import TurbulenceLayer, von_karman_density
 from wfsobs.sensors.zernike import ZernikeProjection, bessel_ratio, noll, noll_covariance

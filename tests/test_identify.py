@@ -13,10 +13,8 @@ from click.testing import CliRunner
 from scipy.stats import binom, gamma, kstest
 
 from wfsobs.cli import main
-from wfsobs.identification import Identification, identify, misfit
-from wfsobs.identification.continuum import is_continuum
-from wfsobs.identification.misfit import margin
-from wfsobs.identification.one_mode import OneMode
+from wfsobs.identification import Identification, identify
+from wfsobs.identification.one_mode import MEAN, VARIANCE, WIDTH, OneMode, is_continuum, margin
 from wfsobs.identification.process import IdentifiedProcess, Number, mean, merge_peaks
 from wfsobs.identification.process import with_reliable_std as known_number
 from wfsobs.identification.report import (
@@ -368,9 +366,9 @@ def test_a_right_spectrum_has_no_margin_and_one_with_lobes_that_of_its_lobes() -
     first = np.exp(0.8 * np.cos(2 * pi * (f - 5.0) / 6.0)) ** (f < 12.0)  # 5 Hz above the smooth curve, 2 and 8 Hz below it
     top = np.array([margin(rng.exponential(first)) for _ in range(40)])[:, (f > 4.5) & (f < 5.5)]
     assert np.exp(0.4) < np.median(top) < np.exp(1.2)  # there are four dips of 27 bins to tell it from
-    dips = gamma(misfit.WIDTH, scale=1.0 / misfit.WIDTH)
-    worth, worth_squared = (dips.expect(lambda r: (misfit.WIDTH * (r - 1.0 - np.log(r))) ** k, ub=1.0) for k in (1, 2))  # noqa: B023
-    assert (worth, worth_squared - worth**2) == pytest.approx((misfit.MEAN, misfit.VARIANCE), abs=1e-4)  # four digits are given
+    dips = gamma(WIDTH, scale=1.0 / WIDTH)
+    worth, worth_squared = (dips.expect(lambda r: (WIDTH * (r - 1.0 - np.log(r))) ** k, ub=1.0) for k in (1, 2))  # noqa: B023
+    assert (worth, worth_squared - worth**2) == pytest.approx((MEAN, VARIANCE), abs=1e-4)  # four digits are given
 
 
 @pytest.mark.parametrize("name", ["ut4", "galacsi-nfm"])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import wfsobs
-from wfsobs.peers.controller import ControllerError, LoopController
+from wfsobs.peers.wfsobs_filter import ControllerError, LoopController
 from wfsobs.record import Sampling
 from wfsobs.scenario.configfile import save_scenario
 

@@ -11,16 +11,14 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import j1, jv
 
-from wfsobs.atmosphere.frequency_grid import FrequencyGrid
-from wfsobs.atmosphere.frozen_flow import View, frozen_flow, waves
+from wfsobs.atmosphere.frozen_flow import FrequencyGrid, View, frozen_flow, waves
 from wfsobs.atmosphere.plane_waves import Footprint, Wave
 from wfsobs.atmosphere.von_karman import TurbulenceLayer, von_karman_density
 from wfsobs.sensors import zernike
 from wfsobs.sensors.aliasing import Aliasing
 from wfsobs.sensors.lenslets import Lenslets
-from wfsobs.sensors.nufft import TrigonometricSum, lagrange_weights
 from wfsobs.sensors.reconstructor import interaction, polynomials, reconstructor
-from wfsobs.sensors.shack_hartmann import ShackHartmann
+from wfsobs.sensors.shack_hartmann import ShackHartmann, TrigonometricSum, lagrange_weights
 from wfsobs.sensors.spots import ARCSEC, SpotModel
 from wfsobs.sensors.zernike import ZernikeProjection, up_to_order
 

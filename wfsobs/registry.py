@@ -15,8 +15,7 @@ from typing import Any, Protocol, TypeVar
 
 import param
 
-from wfsobs.settings.group import Group
-from wfsobs.settings.sections import Section
+from wfsobs.settings.group import Group, Section
 
 log = logging.getLogger(__name__)
 

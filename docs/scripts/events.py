@@ -23,7 +23,7 @@ from wfsobs.priors_from.scenario import arguments, prior_of
 from wfsobs.record import hold_last
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
-from wfsobs.telemetry.bridged import without_bridged
+from wfsobs.telemetry.intake import without_bridged
 from wfsobs.typing import Array
 
 CASES = {

@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 
 from wfsobs import PRESETS, Scenario, observe, simulate
 from wfsobs.tuning import TuningResult, tune
-from wfsobs.tuning.likelihood import likelihood
+from wfsobs.tuning.trials import likelihood
 
 SEEDS, FEW = range(1, 11), range(1, 5)
 USUAL = ("paper", "strong-turbulence", "ut4")

@@ -25,8 +25,7 @@ from wfsobs.app.service import Session
 from wfsobs.campaign.compare import compare
 from wfsobs.campaign.follow import CampaignFolder
 from wfsobs.campaign.plan import Campaign, parse_plan
-from wfsobs.campaign.state import open_folder
-from wfsobs.campaign.store import batch_files, read_results, write_batch
+from wfsobs.campaign.store import batch_files, open_folder, read_results, write_batch
 from wfsobs.campaign.work import run_rows
 from wfsobs.scenario import Scenario
 

@@ -28,14 +28,13 @@ from wfsobs.app.store import Store
 from wfsobs.app.style import look
 from wfsobs.app.views.plots import new_figure
 from wfsobs.live.board import NEXT
-from wfsobs.live.finding import Finding, PeakFinding
+from wfsobs.live.finding import Finding, MinuteSpectrum, PeakFinding
 from wfsobs.live.loop import LiveLoop, LiveOrder
 from wfsobs.live.paced import ALARM, LiveEvent
 from wfsobs.live.peaks import Change
 from wfsobs.live.recording import Recorder
 from wfsobs.live.ring import Ring
 from wfsobs.live.simulated import SimulatedLoop
-from wfsobs.live.spectrum_of_minute import MinuteSpectrum
 from wfsobs.live.view import SHARED, SharedView
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario

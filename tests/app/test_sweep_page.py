@@ -23,8 +23,7 @@ from wfsobs.app.seeds import SeedScores
 from wfsobs.app.service import Service
 from wfsobs.app.sources import SimulatedRecord
 from wfsobs.app.style import look
-from wfsobs.campaign.sweep import parse_axis, plan_sweep
-from wfsobs.campaign.sweep_results import SweepResults, run_sweep
+from wfsobs.campaign.sweep import SweepResults, parse_axis, plan_sweep, run_sweep
 from wfsobs.evaluation.scores import Score
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.idle import idle_settings, why_idle_at

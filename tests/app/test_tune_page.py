@@ -25,7 +25,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings
 from wfsobs.simulation.loop import simulate
 from wfsobs.tuning import Evaluation, TuningResult, tune
-from wfsobs.tuning.judge import Errors
+from wfsobs.tuning.trials import Errors
 
 
 @pytest.fixture

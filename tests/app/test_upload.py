@@ -22,9 +22,8 @@ from wfsobs.pipeline import observe
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
 from wfsobs.simulation.loop import simulate
-from wfsobs.telemetry.examples import TEMPLATE
 from wfsobs.telemetry.formats import format_of
-from wfsobs.telemetry.records import read_record, record_arrays
+from wfsobs.telemetry.records import TEMPLATE, read_record, record_arrays
 
 
 def file_of(short: Scenario, ending: str = ".csv", **changes: Any) -> bytes:

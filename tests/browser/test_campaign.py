@@ -9,8 +9,7 @@ from typing import Any
 from playwright.sync_api import expect
 
 from wfsobs.campaign.plan import parse_plan
-from wfsobs.campaign.state import open_folder
-from wfsobs.campaign.store import write_batch
+from wfsobs.campaign.store import open_folder, write_batch
 from wfsobs.campaign.work import run_rows
 
 SHORT = {"run.duration": 1.0, "run.warm_up": 0.2, "gpr_online.training_size": 40, "gpr_offline.training_size": 40}

@@ -4,8 +4,7 @@ import os
 import time
 
 from wfsobs.campaign.plan import parse_plan
-from wfsobs.campaign.state import LEFTOVER, open_folder, remove_leftovers
-from wfsobs.campaign.store import ROWS, batch_files, write_batch
+from wfsobs.campaign.store import LEFTOVER, ROWS, batch_files, open_folder, remove_leftovers, write_batch
 from wfsobs.files import write_whole
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from wfsobs.campaign.pace import LEAST, UNKNOWN, WrittenBatch, measure_pace
+from wfsobs.campaign.follow import LEAST, UNKNOWN, WrittenBatch, measure_pace
 
 DAY = 86400.0
 UNSTARTED = 9 * DAY

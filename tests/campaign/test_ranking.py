@@ -8,10 +8,8 @@ import pytest
 
 from wfsobs.campaign.compare import Comparison, compare
 from wfsobs.campaign.plan import parse_plan
-from wfsobs.campaign.ranking import critical_difference, first_places, rank
-from wfsobs.campaign.report import write_report
-from wfsobs.campaign.state import open_folder
-from wfsobs.campaign.store import read_results, schema, write_batch
+from wfsobs.campaign.report import critical_difference, first_places, rank, write_report
+from wfsobs.campaign.store import open_folder, read_results, schema, write_batch
 
 NAMES = ["kf-lgs", "kf-multi", "multirate", "persistence"]
 

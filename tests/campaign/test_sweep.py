@@ -12,8 +12,7 @@ from click.testing import CliRunner
 from scipy.stats import t as student
 
 import wfsobs
-from wfsobs.campaign.sweep import EACH_RUN, EACH_STEP, MOST_CELLS, parse_axis, plan_sweep
-from wfsobs.campaign.sweep_results import SweepResults, run_sweep
+from wfsobs.campaign.sweep import EACH_RUN, EACH_STEP, MOST_CELLS, SweepResults, parse_axis, plan_sweep, run_sweep
 from wfsobs.cli import main
 from wfsobs.evaluation.rows import row_label
 from wfsobs.evaluation.scores import BOUND, Score

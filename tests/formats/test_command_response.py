@@ -17,10 +17,9 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.command_response import DECIDED, command_response, saturation_lines
-from wfsobs.telemetry.contradiction import contradiction
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.preview import Preview, preview
-from wfsobs.telemetry.records import load, save_record
+from wfsobs.telemetry.records import contradiction, load, save_record
 from wfsobs.typing import Array
 
 GAIN, LEAK, NOISE = 0.4, 0.995, 0.05

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 from wfsobs.live.board import Board
 from wfsobs.live.crew import Site, trace_width
-from wfsobs.live.observing import made_crew
 from wfsobs.live.paced import LiveEvent
+from wfsobs.live.processes import made_crew
 from wfsobs.live.recording import Recorder
 from wfsobs.live.ring import Ring
 from wfsobs.live.rows import Rows

@@ -10,9 +10,8 @@ from scipy.signal import lfilter
 
 import wfsobs
 from wfsobs.latencies import EDGES, Latencies
-from wfsobs.live.blocks import endless_blocks
 from wfsobs.live.ring import CAPACITY, Ring
-from wfsobs.live.simulated import Integrator
+from wfsobs.live.simulated import Integrator, endless_blocks
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario.presets import paper
 from wfsobs.telemetry.records import save_record

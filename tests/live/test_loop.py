@@ -18,16 +18,15 @@ import pytest
 
 import wfsobs
 from wfsobs.live import simulated
-from wfsobs.live.blocks import Block
 from wfsobs.live.board import Board
 from wfsobs.live.crew import Site, trace_width
 from wfsobs.live.delivery import Delivery, merged_rows
 from wfsobs.live.loop import TICK, LiveLoop, _keep
-from wfsobs.live.observing import POLL, REST, Pause, made_crew
 from wfsobs.live.paced import Pace
+from wfsobs.live.processes import POLL, REST, Pause, made_crew
 from wfsobs.live.ring import LiveFrame, Ring
 from wfsobs.live.rows import Rows
-from wfsobs.live.simulated import FADE, GLANCE, SimulatedFrames, SimulatedLoop
+from wfsobs.live.simulated import FADE, GLANCE, Block, SimulatedFrames, SimulatedLoop
 from wfsobs.live.view import read_view
 from wfsobs.scenario.presets import paper
 from wfsobs.settings.group import SettingError
@@ -351,8 +350,8 @@ def test_a_frame_is_taken_once_all_crews_have_it_and_late_by_the_last():
 
 def test_the_next_look_at_the_ring_is_when_a_frame_is_due(monkeypatch):
     now, slept = 100.0, []
-    monkeypatch.setattr("wfsobs.live.observing.monotonic", lambda: now)
-    monkeypatch.setattr("wfsobs.live.observing.sleep", slept.append)
+    monkeypatch.setattr("wfsobs.live.processes.monotonic", lambda: now)
+    monkeypatch.setattr("wfsobs.live.processes.sleep", slept.append)
     pause = Pause()
     pause.note(99.9990)
     pause.note(99.9998)

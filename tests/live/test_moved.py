@@ -5,8 +5,8 @@ import pytest
 
 from tests.live.in_process import keep_lines
 from wfsobs import PRESETS, simulate
-from wfsobs.live.alarms import Alarms
 from wfsobs.live.finding import identify_frames
+from wfsobs.live.loop import Alarms
 from wfsobs.live.recording import open_loop_record
 from wfsobs.live.ring import LiveFrame
 

@@ -23,12 +23,9 @@ from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.filter_covariance import RiccatiError
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.statespace import disturbance_model
-from wfsobs.spectral.background import WORTH
-from wfsobs.spectral.densities import densities
-from wfsobs.spectral.model import Spectrum
+from wfsobs.spectral.model import BACKGROUND_WORTH, Spectrum, densities
 from wfsobs.spectral.periodogram import periodogram_frequencies
-from wfsobs.spectral.quick import quick_spectrum
-from wfsobs.spectral.quick_fit import WindowFit
+from wfsobs.spectral.quick import WindowFit, quick_spectrum
 
 DT, NOISE = 1e-3, 0.014
 TURBULENCE = Ar2(7.0, 0.9, 0.5, DT)
@@ -144,7 +141,7 @@ def test_slopes_of_a_fit_with_a_background(turbulence: Ar2 | Ar3) -> None:
 
 @pytest.mark.parametrize("peaks", [(), (PEAK,)])
 def test_a_coloured_background_is_found(peaks: tuple[Ar2, ...]) -> None:
-    """The loss of log-likelihood as above; a fit without a background loses more than WORTH of it."""
+    """The loss of log-likelihood as above; a fit without a background loses more than BACKGROUND_WORTH of it."""
     truth, f, lost, poor = Spectrum(NOISE, DT, TURBULENCE, peaks, HISS), periodogram_frequencies(4000, DT), [], []
     for seed in range(8):
         rng = np.random.default_rng(seed)
@@ -155,7 +152,7 @@ def test_a_coloured_background_is_found(peaks: tuple[Ar2, ...]) -> None:
             to.append(np.sum(ratio - 1.0 - np.log(ratio)))
     least = 0.5 * len(truth.vector)
     assert 0.5 * least < np.median(lost) < least + 3 * 3.0 * len(peaks) + 2.0
-    assert np.median(poor) > least + WORTH
+    assert np.median(poor) > least + BACKGROUND_WORTH
 
 
 @pytest.mark.parametrize("hiss", [None, HISS])

@@ -30,8 +30,8 @@ from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.smoother import smoother
 from wfsobs.signal.statespace import disturbance_model
-from wfsobs.spectral.missed import expected_above_zero, missed_variance
 from wfsobs.spectral.model import Spectrum
+from wfsobs.spectral.search import expected_above_zero, missed_variance
 
 DT = 1e-3
 TURBULENCE = Ar2(2.0 * np.pi * 3.0, 0.7, 0.4, DT)

@@ -20,8 +20,7 @@ from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.statespace import sample_ar3
 from wfsobs.spectral.model import Spectrum
-from wfsobs.spectral.quick import follow_spectrum, quick_spectrum
-from wfsobs.spectral.quick_fit import WindowFit
+from wfsobs.spectral.quick import WindowFit, follow_spectrum, quick_spectrum
 
 DT, RATIO = 1e-3, 5
 TURBULENCE, ERROR = Ar2(7.0, 0.9, 0.5, DT), Ar2(9.0, 0.9, 0.05, DT)

@@ -24,7 +24,7 @@ from wfsobs.prior import LgsError, Noise, Prior
 from wfsobs.priors_from.scenario import observer_settings, prior_of
 from wfsobs.record import Measurements
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.tuning.likelihood import log_marginal_likelihood
+from wfsobs.tuning.trials import log_marginal_likelihood
 from wfsobs.typing import Array
 
 RECORDS, STEPS, SETTLED, RATIO = 200, 3000, 1000, 5

@@ -20,7 +20,7 @@ from specula.processing_objects.ssr_filter import SsrFilter  # noqa: E402
 
 import wfsobs  # noqa: E402
 from wfsobs.handover.write import write_design  # noqa: E402
-from wfsobs.peers.controller import ControllerError  # noqa: E402
+from wfsobs.peers.wfsobs_filter import ControllerError  # noqa: E402
 from wfsobs.scenario.configfile import save_scenario  # noqa: E402
 
 FRAMES = 400

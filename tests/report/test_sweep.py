@@ -13,8 +13,7 @@ from scipy import stats
 from wfsobs.app.pages.sweep_views import report_part
 from wfsobs.app.report.data import Report, pack, state_of, unpack
 from wfsobs.app.report.page import page
-from wfsobs.campaign.sweep import parse_axis, plan_sweep
-from wfsobs.campaign.sweep_results import SweepResults
+from wfsobs.campaign.sweep import SweepResults, parse_axis, plan_sweep
 from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.scores import Score
 from wfsobs.scenario import Scenario

@@ -14,7 +14,7 @@ from wfsobs.observers.gpr.offline import training_targets
 from wfsobs.priors_from.scenario import bands_of
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
-from wfsobs.tuning.likelihood import likelihood, log_marginal_likelihood
+from wfsobs.tuning.trials import likelihood, log_marginal_likelihood
 
 
 def windows(signals: np.ndarray, depth: int, first: int, m: int) -> np.ndarray:

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.tuning.search import NoEvaluationLeft, minimise
 from wfsobs.tuning.space import numbers, space
+from wfsobs.tuning.trials import NoEvaluationLeft, minimise
 
 BASES = {name: PRESETS[name]() for name in ("paper", "ut4", "strong-turbulence")}
 

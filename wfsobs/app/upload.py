@@ -31,9 +31,9 @@ from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.settings.errors import SettingError
 from wfsobs.settings.parameters import hint
 from wfsobs.telemetry.columns import ROLES
-from wfsobs.telemetry.examples import TEMPLATE, sample_csv
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.preview import ColumnsPreview, Preview, SpectrumPreview, preview_any, safe_name
+from wfsobs.telemetry.records import TEMPLATE, sample_csv
 from wfsobs.units import UNITS
 
 BACK, STAY = "Back to the simulation", "Stay with the simulation"

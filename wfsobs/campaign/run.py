@@ -12,8 +12,7 @@ import numpy as np
 
 from wfsobs.campaign.plan import Campaign, Cell, wanted_seeds
 from wfsobs.campaign.pools import Workers
-from wfsobs.campaign.state import finished_runs, open_folder, remove_leftovers
-from wfsobs.campaign.store import BatchIndex
+from wfsobs.campaign.store import BatchIndex, finished_runs, open_folder, remove_leftovers
 from wfsobs.campaign.work import Batch, Summary, wfsobs_batch
 from wfsobs.cost import run_seconds
 from wfsobs.settings.errors import SettingError

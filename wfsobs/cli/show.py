@@ -5,23 +5,159 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from math import sqrt
+from statistics import median
 
 import click
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from wfsobs.cli.budget_table import budget_table
 from wfsobs.cli.recovery_tables import OverTime
-from wfsobs.cli.tables import score_table
-from wfsobs.evaluation.budget import Budget, budget_row, error_budget
-from wfsobs.evaluation.evidence import Evidence
+from wfsobs.evaluation.budget import TERMS, Budget, budget_row, error_budget
+from wfsobs.evaluation.evidence import Evidence, seeds_interval
 from wfsobs.evaluation.result import Result
-from wfsobs.evaluation.rows import TIME, Row
-from wfsobs.evaluation.scores import PREDICTION
+from wfsobs.evaluation.rows import (
+    NOT_OBSERVERS,
+    TIME,
+    Row,
+    above_bound,
+    interval_text,
+    is_non_causal,
+    own_bound,
+    own_interval,
+    row_label,
+    scored_interval,
+)
+from wfsobs.evaluation.scores import PREDICTION, RESIDUAL, SCORED
 from wfsobs.evaluation.verdict import explain_harm, verdict
 from wfsobs.observers.base import TARGETS
 from wfsobs.progress import Watch
+
+
+def score_table(rows: Sequence[Row]) -> Table:
+    """Return the RMS table, of errors or, without truth, of predictions.
+
+    Errors are means over the seeds, with their intervals at 95 % confidence, all else medians. The bound of the LGS has the
+    interval of an optimal observer's error in 95 % of records, and observers may state their standard deviation. The caption
+    gives the interval of the scored samples.
+    """
+    several = len({r["seed"] for r in rows}) > 1
+    unknown = any(r["target"] == RESIDUAL for r in rows)
+    title, base = ("One-step prediction error of z, and residual,", "z") if unknown else ("RMS error", "truth")
+    table = Table(title=f"{title} after warm-up" + (", mean over seeds" if several else ""), caption=_caption(rows))
+    for name in ("Target", "Mode", "Observer", "Prior knowledge"):
+        table.add_column(name, no_wrap=True)
+    bounds = {_group(r): r["rms_um"] for r in rows if r["observer"] in NOT_OBSERVERS}
+    bounded = ("to limit",) if any(own_bound(r["observer"]) in {name for *_, name in bounds} for r in rows) else ()
+    stated = ("sigma, nm",) if any(r["sd_um"] for r in rows) else ()
+    for name in ("error, nm", "95 %, nm", *bounded, *stated, f"{base}, nm", f"error / {base}", "lag, ms", "us / step"):
+        table.add_column(name, justify="right", no_wrap=True)
+    last = None
+    for target, mode, observer in sorted({_group(r) for r in rows}, key=_order(rows)):
+        same = [r for r in rows if _group(r) == (target, mode, observer)]
+        error, interval = _mean_and_interval(same)
+        above = above_bound(error, interval, bounds.get((target, mode, own_bound(observer) or "")))
+        if last not in (None, (target, mode)):
+            table.add_section()
+        last = (target, mode)
+        table.add_row(
+            target,
+            mode,
+            row_label(observer) + (" (looks ahead)" if is_non_causal(observer) else "") + _own(same),
+            same[0]["needs"],
+            f"{error * 1e3:.2f}",
+            interval_text(interval, 1e3),
+            *(("-" if above is None else f"{100.0 * above:+.0f} %" if above else "at",) if bounded else ()),
+            *((_number(same, "sd_um", 1e3, 2),) if stated else ()),
+            f"{median(r['truth_rms_um'] for r in same) * 1e3:.2f}",
+            _number(same, "normalised_rms", 1.0, 3),
+            _number(same, "lag_s", 1e3, 2),
+            _number(same, TIME, 1.0, 2),
+        )
+    return table
+
+
+def _group(row: Row) -> tuple[str, str, str]:
+    return row["target"], row["mode"], row["observer"]
+
+
+def _mean_and_interval(same: Sequence[Row]) -> tuple[float, Sequence[float] | None]:
+    """Return the mean error over the seeds and its interval [um]; of one seed, or of a bound, those of the row."""
+    errors = np.array([r["rms_um"] for r in same])
+    alone = errors.size == 1 or same[0]["observer"] in NOT_OBSERVERS
+    return float(errors.mean()), same[0]["interval_um"] if alone else seeds_interval(errors)
+
+
+def _own(same: Sequence[Row]) -> str:
+    """Return the remark on an observer that stands apart, for some seeds or all."""
+    return f" ({own_interval(own[0])})" if (own := [r for r in same if r["apart"]]) else ""
+
+
+def _caption(rows: Sequence[Row]) -> str:
+    """Return the interval of the scored samples, target by target where they differ."""
+    found = {
+        target: scored_interval(r for r in rows if r["target"] == target) for target in dict.fromkeys(r["target"] for r in rows)
+    }
+    spans = {span for span in found.values() if span}
+    if len(spans) > 1:
+        return "Scored: " + "; ".join(f"{target} {span}" for target, span in found.items() if span)
+    return f"Scored: {spans.pop()}" if spans else ""
+
+
+def _number(same: Sequence[Row], key: str, scale: float, digits: int) -> str:
+    values = [r[key] * scale for r in same if r[key] is not None]
+    return f"{median(values):.{digits}f}" if values else "-"
+
+
+def _order(rows: Sequence[Row]):
+    """Turbulence, vibration, then both together; modes as they come, best observer first, those that stand apart last."""
+    modes = list(dict.fromkeys(r["mode"] for r in rows))
+    targets = (*SCORED, PREDICTION, RESIDUAL)
+
+    def key(group: tuple[str, str, str]) -> tuple:
+        same = [r for r in rows if _group(r) == group]
+        return targets.index(group[0]), modes.index(group[1]), any(r["apart"] for r in same), _mean_and_interval(same)[0]
+
+    return key
+
+
+def budget_table(budgets: Sequence[Budget]) -> Table:
+    """Return the table of terms, their shares of the total, and the bound; the smallest error of a target and mode first."""
+    out = Table(
+        title="Error budget: parts of the mean square error, nm^2, and their shares", caption=_caption_of_budget_table(budgets)
+    )
+    for name in ("Target", "Mode", "Observer"):
+        out.add_column(name, no_wrap=True)
+    for name in ("error, nm", "nm^2", *TERMS.values(), "limit, nm^2"):
+        out.add_column(name, justify="right")
+    last = None
+    for it in sorted((b for b in budgets if b.terms), key=lambda b: (SCORED.index(b.target), _mode_order(budgets, b), b.total)):
+        if last not in (None, (it.target, it.mode)):
+            out.add_section()
+        last = (it.target, it.mode)
+        cells = (
+            f"{_number_of_budget_table(it.terms[name] * 1e6)} {round(100.0 * it.terms[name] / it.total):4d} %" for name in TERMS
+        )
+        bound = "-" if it.bound is None else f"{it.bound * 1e6:.1f}"
+        out.add_row(*last, row_label(it.observer), f"{sqrt(it.total) * 1e3:.2f}", f"{it.total * 1e6:.1f}", *cells, bound)
+    return out
+
+
+def _mode_order(budgets: Sequence[Budget], budget: Budget) -> int:
+    return list(dict.fromkeys(b.mode for b in budgets)).index(budget.mode)
+
+
+def _caption_of_budget_table(budgets: Sequence[Budget]) -> str:
+    """Return which observers have no budget, and why."""
+    missing = dict.fromkeys((row_label(b.observer), b.reason) for b in budgets if b.reason)
+    return "; ".join(f"{label}: none, {reason}" for label, reason in missing)
+
+
+def _number_of_budget_table(x: float) -> str:
+    """One digit, without the sign of what rounds to zero."""
+    return f"{round(x, 1) + 0.0:.1f}"
 
 
 def show(all_rows: list[Row], as_json: bool) -> None:

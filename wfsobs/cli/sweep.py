@@ -10,8 +10,7 @@ from typing import Any
 import click
 from rich.table import Table
 
-from wfsobs.campaign.sweep import MOST_SEEDS, parse_axis, plan_sweep
-from wfsobs.campaign.sweep_results import SweepResults, run_sweep
+from wfsobs.campaign.sweep import MOST_SEEDS, SweepResults, parse_axis, plan_sweep, run_sweep
 from wfsobs.cli.options import observer_option, scenario_options
 from wfsobs.cli.show import progress_bar, show_table
 from wfsobs.evaluation.evidence import FEWEST

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 
 import click
+from rich.table import Table
 
-from wfsobs.cli.identification_table import identification_table
 from wfsobs.cli.options import (
     declare_format,
     load_declared,
@@ -22,6 +22,9 @@ from wfsobs.files import check_writable, write_whole
 from wfsobs.identification import identify as identify_record
 from wfsobs.identification import report as identified
 from wfsobs.identification.identification import LEVEL
+from wfsobs.identification.process import Number
+from wfsobs.identification.report import format_number, mode_rows
+from wfsobs.identification.result import Identification
 from wfsobs.pipeline import as_stated
 from wfsobs.pipeline import observe as observe_record
 from wfsobs.priors_from.identification import told_by
@@ -29,6 +32,26 @@ from wfsobs.progress import Watch
 from wfsobs.scenario import configfile
 from wfsobs.spectral.search import LOWEST
 from wfsobs.telemetry.records import save_arrays
+
+
+def identification_table(result: Identification) -> Table:
+    """Noise, turbulence and peaks of every mode."""
+    title = f"Identified from {result.duration:.1f} s, with standard deviations"
+    out = Table(title=title, caption="rms of lines and resonances: within this record")
+    for name in ("Mode", "What"):
+        out.add_column(name, no_wrap=True)
+    for name in ("frequency, Hz", "damping", "rms, nm"):
+        out.add_column(name, justify="right", no_wrap=True)
+    for m in result.modes:
+        out.add_section()
+        for what, frequency, damping, rms in mode_rows(m):
+            numbers = (frequency, damping, None if rms is None else _nm(rms))
+            out.add_row(m.name, what, *("" if n is None else format_number(n) for n in numbers))
+    return out
+
+
+def _nm(n: Number) -> Number:
+    return Number(n.value * 1e3, n.std * 1e3)
 
 
 @click.command()

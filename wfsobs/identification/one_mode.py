@@ -1,31 +1,219 @@
-"""The growing model of one mode: a spectrum, and the undamped lines that have been subtracted."""
+"""The growing model of one mode: a spectrum, and the undamped lines that have been subtracted.
+
+Margin for the shape of a smooth spectrum: it may be as much too low as it is too high nearby.
+
+Frozen flow has lobes, a few hertz apart and by tens of percent above and below any smooth curve, which are no peaks. Peaks only
+rise: where a fitted spectrum is too high, its shape is wrong, and it is as likely to be too low by as much within an octave.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import pi
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import gamma
 
-from wfsobs.identification.misfit import margin
-from wfsobs.identification.order import choose_order, with_background, without_vibration
-from wfsobs.identification.resonances import (
-    NEIGHBOURS,
-    add_resonance,
-    is_peak,
-    misfit_of,
-    reach_of,
-    split_resonance,
-    strongest_bin,
-    window_about,
-)
 from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3
 from wfsobs.spectral.lines import Sinusoid, nearest_line
 from wfsobs.spectral.missing import MissingSamples
-from wfsobs.spectral.model import RMS, Spectrum
+from wfsobs.spectral.model import BACKGROUND_REACHES, BACKGROUND_WORTH, RMS, Spectrum, with_first_guess
 from wfsobs.spectral.periodogram import Cells, inflation, periodogram, periodogram_frequencies
 from wfsobs.spectral.search import LOWEST, PAD, Candidate
-from wfsobs.spectral.whittle import first_guess, fit_spectrum, standard_deviations
+from wfsobs.spectral.whittle import first_guess, fit_spectrum, spectrum_negative_log_likelihood, standard_deviations
 from wfsobs.typing import Array
+
+ORDER_WORTH = 6.0
+"""Minimum gain of log-likelihood by the third corner: noise gains as much with a probability of 0.05 % (chi squared of 12)."""
+STARTS = (1.5, 6.0)
+"""Third corners, over the first two, at which a fit starts."""
+APART = 5.0
+"""Minimum corner of a background over that of turbulence."""
+
+
+def choose_order(spectrum: Spectrum, cells: Cells, third: bool = False) -> Spectrum:
+    """Return a fitted spectrum with turbulence of second order, or of third where that is worth it or asked for."""
+    t = spectrum.turbulence
+    if t is None or (third and isinstance(t, Ar3)):
+        return spectrum
+    if isinstance(t, Ar3):
+        lower, higher = _smooth(replace(spectrum, turbulence=Ar2(t.omega, t.damping, t.rms, t.dt)), cells), spectrum
+    else:
+        starts = [replace(spectrum, turbulence=Ar3(t.omega, t.damping, k * t.omega, t.rms, t.dt)) for k in STARTS]
+        lower, higher = (
+            spectrum,
+            min((_smooth(s, cells) for s in starts), key=lambda s: spectrum_negative_log_likelihood(s, cells)),
+        )
+    gain = spectrum_negative_log_likelihood(lower, cells) - spectrum_negative_log_likelihood(higher, cells)
+    return higher if third or gain > ORDER_WORTH else lower
+
+
+def with_background(spectrum: Spectrum, cells: Cells) -> Spectrum:
+    """Return a fitted spectrum with a background if that is worth it, else without."""
+    if spectrum.background:
+        without, wide = _smooth(replace(spectrum, background=None), cells), spectrum
+    else:
+        shapes = [_smooth(with_first_guess(spectrum, reach), cells) for reach in BACKGROUND_REACHES]
+        without, wide = spectrum, min(shapes, key=lambda s: spectrum_negative_log_likelihood(s, cells))
+    gain = spectrum_negative_log_likelihood(without, cells) - spectrum_negative_log_likelihood(wide, cells)
+    return wide if gain > BACKGROUND_WORTH and _beyond_turbulence(wide) else without
+
+
+def without_vibration(spectrum: Spectrum, cells: Cells, lowest: float) -> Spectrum:
+    """Return a fitted spectrum whose turbulence is none of the vibration.
+
+    A fit may end on a peak, above all where there is no turbulence. The peak is a resonance; turbulence is fitted beside it, and
+    there is none where that is not worth it. lowest : minimum frequency of peaks [Hz]
+    """
+    t = spectrum.turbulence
+    if t is None or is_continuum(spectrum, t, lowest):
+        return spectrum
+    rest = replace(spectrum, turbulence=None)
+    if is_peak(peak := Ar2(t.omega, t.damping, t.rms, t.dt), cells.bin_width):
+        rest = replace(rest, resonances=(*rest.resonances, peak))
+    rest = fit_spectrum(rest, cells)
+    starts = [Ar2(2.0 * pi * corner, 0.7, t.rms, t.dt) for corner in (3.0 * cells.bin_width, 0.5 * lowest)]
+    shapes = [_smooth(replace(rest, turbulence=one), cells) for one in starts]
+    best = min(shapes, key=lambda s: spectrum_negative_log_likelihood(s, cells))
+    gain = spectrum_negative_log_likelihood(rest, cells) - spectrum_negative_log_likelihood(best, cells)
+    slow = best.turbulence is not None and is_continuum(best, best.turbulence, lowest)
+    return best if slow and gain > BACKGROUND_WORTH else rest
+
+
+def _beyond_turbulence(spectrum: Spectrum) -> bool:
+    """Return whether a background differs from the turbulence's own shape."""
+    assert spectrum.background is not None
+    return spectrum.turbulence is None or spectrum.background.omega > APART * spectrum.turbulence.omega
+
+
+def _smooth(spectrum: Spectrum, cells: Cells) -> Spectrum:
+    """Fit the smooth part, without changing resonances."""
+    spectrum = spectrum.with_vector(spectrum.vector)  # within the bounds of its numbers
+    return fit_spectrum(spectrum, cells, range(spectrum.starts[len(spectrum.processes) - len(spectrum.resonances)]))
+
+
+NEIGHBOURS = 4.0
+"""Bins, beside half its width, within which a candidate is not a new peak: two peaks that near are one."""
+WIDEST = 0.5
+"""Maximum damping of a resonance."""
+SPLIT = 8.0
+"""Minimum gain of log-likelihood by two resonances in place of one, which is tried for every wide one."""
+
+
+def reach_of(candidate: Candidate, bin_width: float) -> float:
+    """Return the distance [Hz] within which a peak is the candidate."""
+    return (NEIGHBOURS + candidate.width / 2.0) * bin_width
+
+
+def window_about(candidate: Candidate, f: Array) -> Array:
+    """Return the bins over which explanations of a candidate are compared, bool (len(f),)."""
+    half = max(3.0 * reach_of(candidate, f[0]), 0.03 * candidate.frequency)
+    return np.abs(f - candidate.frequency) < half
+
+
+def misfit_of(spectrum: Spectrum, f: Array, I: Array) -> float:  # noqa: E741
+    """Return - log L of a periodogram (len(f),) [um^2/Hz], without a constant."""
+    S = spectrum.psd(f)
+    return float(np.sum(np.log(S) + I / S))
+
+
+def strongest_bin(candidate: Candidate, f: Array, ratio: Array) -> float:
+    """Return the frequency [Hz] within a candidate at which the ratio of periodogram and spectrum is largest."""
+    if candidate.width == 1:
+        return candidate.frequency
+    near = np.abs(f - candidate.frequency) <= candidate.width / 2.0 * f[0]
+    return float(f[near][np.argmax(ratio[near])])
+
+
+def is_peak(p: Ar2, bin_width: float) -> bool:
+    """Return whether a resonance is narrower than turbulence, not slower than the record, and below half the rate."""
+    return p.damping < WIDEST and 2.0 * bin_width < p.omega / (2 * pi) < 0.5 / p.dt - bin_width
+
+
+def add_resonance(spectrum: Spectrum, f: Array, I: Array, candidate: Candidate) -> Spectrum:  # noqa: E741
+    """Return the spectrum with a resonance of the candidate's width, it alone fitted to the bins about it."""
+    f0, half = candidate.frequency, 0.5 * candidate.width * f[0]
+    near = np.abs(f - f0) <= max(half, f[0])
+    excess = np.maximum(I[near] - spectrum.psd(f[near]), 0.0)
+    power, f0 = float(excess.sum() * f[0]), float(excess @ f[near] / excess.sum()) if excess.any() else f0
+    keep = np.where(window_about(candidate, f), 1.0, 0.0)
+    best: tuple[float, Spectrum] | None = None
+    for share in (0.15, 0.5):
+        damping = min(max(share * half / f0, 1e-6), 0.5)
+        new = Ar2(2.0 * pi * f0, damping, np.sqrt(max(power, 1e-16)), spectrum.dt)
+        wider = replace(spectrum, resonances=(*spectrum.resonances, new))
+        cells = Cells(f, I, keep, [p.omega / (2 * pi) for p in wider.resonances])
+        count = len(wider.vector)
+        shape = fit_spectrum(wider, cells, range(count - 3, count))
+        value = spectrum_negative_log_likelihood(shape, cells)
+        if best is None or value < best[0]:
+            best = value, shape
+    assert best is not None
+    return best[1]
+
+
+def split_resonance(spectrum: Spectrum, f: Array, I: Array, p: Ar2) -> Spectrum | None:  # noqa: E741
+    """Return the spectrum with two resonances in place of one; None where it is narrow or they are not worth it.
+
+    Neighbours look like one resonance of several bins.
+    """
+    f0 = p.omega / (2 * pi)
+    half = p.damping * f0
+    if half < 2.0 * NEIGHBOURS * f[0]:
+        return None
+    two = [Ar2(2 * pi * (f0 + sign * 0.7 * half), 0.4 * p.damping, p.rms / np.sqrt(2.0), spectrum.dt) for sign in (-1, 1)]
+    start = replace(spectrum, resonances=(*spectrum.without(p).resonances, *two))
+    keep = np.where(window_about(Candidate(f0, int(4.0 * half / f[0]), 0.0), f), 1.0, 0.0)
+    cells = Cells(f, I, keep, [q.omega / (2 * pi) for q in (*start.resonances, p)])
+    count = len(start.vector)
+    shape = fit_spectrum(start, cells, range(count - 6, count))
+    gain = spectrum_negative_log_likelihood(spectrum, cells) - spectrum_negative_log_likelihood(shape, cells)
+    return shape if gain > SPLIT and all(is_peak(q, f[0]) for q in shape.resonances[-2:]) else None
+
+
+WIDTH = 27
+"""Bins of a mean I / S: the lobes of frozen flow are wider in a minute."""
+ABOUT, UNUSUAL = 2.0, 0.05
+"""Factor in frequency on either side over which dips are gathered, since the first lobes are as far apart as they are from zero;
+and the probability below which what noise dips by is unusual."""
+FURTHER, LEVEL = 4.0, 1e-3
+"""The same over which dips have to be none of noise: probability at most with which the right spectrum is given a margin at a
+frequency."""
+MEAN, VARIANCE = 0.2772, 0.3543
+"""Of the log-likelihood of a dip of the right spectrum, 0 for means above one; of normal means 0.25 and 0.3125."""
+
+
+def margin(ratio: Array) -> Array:
+    """Return the factor (bins,), 1 or more, by which S may be too low, from I / S (bins,).
+
+    A dip of WIDTH bins is worth d = WIDTH (r - 1 - log r) in log-likelihood, r < 1 their mean. Where the sum of d is unusual over
+    an octave on either side, and none of noise over two, all of it is taken for that of log S + a sin: over n means n WIDTH
+    a^2 / 8, of the octave. The factor is exp(a).
+    """
+    n = len(ratio) // WIDTH
+    if n < 2:
+        return np.ones(len(ratio))
+    r = np.clip(ratio[: n * WIDTH].reshape(n, WIDTH).mean(axis=1), 1e-6, 1.0)
+    worth = np.concatenate([[0.0], np.cumsum(WIDTH * (r - 1.0 - np.log(r)))])
+    near, count, unusual = _sum_dips(worth, ABOUT, UNUSUAL)
+    *_, no_noise = _sum_dips(worth, FURTHER, LEVEL)
+    a = np.where(unusual & no_noise, np.sqrt(8.0 * near / (WIDTH * count)), 0.0)
+    return np.exp(np.interp(np.arange(len(ratio)), WIDTH * (np.arange(n) + 0.5), a))
+
+
+def _sum_dips(worth: Array, about: float, level: float) -> tuple[Array, NDArray[np.intp], NDArray[np.bool_]]:
+    """Sum the log-likelihood of dips within a factor `about` of each mean, from the cumulated `worth`.
+
+    Also return the number of means, and whether noise gives as much with a probability of less than `level`.
+    """
+    n = len(worth) - 1
+    centre = np.arange(n) + 0.5
+    low, high = (centre / about).astype(int), np.minimum(np.ceil(centre * about).astype(int), n)
+    count, found = high - low, worth[high] - worth[low]
+    return found, count, found > gamma.isf(level, count * MEAN**2 / VARIANCE, scale=VARIANCE / MEAN)
+
 
 WIDEST_LINE = 9
 """Maximum width of a candidate, in bins, that may be an undamped line."""
@@ -247,3 +435,30 @@ class OneMode:
     def errors(self) -> Array:
         """Return the standard deviations of the spectrum's parameters, see `standard_deviations`."""
         return standard_deviations(self.spectrum, self.cells(everything=True), inflation(self.n))
+
+
+BROAD = 0.1
+"""Minimum damping of a resonance of the continuum: modes of structures have 0.005 to 0.05."""
+STANDS_OUT = 1.25
+"""Minimum density at the maximum of a broad vibration peak, over that of the dip below it."""
+POINTS = 200
+"""Points at which the density is evaluated."""
+
+
+def is_continuum(spectrum: Spectrum, p: Ar2 | Ar3, lowest: float) -> bool:
+    """Return whether a process of the spectrum belongs to turbulence or background.
+
+    It does if it lies below `lowest`, the minimum frequency of peaks [Hz]; or if it is broad, and the density of the
+    whole model has no maximum there that stands out of the dip on its lower side. Likelihood cannot decide: where no model
+    of turbulence fits, a resonance raises it by any amount.
+    """
+    f0 = p.omega / (2.0 * pi)
+    if f0 < lowest:
+        return True
+    if p.damping <= BROAD:
+        return False
+    f = np.linspace(max(1.0 - 3.0 * p.damping, 0.1) * f0, min((1.0 + p.damping) * f0, 0.5 / p.dt), POINTS)
+    S = spectrum.psd(f)
+    near = np.flatnonzero(f >= (1.0 - p.damping) * f0)
+    top = near[np.argmax(S[near])]
+    return bool(S[top] < STANDS_OUT * S[: top + 1].min())

@@ -7,8 +7,7 @@ from math import nan, pi, sqrt
 from typing import Any
 
 from wfsobs.identification.both_sensors import SensorDifference, error_of_a_star, without_error
-from wfsobs.identification.continuum import is_continuum
-from wfsobs.identification.one_mode import OneMode
+from wfsobs.identification.one_mode import OneMode, is_continuum
 from wfsobs.identification.process import (
     IdentifiedPeak,
     IdentifiedProcess,

@@ -14,8 +14,7 @@ from wfsobs.live.paced import Command
 from wfsobs.live.source import SIMULATION, LiveSource
 from wfsobs.priors_from.scenario import as_sampled
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.groups.events import FRAMES, LASER, PEAK, WIND, Event
-from wfsobs.scenario.timeline import during, shift, strength, wind
+from wfsobs.scenario.groups.events import FRAMES, LASER, PEAK, WIND, Event, during, shift, strength, wind
 from wfsobs.settings.group import SettingError
 from wfsobs.simulation.events import peak_events
 from wfsobs.simulation.loop import record_settings

@@ -3,26 +3,225 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.control.step import StepController
 from wfsobs.identification import identify
 from wfsobs.identification.result import Identification
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.step import StepObserver
-from wfsobs.peers.command import CommandAhead
-from wfsobs.peers.second_sensor import SecondSensor, SecondSensorOptions
 from wfsobs.prior import Training
 from wfsobs.priors_from.identification import told_by
 from wfsobs.record import Record, Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.stepping import design
-from wfsobs.streams.going_back import GoingBack
+from wfsobs.streams.attach import GoingBack
+from wfsobs.streams.layout import StreamError
+from wfsobs.streams.ngs_frames import NgsStream
+from wfsobs.streams.wiring import STUCK, NgsWiring
 from wfsobs.typing import Array
+
+
+@dataclass(frozen=True)
+class SecondSensorOptions:
+    """What a loop's configuration says of its second sensor.
+
+    stream : name of the stream of its slopes
+    matrix : file of the matrix (.npy) from its slopes to the modes of the loop, (modes, slopes)
+    ratio  : frames of the loop per frame of the sensor
+    wfc    : name of the stream of commands
+    lag    : frames of the loop between the end of an exposure and its slopes, below `ratio`
+    """
+
+    stream: str
+    matrix: str
+    ratio: int
+    wfc: str = "wfc"
+    lag: int = 0
+
+
+class SlopeStream:
+    """A stream of slopes, read as residual modes. Raises StreamError where there is none, or no matrix for it."""
+
+    def __init__(self, path: str, matrix: Array):
+        self.path, self._matrix = path, matrix
+        self._stream = open_stream(path)
+        self.n, self.first = len(matrix), self.count
+        if int(np.prod(self._stream.shape)) != matrix.shape[1]:
+            raise StreamError(f"{path}: {int(np.prod(self._stream.shape))} slopes, the matrix takes {matrix.shape[1]}")
+
+    @property
+    def count(self) -> int:
+        """Frames that have been written."""
+        return int(self._stream.count)
+
+    @property
+    def write_time(self) -> int:
+        """When the last frame was written [ns]."""
+        return round(1e9 * self._stream.write_time)
+
+    @property
+    def is_current(self) -> bool:
+        """Whether no other stream has taken its name."""
+        try:
+            return open_stream(self.path).instance_id == self._stream.instance_id
+        except StreamError:
+            return False
+
+    def read(self, patience: float = 0.0) -> tuple[int, Array] | None:
+        """Return the counter and the modes of the last frame, (n,)."""
+        frame = self._stream.read_publication()
+        return int(frame.count), self._matrix @ np.asarray(frame.payload, dtype=float).ravel()
+
+    def reopen(self) -> SlopeStream:
+        """Return the stream that has its name now."""
+        return SlopeStream(self.path, self._matrix)
+
+
+class SecondSensor:
+    """The frames of the second sensor, less what the mirror did in them.
+
+    Parameters
+    ----------
+    options : SecondSensorOptions
+        Streams, ratio and matrix.
+    elements : Array
+        Modes of the loop that are wanted.
+    unit : float
+        Micrometres per unit of the modes.
+    delay : int
+        Frames from a command to the first measurement that sees it.
+    rate : float
+        Frames per second of the loop [Hz].
+    say : callable
+        Receives one line about whatever happens.
+
+    Raises
+    ------
+    StreamError
+        A stream or the matrix cannot be read, or a number is out of range.
+    """
+
+    def __init__(
+        self, options: SecondSensorOptions, elements: Array, unit: float, delay: int, rate: float, say: Callable[[str], None]
+    ):
+        if options.ratio < 1 or not 0 <= options.lag < options.ratio:
+            raise StreamError(f"ngs: ratio = {options.ratio}, lag = {options.lag}: take 1 or more, and less than that")
+        slopes = SlopeStream(options.stream, read_matrix(options.matrix))
+        self._commands, self._elements, self._unit, self._delay = open_stream(options.wfc), elements, unit, delay
+        self._history: deque[Array] = deque(maxlen=delay + 2 * options.ratio)
+        self._count = 0
+        self.ratio = options.ratio
+        stuck = max(STUCK, 3 * options.ratio / rate)
+        wiring = NgsWiring(tuple(map(int, elements)), unit, options.ratio, options.lag, stuck)
+        self._frames = NgsStream(slopes, wiring, say)
+
+    def look(self) -> tuple[int, Array] | None:
+        """Return what is new: how many frames ago its place was, and the pseudo-open-loop modes [um]; once a frame."""
+        self._count += 1
+        command = np.asarray(self._commands.read_publication().payload, dtype=float).ravel()
+        self._history.append(self._unit * command[self._elements])  # the command of the frame before
+        found = self._frames.look(self._count)
+        if found is None or len(self._history) < (self._history.maxlen or 0):
+            return None
+        late, residual = found
+        newest = len(self._history) - self._delay - late
+        exposure = [self._history[k] for k in range(newest - self.ratio + 1, newest + 1)]
+        return late, residual - np.mean(exposure, axis=0)
+
+    @property
+    def age(self) -> int | None:
+        """Frames of the loop since the last one that a frame of the sensor belongs to, 0 to ratio - 1; None where not known."""
+        return None if self._frames.phase is None else (self._count - self._frames.phase) % self.ratio
+
+
+def open_stream(name: str) -> Any:
+    """Open a stream of pyRTC. Raises StreamError where there is none."""
+    import pyshmem  # pyright: ignore[reportMissingImports]
+
+    try:
+        return pyshmem.open(name)
+    except OSError as error:
+        raise StreamError(f"{name}: no stream: {error}") from None
+
+
+def read_matrix(file: str) -> Array:
+    """Return a matrix of a .npy file, (modes, slopes). Raises StreamError."""
+    try:
+        matrix = np.load(Path(file), allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise StreamError(f"{file}: no matrix: {error}") from None
+    if matrix.ndim != 2 or not np.isfinite(matrix).all():
+        raise StreamError(f"{file}: takes a matrix of finite numbers, (modes, slopes), not the shape {matrix.shape}")
+    return matrix.astype(float)
+
+
+class CommandAhead:
+    """Predicts `delay` frames after the last measurement, by the controller of a loop with that delay.
+
+    Parameters
+    ----------
+    controller : StepController
+        Designed for a mirror with this delay and without limits.
+    n_modes : int
+        Its modes.
+    delay : int
+        Frames from a command to the first measurement that sees it.
+    """
+
+    targets = ("disturbance",)
+
+    def __init__(self, controller: StepController, n_modes: int, delay: int):
+        self._controller, self._commands = controller, np.zeros((delay, n_modes))
+        self._mirror = np.zeros((controller.sampling.ratio or 1, n_modes))
+
+    @property
+    def frame(self) -> int:
+        """Frames that it has taken."""
+        return self._controller.frame
+
+    @property
+    def sampling(self) -> Sampling:
+        """That of the controller."""
+        return self._controller.sampling
+
+    def update(self, z: Array, ngs: Array | None = None) -> None:
+        """Take pseudo-open-loop measurements, (n_modes,) [um]: of its own loop they would be residuals. Raises StepError."""
+        seen = self._commands[-1].copy()
+        self._mirror[1:] = self._mirror[:-1].copy()
+        self._mirror[0] = seen
+        u = self._controller.update(z + seen, None if ngs is None else ngs + self._mirror.mean(axis=0))
+        self._commands[1:] = self._commands[:-1].copy()
+        self._commands[0] = u
+
+    def predict(self, frames: float = 0.0, target: str = "disturbance") -> tuple[Array, Array]:
+        """Return mean and standard deviation, which it does not know, (n_modes,) [um] each."""
+        return -self._commands[0], np.full(self._commands.shape[1], np.nan)
+
+    def reset(self) -> None:
+        """Go back to before the first frame."""
+        self._controller.reset()
+        self._commands[:] = self._mirror[:] = 0.0
+
+    def state_dict(self) -> dict[str, Array]:
+        """Return a copy of the state."""
+        own = {"ahead.commands": self._commands.copy(), "ahead.mirror": self._mirror.copy()}
+        return own | self._controller.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Array]) -> None:
+        """Go on from a state of `state_dict`. Raises StepError where it is that of another design."""
+        rest = dict(state)
+        self._commands[:], self._mirror[:] = rest.pop("ahead.commands"), rest.pop("ahead.mirror")
+        self._controller.load_state_dict(rest)
+
 
 SIZE = 0.5
 """Rms that the history of the modes is scaled to before it is identified [um]: the filters' settings are in micrometres."""

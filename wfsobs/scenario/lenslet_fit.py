@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from wfsobs.scenario.groups.shack_hartmann import LensletArrays
+from wfsobs.scenario.groups.sensors import LensletArrays
 from wfsobs.sensors.lenslets import Lenslets
 from wfsobs.sensors.reconstructor import highest_order
 from wfsobs.settings.errors import SettingError

@@ -17,19 +17,16 @@ import param
 
 from wfsobs import registry
 from wfsobs.scenario.groups.atmosphere import PsdTable, Telescope, Turbulence
-from wfsobs.scenario.groups.control import Control
-from wfsobs.scenario.groups.events import FRAMES, LASER, PEAK, WIND, Event
-from wfsobs.scenario.groups.run import Loop, Run
+from wfsobs.scenario.groups.events import FRAMES, LASER, PEAK, WIND, Event, shift, turbulence_time
+from wfsobs.scenario.groups.run import Control, Loop, Run
 from wfsobs.scenario.groups.sensors import Sensors
 from wfsobs.scenario.groups.vibration import Vibration
 from wfsobs.scenario.lenslet_fit import fit_lenslets
-from wfsobs.scenario.timeline import shift, turbulence_time
 from wfsobs.sensors.modes import Mode, modes_up_to
 from wfsobs.settings.errors import SettingError
-from wfsobs.settings.group import Group
+from wfsobs.settings.group import Group, Section, section
 from wfsobs.settings.parameters import declared_settings
 from wfsobs.settings.priors import Butterworth, Kalman
-from wfsobs.settings.sections import Section, section
 
 if TYPE_CHECKING:
     from wfsobs.observers.gpr.offline import OfflineGpr

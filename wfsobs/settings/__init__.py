@@ -1,8 +1,7 @@
 """Building blocks of settings: kinds of values, groups of them, and their error."""
 
 from wfsobs.settings.errors import SettingError
-from wfsobs.settings.group import Group
+from wfsobs.settings.group import Group, Section
 from wfsobs.settings.parameters import Real, Reals, Whole
-from wfsobs.settings.sections import Section
 
 __all__ = ["Group", "Real", "Reals", "Section", "SettingError", "Whole"]

@@ -14,10 +14,9 @@ import numpy as np
 
 from wfsobs.progress import QUIET, Watch
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.groups.events import PEAK
+from wfsobs.scenario.groups.events import PEAK, phase_turns, strength
 from wfsobs.scenario.groups.vibration import Peak
 from wfsobs.scenario.measured_spectra import measured_spectrum
-from wfsobs.scenario.timeline import phase_turns, strength
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.spectrum import bin_edges, bin_frequencies, gaussian_signal, random_phase_signal, resonance_power, table_power
 from wfsobs.simulation import events

@@ -17,8 +17,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import hilbert
 
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.groups.events import FRAMES, LASER, PEAK, WIND, Event
-from wfsobs.scenario.timeline import during, phase_turns, strength, turbulence_time
+from wfsobs.scenario.groups.events import FRAMES, LASER, PEAK, WIND, Event, during, phase_turns, strength, turbulence_time
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.typing import Array
 

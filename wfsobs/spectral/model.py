@@ -1,18 +1,73 @@
-"""The spectrum of one mode of z: white noise, turbulence of order two or three, AR(2) resonances. For lines see `lines`."""
+"""The spectrum of one mode of z: white noise, turbulence of order two or three, AR(2) resonances. For lines see `lines`.
+
+A coloured background of a measurement: noise that is flat up to a corner far above that of turbulence.
+
+The aliasing of a Shack-Hartmann sensor is like that.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
+from math import pi, sqrt
 
 import numpy as np
 from scipy.special import expit, logit
 
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
-from wfsobs.spectral.densities import densities
 from wfsobs.typing import Array
+
+
+def densities(numbers: Array, dt: float, f: Array) -> tuple[Array, Array]:
+    """Compute the densities of AR(2) processes and the derivatives of their logarithms.
+
+    The density is that of the drive over the squares of two distances |1 - r exp(i a)|^2 = (1 - r)^2 + 4 r sin(a / 2)^2, where
+    r exp(+- i angle) are the poles and a = angle -+ 2 pi f dt; that of the drive has two such distances as well, with a = angle
+    and a = angle - pi.
+
+    Parameters
+    ----------
+    numbers : Array
+        Log of omega [rad/s], logit of the damping, log of the rms [um], (processes, 3).
+    dt : float
+        Time step [s].
+    f : Array
+        Frequencies [Hz].
+
+    Returns
+    -------
+    density : Array
+        One-sided [um^2/Hz], (processes, len(f)).
+    slopes : Array
+        Derivatives of its logarithm by the numbers, (processes, 3, len(f)).
+    """
+    omega, damping, rms = np.exp(numbers[:, :1]), expit(numbers[:, 1:2]), np.exp(numbers[:, 2:])
+    damped, rest = damping * omega * dt, np.sqrt(expit(-numbers[:, 1:2]) * (1.0 + damping))  # rest = sqrt(1 - damping^2)
+    angle, r, short, lost = rest * omega * dt, np.exp(-damped), -np.expm1(-damped), -np.expm1(-2.0 * damped)  # 1 - r, 1 - r^2
+
+    def distance(half_sine: Array, sine: Array) -> tuple[Array, Array]:
+        """Return the inverse of one, of 2 sqrt(r) sin(a / 2), and the derivative of its logarithm by a, of 2 r sin(a)."""
+        inverse = 1.0 / (short**2 + half_sine**2)
+        return inverse, sine * inverse
+
+    # The derivative of the logarithm by r is 1 / r - (1 - r^2) / r over the distance.
+    wide, turned = 2.0 * np.sqrt(r), np.pi * f * dt
+    s, c, of_sine, of_cosine = (g(x) for x in (0.5 * angle, angle) for g in (np.sin, np.cos))
+    drive, drive_a = zip(distance(wide * s, 2.0 * r * of_sine), distance(wide * c, -2.0 * r * of_sine), strict=True)
+    sc, cs = wide * s * np.cos(turned), wide * c * np.sin(turned)
+    of_sum, of_difference = 2.0 * r * of_sine * np.cos(2.0 * turned), 2.0 * r * of_cosine * np.sin(2.0 * turned)
+    (low, low_a), (high, high_a) = distance(sc - cs, of_sum - of_difference), distance(sc + cs, of_sum + of_difference)
+    S = 2.0 * dt * rms**2 * lost / ((1.0 + r**2) * drive[0] * drive[1]) * (low * high)
+    by_r = lost / r * (low + high - drive[0] - drive[1]) - 2.0 * r / lost - 2.0 * r / (1.0 + r**2)
+    by_angle = sum(drive_a) - low_a - high_a
+    slopes = np.empty((len(numbers), 3, len(f)))
+    slopes[:, 0] = angle * by_angle - damped * r * by_r
+    slopes[:, 1] = (r * by_r + damping / rest * by_angle) * (-omega * dt * damping * (1.0 - damping))
+    slopes[:, 2] = 2.0
+    return S, slopes
+
 
 STEP = 1e-4
 """Step of the central differences, in the logarithm of a parameter."""
@@ -151,3 +206,20 @@ def _process(v: Array, dt: float) -> Ar2 | Ar3:
         return Ar2(omega, damping, rms, dt)
     omega = min(max(omega, SLOW / dt), FAST / dt)
     return Ar3(omega, max(damping, LEAST), min(omega * (1.0 + float(np.exp(v[3]))), 2.0 * FAST / dt), rms, dt)
+
+
+DAMPING = 0.8
+"""Its damping, which no fit changes."""
+BACKGROUND_REACHES = (0.02, 0.08)
+"""Its corners, over the rate, at which a fit starts: 20 and 80 Hz at 1 kHz."""
+BACKGROUND_WORTH = 8.0
+"""Minimum gain of log-likelihood for its two parameters: noise gains as much with a probability of 0.03 % (chi squared of 16)."""
+
+
+def with_first_guess(spectrum: Spectrum, reach: float) -> Spectrum:
+    """Return a spectrum with a background to start from, of about half the density of the noise.
+
+    reach : its corner over the rate
+    """
+    dt = spectrum.dt
+    return replace(spectrum, background=Ar2(2.0 * pi * reach / dt, DAMPING, spectrum.noise * sqrt(reach), dt))

@@ -14,7 +14,7 @@ from scipy.special import expit, logit
 
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.whittle import whittle_fit
-from wfsobs.spectral.densities import densities
+from wfsobs.spectral.model import densities
 from wfsobs.typing import Array
 
 BINS = 400

@@ -3,23 +3,230 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from time import monotonic
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
+from wfsobs.latencies import Latencies
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.step import StepObserver
-from wfsobs.streams.going_back import GoingBack
-from wfsobs.streams.layout import StreamError
+from wfsobs.record import Sampling
+from wfsobs.streams.layout import Semaphore, StreamError
 from wfsobs.streams.ngs_frames import NgsStream
-from wfsobs.streams.semaphores import Semaphore
 from wfsobs.streams.stream import SinkStream, SourceStream
-from wfsobs.streams.tally import Tally
 from wfsobs.streams.watchdog import Gate, Watchdog
 from wfsobs.streams.wiring import Wiring, check_elements
 from wfsobs.typing import Array
+
+
+class StateObserver(Protocol):
+    """What it takes of a `StepObserver`."""
+
+    @property
+    def frame(self) -> int: ...  # noqa: D102
+
+    @property
+    def sampling(self) -> Sampling: ...  # noqa: D102
+
+    def update(self, z: Array, ngs: Array | None = None, /) -> None: ...  # noqa: D102
+
+    def reset(self) -> None: ...  # noqa: D102
+
+    def state_dict(self) -> dict[str, Array]: ...  # noqa: D102
+
+    def load_state_dict(self, state: Mapping[str, Array], /) -> None: ...  # noqa: D102
+
+
+class GoingBack:
+    """Takes LGS frames as they come, and an NGS frame up to one NGS frame later than it is due.
+
+    The state before the last frame with an NGS measurement is kept, and what has come since; a late NGS frame goes to its place
+    and the LGS frames after it are taken again. From then on the observer is where it would be had the frame come in time.
+
+    Parameters
+    ----------
+    observer : StateObserver
+        Of a sampling with a ratio; without one there is nothing to go back for.
+    """
+
+    def __init__(self, observer: StateObserver):
+        self._observer, self._ratio = observer, observer.sampling.ratio
+        self._state: dict[str, Array] | None = None
+        self._since: list[Array] = []
+
+    def update(self, z: Array, ngs: Array | None = None, late: int = 0) -> None:
+        """Take a frame.
+
+        Parameters
+        ----------
+        z : Array
+            LGS measurement, (n_modes,) [um].
+        ngs : Array, optional
+            NGS measurement, (n_modes,) [um], of the frame `late` before this one; the first frame of an observer has none.
+        late : int
+            LGS frames, below the ratio.
+        """
+        observer = self._observer
+        if ngs is not None and late:
+            self._take_late(ngs, late)
+            ngs = None
+        if self._ratio is not None:
+            self.keep()
+            self._since.append(z)
+        observer.update(z, ngs if observer.frame else None)
+
+    def keep(self) -> None:
+        """Keep the state where the next frame is one with an NGS measurement; `update` does it otherwise."""
+        if self._ratio is not None and self._observer.frame % self._ratio == 0 and (self._since or self._state is None):
+            self._state, self._since = self._observer.state_dict(), []
+
+    def align(self, age: int) -> bool:
+        """Start the observer anew unless its last frame with an NGS measurement was so many frames before the next one.
+
+        age : 0 to ratio - 1, 0 where the next one has an NGS measurement
+        """
+        observer = self._observer
+        if self._ratio is None or observer.frame % self._ratio == age:
+            return False
+        observer.reset()
+        self.forget()
+        for _ in range(age):
+            self.update(np.full(observer.sampling.n_modes, np.nan))
+        return True
+
+    def forget(self) -> None:
+        """Start anew with an observer that does."""
+        self._state, self._since = None, []
+
+    def _take_late(self, ngs: Array, late: int) -> None:
+        first = self._observer.frame - late
+        if self._state is None or late != len(self._since) or first <= 0:
+            return
+        self._observer.load_state_dict(self._state)
+        for k, z in enumerate(self._since):
+            self._observer.update(z, ngs if k == 0 else None)
+
+
+SLOW = 1.5
+"""A frame is late if it comes more than so many frame times after the one before."""
+RATE_ERROR = 0.05
+"""Part of the rate by which a loop may be off the design."""
+NANOMETRE = 1e-6
+"""What stands for it in a histogram, which then goes from 0.1 nm to 1 cm."""
+
+
+class _Span:
+    """What is counted over a stretch of time."""
+
+    def __init__(self) -> None:
+        self.frames = self.missing = self.late = self.out_of_band = 0
+        self.latencies, self.errors, self.sizes = Latencies(), Latencies(), Latencies()
+
+    def quantile(self, share: float) -> float | None:
+        """Return a quantile of the latencies [us]."""
+        return round(self.latencies.quantile(share) * 1e6, 1) if self.frames else None
+
+    def medians(self) -> tuple[float | None, float | None]:
+        """Return the medians of the magnitudes of errors and of what was measured [nm]; None where nothing was predicted."""
+        found = [one.quantile(0.5) / NANOMETRE for one in (self.errors, self.sizes)]
+        return (None, None) if np.isnan(found[0]) else (round(found[0], 3), round(found[1], 3))
+
+
+class Tally:
+    """Statistics.
+
+    Parameters
+    ----------
+    dt : float
+        Time between two frames by the design of the observer [s].
+
+    Attributes
+    ----------
+    torn, stuck : int
+        Frames that were written without an end; times that no frame came.
+    """
+
+    def __init__(self, dt: float):
+        self.torn = self.stuck = 0
+        self._dt, self._last = dt, None
+        self._second, self._all = _Span(), _Span()
+        self._first: float | None = None
+        self._is_off_rate = False
+
+    def add(self, arrival: float, end: float, missing: int, z: Array, error: Array, is_out: bool = False) -> None:
+        """Count a frame.
+
+        Parameters
+        ----------
+        arrival, end : float
+            When it was there and when its estimate was out [s].
+        missing : int
+            Frames missing before it.
+        z, error : Array
+            Measurement, and how far off its prediction was, (n_modes,) [um]; NaN where there is none.
+        is_out : bool
+            Whether a measurement was not taken.
+        """
+        late = self._last is not None and arrival - self._last > SLOW * self._dt * (1 + missing)
+        known = np.isfinite(error)
+        errors, sizes = (1e3 * NANOMETRE * np.abs(x[known]) for x in (error, z))
+        for span in (self._second, self._all):
+            span.frames += 1
+            span.missing += missing
+            span.late += late
+            span.out_of_band += is_out
+            span.latencies.add(end - arrival)
+            span.errors.add(errors)
+            span.sizes.add(sizes)
+        self._first, self._last = self._first or arrival, arrival
+
+    @property
+    def rate(self) -> float | None:
+        """Frames per second that were sent, missing ones too [Hz]."""
+        if self._first is None or self._last is None or self._last <= self._first:
+            return None
+        return (self._all.frames - 1 + self._all.missing) / (self._last - self._first)
+
+    def find_rate_error(self) -> str:
+        """Return once that the loop runs at another rate than the observer is designed for; "" at other times."""
+        rate = self.rate
+        if rate is None or self._is_off_rate or abs(rate * self._dt - 1.0) <= RATE_ERROR:
+            return ""
+        self._is_off_rate = True
+        return f"{rate:.0f} frames per second, the observer is designed for {1.0 / self._dt:g}"
+
+    def line(self, reason: str) -> str:
+        """Return the line of the last second, and begin the next one."""
+        span, self._second = self._second, _Span()
+        if not span.frames:
+            return f"no frame; output: {reason or 'on'}"
+        error, size = span.medians()
+        scores = "" if error is None else f"; next measurement: {error:.1f} of {size:.1f} nm (medians)"
+        return (
+            f"{span.frames} frames, {span.missing} missing, {span.out_of_band} out of band, {span.late} late; "
+            f"{span.quantile(0.5):.0f}, {span.quantile(0.999):.0f} us (p50, p99.9){scores}; output: {reason or 'on'}"
+        )
+
+    def summary(self) -> dict[str, Any]:
+        """Return the statistics since the start."""
+        span = self._all
+        error, size = span.medians()
+        return {
+            "frames": span.frames,
+            "missing": span.missing,
+            "out_of_band": span.out_of_band,
+            "late": span.late,
+            "torn": self.torn,
+            "stuck": self.stuck,
+            "rate_hz": None if self.rate is None else round(self.rate, 2),
+            "p50_us": span.quantile(0.5),
+            "p99_9_us": span.quantile(0.999),
+            "next_median_nm": error,
+            "median_nm": size,
+        }
+
 
 TICK = 0.05
 """Longest wait for a frame before a look at the clock and at the wish to stop [s]."""

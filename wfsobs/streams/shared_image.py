@@ -12,8 +12,18 @@ from pathlib import Path
 import numpy as np
 
 from wfsobs.files import write_whole
-from wfsobs.streams.layout import CURRENT, LONGEST_NAME, TIMES, Layout, StreamError, new_file, read_header
-from wfsobs.streams.semaphores import SIZE, Semaphore, open_named
+from wfsobs.streams.layout import (
+    CURRENT,
+    LONGEST_NAME,
+    SEMAPHORE,
+    TIMES,
+    Layout,
+    Semaphore,
+    StreamError,
+    new_file,
+    open_named,
+    read_header,
+)
 from wfsobs.typing import Array
 
 SUFFIX = ".im.shm"
@@ -205,7 +215,7 @@ class SharedImage:
         n, first = self.header.n_semaphores, self.header.semaphores
         if first is not None:
             start = np.ndarray(1, np.uint8, self._map).ctypes.data
-            return [Semaphore(start + first + SIZE * i) for i in range(n)]
+            return [Semaphore(start + first + SEMAPHORE * i) for i in range(n)]
         folder, file = os.path.split(os.path.abspath(self.path))
         stem = f"{folder.replace('/', '.')}.{file.removesuffix(SUFFIX)}"
         return [open_named(f"{stem}_sem{i:02d}") for i in range(n)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol, Self
 
-from wfsobs.streams.semaphores import Semaphore
+from wfsobs.streams.layout import Semaphore
 from wfsobs.typing import Array
 
 # Each is described where it is written, in SharedImage.

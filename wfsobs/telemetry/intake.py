@@ -4,23 +4,132 @@ A record has y_lgs and u (n_steps, n_modes) and dt or time; optionally frame (n_
 (n_steps, n_modes), NaN where there is no frame, or one row per frame, with ratio or time_ngs, the truth turbulence and vibration,
 open_loop_y, lgs_stars (n_steps,), y_stars (n_steps, n_lgs, n_modes), and for the offline GPR training_y, training_u and
 training_open_loop_y (n, n_modes).
+
+Measurements that somebody has filled in, found by the noise that they lack.
+
+Where a frame was lost, telemetry often has the last value once more, a line between neighbours or a prediction. An observer that
+takes these for measurements trusts them, and starts wrong after the gap. A frame is taken for missing where
+
+- the measurement, or the pseudo-open-loop of it, is the same in all modes for the third time, or
+- the last WINDOW frames follow a polynomial as no measured ones do: the squares left over are below SHARE of their median so far.
+  DEGREE is such that a line of 50 Hz at 1 kHz, which a prediction goes on with, leaves 1e-5 of its power.
+
+No later frame decides, and nothing is found before USUAL / 10 frames with noise. Windows overlap, so that one in 10^9 of white
+noise of usual strength would be below SHARE, and that of one real frame at the end is not where the gap was long. What lasts
+longer than LONGEST is no gap but what the sensor measures.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
-from wfsobs.record import DELAY, Record, RecordError, Training
+from wfsobs.record import DELAY, Record, RecordError, Training, hold_last
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import order_of
-from wfsobs.telemetry import timestamps as clock
-from wfsobs.telemetry.bridged import without_bridged
 from wfsobs.telemetry.formats.contents import APART, FAST, FRAME, LARGEST, NGS, SIGNALS, STARS, TIME, TRAINING, Contents
 from wfsobs.typing import Array
 from wfsobs.units import ANGLES, micrometres_per, parse_unit
+
+WINDOW = 28
+"""Frames that are fitted by a polynomial."""
+
+DEGREE = 8
+"""Of the polynomial."""
+
+SHARE = 0.05
+"""Of the usual square of what the polynomial leaves over."""
+
+USUAL = 2000
+"""Frames that the usual square is the median of, taken anew at every tenth of them, the first of which has to be there first."""
+
+LONGEST = 10.0
+"""Gap that is taken for one, at most [s]."""
+
+ROUNDING = 1e-12
+"""Of a number, that is no noise."""
+
+AT_ONCE = 100_000
+"""Windows that are fitted at once, for the memory."""
+
+
+def without_bridged(record: Record) -> Record:
+    """Return a record that tells no missing frames with those missing that were filled in; its origin says how many."""
+    seen = slice(record.delay, None)  # z before has no commands
+    bridged = np.zeros(record.n_steps, dtype=bool)
+    bridged[seen] = find_bridged(record.y_lgs[seen], hold_last(record.z)[seen], record.dt)
+    if not bridged.any():
+        return record
+    said = f"{bridged.sum()} LGS frames without noise of their own taken for missing"
+    y_lgs = np.where(bridged[:, None], np.nan, record.y_lgs)
+    return replace(record, y_lgs=y_lgs, origin=", ".join(filter(None, (record.origin, said))))
+
+
+def find_bridged(y: Array, z: Array, dt: float) -> Array:
+    """Return which frames were filled in.
+
+    Parameters
+    ----------
+    y : Array
+        Measurements, (n, n_modes), without NaN.
+    z : Array
+        Pseudo-open-loop measurements of the same frames, (n, n_modes).
+    dt : float
+        Time step [s].
+
+    Returns
+    -------
+    Array
+        True where a frame was filled in, (n,).
+    """
+    with np.errstate(over="ignore", invalid="ignore"):  # of values beyond all measure, which are found elsewhere
+        rounding = ROUNDING * (np.abs(y) + np.abs(z))
+        again = _is_again(y, 0.0 * rounding) | _is_again(z, rounding)
+        again[1:] &= again[:-1]
+        return _lacking(again, _squares_left_over(z), rounding, LONGEST / dt)
+
+
+def _lacking(again: Array, left_over: Array, rounding: Array, longest: float) -> Array:
+    """Return which frames repeat, or lack the noise that those before them have, (n,); none before there is some noise."""
+    usual, seen, lasting, apart = np.zeros(left_over.shape[1]), 0, 0, 0
+    last = np.zeros((USUAL, left_over.shape[1]))  # of those that are measured, in any order
+    out = np.zeros(len(left_over), dtype=bool)
+    for k, squares in enumerate(left_over):
+        apart = 0 if again[k] else apart + 1  # a window that has frames that repeat says nothing of the others
+        has_noise = seen >= USUAL // 10 and bool((np.isfinite(usual) & (usual > rounding[k] ** 2)).all())
+        lacks = has_noise and bool(again[k] or (apart >= WINDOW and (squares <= SHARE * usual).all()))
+        lasting = lasting + 1 if lacks else 0
+        out[k] = 0 < lasting <= longest
+        if lasting > longest:
+            seen = 0
+        if not out[k] and k >= WINDOW:
+            last[seen % USUAL] = squares
+            seen += 1
+            if seen % (USUAL // 10) == 0:
+                usual = np.median(last[:seen], axis=0)
+    return out
+
+
+def _is_again(x: Array, rounding: Array) -> Array:
+    """Return where x (n, n_modes) is in all modes what it was one frame before, but for rounding, (n,)."""
+    out = np.zeros(len(x), dtype=bool)
+    out[1:] = (np.abs(np.diff(x, axis=0)) <= rounding[1:]).all(axis=1)
+    return out
+
+
+def _squares_left_over(z: Array) -> Array:
+    """Return what a polynomial leaves of the squares of the last WINDOW frames, (n, n_modes); zeros before there are so many."""
+    powers = np.polynomial.chebyshev.chebvander(np.linspace(-1.0, 1.0, WINDOW), DEGREE)
+    rest = np.linalg.qr(powers, mode="complete")[0][:, DEGREE + 1 :]
+    out = np.zeros_like(z)
+    for first in range(0, max(len(z) - WINDOW + 1, 0), AT_ONCE):
+        windows = sliding_window_view(z[first : first + AT_ONCE + WINDOW - 1], WINDOW, axis=0)
+        out[first + WINDOW - 1 : first + WINDOW - 1 + len(windows)] = np.sum((windows @ rest) ** 2, axis=-1)
+    return out
+
 
 MOST_NAMED = 5
 """Maximum columns that are named as not used."""
@@ -172,19 +281,19 @@ def _apply_timestamps(
     arrays, n, said = contents.arrays, signals["y_lgs"].shape[0], ""
     dt = None if "dt" not in arrays else _number("dt", arrays["dt"])
     if declaration.rate is not None:
-        if dt is not None and abs(dt * declaration.rate - 1.0) > clock.AGREE:
+        if dt is not None and abs(dt * declaration.rate - 1.0) > AGREE:
             raise RecordError(f"its rate is {1.0 / dt:.6g} Hz, but {declaration.rate:.6g} Hz are stated")
         dt = 1.0 / declaration.rate if dt is None else dt
     start = 0.0
-    steps = clock.counted_steps(_clock(FRAME, arrays[FRAME], n)) if FRAME in arrays else None
+    steps = counted_steps(_clock(FRAME, arrays[FRAME], n)) if FRAME in arrays else None
     if TIME in arrays:
         time = _clock(TIME, arrays[TIME], n)
-        steps, dt, said = clock.steps_of(time, dt, steps)
+        steps, dt, said = steps_of(time, dt, steps)
         start = float(time[0])
     if steps is not None:
         for name, values in signals.items():
             if name not in TRAINING and values.shape[0] == n:
-                signals[name] = clock.place_rows(values, steps)
+                signals[name] = place_rows(values, steps)
     if dt is None:
         there = f": which column is the time? It has {', '.join(contents.leftovers[:20])}" if contents.leftovers else ""
         raise RecordError(f"has no dt and no time; a record needs y_lgs, u and dt, or a stated rate{there}")
@@ -194,15 +303,15 @@ def _apply_timestamps(
         ratio = _stamped_frames(signals, arrays, start, dt)
     else:
         ratio = _whole("ratio", arrays)
-        signals[NGS] = clock.place_frames(signals[NGS], signals["y_lgs"].shape[0], ratio)
-    signals[NGS] = clock.drop_partial_frames(signals[NGS], ratio)
+        signals[NGS] = place_frames(signals[NGS], signals["y_lgs"].shape[0], ratio)
+    signals[NGS] = drop_partial_frames(signals[NGS], ratio)
     return dt, ratio, said
 
 
 def _stamped_frames(signals: dict[str, Array], arrays: Mapping[str, Array], start: float, dt: float) -> int:
     """Place the frames by their stamps, start the record `ratio` steps before a frame, and return the ratio."""
     frames, n = signals[NGS], signals["y_lgs"].shape[0]
-    steps = clock.frames_at(_clock("time_ngs", arrays["time_ngs"], frames.shape[0]), start, dt)
+    steps = frames_at(_clock("time_ngs", arrays["time_ngs"], frames.shape[0]), start, dt)
     between = int(np.median(np.diff(steps))) if steps.size > 1 else None
     ratio = _whole("ratio", arrays, None, between)
     late = np.flatnonzero((steps - steps[0]) % ratio)
@@ -248,3 +357,199 @@ def _whole(name: str, arrays: Mapping[str, Array], declaration: int | None = Non
     if declaration is not None and value != declaration:
         raise RecordError(f"{name} is {value:g}, but {declaration} is stated")
     return int(value)
+
+
+JITTER = 0.3
+"""Maximum distance of a stamp from its step, in steps."""
+
+AGREE = 1e-3
+"""Maximum relative difference of the step of the stamps and a declared one."""
+
+BLOCK = 64
+"""Rows whose median tells a lost frame from the jitter of stamps."""
+
+COUNTERS = (8, 16, 32, 64)
+"""Bits of a frame counter."""
+
+
+def steps_of(time: Array, dt: float | None = None, frames: Array | None = None) -> tuple[Array, float, str]:
+    """Return the step of every row, and the time step, of time stamps.
+
+    A difference of several steps is a gap. Stamps that scatter are accepted where the frames are counted, or where the rate is
+    declared and no frame, or none that could not be told, is missing.
+
+    Parameters
+    ----------
+    time : Array
+        Time stamps, (n,) [s].
+    dt : float, optional
+        Declared time step [s].
+    frames : Array, optional
+        Step of every row where a frame counter tells it, (n,); the stamps then give the time step alone.
+
+    Returns
+    -------
+    steps : Array
+        Integers from 0, (n,).
+    dt : float
+        Time step [s].
+    said : str
+        That stamps scatter, in a few words.
+
+    Raises
+    ------
+    RecordError
+        Time goes backwards, the rate is not constant or not the declared one, or most frames are missing.
+    """
+    bad = np.flatnonzero(~np.isfinite(time))
+    if bad.size:
+        raise RecordError(f"time is {time[bad[0]]} in row {bad[0]}")
+    if time.size < 2:
+        raise RecordError("time needs two rows at least")
+    if frames is not None:
+        return frames, *_step_of_frames(time, dt, frames)
+    try:
+        return *_regular_steps(time, dt), ""
+    except RecordError:
+        steps = None if dt is None else _scattered_steps(time, dt)
+        if dt is None or steps is None:
+            raise
+    _check_lost(steps)
+    return steps, dt, f"stamps {np.std(time / dt - steps):.2g} steps rms off the stated rate"
+
+
+def _regular_steps(time: Array, dt: float | None) -> tuple[Array, float]:
+    """Return the steps and the time step of stamps that are at most JITTER from their steps."""
+    hint = "stamps that scatter need a stated rate" if dt is None else "it is not known which frames are missing"
+    difference = np.diff(time)
+    back = np.flatnonzero(difference <= 0)
+    if back.size:
+        row = back[0] + 1
+        raise RecordError(
+            f"time {'stands still' if difference[row - 1] == 0 else 'goes backwards'} at row {row}, "
+            f"from {time[row - 1]:.9g} to {time[row]:.9g} s; {hint}"
+        )
+    jump = np.rint(difference / np.median(difference))
+    steps = np.concatenate([[0.0], np.cumsum(np.maximum(jump, 1.0))])
+    step = _round_step((time[-1] - time[0]) / steps[-1], time)
+    off = np.abs(time - time[0] - steps * step) / step
+    uneven = np.abs(difference / step - np.diff(steps))
+    if max(off.max(), uneven.max()) > JITTER:
+        row = int(np.argmax(uneven)) + 1
+        raise RecordError(
+            f"the rate is not constant: {difference[row - 1]:.6g} s before row {row}, {step:.6g} s on average; {hint}"
+        )
+    _check_lost(steps)
+    if dt is not None and abs(step / dt - 1.0) > AGREE:
+        raise RecordError(f"time has a step of {step:.6g} s, but {dt:.6g} s are stated")
+    return steps.astype(int), step if dt is None else dt
+
+
+def counted_steps(frame: Array) -> Array:
+    """Return the step of every row of a frame counter (n,), from 0; one that starts anew at a power of two goes on.
+
+    >>> counted_steps(np.array([65534.0, 65535.0, 0.0, 3.0]))
+    array([0, 1, 2, 5])
+    """
+    if not (np.isfinite(frame) & (frame >= 0) & (frame == np.round(frame))).all():
+        raise RecordError("frame takes whole numbers from 0")
+    difference = np.diff(frame)
+    turn = next(2.0**bits for bits in COUNTERS if frame.max() < 2.0**bits)
+    around = difference + turn * (difference < 0)
+    each = np.median(around)
+    wrong = np.flatnonzero((around <= 0) | (around % max(each, 1) != 0) | ((difference < 0) & (around > frame.size * each)))
+    if wrong.size:
+        row = wrong[0] + 1
+        raise RecordError(f"frame does not count at row {row}: from {frame[row - 1]:.0f} to {frame[row]:.0f}")
+    steps = np.concatenate([[0.0], np.cumsum(around / each)])
+    _check_lost(steps)
+    return steps.astype(int)
+
+
+def _check_lost(steps: Array) -> None:
+    lost = steps[-1] + 1 - steps.size
+    if lost > steps.size:
+        raise RecordError(f"{lost:.0f} frames are missing, more than the {steps.size} measured: cut the record at its gaps")
+
+
+def _step_of_frames(time: Array, dt: float | None, steps: Array) -> tuple[float, str]:
+    """Return the time step of rows whose steps are known, and how far the stamps are off. Raises where a pause lies between."""
+    step = _round_step((time[-1] - time[0]) / steps[-1], time)
+    if dt is not None and abs(step / dt - 1.0) > AGREE:
+        raise RecordError(f"time has a step of {step:.6g} s per frame, but {dt:.6g} s are stated")
+    off = (time - time[0]) / step - steps
+    if np.ptp(_medians(off)) > 1.0:
+        raise RecordError("time and frame do not agree: the frames counted do not come at one rate")
+    rms = np.std(off)
+    return step if dt is None else dt, f"stamps {rms:.2g} steps rms off the frames counted" if rms > JITTER / 3 else ""
+
+
+def _scattered_steps(time: Array, dt: float) -> Array | None:
+    """Return the steps of stamps that scatter about a known rate; None where they do not tell which frames are missing."""
+    exact = (time - time[0]) / dt
+    exact -= np.median(exact - np.rint(exact))
+    near = np.rint(exact)
+    jump = np.diff(near)
+    if np.median(jump) == 1 and jump.min() == 1 and np.abs(exact - near).max() < 0.5 - JITTER / 3:
+        return (near - near[0]).astype(int)
+    middle = _medians(exact - np.arange(time.size))
+    if middle.size < 3 or np.abs(middle[2:] - middle[:-2]).max() > 0.5:
+        return None
+    return np.arange(time.size)
+
+
+def _medians(x: Array) -> Array:
+    """Return the medians of successive blocks; of all where there are few."""
+    n = max(x.size // BLOCK, 1)
+    return np.array([np.median(part) for part in np.array_split(x, n)])
+
+
+def place_rows(values: Array, steps: Array) -> Array:
+    """Return an array with the rows at their steps, NaN where a step has none."""
+    out = np.full((steps[-1] + 1, values.shape[1]), np.nan)
+    out[steps] = values
+    return out
+
+
+def place_frames(frames: Array, n: int, ratio: int) -> Array:
+    """Return frames with a row per fast step, from one row per step or per frame."""
+    if frames.shape[0] == n:
+        return frames
+    out = np.full((n, frames.shape[1]), np.nan)
+    due = out[ratio::ratio]
+    if not 0 <= frames.shape[0] - len(due) <= 1:
+        raise RecordError(f"y_ngs has {frames.shape[0]} rows; it takes {n}, or one per frame, {len(due)}")
+    due[:] = frames[: len(due)]
+    return out
+
+
+def drop_partial_frames(y_ngs: Array, ratio: int) -> Array:
+    """Check that frames are at k = n, 2n, ...; drop a frame at k = 0, which saw nothing, and frames without all modes."""
+    steps = np.arange(y_ngs.shape[0])
+    due = (steps % ratio == 0) & (steps >= ratio)
+    wrong = ~due & ~np.isnan(y_ngs).all(axis=1) & (steps > 0)
+    if wrong.any():
+        raise RecordError(
+            f"y_ngs has a frame at step {int(np.argmax(wrong))}; with ratio = {ratio} "
+            f"frames are at steps {ratio}, {2 * ratio}, ... and NaN elsewhere"
+        )
+    return np.where((due & ~np.isnan(y_ngs).any(axis=1))[:, None], y_ngs, np.nan)
+
+
+def frames_at(time: Array, start: float, dt: float) -> Array:
+    """Return the fast steps (n,) of frames stamped `time` [s], where step 0 is at `start`. Raises RecordError between steps."""
+    exact = (time - start) / dt
+    steps = np.rint(exact)
+    wrong = np.flatnonzero(~(np.abs(exact - steps) <= JITTER))
+    if wrong.size:
+        raise RecordError(f"time_ngs is {time[wrong[0]]:.9g} s in row {wrong[0]}, which is no step of the fast clock")
+    back = np.flatnonzero(np.diff(steps) <= 0)
+    if back.size:
+        raise RecordError(f"time_ngs goes backwards or stands still at row {back[0] + 1}")
+    return steps.astype(int)
+
+
+def _round_step(step: float, time: Array) -> float:
+    """Return the shortest number within the rounding errors of the stamps that a step was computed from."""
+    error = 4.0 * np.spacing(np.abs(time).max()) / time.size
+    return next((x for x in (float(f"{step:.{digits}g}") for digits in range(1, 17)) if abs(x - step) <= error), step)

@@ -8,9 +8,8 @@ from typing import Any
 from wfsobs.evaluation.rows import row_label
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import add_comments, changed_settings, to_toml
-from wfsobs.tuning.judge import Errors
 from wfsobs.tuning.records import TRUTH
-from wfsobs.tuning.trials import Stage
+from wfsobs.tuning.trials import Errors, Stage
 from wfsobs.tuning.tuning import TuningResult
 
 

@@ -1,23 +1,202 @@
-"""Runs of an observer with trial settings on a validation record."""
+"""Runs of an observer with trial settings on a validation record.
+
+Log marginal likelihood of a GPR's training targets: what Gaussian processes are usually tuned by, here as information.
+
+    log p(f) = -1/2 f' C^-1 f - 1/2 log det C - m/2 log 2 pi,    C = K + sigma_n^2 I
+
+With M of `observers.kernels`, C = (M + sigma_n^2 I) + s2 delta delta', a rank-one border: with a = f' N f, b = f' N delta,
+c = delta' N delta, N = (M + sigma_n^2 I)^-1,
+
+    f' C^-1 f = a - b^2 / (1 / s2 + c),    log det C = log det (M + sigma_n^2 I) + log(1 + s2 c).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from math import inf
+from math import inf, isfinite
 from typing import Any
 
-from wfsobs.evaluation.scores import PREDICTION
+import numpy as np
+from scipy.optimize import minimize
+from scipy.stats import qmc
+
+from wfsobs.evaluation.result import Failure
+from wfsobs.evaluation.scores import PREDICTION, supervised_scores, unsupervised_scores
+from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
-from wfsobs.progress import Watch
-from wfsobs.record import RecordError
+from wfsobs.observers.base import TARGETS, VIBRATION
+from wfsobs.observers.estimates import Estimate
+from wfsobs.observers.gpr.inputs import scale_of, window_signals
+from wfsobs.observers.gpr.kernels import SquaredExponential, band, check_condition, square_from_band
+from wfsobs.observers.gpr.offline import training_targets
+from wfsobs.observers.gpr.online import kernel_of, online_targets
+from wfsobs.observers.missing import fill_missing
+from wfsobs.prior import Bands
+from wfsobs.priors_from.scenario import bands_of, prior_of
+from wfsobs.progress import QUIET, Watch
+from wfsobs.record import Record, RecordError, pseudo_open_loop
 from wfsobs.scenario import Scenario
-from wfsobs.tuning.judge import Errors, Judge
-from wfsobs.tuning.likelihood import likelihood
+from wfsobs.settings.errors import SettingError
+from wfsobs.signal.linalg import eliminate
 from wfsobs.tuning.records import Records
-from wfsobs.tuning.search import NoEvaluationLeft
 from wfsobs.tuning.space import Space
 from wfsobs.typing import Array
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Mode -> rms error [um]."""
+
+    modes: dict[str, float]
+
+    @property
+    def rms(self) -> float:
+        """Root of the mean square over the modes [um]."""
+        return float(np.sqrt(np.mean(np.square([*self.modes.values()]))))
+
+
+@dataclass(frozen=True)
+class Judge:
+    """The errors of one observer in one target: "turbulence", "vibration", or PREDICTION where there is no truth."""
+
+    observer: str
+    target: str
+
+    def estimates(self, record: Record, scenario: Scenario, watch: Watch) -> list[Estimate]:
+        """Run the observer on a record. Raises ValueError in one line where it cannot, Cancelled."""
+        scenario.validate()
+        out = []
+        for item in each_estimate(record, scenario, watch, [self.observer]):
+            if isinstance(item, Failure):
+                raise RecordError(item.reason)
+            out.append(item)
+        return out
+
+    def errors(self, record: Record, scenario: Scenario, estimates: list[Estimate], warm_up: float) -> Errors:
+        """Over the steps after the warm-up [s] that have an estimate. Raises RecordError where there is none."""
+        names = [m.name for m in scenario.modes][: record.n_modes]
+        if self.target == PREDICTION:
+            scores = [s for s in unsupervised_scores(record, estimates, warm_up, names) if s.observer == self.observer]
+        else:
+            scores = supervised_scores(record, [e for e in estimates if e.target == self.target], warm_up, names)
+        modes = {s.mode: s.rms for s in scores}
+        if len(modes) < len(names) or not all(map(isfinite, modes.values())):
+            raise RecordError(f"{self.observer} has no estimate after the warm-up, {warm_up:g} s")
+        return Errors(modes)
+
+    def begins(self, estimates: list[Estimate]) -> int:
+        """Return the first step with estimates."""
+        silent = np.logical_or.reduce([np.isnan(e.values).any(axis=1) for e in estimates])[:-1]  # a reference lacks the last
+        return int(silent.size - np.argmax(silent[::-1])) if silent.any() else 0
+
+
+def target_of(observer: str, target: str | None) -> str:
+    """Return the given target, by default vibration where the observer estimates it. Raises SettingError."""
+    known = OBSERVERS[observer].targets
+    if target is None:
+        return VIBRATION if VIBRATION in known else known[0]
+    if target not in TARGETS:
+        raise SettingError(f"target {target!r}: takes one of {', '.join(TARGETS)}")
+    if target not in known:
+        raise SettingError(f"target {target!r}: {observer} estimates {' and '.join(known)}")
+    return target
+
+
+DESIGN = 3
+"""One evaluation in so many goes to the hypercube."""
+SIMPLEX = (0.15, 0.03)
+"""Sizes of the first simplex, of one descent and of a second from where that ends."""
+CLOSE, LEVEL = 2e-3, 1e-4
+"""Where a descent ends: simplex of this size, values this near to each other (relative)."""
+
+
+class NoEvaluationLeft(Exception):
+    """No evaluation is left."""
+
+
+def minimise(f: Callable[[Array], float], start: Array, evaluations: int, rng: np.random.Generator) -> None:
+    """Ask f at points (d,) of the unit cube, `start` first, until it raises Spent or nothing is left to gain.
+
+    f gives infinity where it fails; it keeps what it was asked.
+    """
+    try:
+        points = [start, *qmc.LatinHypercube(len(start), seed=rng).random(evaluations // DESIGN)]
+        values = [f(point) for point in points]
+        for size in SIMPLEX:
+            i = int(np.argmin(values))
+            if not np.isfinite(values[i]):
+                return
+            found = minimize(
+                f,
+                points[i],
+                method="Nelder-Mead",
+                bounds=[(0.0, 1.0)] * len(start),
+                options={"initial_simplex": _simplex(points[i], size), "xatol": CLOSE, "fatol": LEVEL * values[i]},
+            )
+            points.append(found.x)
+            values.append(float(found.fun))
+    except NoEvaluationLeft:
+        return
+
+
+def _simplex(point: Array, size: float) -> Array:
+    """Return the point, and one beside it along every axis, on the side with more room."""
+    return np.vstack([point, point + size * np.diag(np.where(point < 0.5, 1.0, -1.0))])
+
+
+GPRS = ("gpr-offline", "gpr-online")
+
+
+def log_marginal_likelihood(
+    signals: Array, targets: Array, depth: int, first: int, m: int, kernel: SquaredExponential, watch: Watch = QUIET
+) -> float:
+    """Of the targets (n,) [um] of the m windows of signals (n, channels) that end at first ... first + m - 1.
+
+    Raises ConditionError where the precision is not enough, Cancelled.
+    """
+    V, points = band(signals, depth, kernel, first, m, m - 1)
+    S = np.zeros((m + 2, m + 2), order="F")  # the covariance with the targets and delta as two more rows
+    S[:m, :m] = square_from_band(V, 0, m)
+    S[m:, :m] = targets[first : first + m], points.delta
+    check_condition(S[:m, :m], kernel)
+    eliminate(S, m, watch.check)
+    a, b, c = -S[m, m], -S[m + 1, m], -S[m + 1, m + 1]
+    quadratic = a - b**2 / (1.0 / kernel.variance + c)
+    log_determinant = 2.0 * np.log(np.diagonal(S)[:m]).sum() + np.log1p(kernel.variance * c)
+    return float(-0.5 * (quadratic + log_determinant + m * np.log(2.0 * np.pi)))
+
+
+def likelihood(observer: str, record: Record, scenario: Scenario, watch: Watch = QUIET) -> tuple[float, ...] | None:
+    """One number per mode, of a GPR on a record: the offline one's training set, or the last one of the online GPR.
+
+    None for what is no GPR, and where the record or the numbers do not suffice.
+    """
+    if observer not in GPRS:
+        return None
+    try:
+        whole = fill_missing(record, prior_of(scenario, record, (Bands,)))
+        return tuple(_of_mode(observer, whole, scenario, mode, watch) for mode in range(record.n_modes))
+    except ValueError:
+        return None
+
+
+def _of_mode(observer: str, record: Record, scenario: Scenario, mode: int, watch: Watch) -> float:
+    g = scenario.gpr_offline if observer == "gpr-offline" else scenario.gpr_online
+    bands, scale = bands_of(scenario), scale_of(g, record.training, record.delay, mode)
+    if observer == "gpr-offline":
+        training = record.training
+        assert training is not None
+        targets, first = training_targets(training, bands, record.dt, record.delay), g.depth - 1
+        y, u, z = training.y_lgs, training.u, pseudo_open_loop(training.y_lgs, training.u, record.delay)
+    else:
+        targets, first = online_targets(record, bands), record.n_steps - 1 - g.training_size
+        y, u, z = record.y_lgs, record.u, record.z
+    if first < g.depth - 1 or first + g.training_size > targets.shape[0]:
+        raise RecordError("the record is too short for the training set")
+    signals = window_signals(g, y, u, z, mode, record.dt, scale)
+    return log_marginal_likelihood(signals, targets[:, mode], g.depth, first, g.training_size, kernel_of(g), watch)
+
 
 LEARNING, LATEST = 0.25, 0.5
 """Part of the validation record that counts for nothing, so that slow starters are compared with others on the same steps; and

@@ -11,11 +11,9 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
-from wfsobs.tuning.judge import Judge, target_of
 from wfsobs.tuning.records import DESIGN, MEASURES, cut_record, simulate_records, stream
-from wfsobs.tuning.search import minimise
 from wfsobs.tuning.space import space
-from wfsobs.tuning.trials import Evaluation, Stage, Trials
+from wfsobs.tuning.trials import Evaluation, Judge, Stage, Trials, minimise, target_of
 
 EVALUATIONS = 40
 

@@ -23,11 +23,10 @@ from wfsobs.app.report.sections import value_of
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.store import Store
 from wfsobs.app.style import look, swatch
-from wfsobs.campaign.axes import SCENARIO, PlanAxis, plan_axes
 from wfsobs.campaign.errors import CampaignErrors
 from wfsobs.campaign.follow import CampaignFolder, CampaignState
 from wfsobs.campaign.report import name_label
-from wfsobs.campaign.selection import condition
+from wfsobs.campaign.selection import SCENARIO, PlanAxis, condition, plan_axes
 from wfsobs.campaign.standings import UNTESTED, TogetherRow, standings
 from wfsobs.evaluation.rows import target_title
 from wfsobs.evaluation.scores import BOUNDS

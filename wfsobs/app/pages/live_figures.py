@@ -31,9 +31,8 @@ from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.latencies import EDGES
 from wfsobs.live.board import SLOTS, Board
 from wfsobs.live.control_crew import ControlView
-from wfsobs.live.finding import Bounds
+from wfsobs.live.finding import Bounds, bridge_missing
 from wfsobs.live.paced import LiveEvent
-from wfsobs.live.spectrum_of_minute import bridge_missing
 from wfsobs.live.view import LiveView
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import welch_psd

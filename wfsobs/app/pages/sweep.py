@@ -52,8 +52,7 @@ from wfsobs.app.seeds import SeedScores
 from wfsobs.app.service import BackgroundTask, Session
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, look
-from wfsobs.campaign.sweep import MOST_SEEDS, SEED, Sweep, parse_axis, plan_sweep
-from wfsobs.campaign.sweep_results import SweepResults, run_cell
+from wfsobs.campaign.sweep import MOST_SEEDS, SEED, Sweep, SweepResults, parse_axis, plan_sweep, run_cell
 from wfsobs.evaluation.rows import target_title
 from wfsobs.evaluation.scores import SCORED
 from wfsobs.priors_from.selection import quick_observers

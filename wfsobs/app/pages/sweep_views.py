@@ -17,7 +17,7 @@ from wfsobs.app.render import number
 from wfsobs.app.report.sections import value_of
 from wfsobs.app.style import look, observers_of
 from wfsobs.app.views.plots import add_line, call, new_figure
-from wfsobs.campaign.sweep_results import SweepResults
+from wfsobs.campaign.sweep import SweepResults
 from wfsobs.evaluation.evidence import FEWEST
 from wfsobs.evaluation.rows import row_label
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH

@@ -52,9 +52,9 @@ from wfsobs.scenario.configfile import changed_settings
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.settings.errors import SettingError
 from wfsobs.tuning import Evaluation, Stage, TuningResult, tune
-from wfsobs.tuning.judge import Errors
 from wfsobs.tuning.records import MEASURES, NEXT, REFERENCE, TRUTH, judged_by
 from wfsobs.tuning.report import settings, tuning_remarks, tuning_toml
+from wfsobs.tuning.trials import Errors
 from wfsobs.tuning.tuning import EVALUATIONS
 
 MOST = 1000

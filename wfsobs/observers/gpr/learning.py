@@ -38,10 +38,10 @@ from wfsobs.signal.periodic import FilterStep, PeriodicFilter
 from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.smoother import smoother
 from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
-from wfsobs.spectral.missed import missed_variance
 from wfsobs.spectral.model import Spectrum
 from wfsobs.spectral.periodogram import periodogram, periodogram_frequencies
 from wfsobs.spectral.quick import quick_spectrum
+from wfsobs.spectral.search import missed_variance
 from wfsobs.typing import Array
 
 WORTH = 8.0

@@ -7,9 +7,8 @@ from types import MappingProxyType
 import param
 
 from wfsobs.sensors.modes import HIGHEST_ORDER
-from wfsobs.settings.group import Group
+from wfsobs.settings.group import Group, section
 from wfsobs.settings.parameters import Real, Reals, Whole
-from wfsobs.settings.sections import section
 
 
 class Telescope(Group):

@@ -7,10 +7,9 @@ from types import MappingProxyType
 import param
 
 from wfsobs.scenario.groups.atmosphere import PsdTable
-from wfsobs.settings.group import Group
+from wfsobs.settings.group import Group, section
 from wfsobs.settings.parameters import Real, Reals
 from wfsobs.settings.priors import PAPER_PEAK_HZ
-from wfsobs.settings.sections import section
 
 
 class Peak(Group):
