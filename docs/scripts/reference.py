@@ -127,7 +127,7 @@ def observers() -> str:
             ("Computing time, Kalman filter = 1", f"{o.weight:g}"),
             ("Its settings", listed([o.group] if o.group else ())),
             ("Settings that are tuned", listed(o.tunable.usual)),
-            ("Function", reference(o.run)),
+            ("Function", reference(o.run or getattr(o.step, "func", o.step))),
         )
         about = f"{o.help[:1].upper()}{o.help[1:]}.\n\n" if o.help else ""
         out.append(f"## {o.label} (`{o.id}`)\n\n{about}{table(('Property', 'Value'), rows)}\n\n{inspect.getdoc(o.run)}\n")
