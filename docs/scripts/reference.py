@@ -119,6 +119,7 @@ def observers() -> str:
         "[Model](../model.md#observers) the equations.\n"
     ]
     for o in OBSERVERS.values():
+        function = o.run or getattr(o.step, "func", o.step)
         rows = (
             ("Estimates", ", ".join(o.targets)),
             ("Needs beside measurements", o.needs_text()),
@@ -127,10 +128,10 @@ def observers() -> str:
             ("Computing time, Kalman filter = 1", f"{o.weight:g}"),
             ("Its settings", listed([o.group] if o.group else ())),
             ("Settings that are tuned", listed(o.tunable.usual)),
-            ("Function", reference(o.run or getattr(o.step, "func", o.step))),
+            ("Function", reference(function)),
         )
         about = f"{o.help[:1].upper()}{o.help[1:]}.\n\n" if o.help else ""
-        out.append(f"## {o.label} (`{o.id}`)\n\n{about}{table(('Property', 'Value'), rows)}\n\n{inspect.getdoc(o.run)}\n")
+        out.append(f"## {o.label} (`{o.id}`)\n\n{about}{table(('Property', 'Value'), rows)}\n\n{inspect.getdoc(function)}\n")
     return "\n".join(out)
 
 
