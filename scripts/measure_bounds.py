@@ -16,7 +16,7 @@ from time import perf_counter, process_time
 import numpy as np
 
 from wfsobs.app.work import one_blas_thread
-from wfsobs.evaluation.record_bounds import JOINT, joint_observers, record_bounds
+from wfsobs.evaluation.bound import INFORMATION, bound, joint_observers, record_bounds
 from wfsobs.evaluation.rows import JOINT_BOUNDS
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
@@ -27,12 +27,12 @@ def main(names: list[str]) -> None:
     """Print a line per preset and kind of row."""
     print(f"{'preset':20}{'rows':20}{'first':>8}{'next':>8}{'first, CPU':>12}{'next, CPU':>12}   s")
     for name in names or [name for name, preset in PRESETS.items() if not preset().events]:
-        for observer in ("", *joint_observers(PRESETS[name](), JOINT)):
+        for observer in ("", *joint_observers(PRESETS[name](), JOINT_BOUNDS)):
             subprocess.run([sys.executable, __file__, "--one", name, observer], check=True)
 
 
 def one(name: str, observer: str) -> None:
-    """Print the line of a preset; observer : one of JOINT, or empty."""
+    """Print the line of a preset; observer : one of JOINT_BOUNDS, or empty."""
     one_blas_thread()
     scenario = PRESETS[name]()
     first, first_busy = times(scenario, observer)
@@ -45,7 +45,7 @@ def times(scenario: Scenario, observer: str) -> tuple[float, float]:
     """Return the time that the bounds take, and the processor's [s]."""
     start, busy = perf_counter(), process_time()
     if observer:
-        JOINT[observer][-1](scenario)
+        bound(scenario, next(name for name, row in INFORMATION.items() if row == JOINT_BOUNDS[observer]))
     else:
         nothing = np.zeros((scenario.n_steps, len(scenario.modes)))
         record_bounds(scenario, Record(nothing, nothing, scenario.dt))

@@ -10,9 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import cholesky, solve_triangular, toeplitz
 
-from wfsobs.evaluation.bound import bound_rms
-from wfsobs.evaluation.bound_both import bound_rms_of_both, least_errors_of_both
-from wfsobs.evaluation.record_bounds import record_bounds
+from wfsobs.evaluation.bound import bound_rms, least_errors_of_both, record_bounds
 from wfsobs.evaluation.rows import can_be_best
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, COMMON_BOUNDS, SCORED
 from wfsobs.observers.kalman.multirate import optimal_cycle
@@ -201,7 +199,7 @@ FIGURES = {
 def test_filters_of_many_seconds_come_near_from_above(preset: str, ahead: int) -> None:
     scenario = PRESETS[preset]()
     for mode in range(2):
-        least = bound_rms_of_both(scenario, mode, ahead)
+        least = bound_rms(scenario, mode, ahead, information="both")
         for target, figures in FIGURES[preset, ahead].items():
             # Two decimals. Lines 1/160 Hz wide have a memory of 50 s, so that a filter of 10 s leaves up to 0.5 % more.
             assert -0.006 < figures[mode] - 1e3 * least[target] < 0.005 + 0.005 * figures[mode], (mode, target)
@@ -209,7 +207,8 @@ def test_filters_of_many_seconds_come_near_from_above(preset: str, ahead: int) -
 
 def test_more_sensors_leave_less_and_worse_ones_more() -> None:
     scenario = PRESETS["paper"]()
-    noises = [bound_rms_of_both(scenario.replace({"sensors.ngs_noise": noise}), 0) for noise in (0.005, 0.01, 0.05, 10.0)]
+    noisy = [scenario.replace({"sensors.ngs_noise": noise}) for noise in (0.005, 0.01, 0.05, 10.0)]
+    noises = [bound_rms(one, 0, information="both") for one in noisy]
     alone = bound_rms(scenario, 0)
     for target, least in alone.items():
         errors = [found[target] for found in noises]
@@ -221,9 +220,10 @@ def test_more_sensors_leave_less_and_worse_ones_more() -> None:
 def test_frames_that_see_what_the_lasers_see_not() -> None:
     """Without tip and tilt in the LGS the turbulence is known from the NGS alone."""
     blind = PRESETS["paper"]().replace({"sensors.tip_tilt_indetermination": True, "vibration.source": "none"})
-    expected = bound_rms_of_both(blind.replace({"sensors.tip_tilt_indetermination": False, "sensors.lgs_noise": 10.0}), 0)
+    seeing = blind.replace({"sensors.tip_tilt_indetermination": False, "sensors.lgs_noise": 10.0})
+    expected = bound_rms(seeing, 0, information="both")
     # 10 um of noise in an LGS tell 1e-5 of what a frame does
-    assert bound_rms_of_both(blind, 0)["turbulence"] == pytest.approx(expected["turbulence"], rel=1e-3)
+    assert bound_rms(blind, 0, information="both")["turbulence"] == pytest.approx(expected["turbulence"], rel=1e-3)
 
 
 def test_events_have_none_and_no_bound_is_best() -> None:
@@ -241,7 +241,7 @@ def test_what_is_remembered_is_of_these_settings() -> None:
         other = scenario.replace(changed)
         found = {(it.row, it.target, it.column): it.error.rms for it in record_bounds(other, simulate(other))}
         for mode in range(2):
-            both, alone = bound_rms_of_both(other, mode), bound_rms(other, mode)
+            both, alone = bound_rms(other, mode, information="both"), bound_rms(other, mode)
             for target in SCORED:
                 assert found[BOUND_BOTH, target, mode] == both[target], changed
                 assert found[BOUND, target, mode] == alone[target], changed

@@ -7,8 +7,7 @@ import pytest
 
 from wfsobs import PRESETS
 from wfsobs.control.mirror import Mirror
-from wfsobs.evaluation.bound_delay import WAYS, least_residual
-from wfsobs.evaluation.scores import BOUND, BOUND_BOTH
+from wfsobs.evaluation.bound import least_residual
 from wfsobs.simulation.true_spectra import TrueSpectra, true_spectra
 from wfsobs.typing import Array
 
@@ -32,7 +31,7 @@ def residual_of_taps(spectra: TrueSpectra, delay: float, taps: int) -> float:
 def test_no_filter_of_many_taps_leaves_less_and_some_leave_hardly_more(delay: float) -> None:
     """Of 1500 taps, which miss 1e-5; what the fraction costs is 2 and 5 % for delays of 2.7 and 2.95."""
     spectra = true_spectra(SCENARIO, 0)
-    bound, taps = least_residual(spectra, delay, WAYS[BOUND]), residual_of_taps(spectra, delay, 1500)
+    bound, taps = least_residual(spectra, delay, "lgs"), residual_of_taps(spectra, delay, 1500)
     assert bound * (1.0 - 1e-5) < taps < bound * (1.0 + 1e-4)
 
 
@@ -91,12 +90,12 @@ def test_no_filter_of_both_sensors_leaves_less_and_some_leave_hardly_more(delay:
     """Of 160 steps; beyond half a frame the fraction costs 40 %."""
     spectra = true_spectra(SHORT, 0)
     # 1e-7 for what wraps around the DFT, and for conjugate gradients that stop at 1e-4, whose square counts
-    assert least_residual(spectra, delay, WAYS[BOUND_BOTH]) == pytest.approx(residual_of_both(spectra, delay, 160), rel=1e-6)
+    assert least_residual(spectra, delay, "both") == pytest.approx(residual_of_both(spectra, delay, 160), rel=1e-6)
 
 
-@pytest.mark.parametrize("row", [BOUND, BOUND_BOTH])
-def test_up_to_half_a_frame_costs_nothing_and_more_leads_to_one_frame_more(row: str) -> None:
-    spectra, least = true_spectra(SCENARIO, 0), WAYS[row]
-    two, half, more, most, three = (least_residual(spectra, delay, least) for delay in (2.0, 2.5, 2.75, 2.9999, 3.0))
+@pytest.mark.parametrize("information", ["lgs", "both"])
+def test_up_to_half_a_frame_costs_nothing_and_more_leads_to_one_frame_more(information: str) -> None:
+    spectra = true_spectra(SCENARIO, 0)
+    two, half, more, most, three = (least_residual(spectra, delay, information) for delay in (2.0, 2.5, 2.75, 2.9999, 3.0))
     assert two == half < more < most
     assert most == pytest.approx(three, rel=1e-4)

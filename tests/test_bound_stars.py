@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import cholesky, solve_triangular
 
-from wfsobs.evaluation.bound_both import bound_rms_of_both, exposure_response, least_errors_of_both
-from wfsobs.evaluation.bound_stars import bound_rms_of_stars, least_errors_of_stars
-from wfsobs.evaluation.record_bounds import record_bounds
+from wfsobs.evaluation.bound import bound_rms, exposure_response, least_errors_of_both, record_bounds
 from wfsobs.evaluation.scores import BOUND_STARS
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
@@ -94,7 +92,7 @@ CASES = {
 def test_the_best_estimate_of_a_long_record_comes_near_from_above(case: str) -> None:
     stars = star_spectra(ASTERISM.replace(CASES[case]), 0)
     for phase, ahead in ((0, 0), (3, 1)):
-        least, both = least_errors_of_stars(stars, ahead), least_errors_of_both(stars.mean, ahead)
+        least, both = least_errors_of_both(stars.mean, ahead, stars), least_errors_of_both(stars.mean, ahead)
         for name, exact in exact_errors(stars, 1000, phase, ahead).items():
             found = least[name].phases[phase]
             assert found <= exact * (1 + 1e-4), "what wraps around the DFT"
@@ -139,8 +137,8 @@ def test_spectra_add_up_to_the_covariance_of_the_stars(stars: int) -> None:
 
 def test_stars_that_see_the_same_tell_no_more_than_their_mean() -> None:
     near = ASTERISM.replace({"sensors.lgs_radius": 1e-3, "sensors.ngs_direction": [0.0, 0.0]})
-    both = bound_rms_of_both(near, 0)
-    for target, least in bound_rms_of_stars(near, 0).items():
+    both = bound_rms(near, 0, information="both")
+    for target, least in bound_rms(near, 0, information="stars").items():
         # Of the frames the last 8192 steps are used, of the mean all.
         assert least == pytest.approx(both[target], rel=1e-3), target
 

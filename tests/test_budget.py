@@ -14,10 +14,8 @@ from scipy.linalg import solve_discrete_lyapunov
 
 import wfsobs
 from wfsobs.cli import main
-from wfsobs.evaluation.budget import AVERAGED, TERMS, Budget, error_budget
-from wfsobs.evaluation.responses import _shapley_share
+from wfsobs.evaluation.budget import AVERAGED, TERMS, Budget, error_budget, shapley_shares, split_lines, split_record, sum_sources
 from wfsobs.evaluation.scores import BOUNDS
-from wfsobs.evaluation.sources import split_lines, split_record, sum_sources
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.pipeline import run
 from wfsobs.priors_from.scenario import kalman_model
@@ -219,7 +217,7 @@ def test_the_average_over_orders_shares_what_two_causes_do_together() -> None:
         of = set(names)
         return {"a": np.array([6.0 * ({"x", "y"} <= of) + values["z"] * ("z" in of)])}
 
-    share = _shapley_share(tuple(values), estimate, estimate(()))
+    share = shapley_shares(tuple(values), estimate, estimate(()))
     assert [float(share[name]["a"][0]) for name in values] == pytest.approx([3.0, 3.0, 5.0])
 
 

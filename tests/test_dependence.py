@@ -14,7 +14,7 @@ import pytest
 
 from tests.records import ON_PAPER
 from wfsobs.dependence import Memo, RecordMemo, digest, observers_reached, record_digest, simulate_once
-from wfsobs.evaluation.record_bounds import record_bounds
+from wfsobs.evaluation.bound import record_bounds
 from wfsobs.evaluation.result import Failure
 from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS

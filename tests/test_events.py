@@ -14,7 +14,7 @@ from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import rows
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.cost import run_bytes, run_seconds
-from wfsobs.evaluation.record_bounds import record_bounds
+from wfsobs.evaluation.bound import record_bounds
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH
 from wfsobs.identification import identify
 from wfsobs.observers import OBSERVERS

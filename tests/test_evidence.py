@@ -11,8 +11,7 @@ from scipy.stats import binom, ttest_1samp, ttest_rel
 
 from wfsobs.evaluation.evidence import Evidence, columns_differ, gather_evidence, holm, means_differ
 from wfsobs.evaluation.rows import can_be_best
-from wfsobs.evaluation.samples import batch_means
-from wfsobs.evaluation.scores import Score
+from wfsobs.evaluation.scores import Score, batch_means
 from wfsobs.evaluation.verdict import verdict
 from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import run

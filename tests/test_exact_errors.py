@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.records import MATCHED
-from wfsobs.evaluation.bound_both import bound_rms_of_both
+from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.exact_errors import exact_errors
 from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
@@ -33,7 +33,7 @@ def test_where_the_truth_is_the_model_it_is_the_covariance_and_the_bound(name: s
             expected = [sqrt(row @ states[(p - 1) % ratio].posterior @ row) for p in range(ratio)]
             # what the slowest correlations have left after half the DFT, exp(-10)
             assert errors[target].phases == pytest.approx(expected, rel=1e-5), (mode, target)
-        for target, least in bound_rms_of_both(MATCHED, mode).items():
+        for target, least in bound_rms(MATCHED, mode, information="both").items():
             assert 1.0 - 1e-5 < errors[target].rms / least < 1.0001, "the bound is met to what its search leaves"
 
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import csd, welch
 
-from wfsobs.evaluation.bound import bound_rms
-from wfsobs.evaluation.record_bounds import record_bounds
+from wfsobs.evaluation.bound import bound_rms, record_bounds
 from wfsobs.execution import run_observer
 from wfsobs.scenario import Scenario
 from wfsobs.signal.wiener import circle_mean

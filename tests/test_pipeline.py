@@ -11,7 +11,6 @@ import pytest
 from tests.records import ON_PAPER
 from wfsobs import PRESETS, Record, Scenario, SettingError, observe, run, simulate
 from wfsobs.evaluation.bound import bound_rms
-from wfsobs.evaluation.bound_both import bound_rms_of_both
 from wfsobs.evaluation.result import Failure
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, BOUNDS, COMMON_BOUNDS, LOOP, PREDICTION, RESIDUAL, SCORED
 from wfsobs.execution import each_estimate
@@ -65,8 +64,8 @@ def test_scores_are_those_of_the_estimates() -> None:
             scored = slice(300, 799 if s.target == "vibration" else 800)  # those of the rows beside it
             assert truth is not None and s.truth_rms == pytest.approx(np.sqrt(np.mean(truth[scored, mode] ** 2)), rel=1e-12)
             assert (s.start, s.stop) == pytest.approx((0.3, scored.stop / 1000))
-            least = bound_rms if s.observer == BOUND else bound_rms_of_both
-            assert s.rms == least(scenario(), mode)[s.target]
+            information = "lgs" if s.observer == BOUND else "both"
+            assert s.rms == bound_rms(scenario(), mode, information=information)[s.target]
             assert (s.interval is None, s.phases is None) == (s.observer == BOUND_BOTH, s.observer == BOUND)
             # rms is over all phases of a frame
             assert s.phases is None or s.rms == pytest.approx(np.sqrt(np.mean(np.square(s.phases))), rel=1e-12)

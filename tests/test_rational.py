@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from wfsobs import PRESETS
-from wfsobs.evaluation.bound_both import bound_rms_of_both
+from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.exact_errors import exact_errors
 from wfsobs.observers import OBSERVERS
 from wfsobs.priors_from.scenario import lines_of
@@ -75,5 +75,5 @@ def test_the_floor_brings_no_observer_far_from_its_bound() -> None:
     s = PRESETS["ut4-floor"]()
     errors = exact_errors(OBSERVERS["multirate-multi"], s)
     for mode, of_mode in enumerate(errors):
-        least = bound_rms_of_both(s, mode)
+        least = bound_rms(s, mode, information="both")
         assert all(1.0 < of_mode[target].rms / least[target] < 1.25 for target in least)

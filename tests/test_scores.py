@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs.evaluation.error_spectra import cumulative_rms, scored_samples
-from wfsobs.evaluation.lag import lag
-from wfsobs.evaluation.scores import supervised_scores, unsupervised_scores
+from wfsobs.evaluation.scores import lag, supervised_scores, unsupervised_scores
 from wfsobs.observers.estimates import TOTAL, Estimate
 from wfsobs.record import Record
 from wfsobs.signal.ar2 import Ar2

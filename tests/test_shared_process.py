@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wfsobs.evaluation.bound_both import bound_rms_of_both
+from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.exact_errors import exact_errors
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario.presets import PRESETS
@@ -64,6 +64,6 @@ def test_the_filter_comes_near_the_bound(preset: str, turbulence: float, vibrati
     """Limits that were set before there was a filter."""
     scenario = PRESETS[preset]()
     for mode, errors in enumerate(exact_errors(OBSERVERS["multirate-multi"], scenario)):
-        least = bound_rms_of_both(scenario, mode)
+        least = bound_rms(scenario, mode, information="both")
         assert 0.9999 < errors["turbulence"].rms / least["turbulence"] < turbulence, mode
         assert 0.9999 < errors["vibration"].rms / least["vibration"] < vibration, mode

@@ -11,10 +11,9 @@ from scipy.signal import get_window
 
 import wfsobs
 from wfsobs.evaluation.bound import bound_rms
-from wfsobs.evaluation.error_spectra import band_rms, spectra
+from wfsobs.evaluation.error_spectra import TRUTH, Prediction, Theory, band_rms, spectra
 from wfsobs.evaluation.exact_errors import exact_errors
 from wfsobs.evaluation.scores import BOUND
-from wfsobs.evaluation.theory import TRUTH, Prediction, Theory
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.single import steady_filter

@@ -14,10 +14,8 @@ from wfsobs.evaluation.evidence import LEVEL, means_differ
 from wfsobs.evaluation.known_lines import NOTHING, PEAKS, prior_knowledge
 from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.rows import can_be_best, row_label, target_title
-from wfsobs.evaluation.samples import BATCHES, batch_means
-from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS, PREDICTION
-from wfsobs.evaluation.verdict import explain_harm, verdict
-from wfsobs.evaluation.verdict_words import HEADINGS
+from wfsobs.evaluation.scores import BATCHES, BOUND_BOTH, BOUNDS, PREDICTION, batch_means
+from wfsobs.evaluation.verdict import HEADINGS, explain_harm, verdict
 from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import observe, run
 from wfsobs.scenario.presets import PRESETS

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wfsobs.dependence import RecordMemo
-from wfsobs.evaluation.record_bounds import Bound, bound_scores, record_bounds
+from wfsobs.evaluation.bound import Bound, bound_scores, record_bounds
 from wfsobs.evaluation.result import Failure, Result
 from wfsobs.evaluation.scores import SCORED, Derive, make_anew, score
 from wfsobs.execution import each_estimate

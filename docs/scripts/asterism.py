@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from wfsobs import PRESETS, observe, simulate
-from wfsobs.evaluation.bound_asterism import bound_rms_of_asterism
-from wfsobs.evaluation.bound_both import bound_rms_of_both
-from wfsobs.evaluation.bound_stars import bound_rms_of_stars
+from wfsobs.evaluation.bound import bound
 from wfsobs.scenario import Scenario
 
 SEEDS = range(1, 11)
@@ -33,13 +31,9 @@ def errors(scenario: Scenario) -> dict[str, dict[str, list[float]]]:
 
 def bounds(scenario: Scenario) -> dict[str, dict[str, list[float]]]:
     """Bound -> target -> rms of each mode [um]."""
-    modes = range(len(scenario.modes))
-    found = {
-        "bound-both": [bound_rms_of_both(scenario, mode) for mode in modes],
-        "bound-stars": [bound_rms_of_stars(scenario, mode) for mode in modes],
-        "Bound, stars and modes together": bound_rms_of_asterism(scenario),
-    }
-    return {name: {t: [one[t] for one in by_mode] for t in TARGETS} for name, by_mode in found.items()}
+    rows = {"bound-both": "both", "bound-stars": "stars", "Bound, stars and modes together": "asterism"}
+    found = {name: bound(scenario, information) for name, information in rows.items()}
+    return {name: {t: [one[t].rms for one in by_mode] for t in TARGETS} for name, by_mode in found.items()}
 
 
 def table(preset: str, kind: str) -> str:

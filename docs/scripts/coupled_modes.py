@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from wfsobs import PRESETS, observe, simulate
-from wfsobs.evaluation.bound import bound_rms
-from wfsobs.evaluation.bound_asterism import bound_rms_of_modes_of_both
-from wfsobs.evaluation.bound_both import bound_rms_of_both
-from wfsobs.evaluation.bound_modes import bound_rms_of_modes
+from wfsobs.evaluation.bound import bound
 from wfsobs.scenario import Scenario
 
 OBSERVERS = {"of the LGS": ("kf-lgs", "kf-multi", "kf-coupled"), "of both sensors": ("multirate-multi", "multirate-coupled")}
@@ -21,12 +17,8 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "slow": ("the same in wind of 5 m/s", {"turbulence.wind_speed": 5.0}),
     "fast": ("the same in wind of 30 m/s", {"turbulence.wind_speed": 30.0}),
 }
-Bounds = dict[str, tuple[Callable[[Scenario, int], dict[str, float]], Callable[[Scenario], list[dict[str, float]]]]]
-BOUNDS: Bounds = {
-    "of the LGS": (bound_rms, bound_rms_of_modes),
-    "of both sensors": (bound_rms_of_both, bound_rms_of_modes_of_both),
-}
-"""Sensors -> bound of a mode by itself, and of all modes together."""
+BOUNDS = {"of the LGS": ("lgs", "modes"), "of both sensors": ("both", "both-modes")}
+"""Sensors -> information of each mode by itself, and of all modes together."""
 
 
 def errors(scenario: Scenario, seeds: int) -> dict[str, np.ndarray]:
@@ -48,8 +40,8 @@ def tables(changes: dict[str, Any], seeds: int) -> str:
     orders = np.array([mode.radial_order for mode in scenario.modes])
     for sensors, (alone, together) in BOUNDS.items():
         columns = {f"`{name}`": found[name] for name in OBSERVERS[sensors]}
-        columns["Bound, each mode by itself"] = np.array([alone(scenario, i)["turbulence"] ** 2 for i in range(len(orders))])
-        columns["Bound, modes together"] = np.array([one["turbulence"] ** 2 for one in together(scenario)])
+        for title, information in (("each mode by itself", alone), ("modes together", together)):
+            columns[f"Bound, {title}"] = np.array([one["turbulence"].rms ** 2 for one in bound(scenario, information)])
         out += [f"| Radial order, {sensors} | {' | '.join(columns)} |", "|---" * (1 + len(columns)) + "|"]
         for n in sorted(set(orders)):
             out.append(f"| {n} | {' | '.join(f'{1e3 * np.sqrt(x[orders == n].mean()):.1f}' for x in columns.values())} |")

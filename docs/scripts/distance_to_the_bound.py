@@ -13,7 +13,7 @@ from math import sqrt
 import numpy as np
 
 from wfsobs import PRESETS
-from wfsobs.evaluation.bound_both import bound_rms_of_both
+from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.exact_errors import exact_errors
 from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
@@ -40,7 +40,7 @@ def rows(preset: str) -> Iterator[str]:
     scenario = PRESETS[preset]()
     found = {name: exact_errors(OBSERVERS[name], scenario) for name in NAMES}
     for mode in range(min(len(scenario.modes), 2)):
-        least = bound_rms_of_both(scenario, mode)
+        least = bound_rms(scenario, mode, information="both")
         cells = [f"`{preset}`, {scenario.modes[mode].name}", " / ".join(f"{1e3 * least[target]:.2f}" for target in TARGETS)]
         cells += [
             " / ".join(f"{errors[mode][target].rms / least[target]:.3f}" for target in TARGETS) for errors in found.values()

@@ -11,7 +11,6 @@ import numpy as np
 
 from wfsobs import PRESETS, simulate
 from wfsobs.evaluation.bound import bound_rms
-from wfsobs.evaluation.bound_both import bound_rms_of_both
 from wfsobs.execution import run_observer
 
 NAMES = ("zero", "gpr-offline", "gpr-online", "ridge-30", "gpr-adaptive", "kf-adaptive")
@@ -38,7 +37,7 @@ def table(name: str, seeds: int) -> None:
             error = (run_observer(observer, record, s)["vibration"] - record.vibration)[round(START / s.dt) :]
             found.append(np.mean(error**2, axis=0))
     for mode in range(2):
-        alone, both = bound_rms(scenario, mode)["vibration"], bound_rms_of_both(scenario, mode)["vibration"]
+        alone, both = bound_rms(scenario, mode)["vibration"], bound_rms(scenario, mode, information="both")["vibration"]
         errors = [np.sqrt(np.mean(found, axis=0))[mode] for found in squares.values()]
         cells = [f"{1e3 * error:.2f} = {error / alone:.2f}" for error in errors]
         print(

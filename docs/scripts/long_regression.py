@@ -11,7 +11,7 @@ import argparse
 import numpy as np
 
 from wfsobs import PRESETS, simulate
-from wfsobs.evaluation.bound_both import least_errors_of_both
+from wfsobs.evaluation.bound import least_errors_of_both
 from wfsobs.simulation.true_spectra import true_spectra
 
 TAPS, FRAMES, PHASE = 1200, 100, 2

@@ -20,7 +20,7 @@ from time import process_time
 import numpy as np
 
 from wfsobs import PRESETS, simulate
-from wfsobs.evaluation.bound_both import bound_rms_of_both
+from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.exact_errors import exact_errors
 from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
@@ -67,7 +67,7 @@ def table(preset: str, seeds: int, first: int) -> None:
     squares, seconds = square_errors(scenario, seeds, first)
     exact = exact_errors(OBSERVERS[NAMES[-1]], scenario)
     for mode in range(min(len(scenario.modes), 2)):
-        bound = bound_rms_of_both(scenario, mode)
+        bound = bound_rms(scenario, mode, information="both")
         for j, target in enumerate(TARGETS):
             computed, of_all = exact[mode][target].rms / bound[target], squares[:, j, :, mode]
             cells = []

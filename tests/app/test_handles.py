@@ -24,7 +24,7 @@ from wfsobs.app.views.spectrum_editor import (
 )
 from wfsobs.closed_loop.design import design
 from wfsobs.control.integrator import highest_stable_gain
-from wfsobs.evaluation.theory import Theory
+from wfsobs.evaluation.error_spectra import Theory
 from wfsobs.priors_from.controllers import plant_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS

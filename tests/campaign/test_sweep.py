@@ -16,7 +16,7 @@ from wfsobs.campaign.sweep import EACH_RUN, EACH_STEP, MOST_CELLS, SweepResults,
 from wfsobs.cli import main
 from wfsobs.evaluation.rows import row_label
 from wfsobs.evaluation.scores import BOUND, Score
-from wfsobs.evaluation.verdict_words import sentence_of_several
+from wfsobs.evaluation.verdict import sentence_of_several
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 

@@ -9,7 +9,7 @@ from tests.records import MATCHED
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.exact_residuals import exact_residuals
 from wfsobs.closed_loop.run import closed_loop
-from wfsobs.evaluation.bound_both import bound_rms_of_both
+from wfsobs.evaluation.bound import bound_rms
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
 
@@ -27,7 +27,7 @@ def test_a_time_invariant_law_leaves_what_its_transfer_function_does(name: str, 
 def test_where_the_truth_is_the_model_it_is_the_bound_of_the_prediction(delay: float) -> None:
     s = MATCHED.replace({"control.delay": delay})
     for mode, found in enumerate(exact_residuals("lqg-multirate-multi", s)):
-        least = bound_rms_of_both(s, mode, int(delay) - 1)["total"]
+        least = bound_rms(s, mode, int(delay) - 1, information="both")["total"]
         assert 1.0 - 1e-5 < found.rms / least < 1.0001, "the bound is met to what its search leaves"
 
 
@@ -57,7 +57,7 @@ def test_records_leave_it_at_every_step_of_a_cycle() -> None:
 def test_ut4_with_two_frames_is_near_the_bound() -> None:
     s = PRESETS["ut4"]()
     for mode, found in enumerate(exact_residuals("lqg-multirate-multi", s)):
-        assert 1.0 < found.rms / bound_rms_of_both(s, mode, 1)["total"] < 1.05
+        assert 1.0 < found.rms / bound_rms(s, mode, 1, information="both")["total"] < 1.05
 
 
 def test_what_has_none_says_so() -> None:

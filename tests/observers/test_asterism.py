@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import wfsobs
-from wfsobs.evaluation.bound_asterism import bound_rms_of_asterism
-from wfsobs.evaluation.bound_stars import bound_rms_of_stars
+from wfsobs.evaluation.bound import bound, bound_rms
 from wfsobs.evaluation.calibration import half_width
 from wfsobs.execution import run_observer
 from wfsobs.live.board import SLOTS
@@ -158,13 +157,13 @@ def test_shares_are_those_of_a_simulation(lost: int) -> None:
 def test_what_it_states_is_near_the_bounds_and_below_that_of_the_mean() -> None:
     """With lines as wide as those of the record. Modes tell of one another: it may lie below the bound of single modes."""
     scenario = STARS.replace({"multipeak.line_width": line_width(STARS)})
-    bound, model = bound_rms_of_asterism(STARS), model_of(scenario)
+    least, model = bound(STARS, "asterism"), model_of(scenario)
     for target in ("turbulence", "vibration", "total"):
         found = stated(scenario, target, model)
         for mode in range(2):
-            alone = bound_rms_of_stars(STARS, mode)[target]
-            assert bound[mode][target] * 0.999 < found[mode] < 1.06 * bound[mode][target]
-            assert 0.95 * alone < bound[mode][target] < 1.001 * alone
+            alone = bound_rms(STARS, mode, information="stars")[target]
+            assert least[mode][target].rms * 0.999 < found[mode] < 1.06 * least[mode][target].rms
+            assert 0.95 * alone < least[mode][target].rms < 1.001 * alone
 
 
 def test_errors_are_as_it_states() -> None:

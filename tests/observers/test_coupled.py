@@ -11,12 +11,11 @@ import wfsobs
 from tests.test_mode_spectra import FLOW
 from wfsobs.campaign.plan import parse_plan
 from wfsobs.campaign.sweep import parse_axis, plan_sweep
-from wfsobs.evaluation.bound import bound_rms
-from wfsobs.evaluation.bound_modes import bound_rms_of_modes
+from wfsobs.evaluation.bound import bound, bound_rms
 from wfsobs.evaluation.calibration import half_width
+from wfsobs.evaluation.error_spectra import is_predicted
 from wfsobs.evaluation.exact_errors import exact_errors
 from wfsobs.evaluation.scores import BOUND, BOUND_MODES, SCORED
-from wfsobs.evaluation.theory import is_predicted
 from wfsobs.evaluation.verdict import verdict
 from wfsobs.execution import run_observer
 from wfsobs.live.checks import observers_on
@@ -60,12 +59,12 @@ def test_the_bound_is_that_of_dense_algebra() -> None:
     explained = np.einsum("ti,it->t", with_target.reshape(5, -1), weights)
     own = np.fft.irfft(found.own, n)[:, 0] * (0.5 / FLOW.dt)
     dense = np.sqrt(own - explained)
-    bound = np.array([one["turbulence"] for one in bound_rms_of_modes(FLOW)])
-    assert (bound < 1.001 * dense).all()
-    np.testing.assert_allclose(np.delete(bound, 1), np.delete(dense, 1), rtol=0.015)
-    assert bound[1] > 0.93 * dense[1]
+    least = np.array([one["turbulence"].rms for one in bound(FLOW, "modes")])
+    assert (least < 1.001 * dense).all()
+    np.testing.assert_allclose(np.delete(least, 1), np.delete(dense, 1), rtol=0.015)
+    assert least[1] > 0.93 * dense[1]
     alone = [bound_rms(FLOW, mode)["turbulence"] for mode in modes]
-    assert (bound < 0.95 * np.array(alone)).all() and bound[0] < 0.6 * alone[0]
+    assert (least < 0.95 * np.array(alone)).all() and least[0] < 0.6 * alone[0]
 
 
 def test_its_bound_is_a_row_of_its_table_and_of_no_other() -> None:
@@ -73,8 +72,8 @@ def test_its_bound_is_a_row_of_its_table_and_of_no_other() -> None:
     result = run(short, observers=["kf-coupled"])
     rows, alone = ({(s.target, s.mode): s.rms for s in result.scores if s.observer == row} for row in (BOUND_MODES, BOUND))
     names = [mode.name for mode in short.modes]
-    bound = bound_rms_of_modes(short)
-    found = {(target, name): one[target] for one, name in zip(bound, names, strict=True) for target in SCORED}
+    least = bound(short, "modes")
+    found = {(target, name): one[target].rms for one, name in zip(least, names, strict=True) for target in SCORED}
     assert rows == {key: min(value, alone[key]) for key, value in found.items()}, "no higher than that of a mode by itself"
     assert not [s for s in run(short, observers=["zero"]).scores if s.observer == BOUND_MODES]
     said = verdict(short, result.record, result.estimates, result.scores, "turbulence", names[0])
@@ -83,11 +82,11 @@ def test_its_bound_is_a_row_of_its_table_and_of_no_other() -> None:
 
 def test_what_it_states_is_near_the_bound_and_below_the_independent_filters() -> None:
     alone = exact_errors(OBSERVERS["kf-multi"], SHAKEN)
-    bound = bound_rms_of_modes(SHAKEN)
+    least = bound(SHAKEN, "modes")
     for target in ("turbulence", "vibration", "total"):
         found = stated(SHAKEN, target)
         for mode in range(2):
-            assert bound[mode][target] * 0.999 < found[mode] < 1.05 * bound[mode][target]
+            assert least[mode][target].rms * 0.999 < found[mode] < 1.05 * least[mode][target].rms
             assert found[mode] < alone[mode][target].rms
 
 
@@ -177,4 +176,4 @@ def test_figures_of_single_modes_leave_it_out() -> None:
     with pytest.raises(ValueError, match="every mode by itself"):
         exact_errors(OBSERVERS["kf-coupled"], SHAKEN)
     with pytest.raises(ValueError, match="independent"):
-        bound_rms_of_modes(FLOW.replace({"turbulence.source": "ar2"}))
+        bound(FLOW.replace({"turbulence.source": "ar2"}), "modes")

@@ -10,7 +10,7 @@ import pytest
 import wfsobs
 from tests.observers.test_coupled import SHAKEN
 from tests.test_mode_spectra import FLOW
-from wfsobs.evaluation.bound_asterism import bound_rms_of_modes_of_both, least_errors_of_modes_of_both
+from wfsobs.evaluation.bound import bound
 from wfsobs.evaluation.calibration import half_width
 from wfsobs.evaluation.scores import BOUND_BOTH, BOUND_BOTH_MODES
 from wfsobs.observers import OBSERVERS
@@ -49,7 +49,7 @@ def test_the_bound_is_that_of_dense_algebra() -> None:
     own = np.fft.irfft(found.own, n)[:, 0] * (0.5 / scenario.dt)
     prior = prior_of(scenario, None, (Lines, FlowOfBoth))
     assert prior.asterism is not None
-    bound = least_errors_of_modes_of_both(scenario)
+    least = bound(scenario, "both-modes")
     for phase in (0, 3):
         # disturbance at the age a (of z[k - a]: phi[k - 1 - a]), and frames that are the mean of n of them
         ages = [(i, np.array([a])) for a in range(past) for i in range(m)]
@@ -69,7 +69,7 @@ def test_the_bound_is_that_of_dense_algebra() -> None:
                 toeplitz = among[i, j][(lags - lags[:, None]) % n]
                 covariance[np.ix_(rows, beam == j)] = weights[rows] @ toeplitz @ weights[beam == j].T
         dense = np.sqrt(own - np.sum(np.linalg.solve(covariance + np.diag(np.square(noise)), b.T) * b.T, axis=0))
-        got = np.sqrt([of["turbulence"].variance[phase] for of in bound])
+        got = np.sqrt([of["turbulence"].variance[phase] for of in least])
         assert (got < 1.001 * dense).all() and (got > [0.99, 0.96, 0.99, 0.99, 0.99][:m] * dense).all()
 
 
@@ -166,15 +166,15 @@ def test_where_modes_are_independent_it_refuses_and_runs_only_if_named() -> None
     assert line.reason == f"multirate-coupled left out: {INDEPENDENT}"
     assert OBSERVER.id not in usual_observers(scenario) and OBSERVER.id in usual_observers(FLOW)
     with pytest.raises(ValueError, match="the bound of each is its own"):
-        bound_rms_of_modes_of_both(scenario)
+        bound(scenario, "both-modes")
 
 
 def test_its_bound_is_a_row_of_its_table_and_no_higher_than_that_of_single_modes() -> None:
     short = SHAKEN.replace({"run.duration": 2.0, "run.warm_up": 1.0})
     rows = {(s.observer, s.target, s.mode): s.rms for s in run(short, observers=[OBSERVER.id]).scores}
-    for one, mode in zip(bound_rms_of_modes_of_both(short), short.modes, strict=True):
+    for one, mode in zip(bound(short, "both-modes"), short.modes, strict=True):
         for target in TARGETS:
             alone = rows[BOUND_BOTH, target, mode.name]
-            assert rows[BOUND_BOTH_MODES, target, mode.name] == min(one[target], alone)
+            assert rows[BOUND_BOTH_MODES, target, mode.name] == min(one[target].rms, alone)
             if target == "turbulence":
-                assert one[target] < 0.97 * alone
+                assert one[target].rms < 0.97 * alone

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import butter, freqz_sos, lfilter
 
-from wfsobs.evaluation.lag import lag
+from wfsobs.evaluation.scores import lag
 from wfsobs.execution import run_observer
 from wfsobs.observers.baselines import open_loop_reference
 from wfsobs.priors_from.scenario import bands_of

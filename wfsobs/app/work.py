@@ -20,8 +20,8 @@ from threadpoolctl import threadpool_limits
 from wfsobs.app.jobs import INTERVAL, Tell
 from wfsobs.app.sources import Source
 from wfsobs.dependence import Memo, RecordMemo, digest, simulate_once
+from wfsobs.evaluation.bound import Bound, joint_observers, record_bounds
 from wfsobs.evaluation.error_spectra import spectra
-from wfsobs.evaluation.record_bounds import Bound, joint_observers, record_bounds
 from wfsobs.evaluation.result import Failure, Result
 from wfsobs.evaluation.rows import NO_ESTIMATE
 from wfsobs.execution import each_estimate

@@ -21,7 +21,7 @@ from wfsobs.campaign.store import write_batch
 from wfsobs.closed_loop.design import Design, design
 from wfsobs.closed_loop.rows import rows as loop_rows
 from wfsobs.closed_loop.run import closed_loop
-from wfsobs.evaluation.record_bounds import Bound, record_bounds
+from wfsobs.evaluation.bound import Bound, record_bounds
 from wfsobs.evaluation.result import Failure
 from wfsobs.evaluation.rows import TIME, score_rows
 from wfsobs.execution import each_estimate

@@ -13,7 +13,7 @@ from wfsobs.control.law import Law
 from wfsobs.control.margins import Margins, frequencies, margins
 from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.control.residual import residual_variance
-from wfsobs.evaluation.bound_delay import WAYS, least_residual
+from wfsobs.evaluation.bound import INFORMATION, least_residual
 from wfsobs.observers.kalman.multirate import UnstableCycle
 from wfsobs.prior import Prior, Spectra
 from wfsobs.priors_from.controllers import own_settings, plant_of, prior_for
@@ -80,8 +80,8 @@ def design(scenario: Scenario, controllers: Sequence[str] | None = None, start: 
     if scenario.events:
         laws = {name: tuple(replace(one, predicted_rms=None) for one in designed) for name, designed in laws.items()}
         return Design(scenario, plant, laws, {}, priors, max(scenario.run.warm_up, start))
-    ways = WAYS if true else {}
-    bounds = {name: tuple(least_residual(one, plant.mirror.delay, least) for one in true) for name, least in ways.items()}
+    given = ("lgs", "both") if true else ()
+    bounds = {INFORMATION[of]: tuple(least_residual(one, plant.mirror.delay, of) for one in true) for of in given}
     return Design(scenario, plant, laws, bounds, priors, max(scenario.run.warm_up, start))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from wfsobs.closed_loop.design import design
 from wfsobs.control.law import Law
 from wfsobs.control.mirror import Mirror
-from wfsobs.evaluation.bound_both import PeriodicError
+from wfsobs.evaluation.bound import PeriodicError
 from wfsobs.evaluation.exact_errors import variance_of
 from wfsobs.observers.estimates import TOTAL
 from wfsobs.scenario import Scenario

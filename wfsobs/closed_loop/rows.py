@@ -14,8 +14,7 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.evidence import means_differ
 from wfsobs.evaluation.known_lines import SPECTRA, knowledge_of
 from wfsobs.evaluation.rows import NOT_OBSERVERS, Row
-from wfsobs.evaluation.samples import batch_means, rms_interval
-from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS
+from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS, batch_means, rms_interval
 from wfsobs.evaluation.verdict import Contender, Verdict
 from wfsobs.prior import TRUE, PriorSource, Spectra, words_for
 from wfsobs.priors_from.controllers import own_settings

@@ -1,12 +1,20 @@
 """Error budget: the mean square error of an observer, cause by cause.
 
-The measurements are a sum of sources (`sources`), and so are the estimates of a linear observer and its errors,
+The measurements are a sum of sources,
+
+    z[k] = phi_dist[k-1] + noise + what the sensors see beside the turbulence on the axis,
+
+in which the vibration is cut into the lines that an observer is given and the others: each frequency belongs to the nearest line.
+So are the estimates of a linear observer and its errors,
 
     e = e_noise + e_cone + e_lines + e_lag + e_mismatch.
 
 The term of a cause is the mean of e_cause e. The terms add up to the mean of e^2, whatever the record and without an order of the
 causes; between independent sources it is the mean of e_cause^2 but for chance. The response to the signal is compared with
-that of the filter of the right model (`reference_filter`): what this lacks is lag, the difference of the two mismatch.
+that of the Kalman filter of the right model: what this lacks is lag, the difference of the two mismatch. Its turbulence has the
+true spectrum, of third order where that is no autoregressive process, its lines and its noise are those of the scenario. Both
+sensors together tell the slow error of the LGS from the turbulence, so that it is in the model of their filter, as is the
+turbulence that the LGS alone see; the LGS by themselves cannot.
 
 An observer that is not linear runs on every combination of sources, and e_cause is the mean over all orders of switching
 them on (Shapley, Contributions to the Theory of Games II, 1953): those that learn from measurements learn anew each time.
@@ -14,30 +22,45 @@ them on (Shapley, Contributions to the Theory of Games II, 1953): those that lea
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
+from math import factorial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wfsobs.evaluation.known_lines import given_lines
-from wfsobs.evaluation.reference_filter import follow_signal
-from wfsobs.evaluation.responses import observer_responses
+from wfsobs.evaluation.known_lines import given_lines, is_near
 from wfsobs.evaluation.rows import NO_ESTIMATE, own_bound
 from wfsobs.evaluation.scores import Score
-from wfsobs.evaluation.sources import CONE, LINES, NOISE, SIGNAL, Source, split_record
-from wfsobs.evaluation.totals import with_total
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import Observer
-from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Record
+from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Observer
+from wfsobs.observers.estimates import TOTAL
+from wfsobs.observers.kalman.multirate import beam_model, estimated_cycle, optimal_filter
+from wfsobs.observers.kalman.single import MIN_NOISE, steady_filter
+from wfsobs.prior import Beams, Line, Lines
+from wfsobs.priors_from.scenario import arguments
+from wfsobs.priors_from.turbulence import beams_of, modelled_turbulence
+from wfsobs.priors_from.vibration import vibration_continuum
+from wfsobs.progress import QUIET, Watch, detach_watch
+from wfsobs.record import Record, delay_signal, frame_mean
 from wfsobs.scenario import Scenario
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3
 from wfsobs.simulation.disturbance import vibration_lines
+from wfsobs.simulation.guide_stars import lgs_noise_rms
+from wfsobs.simulation.loop import measure_closed_loop, simulate_noise
 from wfsobs.simulation.sensing import OpenLoop
+from wfsobs.simulation.sensor_noise import noise_rms
+from wfsobs.simulation.turbulence import processes, third_order_process, turbulence_process
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:
     from wfsobs.evaluation.result import Result
+
+NOISE, CONE, LINES, SIGNAL = "noise", "cone", "lines", "signal"
+"""White noise of the sensors; what they see beside the turbulence on the axis; vibration lines that an observer is not given;
+turbulence on the axis and the lines that it is given."""
 
 LAG, MISMATCH = "lag", "mismatch"
 
@@ -55,6 +78,12 @@ LINEAR, AVERAGED = "linear", "averaged over orders"
 
 ONLY_NAMED = "only if named"
 """End of the reason why an observer has no budget that can have one."""
+
+
+MATCHED = {"multipeak.turbulence_order": 3, "kalman.process_noise": "matched", "kalman.measurement_noise": "matched"}
+"""Settings of the filter of the right model."""
+
+Estimates = dict[str, Array]
 
 
 @dataclass(frozen=True)
@@ -86,6 +115,22 @@ class Budget:
     bound: float | None = None
     method: str = LINEAR
     reason: str = ""
+
+
+@dataclass(frozen=True)
+class Source:
+    """One part of a record.
+
+    Attributes
+    ----------
+    measurement : OpenLoop
+        What the sensors measure of it, NaN where the record has no measurement.
+    truth : dict of str to Array
+        Target -> part of the truth, (n_steps, n_modes) [um].
+    """
+
+    measurement: OpenLoop
+    truth: dict[str, Array]
 
 
 def error_budget(
@@ -130,89 +175,72 @@ def error_budget(
     True
     """
     scenario, record = result.scenario, result.record
-    _check_simulated(scenario, record)
+    if record.turbulence is None or record.vibration is None or record.n_steps != scenario.n_steps:
+        raise ValueError("error budget: takes a record that was simulated from its scenario")
+    if scenario.vibration.source == "psd":
+        raise ValueError("error budget: vibration.source = psd is a table, not lines that a model could have")
     chosen = [name for name in dict.fromkeys(e.observer for e in result.estimates) if observers is None or name in observers]
     out: list[Budget] = []
     for i, name in enumerate(chosen):
         watch.step(i / len(chosen))
         own = [s for s in result.scores if s.observer == name and mode in (None, s.mode)]
-        if name != NO_ESTIMATE and own:
+        if name == NO_ESTIMATE or not own:
+            continue
+        observer, limit = OBSERVERS[name], own_bound(name)
+        bounds = {(s.target, s.mode): s.rms**2 for s in result.scores if s.observer == limit}
+        reason, terms = "", list[dict[str, float]]()
+        if not observer.causal:
+            reason = "looks ahead"
+        elif "y_stars" in observer.needs:
+            reason = "takes every LGS by itself"
+        elif not observer.linear and observers is None:
+            reason = f"not linear, takes 16 runs: {ONLY_NAMED}"
+        else:
             values = with_total({e.target: e.values for e in result.estimates if e.observer == name})
-            bounds = {(s.target, s.mode): s.rms**2 for s in result.scores if s.observer == own_bound(name)}
-            if reason := _without_budget(OBSERVERS[name], observers is not None):
-                found = [Budget(s.observer, s.target, s.mode, s.rms**2, reason=reason) for s in own]
-            else:
-                found = _of_observer(OBSERVERS[name], scenario, record, values, own, watch)
-            out += [replace(it, bound=bounds.get((it.target, it.mode))) for it in found]
+            terms = _terms(observer, scenario, record, values, own, watch)
+        method = LINEAR if reason or observer.linear else AVERAGED
+        out += [
+            Budget(name, s.target, s.mode, s.rms**2, of, bounds.get((s.target, s.mode)), method, reason)
+            for s, of in zip(own, terms or [{} for _ in own], strict=True)
+        ]
     return out
 
 
-def _check_simulated(scenario: Scenario, record: Record) -> None:
-    """Raise ValueError where the sources of a record are not known."""
-    if record.turbulence is None or record.vibration is None or record.n_steps != scenario.n_steps:
-        raise ValueError("error budget: takes a record that was simulated from its scenario")
-    if scenario.vibration.source == "psd":
-        raise ValueError("error budget: vibration.source = psd is a table, not lines that a model could have")
-
-
-def _without_budget(observer: Observer, by_name: bool) -> str:
-    """Return why an observer has no budget, empty if it has."""
-    if not observer.causal:
-        return "looks ahead"
-    if "y_stars" in observer.needs:
-        return "takes every LGS by itself"
-    return "" if observer.linear or by_name else f"not linear, takes 16 runs: {ONLY_NAMED}"
-
-
-def _of_observer(
-    observer: Observer, scenario: Scenario, record: Record, values: dict[str, Array], scores: Iterable[Score], watch: Watch
-) -> list[Budget]:
-    before = scenario.before_events
+def _terms(
+    observer: Observer, scenario: Scenario, record: Record, values: Estimates, scores: Iterable[Score], watch: Watch
+) -> list[dict[str, float]]:
+    """Return the terms of the budget of every score: the mean of part times error over its samples."""
+    before, columns = scenario.before_events, [mode.name for mode in scenario.modes]
     lines = [[line[0] for line in vibration_lines(scenario, i)] for i in range(record.n_modes)]
-    given = [_lines_of(observer, before, i, of) for i, of in enumerate(lines)]
+    finds_all = not observer.prior and not observer.linear  # one without a prior that learns can find every line
+    given = lines if finds_all else [given_lines(before, observer.id, i) for i in range(record.n_modes)]
     sources = split_record(scenario, record, lines, given)
-    split, rest = observer_responses(observer, scenario, record, sources, watch)
-    responses, rest = {name: with_total(of) for name, of in split.items()}, with_total(rest)
+    responses, rest = _responses(observer, scenario, record, sources, watch)
     truths = {name: with_total(part.truth) for name, part in sources.items()}
-    columns = {mode.name: i for i, mode in enumerate(scenario.modes)}
-    complete = {name: Source(_fill(part.measurement), part.truth) for name, part in sources.items()}
-    reference: dict[int, dict[str, Array]] = {}
+    seen, reference = sources[SIGNAL].measurement, dict[int, Estimates]()
+    signal = OpenLoop(np.nan_to_num(seen.lgs), np.nan_to_num(seen.ngs))
     out = []
     for s in scores:
-        i = columns[s.mode]
+        i = columns.index(s.mode)
         if i not in reference:
             watch.check()
-            sensors = observer.sensors
-            ratio = scenario.sensors.exposure_ratio
-            reference[i] = with_total(follow_signal(before, i, given[i], sensors, complete[SIGNAL].measurement, ratio))
+            reference[i] = with_total(follow_signal(before, i, given[i], observer.sensors, signal))
         truth = {name: of[s.target][:, i] for name, of in truths.items()}
         parts = {name: responses[name][s.target][:, i] - truth[name] for name in sources}
         lag = reference[i][s.target] - truth[SIGNAL]
         parts |= {LAG: lag, MISMATCH: parts.pop(SIGNAL) - lag + rest[s.target][:, i]}
         error = values[s.target][:, i] - sum(truth.values())
-        out.append(Budget(s.observer, s.target, s.mode, s.rms**2, _terms(parts, error, s, record.dt), method=_method(observer)))
+        assert s.start is not None and s.stop is not None
+        scored = slice(round(s.start / record.dt), round(s.stop / record.dt))
+        known = ~np.isnan(error[scored])
+        out.append({name: float(np.mean(parts[name][scored][known] * error[scored][known])) for name in TERMS})
     return out
 
 
-def _terms(parts: dict[str, Array], error: Array, score: Score, dt: float) -> dict[str, float]:
-    """Return the mean of part times error over the scored samples, term by term."""
-    assert score.start is not None and score.stop is not None
-    scored = slice(round(score.start / dt), round(score.stop / dt))
-    known = ~np.isnan(error[scored])
-    return {name: float(np.mean(parts[name][scored][known] * error[scored][known])) for name in TERMS}
-
-
-def _lines_of(observer: Observer, scenario: Scenario, column: int, lines: Sequence[float]) -> Sequence[float]:
-    """Return the lines that an observer models; one that is given none and learns from the measurements can find them all."""
-    return lines if not observer.prior and not observer.linear else given_lines(scenario, observer.id, column)
-
-
-def _method(observer: Observer) -> str:
-    return LINEAR if observer.linear else AVERAGED
-
-
-def _fill(open_loop: OpenLoop) -> OpenLoop:
-    return OpenLoop(np.nan_to_num(open_loop.lgs), np.nan_to_num(open_loop.ngs))
+def with_total(parts: Mapping[str, Array]) -> Estimates:
+    """Return what there is of each target, and where there is both also the sum."""
+    both = {TOTAL: np.sum([parts[target] for target in TARGETS], axis=0)} if set(TARGETS) <= set(parts) else {}
+    return {**parts, **both}
 
 
 def budget_row(budget: Budget) -> dict[str, Any]:
@@ -224,3 +252,179 @@ def budget_row(budget: Budget) -> dict[str, Any]:
         "method": budget.method if budget.terms else None,
         "reason": budget.reason or None,
     }
+
+
+# ---------------------------------------------------------------------- sources
+
+
+def split_record(
+    scenario: Scenario, record: Record, lines: Sequence[Sequence[float]], given_lines: Sequence[Sequence[float]]
+) -> dict[str, Source]:
+    """Split a record into its sources.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings that the record was simulated from.
+    record : Record
+        The record.
+    lines, given_lines : sequence
+        All the lines [Hz] of the vibration, and those that an observer is given, mode by mode.
+
+    Returns
+    -------
+    dict of str to Source
+        The sources by name; their sum is the record.
+    """
+    assert record.turbulence is not None and record.vibration is not None and record.ratio is not None
+    assert record.open_loop_y is not None
+    total = OpenLoop(record.open_loop_y, record.z_ngs, record.lgs_stars)
+    noise, nothing = simulate_noise(scenario), np.zeros_like(record.vibration)
+    columns = zip(record.vibration.T, lines, given_lines, strict=True)
+    known = np.column_stack([split_lines(x, record.dt, *of) for x, *of in columns])
+    others = record.vibration - known
+    on_axis = _see(record.turbulence + record.vibration, record.ratio)
+    beside = OpenLoop(total.lgs - noise.lgs - on_axis.lgs, total.ngs - noise.ngs - on_axis.ngs)
+    parts = {
+        NOISE: (noise, nothing, nothing),
+        CONE: (beside, nothing, nothing),
+        LINES: (_see(others, record.ratio), nothing, others),
+        SIGNAL: (_see(record.turbulence + known, record.ratio), record.turbulence, known),
+    }
+    no_lgs, no_ngs = np.isnan(total.lgs), np.isnan(total.ngs)
+    return {
+        name: Source(
+            OpenLoop(np.where(no_lgs, np.nan, seen.lgs), np.where(no_ngs, np.nan, seen.ngs), total.stars),
+            {TURBULENCE: turbulence, VIBRATION: vibration},
+        )
+        for name, (seen, turbulence, vibration) in parts.items()
+    }
+
+
+def split_lines(vibration: Array, dt: float, lines: Sequence[float], given_lines: Sequence[float]) -> Array:
+    """Return the part (n,) of a vibration (n,) whose frequencies belong to a line [Hz] that is given.
+
+    A frequency belongs to the nearest of the lines; where there are none it is a line itself.
+    """
+    bins = np.fft.rfftfreq(vibration.size, dt)
+    at = np.asarray(lines, dtype=float) if len(lines) else bins
+    nearest = np.argmin(np.abs(bins[:, None] - at), axis=1) if len(lines) else np.arange(bins.size)
+    known = is_near(at, given_lines)
+    if known.all():
+        return vibration
+    return np.fft.irfft(np.fft.rfft(vibration) * known[nearest], vibration.size)
+
+
+def sum_sources(parts: Sequence[Source]) -> OpenLoop:
+    """Return the measurements of several sources together."""
+    seen = [part.measurement for part in parts]
+    return OpenLoop(sum(one.lgs for one in seen), sum(one.ngs for one in seen), seen[0].stars)  # type: ignore[arg-type]
+
+
+def _see(signal: Array, ratio: int) -> OpenLoop:
+    """Return the noiseless measurements of a signal that is the same for all stars."""
+    return OpenLoop(delay_signal(signal, 1), frame_mean(signal, ratio))
+
+
+# ---------------------------------------------------------------------- responses
+
+
+def _responses(
+    observer: Observer, scenario: Scenario, record: Record, sources: dict[str, Source], watch: Watch
+) -> tuple[dict[str, Estimates], Estimates]:
+    """Split an observer's estimate into source -> target -> response, and the estimate from nothing; the sum is the estimate."""
+    _, prior, settings = arguments(observer, record, scenario.before_events)
+    silent = replace(watch, progress=lambda _: None, partial=lambda *_: None)
+
+    def estimate(names: Iterable[str]) -> Estimates:
+        watch.check()
+        seen, chosen = sources[SIGNAL].measurement, [sources[name] for name in names]
+        measured = measure_closed_loop(scenario, sum_sources(chosen) if chosen else OpenLoop(0.0 * seen.lgs, 0.0 * seen.ngs))
+        own = measured if "open_loop_y" in observer.needs else replace(measured, open_loop_y=None)
+        with detach_watch(silent) as alone:
+            found = observer.estimate(own, prior, settings, alone)
+        return with_total({target: np.nan_to_num(values) for target, values in found.items()})
+
+    rest = estimate(())
+    if not observer.linear:
+        return shapley_shares(tuple(sources), estimate, rest), rest
+    return {name: {target: x - rest[target] for target, x in estimate((name,)).items()} for name in sources}, rest
+
+
+def shapley_shares(names: Sequence[str], estimate: Callable[[Iterable[str]], Estimates], rest: Estimates) -> dict[str, Estimates]:
+    """Return the mean over all orders of what a source adds to the estimate from those before it."""
+    n = len(names)
+    found = {frozenset(of): estimate(of) if of else rest for size in range(n + 1) for of in combinations(names, size)}
+    out = {}
+    for name in names:
+        weight = {of: factorial(len(of)) * factorial(n - len(of) - 1) / factorial(n) for of in found if name not in of}
+        out[name] = {
+            target: sum(w * (found[of | {name}][target] - found[of][target]) for of, w in weight.items()) for target in rest
+        }
+    return out
+
+
+# ---------------------------------------------------------------------- filter of the right model
+
+
+def follow_signal(
+    scenario: Scenario, mode: int, given_lines: Sequence[float], sensors: Sequence[str], open_loop: OpenLoop
+) -> dict[str, Array]:
+    """Run the Kalman filter of the right model on the noiseless measurements of one mode.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings of the simulation, without events.
+    mode : int
+        Index of the mode.
+    given_lines : sequence of float
+        Lines [Hz] in the model.
+    sensors : sequence of str
+        Sensors in use, of "lgs" and "ngs".
+    open_loop : OpenLoop
+        What the sensors measure of turbulence and lines; steps without a frame count as zero.
+
+    Returns
+    -------
+    dict of str to Array
+        Target -> estimate, (n_steps,) [um].
+    """
+    lines = [Line(*line) for line in vibration_lines(scenario, mode)]
+    near = is_near(np.array([line.frequency for line in lines]), given_lines)
+    known = tuple(line for line, is_given in zip(lines, near, strict=True) if is_given)
+    continuum = vibration_continuum(scenario, mode) if near.all() else ()  # given all lines, of what is no line as well
+    vibration = Lines(0.0, scenario.dt, lines=known, continuum=continuum).vibration(scenario.multipeak.line_width)
+    noise, both = max(lgs_noise_rms(scenario, mode), MIN_NOISE), set(sensors) == {"lgs", "ngs"}
+    beams = true_beams(scenario, mode) if both else Beams(true_turbulence(scenario, mode))
+    if not (vibration or beams.common or beams.target):
+        return {target: np.zeros(len(open_loop.lgs)) for target in TARGETS}
+    model = beam_model(beams, vibration)
+    if "ngs" not in sensors:
+        out = steady_filter(model, noise)[0].run(open_loop.lgs[:, None, mode, None])[:, :, 0]
+    else:
+        ngs_noise = max(noise_rms(scenario, "ngs")[mode], MIN_NOISE)
+        cycle = estimated_cycle(model, scenario.sensors.exposure_ratio, noise, ngs_noise, beams.lgs)
+        used = np.array([[float(both)], [1.0]])
+        kalman, _ = optimal_filter([(A, used * C, Q, R) for A, C, Q, R in cycle.steps], cycle.rows)
+        out = kalman.run(np.column_stack([open_loop.lgs[:, mode], open_loop.ngs[:, mode]]))
+    return {target: out[:, i] for i, target in enumerate(TARGETS)}
+
+
+def true_beams(scenario: Scenario, mode: int) -> Beams:
+    """Return processes that have the spectra of the turbulence as the target has it and as the LGS see it, or are nearest."""
+    if scenario.turbulence.source in ("none", "processes", "ar2", "ar3"):
+        return replace(beams_of(scenario, mode), common=true_turbulence(scenario, mode), target=())
+    return beams_of(scenario.replace(MATCHED), mode)
+
+
+def true_turbulence(scenario: Scenario, mode: int) -> tuple[Ar2 | Ar3, ...]:
+    """Return processes that have the spectrum of the turbulence, or are nearest to it."""
+    source, of = scenario.turbulence.source, (mode, scenario.dt)
+    if source == "none":
+        return ()
+    if source == "processes":
+        return tuple(processes(scenario, *of))
+    if source in ("ar2", "ar3"):
+        return ((turbulence_process if source == "ar2" else third_order_process)(scenario, *of),)
+    return (modelled_turbulence(scenario.replace(MATCHED), *of),)

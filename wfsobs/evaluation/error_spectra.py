@@ -1,12 +1,58 @@
-"""Spectra of an estimate and of its error, and the variance above a frequency."""
+"""Spectra of estimates and of their errors: of a record, and as theory predicts them without a simulation.
+
+Predictions follow from the true spectra of the scenario (`true_spectra`) and the responses of an observer (`exact_errors`). They
+are the expectation over records after an infinitely long start. A record is one of them, and the scores of a short one scatter
+around it.
+
+Observers that are linear, every mode by itself, have a prediction. Those that train on a record or learn during it have none,
+nor has one that looks ahead.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from math import sqrt
+from time import monotonic
+from typing import Any
+
 import numpy as np
 
+from wfsobs.evaluation.exact_errors import (
+    SETTLED,
+    SHORTEST,
+    Taps,
+    TargetSpectra,
+    Waves,
+    cycle_spectra,
+    impulse_responses,
+    target_spectra,
+    waves,
+)
+from wfsobs.evaluation.scores import BOUND
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import Observer
+from wfsobs.prior import Beams, LgsError, LgsStars, Lines, Prior, Training
+from wfsobs.priors_from.scenario import lines_of, observer_settings, prior_of
+from wfsobs.priors_from.turbulence import beams_of, lgs_error_of, lines_turbulence
 from wfsobs.record import Record
-from wfsobs.signal.welch import welch_psd
+from wfsobs.scenario import Scenario
+from wfsobs.signal.ar3 import Ar3Fits
+from wfsobs.signal.welch import expected_psd, welch_psd
+from wfsobs.signal.wiener import advance_spectrum, circle_mean, error_spectrum
+from wfsobs.simulation.guide_stars import MEAN
+from wfsobs.simulation.true_spectra import MOST, TrueSpectra, has_known_spectra, n_frequencies, true_spectra
+from wfsobs.simulation.turbulence_spectra import TurbulenceSpectra, turbulence_spectra
 from wfsobs.typing import Array
+
+TRUTH = "truth"
+"""Name of the prediction of the target itself: the error of an estimate of zero."""
+
+AIR = ("telescope", "turbulence", "sensors", "run")
+"""Groups of settings that the turbulence and its sensors depend on."""
+
+
+# ---------------------------------------------------------------------- of a record
 
 
 def scored_samples(record: Record, truth: Array, value: Array, warm_up: float) -> tuple[Array, Array]:
@@ -43,8 +89,7 @@ def spectra(record: Record, target: str, values: Array, warm_up: float) -> tuple
     shortest = min(true.size for true, _ in columns)
     if shortest < 16:
         return None
-    true = np.column_stack([t[-shortest:] for t, _ in columns])
-    value = np.column_stack([v[-shortest:] for _, v in columns])
+    true, value = (np.column_stack([x[-shortest:] for x in of]) for of in zip(*columns, strict=True))
     frequency, density = welch_psd(np.hstack([value, value - true]), record.dt)
     signal, error = np.hsplit(density, 2)
     return frequency, signal, error
@@ -60,3 +105,207 @@ def cumulative_rms(frequency: Array, density: Array) -> Array:
     """Return the root of the variance above each frequency, from high to low (the AO habit); same shape as `density`."""
     df = frequency[1] - frequency[0]
     return np.sqrt(np.cumsum(density[::-1], axis=0)[::-1] * df)
+
+
+# ---------------------------------------------------------------------- as predicted
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Prediction of one observer, target and mode.
+
+    Attributes
+    ----------
+    observer, target : str
+        Of what: an observer, BOUND, or TRUTH for the target itself.
+    rms : float
+        Rms error [um].
+    frequency : Array
+        Frequencies, (n,) [Hz].
+    density : Array
+        Expected Welch estimate of the spectrum of the error, or of the estimate, (n,) [um^2/Hz].
+    """
+
+    observer: str
+    target: str
+    rms: float
+    frequency: Array
+    density: Array
+
+
+def is_predicted(observer: Observer | None, target: str) -> bool:
+    """Return whether an observer's errors have a prediction; None stands for the bound."""
+    return observer is None or (
+        observer.linear
+        and not observer.couples_modes
+        and observer.causal
+        and target in observer.targets
+        and Training not in observer.prior
+    )
+
+
+class _Identity:
+    """An object as a key: equal to the same object only, which it keeps from being thrown away."""
+
+    def __init__(self, it: object):
+        self.it = it
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Identity) and other.it is self.it
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+@dataclass
+class Theory:
+    """Predictions for one scenario after another; what two of them share is computed once.
+
+    Attributes
+    ----------
+    resolution : float
+        Resolution of the Welch estimates [Hz].
+    most : int or None
+        The most frequencies to compute with, a power of two; None for as many as the scenario needs. With fewer, lines that are
+        narrower than their spacing are coarse, and fits of turbulence start from those before.
+    left : float
+        What may be left at the end of a response, over its maximum.
+    """
+
+    resolution: float = 0.5
+    most: int | None = None
+    left: float = SETTLED
+    _results: dict[str, tuple[Any, Any]] = field(default_factory=dict, repr=False)
+    _lengths: dict[tuple[str, float], int] = field(default_factory=dict, repr=False)
+    _fits: dict[int, Ar3Fits] = field(default_factory=dict, repr=False)
+
+    def predict(
+        self,
+        scenario: Scenario,
+        mode: int,
+        target: str,
+        observers: Iterable[str] | None = None,
+        of_error: bool = True,
+        until: float = np.inf,
+    ) -> list[Prediction]:
+        """Predict the errors of observers.
+
+        Parameters
+        ----------
+        scenario : Scenario
+            Settings.
+        mode : int
+            Index of the mode.
+        target : str
+            "turbulence" or "vibration".
+        observers : iterable of str, optional
+            Ids of the observers, and BOUND; by default all. Those without a prediction are left out.
+        of_error : bool
+            Whether densities are those of errors, else of estimates.
+        until : float
+            Time on the monotonic clock after which no more observers but the first are begun [s].
+
+        Returns
+        -------
+        list of Prediction
+            That of the target itself (TRUTH), then one per observer.
+
+        Raises
+        ------
+        ValueError
+            The spectra of the scenario are not known.
+        """
+        if not has_known_spectra(scenario):
+            raise ValueError("no prediction: the spectra of this scenario are not known, or events change them")
+        known = self.spectra(scenario, mode)
+        sensors = self._keep(f"spectra {target}", _Identity(known), lambda: target_spectra(known, target))
+        n_steps = scenario.n_steps - round(scenario.run.warm_up / scenario.dt)
+        out = []
+        for name in (TRUTH, *([*OBSERVERS, BOUND] if observers is None else observers)):
+            observer = OBSERVERS.get(name)
+            if not is_predicted(observer, target):
+                continue
+            if len(out) > 1 and monotonic() > until:
+                break
+            response = None if observer is None else self._response(observer, scenario, mode, target, known.n)
+            made_of = _Identity(known), _Identity(response), n_steps, of_error
+
+            def make(name: str = name, response: Waves | None = response) -> Prediction:
+                signal, error = _own(known, sensors, name, target) if response is None else cycle_spectra(response, sensors)
+                frequency, density = expected_psd(error if of_error else signal, scenario.dt, n_steps, self.resolution)
+                return Prediction(name, target, sqrt(max(circle_mean(error), 0.0)), frequency, density)
+
+            out.append(self._keep(f"{name}, {target}", made_of, make))
+        return out
+
+    # ------------------------------------------------------------------ what is kept
+
+    def _keep(self, name: str, key: Any, make: Callable[[], Any]) -> Any:
+        """Return the last result of a name if its key is the same, else make it."""
+        if name not in self._results or self._results[name][0] != key:
+            self._results[name] = key, make()
+        return self._results[name][1]
+
+    def spectra(self, scenario: Scenario, mode: int) -> TrueSpectra:
+        """Return the true spectra of a mode."""
+        key = mode, self.most, _groups(scenario, *AIR, "vibration")
+        return self._keep("spectra", key, lambda: true_spectra(scenario, mode, self._air(scenario, mode)))
+
+    def _air(self, scenario: Scenario, mode: int) -> TurbulenceSpectra:
+        n = min(n_frequencies(scenario, mode), self.most or MOST)
+        return self._keep("air", (mode, n, _groups(scenario, *AIR)), lambda: turbulence_spectra(scenario, mode, n))
+
+    def _response(self, observer: Observer, scenario: Scenario, mode: int, target: str, n: int) -> Waves:
+        settings, ratio, name = observer_settings(observer, scenario), scenario.sensors.exposure_ratio, observer.id
+        prior, length = self._prior(observer, scenario, mode), (name, self.left)
+
+        def make() -> dict[str, Taps]:
+            first = self._lengths.get(length, SHORTEST)
+            found = impulse_responses(observer, prior, settings, scenario.dt, ratio, n, first, self.left)
+            self._lengths[length] = found[target].fast.shape[1]
+            return found
+
+        taps = self._keep(f"response {name}", (prior, settings, n, self.left, ratio), make)[target]
+        return self._keep(f"response {name}, {target}", _Identity(taps), lambda: waves(taps, n))
+
+    def _prior(self, observer: Observer, scenario: Scenario, mode: int) -> Prior:
+        parts = observer.parts(observer_settings(observer, scenario))
+        slow: dict[str, tuple[Any, ...]] = {}
+        if Lines in parts:
+            turbulence = () if Beams in parts else self._turbulence(scenario, mode)  # that of beams is in these
+            slow["lines"] = (lines_of(scenario, mode, turbulence=turbulence),)
+        # The vibration, too, where it moves the best weights of the LGS.
+        groups = "kalman", "multipeak", *([] if scenario.sensors.lgs_combination == MEAN else ["vibration"])
+        air, fits = self._air(scenario, mode), self._start_of_fits(mode)
+        key = _Identity(air), _groups(scenario, *groups)
+        if Beams in parts:
+            slow["beams"] = (self._keep("beams", key, lambda: beams_of(scenario, mode, scenario.dt, air, fits)),)
+        if LgsError in parts:
+            slow["lgs_error"] = (self._keep("LGS error", key, lambda: lgs_error_of(scenario, mode, scenario.dt)),)
+        fast = [part for part in parts if part not in (Lines, Beams, LgsError, LgsStars)]
+        return replace(prior_of(scenario, None, fast, modes=[mode]), **slow)
+
+    def _turbulence(self, scenario: Scenario, mode: int) -> tuple[Any, ...]:
+        """Return the processes of the turbulence of a mode."""
+        air, k, fits = self._air(scenario, mode), scenario.kalman, self._start_of_fits(mode)
+        used = k.process_noise, k.turbulence_rms, k.measurement_noise, k.lgs_noise
+        key = _Identity(air), scenario.multipeak.turbulence_order, used
+        return self._keep("turbulence", key, lambda: lines_turbulence(scenario, mode, scenario.dt, air.measurement, fits))
+
+    def _start_of_fits(self, mode: int) -> Ar3Fits:
+        """Return the fits of a mode to start from: none before one with all frequencies."""
+        if self.most is None:
+            self._fits.clear()
+        return self._fits.setdefault(mode, Ar3Fits())
+
+
+def _groups(scenario: Scenario, *names: str) -> list[dict[str, Any]]:
+    return [getattr(scenario, name).to_dict() for name in names]
+
+
+def _own(spectra: TrueSpectra, sensors: TargetSpectra, name: str, target: str) -> tuple[Array, Array]:
+    """Return, twice, the spectrum of the target, or that of the minimum error from the mean of the LGS."""
+    if name == TRUTH:
+        return sensors.signal, sensors.signal
+    known = spectra.without_lines
+    least = error_spectrum(known.signal[target], advance_spectrum(known.cross[target], 1), known.whitener)
+    return least, least

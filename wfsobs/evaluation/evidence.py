@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtr, stdtrit
 
 from wfsobs.evaluation.rows import NO_ESTIMATE, can_be_best
-from wfsobs.evaluation.samples import scatter_of_mean
-from wfsobs.evaluation.scores import BOUNDS, Score
+from wfsobs.evaluation.scores import BOUNDS, Score, scatter_of_mean
 from wfsobs.observers import OBSERVERS
 from wfsobs.typing import Array
 

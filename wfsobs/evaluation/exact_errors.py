@@ -1,42 +1,206 @@
-"""The error of a fixed linear observer under the true spectra, computed, not measured on records.
+"""Responses of linear observers to single measurements, and the errors that follow from them, computed, not measured on records.
 
-The responses of the observer to one measurement of the LGS at every place in the cycle of an NGS frame, and to one frame, are the
+The responses of an observer to one measurement of the LGS at every place in the cycle of an NGS frame, and to one frame, are the
 coefficients h_p and g_p of its estimates p steps after a frame,
 
     s_hat[k] = sum_j h_p[j] z[k-j] + sum_j g_p[j] y[k-j].
 
 With their transforms H_p and G_p, and y = x + v as in `slow_sensor`, the error s - s_hat has the variance
 
-    mean(S_s + |H_p|^2 S_z - 2 Re(S_sz H_p*) + |G_p|^2 S_x - 2 Re((S_sx - H_p S_zx) G_p*)) + sum_j g_p[j]^2 E v^2,
+    mean(S_s + |H_p|^2 S_z + |G_p|^2 S_y + 2 Re(G_p S_yz H_p*) - 2 Re(S_sz H_p* + S_sy G_p*))
 
-what the frames leave of what the LGS leave (`linear_response`).
+whatever the model that the observer is built on. Undamped lines are in neither: each adds its variance times the square of what
+the observer leaves of it.
 
-Undamped lines are in neither: each adds its variance times the square of what the observer leaves of it.
+A wave exp(i w k) of z becomes n waves of the estimate,
+
+    H_p(w) exp(i w k) = sum_l c_l(w) exp(i (w + 2 pi l / n) k),    c_l(w) = mean over p of H_p(w) exp(-2 pi i l p / n),
+
+and one of the frames likewise. At w + 2 pi l / n the error has, on average over the cycle, |1 at l = 0, -c_l, -d_l|^2 in the
+spectral matrix of s, z and y at w. (Bittanti and Colaneri, Periodic Systems, 2009, chapter 6, have these transfer functions.)
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from wfsobs.evaluation.bound_both import PeriodicError, exposure_response
-from wfsobs.evaluation.linear_response import estimate_and_error, impulse_responses
-from wfsobs.observers.base import Observer
+from wfsobs.evaluation.bound import PeriodicError, ngs_frames
+from wfsobs.observers.base import TURBULENCE, Observer
 from wfsobs.observers.estimates import TOTAL
 from wfsobs.prior import Prior
 from wfsobs.priors_from.scenario import observer_settings, prior_of
+from wfsobs.progress import QUIET
+from wfsobs.record import Measurements
 from wfsobs.scenario import Scenario
-from wfsobs.settings import Group
-from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean
+from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean, square
 from wfsobs.simulation.true_spectra import TrueSpectra, true_spectra
 from wfsobs.typing import Array
+
+SETTLED, EXACT = 1e-6, 1e-12
+"""What may be left at the end of a response, over its maximum: of a spectrum that is shown, and of an exact error."""
+
+SHORTEST = 2**11
+"""Steps of the first look at a response; each next one is twice as long."""
+
+START = 1000
+"""Steps before the first impulse: windows are full and gains are those that repeat."""
+
+
+class Taps(NamedTuple):
+    """Coefficients of an estimate p steps after a frame.
+
+    fast, slow : h_p of z and g_p of the frames, (ratio, length); of an observer of the LGS alone (1, length), and None
+    """
+
+    fast: Array
+    slow: Array | None
+
+
+class Waves(NamedTuple):
+    """Transforms c_l of z and d_l of the frames, (ratio, n // 2 + 1); None for those of no frames."""
+
+    fast: Complex
+    slow: Complex | None
+
+
+class TargetSpectra(NamedTuple):
+    """Spectra of a target and of the measurements, all (n // 2 + 1,) [um^2 per sample].
+
+    signal, z, frames : of s, z and the NGS with the noise of a frame;  by_z, by_frames : cross spectra of s with these
+    frames_by_z       : cross spectrum of the NGS with z
+    """
+
+    signal: Array
+    z: Array
+    frames: Array
+    by_z: Complex
+    by_frames: Complex
+    frames_by_z: Complex
+
+
+def target_spectra(spectra: TrueSpectra, target: str) -> TargetSpectra:
+    """Return the spectra of a target, or of all together for TOTAL, and of both sensors."""
+    ngs, (frames, exposure) = spectra.ngs, ngs_frames(spectra)
+    names = [target] if target in spectra.signal else list(spectra.signal)
+    signal, cross, seen = (np.sum([of[name] for name in names], axis=0) for of in (spectra.signal, spectra.cross, ngs.cross))
+    by_frames, noisy = seen * exposure.conj(), frames.spectrum + frames.noise
+    return TargetSpectra(signal, spectra.measurement, noisy, advance_spectrum(cross, 1), by_frames, frames.cross)
+
+
+def impulse_responses(
+    observer: Observer,
+    prior: Prior,
+    settings: Any,
+    dt: float,
+    ratio: int,
+    most: int,
+    first: int = SHORTEST,
+    left: float = SETTLED,
+) -> dict[str, Taps]:
+    """Compute the coefficients of a linear observer's estimates, in one mode, from one record of impulses one after the other.
+
+    Parameters
+    ----------
+    observer : Observer
+        The observer.
+    prior, settings : Prior, Group or None
+        Of one mode, and its own settings.
+    dt : float
+        Time step [s].
+    ratio : int
+        Steps of a cycle.
+    most : int
+        Maximum number of steps of a response.
+    first : int
+        Steps of the first try, twice as many in each next, until every response has settled.
+    left : float
+        What may be left at the end of a response, over its maximum.
+
+    Returns
+    -------
+    dict of str to Taps
+        Target -> coefficients.
+    """
+    has_frames = "ngs" in observer.sensors
+    ratio = ratio if has_frames else 1
+    start, longest = -(-START // ratio) * ratio, most // ratio * ratio
+    length = min(-(-first // ratio) * ratio, longest)
+    while True:
+        at = [start + i * (length + ratio) + i % ratio for i in range(ratio + has_frames)]  # the last in a frame
+        z = np.zeros((start + len(at) * (length + ratio), 1))
+        frames = np.full_like(z, np.nan)
+        frames[ratio::ratio] = 0.0
+        z[at[:ratio]] = frames[at[ratio:]] = 1.0
+        sensors = {"y_ngs": frames, "ratio": ratio} if has_frames else {}
+        found = observer.estimate(Measurements(z, np.zeros_like(z), dt, **sensors), prior, settings, QUIET)
+        out, settled = dict[str, Taps](), True
+        for target, values in found.items():
+            taps, late = np.zeros((2, ratio, length)), np.arange(length)
+            rest = np.nan_to_num(values[at[0] - ratio : at[0], 0])  # over the cycle before the first impulse
+            for i, step in enumerate(at):
+                response = np.nan_to_num(values[step : step + length, 0]) - rest[(late + step - at[0]) % ratio]
+                settled &= bool(np.abs(response[-length // 8 :]).max() <= left * np.abs(response).max())
+                taps[i // ratio, (i + late) % ratio, late] = response
+            out[target] = Taps(taps[0], taps[1] if has_frames else None)
+        if settled or length == longest:
+            return out
+        length = min(2 * length, longest)
+
+
+def waves(taps: Taps, n: int) -> Waves:
+    """Return the transforms of coefficients over n steps."""
+    phases = np.arange(len(taps.fast))
+    places = np.exp(-2j * np.pi * np.outer(phases, phases) / phases.size) / phases.size
+    fast, slow = (None if h is None else places @ np.fft.rfft(h, n) for h in taps)
+    assert fast is not None
+    return Waves(fast, slow)
+
+
+def cycle_spectra(responses: Waves, sensors: TargetSpectra) -> tuple[Array, Array]:
+    """Return the spectra of an estimate and of its error on average over the cycle, (n // 2 + 1,).
+
+    What moves to a frequency between those of the DFT is at the nearest one.
+    """
+    ratio, n = len(responses.fast), 2 * (sensors.z.size - 1)
+    out = np.zeros((2, 2 * n))
+    for wave, c in enumerate(responses.fast):
+        d = None if responses.slow is None else responses.slow[wave]
+        power = _estimate_power(c, d, sensors)
+        parts = np.stack([power, power + _rest_of_error(c, d, sensors) if wave == 0 else power])
+        if ratio == 1:
+            return parts[0], parts[1]
+        shift = round(wave * n / ratio)
+        parts[:, [0, -1]] *= 0.5  # these are their own at negative frequencies
+        out[:, shift : shift + parts.shape[1]] += parts
+    circle = out[:, :n] + out[:, n:]
+    signal, error = (circle + np.roll(circle[:, ::-1], 1, axis=1))[:, : n // 2 + 1]
+    return signal, error
+
+
+def _estimate_power(c: Complex, d: Complex | None, sensors: TargetSpectra) -> Array:
+    """Return the spectrum of an estimate from its responses to z and to the frames."""
+    power = square(c) * sensors.z
+    return power if d is None else power + square(d) * sensors.frames + 2.0 * _real_product(d * sensors.frames_by_z, c)
+
+
+def _rest_of_error(c: Complex, d: Complex | None, sensors: TargetSpectra) -> Array:
+    """Return the spectrum of its error less that of the estimate."""
+    shared = _real_product(sensors.by_z, c)
+    return sensors.signal - 2.0 * (shared if d is None else shared + _real_product(sensors.by_frames, d))
+
+
+def _real_product(a: Complex, b: Complex) -> Array:
+    """Return the real part of a b*."""
+    return a.real * b.real + a.imag * b.imag
 
 
 def exact_errors(
     observer: Observer, scenario: Scenario, *, spectra: Sequence[TrueSpectra] = ()
 ) -> list[dict[str, PeriodicError]]:
-    """Compute the errors of an observer that is told the scenario, mode by mode.
+    """Compute the errors of an observer whose prior is that of the scenario, mode by mode.
 
     Parameters
     ----------
@@ -57,60 +221,38 @@ def exact_errors(
     ValueError
         The observer is not of that kind, or the scenario has no such prior.
     """
-    settings = observer_settings(observer, scenario)
-    parts = observer.parts(settings)
     if not observer.linear or observer.couples_modes or not observer.causal or "training" in observer.needs:
         raise ValueError(
             f"{observer.id}: the exact error is that of an observer that is linear, causal and needs no training record, "
             "and takes every mode by itself"
         )
-    met = spectra or [true_spectra(scenario, mode) for mode in range(len(scenario.modes))]
-    return errors_under(observer, prior_of(scenario, None, parts), settings, scenario.dt, met)
-
-
-def errors_under(
-    observer: Observer, prior: Prior, settings: Group | None, dt: float, spectra: Sequence[TrueSpectra]
-) -> list[dict[str, PeriodicError]]:
-    """Compute the errors of an observer under these spectra, whatever it is told; dt [s]. Else as `exact_errors`."""
-    ratio = spectra[0].ngs.ratio
-    length = max(known.measurement.size for known in spectra) // ratio * ratio
-    responses = impulse_responses(observer, prior, settings, dt, len(spectra), ratio, length)
-    out = []
-    for mode, known in enumerate(spectra):
-        taps = {target: (fast[..., mode], slow[..., mode]) for target, (fast, slow) in responses.items()}
-        if len(taps) > 1:
-            fast, slow = zip(*taps.values(), strict=True)
-            taps[TOTAL] = np.sum(fast, axis=0), np.sum(slow, axis=0)
-        out.append({target: PeriodicError(variance_of(*pair, target, known)) for target, pair in taps.items()})
+    settings, out = observer_settings(observer, scenario), []
+    for mode, known in enumerate(spectra or [true_spectra(scenario, mode) for mode in range(len(scenario.modes))]):
+        prior, ratio = prior_of(scenario, None, observer.parts(settings), modes=[mode]), known.ngs.ratio
+        taps = impulse_responses(observer, prior, settings, scenario.dt, ratio, known.measurement.size, left=EXACT)
+        of = {target: (h, np.zeros_like(h) if g is None else g) for target, (h, g) in taps.items()}
+        if len(of) > 1:
+            of[TOTAL] = tuple(np.sum(pair, axis=0) for pair in zip(*of.values(), strict=True))
+        variances = {target: variance_of(*pair, target, known) for target, pair in of.items()}
+        out.append({target: PeriodicError(np.repeat(x, ratio // x.size)) for target, x in variances.items()})
     return out
 
 
 def variance_of(fast: Array, slow: Array, target: str, spectra: TrueSpectra) -> Array:
     """Return the variance of the error [um^2] at every place in the cycle, (ratio,); fast, slow : h_p, g_p (ratio, length)."""
-    known, ratio = spectra.without_lines, spectra.ngs.ratio
-    ngs, n = known.ngs, 2 * (known.measurement.size - 1)
-    exposure = exposure_response(ratio, known.measurement.size)
-    names = [target] if target in known.signal else list(known.signal)
-    own = sum((known.signal[name] for name in names), np.zeros(1))
-    by_z = advance_spectrum(sum((known.cross[name] for name in names), np.zeros(1)), 1)
-    by_x = sum((ngs.cross[name] for name in names), np.zeros(1)) * exposure.conj()
-    x, x_by_z = ngs.signal * np.abs(exposure) ** 2, advance_spectrum(ngs.measurement_cross * exposure, 1)
-    out = np.empty(ratio)
-    for phase in range(ratio):
-        H, G = np.fft.rfft(fast[phase], n), np.fft.rfft(slow[phase], n)
-        _, left = estimate_and_error(H, known.measurement, own, by_z)
-        _, left = estimate_and_error(G, x, left, by_x - H * x_by_z.conj())
-        of_lines = sum(
-            variance * abs(_line_left(fast[phase], slow[phase], frequency, spectra.gain, ratio, target)) ** 2
-            for frequency, variance in spectra.pure
-        )
-        out[phase] = circle_mean(left) + ngs.noise * np.sum(slow[phase] ** 2) + of_lines
+    known = spectra.without_lines
+    sensors = target_spectra(known, target)
+    out = np.zeros(len(fast))
+    for phase, pair in enumerate(zip(fast, slow, strict=True)):
+        c, d = np.fft.rfft(pair, known.n)
+        out[phase] = circle_mean(_estimate_power(c, d, sensors) + _rest_of_error(c, d, sensors))
+        for frequency, variance in spectra.pure:
+            out[phase] += variance * abs(_line_left(*pair, frequency, spectra, target)) ** 2
     return out
 
 
-def _line_left(fast: Array, slow: Array, frequency: float, gain: float, ratio: int, target: str) -> complex:
+def _line_left(fast: Array, slow: Array, frequency: float, spectra: TrueSpectra, target: str) -> complex:
     """Return the error for a line of amplitude one; frequency [cycles per step]."""
-    turn = np.exp(-2j * np.pi * frequency * np.arange(fast.size))
-    exposure: Complex = np.exp(-2j * np.pi * frequency * np.arange(1, ratio + 1)).mean()
-    is_part = 0.0 if target == "turbulence" else 1.0
-    return complex(is_part - gain * turn[1] * (fast @ turn) - exposure * (slow @ turn))
+    turn = np.exp(-2j * np.pi * frequency * np.arange(max(fast.size, spectra.ngs.ratio + 1)))
+    exposure, seen = turn[1 : spectra.ngs.ratio + 1].mean(), turn[: fast.size]
+    return complex((target != TURBULENCE) - spectra.gain * turn[1] * (fast @ seen) - exposure * (slow @ seen))

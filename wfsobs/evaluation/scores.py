@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import blake2b
-from typing import Any
 
 import numpy as np
+from scipy.special import stdtrit
 
 from wfsobs.evaluation.calibration import Calibration, calibration
-from wfsobs.evaluation.lag import lag
-from wfsobs.evaluation.samples import batch_means, common_samples, rms_interval, samples_after, stretch_of
-from wfsobs.evaluation.totals import of_both, totals
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimate
 from wfsobs.record import Record
@@ -37,6 +34,15 @@ COMMON_BOUNDS = (BOUND, BOUND_BOTH)
 
 BOUNDS = (*COMMON_BOUNDS, BOUND_STARS, BOUND_MODES, BOUND_BOTH_MODES, BOUND_ASTERISM)
 """The bounds, in the order of tables."""
+
+SHARE = 0.5
+"""Minimum share of the samples after the warm-up that observers in a table have in common; those that leave fewer stand apart."""
+
+BATCHES = 20
+"""Pieces of a record whose means tell how far that of the whole scatters."""
+
+MAX_LAG = 0.025
+"""Maximum lag [s]."""
 
 
 @dataclass(frozen=True)
@@ -146,40 +152,50 @@ def supervised_scores(
         if truth is None:
             continue
         for mode, name in enumerate(mode_names):
-            true = truth[:, mode]
-            counts = samples_after(record, warm_up) & ~np.isnan(true)
+            counts = _samples_after(record, warm_up) & ~np.isnan(truth[:, mode])
             scored = common_samples([counts & ~np.isnan(e.values[:, mode]) for e in of])
             words = {id(samples): blake2b(samples.tobytes(), digest_size=16).hexdigest() for samples, _ in scored}
             for e, (samples, apart) in zip(of, scored, strict=True):
                 if samples.any():
-                    make = partial(_score_mode, e, true, mode, name, record.dt, samples, apart)
+                    make = partial(_score_mode, e, truth[:, mode], mode, name, record.dt, samples, apart)
                     out.append(derive(e, f"score {target} {mode} {name} {words[id(samples)]} {apart}", make))
     return out
 
 
 def _score_mode(e: Estimate, true: Array, mode: int, name: str, dt: float, samples: Array, apart: bool) -> Score:
     """Score one mode of an estimate on some samples of the truth (n_steps,) [um]."""
-    t, value = true[samples], e.values[samples, mode]
+    value, sd = e.values[:, mode], None if e.sd is None else e.sd[:, mode]
+    late = lag(true[samples], value[samples], dt)
+    return _score_error((e.observer, e.target, name), value - true, true, dt, samples, apart, late, e.seconds_per_step, sd)
+
+
+def _score_error(
+    key: tuple[str, str, str],
+    error: Array,
+    signal: Array,
+    dt: float,
+    samples: Array,
+    apart: bool = False,
+    late: float | None = None,
+    seconds: float = 0.0,
+    sd: Array | None = None,
+) -> Score:
+    """Score an error (n_steps,) [um] on some samples; key : observer, target and mode."""
+    error, signal = error[samples], signal[samples]
+    size, scale, pieces = rms(error), rms(signal), batch_means(np.column_stack([error, signal]) ** 2)
     return Score(
-        e.observer,
-        e.target,
-        name,
-        rms(value - t),
-        rms(t),
-        _ratio(value - t, t),
-        lag(t, value, dt),
-        e.seconds_per_step,
+        *key,
+        size,
+        scale,
+        size / scale if scale > 0 else None,
+        late,
+        seconds,
         *stretch_of(samples, dt),
         apart,
-        calibration=None if e.sd is None else calibration(value - t, e.sd[samples, mode]),
-        **_scatter(value - t, t),
+        interval=rms_interval(size, pieces[:, :1]),
+        calibration=None if sd is None else calibration(error, sd[samples]),
+        pieces=tuple(map(tuple, pieces.tolist())),
     )
-
-
-def _scatter(error: Array, truth: Array) -> dict[str, Any]:
-    """Return the fields `pieces` and `interval` of a score."""
-    pieces = batch_means(np.column_stack([error, truth]) ** 2)
-    return {"pieces": tuple(map(tuple, pieces.tolist())), "interval": rms_interval(rms(error), pieces[:, :1])}
 
 
 def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: float, mode_names: list[str]) -> list[Score]:
@@ -191,51 +207,43 @@ def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: 
     - RESIDUAL: rms of y_lgs, the residual of the recorded loop.
     """
     out: list[Score] = []
-    both = of_both(estimates)
-    counts = samples_after(record, warm_up + record.dt)
+    both = totals(estimates)
+    counts = _samples_after(record, warm_up + record.dt)
     for mode, name in enumerate(mode_names):
         z, left = record.z[:, mode], record.y_lgs[:, mode]
         measured = counts & ~np.isnan(z)
         if not rms(z[measured]) > 0:
             continue
-        errors = [z - _later(sum(e.values[:, mode] for e in parts)) for parts in both.values()]  # type: ignore[arg-type]
+        errors = [z - _later(e.values[:, mode]) for e in both]
         scored = common_samples([measured & ~np.isnan(error) for error in errors])
-        for (observer, parts), error, (samples, apart) in zip(both.items(), errors, scored, strict=True):
+        for e, error, (samples, apart) in zip(both, errors, scored, strict=True):
             if samples.any():
-                sd = parts[0].sd_of_sum.get(PREDICTION)
-                out.append(
-                    Score(
-                        observer,
-                        PREDICTION,
-                        name,
-                        rms(error[samples]),
-                        rms(z[samples]),
-                        _ratio(error[samples], z[samples]),
-                        None,
-                        max(e.seconds_per_step for e in parts),
-                        *stretch_of(samples, record.dt),
-                        apart,
-                        calibration=None if sd is None else calibration(error[samples], _later(sd[:, mode])[samples]),
-                        **_scatter(error[samples], z[samples]),
-                    )
-                )
+                sd, seconds = e.sd_of_sum.get(PREDICTION), e.seconds_per_step
+                stated = None if sd is None else _later(sd[:, mode])
+                key = e.observer, PREDICTION, name
+                out.append(_score_error(key, error, z, record.dt, samples, apart, seconds=seconds, sd=stated))
         samples = next((s for s, apart in scored if not apart and s.any()), measured) & ~np.isnan(left)
         if samples.any():
-            out.append(
-                Score(
-                    LOOP,
-                    RESIDUAL,
-                    name,
-                    rms(left[samples]),
-                    rms(z[samples]),
-                    _ratio(left[samples], z[samples]),
-                    None,
-                    0.0,
-                    *stretch_of(samples, record.dt),
-                    **_scatter(left[samples], z[samples]),
-                )
-            )
+            out.append(_score_error((LOOP, RESIDUAL, name), left, z, record.dt, samples))
     return out
+
+
+def totals(estimates: Sequence[Estimate]) -> list[Estimate]:
+    """Return the estimate of the sum of turbulence and vibration of every observer that estimates both."""
+    whole: dict[str, list[Estimate]] = {}
+    for estimate in estimates:
+        whole.setdefault(estimate.observer, []).append(estimate)
+    return [
+        replace(
+            parts[0],
+            target=TOTAL,
+            values=np.sum([e.values for e in parts], axis=0),
+            seconds_per_step=max(e.seconds_per_step for e in parts),
+            sd=parts[0].sd_of_sum.get(TOTAL),
+        )
+        for parts in whole.values()
+        if {e.target for e in parts} == set(TARGETS)
+    ]
 
 
 def _later(x: Array) -> Array:
@@ -243,7 +251,109 @@ def _later(x: Array) -> Array:
     return np.concatenate([[np.nan], x[:-1]])
 
 
-def _ratio(error: Array, signal: Array) -> float | None:
-    """Return the rms of an error over that of the signal, None where that is zero."""
-    scale = rms(signal)
-    return rms(error) / scale if scale > 0 else None
+def _samples_after(record: Record, warm_up: float) -> Array:
+    """Return which steps are after the warm-up [s]."""
+    return np.arange(record.n_steps) >= round(warm_up / record.dt)
+
+
+def common_samples(samples: Sequence[Array]) -> list[tuple[Array, bool]]:
+    """Select the samples on which estimates are scored.
+
+    Starting with the estimate with most samples, every estimate takes part that leaves SHARE of the samples in common. These are
+    scored on the common samples, every other one on its own, apart.
+
+    Parameters
+    ----------
+    samples : sequence of Array
+        Samples that each estimate has, bool (n,).
+
+    Returns
+    -------
+    list of (Array, bool)
+        Samples of each estimate, and whether it stands apart.
+    """
+    if not samples:
+        return []
+    order = sorted(range(len(samples)), key=lambda i: -samples[i].sum())
+    shared, apart = samples[order[0]], set()
+    for i in order[1:]:
+        both = shared & samples[i]
+        if both.sum() >= SHARE * samples[order[0]].sum():
+            shared = both
+        else:
+            apart.add(i)
+    return [(samples[i] if i in apart else shared, i in apart) for i in range(len(samples))]
+
+
+def stretch_of(samples: Array, dt: float) -> tuple[float, float]:
+    """Return the time [s] of the first sample and of the end of the last."""
+    return float(np.argmax(samples) * dt), float((samples.size - np.argmax(samples[::-1])) * dt)
+
+
+def batch_means(values: Array) -> Array:
+    """Return the means of BATCHES pieces of values (n, ...), of fewer where there are fewer values."""
+    edges = np.unique(np.linspace(0, len(values), BATCHES + 1).astype(int))
+    return (np.add.reduceat(values, edges[:-1], axis=0).T / np.diff(edges)).T
+
+
+def scatter_of_mean(values: Array, independent: bool = False) -> tuple[Array, Array, Array]:
+    """Return the means of columns of values (n, k), their standard deviations and degrees of freedom, each (k,).
+
+    Values that are not independent are batch means: slow signals make neighbours alike, which counts as fewer of them, those of a
+    first-order autoregression with their correlation (Law and Kelton, Simulation Modeling and Analysis, ch. 9). Fewer than three
+    of them say nothing, and fewer than two of any: NaN.
+    """
+    n, mean = len(values), values.mean(axis=0)
+    if n < (2 if independent else 3):
+        return mean, np.full_like(mean, np.nan), np.ones_like(mean)
+    deviation = values - mean
+    power = (deviation**2).sum(axis=0)
+    if independent:
+        return mean, np.sqrt(power / (n - 1) / n), np.full_like(mean, n - 1.0)
+    alike = np.divide((deviation[1:] * deviation[:-1]).sum(axis=0), power, out=np.zeros_like(power), where=power > 0)
+    alike = np.maximum(alike + 1.0 / n, 0.0)  # the estimate of a correlation from n values is low by about 1 / n
+    effective = np.maximum(n * (1.0 - alike) / (1.0 + alike), 2.0)
+    return mean, np.sqrt(power / (n - 1) / effective), effective - 1.0
+
+
+def rms_interval(rms: float, squares: Array) -> tuple[float, float] | None:
+    """Return the interval of an rms at 95 % confidence, by the scatter of its logarithm in batch means of squares (n, 1).
+
+    None where there is none: of too few, or of an error that is zero.
+    """
+    mean, deviation, freedom = (float(x[0]) for x in scatter_of_mean(squares))
+    reach = 0.5 * float(stdtrit(freedom, 0.975)) * deviation / mean if mean > 0 else np.nan
+    low, high = (rms * np.exp([-reach, reach])).tolist()
+    return (low, high) if np.isfinite(reach) else None
+
+
+def lag(truth: Array, value: Array, dt: float) -> float | None:
+    """Estimate the delay of `value` behind `truth` [s]: where their correlation coefficient is highest.
+
+    The maximum is interpolated by a parabola through three points. Positive is late; None where either is constant.
+
+    The middle of the truth is compared with equally long pieces of the estimate, each with its own mean and variance:
+    a plain cross-correlation has fewer terms at larger lags, which biases the broad maximum of a slow signal towards
+    zero. The phase of an oscillation tells its delay but for whole periods: of maxima that reach half of the highest, which
+    may be highest by chance, it is the one nearest to zero.
+    """
+    reach = min(round(MAX_LAG / dt), (truth.size - 1) // 4)
+    middle = truth[reach : truth.size - reach]
+    if np.ptp(value) == 0 or np.ptp(middle) == 0:
+        return None
+    n, moving = middle.size, value - value.mean()
+    sums, squares = (np.concatenate([[0.0], np.cumsum(x)]) for x in (moving, moving**2))
+    power = squares[n:] - squares[:-n] - (sums[n:] - sums[:-n]) ** 2 / n
+    if not power.max() > 0:  # so small that its square is nothing
+        return None
+    power = np.maximum(power, 1e-12 * power.max())
+    alike = np.correlate(moving, middle - middle.mean(), "valid") / np.sqrt(power)
+    inner = alike[1:-1]
+    tops = 1 + np.flatnonzero((inner >= alike[:-2]) & (inner >= alike[2:]) & (inner >= 0.5 * alike.max()))
+    if tops.size == 0:
+        return float((np.argmax(alike) - reach) * dt)
+    peak = tops[np.argmin(np.abs(tops - reach))]
+    before, at, after = alike[peak - 1 : peak + 2]
+    curvature = before - 2.0 * at + after
+    shift = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
+    return float((peak - reach + shift) * dt)

@@ -1,19 +1,37 @@
-"""What a table of errors says of a target: the best with each kind of prior knowledge, the limit, and who does harm and why."""
+"""Verdict on a table of errors: the best with each kind of prior knowledge, the limit, and observers worse than assuming zero."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wfsobs.evaluation.budget import Budget, error_budget
+from wfsobs.evaluation.budget import CONE, LAG, LINES, MISMATCH, NOISE, Budget, error_budget
 from wfsobs.evaluation.evidence import Evidence, gather_evidence
-from wfsobs.evaluation.known_lines import given_lines, is_near, prior_knowledge
-from wfsobs.evaluation.rows import JOINT_BOUNDS, above_bound
-from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS, PREDICTION, Score
-from wfsobs.evaluation.verdict_words import verdict_sentences
+from wfsobs.evaluation.known_lines import (
+    BANDS,
+    NOTHING,
+    ONE_PEAK,
+    PEAKS,
+    SPECTRA,
+    TRAINED,
+    given_lines,
+    is_near,
+    prior_knowledge,
+)
+from wfsobs.evaluation.rows import JOINT_BOUNDS, above_bound, row_label, target_title
+from wfsobs.evaluation.scores import (
+    BOUND_ASTERISM,
+    BOUND_BOTH,
+    BOUND_BOTH_MODES,
+    BOUND_MODES,
+    BOUNDS,
+    PREDICTION,
+    Score,
+)
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import Estimate
@@ -26,6 +44,39 @@ from wfsobs.typing import Array
 
 if TYPE_CHECKING:
     from wfsobs.evaluation.result import Result
+
+HEADINGS = {
+    NOTHING: "Without prior knowledge",
+    PEAKS: "With known peak frequencies",
+    ONE_PEAK: "With one known peak",
+    TRAINED: "With training data",
+    BANDS: "With known frequency bands",
+    SPECTRA: "With known spectra",
+}
+"""Kinds of prior knowledge, as the beginning of a sentence."""
+
+ALWAYS = ("gpr-online", "kf-lgs", "integrator", "integrator+gpr-online", "lqg-kf-lgs")
+"""Observers and controllers that are named whatever their error: the subject of the paper, and what it is compared with."""
+
+MOST = 3
+"""Observers that are named as equal to the best; the table has all."""
+
+USING = {
+    BOUND_BOTH: "LGS and NGS",
+    BOUND_MODES: "the LGS in all modes",
+    BOUND_BOTH_MODES: "LGS and NGS in all modes",
+    BOUND_ASTERISM: "every LGS in all modes, and NGS",
+}
+"""Bounds that an error is compared with, and what they use."""
+
+CAUSES = {
+    NOISE: "sensor noise",
+    LAG: "lag",
+    LINES: "unmodelled peaks",
+    MISMATCH: "model mismatch",
+    CONE: "cone effect and aliasing",
+}
+"""Terms of an error budget, as causes."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +104,34 @@ class Contender:
     def above_limit(self) -> float | None:
         """By which share the error is above the limit: 0 where its interval has the limit in it."""
         return above_bound(self.rms, self.interval, self.limit[0] if self.limit else None)
+
+    @property
+    def name(self) -> str:
+        """Label of the observer or controller."""
+        return self.label or row_label(self.observer)
+
+    def with_error(self, scale: float, unit: str) -> str:
+        """Write the name and the error with its interval; scale : from micrometres to the unit."""
+        half = 0.5 * (self.interval[1] - self.interval[0]) * scale if self.interval else None
+        return f"{self.name} {_format_number(self.rms * scale, half)} {unit}"
+
+    def knowledge_clause(self, lines: int, several: bool = False) -> str:
+        """Write what it knows before it measures; lines : of the vibration, 0 where that is not known."""
+        they, know, have, model = (
+            ("they", "know", "have", "their models have") if several else ("it", "knows", "has", "its model has")
+        )
+        n = self.n_peaks
+        of = f" of {lines}" if lines > n else ""
+        all_n = f"all {n}" if 1 < n == lines else f"{n}{of}"
+        frequencies = f"{they} {know} {'the peak frequency' if n == 1 >= lines else f'{all_n} peak frequencies'}"
+        return {
+            PEAKS: frequencies if n or lines else f"{model} no peak",
+            ONE_PEAK: f"{model} {'one' if n else 'none'}{of} peak{'s' * bool(of)}",
+            TRAINED: f"{they} {have} training data",
+            BANDS: f"{they} {know} the frequency bands",
+            SPECTRA: f"{they} {know} the spectra",
+            NOTHING: f"{they} {have} no prior knowledge",
+        }[self.knowledge]
 
 
 @dataclass(frozen=True)
@@ -109,8 +188,61 @@ class Verdict:
         return next((place for place in self.places if place.knowledge in knowledge), None)
 
     def sentences(self, scale: float = 1e3, unit: str = "nm") -> list[str]:
-        """Return the verdict in words; scale: from micrometres to the unit."""
-        return verdict_sentences(self, scale, unit)
+        """Write the best with each kind of prior knowledge and the limit, then the observers of the paper, then the harms.
+
+        scale : from micrometres to the unit
+        """
+        chosen = {place.observer: place for kind in (NOTHING, PEAKS) if (place := self.best_with(kind))}
+        chosen.setdefault(self.best.observer, self.best)
+        equal = [place.name for place in self.places[1:] if place.is_tie and place.observer not in chosen]
+        parts = []
+        for place in chosen.values():
+            words, heading = [place.with_error(scale, unit)], HEADINGS[place.knowledge]
+            if place.knowledge == PEAKS and place.n_peaks < self.lines:
+                heading = f"With {place.n_peaks} of {self.lines} peak frequencies known"
+            if place is not self.best:
+                words += ["statistically equal to the best"] * place.is_tie
+            else:
+                if place.above_limit is not None and place.limit is not None:
+                    percent = round(100.0 * place.above_limit)
+                    where = f"{abs(percent)} % {'above' if percent > 0 else 'below'}" if percent else "at"
+                    words.append(f"{where} the theoretical limit using {USING[place.limit[1]]}")
+                if equal:
+                    shown = equal if len(equal) <= MOST + 1 else [*equal[:MOST], f"{len(equal) - MOST} others"]
+                    words.append(f"statistically equal to {_join(shown)}")
+            parts.append(f"{heading}: {', '.join(words)}.")
+        over = f", over {self.seeds} seeds" if self.seeds > 1 else ""
+        others = {place.observer: place for place in self.places if place.observer in ALWAYS and place.observer not in chosen}
+        groups: dict[tuple[object, ...], list[Harm]] = {}
+        for harm in self.harms:
+            others.pop(harm.observer, None)
+            groups.setdefault((harm.worse, harm.place.knowledge_clause(self.lines), harm.cause), []).append(harm)
+        return [
+            f"{target_title(self.target)}, {self.mode}{over}. {' '.join(parts)}",
+            *([" ".join(f"{place.with_error(scale, unit)}." for place in others.values())] if others else []),
+            *(self._harm_sentence(of, scale, unit) for of in groups.values()),
+        ]
+
+    def _harm_sentence(self, harms: Sequence[Harm], scale: float, unit: str) -> str:
+        """Write a sentence for observers that know the same and fail for the same reason; shares are the mean of theirs."""
+        several, first = len(harms) > 1, harms[0]
+        be, their, models = ("are", "their", "models") if several else ("is", "its", "model")
+        names = _join([h.place.with_error(scale, unit) if h.observer in ALWAYS else row_label(h.observer) for h in harms])
+        known, others, share = np.mean([(h.at_known, h.at_others, h.share) for h in harms], axis=0).tolist()
+        reason = ""
+        if first.cause:
+            percent = round(100.0 * share)
+            reason = f"; {f'{percent} %' if percent < 100 else 'all'} of {their} error comes from {CAUSES[first.cause]}"
+        elif self.lines:
+            shares = {
+                f"at peaks that are not in {their} {models}": others,
+                f"at peaks in {their} {models}": known,
+                "away from the peaks": 1.0 - known - others,
+            }
+            where, share = max(shares.items(), key=lambda item: item[1])
+            reason = f"; {100.0 * share:.0f} % of {their} error lies {where}"
+        knowledge = first.place.knowledge_clause(self.lines, several)
+        return f"{names} {be} {'worse' if first.worse else 'no better'} than assuming no {self.target}: {knowledge}{reason}."
 
 
 def verdict(
@@ -142,22 +274,17 @@ def verdict(
     lines = () if simulation is None else tuple(line[0] for line in vibration_lines(simulation, column))
     of = {s.observer: s for s in scores if (s.target, s.mode) == (target, mode)}
     places = {place.observer: place for place in contenders(scenario, found, scores, target, mode, lines)}
-    given = {name: given_lines(scenario, name, column) for name in ranked}
-    causes = {b.observer: _largest_term(b) for b in budgets if (b.target, b.mode) == (target, mode) and b.terms}
+    explained = {b.observer: b for b in budgets if (b.target, b.mode) == (target, mode) and b.terms}
     values = {e.observer: e.values[:, column] for e in estimates if e.target == target}
-    harms = (
-        ()
-        if truth is None
-        else (
-            Harm(
-                places[name],
-                worse,
-                *_shares(_keep_scored(record, values[name] - truth[:, column], of[name]), record.dt, lines, given[name]),
-                *causes.get(name, ("", 0.0)),
-            )
-            for name, worse in found.harmful(target, mode).items()
-        )
-    )
+    harms = []
+    for name, worse in found.harmful(target, mode).items() if truth is not None else ():
+        start, stop = of[name].start, of[name].stop
+        assert truth is not None and start is not None and stop is not None
+        error = (values[name] - truth[:, column])[round(start / record.dt) : round(stop / record.dt)]
+        shares = _shares(error, record.dt, lines, given_lines(scenario, name, column))
+        terms, total = (explained[name].terms, explained[name].total) if name in explained else ({"": 0.0}, 1.0)
+        cause = max(terms, key=terms.__getitem__)
+        harms.append(Harm(places[name], worse, *shares, cause, terms[cause] / total))
     return Verdict(target, mode, tuple(places.values()), len(lines), tuple(harms), found.n_seeds)
 
 
@@ -180,12 +307,6 @@ def contenders(
     return tuple(out)
 
 
-def _largest_term(budget: Budget) -> tuple[str, float]:
-    """Return the largest term of an error budget, and its part of the total."""
-    name = max(budget.terms, key=budget.terms.__getitem__)
-    return name, budget.terms[name] / budget.total
-
-
 def explain_harm(result: Result, mode: str | None = None, watch: Watch = QUIET) -> list[Budget]:
     """Return the error budgets of the observers that do harm, of those that are as fast as a Kalman filter.
 
@@ -200,15 +321,6 @@ def explain_harm(result: Result, mode: str | None = None, watch: Watch = QUIET) 
         return []
 
 
-def _keep_scored(record: Record, error: Array, score: Score) -> Array:
-    """Return a signal where it was scored, NaN elsewhere."""
-    assert score.start is not None and score.stop is not None
-    out = np.full_like(error, np.nan)
-    scored = slice(round(score.start / record.dt), round(score.stop / record.dt))
-    out[scored] = error[scored]
-    return out
-
-
 def _shares(error: Array, dt: float, lines: Sequence[float], given_lines: Sequence[float]) -> tuple[float, float]:
     """Shares of an error's variance at the lines [Hz] that an observer is given, and at the others."""
     frequency, density = welch_psd(error[~np.isnan(error)][:, None], dt)
@@ -219,3 +331,43 @@ def _shares(error: Array, dt: float, lines: Sequence[float], given_lines: Sequen
     at_given = at_lines & is_near(frequency, given_lines)
     at_others = at_lines & ~at_given
     return float(density[at_given].sum() / total), float(density[at_others].sum() / total)
+
+
+def sentence_of_several(verdicts: Sequence[Verdict], scales: Sequence[float], unit: str) -> str:
+    """Write who is best in how many of several scenarios, without prior knowledge and with known peak frequencies.
+
+    scales : from micrometres to the unit, of every verdict
+    """
+    parts = []
+    for kind in (NOTHING, PEAKS):
+        best = [(place, scale) for it, scale in zip(verdicts, scales, strict=True) if (place := it.best_with(kind))]
+        if best:
+            counts = Counter(row_label(place.observer) for place, _ in best).most_common()
+            errors = [place.rms * scale for place, scale in best]
+            n_equal = sum(place.above_limit == 0.0 for place, _ in best)
+            parts.append(
+                f"{HEADINGS[kind]}: smallest error of "
+                f"{', '.join(f'{name} in {n}' for name, n in counts)} of {len(best)} scenarios"
+                f", {_format_number(min(errors))} to {_format_number(max(errors))} {unit}"
+                f"{f', at the theoretical limit in {n_equal}' if n_equal else ''}."
+            )
+    return " ".join(parts)
+
+
+def _join(names: Sequence[str]) -> str:
+    """Write names as a list in a sentence.
+
+    >>> _join(["LGS KF", "Ridge", "Multi-peak KF"])
+    'LGS KF, Ridge and Multi-peak KF'
+    """
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+
+
+def _format_number(x: float, half_width: float | None = None) -> str:
+    """Return three digits of a number, and its interval to the last of them.
+
+    >>> _format_number(14.96), _format_number(0.5), _format_number(120.4), _format_number(1234.0), _format_number(9.63, 0.418)
+    ('15.0', '0.500', '120', '1234', '9.63 ± 0.42')
+    """
+    text = f"{x:#.3g}".rstrip(".") if x < 999.5 else f"{x:.0f}"
+    return text if half_width is None else f"{text} ± {half_width:.{len(text.partition('.')[2])}f}"

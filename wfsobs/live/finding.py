@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wfsobs.evaluation.bound import bound_rms
-from wfsobs.evaluation.bound_both import bound_rms_of_both
-from wfsobs.evaluation.scores import BOUND, BOUND_BOTH
+from wfsobs.evaluation.bound import INFORMATION, bound
 from wfsobs.identification import identify
 from wfsobs.priors_from.identification import told_by
 from wfsobs.record import Record
@@ -149,7 +147,7 @@ def bounds_of(settings: dict[str, Any]) -> dict[str, dict[str, list[float]]]:
     if not has_known_spectra(scenario):
         return {}
     out: dict[str, dict[str, list[float]]] = {}
-    for bound, rms_of in ((BOUND, bound_rms), (BOUND_BOTH, bound_rms_of_both)):
-        modes = [rms_of(scenario, mode) for mode in range(len(scenario.modes))]
-        out[bound] = {target: [one[target] for one in modes] for target in modes[0]}
+    for information in ("lgs", "both"):
+        modes = bound(scenario, information)
+        out[INFORMATION[information]] = {target: [one[target].rms for one in modes] for target in modes[0]}
     return out

@@ -13,8 +13,7 @@ import numpy as np
 
 from wfsobs.campaign.keys import PHYSICS_VERSION
 from wfsobs.closed_loop.design import design
-from wfsobs.evaluation.bound import least_errors
-from wfsobs.evaluation.bound_both import least_errors_of_both
+from wfsobs.evaluation.bound import least_errors, least_errors_of_both
 from wfsobs.observers.base import Observer
 from wfsobs.observers.estimates import TOTAL
 from wfsobs.prior import Prior

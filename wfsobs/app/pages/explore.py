@@ -39,7 +39,7 @@ from wfsobs.app.views.target_figures import Stretch
 from wfsobs.app.views.traces import Traces
 from wfsobs.app.views.verdict import VerdictLine
 from wfsobs.app.work import TRUTH
-from wfsobs.evaluation.theory import Theory
+from wfsobs.evaluation.error_spectra import Theory
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION
 
 HEAD = grid_style("minmax(0, 2fr) minmax(0, 3fr)")

@@ -45,8 +45,8 @@ from wfsobs.app.store import Store
 from wfsobs.app.style import look
 from wfsobs.app.views.spectrum_editor import Frames, SpectrumEditor
 from wfsobs.app.work import TRUTH
+from wfsobs.evaluation.error_spectra import Theory
 from wfsobs.evaluation.scores import BOUNDS
-from wfsobs.evaluation.theory import Theory
 from wfsobs.live.board import NEXT
 from wfsobs.live.checks import can_control, can_run
 from wfsobs.live.finding import Bounds

@@ -21,7 +21,7 @@ from wfsobs.campaign.sweep import SweepResults
 from wfsobs.evaluation.evidence import FEWEST
 from wfsobs.evaluation.rows import row_label
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH
-from wfsobs.evaluation.verdict_words import sentence_of_several
+from wfsobs.evaluation.verdict import sentence_of_several
 from wfsobs.scenario import Scenario
 from wfsobs.settings.parameters import Reals, unit_of
 from wfsobs.typing import Array

@@ -22,7 +22,7 @@ from wfsobs.app.views.spectrum_editor import Frames, HandleLayer, positive
 from wfsobs.closed_loop.design import LawDesign, design_mode
 from wfsobs.control.curves import Curves, curves
 from wfsobs.control.integrator import highest_stable_gain
-from wfsobs.evaluation.theory import Theory
+from wfsobs.evaluation.error_spectra import Theory
 from wfsobs.priors_from.controllers import plant_of
 from wfsobs.priors_from.scenario import told_spectra
 from wfsobs.scenario import Scenario

@@ -22,10 +22,9 @@ from wfsobs.app.service import Session
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, look, observers_of
 from wfsobs.app.views.plots import AFTERWARDS_MS, ExtraLines, once
-from wfsobs.evaluation.error_spectra import cumulative_rms
-from wfsobs.evaluation.linear_response import SETTLED
+from wfsobs.evaluation.error_spectra import TRUTH, Prediction, Theory, cumulative_rms, is_predicted
+from wfsobs.evaluation.exact_errors import SETTLED
 from wfsobs.evaluation.scores import BOUND
-from wfsobs.evaluation.theory import TRUTH, Prediction, Theory, is_predicted
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TURBULENCE, VIBRATION
 from wfsobs.scenario import Scenario
