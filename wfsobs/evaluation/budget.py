@@ -24,12 +24,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from itertools import combinations
 from math import factorial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from wfsobs.evaluation.bound import TRUE_MODEL
 from wfsobs.evaluation.known_lines import given_lines, is_near
 from wfsobs.evaluation.rows import NO_ESTIMATE, own_bound
 from wfsobs.evaluation.scores import Score
@@ -79,9 +81,6 @@ LINEAR, AVERAGED = "linear", "averaged over orders"
 ONLY_NAMED = "only if named"
 """End of the reason why an observer has no budget that can have one."""
 
-
-MATCHED = {"multipeak.turbulence_order": 3, "kalman.process_noise": "matched", "kalman.measurement_noise": "matched"}
-"""Settings of the filter of the right model."""
 
 Estimates = dict[str, Array]
 
@@ -186,23 +185,19 @@ def error_budget(
         own = [s for s in result.scores if s.observer == name and mode in (None, s.mode)]
         if name == NO_ESTIMATE or not own:
             continue
-        observer, limit = OBSERVERS[name], own_bound(name)
-        bounds = {(s.target, s.mode): s.rms**2 for s in result.scores if s.observer == limit}
-        reason, terms = "", list[dict[str, float]]()
+        observer, limit, reason = OBSERVERS[name], own_bound(name), ""
         if not observer.causal:
             reason = "looks ahead"
         elif "y_stars" in observer.needs:
             reason = "takes every LGS by itself"
         elif not observer.linear and observers is None:
             reason = f"not linear, takes 16 runs: {ONLY_NAMED}"
-        else:
-            values = with_total({e.target: e.values for e in result.estimates if e.observer == name})
-            terms = _terms(observer, scenario, record, values, own, watch)
+        values = with_total({e.target: e.values for e in result.estimates if e.observer == name})
+        terms = [dict[str, float]()] * len(own) if reason else _terms(observer, scenario, record, values, own, watch)
+        bounds = {(s.target, s.mode): s.rms**2 for s in result.scores if s.observer == limit}
         method = LINEAR if reason or observer.linear else AVERAGED
-        out += [
-            Budget(name, s.target, s.mode, s.rms**2, of, bounds.get((s.target, s.mode)), method, reason)
-            for s, of in zip(own, terms or [{} for _ in own], strict=True)
-        ]
+        for s, of in zip(own, terms, strict=True):
+            out.append(Budget(name, s.target, s.mode, s.rms**2, of, bounds.get((s.target, s.mode)), method, reason))
     return out
 
 
@@ -217,23 +212,24 @@ def _terms(
     sources = split_record(scenario, record, lines, given)
     responses, rest = _responses(observer, scenario, record, sources, watch)
     truths = {name: with_total(part.truth) for name, part in sources.items()}
-    seen, reference = sources[SIGNAL].measurement, dict[int, Estimates]()
+    seen, out = sources[SIGNAL].measurement, []
     signal = OpenLoop(np.nan_to_num(seen.lgs), np.nan_to_num(seen.ngs))
-    out = []
+
+    @cache
+    def reference(i: int) -> Estimates:
+        watch.check()
+        return with_total(follow_signal(before, i, given[i], observer.sensors, signal))
+
     for s in scores:
         i = columns.index(s.mode)
-        if i not in reference:
-            watch.check()
-            reference[i] = with_total(follow_signal(before, i, given[i], observer.sensors, signal))
         truth = {name: of[s.target][:, i] for name, of in truths.items()}
         parts = {name: responses[name][s.target][:, i] - truth[name] for name in sources}
-        lag = reference[i][s.target] - truth[SIGNAL]
+        lag = reference(i)[s.target] - truth[SIGNAL]
         parts |= {LAG: lag, MISMATCH: parts.pop(SIGNAL) - lag + rest[s.target][:, i]}
         error = values[s.target][:, i] - sum(truth.values())
         assert s.start is not None and s.stop is not None
         scored = slice(round(s.start / record.dt), round(s.stop / record.dt))
-        known = ~np.isnan(error[scored])
-        out.append({name: float(np.mean(parts[name][scored][known] * error[scored][known])) for name in TERMS})
+        out.append({name: float(np.nanmean(parts[name][scored] * error[scored])) for name in TERMS})
     return out
 
 
@@ -291,12 +287,8 @@ def split_record(
         LINES: (_see(others, record.ratio), nothing, others),
         SIGNAL: (_see(record.turbulence + known, record.ratio), record.turbulence, known),
     }
-    no_lgs, no_ngs = np.isnan(total.lgs), np.isnan(total.ngs)
-    return {
-        name: Source(
-            OpenLoop(np.where(no_lgs, np.nan, seen.lgs), np.where(no_ngs, np.nan, seen.ngs), total.stars),
-            {TURBULENCE: turbulence, VIBRATION: vibration},
-        )
+    return {  # NaN where the record has no measurement
+        name: Source(_add([seen], total), {TURBULENCE: turbulence, VIBRATION: vibration})
         for name, (seen, turbulence, vibration) in parts.items()
     }
 
@@ -315,10 +307,10 @@ def split_lines(vibration: Array, dt: float, lines: Sequence[float], given_lines
     return np.fft.irfft(np.fft.rfft(vibration) * known[nearest], vibration.size)
 
 
-def sum_sources(parts: Sequence[Source]) -> OpenLoop:
-    """Return the measurements of several sources together."""
-    seen = [part.measurement for part in parts]
-    return OpenLoop(sum(one.lgs for one in seen), sum(one.ngs for one in seen), seen[0].stars)  # type: ignore[arg-type]
+def _add(parts: Iterable[OpenLoop], total: OpenLoop) -> OpenLoop:
+    """Return several measurements together, zero without any, where the whole is measured."""
+    parts = [OpenLoop(0.0 * total.lgs, 0.0 * total.ngs), *parts]
+    return OpenLoop(np.sum([one.lgs for one in parts], axis=0), np.sum([one.ngs for one in parts], axis=0), total.stars)
 
 
 def _see(signal: Array, ratio: int) -> OpenLoop:
@@ -338,8 +330,8 @@ def _responses(
 
     def estimate(names: Iterable[str]) -> Estimates:
         watch.check()
-        seen, chosen = sources[SIGNAL].measurement, [sources[name] for name in names]
-        measured = measure_closed_loop(scenario, sum_sources(chosen) if chosen else OpenLoop(0.0 * seen.lgs, 0.0 * seen.ngs))
+        chosen = [sources[name].measurement for name in names]
+        measured = measure_closed_loop(scenario, _add(chosen, sources[SIGNAL].measurement))
         own = measured if "open_loop_y" in observer.needs else replace(measured, open_loop_y=None)
         with detach_watch(silent) as alone:
             found = observer.estimate(own, prior, settings, alone)
@@ -415,7 +407,7 @@ def true_beams(scenario: Scenario, mode: int) -> Beams:
     """Return processes that have the spectra of the turbulence as the target has it and as the LGS see it, or are nearest."""
     if scenario.turbulence.source in ("none", "processes", "ar2", "ar3"):
         return replace(beams_of(scenario, mode), common=true_turbulence(scenario, mode), target=())
-    return beams_of(scenario.replace(MATCHED), mode)
+    return beams_of(scenario.replace(TRUE_MODEL), mode)
 
 
 def true_turbulence(scenario: Scenario, mode: int) -> tuple[Ar2 | Ar3, ...]:
@@ -427,4 +419,4 @@ def true_turbulence(scenario: Scenario, mode: int) -> tuple[Ar2 | Ar3, ...]:
         return tuple(processes(scenario, *of))
     if source in ("ar2", "ar3"):
         return ((turbulence_process if source == "ar2" else third_order_process)(scenario, *of),)
-    return (modelled_turbulence(scenario.replace(MATCHED), *of),)
+    return (modelled_turbulence(scenario.replace(TRUE_MODEL), *of),)

@@ -6,19 +6,19 @@ without error and have none. Poles are those of A - K C of the disturbance model
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from wfsobs.observers.kalman.multirate import MultiRate, multirate_filter, multirate_noise, optimal_filter, optimal_model
+from wfsobs.observers.kalman.multirate import multirate_filter, multirate_noise, optimal_filter, optimal_model
 from wfsobs.observers.kalman.single import steady_filter
-from wfsobs.prior import Model, Prior
+from wfsobs.prior import Prior
 from wfsobs.priors_from.scenario import model_of
 from wfsobs.priors_from.turbulence import lgs_error_of
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.riccati import steady_state
+from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.statespace import paper_matrices
 from wfsobs.simulation.sensor_noise import aliasing_rms, noise_rms
 from wfsobs.typing import Array
@@ -112,17 +112,22 @@ def describe(scenario: Scenario, mode: int) -> Description:
     Description
         Model, filters, GPR and sensors; a filter that does not exist has its reason in place of numbers.
     """
-    dt, ratio = scenario.dt, scenario.sensors.exposure_ratio
-    model, own = model_of(scenario, mode), scenario.multirate
+    dt, ratio, own = scenario.dt, scenario.sensors.exposure_ratio, scenario.multirate
+    prior = model_of(scenario, mode)
+    model, slow, both = prior.disturbance(), prior.at(ratio * dt).disturbance(), ("LGS with NGS", "NGS")
 
-    def both() -> Prior:
-        return Prior((model,), (lgs_error_of(scenario, mode),))
+    def optimal() -> PeriodicFilter:
+        steps = optimal_model(own, Prior((prior,), (lgs_error_of(scenario, mode),)), 0, ratio).steps
+        return optimal_filter(steps, np.pad(model.pairs, ((0, 0), (0, len(steps[0][0]) - len(model.A)))))[0].cycle
+
+    def multirate() -> PeriodicFilter:
+        return multirate_filter(model, ratio, *multirate_noise(own, prior), model.pairs).cycle
 
     filters = {
-        "kf-lgs": _facts(dt, dt, lambda: _kalman(model, model.lgs_noise, "LGS")),
-        "kf-ngs": _facts(ratio * dt, ratio * dt, lambda: _kalman(model.at(ratio * dt), model.ngs_noise, "NGS")),
-        "multirate": _facts(dt, ratio * dt, lambda: _multirate(model, own, ratio)),
-        "multirate-optimal": _facts(dt, ratio * dt, lambda: _optimal(both(), own, ratio)),
+        "kf-lgs": _facts(dt, dt, lambda: steady_filter(model, prior.lgs_noise, model.pairs)[0], ["LGS"]),
+        "kf-ngs": _facts(ratio * dt, ratio * dt, lambda: steady_filter(slow, prior.ngs_noise, slow.pairs)[0], ["NGS"]),
+        "multirate": _facts(dt, ratio * dt, multirate, both, "LGS alone"),
+        "multirate-optimal": _facts(dt, ratio * dt, optimal, both, "LGS, step 1"),
     }
     gprs = {
         name: GprFacts((g.noise_std * g.length_scale / g.signal_std) ** 2, g.depth * dt, (g.training_size + g.depth - 1) * dt)
@@ -132,46 +137,19 @@ def describe(scenario: Scenario, mode: int) -> Description:
         kind.upper(): SensorFacts(float(noise_rms(scenario, kind)[mode]), float(aliasing_rms(scenario, kind)[mode]))
         for kind in ("lgs", "ngs")
     }
-    matrices = paper_matrices(model.turbulence, model.vibration)
-    return Description(scenario.modes[mode].name, ratio, model.turbulence, model.vibration, *matrices, filters, gprs, sensors)
+    processes = prior.turbulence, prior.vibration
+    return Description(scenario.modes[mode].name, ratio, *processes, *paper_matrices(*processes), filters, gprs, sensors)
 
 
-Gains = dict[str, Array]
-
-
-def _facts(step: float, period: float, make: Callable[[], tuple[Gains, Array]]) -> FilterFacts:
+def _facts(
+    step: float, period: float, make: Callable[[], PeriodicFilter], sensors: Sequence[str], alone: str = ""
+) -> FilterFacts:
+    """Return the gains of the last step of a cycle, by sensor, and of the LGS in the first of several; the poles of a cycle."""
     try:
-        gains, transition = make()
+        found = make()
     except ValueError as error:
         return FilterFacts(step, period, {}, np.empty(0), str(error))
-    poles = np.linalg.eigvals(transition)
+    (*_, first), (*_, last) = found.steps[0], found.steps[-1]
+    gains = ({alone: first[:, 0]} if len(found.steps) > 1 else {}) | dict(zip(sensors, last.T, strict=True))
+    poles = np.linalg.eigvals(found.cycle_matrix())
     return FilterFacts(step, period, gains, poles[np.argsort(-np.abs(poles), kind="stable")])
-
-
-def _kalman(prior: Model, noise: float, sensor: str) -> tuple[Gains, Array]:
-    """Return gain and A - K C of a single-rate filter."""
-    model = prior.disturbance()
-    kalman, steady = steady_filter(model, noise)
-    return {sensor: model.pairs @ steady.L[:, 0]}, kalman.cycle_matrix()
-
-
-def _multirate(prior: Model, settings: MultiRate, ratio: int) -> tuple[Gains, Array]:
-    """Return the paper's two gains (eq. 11), and the product of the A - K C of one cycle. Raises where that is unstable."""
-    model = prior.disturbance()
-    lgs, ngs = multirate_noise(settings, prior)
-    cycle = multirate_filter(model, ratio, lgs, ngs).cycle
-    alone = steady_state(model.A, model.C, model.Q, np.array(lgs**2)).L
-    both = steady_state(model.A, np.vstack([model.C, model.C]), model.Q, np.diag([lgs**2, ngs**2])).L
-    gains = {"LGS alone": alone[:, 0], "LGS with NGS": both[:, 0], "NGS": both[:, 1]}
-    return {name: model.pairs @ gain for name, gain in gains.items()}, cycle.cycle_matrix()
-
-
-def _optimal(prior: Prior, settings: MultiRate, ratio: int) -> tuple[Gains, Array]:
-    """Return the gains of the first step and of the step with the frame, and the product of the A - K C of one cycle."""
-    model = prior.model[0].disturbance()
-    made, states = optimal_filter(*optimal_model(settings, prior, 0, ratio)[:2])
-    n = len(model.A)
-    gains = {"LGS with NGS": states[-1].L[:n, 0], "NGS": states[-1].L[:n, 1]}
-    if len(states) > 1:
-        gains = {"LGS, step 1": states[0].L[:n, 0], **gains}
-    return {name: model.pairs @ gain for name, gain in gains.items()}, made.cycle.cycle_matrix()

@@ -21,25 +21,24 @@ import numpy as np
 from wfsobs.evaluation.exact_errors import (
     SETTLED,
     SHORTEST,
-    Taps,
-    TargetSpectra,
-    Waves,
+    SensorResponse,
     cycle_spectra,
+    has_exact_error,
     impulse_responses,
+    over_cycle,
     target_spectra,
-    waves,
 )
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
-from wfsobs.prior import Beams, LgsError, LgsStars, Lines, Prior, Training
+from wfsobs.prior import Beams, LgsError, LgsStars, Lines, Prior
 from wfsobs.priors_from.scenario import lines_of, observer_settings, prior_of
 from wfsobs.priors_from.turbulence import beams_of, lgs_error_of, lines_turbulence
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar3 import Ar3Fits
 from wfsobs.signal.welch import expected_psd, welch_psd
-from wfsobs.signal.wiener import advance_spectrum, circle_mean, error_spectrum
+from wfsobs.signal.wiener import circle_mean
 from wfsobs.simulation.guide_stars import MEAN
 from wfsobs.simulation.true_spectra import MOST, TrueSpectra, has_known_spectra, n_frequencies, true_spectra
 from wfsobs.simulation.turbulence_spectra import TurbulenceSpectra, turbulence_spectra
@@ -135,25 +134,7 @@ class Prediction:
 
 def is_predicted(observer: Observer | None, target: str) -> bool:
     """Return whether an observer's errors have a prediction; None stands for the bound."""
-    return observer is None or (
-        observer.linear
-        and not observer.couples_modes
-        and observer.causal
-        and target in observer.targets
-        and Training not in observer.prior
-    )
-
-
-class _Identity:
-    """An object as a key: equal to the same object only, which it keeps from being thrown away."""
-
-    def __init__(self, it: object):
-        self.it = it
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Identity) and other.it is self.it
-
-    __hash__ = None  # type: ignore[assignment]
+    return observer is None or (has_exact_error(observer) and target in observer.targets)
 
 
 @dataclass
@@ -162,8 +143,6 @@ class Theory:
 
     Attributes
     ----------
-    resolution : float
-        Resolution of the Welch estimates [Hz].
     most : int or None
         The most frequencies to compute with, a power of two; None for as many as the scenario needs. With fewer, lines that are
         narrower than their spacing are coarse, and fits of turbulence start from those before.
@@ -171,7 +150,6 @@ class Theory:
         What may be left at the end of a response, over its maximum.
     """
 
-    resolution: float = 0.5
     most: int | None = None
     left: float = SETTLED
     _results: dict[str, tuple[Any, Any]] = field(default_factory=dict, repr=False)
@@ -217,7 +195,7 @@ class Theory:
         if not has_known_spectra(scenario):
             raise ValueError("no prediction: the spectra of this scenario are not known, or events change them")
         known = self.spectra(scenario, mode)
-        sensors = self._keep(f"spectra {target}", _Identity(known), lambda: target_spectra(known, target))
+        sensors = self._keep(f"spectra {target}", self._key("spectra"), lambda: target_spectra(known, target))
         n_steps = scenario.n_steps - round(scenario.run.warm_up / scenario.dt)
         out = []
         for name in (TRUTH, *([*OBSERVERS, BOUND] if observers is None else observers)):
@@ -227,14 +205,17 @@ class Theory:
             if len(out) > 1 and monotonic() > until:
                 break
             response = None if observer is None else self._response(observer, scenario, mode, target, known.n)
-            made_of = _Identity(known), _Identity(response), n_steps, of_error
+            key = self._key("spectra"), self._key(f"response {name}"), n_steps, of_error
 
-            def make(name: str = name, response: Waves | None = response) -> Prediction:
-                signal, error = _own(known, sensors, name, target) if response is None else cycle_spectra(response, sensors)
-                frequency, density = expected_psd(error if of_error else signal, scenario.dt, n_steps, self.resolution)
+            def make(name: str = name, response: SensorResponse | None = response) -> Prediction:
+                if response is None:
+                    signal = error = sensors.signal if name == TRUTH else known.without_lines.estimate(target).error
+                else:
+                    signal, error = cycle_spectra(response, sensors)
+                frequency, density = expected_psd(error if of_error else signal, scenario.dt, n_steps)
                 return Prediction(name, target, sqrt(max(circle_mean(error), 0.0)), frequency, density)
 
-            out.append(self._keep(f"{name}, {target}", made_of, make))
+            out.append(self._keep(f"{name}, {target}", key, make))
         return out
 
     # ------------------------------------------------------------------ what is kept
@@ -245,6 +226,10 @@ class Theory:
             self._results[name] = key, make()
         return self._results[name][1]
 
+    def _key(self, name: str) -> Any:
+        """Return the key of the last result of a name."""
+        return self._results.get(name, (None,))[0]
+
     def spectra(self, scenario: Scenario, mode: int) -> TrueSpectra:
         """Return the true spectra of a mode."""
         key = mode, self.most, _groups(scenario, *AIR, "vibration")
@@ -254,58 +239,41 @@ class Theory:
         n = min(n_frequencies(scenario, mode), self.most or MOST)
         return self._keep("air", (mode, n, _groups(scenario, *AIR)), lambda: turbulence_spectra(scenario, mode, n))
 
-    def _response(self, observer: Observer, scenario: Scenario, mode: int, target: str, n: int) -> Waves:
+    def _response(self, observer: Observer, scenario: Scenario, mode: int, target: str, n: int) -> SensorResponse:
         settings, ratio, name = observer_settings(observer, scenario), scenario.sensors.exposure_ratio, observer.id
         prior, length = self._prior(observer, scenario, mode), (name, self.left)
 
-        def make() -> dict[str, Taps]:
+        def make() -> dict[str, SensorResponse]:
             first = self._lengths.get(length, SHORTEST)
             found = impulse_responses(observer, prior, settings, scenario.dt, ratio, n, first, self.left)
             self._lengths[length] = found[target].fast.shape[1]
             return found
 
-        taps = self._keep(f"response {name}", (prior, settings, n, self.left, ratio), make)[target]
-        return self._keep(f"response {name}, {target}", _Identity(taps), lambda: waves(taps, n))
+        key = prior, settings, scenario.dt, n, self.left, ratio
+        taps = self._keep(f"response {name}", key, make)[target]
+        return self._keep(f"response {name}, {target}", key, lambda: over_cycle(taps, n))
 
     def _prior(self, observer: Observer, scenario: Scenario, mode: int) -> Prior:
-        parts = observer.parts(observer_settings(observer, scenario))
-        slow: dict[str, tuple[Any, ...]] = {}
-        if Lines in parts:
-            turbulence = () if Beams in parts else self._turbulence(scenario, mode)  # that of beams is in these
-            slow["lines"] = (lines_of(scenario, mode, turbulence=turbulence),)
+        parts, air = observer.parts(observer_settings(observer, scenario)), self._air(scenario, mode)
+        of, seen, slow = (scenario, mode, scenario.dt), self._key("air"), dict[str, Any]()
+        if self.most is None:  # fits with all frequencies start from none before
+            self._fits.clear()
+        fits = self._fits.setdefault(mode, Ar3Fits())
         # The vibration, too, where it moves the best weights of the LGS.
-        groups = "kalman", "multipeak", *([] if scenario.sensors.lgs_combination == MEAN else ["vibration"])
-        air, fits = self._air(scenario, mode), self._start_of_fits(mode)
-        key = _Identity(air), _groups(scenario, *groups)
+        mean, k = scenario.sensors.lgs_combination == MEAN, scenario.kalman
+        key = seen, _groups(scenario, "kalman", "multipeak", *([] if mean else ["vibration"]))
         if Beams in parts:
-            slow["beams"] = (self._keep("beams", key, lambda: beams_of(scenario, mode, scenario.dt, air, fits)),)
+            slow["beams"] = (self._keep("beams", key, lambda: beams_of(*of, air, fits)),)
+            slow["lines"] = (lines_of(scenario, mode, turbulence=()),)  # that of the beams is in these
+        elif Lines in parts:
+            used = scenario.multipeak.turbulence_order, k.process_noise, k.turbulence_rms, k.measurement_noise, k.lgs_noise
+            turbulence = self._keep("turbulence", (seen, used), lambda: lines_turbulence(*of, air.measurement, fits))
+            slow["lines"] = (lines_of(scenario, mode, turbulence=turbulence),)
         if LgsError in parts:
-            slow["lgs_error"] = (self._keep("LGS error", key, lambda: lgs_error_of(scenario, mode, scenario.dt)),)
+            slow["lgs_error"] = (self._keep("LGS error", key, lambda: lgs_error_of(*of)),)
         fast = [part for part in parts if part not in (Lines, Beams, LgsError, LgsStars)]
         return replace(prior_of(scenario, None, fast, modes=[mode]), **slow)
-
-    def _turbulence(self, scenario: Scenario, mode: int) -> tuple[Any, ...]:
-        """Return the processes of the turbulence of a mode."""
-        air, k, fits = self._air(scenario, mode), scenario.kalman, self._start_of_fits(mode)
-        used = k.process_noise, k.turbulence_rms, k.measurement_noise, k.lgs_noise
-        key = _Identity(air), scenario.multipeak.turbulence_order, used
-        return self._keep("turbulence", key, lambda: lines_turbulence(scenario, mode, scenario.dt, air.measurement, fits))
-
-    def _start_of_fits(self, mode: int) -> Ar3Fits:
-        """Return the fits of a mode to start from: none before one with all frequencies."""
-        if self.most is None:
-            self._fits.clear()
-        return self._fits.setdefault(mode, Ar3Fits())
 
 
 def _groups(scenario: Scenario, *names: str) -> list[dict[str, Any]]:
     return [getattr(scenario, name).to_dict() for name in names]
-
-
-def _own(spectra: TrueSpectra, sensors: TargetSpectra, name: str, target: str) -> tuple[Array, Array]:
-    """Return, twice, the spectrum of the target, or that of the minimum error from the mean of the LGS."""
-    if name == TRUTH:
-        return sensors.signal, sensors.signal
-    known = spectra.without_lines
-    least = error_spectrum(known.signal[target], advance_spectrum(known.cross[target], 1), known.whitener)
-    return least, least

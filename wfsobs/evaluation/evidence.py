@@ -68,19 +68,18 @@ class Evidence:
 
     def over_seeds(self, score: Score) -> Score:
         """Return a score with mean error, its interval and the mean truth of all seeds; as it was where these are not known."""
-        key = score.observer, score.target, score.mode
+        key, is_bound = (score.observer, score.target, score.mode), score.observer in BOUNDS
         truth = next((float(of.mean()) for other, of in self.truths.items() if other[1:] == key[1:]), 0.0)
-        if score.apart or not truth > 0 or (key[0] not in BOUNDS and key not in self.errors):
+        if score.apart or not truth > 0 or not (is_bound or key in self.errors):
             return score
-        error, interval = (
-            (score.rms, score.interval) if key[0] in BOUNDS else (float(self.errors[key].mean()), self.interval(key))
-        )
+        error = score.rms if is_bound else float(self.errors[key].mean())
+        interval = score.interval if is_bound else self.interval(key)
         return replace(score, rms=error, truth_rms=truth, normalised_rms=error / truth, interval=interval)
 
     def ranking(self, target: str, mode: str) -> list[str]:
         """Return the observers that can be best, the smallest mean error first."""
-        of = [key for key in self.errors if key[1:] == (target, mode) and can_be_best(key[0], False) and key[0] != NO_ESTIMATE]
-        return rank_observers({key[0]: float(self.errors[key].mean()) for key in of})
+        means = {name: float(x.mean()) for (name, *of), x in self.errors.items() if of == [target, mode]}
+        return rank_observers({name: x for name, x in means.items() if can_be_best(name, False) and name != NO_ESTIMATE})
 
     def leaders(self, target: str, mode: str) -> tuple[str, ...]:
         """Return the observer with the smallest mean error, and all whose errors do not differ significantly from its own."""
@@ -88,7 +87,7 @@ class Evidence:
         if not ranked or 1 < self.n_seeds < FEWEST:
             return ()
         mean = np.array([self.errors[name, target, mode].mean() for name in ranked])
-        worse = means_differ(*self._values(ranked, target, mode, False))[0] & (mean > mean[0] * (1.0 + SAME))
+        worse = self._differ(ranked, target, mode, False)[0] & (mean > mean[0] * (1.0 + SAME))
         return tuple(name for name, is_worse in zip(ranked, worse, strict=True) if not is_worse)
 
     def harmful(self, target: str, mode: str) -> dict[str, bool]:
@@ -96,19 +95,22 @@ class Evidence:
         ranked = self.ranking(target, mode)
         if not ranked:
             return {}
-        apart = dict(zip(ranked, means_differ(*self._values(ranked, target, mode, True))[-1, :-1].tolist(), strict=True))
+        apart = self._differ(ranked, target, mode, True)[-1].tolist()
         known = {name: (name, target, mode) for name in reversed(ranked)}
-        return {name: apart[name] for name, key in known.items() if self.errors[key].mean() >= self.truths[key].mean()}
+        return {
+            name: apart[ranked.index(name)] for name, key in known.items() if self.errors[key].mean() >= self.truths[key].mean()
+        }
 
-    def _values(self, names: Sequence[str], target: str, mode: str, with_truth: bool) -> tuple[Array, bool]:
-        """Return errors of observers, and the truth after them, as columns; and whether rows are pieces of one record."""
+    def _differ(self, names: Sequence[str], target: str, mode: str, with_truth: bool) -> NDArray[np.bool_]:
+        """Return which errors of observers, and the truth after them, differ significantly: over the seeds, or in pieces."""
         keys = [(name, target, mode) for name in names]
-        if self.n_seeds > 1:
-            return np.array([*(self.errors[key] for key in keys), self.truths[keys[0]]][: len(keys) + with_truth]).T, False
-        pieces = [np.array(self.record[key].pieces).reshape(-1, 2) for key in keys]
-        if min(map(len, pieces)) < 3:
-            return np.ones((3, len(keys) + with_truth)), True  # nothing differs
-        return np.column_stack([*(of[:, 0] for of in pieces), pieces[0][:, 1]][: len(keys) + with_truth]), True
+        columns = [*(self.errors[key] for key in keys), self.truths[keys[0]]]
+        if self.n_seeds == 1:
+            pieces = [np.array(self.record[key].pieces).reshape(-1, 2).T for key in keys]
+            columns = [*(error for error, _ in pieces), pieces[0][1]]
+            if min(of.size for of in columns) < 3:
+                return np.zeros((len(columns), len(columns)), dtype=bool)
+        return means_differ(np.column_stack(columns[: len(keys) + with_truth]), self.n_seeds == 1)
 
 
 def means_differ(values: Array, in_order: bool = False) -> NDArray[np.bool_]:
@@ -152,12 +154,8 @@ def gather_evidence(seeds: Sequence[Iterable[Score]]) -> Evidence:
     """Gather the scores of several seeds, one sequence each: of rows that all of them have and that can be compared."""
     known = [{(s.observer, s.target, s.mode): s for s in scores if not s.apart and s.observer not in BOUNDS} for scores in seeds]
     keys = [key for key in known[0] if all(key in of for of in known)] if known else []
-    return Evidence(
-        {key: np.array([of[key].rms for of in known]) for key in keys},
-        {key: np.array([of[key].truth_rms for of in known]) for key in keys},
-        len(known),
-        {key: known[0][key] for key in keys},
-    )
+    errors, truths = ({key: np.array([getattr(of[key], name) for of in known]) for key in keys} for name in ("rms", "truth_rms"))
+    return Evidence(errors, truths, len(known), {key: known[0][key] for key in keys})
 
 
 def columns_differ(values: Array, level: float = LEVEL) -> Array:
@@ -171,14 +169,11 @@ def columns_differ(values: Array, level: float = LEVEL) -> Array:
            [0, 0, 0]])
     """
     one, other = all_pairs(values.shape[1])
-    difference = values[:, other] - values[:, one]
-    known = ~np.isnan(difference)
-    n = known.sum(axis=0)
-    enough = n > 1
-    mean = np.divide(np.where(known, difference, 0.0).sum(axis=0), n, out=np.zeros(n.size), where=enough)
-    squares = np.where(known, difference - mean, 0.0) ** 2
-    variance = np.divide(squares.sum(axis=0), n * (n - 1.0), out=np.zeros(n.size), where=enough)
-    return pairs_differ(t_probability(mean, np.sqrt(variance), np.maximum(n - 1.0, 1.0)), level)
+    difference = np.ma.masked_invalid(values[:, other] - values[:, one])
+    n = difference.count(axis=0)
+    mean = np.where(n > 1, difference.mean(axis=0).filled(0.0), 0.0)
+    error = difference.std(axis=0, ddof=1).filled(0.0) / np.sqrt(np.maximum(n, 1))
+    return pairs_differ(t_probability(mean, error, np.maximum(n - 1.0, 1.0)), level)
 
 
 def all_pairs(k: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -30,7 +30,7 @@ import numpy as np
 from wfsobs.evaluation.bound import PeriodicError, ngs_frames
 from wfsobs.observers.base import TURBULENCE, Observer
 from wfsobs.observers.estimates import TOTAL
-from wfsobs.prior import Prior
+from wfsobs.prior import Prior, Training
 from wfsobs.priors_from.scenario import observer_settings, prior_of
 from wfsobs.progress import QUIET
 from wfsobs.record import Measurements
@@ -49,21 +49,15 @@ START = 1000
 """Steps before the first impulse: windows are full and gains are those that repeat."""
 
 
-class Taps(NamedTuple):
-    """Coefficients of an estimate p steps after a frame.
+class SensorResponse(NamedTuple):
+    """SensorResponse of an estimate to both sensors.
 
-    fast, slow : h_p of z and g_p of the frames, (ratio, length); of an observer of the LGS alone (1, length), and None
+    fast, slow : h_p of z and g_p of the frames, (ratio, length); of an observer of the LGS alone (1, length), and None. Or their
+        transforms c_l and d_l, (ratio, n // 2 + 1)
     """
 
-    fast: Array
-    slow: Array | None
-
-
-class Waves(NamedTuple):
-    """Transforms c_l of z and d_l of the frames, (ratio, n // 2 + 1); None for those of no frames."""
-
-    fast: Complex
-    slow: Complex | None
+    fast: Any
+    slow: Any = None
 
 
 class TargetSpectra(NamedTuple):
@@ -99,7 +93,7 @@ def impulse_responses(
     most: int,
     first: int = SHORTEST,
     left: float = SETTLED,
-) -> dict[str, Taps]:
+) -> dict[str, SensorResponse]:
     """Compute the coefficients of a linear observer's estimates, in one mode, from one record of impulses one after the other.
 
     Parameters
@@ -121,7 +115,7 @@ def impulse_responses(
 
     Returns
     -------
-    dict of str to Taps
+    dict of str to SensorResponse
         Target -> coefficients.
     """
     has_frames = "ngs" in observer.sensors
@@ -136,7 +130,7 @@ def impulse_responses(
         z[at[:ratio]] = frames[at[ratio:]] = 1.0
         sensors = {"y_ngs": frames, "ratio": ratio} if has_frames else {}
         found = observer.estimate(Measurements(z, np.zeros_like(z), dt, **sensors), prior, settings, QUIET)
-        out, settled = dict[str, Taps](), True
+        out, settled = dict[str, SensorResponse](), True
         for target, values in found.items():
             taps, late = np.zeros((2, ratio, length)), np.arange(length)
             rest = np.nan_to_num(values[at[0] - ratio : at[0], 0])  # over the cycle before the first impulse
@@ -144,30 +138,28 @@ def impulse_responses(
                 response = np.nan_to_num(values[step : step + length, 0]) - rest[(late + step - at[0]) % ratio]
                 settled &= bool(np.abs(response[-length // 8 :]).max() <= left * np.abs(response).max())
                 taps[i // ratio, (i + late) % ratio, late] = response
-            out[target] = Taps(taps[0], taps[1] if has_frames else None)
+            out[target] = SensorResponse(*taps[: 1 + has_frames])
         if settled or length == longest:
             return out
         length = min(2 * length, longest)
 
 
-def waves(taps: Taps, n: int) -> Waves:
+def over_cycle(taps: SensorResponse, n: int) -> SensorResponse:
     """Return the transforms of coefficients over n steps."""
     phases = np.arange(len(taps.fast))
     places = np.exp(-2j * np.pi * np.outer(phases, phases) / phases.size) / phases.size
-    fast, slow = (None if h is None else places @ np.fft.rfft(h, n) for h in taps)
-    assert fast is not None
-    return Waves(fast, slow)
+    return SensorResponse(*(places @ np.fft.rfft(h, n) for h in taps if h is not None))
 
 
-def cycle_spectra(responses: Waves, sensors: TargetSpectra) -> tuple[Array, Array]:
+def cycle_spectra(response: SensorResponse, sensors: TargetSpectra) -> tuple[Array, Array]:
     """Return the spectra of an estimate and of its error on average over the cycle, (n // 2 + 1,).
 
     What moves to a frequency between those of the DFT is at the nearest one.
     """
-    ratio, n = len(responses.fast), 2 * (sensors.z.size - 1)
+    ratio, n = len(response.fast), 2 * (sensors.z.size - 1)
     out = np.zeros((2, 2 * n))
-    for wave, c in enumerate(responses.fast):
-        d = None if responses.slow is None else responses.slow[wave]
+    for wave, c in enumerate(response.fast):
+        d = None if response.slow is None else response.slow[wave]
         power = _estimate_power(c, d, sensors)
         parts = np.stack([power, power + _rest_of_error(c, d, sensors) if wave == 0 else power])
         if ratio == 1:
@@ -197,6 +189,11 @@ def _real_product(a: Complex, b: Complex) -> Array:
     return a.real * b.real + a.imag * b.imag
 
 
+def has_exact_error(observer: Observer) -> bool:
+    """Return whether an observer is linear and causal, takes every mode by itself and needs no training record."""
+    return observer.linear and observer.causal and not observer.couples_modes and Training not in observer.prior
+
+
 def exact_errors(
     observer: Observer, scenario: Scenario, *, spectra: Sequence[TrueSpectra] = ()
 ) -> list[dict[str, PeriodicError]]:
@@ -221,7 +218,7 @@ def exact_errors(
     ValueError
         The observer is not of that kind, or the scenario has no such prior.
     """
-    if not observer.linear or observer.couples_modes or not observer.causal or "training" in observer.needs:
+    if not has_exact_error(observer):
         raise ValueError(
             f"{observer.id}: the exact error is that of an observer that is linear, causal and needs no training record, "
             "and takes every mode by itself"
@@ -230,9 +227,9 @@ def exact_errors(
     for mode, known in enumerate(spectra or [true_spectra(scenario, mode) for mode in range(len(scenario.modes))]):
         prior, ratio = prior_of(scenario, None, observer.parts(settings), modes=[mode]), known.ngs.ratio
         taps = impulse_responses(observer, prior, settings, scenario.dt, ratio, known.measurement.size, left=EXACT)
-        of = {target: (h, np.zeros_like(h) if g is None else g) for target, (h, g) in taps.items()}
+        of = {target: (h, 0.0 * h if g is None else g) for target, (h, g) in taps.items()}
         if len(of) > 1:
-            of[TOTAL] = tuple(np.sum(pair, axis=0) for pair in zip(*of.values(), strict=True))
+            of[TOTAL] = tuple(np.sum([*of.values()], axis=0))
         variances = {target: variance_of(*pair, target, known) for target, pair in of.items()}
         out.append({target: PeriodicError(np.repeat(x, ratio // x.size)) for target, x in variances.items()})
     return out
@@ -242,17 +239,12 @@ def variance_of(fast: Array, slow: Array, target: str, spectra: TrueSpectra) -> 
     """Return the variance of the error [um^2] at every place in the cycle, (ratio,); fast, slow : h_p, g_p (ratio, length)."""
     known = spectra.without_lines
     sensors = target_spectra(known, target)
-    out = np.zeros(len(fast))
-    for phase, pair in enumerate(zip(fast, slow, strict=True)):
-        c, d = np.fft.rfft(pair, known.n)
-        out[phase] = circle_mean(_estimate_power(c, d, sensors) + _rest_of_error(c, d, sensors))
-        for frequency, variance in spectra.pure:
-            out[phase] += variance * abs(_line_left(*pair, frequency, spectra, target)) ** 2
-    return out
-
-
-def _line_left(fast: Array, slow: Array, frequency: float, spectra: TrueSpectra, target: str) -> complex:
-    """Return the error for a line of amplitude one; frequency [cycles per step]."""
-    turn = np.exp(-2j * np.pi * frequency * np.arange(max(fast.size, spectra.ngs.ratio + 1)))
-    exposure, seen = turn[1 : spectra.ngs.ratio + 1].mean(), turn[: fast.size]
-    return complex((target != TURBULENCE) - spectra.gain * turn[1] * (fast @ seen) - exposure * (slow @ seen))
+    out = [
+        circle_mean(_estimate_power(c, d, sensors) + _rest_of_error(c, d, sensors))
+        for c, d in (np.fft.rfft(pair, known.n) for pair in zip(fast, slow, strict=True))
+    ]
+    for frequency, variance in spectra.pure:
+        turn = np.exp(-2j * np.pi * frequency * np.arange(fast.shape[1]))
+        seen = spectra.gain * turn[1] * (fast @ turn) + turn[1 : spectra.ngs.ratio + 1].mean() * (slow @ turn)
+        out += variance * np.abs((target != TURBULENCE) - seen) ** 2
+    return np.array(out)

@@ -56,16 +56,17 @@ def trailing_rms(x: Array, n: int) -> Array:
 def trailing_sum(x: Array, n: int) -> Array:
     """Return x[k-n+1] + ... + x[k] at every k, zeros before the start; same shape as x (n_steps, n_columns).
 
-    Of blocks of n, the sum from the start of the block to k and that from k - n + 1 to the end of the block before: nothing is
-    subtracted, so that a large error leaves no trace in the sums after it.
+    It is put together of sums over 1, 2, 4, ... steps: nothing is subtracted, so that a large error leaves no trace in the sums
+    after it.
     """
-    steps, columns = x.shape
-    blocks = np.zeros((1 + -(-steps // n), n, columns))
-    blocks[1:].reshape(-1, columns)[:steps] = x
-    upto = np.cumsum(blocks, axis=1)
-    after = np.zeros_like(blocks)
-    after[:, :-1] = np.cumsum(blocks[:, :0:-1], axis=1)[:, ::-1]
-    return (upto[1:] + after[:-1]).reshape(-1, columns)[:steps]
+    total, late, width = np.zeros_like(x), 0, 1
+    while n and late < len(x):
+        if n & 1:
+            total[late:] += x[: len(x) - late]
+            late += width
+        x = x + np.concatenate([np.zeros_like(x[:width]), x[:-width]])
+        n, width = n >> 1, 2 * width
+    return total
 
 
 @dataclass

@@ -27,6 +27,9 @@ Row = dict[str, Any]
 TIME = "time_per_step_us"
 """Computing time per step and mode [us]: in the table, but not part of the result, which the seed determines."""
 
+STATED = ("sd_um", "within_68", "within_95", "crps_um")
+"""What an observer states of its errors, and how it fits them (`Calibration`)."""
+
 NOT_OBSERVERS = {
     LOOP: "Recorded loop",
     BOUND: "Theoretical limit, mean of the LGS",
@@ -79,21 +82,17 @@ def score_rows(scores: Iterable[Score], seed: int | None, *, source: PriorSource
             "start_s": s.start,
             "stop_s": s.stop,
             "apart": s.apart,
-            "needs": row_needs(s.observer, source=source),
+            "needs": ("" if s.observer not in BOUNDS else SPECTRA)
+            if s.observer in NOT_OBSERVERS
+            else OBSERVERS[s.observer].needs_text(source=source),
             "interval_um": None if s.interval is None else list(s.interval),
             "phases_um": None if s.phases is None else list(s.phases),
-            **_calibration(s),
+            **dict(zip(STATED, s.calibration or (None,) * len(STATED), strict=True)),
             "seed": seed,
             TIME: None if s.observer in NOT_OBSERVERS else s.seconds_per_step * 1e6,
         }
         for s in scores
     ]
-
-
-def _calibration(score: Score) -> Row:
-    """Return what the observer states of its errors, and how it fits them; None where it states nothing."""
-    names = ("sd_um", "within_68", "within_95", "crps_um")
-    return dict(zip(names, score.calibration or (None,) * len(names), strict=True))
 
 
 def interval_text(interval: Sequence[float] | None, scale: float) -> str:
@@ -104,13 +103,6 @@ def interval_text(interval: Sequence[float] | None, scale: float) -> str:
 def row_label(observer: str) -> str:
     """Return the label of a row."""
     return NOT_OBSERVERS.get(observer) or OBSERVERS[observer].label
-
-
-def row_needs(observer: str, *, source: PriorSource = TRUE) -> str:
-    """Return what a row needs beside measurements, from this source; a bound needs the true spectra."""
-    if observer in NOT_OBSERVERS:
-        return SPECTRA if observer in BOUNDS else ""
-    return OBSERVERS[observer].needs_text(source=source)
 
 
 def above_bound(rms: float, interval: Sequence[float] | None, bound: float | None) -> float | None:
@@ -130,7 +122,7 @@ def at_bound(scores: Iterable[Score]) -> set[tuple[str, str, str]]:
     """Return (observer, target, mode) of scores whose interval has the bound of what the observer measures in it."""
     of = {(s.observer, s.target, s.mode): s for s in scores}
     bounds = {key: of.get((own_bound(key[0]) or "", *key[1:])) for key in of}
-    return {key for key, bound in bounds.items() if bound and above_bound(of[key].rms, of[key].interval, bound.rms) == 0.0}
+    return {key for key, it in bounds.items() if it and above_bound(of[key].rms, of[key].interval, it.rms) == 0.0}
 
 
 def can_be_best(observer: str, apart: bool) -> bool:

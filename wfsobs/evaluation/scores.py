@@ -146,27 +146,23 @@ def supervised_scores(
 
     None for a target without truth or where no sample is left.
     """
-    out, every = [], [*estimates, *totals(estimates)]
+    out, every, after = [], [*estimates, *totals(estimates)], np.arange(record.n_steps) >= round(warm_up / record.dt)
     for target in SCORED:
         truth, of = record.truth(target), [e for e in every if e.target == target]
         if truth is None:
             continue
         for mode, name in enumerate(mode_names):
-            counts = _samples_after(record, warm_up) & ~np.isnan(truth[:, mode])
+            true = truth[:, mode]
+            counts = after & ~np.isnan(true)
             scored = common_samples([counts & ~np.isnan(e.values[:, mode]) for e in of])
             words = {id(samples): blake2b(samples.tobytes(), digest_size=16).hexdigest() for samples, _ in scored}
             for e, (samples, apart) in zip(of, scored, strict=True):
                 if samples.any():
-                    make = partial(_score_mode, e, truth[:, mode], mode, name, record.dt, samples, apart)
+                    value, sd, key = e.values[:, mode], None if e.sd is None else e.sd[:, mode], (e.observer, target, name)
+                    of_truth = value - true, true, record.dt, samples, apart, e.seconds_per_step
+                    make = partial(_score_error, key, *of_truth, sd, value)
                     out.append(derive(e, f"score {target} {mode} {name} {words[id(samples)]} {apart}", make))
     return out
-
-
-def _score_mode(e: Estimate, true: Array, mode: int, name: str, dt: float, samples: Array, apart: bool) -> Score:
-    """Score one mode of an estimate on some samples of the truth (n_steps,) [um]."""
-    value, sd = e.values[:, mode], None if e.sd is None else e.sd[:, mode]
-    late = lag(true[samples], value[samples], dt)
-    return _score_error((e.observer, e.target, name), value - true, true, dt, samples, apart, late, e.seconds_per_step, sd)
 
 
 def _score_error(
@@ -176,11 +172,11 @@ def _score_error(
     dt: float,
     samples: Array,
     apart: bool = False,
-    late: float | None = None,
     seconds: float = 0.0,
     sd: Array | None = None,
+    value: Array | None = None,
 ) -> Score:
-    """Score an error (n_steps,) [um] on some samples; key : observer, target and mode."""
+    """Score an error (n_steps,) [um] on some samples; key : observer, target and mode; value : estimate that has a lag."""
     error, signal = error[samples], signal[samples]
     size, scale, pieces = rms(error), rms(signal), batch_means(np.column_stack([error, signal]) ** 2)
     return Score(
@@ -188,7 +184,7 @@ def _score_error(
         size,
         scale,
         size / scale if scale > 0 else None,
-        late,
+        None if value is None else lag(signal, value[samples], dt),
         seconds,
         *stretch_of(samples, dt),
         apart,
@@ -206,22 +202,21 @@ def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: 
       z; the others have no such score. Missing samples do not count.
     - RESIDUAL: rms of y_lgs, the residual of the recorded loop.
     """
-    out: list[Score] = []
-    both = totals(estimates)
-    counts = _samples_after(record, warm_up + record.dt)
+    out, both = list[Score](), totals(estimates)
+    after = np.arange(record.n_steps) > round(warm_up / record.dt)
     for mode, name in enumerate(mode_names):
         z, left = record.z[:, mode], record.y_lgs[:, mode]
-        measured = counts & ~np.isnan(z)
+        measured = after & ~np.isnan(z)
         if not rms(z[measured]) > 0:
             continue
         errors = [z - _later(e.values[:, mode]) for e in both]
         scored = common_samples([measured & ~np.isnan(error) for error in errors])
         for e, error, (samples, apart) in zip(both, errors, scored, strict=True):
             if samples.any():
-                sd, seconds = e.sd_of_sum.get(PREDICTION), e.seconds_per_step
+                sd = e.sd_of_sum.get(PREDICTION)
                 stated = None if sd is None else _later(sd[:, mode])
                 key = e.observer, PREDICTION, name
-                out.append(_score_error(key, error, z, record.dt, samples, apart, seconds=seconds, sd=stated))
+                out.append(_score_error(key, error, z, record.dt, samples, apart, e.seconds_per_step, stated))
         samples = next((s for s, apart in scored if not apart and s.any()), measured) & ~np.isnan(left)
         if samples.any():
             out.append(_score_error((LOOP, RESIDUAL, name), left, z, record.dt, samples))
@@ -249,11 +244,6 @@ def totals(estimates: Sequence[Estimate]) -> list[Estimate]:
 def _later(x: Array) -> Array:
     """Return x one step later, NaN first."""
     return np.concatenate([[np.nan], x[:-1]])
-
-
-def _samples_after(record: Record, warm_up: float) -> Array:
-    """Return which steps are after the warm-up [s]."""
-    return np.arange(record.n_steps) >= round(warm_up / record.dt)
 
 
 def common_samples(samples: Sequence[Array]) -> list[tuple[Array, bool]]:

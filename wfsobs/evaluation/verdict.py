@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wfsobs.evaluation.budget import CONE, LAG, LINES, MISMATCH, NOISE, Budget, error_budget
+from wfsobs.evaluation.budget import NOISE, TERMS, Budget, error_budget
 from wfsobs.evaluation.evidence import Evidence, gather_evidence
 from wfsobs.evaluation.known_lines import (
     BANDS,
@@ -35,7 +35,6 @@ from wfsobs.evaluation.scores import (
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import Estimate
-from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import welch_psd
@@ -69,13 +68,7 @@ USING = {
 }
 """Bounds that an error is compared with, and what they use."""
 
-CAUSES = {
-    NOISE: "sensor noise",
-    LAG: "lag",
-    LINES: "unmodelled peaks",
-    MISMATCH: "model mismatch",
-    CONE: "cone effect and aliasing",
-}
+CAUSES = {name: label.lower() for name, label in TERMS.items()} | {NOISE: "sensor noise"}
 """Terms of an error budget, as causes."""
 
 
@@ -307,16 +300,16 @@ def contenders(
     return tuple(out)
 
 
-def explain_harm(result: Result, mode: str | None = None, watch: Watch = QUIET) -> list[Budget]:
+def explain_harm(result: Result, mode: str | None = None) -> list[Budget]:
     """Return the error budgets of the observers that do harm, of those that are as fast as a Kalman filter.
 
-    result : of a record that was simulated from its scenario; mode : by default all. Raises Cancelled.
+    result : of a record that was simulated from its scenario; mode : by default all
     """
     of = [s for s in result.scores if s.target in TARGETS and mode in (None, s.mode)]
     harmful = {s.observer for s in of if s.rms >= s.truth_rms}
     chosen = [o.id for o in OBSERVERS.values() if o.id in harmful and o.linear and o.seconds is None]
     try:
-        return error_budget(result, observers=chosen, mode=mode, watch=watch)
+        return error_budget(result, observers=chosen, mode=mode)
     except ValueError:
         return []
 
@@ -327,10 +320,8 @@ def _shares(error: Array, dt: float, lines: Sequence[float], given_lines: Sequen
     total = density.sum()
     if not total > 0:
         return 0.0, 0.0
-    at_lines = is_near(frequency, lines)
-    at_given = at_lines & is_near(frequency, given_lines)
-    at_others = at_lines & ~at_given
-    return float(density[at_given].sum() / total), float(density[at_others].sum() / total)
+    at_lines, known = is_near(frequency, lines), is_near(frequency, given_lines)
+    return float(density[at_lines & known].sum() / total), float(density[at_lines & ~known].sum() / total)
 
 
 def sentence_of_several(verdicts: Sequence[Verdict], scales: Sequence[float], unit: str) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 
 from wfsobs.campaign.keys import PHYSICS_VERSION
 from wfsobs.closed_loop.design import design
-from wfsobs.evaluation.bound import least_errors, least_errors_of_both
+from wfsobs.evaluation.bound import bound
 from wfsobs.observers.base import Observer
 from wfsobs.observers.estimates import TOTAL
 from wfsobs.prior import Prior
@@ -21,7 +21,7 @@ from wfsobs.priors_from.scenario import prior_and_settings
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import simulate, training_settings
-from wfsobs.simulation.true_spectra import has_known_spectra, true_spectra
+from wfsobs.simulation.true_spectra import has_known_spectra
 from wfsobs.typing import Array
 from wfsobs_arena.reference import TAPS, taps_error
 from wfsobs_arena.tracks import DISTURBANCE, RESIDUAL, TRACKS, Track
@@ -159,9 +159,9 @@ class SimulatedCase:
         if self.of.target == RESIDUAL:
             of_modes = design(self.scenario, []).bounds["bound-both"]
         else:
-            of = least_errors_of_both if "ngs" in self.of.sensors else least_errors
+            least = bound(self.scenario, "both" if "ngs" in self.of.sensors else "lgs")
             name = TOTAL if self.of.target == DISTURBANCE else self.of.target
-            of_modes = tuple(of(true_spectra(self.scenario, mode))[name].rms for mode in range(len(self.scenario.modes)))
+            of_modes = tuple(one[name].rms for one in least)
         return float(np.sum(np.square(of_modes)))
 
     def reference_squares(self, record: Record, seed: int) -> list[float]:
