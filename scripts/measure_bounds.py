@@ -45,7 +45,7 @@ def times(scenario: Scenario, observer: str) -> tuple[float, float]:
     """Return the time that the bounds take, and the processor's [s]."""
     start, busy = perf_counter(), process_time()
     if observer:
-        bound(scenario, next(name for name, row in INFORMATION.items() if row == JOINT_BOUNDS[observer]))
+        bound(scenario, information=next(name for name, row in INFORMATION.items() if row == JOINT_BOUNDS[observer]))
     else:
         nothing = np.zeros((scenario.n_steps, len(scenario.modes)))
         record_bounds(scenario, Record(nothing, nothing, scenario.dt))

@@ -9,9 +9,10 @@ import pytest
 from scipy.linalg import cholesky, solve_triangular, toeplitz
 from scipy.stats import binom
 
-from wfsobs.evaluation.bound import least_errors
+from wfsobs.evaluation.bound import INFORMATION, bound, least_errors
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.welch import rms
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import TrueSpectra, true_spectra
@@ -100,3 +101,31 @@ def test_the_best_observer_there_is_scatters_as_the_interval_says(case: str) -> 
         inside = np.sum((found > low) & (found < high))
         assert binom.ppf(0.001, SEEDS, 0.95) <= inside <= binom.ppf(0.999, SEEDS, 0.95), target
         assert low < rms(found) < high
+
+
+def test_more_information_leaves_less() -> None:
+    """Every LGS by itself has all that their mean has, and a bound of some modes is that of all."""
+    scenario = PRESETS["galacsi-nfm"]()
+    lgs, both, stars = (bound(scenario, information=of, modes=[1])[0]["turbulence"].rms for of in ("lgs", "both", "stars"))
+    assert stars < both < lgs
+    assert bound(scenario)[1]["turbulence"].rms == lgs
+
+
+def test_where_all_stars_see_the_same_their_bound_is_that_of_both() -> None:
+    (found,), (both,) = (bound(BASE, information=of, modes=[0]) for of in ("stars", "both"))
+    assert {name: error.phases for name, error in found.items()} == {name: error.phases for name, error in both.items()}
+
+
+@pytest.mark.parametrize("information", ["modes", "both-modes", "asterism"])
+def test_there_is_no_bound_of_modes_that_are_independent(information: str) -> None:
+    with pytest.raises(ValueError, match="independent|see the same"):
+        bound(BASE, information=information)
+
+
+def test_what_cannot_be_known_is_refused() -> None:
+    with pytest.raises(ValueError, match=f"information = 'ngs': takes one of {', '.join(INFORMATION)}"):
+        bound(BASE, information="ngs")
+    with pytest.raises(ValueError, match="events change them"):
+        bound(PRESETS["peak-jump"]())
+    with pytest.raises(ValueError, match=r"ahead = 0\.5: takes whole steps"):
+        bound(BASE, ahead=0.5)

@@ -22,6 +22,7 @@ from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.telemetry.records import save_record
 
 FUNCTIONS = (
+    "bound",
     "close_loop",
     "error_budget",
     "export",

@@ -17,6 +17,7 @@ from wfsobs.version import __version__ as __version__
 if TYPE_CHECKING:
     from wfsobs.app.report.export import export
     from wfsobs.closed_loop.run import close_loop
+    from wfsobs.evaluation.bound import bound
     from wfsobs.evaluation.budget import error_budget
     from wfsobs.evaluation.result import Result
     from wfsobs.evaluation.scores import score
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
 
 _HOMES = {
+    "bound": "evaluation.bound",
     "export": "app.report.export",
     "close_loop": "closed_loop.run",
     "design": "stepping",
@@ -64,6 +66,7 @@ __all__ = [
     "Result",
     "Scenario",
     "SettingError",
+    "bound",
     "close_loop",
     "design",
     "error_budget",

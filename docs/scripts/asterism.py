@@ -32,7 +32,7 @@ def errors(scenario: Scenario) -> dict[str, dict[str, list[float]]]:
 def bounds(scenario: Scenario) -> dict[str, dict[str, list[float]]]:
     """Bound -> target -> rms of each mode [um]."""
     rows = {"bound-both": "both", "bound-stars": "stars", "Bound, stars and modes together": "asterism"}
-    found = {name: bound(scenario, information) for name, information in rows.items()}
+    found = {name: bound(scenario, information=information) for name, information in rows.items()}
     return {name: {t: [one[t].rms for one in by_mode] for t in TARGETS} for name, by_mode in found.items()}
 
 

@@ -41,7 +41,8 @@ def tables(changes: dict[str, Any], seeds: int) -> str:
     for sensors, (alone, together) in BOUNDS.items():
         columns = {f"`{name}`": found[name] for name in OBSERVERS[sensors]}
         for title, information in (("each mode by itself", alone), ("modes together", together)):
-            columns[f"Bound, {title}"] = np.array([one["turbulence"].rms ** 2 for one in bound(scenario, information)])
+            least = bound(scenario, information=information)
+            columns[f"Bound, {title}"] = np.array([one["turbulence"].rms ** 2 for one in least])
         out += [f"| Radial order, {sensors} | {' | '.join(columns)} |", "|---" * (1 + len(columns)) + "|"]
         for n in sorted(set(orders)):
             out.append(f"| {n} | {' | '.join(f'{1e3 * np.sqrt(x[orders == n].mean()):.1f}' for x in columns.values())} |")

@@ -157,7 +157,7 @@ def test_shares_are_those_of_a_simulation(lost: int) -> None:
 def test_what_it_states_is_near_the_bounds_and_below_that_of_the_mean() -> None:
     """With lines as wide as those of the record. Modes tell of one another: it may lie below the bound of single modes."""
     scenario = STARS.replace({"multipeak.line_width": line_width(STARS)})
-    least, model = bound(STARS, "asterism"), model_of(scenario)
+    least, model = bound(STARS, information="asterism"), model_of(scenario)
     for target in ("turbulence", "vibration", "total"):
         found = stated(scenario, target, model)
         for mode in range(2):

@@ -59,7 +59,7 @@ def test_the_bound_is_that_of_dense_algebra() -> None:
     explained = np.einsum("ti,it->t", with_target.reshape(5, -1), weights)
     own = np.fft.irfft(found.own, n)[:, 0] * (0.5 / FLOW.dt)
     dense = np.sqrt(own - explained)
-    least = np.array([one["turbulence"].rms for one in bound(FLOW, "modes")])
+    least = np.array([one["turbulence"].rms for one in bound(FLOW, information="modes")])
     assert (least < 1.001 * dense).all()
     np.testing.assert_allclose(np.delete(least, 1), np.delete(dense, 1), rtol=0.015)
     assert least[1] > 0.93 * dense[1]
@@ -72,7 +72,7 @@ def test_its_bound_is_a_row_of_its_table_and_of_no_other() -> None:
     result = run(short, observers=["kf-coupled"])
     rows, alone = ({(s.target, s.mode): s.rms for s in result.scores if s.observer == row} for row in (BOUND_MODES, BOUND))
     names = [mode.name for mode in short.modes]
-    least = bound(short, "modes")
+    least = bound(short, information="modes")
     found = {(target, name): one[target].rms for one, name in zip(least, names, strict=True) for target in SCORED}
     assert rows == {key: min(value, alone[key]) for key, value in found.items()}, "no higher than that of a mode by itself"
     assert not [s for s in run(short, observers=["zero"]).scores if s.observer == BOUND_MODES]
@@ -82,7 +82,7 @@ def test_its_bound_is_a_row_of_its_table_and_of_no_other() -> None:
 
 def test_what_it_states_is_near_the_bound_and_below_the_independent_filters() -> None:
     alone = exact_errors(OBSERVERS["kf-multi"], SHAKEN)
-    least = bound(SHAKEN, "modes")
+    least = bound(SHAKEN, information="modes")
     for target in ("turbulence", "vibration", "total"):
         found = stated(SHAKEN, target)
         for mode in range(2):
@@ -176,4 +176,4 @@ def test_figures_of_single_modes_leave_it_out() -> None:
     with pytest.raises(ValueError, match="every mode by itself"):
         exact_errors(OBSERVERS["kf-coupled"], SHAKEN)
     with pytest.raises(ValueError, match="independent"):
-        bound(FLOW.replace({"turbulence.source": "ar2"}), "modes")
+        bound(FLOW.replace({"turbulence.source": "ar2"}), information="modes")

@@ -49,7 +49,7 @@ def test_the_bound_is_that_of_dense_algebra() -> None:
     own = np.fft.irfft(found.own, n)[:, 0] * (0.5 / scenario.dt)
     prior = prior_of(scenario, None, (Lines, FlowOfBoth))
     assert prior.asterism is not None
-    least = bound(scenario, "both-modes")
+    least = bound(scenario, information="both-modes")
     for phase in (0, 3):
         # disturbance at the age a (of z[k - a]: phi[k - 1 - a]), and frames that are the mean of n of them
         ages = [(i, np.array([a])) for a in range(past) for i in range(m)]
@@ -166,13 +166,13 @@ def test_where_modes_are_independent_it_refuses_and_runs_only_if_named() -> None
     assert line.reason == f"multirate-coupled left out: {INDEPENDENT}"
     assert OBSERVER.id not in usual_observers(scenario) and OBSERVER.id in usual_observers(FLOW)
     with pytest.raises(ValueError, match="the bound of each is its own"):
-        bound(scenario, "both-modes")
+        bound(scenario, information="both-modes")
 
 
 def test_its_bound_is_a_row_of_its_table_and_no_higher_than_that_of_single_modes() -> None:
     short = SHAKEN.replace({"run.duration": 2.0, "run.warm_up": 1.0})
     rows = {(s.observer, s.target, s.mode): s.rms for s in run(short, observers=[OBSERVER.id]).scores}
-    for one, mode in zip(bound(short, "both-modes"), short.modes, strict=True):
+    for one, mode in zip(bound(short, information="both-modes"), short.modes, strict=True):
         for target in TARGETS:
             alone = rows[BOUND_BOTH, target, mode.name]
             assert rows[BOUND_BOTH_MODES, target, mode.name] == min(one[target].rms, alone)

@@ -163,8 +163,8 @@ def learning_freedom(ratio: float) -> float:
     return log(ratio) ** 2 / (2.0 * (log(ratio) - 1.0 + 1.0 / ratio))
 
 
-def bound(scenario: Scenario, information: str = "lgs", *, ahead: float = 0, modes: Sequence[int] | None = None) -> list[Errors]:
-    """Compute the minimum error of phi[k + ahead] of any causal linear observer with this information up to step k.
+def bound(scenario: Scenario, *, information: str = "lgs", ahead: float = 0, modes: Sequence[int] | None = None) -> list[Errors]:
+    """Compute the minimum error of any causal linear observer with this information.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def bound(scenario: Scenario, information: str = "lgs", *, ahead: float = 0, mod
     information : {"lgs", "both", "stars", "modes", "both-modes", "asterism"}
         Measurements of the mean of the LGS; with the NGS; every LGS by itself with the NGS; and the same of all modes together.
     ahead : float
-        Steps of prediction, whole ones where every mode is by itself.
+        Steps of prediction: of phi[k + ahead] from measurements up to step k. Whole ones where every mode is by itself.
     modes : sequence of int, optional
         Indices of the modes; by default all.
 
@@ -185,10 +185,24 @@ def bound(scenario: Scenario, information: str = "lgs", *, ahead: float = 0, mod
     Raises
     ------
     ValueError
-        There is no such information in the scenario: its modes are independent, or all LGS see the same.
+        The spectra of the scenario are not known, or there is no such information in it: its modes are independent, or all LGS
+        see the same.
+
+    See Also
+    --------
+    run : Has these bounds as rows, each where an observer has that information.
+
+    Examples
+    --------
+    >>> import wfsobs
+    >>> lgs, both = (wfsobs.bound(wfsobs.PRESETS["paper"](), information=of)[0]["total"].rms for of in ("lgs", "both"))
+    >>> 0.0 < both < lgs
+    True
     """
     if information not in INFORMATION:
         raise ValueError(f"information = {information!r}: takes one of {', '.join(INFORMATION)}")
+    if not has_known_spectra(scenario):
+        raise ValueError("no bound: the spectra of this scenario are not known, or events change them")
     row, chosen = INFORMATION[information], range(len(scenario.modes)) if modes is None else modes
     if row in ALONE:
         found = _least_together(scenario, row, ahead)
@@ -200,7 +214,7 @@ def bound(scenario: Scenario, information: str = "lgs", *, ahead: float = 0, mod
 
 def bound_rms(scenario: Scenario, mode: int, ahead: float = 0, information: str = "lgs") -> dict[str, float]:
     """Return target -> rms [um] of the minimum error, as `bound`, of one mode."""
-    return {name: error.rms for name, error in bound(scenario, information, ahead=ahead, modes=[mode])[0].items()}
+    return {name: error.rms for name, error in bound(scenario, information=information, ahead=ahead, modes=[mode])[0].items()}
 
 
 # ---------------------------------------------------------------------- every mode by itself

@@ -148,6 +148,6 @@ def bounds_of(settings: dict[str, Any]) -> dict[str, dict[str, list[float]]]:
         return {}
     out: dict[str, dict[str, list[float]]] = {}
     for information in ("lgs", "both"):
-        modes = bound(scenario, information)
+        modes = bound(scenario, information=information)
         out[INFORMATION[information]] = {target: [one[target].rms for one in modes] for target in modes[0]}
     return out

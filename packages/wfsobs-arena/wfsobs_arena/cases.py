@@ -159,7 +159,7 @@ class SimulatedCase:
         if self.of.target == RESIDUAL:
             of_modes = design(self.scenario, []).bounds["bound-both"]
         else:
-            least = bound(self.scenario, "both" if "ngs" in self.of.sensors else "lgs")
+            least = bound(self.scenario, information="both" if "ngs" in self.of.sensors else "lgs")
             name = TOTAL if self.of.target == DISTURBANCE else self.of.target
             of_modes = tuple(one[name].rms for one in least)
         return float(np.sum(np.square(of_modes)))
