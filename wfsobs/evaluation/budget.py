@@ -125,7 +125,7 @@ class Source:
     measurement : OpenLoop
         What the sensors measure of it, NaN where the record has no measurement.
     truth : dict of str to Array
-        Target -> part of the truth, (n_steps, n_modes) [um].
+        Target, or TOTAL -> part of the truth, (n_steps, n_modes) [um].
     """
 
     measurement: OpenLoop
@@ -211,7 +211,6 @@ def _terms(
     given = lines if finds_all else [given_lines(before, observer.id, i) for i in range(record.n_modes)]
     sources = split_record(scenario, record, lines, given)
     responses, rest = _responses(observer, scenario, record, sources, watch)
-    truths = {name: with_total(part.truth) for name, part in sources.items()}
     seen, out = sources[SIGNAL].measurement, []
     signal = OpenLoop(np.nan_to_num(seen.lgs), np.nan_to_num(seen.ngs))
 
@@ -222,7 +221,7 @@ def _terms(
 
     for s in scores:
         i = columns.index(s.mode)
-        truth = {name: of[s.target][:, i] for name, of in truths.items()}
+        truth = {name: part.truth[s.target][:, i] for name, part in sources.items()}
         parts = {name: responses[name][s.target][:, i] - truth[name] for name in sources}
         lag = reference(i)[s.target] - truth[SIGNAL]
         parts |= {LAG: lag, MISMATCH: parts.pop(SIGNAL) - lag + rest[s.target][:, i]}
@@ -235,8 +234,8 @@ def _terms(
 
 def with_total(parts: Mapping[str, Array]) -> Estimates:
     """Return what there is of each target, and where there is both also the sum."""
-    both = {TOTAL: np.sum([parts[target] for target in TARGETS], axis=0)} if set(TARGETS) <= set(parts) else {}
-    return {**parts, **both}
+    both = set(TARGETS) <= set(parts)
+    return {**parts, TOTAL: parts[TURBULENCE] + parts[VIBRATION]} if both else {**parts}
 
 
 def budget_row(budget: Budget) -> dict[str, Any]:
@@ -288,7 +287,7 @@ def split_record(
         SIGNAL: (_see(record.turbulence + known, record.ratio), record.turbulence, known),
     }
     return {  # NaN where the record has no measurement
-        name: Source(_add([seen], total), {TURBULENCE: turbulence, VIBRATION: vibration})
+        name: Source(_add([seen], total), with_total({TURBULENCE: turbulence, VIBRATION: vibration}))
         for name, (seen, turbulence, vibration) in parts.items()
     }
 

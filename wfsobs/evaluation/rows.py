@@ -82,8 +82,10 @@ def score_rows(scores: Iterable[Score], seed: int | None, *, source: PriorSource
             "start_s": s.start,
             "stop_s": s.stop,
             "apart": s.apart,
-            "needs": ("" if s.observer not in BOUNDS else SPECTRA)
-            if s.observer in NOT_OBSERVERS
+            "needs": SPECTRA
+            if s.observer in BOUNDS
+            else ""
+            if s.observer == LOOP
             else OBSERVERS[s.observer].needs_text(source=source),
             "interval_um": None if s.interval is None else list(s.interval),
             "phases_um": None if s.phases is None else list(s.phases),
