@@ -10,14 +10,13 @@ from contextlib import closing, contextmanager
 import click
 import numpy as np
 
-from wfsobs.cli.options import ngs_options, ngs_wiring, scenario_options, stream_elements
+from wfsobs.cli.options import ngs_options, ngs_wiring, scenario_options, stream_elements, told_scenario
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.step import StepError, StepObserver
 from wfsobs.prior import LgsError, Lines, Model, Training
-from wfsobs.priors_from.identification import told_by
 from wfsobs.priors_from.scenario import observer_settings
 from wfsobs.record import Sampling
-from wfsobs.scenario import Scenario, configfile
+from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 from wfsobs.stepping import design, prior_in
 from wfsobs.streams.attach import Attachment
@@ -80,9 +79,7 @@ from wfsobs.units import UNITS, micrometres_per
 @click.option("--seconds", type=click.FloatRange(0, min_open=True), metavar="S", help="Duration; by default until Ctrl+C.")
 @click.option("--json", "as_json", is_flag=True, help="At the end print one JSON object.")
 def attach(
-    preset: str | None,
-    config: str | None,
-    assignments: tuple[str, ...],
+    scenario: Scenario,
     source: str,
     sink: str | None,
     shadow: bool,
@@ -106,11 +103,7 @@ def attach(
         raise SettingError("attach: takes --out STREAM, or --shadow to write nothing")
     if limit is not None and np.isnan(limit):
         raise SettingError("--limit nan: takes a number above 0")
-    scenario = configfile.scenario_from(preset, config, assignments)
-    if prior is not None:
-        scenario = told_by(configfile.load_scenario(prior), scenario)
-        for path, value in map(configfile.parse_assignment, assignments):
-            scenario.set(path, value)
+    scenario = told_scenario(prior, scenario)
     elements = stream_elements(modes, len(scenario.modes))
     per_unit = micrometres_per(unit, scenario.telescope.diameter)
     try:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import click
 
 from wfsobs.campaign.sweep import MOST_SEEDS
-from wfsobs.cli.options import observer_option, scenario_options
+from wfsobs.cli.options import observer_option, preset_of_command, scenario_options
 from wfsobs.cli.show import progress_bar, warn
 from wfsobs.progress import Watch
-from wfsobs.scenario import configfile
+from wfsobs.scenario import Scenario
 from wfsobs.scenario.grid import MOST, parse_variation
 from wfsobs.settings.errors import SettingError
 
@@ -32,15 +32,12 @@ from wfsobs.settings.errors import SettingError
 )
 def export(
     out: str,
-    preset: str | None,
-    config: str | None,
-    assignments: tuple[str, ...],
+    scenario: Scenario,
     observers: tuple[str, ...],
     vary: tuple[str, ...],
     seeds: int,
 ) -> None:
     """Write a report: one HTML file with figures and numbers that opens without a network."""
-    base = configfile.scenario_from(preset, config, assignments)
     variations = [parse_variation(text) for text in vary]
     try:
         from wfsobs.app.report.export import export as write
@@ -49,11 +46,11 @@ def export(
     with progress_bar("runs") as update:
         write(
             out,
-            base,
+            scenario,
             observers=observers or None,
             vary=variations,
             seeds=seeds,
-            preset=configfile.preset_name(preset, config),
+            preset=preset_of_command(),
             watch=Watch(progress=update),
             on_result=warn,
         )

@@ -11,11 +11,11 @@ import numpy as np
 from rich.table import Table
 
 from wfsobs.cli.options import (
-    declare_format,
     load_declared,
     ngs_options,
     ngs_wiring,
     observer_option,
+    preset_of_command,
     record_options,
     scenario_options,
     stream_elements,
@@ -73,21 +73,14 @@ from wfsobs.units import micrometres_per
 @click.option("--seconds", type=click.FloatRange(0.01, 86_400), default=10.0, metavar="N", help="Duration; by default 10.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of a table.")
 def live(
-    preset: str | None,
-    config: str | None,
-    assignments: tuple[str, ...],
+    scenario: Scenario,
     replay_file: str | None,
     stream: str | None,
     modes: str | None,
     ngs: str | None,
     ngs_modes: str | None,
     ngs_lag: int,
-    unit: str | None,
-    command_sign: str | None,
-    command_delay: int | None,
-    rate: float | None,
-    columns: tuple[str, ...],
-    trust: bool,
+    declaration: DeclaredFormat,
     sha256: str | None,
     observers: tuple[str, ...],
     controllers: tuple[str, ...],
@@ -107,8 +100,6 @@ def live(
     for file in (record_file, log_file):
         if file:
             check_writable(file)
-    scenario = configfile.scenario_from(preset, config, assignments)
-    declaration = declare_format(unit, command_sign, command_delay, rate, columns, trust)
     if not replay_file and (sha256 or replace(declaration, unit=None) != DeclaredFormat()):
         raise SettingError("live: options of a record need --replay")
     source = _source(scenario, replay_file, stream, modes, declaration, sha256)
@@ -116,7 +107,7 @@ def live(
         scenario = scenario.before_events
     acts_of(scenario)
     if ngs is not None:
-        source = _with_ngs(source, scenario, ngs, ngs_modes, unit or "um", ngs_lag)
+        source = _with_ngs(source, scenario, ngs, ngs_modes, declaration.unit or "um", ngs_lag)
     names = tuple(observers or observers_on(source, scenario))
     if headless:
         _run_headless(source, scenario, names, speed, seconds, record_file, log_file, as_json)
@@ -130,7 +121,14 @@ def live(
         from wfsobs.live.loop import LiveOrder
     except ModuleNotFoundError as error:
         raise SettingError(f"live: the page needs {error.name}; install wfsobs with its extra: wfsobs[app]") from None
-    addresses = {"in": stream, "modes": modes, "ngs": ngs, "ngs-modes": ngs_modes, "ngs-lag": ngs_lag or None, "unit": unit}
+    addresses = {
+        "in": stream,
+        "modes": modes,
+        "ngs": ngs,
+        "ngs-modes": ngs_modes,
+        "ngs-lag": ngs_lag or None,
+        "unit": declaration.unit,
+    }
     order = LiveOrder(
         source,
         scenario,
@@ -140,7 +138,7 @@ def live(
         key="live",
         record_file=record_file or "",
         log_file=log_file or "",
-        preset=configfile.preset_name(preset, config),
+        preset=preset_of_command(),
         options=tuple(word for name, value in addresses.items() if stream and value for word in (f"--{name}", str(value))),
     )
     server.serve(server.Options(port=port, open_browser=open_browser, runs=max(2, cpu_count() or 1)), order)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import Any
 
 import click
 
+from wfsobs.priors_from.identification import told_by
 from wfsobs.priors_from.training import training_part
 from wfsobs.record import DELAY, Record
-from wfsobs.scenario import Scenario
+from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.errors import SettingError
 from wfsobs.streams.wiring import STUCK, NgsWiring
@@ -18,9 +21,22 @@ from wfsobs.telemetry.records import load_record
 from wfsobs.units import UNITS, micrometres_per
 
 
+def add_options(command: Callable, *options: Callable) -> Callable:
+    """Return a command with options, the last one first in its help."""
+    for option in options:
+        command = option(command)
+    return command
+
+
 def scenario_options(command: Callable) -> Callable:
-    """--preset, --config and --set."""
-    for option in (
+    """Add --preset, --config and --set; the command receives the `scenario`."""
+
+    @wraps(command)
+    def with_scenario(*, preset: str | None, config: str | None, assignments: tuple[str, ...], **values: Any) -> Any:
+        return command(scenario=configfile.scenario_from(preset, config, assignments), **values)
+
+    return add_options(
+        with_scenario,
         click.option(
             "--set",
             "assignments",
@@ -30,9 +46,7 @@ def scenario_options(command: Callable) -> Callable:
         ),
         click.option("--config", metavar="F.toml", help="Settings from a TOML file, on top of the preset."),
         click.option("--preset", metavar="NAME", help=f"Start from {', '.join(PRESETS)}; by default paper."),
-    ):
-        command = option(command)
-    return command
+    )
 
 
 observer_option = click.option(
@@ -40,9 +54,25 @@ observer_option = click.option(
 )
 
 
+def told_scenario(prior: str | None, scenario: Scenario) -> Scenario:
+    """Return a scenario with the prior of a file, if there is one, and what --set says of it."""
+    if prior is not None:
+        scenario = told_by(configfile.load_scenario(prior), scenario)
+        for path, value in map(configfile.parse_assignment, click.get_current_context().params["assignments"]):
+            scenario.set(path, value)
+    return scenario
+
+
+def preset_of_command() -> str:
+    """Return the preset that the command starts from."""
+    given = click.get_current_context().params
+    return configfile.preset_name(given["preset"], given["config"])
+
+
 def ngs_options(command: Callable) -> Callable:
     """Add --ngs, --ngs-modes and --ngs-lag, the stream of a second sensor."""
-    for option in (
+    return add_options(
+        command,
         click.option(
             "--ngs-lag",
             type=click.IntRange(0, 999),
@@ -53,14 +83,34 @@ def ngs_options(command: Callable) -> Callable:
         ),
         click.option("--ngs-modes", metavar="I,J,...", help="Elements of a frame of the NGS that are its modes."),
         click.option("--ngs", metavar="STREAM", help="Pseudo-open-loop modes of the NGS, for observers of both sensors."),
-    ):
-        command = option(command)
-    return command
+    )
 
 
 def record_options(command: Callable) -> Callable:
-    """Add --unit, --command-sign, --command-delay, --rate, --column, --trust and --sha256, the declarations on a record file."""
-    for option in (
+    """Add what is stated of a record file, from --unit to --trust, received as `declaration`, and --sha256."""
+
+    @wraps(command)
+    def with_declaration(
+        *,
+        unit: str | None,
+        command_sign: str | None,
+        command_delay: int | None,
+        rate: float | None,
+        columns: Sequence[str],
+        trust: bool,
+        **values: Any,
+    ) -> Any:
+        roles = {}
+        for text in columns:
+            role, equals, name = text.partition("=")
+            if not equals:
+                raise SettingError(f"--column {text}: takes ROLE=NAME, such as y_lgs/tip=slope_x")
+            roles[role.strip()] = name
+        sign = int(command_sign) if command_sign else None
+        return command(declaration=DeclaredFormat(unit, sign, command_delay, rate, roles, trust), **values)
+
+    return add_options(
+        with_declaration,
         click.option("--trust", is_flag=True, help="Go on though the data exclude the sign or the delay of the commands."),
         click.option("--sha256", metavar="HEX", help="Refuse the record unless its file has this SHA-256."),
         click.option(
@@ -87,27 +137,13 @@ def record_options(command: Callable) -> Callable:
             type=click.Choice(UNITS),
             help="Unit of the record where the file has none, or of the stream; um by default.",
         ),
-    ):
-        command = option(command)
-    return command
-
-
-def declare_format(
-    unit: str | None, command_sign: str | None, command_delay: int | None, rate: float | None, columns: Sequence[str], trust: bool
-) -> DeclaredFormat:
-    """Collect what the options say of a record file. Raises SettingError."""
-    roles = {}
-    for text in columns:
-        role, equals, name = text.partition("=")
-        if not equals:
-            raise SettingError(f"--column {text}: takes ROLE=NAME, such as y_lgs/tip=slope_x")
-        roles[role.strip()] = name
-    return DeclaredFormat(unit, int(command_sign) if command_sign else None, command_delay, rate, roles, trust)
+    )
 
 
 def training_options(command: Callable) -> Callable:
     """Add --train and --train-until."""
-    for option in (
+    return add_options(
+        command,
         click.option(
             "--train-until",
             type=click.FloatRange(0, min_open=True),
@@ -115,9 +151,7 @@ def training_options(command: Callable) -> Callable:
             help="Train on the first S seconds of the record; estimates and scores begin after them.",
         ),
         click.option("--train", metavar="RECORD", help="Train on another record of the same loop."),
-    ):
-        command = option(command)
-    return command
+    )
 
 
 def training(

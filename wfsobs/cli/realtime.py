@@ -15,7 +15,7 @@ from wfsobs.bench.steps import SHARE, RealTime, measure_realtime
 from wfsobs.cli.options import scenario_options
 from wfsobs.cli.show import show_table
 from wfsobs.observers.step import StepError
-from wfsobs.scenario import configfile
+from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 
 
@@ -24,11 +24,8 @@ from wfsobs.settings.group import SettingError
 @click.option("--observer", "name", default="kf-multi", show_default=True, metavar="ID", help="Observer or controller that runs.")
 @click.option("--seconds", type=click.FloatRange(0.01, 3600), default=5.0, show_default=True, metavar="S", help="Duration.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
-def rt_check(
-    preset: str | None, config: str | None, assignments: tuple[str, ...], name: str, seconds: float, as_json: bool
-) -> None:
+def rt_check(scenario: Scenario, name: str, seconds: float, as_json: bool) -> None:
     """Tell what this machine can hold: how late a loop at the LGS rate wakes, and what a step takes in it."""
-    scenario = configfile.scenario_from(preset, config, assignments)
     rate = scenario.sensors.lgs_rate
     try:
         with threadpool_limits(1, user_api="blas"):

@@ -12,7 +12,6 @@ import numpy as np
 from rich.table import Table
 
 from wfsobs.cli.options import (
-    declare_format,
     load_declared,
     observer_option,
     record_options,
@@ -46,10 +45,11 @@ from wfsobs.pipeline import observe as observe_record
 from wfsobs.prior import GIVEN
 from wfsobs.priors_from.training import trained_until, with_training
 from wfsobs.progress import Watch
-from wfsobs.scenario import configfile
+from wfsobs.scenario import Scenario, configfile
 from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.formats.psd import load_psd
+from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.records import save_record
 from wfsobs.units import UNITS
 
@@ -141,9 +141,7 @@ def _order(rows: Sequence[Row]):
     "--budget-of", multiple=True, metavar="NAME", help="Print the error budget of this observer alone; can be repeated."
 )
 def run(
-    preset: str | None,
-    config: str | None,
-    assignments: tuple[str, ...],
+    scenario: Scenario,
     observers: tuple[str, ...],
     seeds: int,
     as_json: bool,
@@ -163,7 +161,6 @@ def run(
         raise SettingError("--budget: is of one record, without --over-time; leave --seeds at 1")
     if unknown := set(budget_of) - set(OBSERVERS):
         raise SettingError(f"--budget-of {min(unknown)}: no such observer; there are {', '.join(OBSERVERS)}")
-    scenario = configfile.scenario_from(preset, config, assignments)
     if vibration_psd is not None:
         table = load_psd(vibration_psd, psd_unit, scenario.telescope.diameter)
         scenario = scenario.replace({"vibration.source": "psd", "vibration.psd": table})
@@ -204,34 +201,26 @@ def run(
 @training_options
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
 def loop(
-    preset: str | None,
-    config: str | None,
-    assignments: tuple[str, ...],
+    scenario: Scenario,
     controllers: tuple[str, ...],
     seeds: int,
     record_file: str | None,
-    unit: str | None,
-    command_sign: str | None,
-    command_delay: int | None,
-    rate: float | None,
-    columns: tuple[str, ...],
-    trust: bool,
+    declaration: DeclaredFormat,
     sha256: str | None,
     train: str | None,
     train_until: float | None,
     as_json: bool,
 ) -> None:
     """Close the loop with every controller on the same disturbance and print what is left of it (docs/closed_loop.md)."""
-    scenario, record, start = configfile.scenario_from(preset, config, assignments), None, 0.0
+    record, start = None, 0.0
     if record_file is None and (train is not None or train_until is not None):
         raise SettingError("--train, --train-until: only with --record; a simulated record has its own training data")
     if record_file is not None:
         if seeds > 1:
             raise SettingError("--seeds: only for simulated records, not with --record")
-        stated = declare_format(unit, command_sign, command_delay, rate, columns, trust)
-        record = load_declared(record_file, scenario, stated, sha256)
+        record = load_declared(record_file, scenario, declaration, sha256)
         scenario = as_stated(record, scenario)
-        learnt = training(train, train_until, record, scenario, stated)
+        learnt = training(train, train_until, record, scenario, declaration)
         record, start = record if learnt is None else with_training(record, learnt, scenario), trained_until(learnt)
     all_rows: list[Row] = []
     with progress_bar("controllers") as update:

@@ -17,7 +17,7 @@ from wfsobs.evaluation.evidence import FEWEST
 from wfsobs.evaluation.rows import row_label
 from wfsobs.files import check_writable, write_whole
 from wfsobs.progress import Watch
-from wfsobs.scenario import configfile
+from wfsobs.scenario import Scenario
 
 
 @click.command()
@@ -41,16 +41,13 @@ from wfsobs.scenario import configfile
 @observer_option
 @click.option("--csv", "csv_file", metavar="FILE", help="Save the errors of all observers.")
 def sweep(
-    preset: str | None,
-    config: str | None,
-    assignments: tuple[str, ...],
+    scenario: Scenario,
     axes: tuple[str, ...],
     seeds: int,
     observers: tuple[str, ...],
     csv_file: str | None,
 ) -> None:
     """Run a scenario over the values of one or two settings and print the best observer in each (docs/sweeps.md)."""
-    scenario = configfile.scenario_from(preset, config, assignments)
     plan = plan_sweep(scenario, [parse_axis(text) for text in axes], seeds, observers or None)
     if csv_file:
         check_writable(csv_file)

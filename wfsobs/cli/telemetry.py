@@ -8,11 +8,11 @@ import click
 from rich.table import Table
 
 from wfsobs.cli.options import (
-    declare_format,
     load_declared,
     observer_option,
     record_options,
     scenario_options,
+    told_scenario,
     training,
     training_options,
 )
@@ -27,10 +27,10 @@ from wfsobs.identification.report import format_number, mode_rows
 from wfsobs.identification.result import Identification
 from wfsobs.pipeline import as_stated
 from wfsobs.pipeline import observe as observe_record
-from wfsobs.priors_from.identification import told_by
 from wfsobs.progress import Watch
-from wfsobs.scenario import configfile
+from wfsobs.scenario import Scenario
 from wfsobs.spectral.search import LOWEST
+from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.records import save_arrays
 
 
@@ -65,15 +65,8 @@ def _nm(n: Number) -> Number:
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
 def observe(
     record_file: str,
-    preset: str | None,
-    config: str | None,
-    assignments: tuple[str, ...],
-    unit: str | None,
-    command_sign: str | None,
-    command_delay: int | None,
-    rate: float | None,
-    columns: tuple[str, ...],
-    trust: bool,
+    scenario: Scenario,
+    declaration: DeclaredFormat,
     sha256: str | None,
     train: str | None,
     train_until: float | None,
@@ -83,16 +76,11 @@ def observe(
     as_json: bool,
 ) -> None:
     """Run the observers on a record: .npz, .csv, .fits or AOT (by default preset paper)."""
-    scenario = configfile.scenario_from(preset, config, assignments)
     if out:
         check_writable(out)
-    if prior is not None:
-        scenario = told_by(configfile.load_scenario(prior), scenario)
-        for path, value in map(configfile.parse_assignment, assignments):
-            scenario.set(path, value)
-    stated = declare_format(unit, command_sign, command_delay, rate, columns, trust)
-    record = load_declared(record_file, scenario, stated, sha256)
-    learnt = training(train, train_until, record, scenario, stated)
+    scenario = told_scenario(prior, scenario)
+    record = load_declared(record_file, scenario, declaration, sha256)
+    learnt = training(train, train_until, record, scenario, declaration)
     with progress_bar() as update:
         told = None if prior is None else scenario
         result = observe_record(
@@ -133,15 +121,8 @@ def observe(
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
 def identify(
     record_file: str,
-    preset: str | None,
-    config: str | None,
-    assignments: tuple[str, ...],
-    unit: str | None,
-    command_sign: str | None,
-    command_delay: int | None,
-    rate: float | None,
-    columns: tuple[str, ...],
-    trust: bool,
+    scenario: Scenario,
+    declaration: DeclaredFormat,
     sha256: str | None,
     level: float,
     lowest: float,
@@ -149,9 +130,7 @@ def identify(
     as_json: bool,
 ) -> None:
     """Find noise, turbulence and vibration peaks in a record (docs/identification.md)."""
-    scenario = configfile.scenario_from(preset, config, assignments)
-    stated = declare_format(unit, command_sign, command_delay, rate, columns, trust)
-    record = load_declared(record_file, scenario, stated, sha256)
+    record = load_declared(record_file, scenario, declaration, sha256)
     if out:
         check_writable(out)
     with progress_bar("sweeps") as update:

@@ -7,7 +7,7 @@ import json
 import click
 from rich.table import Table
 
-from wfsobs.cli.options import declare_format, load_declared, record_options, scenario_options
+from wfsobs.cli.options import load_declared, record_options, scenario_options
 from wfsobs.cli.show import progress_bar, show_table
 from wfsobs.evaluation.rows import row_label
 from wfsobs.evaluation.scores import PREDICTION
@@ -15,8 +15,9 @@ from wfsobs.files import check_writable, write_whole
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.progress import Watch
-from wfsobs.scenario import configfile
+from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
+from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.tuning import report
 from wfsobs.tuning import tune as search
 from wfsobs.tuning.report import nm, settings
@@ -87,31 +88,23 @@ NAMES = [o.id for o in OBSERVERS.values() if o.tunable.usual]
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
 def tune(
     observer: str,
-    preset: str | None,
-    config: str | None,
-    assignments: tuple[str, ...],
+    scenario: Scenario,
     settings: tuple[str, ...],
     target: str | None,
     evaluations: int,
     validation: float | None,
     record_file: str | None,
-    unit: str | None,
-    command_sign: str | None,
-    command_delay: int | None,
-    rate: float | None,
-    columns: tuple[str, ...],
-    trust: bool,
+    declaration: DeclaredFormat,
     sha256: str | None,
     out: str | None,
     as_json: bool,
 ) -> None:
     """Search for the settings of an observer that are best on a validation record (docs/tuning.md)."""
-    scenario, record = configfile.scenario_from(preset, config, assignments), None
+    record = None
     if record_file is not None:
         if validation is not None:
             raise SettingError("--validation: only for simulated records, not with --record")
-        stated = declare_format(unit, command_sign, command_delay, rate, columns, trust)
-        record = load_declared(record_file, scenario, stated, sha256)
+        record = load_declared(record_file, scenario, declaration, sha256)
     if out:
         check_writable(out)
     with progress_bar("evaluations") as update:
