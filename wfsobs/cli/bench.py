@@ -35,7 +35,7 @@ HEADS = {
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
 @click.pass_obj
 def bench(libraries: Mapping[str, tasks.Library] | None, full: bool, as_json: bool) -> None:
-    """Time the observers beside textbook versions; `benchmarks/` of the repository has other libraries, too."""
+    """Time the observers beside textbook versions."""
     if libraries is None:
         click.echo(
             "wfsobs: bench: without scikit-learn, filterpy and statsmodels; python -m benchmarks, in the repository, has them",

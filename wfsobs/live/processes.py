@@ -136,9 +136,11 @@ class CrewProcess:
     width : int
         Of a row of what it writes.
     work : callable
-        Receives site, name of the rows, inbox, and what else is given.
+        Receives site, name of the rows, inbox, and the further arguments.
     site : Site
         Where.
+    *more
+        Further arguments.
 
     Attributes
     ----------
