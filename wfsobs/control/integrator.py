@@ -10,9 +10,9 @@ from scipy.optimize import minimize_scalar
 from wfsobs.control.law import Law, steady_law
 from wfsobs.control.mirror import Mirror
 from wfsobs.control.residual import residual_density
+from wfsobs.observers.stepping import Gain, GainCycle
 from wfsobs.prior import Spectra
 from wfsobs.signal.periodic import PeriodicFilter
-from wfsobs.signal.stepping import Gain, GainCycle
 from wfsobs.typing import Array
 
 FINE, COARSE = 2048, 64

@@ -17,8 +17,8 @@ import numpy as np
 from scipy.linalg import schur
 
 from wfsobs.observers.kalman.mode_filter import ModeFilter
+from wfsobs.observers.stepping import GainCycle
 from wfsobs.signal.periodic import FilterStep, PeriodicFilter
-from wfsobs.signal.stepping import GainCycle
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
 

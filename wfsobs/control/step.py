@@ -15,8 +15,8 @@ from wfsobs.control.mirror import Plant
 from wfsobs.control.step_laws import StepLaw, VibrationAhead, push_row
 from wfsobs.observers.missing import Bridge
 from wfsobs.observers.step import StepError, check_frame, check_ngs, check_stars, check_state
+from wfsobs.observers.stepping import Stateful, load_parts, save_parts
 from wfsobs.record import Sampling
-from wfsobs.signal.stepping import Stateful, load_parts, save_parts
 from wfsobs.typing import Array
 
 

@@ -11,11 +11,12 @@ from wfsobs.control.law import Law
 from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.observers.step import Estimator, StepError, each_frame
+from wfsobs.observers.stepping import FilterBank, StateArrays, Stateful
 from wfsobs.prior import Bands, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.signal.bandpass import bandpass_bank, bank_recursion
-from wfsobs.signal.stepping import FilterBank, Recursion, StateArrays, Stateful
+from wfsobs.signal.periodic import Recursion
 from wfsobs.typing import Array
 
 StepPredict = Callable[[Prior, Plant, Any, Sampling], Estimator]

@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 from wfsobs.files import write_whole
 from wfsobs.handover.linear import LinearDesign
 from wfsobs.observers.step import StepError
-from wfsobs.signal.stepping import Gain
+from wfsobs.observers.stepping import Gain
 from wfsobs.typing import Array
 
 EQUATIONS = (

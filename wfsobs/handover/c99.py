@@ -17,9 +17,9 @@ from wfsobs.files import write_whole
 from wfsobs.handover.linear import LinearDesign
 from wfsobs.handover.vectors import Vectors
 from wfsobs.observers.step import StepError
+from wfsobs.observers.stepping import Gain, GainCycle
 from wfsobs.signal.gap_gains import GapGains
 from wfsobs.signal.riccati import Step
-from wfsobs.signal.stepping import Gain, GainCycle
 from wfsobs.typing import Array
 
 TEMPLATES = files("wfsobs.handover") / "templates"

@@ -16,8 +16,8 @@ from typing import NamedTuple
 from wfsobs.control.step import StepController
 from wfsobs.control.step_laws import Integrators, KalmanLaws, LinearLaws
 from wfsobs.observers.step import StepError
+from wfsobs.observers.stepping import GainCycle
 from wfsobs.signal.gap_gains import ONE, GapGains
-from wfsobs.signal.stepping import GainCycle
 from wfsobs.typing import Array
 
 

@@ -11,11 +11,11 @@ import numpy as np
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Look, Observer, Tunable
 from wfsobs.observers.step import HeldEstimate, StepError
+from wfsobs.observers.stepping import FilterBank
 from wfsobs.prior import Bands, OfflineBands, OnlineBands, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.signal.bandpass import bandpass_bank, bank_recursion, filter_causal, filter_zero_phase
-from wfsobs.signal.stepping import FilterBank
 from wfsobs.typing import Array
 
 

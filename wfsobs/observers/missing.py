@@ -14,11 +14,11 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
+from wfsobs.observers.stepping import FilterBank, Gain, GainCycle, StateArrays
 from wfsobs.prior import Prior
 from wfsobs.record import Signals, delay_signal, frame_mean, hold_last
 from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.statespace import DisturbanceModel
-from wfsobs.signal.stepping import FilterBank, Gain, GainCycle, StateArrays
 from wfsobs.typing import Array
 
 S = TypeVar("S", bound=Signals)

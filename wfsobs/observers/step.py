@@ -18,10 +18,10 @@ from numpy.typing import ArrayLike
 
 from wfsobs.observers.estimates import Estimates, by_name
 from wfsobs.observers.missing import Bridge
+from wfsobs.observers.stepping import StateArrays, Stateful, load_parts, save_parts
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
-from wfsobs.signal.stepping import StateArrays, Stateful, load_parts, save_parts
 from wfsobs.typing import Array
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.signal import butter, sosfilt
 
-from wfsobs.signal.stepping import Recursion
+from wfsobs.signal.periodic import Recursion
 from wfsobs.typing import Array
 
 

@@ -24,6 +24,14 @@ BLOCK = 48
 
 
 @dataclass(frozen=True)
+class Recursion:
+    """A linear filter as steps (F, G, H, J) that repeat, after a step 0 of its own where there is one."""
+
+    steps: Sequence[FilterStep]
+    first: FilterStep | None = None
+
+
+@dataclass(frozen=True)
 class PeriodicFilter:
     """Linear filter with a cycle of matrices.
 

@@ -19,11 +19,11 @@ from wfsobs.observers.gpr.learning import Learnt, learn, nothing_learnt
 from wfsobs.observers.kalman.adaptive import identification_settings
 from wfsobs.observers.kalman.window_model import ADAPTIVE, Adaptive, pack_spectrum, unpack_spectrum, window_lengths
 from wfsobs.observers.step import HeldEstimate, StepError, run_frames, whole_frames
+from wfsobs.observers.stepping import SampleHistory, Saved
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, RecordError, Sampling
 from wfsobs.signal.periodic import PeriodicFilter
-from wfsobs.signal.stepping import SampleHistory, Saved
 from wfsobs.spectral.quick import SHORTEST
 from wfsobs.typing import Array
 

@@ -16,9 +16,9 @@ import param
 from scipy.signal import butter, sosfilt, sosfilt_zi
 
 from wfsobs.observers.step import StepError
+from wfsobs.observers.stepping import SampleHistory, StateArrays
 from wfsobs.record import Measurements, RecordError, Sampling, Training, pseudo_open_loop
 from wfsobs.settings import Group, Real, Whole
-from wfsobs.signal.stepping import SampleHistory, StateArrays
 from wfsobs.typing import Array
 
 

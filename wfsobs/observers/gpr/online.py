@@ -20,12 +20,12 @@ from wfsobs.observers.gpr.sliding import finish, run_lengths, slide
 from wfsobs.observers.gpr.sliding_regression import LateRegression, SlidingRegression
 from wfsobs.observers.per_mode import over_modes, turns
 from wfsobs.observers.step import HeldEstimate, StepError, whole_frames
+from wfsobs.observers.stepping import FilterBank, Saved
 from wfsobs.prior import Bands, OnlineBands, Part, Prior, Training
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, Sampling, Signals
 from wfsobs.settings import Real, Section, Whole
 from wfsobs.signal.bandpass import StreamingBank, bandpass_bank, bank_recursion
-from wfsobs.signal.stepping import FilterBank, Saved
 from wfsobs.typing import Array
 
 

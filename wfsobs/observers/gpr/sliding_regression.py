@@ -29,7 +29,7 @@ import numpy as np
 from scipy.linalg.blas import dsymv, dsyr2k
 
 from wfsobs.observers.gpr.kernels import ConditionError, Points, SquaredExponential, restart_interval
-from wfsobs.signal.stepping import Saved
+from wfsobs.observers.stepping import Saved
 from wfsobs.typing import Array
 
 ENOUGH = 2e-10

@@ -38,10 +38,10 @@ from wfsobs.observers.kalman.window_model import (
     window_lengths,
 )
 from wfsobs.observers.step import StepError, run_frames
+from wfsobs.observers.stepping import SampleHistory, Saved, StateArrays
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, RecordError, Sampling
-from wfsobs.signal.stepping import SampleHistory, Saved, StateArrays
 from wfsobs.typing import Array
 
 STILL = 0.7, 1.4

@@ -21,6 +21,7 @@ from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimates, by_name
 from wfsobs.observers.kalman.mode_filter import ModeFilter
 from wfsobs.observers.kalman.single import PEAKS, MultiPeak, independent_filters, vibration_used
 from wfsobs.observers.kalman.step import KalmanEstimator, matrix_power
+from wfsobs.observers.stepping import StateArrays
 from wfsobs.prior import Flow, Lines, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
@@ -29,7 +30,6 @@ from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.joint_states import LeastVariance, StateFilter, real_product, running_means, shared_covariance
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.statespace import disturbance_model
-from wfsobs.signal.stepping import StateArrays
 from wfsobs.typing import Array
 
 MEANS = running_means((0.0, 3.0, 9.0, 27.0, 81.0, 243.0))

@@ -30,12 +30,12 @@ from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimates, by_name
 from wfsobs.observers.kalman.asterism_model import AsterismModel, Beginning
 from wfsobs.observers.kalman.single import NGS, PEAKS, MultiPeak, vibration_used
 from wfsobs.observers.step import StepError, run_frames
+from wfsobs.observers.stepping import StateArrays
 from wfsobs.prior import Asterism, FlowOfBoth, Lines, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.present_inputs import Present
-from wfsobs.signal.stepping import StateArrays
 from wfsobs.typing import Array
 
 INDEPENDENT = "the modes tell nothing of one another: `multirate-multi` estimates each by itself"

@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from wfsobs.observers.estimates import TARGETS
+from wfsobs.observers.stepping import GainCycle
 from wfsobs.prior import Prior
 from wfsobs.signal.filter_covariance import lyapunov
 from wfsobs.signal.gap_gains import ONE, GapGains, SensorMean
 from wfsobs.signal.riccati import Step
 from wfsobs.signal.statespace import DisturbanceModel
-from wfsobs.signal.stepping import GainCycle
 from wfsobs.typing import Array
 
 

@@ -36,6 +36,7 @@ from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
 from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean
 from wfsobs.observers.kalman.single import MODEL, NGS, PEAKS, MultiPeak, vibration_used
 from wfsobs.observers.kalman.step import KalmanEstimator
+from wfsobs.observers.stepping import Gain, GainCycle
 from wfsobs.prior import Beams, LgsError, LgsStars, Lines, Model, Noise, NoiselessModel, Part, Prior
 from wfsobs.record import Sampling
 from wfsobs.settings import Group, Real, Section
@@ -46,7 +47,6 @@ from wfsobs.signal.gap_gains import ONE, SensorMean
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.riccati import SteadyState, periodic_steady_state, steady_state
 from wfsobs.signal.statespace import DisturbanceModel, blocks_along_diagonal, disturbance_model
-from wfsobs.signal.stepping import Gain, GainCycle
 from wfsobs.typing import Array
 
 

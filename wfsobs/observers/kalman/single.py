@@ -20,6 +20,7 @@ import numpy as np
 from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
 from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean
 from wfsobs.observers.kalman.step import FrameErrors, FrameEstimator, KalmanEstimator
+from wfsobs.observers.stepping import Gain, GainCycle
 from wfsobs.prior import LgsModel, LgsStars, Lines, Model, NgsModel, Prior
 from wfsobs.record import Sampling
 from wfsobs.settings import Group, Real, Section, Whole
@@ -28,7 +29,6 @@ from wfsobs.signal.gap_gains import ONE, SensorMean
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.riccati import SteadyState, steady_state
 from wfsobs.signal.statespace import DisturbanceModel
-from wfsobs.signal.stepping import Gain, GainCycle
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:

@@ -19,12 +19,12 @@ from scipy.linalg import block_diag, fractional_matrix_power
 from wfsobs.observers.estimates import TARGETS, Estimates, by_name
 from wfsobs.observers.kalman.mode_filter import ModeFilter, StatedErrors
 from wfsobs.observers.step import StepError, run_frames, whole_frames
+from wfsobs.observers.stepping import FilterBank, Gain, GainCycle, Saved, StateArrays
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements
 from wfsobs.signal.filter_covariance import lyapunov
 from wfsobs.signal.gap_gains import GapGains, GapStep, SensorMean
 from wfsobs.signal.statespace import DisturbanceModel
-from wfsobs.signal.stepping import FilterBank, Gain, GainCycle, Saved, StateArrays
 from wfsobs.typing import Array
 
 STEADY, OPEN, CLOSED = range(3)

@@ -26,10 +26,10 @@ from wfsobs.control.step import StepController
 from wfsobs.control.step_laws import StepLaw, push_row
 from wfsobs.observers.missing import bridges, fill_missing
 from wfsobs.observers.step import StepError
+from wfsobs.observers.stepping import Saved
 from wfsobs.prior import Prior
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, Sampling
-from wfsobs.signal.stepping import Saved
 from wfsobs.typing import Array
 from wfsobs_arena.challengers.base import Challenger
 from wfsobs_arena.challengers.rls import BLOCK, MEMORY, ORDER, Rls

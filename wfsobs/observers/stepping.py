@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from wfsobs.signal.periodic import FilterStep, PeriodicFilter
+from wfsobs.signal.periodic import FilterStep, PeriodicFilter, Recursion
 from wfsobs.typing import Array
 
 Saved = dict[str, Array]
@@ -144,14 +144,6 @@ class Gain(NamedTuple):
         """Return (F, G, H, J) of the state x_pred[k]; the result is outputs (p, n) times x_hat[k]."""
         reduced = np.eye(len(self.A)) - self.L @ self.C
         return self.A @ reduced, self.A @ self.L, outputs @ reduced, outputs @ self.L
-
-
-@dataclass(frozen=True)
-class Recursion:
-    """A linear filter as steps (F, G, H, J) that repeat, after a step 0 of its own where there is one."""
-
-    steps: Sequence[FilterStep]
-    first: FilterStep | None = None
 
 
 @dataclass(frozen=True)
