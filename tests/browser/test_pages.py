@@ -113,8 +113,8 @@ def test_by_keyboard_on_a_phone(open_page: Any, server: Any) -> None:
     no_wider_than(page, 390)
 
 
-def test_pin_and_compare(open_page: Any, server: Any) -> None:
-    page = open_page(url=server.url + QUICK)
+def test_pin_and_compare(open_page: Any) -> None:
+    page = open_page()
     before = cells(page, "kf-lgs", "turbulence")[0].split()[-1]
     page.get_by_role("button", name="Pin this run to compare others with it").click()
     legend = page.get_by_role("status").filter(has_text="Compared with, faint in the figures")

@@ -170,8 +170,8 @@ def test_menus_by_keyboard(open_short: Any) -> None:
     expect(button).to_be_focused()
 
 
-def test_back_and_reload_return_to_the_view(open_short: Any) -> None:
-    page = open_short()
+def test_back_and_reload_return_to_the_view(open_page: Any) -> None:
+    page = open_page()
     start = page.evaluate("location.search")
     page.get_by_role("button", name="Tilt", exact=True).click()
     page.wait_for_function("location.search.includes('view.mode=tilt')")
@@ -191,7 +191,7 @@ def test_back_and_reload_return_to_the_view(open_short: Any) -> None:
     page.reload()
     expect(page.get_by_role("button", name="Tilt", exact=True)).to_have_attribute("aria-pressed", "true")
     expect(page.locator(".card[data-name=kf-multi]").first).to_have_attribute("aria-pressed", "false")
-    expect(page.locator("p.stretch").first).to_contain_text(re.compile(r"1\.15 – 1\.35 s"))
+    expect(page.locator("p.stretch").first).to_contain_text(re.compile(r"5\.40 – 5\.60 s"))
     page.wait_for_function("address => location.search === address", arg=address)
     page.go_back()
     page.wait_for_function("address => location.search === address", arg=start)

@@ -72,7 +72,7 @@ def test_a_stream_is_followed_through_whatever_happens_to_it(stream, monkeypatch
         frames.take()
 
     def lines():
-        out = [(k, line.removeprefix(f"{path}: ")) for k, line in list(news.queue)]
+        out = [(event.frame, event.what) for event in list(news.queue)]
         news.queue.clear()
         return out
 
@@ -150,7 +150,8 @@ def test_a_stream_by_network_is_followed_and_its_next_program_too():
     counters[0] = itertools.count(1)  # a program that starts anew
     while news.empty():
         take_until(ring.count + 1)
-    assert news.get()[1] == f"{source.path}: the counter has jumped" and news.empty()
+    event = news.get()
+    assert (event.origin, event.what) == (source.path, "the counter has jumped") and news.empty()
     is_over.set()
     publisher.join()
     frames._stream.close()
@@ -258,7 +259,7 @@ def test_two_streams_are_the_rows_of_the_record(tmp_path, lag, jitter):
     z[810 - 200 : 813 - 200], expected[700 - 200] = np.nan, np.nan
     np.testing.assert_array_equal(sent.z[start:], z)
     np.testing.assert_array_equal(sent.ngs[start:], expected)
-    assert [line.removeprefix(f"{ngs.path}: ") for _, line in news.queue] == ["one frame in 5 of the LGS"]
+    assert [event.line for event in news.queue] == [f"{ngs.path}: one frame in 5 of the LGS"]
     frames._ring.release()
     ring.release()
 
