@@ -25,11 +25,13 @@ export function render({model, el}) {
   const follow = () => {
     setMarkup(sheet, model.html)
     sheet.classList.toggle("dark", model.dark)
-    if (model.open === sheet.matches(":popover-open")) return
-    if (model.open) {
+    const close = sheet.querySelector("button") // of a sheet that is opened again it may come after the word to open
+    const isOpen = model.open && close !== null
+    if (isOpen === sheet.matches(":popover-open")) return
+    if (isOpen) {
       before = focused()
       sheet.showPopover()
-      sheet.querySelector("button").focus()
+      close.focus()
     } else {
       sheet.hidePopover()
       before?.focus()
