@@ -3,7 +3,7 @@
 
 const TICK = 250 // [ms]; only those count in which this page gets to work, so that a busy computer is no lost connection
 const PATIENCE = 16 // with a question to the server: to make the page of another visitor takes two seconds on a busy machine [ticks]
-const GIVEN_UP = 120 // after which another way to the server is tried: a message that is cut off in the middle costs a page [ticks]
+const GIVEN_UP = 40 // after which another way to the server is tried [ticks]
 const PERIOD = 12 // between questions where nothing is changed [ticks]
 const TIMEOUT = 3_000 // of a question beside the connection [ms]
 const LONGEST = 3_000 // between two attempts to connect [ms]
