@@ -116,10 +116,11 @@ def test_rows_are_complete(rows):
 
 
 def test_every_version_computes_the_same(rows):
-    errors = {(r["task"], r["variant"]): r["max_error_over_std"] for r in rows if r["max_error_over_std"] is not None}
-    for (task, variant), error in errors.items():
-        ill_conditioned = variant.startswith("gemm")
-        assert 0 <= error < (1e-5 if ill_conditioned else 1e-9), (task, variant)
+    compared = [r for r in rows if r["max_error_over_std"] is not None]
+    for r in compared:
+        ill_conditioned = r["variant"].startswith("gemm")
+        assert 0 <= r["max_error_over_std"] < (1e-5 if ill_conditioned else 1e-9), r
+    assert compared
 
 
 def test_stream_percentile_needs_enough_steps(rows):

@@ -86,7 +86,7 @@ def test_records_confirm_it() -> None:
         assert abs(np.mean(found) - expected[name][mode][target].rms ** 2) < 3.0 * standard_error, (name, mode, target)
 
 
-@pytest.mark.parametrize("name", ["gpr-online", "butterworth-ol", "ridge"])
+@pytest.mark.parametrize("name", ["gpr-online", "butterworth-ol", "ridge", "kf-coupled"])
 def test_no_other_observer_has_one(name: str) -> None:
     with pytest.raises(ValueError, match=f"{name}: the exact error is that of"):
         exact_errors(OBSERVERS[name], MATCHED)

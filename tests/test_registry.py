@@ -139,6 +139,31 @@ def test_a_scenario_made_before_has_the_settings_too() -> None:
     assert "'mine'" in done.stdout.splitlines()[1]
 
 
+EARLY = """
+import logging
+from dataclasses import replace
+from wfsobs.observers import OBSERVERS
+from wfsobs.settings import Group, Section
+
+class Own(Group):
+    "A group."
+
+OBSERVERS.add(replace(OBSERVERS["zero"], id="mine", label="Mine", settings={settings}))
+from wfsobs.scenario import Scenario
+print("mine" in OBSERVERS, list(Scenario.settings())[:2])
+"""
+
+
+@pytest.mark.parametrize(
+    ("settings", "is_kept"), [('"kalman"', True), ('"no_group"', False), ('Section("turbulence", "Turbulence", Own)', False)]
+)
+def test_what_is_registered_before_the_scenario_is_there_is_checked_when_it_is(settings: str, is_kept: bool) -> None:
+    done = subprocess.run([sys.executable, "-c", EARLY.format(settings=settings)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == f"{is_kept} {list(Scenario.settings())[:2]}"
+    assert ("is left out" in done.stderr) != is_kept
+
+
 def test_groups_of_our_own_stand_in_the_order_of_the_registry() -> None:
     names = [s.name for s in sections().values()]
     assert names == ["multipeak", "adaptive", "multirate", "gp", "gpr_offline", "gpr_online"]

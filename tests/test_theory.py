@@ -41,6 +41,22 @@ def predictions(scenario: Scenario, target: str, theory: Theory | None = None, *
     return {p.observer: p for p in (theory or Theory()).predict(scenario, 0, target, **options)}
 
 
+def test_a_response_follows_the_time_step() -> None:
+    """A band filter has the same prior, settings and number of frequencies at another rate."""
+    theory, of = Theory(most=2**14), {"observers": ["butterworth-cl"]}
+    predictions(RIGHT, "vibration", theory, **of)
+    slower = RIGHT.replace({"sensors.lgs_rate": 0.8 * RIGHT.sensors.lgs_rate})
+    kept, fresh = (predictions(slower, "vibration", it, **of) for it in (theory, Theory(most=2**14)))
+    # a response is cut off where a millionth of it is left
+    assert kept["butterworth-cl"].rms == pytest.approx(fresh["butterworth-cl"].rms, rel=1e-6)
+
+
+def test_observers_of_the_lgs_need_no_spectra_of_the_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wfsobs.evaluation.exact_errors.ngs_frames", None)
+    found = predictions(RIGHT, "vibration", observers=["kf-lgs", BOUND])
+    assert found.keys() == {TRUTH, "kf-lgs", BOUND} and found["kf-lgs"].rms > found[BOUND].rms > 0.0
+
+
 class TestRms:
     @pytest.mark.parametrize("target", TARGETS)
     def test_of_the_right_model_is_that_of_the_riccati_equation(self, target: str) -> None:

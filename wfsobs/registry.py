@@ -174,6 +174,8 @@ def sections() -> Mapping[str, Section]:
 
 def announce(tree: type[Group]) -> None:
     """Have the settings of entries fit the tree of all settings; those of packages that do not are logged and left out."""
+    for name in [name for name in _SECTIONS if hasattr(tree, name)]:  # taken by the tree, before there was one to ask
+        del _SECTIONS[name]
     _TREES.append(tree)
     for registry in _REGISTRIES.values():
         registry.review()

@@ -12,6 +12,7 @@ from tests.records import short
 from wfsobs import PRESETS, simulate
 from wfsobs.evaluation.calibration import calibration
 from wfsobs.execution import run_observer
+from wfsobs.observers.gpr.adaptive import schedule_of
 from wfsobs.observers.gpr.learning import (
     RATIOS,
     factor_of,
@@ -261,3 +262,21 @@ def test_it_is_about_as_sure_as_it_may_be() -> None:
             shares.append((found.within_68, found.within_95))
     low, high = np.mean(shares, axis=0)
     assert 0.62 < low < 0.80 and 0.91 < high < 0.99
+
+
+def test_between_two_times_of_learning_it_is_a_fixed_filter_of_whitened_measurements() -> None:
+    """Oracle: the windows of the record by themselves, learnt, whitened and convolved with the weights."""
+    scenario = PRESETS["paper"]().replace({"run.duration": 2.5, "adaptive.window": 1.0})
+    record, a = simulate(scenario), scenario.adaptive
+    got = run_observer("gpr-adaptive", record, scenario)["vibration"][:, 0]
+    s, delay, z = schedule_of(a, record.dt), record.delay, record.z[:, 0]
+    want, last = np.full(record.n_steps, np.nan), nothing_learnt(s.depth)
+    z = z[delay:]
+    for now in range(s.first, len(z), s.interval):
+        start, stop = max(now - s.longest, 0), min(now + s.interval, len(z))
+        last = learn(z[start:now], record.dt, s.depth, a.peak_count, a.lowest, last)
+        x = PeriodicFilter([last.whitener]).run((z[start:stop] - last.mean)[:, None, None], since=now - start - s.depth + 1)
+        want[delay + now : delay + stop] = np.convolve(x[:, 0, 0], last.weights, "valid")
+    assert np.nanstd(want) > 1e-3, "the vibration of the paper has 10 nm"
+    # sums in another order, and the condition of the kernel
+    np.testing.assert_allclose(got, want, rtol=0.0, atol=1e-9 * np.nanstd(want))

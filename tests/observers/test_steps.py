@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
@@ -60,9 +61,16 @@ def with_gaps(preset: str) -> tuple[Record, Scenario]:
     return replace(record, y_lgs=y, u=u, y_ngs=ngs), scenario.before_events
 
 
+def whole(preset: str) -> tuple[Record, Scenario]:
+    """A record in which nothing is missing: filters run over it at once."""
+    record, scenario = short(preset)
+    return record, scenario.before_events
+
+
+@pytest.mark.parametrize("record_of", [whole, with_gaps])
 @pytest.mark.parametrize(("name", "preset"), third_of_pairs(STEPS, PRESETS))
-def test_steps_are_the_run_over_the_record(name: str, preset: str) -> None:
-    record, scenario = with_gaps(preset)
+def test_steps_are_the_run_over_the_record(name: str, preset: str, record_of: Callable[[str], tuple[Record, Scenario]]) -> None:
+    record, scenario = record_of(preset)
     try:
         given = arguments(OBSERVERS[name], record, scenario)
         is_given = has_prior(OBSERVERS[name], scenario)

@@ -22,7 +22,6 @@ from wfsobs.settings.tree import leaves
 if TYPE_CHECKING:
     import pyarrow
 
-    from wfsobs.campaign.plan import Campaign
     from wfsobs.typing import Array
 
 HELD = 20_000

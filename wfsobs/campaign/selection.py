@@ -49,7 +49,7 @@ class PlanAxis:
     @property
     def is_numeric(self) -> bool:
         """Whether the values are numbers."""
-        return self.is_binned or all(_is_number_of_axes(v) for v in self.values)
+        return self.is_binned or all(_is_number(v) for v in self.values)
 
 
 def plan_axes(plan: Campaign) -> list[PlanAxis]:
@@ -62,7 +62,7 @@ def plan_axes(plan: Campaign) -> list[PlanAxis]:
 
 def _axis(path: str, of_cell: Sequence[Any]) -> PlanAxis:
     values = list({repr(value): value for value in of_cell}.values())
-    is_numeric = all(map(_is_number_of_axes, values))
+    is_numeric = all(map(_is_number, values))
     if not is_numeric or len(values) <= MOST_VALUES:
         values = sorted(values) if is_numeric else values
         order = {repr(value): i for i, value in enumerate(values)}
@@ -72,10 +72,6 @@ def _axis(path: str, of_cell: Sequence[Any]) -> PlanAxis:
     _, bins = np.unique(np.searchsorted(edges, x), return_inverse=True)
     spans = tuple((float(x[bins == i].min()), float(x[bins == i].max())) for i in range(bins.max() + 1))
     return PlanAxis(path, spans, True, bins)
-
-
-def _is_number_of_axes(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 NOT_SET = "-"

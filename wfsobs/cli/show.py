@@ -70,11 +70,11 @@ def score_table(rows: Sequence[Row]) -> Table:
             f"{error * 1e3:.2f}",
             interval_text(interval, 1e3),
             *(("-" if above is None else f"{100.0 * above:+.0f} %" if above else "at",) if bounded else ()),
-            *((_number(same, "sd_um", 1e3, 2),) if stated else ()),
+            *((median_text(same, "sd_um", 2, 1e3),) if stated else ()),
             f"{median(r['truth_rms_um'] for r in same) * 1e3:.2f}",
-            _number(same, "normalised_rms", 1.0, 3),
-            _number(same, "lag_s", 1e3, 2),
-            _number(same, TIME, 1.0, 2),
+            median_text(same, "normalised_rms", 3),
+            median_text(same, "lag_s", 2, 1e3),
+            median_text(same, TIME, 2),
         )
     return table
 
@@ -106,7 +106,8 @@ def _caption(rows: Sequence[Row]) -> str:
     return f"Scored: {spans.pop()}" if spans else ""
 
 
-def _number(same: Sequence[Row], key: str, scale: float, digits: int) -> str:
+def median_text(same: Sequence[Row], key: str, digits: int, scale: float = 1.0) -> str:
+    """Write the median of a number over the rows that have it; "-" where none has."""
     values = [r[key] * scale for r in same if r[key] is not None]
     return f"{median(values):.{digits}f}" if values else "-"
 
@@ -125,9 +126,7 @@ def _order(rows: Sequence[Row]):
 
 def budget_table(budgets: Sequence[Budget]) -> Table:
     """Return the table of terms, their shares of the total, and the bound; the smallest error of a target and mode first."""
-    out = Table(
-        title="Error budget: parts of the mean square error, nm^2, and their shares", caption=_caption_of_budget_table(budgets)
-    )
+    out = Table(title="Error budget: parts of the mean square error, nm^2, and their shares", caption=_reasons(budgets))
     for name in ("Target", "Mode", "Observer"):
         out.add_column(name, no_wrap=True)
     for name in ("error, nm", "nm^2", *TERMS.values(), "limit, nm^2"):
@@ -137,9 +136,7 @@ def budget_table(budgets: Sequence[Budget]) -> Table:
         if last not in (None, (it.target, it.mode)):
             out.add_section()
         last = (it.target, it.mode)
-        cells = (
-            f"{_number_of_budget_table(it.terms[name] * 1e6)} {round(100.0 * it.terms[name] / it.total):4d} %" for name in TERMS
-        )
+        cells = (f"{_one_digit(it.terms[name] * 1e6)} {round(100.0 * it.terms[name] / it.total):4d} %" for name in TERMS)
         bound = "-" if it.bound is None else f"{it.bound * 1e6:.1f}"
         out.add_row(*last, row_label(it.observer), f"{sqrt(it.total) * 1e3:.2f}", f"{it.total * 1e6:.1f}", *cells, bound)
     return out
@@ -149,13 +146,13 @@ def _mode_order(budgets: Sequence[Budget], budget: Budget) -> int:
     return list(dict.fromkeys(b.mode for b in budgets)).index(budget.mode)
 
 
-def _caption_of_budget_table(budgets: Sequence[Budget]) -> str:
+def _reasons(budgets: Sequence[Budget]) -> str:
     """Return which observers have no budget, and why."""
     missing = dict.fromkeys((row_label(b.observer), b.reason) for b in budgets if b.reason)
     return "; ".join(f"{label}: none, {reason}" for label, reason in missing)
 
 
-def _number_of_budget_table(x: float) -> str:
+def _one_digit(x: float) -> str:
     """One digit, without the sign of what rounds to zero."""
     return f"{round(x, 1) + 0.0:.1f}"
 

@@ -23,6 +23,7 @@ from wfsobs.cli.recovery_tables import OverTime
 from wfsobs.cli.show import (
     add_budgets,
     find_budgets,
+    median_text,
     progress_bar,
     show,
     show_budgets,
@@ -80,12 +81,12 @@ def loop_table(rows: Sequence[Row]) -> Table:
             same[0]["needs"],
             shown,
             *((interval_text(seeds_interval(np.array(left)), 1.0),) if several else ()),
-            _number(same, "residual_rms_mas", 3),
-            _number(same, "strehl", 4),
-            linear(same, _number(same, "predicted_rms_nm", 2)),
-            _number(same, "gain", 3),
+            median_text(same, "residual_rms_mas", 3),
+            median_text(same, "strehl", 4),
+            linear(same, median_text(same, "predicted_rms_nm", 2)),
+            median_text(same, "gain", 3),
             linear(same, _margins(same[0])),
-            linear(same, _number(same, "delay_margin_ms", 2)),
+            linear(same, median_text(same, "delay_margin_ms", 2)),
             _share(same),
         )
     if any(r["limited"] for r in rows):
@@ -102,11 +103,6 @@ def _share(same: Sequence[Row]) -> str:
 def _margins(row: Row) -> str:
     gain, phase = row["gain_margin_db"], row["phase_margin_deg"]
     return "-" if phase is None else f"{'-' if gain is None else f'{gain:.1f}'} dB, {phase:.0f}°"
-
-
-def _number(same: Sequence[Row], key: str, digits: int) -> str:
-    values = [r[key] for r in same if r[key] is not None]
-    return f"{median(values):.{digits}f}" if values else "-"
 
 
 def _order(rows: Sequence[Row]):

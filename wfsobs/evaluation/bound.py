@@ -43,7 +43,17 @@ from scipy.special import diric
 from scipy.stats import chi2
 
 from wfsobs.evaluation.rows import JOINT_BOUNDS
-from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, BOUND_STARS, BOUNDS, COMMON_BOUNDS, SCORED, Score
+from wfsobs.evaluation.scores import (
+    BOUND,
+    BOUND_ASTERISM,
+    BOUND_BOTH,
+    BOUND_MODES,
+    BOUND_STARS,
+    BOUNDS,
+    COMMON_BOUNDS,
+    SCORED,
+    Score,
+)
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, TURBULENCE
 from wfsobs.observers.estimates import TOTAL
@@ -179,14 +189,20 @@ def bound(scenario: Scenario, *, information: str = "lgs", ahead: float = 0, mod
 
     Returns
     -------
-    list of dict
-        Per mode: target -> error; "total" is that of turbulence and vibration together.
+    list of dict of str to PeriodicError
+        Per mode: target -> variance at every step of the cycle of an NGS frame [um^2], whose `rms` is in um; "total" is that of
+        turbulence and vibration together.
 
     Raises
     ------
     ValueError
-        The spectra of the scenario are not known, or there is no such information in it: its modes are independent, or all LGS
-        see the same.
+        The spectra of the scenario are not known, or there is no such information in it: its modes are independent ("modes",
+        "both-modes"), or all LGS see the same ("asterism").
+
+    Notes
+    -----
+    The causal Wiener filter by spectral factorisation (Oppenheim and Schafer, Discrete-Time Signal Processing, section 13.6); of
+    all modes together the Kalman filter of the whole model.
 
     See Also
     --------
@@ -205,7 +221,7 @@ def bound(scenario: Scenario, *, information: str = "lgs", ahead: float = 0, mod
         raise ValueError("no bound: the spectra of this scenario are not known, or events change them")
     row, chosen = INFORMATION[information], range(len(scenario.modes)) if modes is None else modes
     if row in ALONE:
-        found = _least_together(scenario, row, ahead)
+        found = _least_together(scenario.replace({"run.seed": 0}), row, ahead)
         return [dict(found[mode]) for mode in chosen]
     if ahead != int(ahead):
         raise ValueError(f"ahead = {ahead:g}: takes whole steps where every mode is by itself")
@@ -340,14 +356,24 @@ def exposure_response(ratio: int, size: int) -> Complex:
 # ---------------------------------------------------------------------- all modes together
 
 
+def _raise_threshold() -> None:
+    """Have the C library keep the memory of arrays.
+
+    That of Linux returns every array to the system that is larger than any freed before. One of a few MB after the other is then
+    cleared page by page, which takes as long as the computations.
+    """
+    np.empty(FREED, dtype=np.uint8)
+
+
 @lru_cache(maxsize=4)
-def _least_together(scenario: Scenario, row: str, ahead: float = 0) -> list[Errors]:
+def _least_together(scenario: Scenario, row: str, ahead: float) -> list[Errors]:
     """Return the minimum errors of every mode from the measurements of all modes; row : of ALONE."""
-    of_stars = row == INFORMATION["asterism"]
+    _raise_threshold()
+    of_stars = row == BOUND_ASTERISM
     if not of_stars and not are_coupled(scenario):
         raise ValueError("the modes of this scenario are independent: the bound of each is its own")
     true = scenario.replace({**TRUE_MODEL, "multipeak.line_width": line_width(scenario)})
-    if row == INFORMATION["modes"]:
+    if row == BOUND_MODES:
         coupled = CoupledModel(prior_of(true, None, (Lines, Flow)), true.multipeak, MEANS)
         variance = {target: coupled.plan(ahead, target)[1][None] ** 2 for target in (*TARGETS, TOTAL)}
     else:
@@ -431,13 +457,10 @@ def record_bounds(scenario: Scenario, record: Record, observers: Collection[str]
     """
     if not has_known_spectra(scenario):
         return []
-    # The C library of Linux returns every array to the system that is larger than any freed before. One of a few MB after the
-    # other is then cleared page by page, which takes as long as the computations.
-    np.empty(FREED, dtype=np.uint8)
     plain = scenario.replace({"run.seed": 0})
     rows = [dict(of_mode) for of_mode in _least_of_modes(plain, record.n_modes, record.n_steps)]
     for row in (JOINT_BOUNDS[observer] for observer in joint_observers(scenario, observers)):
-        for of_mode, together in zip(rows, _least_together(plain, row), strict=True):
+        for of_mode, together in zip(rows, _least_together(plain, row, 0), strict=True):
             alone = of_mode.get(ALONE[row], together)  # no number of means is enough for a narrow line, or for a continuum
             lesser = {name: it if it.rms <= alone[name].rms else alone[name] for name, it in together.items()}
             of_mode[row] = {name: PeriodicError(it.variance) for name, it in lesser.items()}
@@ -457,6 +480,7 @@ def joint_observers(scenario: Scenario, observers: Collection[str]) -> list[str]
 @lru_cache(maxsize=4)  # no seed changes them, and they take longer than most observers
 def _least_of_modes(scenario: Scenario, n_modes: int, n_steps: int) -> list[dict[str, Errors]]:
     """Compute row -> errors of the first modes of a scenario, each by itself."""
+    _raise_threshold()
 
     def of_mode(mode: int) -> dict[str, Errors]:
         rows = (*COMMON_BOUNDS, BOUND_STARS) if stars_differ(scenario, mode) else COMMON_BOUNDS

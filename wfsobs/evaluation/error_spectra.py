@@ -254,14 +254,15 @@ class Theory:
         return self._keep(f"response {name}, {target}", key, lambda: over_cycle(taps, n))
 
     def _prior(self, observer: Observer, scenario: Scenario, mode: int) -> Prior:
-        parts, air = observer.parts(observer_settings(observer, scenario)), self._air(scenario, mode)
-        of, seen, slow = (scenario, mode, scenario.dt), self._key("air"), dict[str, Any]()
+        parts, of, slow = observer.parts(observer_settings(observer, scenario)), (scenario, mode, scenario.dt), dict[str, Any]()
+        seen, air = self._results["air"]  # of the spectra, made before
         if self.most is None:  # fits with all frequencies start from none before
             self._fits.clear()
         fits = self._fits.setdefault(mode, Ar3Fits())
-        # The vibration, too, where it moves the best weights of the LGS.
-        mean, k = scenario.sensors.lgs_combination == MEAN, scenario.kalman
-        key = seen, _groups(scenario, "kalman", "multipeak", *([] if mean else ["vibration"]))
+        key, k = None, scenario.kalman
+        if Beams in parts or LgsError in parts:  # the vibration, too, where it moves the best weights of the LGS
+            mean = scenario.sensors.lgs_combination == MEAN
+            key = seen, _groups(scenario, "kalman", "multipeak", *([] if mean else ["vibration"]))
         if Beams in parts:
             slow["beams"] = (self._keep("beams", key, lambda: beams_of(*of, air, fits)),)
             slow["lines"] = (lines_of(scenario, mode, turbulence=()),)  # that of the beams is in these

@@ -23,6 +23,8 @@ spectral matrix of s, z and y at w. (Bittanti and Colaneri, Periodic Systems, 20
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,6 +37,7 @@ from wfsobs.priors_from.scenario import observer_settings, prior_of
 from wfsobs.progress import QUIET
 from wfsobs.record import Measurements
 from wfsobs.scenario import Scenario
+from wfsobs.signal.slow_sensor import SlowSensor
 from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean, square
 from wfsobs.simulation.true_spectra import TrueSpectra, true_spectra
 from wfsobs.typing import Array
@@ -46,42 +49,68 @@ SHORTEST = 2**11
 """Steps of the first look at a response; each next one is twice as long."""
 
 START = 1000
-"""Steps before the first impulse: windows are full and gains are those that repeat."""
+"""Steps before the first impulse where there are frames of the NGS: gains are those that repeat."""
 
 
 class SensorResponse(NamedTuple):
-    """SensorResponse of an estimate to both sensors.
+    """Response of an estimate to the LGS and to the frames of the NGS.
 
     fast, slow : h_p of z and g_p of the frames, (ratio, length); of an observer of the LGS alone (1, length), and None. Or their
         transforms c_l and d_l, (ratio, n // 2 + 1)
     """
 
-    fast: Any
-    slow: Any = None
+    fast: Array | Complex
+    slow: Array | Complex | None = None
 
 
-class TargetSpectra(NamedTuple):
+@dataclass(frozen=True)
+class TargetSpectra:
     """Spectra of a target and of the measurements, all (n // 2 + 1,) [um^2 per sample].
 
-    signal, z, frames : of s, z and the NGS with the noise of a frame;  by_z, by_frames : cross spectra of s with these
-    frames_by_z       : cross spectrum of the NGS with z
+    Those of the NGS are computed when an observer needs them.
+
+    Attributes
+    ----------
+    signal, z, by_z : Array
+        Of s and z, and the cross spectrum of s with z.
+    ngs_cross : Complex
+        Cross spectrum of s with the NGS before its exposure.
+    spectra : TrueSpectra
+        Of the mode.
     """
 
     signal: Array
     z: Array
-    frames: Array
     by_z: Complex
-    by_frames: Complex
-    frames_by_z: Complex
+    ngs_cross: Complex
+    spectra: TrueSpectra
+
+    @cached_property
+    def _ngs(self) -> tuple[SlowSensor, Complex]:
+        return ngs_frames(self.spectra)
+
+    @cached_property
+    def frames(self) -> Array:
+        """Spectrum of the NGS with the noise of a frame."""
+        return self._ngs[0].spectrum + self._ngs[0].noise
+
+    @property
+    def frames_by_z(self) -> Complex:
+        """Cross spectrum of the NGS with z."""
+        return self._ngs[0].cross
+
+    @cached_property
+    def by_frames(self) -> Complex:
+        """Cross spectrum of s with the NGS."""
+        return self.ngs_cross * self._ngs[1].conj()
 
 
 def target_spectra(spectra: TrueSpectra, target: str) -> TargetSpectra:
     """Return the spectra of a target, or of all together for TOTAL, and of both sensors."""
-    ngs, (frames, exposure) = spectra.ngs, ngs_frames(spectra)
-    names = [target] if target in spectra.signal else list(spectra.signal)
-    signal, cross, seen = (np.sum([of[name] for name in names], axis=0) for of in (spectra.signal, spectra.cross, ngs.cross))
-    by_frames, noisy = seen * exposure.conj(), frames.spectrum + frames.noise
-    return TargetSpectra(signal, spectra.measurement, noisy, advance_spectrum(cross, 1), by_frames, frames.cross)
+    names = list(spectra.signal) if target == TOTAL else [target]
+    sums = (reduce(np.add, [of[name] for name in names]) for of in (spectra.signal, spectra.cross, spectra.ngs.cross))
+    signal, cross, ngs_cross = sums
+    return TargetSpectra(signal, spectra.measurement, advance_spectrum(cross, 1), ngs_cross, spectra)
 
 
 def impulse_responses(
@@ -120,7 +149,7 @@ def impulse_responses(
     """
     has_frames = "ngs" in observer.sensors
     ratio = ratio if has_frames else 1
-    start, longest = -(-START // ratio) * ratio, most // ratio * ratio
+    start, longest = -(-(START if has_frames else 1) // ratio) * ratio, most // ratio * ratio
     length = min(-(-first // ratio) * ratio, longest)
     while True:
         at = [start + i * (length + ratio) + i % ratio for i in range(ratio + has_frames)]  # the last in a frame
@@ -157,13 +186,14 @@ def cycle_spectra(response: SensorResponse, sensors: TargetSpectra) -> tuple[Arr
     What moves to a frequency between those of the DFT is at the nearest one.
     """
     ratio, n = len(response.fast), 2 * (sensors.z.size - 1)
+    pairs = list(zip(response.fast, [None] * ratio if response.slow is None else response.slow, strict=True))
+    if ratio == 1:
+        power = _estimate_power(*pairs[0], sensors)
+        return power, power + _rest_of_error(*pairs[0], sensors)
     out = np.zeros((2, 2 * n))
-    for wave, c in enumerate(response.fast):
-        d = None if response.slow is None else response.slow[wave]
+    for wave, (c, d) in enumerate(pairs):
         power = _estimate_power(c, d, sensors)
         parts = np.stack([power, power + _rest_of_error(c, d, sensors) if wave == 0 else power])
-        if ratio == 1:
-            return parts[0], parts[1]
         shift = round(wave * n / ratio)
         parts[:, [0, -1]] *= 0.5  # these are their own at negative frequencies
         out[:, shift : shift + parts.shape[1]] += parts
@@ -227,24 +257,26 @@ def exact_errors(
     for mode, known in enumerate(spectra or [true_spectra(scenario, mode) for mode in range(len(scenario.modes))]):
         prior, ratio = prior_of(scenario, None, observer.parts(settings), modes=[mode]), known.ngs.ratio
         taps = impulse_responses(observer, prior, settings, scenario.dt, ratio, known.measurement.size, left=EXACT)
-        of = {target: (h, 0.0 * h if g is None else g) for target, (h, g) in taps.items()}
-        if len(of) > 1:
-            of[TOTAL] = tuple(np.sum([*of.values()], axis=0))
-        variances = {target: variance_of(*pair, target, known) for target, pair in of.items()}
+        if len(taps) > 1:
+            taps[TOTAL] = SensorResponse(*(np.sum(h, axis=0) for h in zip(*taps.values(), strict=True) if h[0] is not None))
+        variances = {target: variance_of(*pair, target, known) for target, pair in taps.items()}
         out.append({target: PeriodicError(np.repeat(x, ratio // x.size)) for target, x in variances.items()})
     return out
 
 
-def variance_of(fast: Array, slow: Array, target: str, spectra: TrueSpectra) -> Array:
-    """Return the variance of the error [um^2] at every place in the cycle, (ratio,); fast, slow : h_p, g_p (ratio, length)."""
+def variance_of(fast: Array, slow: Array | None, target: str, spectra: TrueSpectra) -> Array:
+    """Return the variance of the error [um^2] at every place in the cycle, (ratio,); fast, slow : h_p, g_p (ratio, length).
+
+    slow : None for an observer of the LGS alone
+    """
     known = spectra.without_lines
     sensors = target_spectra(known, target)
-    out = [
-        circle_mean(_estimate_power(c, d, sensors) + _rest_of_error(c, d, sensors))
-        for c, d in (np.fft.rfft(pair, known.n) for pair in zip(fast, slow, strict=True))
-    ]
+    pairs = zip(np.fft.rfft(fast, known.n), [None] * len(fast) if slow is None else np.fft.rfft(slow, known.n), strict=True)
+    out = [circle_mean(_estimate_power(c, d, sensors) + _rest_of_error(c, d, sensors)) for c, d in pairs]
     for frequency, variance in spectra.pure:
         turn = np.exp(-2j * np.pi * frequency * np.arange(fast.shape[1]))
-        seen = spectra.gain * turn[1] * (fast @ turn) + turn[1 : spectra.ngs.ratio + 1].mean() * (slow @ turn)
+        seen = spectra.gain * turn[1] * (fast @ turn)
+        if slow is not None:
+            seen = seen + turn[1 : spectra.ngs.ratio + 1].mean() * (slow @ turn)
         out += variance * np.abs((target != TURBULENCE) - seen) ** 2
     return np.array(out)

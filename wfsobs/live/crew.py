@@ -95,7 +95,7 @@ class Crew(Generic[D, M]):
                 self._swap(name, member, design)
             except StepError as error:
                 self._waiting[name] = design
-                self._say(LiveEvent(number, f"{error}: restarted"))
+                self._say(LiveEvent(number, "{} restarted", name, f": {error}"))
             else:
                 self._say(LiveEvent(number, "{} has a new design", name))
 

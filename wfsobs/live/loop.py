@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from math import isnan
 from threading import Event, Lock, Thread
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from weakref import ReferenceType, finalize, ref
 
 import numpy as np
@@ -35,10 +35,6 @@ from wfsobs.settings.group import SettingError
 from wfsobs.stepping import sampling_of
 from wfsobs.telemetry.records import save_record
 from wfsobs.typing import Array
-
-if TYPE_CHECKING:
-    from wfsobs.live.loop import LiveLoop
-    from wfsobs.live.processes import LiveProcesses
 
 MISSING = 0.01
 """Part of the frames of a second that may be missing."""
@@ -392,8 +388,9 @@ class LiveLoop:
         if (line := self._processes.failure()) or self._processes.observers_are_alive:
             return line
         self.tend()
-        events = [*(event for event in self.events if event.kind == FAILURE), *list(self.events)[-1:]]
-        return events[0].line if events else "the processes of the loop have ended"
+        events = list(self.events)  # others may append
+        last = [*(event for event in events if event.kind == FAILURE), *events[-1:]]
+        return last[0].line if last else "the processes of the loop have ended"
 
     def stop(self) -> None:
         """End the processes and give the memory back."""

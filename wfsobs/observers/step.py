@@ -135,7 +135,7 @@ def run_frames(estimator: Any, targets: Sequence[str], measurements: Measurement
     for frame in each_frame(estimator, measurements, watch):
         estimator.advance(*frame)
         now, spread = estimate() if estimate else np.array([estimator.predict(0.0, one) for one in targets]).swapaxes(0, 1)
-        values.append(now.copy())
+        values.append(now)
         sd.append(spread)
     if estimate:
         return Estimates(by_name(np.array(values)), by_name(np.array(sd)))

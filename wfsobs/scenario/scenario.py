@@ -224,9 +224,6 @@ class Scenario(Group):
                 )
 
 
-registry.announce(Scenario)
-
-
 @cache
 def _has_controllers() -> bool:
     """Return whether an installed package has controllers."""
@@ -266,3 +263,6 @@ def _validate_psd(psd: PsdTable, group: str) -> None:
     for name in ("tip", "tilt"):
         if len(getattr(psd, name)) != len(f):
             raise SettingError(f"{group}.psd.{name}: has {len(getattr(psd, name))} numbers, {group}.psd.frequency {len(f)}")
+
+
+registry.announce(Scenario)

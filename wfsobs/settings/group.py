@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeVar, cast
+from typing import Any, ClassVar, NamedTuple, Self, TypeVar, cast
 
 import param
 
@@ -16,9 +16,6 @@ from wfsobs.notebook import html_table
 from wfsobs.settings.errors import SettingError, shorten
 from wfsobs.settings.parameters import allowed_values, hint, settings_once
 from wfsobs.settings.tree import Plain, leaves, put_value, to_native
-
-if TYPE_CHECKING:
-    from wfsobs.settings.group import Group
 
 SHOWN = 3
 """Maximum number of settings in the representation of a group."""

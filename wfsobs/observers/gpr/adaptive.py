@@ -1,7 +1,7 @@
 """Adaptive Gaussian process regression: inputs, kernel and targets learnt from the record itself, again and again.
 
-The GPR of the paper is told bands, sees raw windows, and its targets online are causal band-passes, which lag and hold
-turbulence. This one is told nothing. `learning` has what it learns from the last seconds of z; between two times of learning it
+The GPR of the paper has given bands, sees raw windows, and its targets online are causal band-passes, which lag and hold
+turbulence. This one has no prior. `learning` has what it learns from the last seconds of z; between two times of learning it
 is a fixed filter of the whitened measurements. It learns after the estimate of a step, for those that follow: first from half of
 `adaptive.window`, and its window then grows to twice `adaptive.window`.
 """
@@ -19,14 +19,16 @@ from wfsobs.observers.gpr.learning import Learnt, learn, nothing_learnt
 from wfsobs.observers.kalman.adaptive import identification_settings
 from wfsobs.observers.kalman.window_model import ADAPTIVE, Adaptive, pack_spectrum, unpack_spectrum, window_lengths
 from wfsobs.observers.step import HeldEstimate, StepError, run_frames, whole_frames
-from wfsobs.observers.stepping import SampleHistory, Saved
+from wfsobs.observers.stepping import FilterBank, SampleHistory, Saved
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, RecordError, Sampling
-from wfsobs.signal.periodic import PeriodicFilter
+from wfsobs.signal.periodic import PeriodicFilter, Recursion
 from wfsobs.spectral.quick import SHORTEST
 from wfsobs.typing import Array
 
+ORDER = 4
+"""Maximum number of states of a whitener: two of the turbulence, and of a background where there is one."""
 SLOWER = 1.5
 """Time from learning to learning, over `adaptive.interval`: less often costs errors, more often processor time alone."""
 
@@ -59,7 +61,7 @@ class AdaptiveGprEstimator(HeldEstimate):
     Raises StepError where the horizon leaves too few targets.
     """
 
-    state_names = ("_samples", "_recent", "_states", "_mean", "_sd", "count")
+    state_names = ("_samples", "_recent", "_filters", "_mean", "_sd", "count")
 
     def __init__(self, settings: Adaptive, sampling: Sampling, horizon: int = 0):
         super().__init__(sampling.n_modes, float(horizon))
@@ -68,12 +70,13 @@ class AdaptiveGprEstimator(HeldEstimate):
         if horizon >= self.schedule.first // 4:
             raise StepError(f"gpr-adaptive: {horizon} frames ahead: takes less than an eighth of adaptive.window")
         n = sampling.n_modes
-        self._samples = SampleHistory(n, self.schedule.longest)
-        self._recent = np.zeros((n, self.schedule.depth))  # whitened, in a ring
-        self._states = np.zeros((n, 4))  # of the whiteners: turbulence, and a background where there is one
+        none = np.zeros((ORDER, ORDER)), np.zeros((ORDER, 1)), np.zeros((1, ORDER)), np.zeros((1, 1))
+        self._filters = FilterBank([Recursion([none])] * n)  # the whiteners
+        self._samples, self._recent = SampleHistory(n, self.schedule.longest), SampleHistory(n, self.schedule.depth)  # whitened
+        self._weights, self._means, self._sds = np.zeros((n, self.schedule.depth)), np.zeros(n), np.zeros(n)
         self.count, self._pending = 0, False
         self.learnt = [nothing_learnt(self.schedule.depth)] * n
-        self._whiteners = [one.whitener for one in self.learnt]
+        self._use()
         self.mark_start()
 
     def run(self, measurements: Measurements, watch: Watch) -> Estimates:
@@ -99,12 +102,9 @@ class AdaptiveGprEstimator(HeldEstimate):
 
     def _estimate(self, z: Array) -> None:
         """Whiten the samples z (n_modes,), and put their windows through the weights."""
-        self._recent[:, 1:] = self._recent[:, :-1].copy()
-        for mode, (one, (F, G, H, J)) in enumerate(zip(self.learnt, self._whiteners, strict=True)):
-            state, value = self._states[mode, : len(F)], z[mode] - one.mean
-            self._recent[mode, 0] = H[0] @ state + J[0, 0] * value
-            state[...] = F @ state + G[:, 0] * value
-            self._mean[mode], self._sd[mode] = one.weights @ self._recent[mode], one.sd
+        self._recent.push(self._filters.step((z - self._means)[:, None])[:, 0])
+        np.einsum("ij,ij->i", self._weights, self._recent.last(self.schedule.depth), out=self._mean)
+        self._sd[...] = self._sds
 
     def settle(self) -> None:
         """Learn, where the last frame ended an interval; estimates of the next frames are of it."""
@@ -112,18 +112,33 @@ class AdaptiveGprEstimator(HeldEstimate):
             return
         self._pending = False
         size = min(self.count - self.sampling.delay, self.schedule.longest)
-        s = self.settings
-        for mode, (last, z) in enumerate(zip(self.learnt, self._samples.last(size), strict=True)):
-            one = learn(z, self.sampling.dt, self.schedule.depth, s.peak_count, s.lowest, last, self._ahead)
-            self.learnt[mode], self._whiteners[mode] = one, one.whitener
-            self._whiten_past(mode, z - one.mean)
+        s, windows = self.settings, self._samples.last(size)
+        self.learnt = [
+            learn(z, self.sampling.dt, self.schedule.depth, s.peak_count, s.lowest, last, self._ahead)
+            for last, z in zip(self.learnt, windows, strict=True)
+        ]
+        self._use()
+        past = [self._whiten_past(mode, z - one.mean) for mode, (one, z) in enumerate(zip(self.learnt, windows, strict=True))]
+        self._recent.load({"newest": np.array(past)})
 
-    def _whiten_past(self, mode: int, z: Array) -> None:
-        """Take the new whitener of a mode through its window z (n,), from rest."""
-        F, G, H, J = self._whiteners[mode]
-        out = PeriodicFilter([(F, G, np.vstack([H, F]), np.vstack([J, G]))]).run(z[:, None, None])[:, :, 0]
-        self._recent[mode] = out[: -self.schedule.depth - 1 : -1, 0]
-        self._states[mode, : len(F)] = out[-1, 1:]
+    def _use(self) -> None:
+        """Take over what was learnt."""
+        for mode, one in enumerate(self.learnt):
+            F, G, H, J = one.whitener
+            order, filter_map = len(F), self._filters.maps[0][mode]
+            filter_map[...] = 0.0
+            filter_map[:order, :order], filter_map[:order, ORDER:] = F, G
+            filter_map[ORDER:, :order], filter_map[ORDER:, ORDER:] = H, J
+            self._weights[mode], self._means[mode], self._sds[mode] = one.weights[::-1], one.mean, one.sd
+
+    def _whiten_past(self, mode: int, z: Array) -> Array:
+        """Take the whitener of a mode through its window z (n,) from rest; return its last outputs, (depth,)."""
+        F, G, H, J = self.learnt[mode].whitener
+        whitener = PeriodicFilter([(F, G, np.vstack([H, F]), np.vstack([J, G]))])
+        out = whitener.run(z[:, None, None], since=len(z) - self.schedule.depth)[:, :, 0]
+        self._filters.x[mode] = 0.0
+        self._filters.x[mode, : len(F)] = out[-1, 1:]
+        return out[:, 0]
 
     def save(self) -> Saved:
         """Return a copy of the state: the window, what was learnt, and the states of the whiteners."""
@@ -143,7 +158,7 @@ class AdaptiveGprEstimator(HeldEstimate):
         self.learnt = [
             Learnt(unpack_spectrum(table, self.sampling.dt), mean, weights.copy(), sd) for table, (mean, sd), weights in packed
         ]
-        self._whiteners = [one.whitener for one in self.learnt]
+        self._use()
 
     def take_over(self, old: Any) -> None:
         """Go on from another design with the same windows, number of peaks and horizon. Raises StepError."""
