@@ -205,6 +205,10 @@ def made(rate: float, modes: Modes, scale: float, turbulent: bool, seed: int) ->
 )
 @example(rate=1000.0, modes=[[(0.97, 0.4, 30.0)]], scale=0.02, turbulent=True, seed=1, name="paper")  # a hump near half the rate
 @example(rate=100.0, modes=[[], []], scale=0.02, turbulent=True, seed=1, name="paper")  # bands beyond half the rate
+@example(  # a broad process that is found beyond half the rate
+    rate=137.5, modes=[[(1.095703125, 0.4, 14.125), (0.75, 0.0, 1.0), (0.7234266661676317, 0.02, 11.5)]],
+    scale=0.02, turbulent=False, seed=23910, name="paper",
+)  # fmt: skip
 @example(rate=25.0, modes=[[], []], scale=0.02, turbulent=True, seed=1, name="paper")  # all of them
 def test_whatever_is_written_loads_and_runs(
     tmp_path: Path, rate: float, modes: Modes, scale: float, turbulent: bool, seed: int, name: str

@@ -457,6 +457,8 @@ def is_continuum(spectrum: Spectrum, p: Ar2 | Ar3, lowest: float) -> bool:
         return True
     if p.damping <= BROAD:
         return False
+    if (1.0 - p.damping) * f0 >= 0.5 / p.dt:  # beyond half the rate nothing can be seen
+        return True
     f = np.linspace(max(1.0 - 3.0 * p.damping, 0.1) * f0, min((1.0 + p.damping) * f0, 0.5 / p.dt), POINTS)
     S = spectrum.psd(f)
     near = np.flatnonzero(f >= (1.0 - p.damping) * f0)
