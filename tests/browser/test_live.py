@@ -175,7 +175,8 @@ def test_errors_of_both_targets_together(running: Page) -> None:
     table = page.get_by_role("region", name="Live")
 
     def of(name: str) -> Locator:
-        return table.get_by_role("row").filter(has_text=name).get_by_role("cell").first
+        row = table.get_by_role("row").filter(has=page.get_by_role("rowheader", name=name, exact=True))
+        return row.get_by_role("cell").first
 
     def known(name: str) -> float:
         expect(of(name)).to_have_text(re.compile(r"\d"))
@@ -183,10 +184,11 @@ def test_errors_of_both_targets_together(running: Page) -> None:
 
     # five seconds behind the start, at which filters settle; the table is of the second before at most
     expect(page.get_by_text(re.compile(r"real time · (8|9|\d\d+)\.\d s ·"))).to_be_visible()
-    bound = known("Theoretical limit, LGS and NGS")
-    for name in ("Multi-peak", "Multi-rate multi-peak"):
-        # Near the bound of endless records: five seconds scatter by a few per cent, more where a busy machine starts slowly.
-        eventually(page, lambda name=name: 0.8 * bound < known(name) < 1.3 * bound)
+    # Bounds are those of endless records: five seconds scatter by a few per cent, and by a third where slow turbulence is most of
+    # the error, as without the natural star.
+    for name, of_bound, scatter in (("Multi-peak", "mean of the LGS", 2.0), ("Multi-rate multi-peak", "LGS and NGS", 1.3)):
+        bound = known(f"Theoretical limit, {of_bound}")
+        eventually(page, lambda name=name, bound=bound, scatter=scatter: bound / scatter < known(name) < bound * scatter)
     expect(of("Online GPR")).to_have_text("–")
     page.get_by_role("combobox", name="Errors of").click()
     page.get_by_role("option", name="Turbulence", exact=True).click()

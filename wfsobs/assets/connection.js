@@ -104,7 +104,10 @@ class Link {
     if (this.connection || !this.ready) return
     if (this.asked === this.model.last_arrival) this.ticks = 0
     this.asked += 1
-    this.socket = socketOf(() => this.model.send_msg({ask: this.asked}))
+    const socket = socketOf(() => this.model.send_msg({ask: this.asked}))
+    // Whatever comes is a sign of life: a socket closed in the middle of a message leaves Bokeh waiting for the rest of it.
+    if (socket !== this.socket) socket?.addEventListener("message", () => { this.ticks = 0 })
+    this.socket = socket
   }
 
   // The connection stands, as far as one knows.
