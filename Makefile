@@ -49,7 +49,7 @@ test: setup  ## run all tests, then the tutorials, then those in a browser
 	$(BIN)/python -m pytest -n auto --dist loadfile tests/browser || status=1; \
 	exit $$status
 
-test-fast: $(TEST)  ## the quick tests alone: no dashboard, no report, none that takes long (tests/slow.txt)
+test-fast: $(TEST)  ## the quick tests alone: no dashboard, no report, none marked as slow
 	@$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow" tests wfsobs packages --ignore=tests/app --ignore=tests/report --ignore=wfsobs/app
 
 test-peers: $(PEERS:%=test-peer-%)  ## run the tests in pyRTC and HCIPy, each in an environment of its own (make test-peer-specula, test-peer-oopao, test-peer-soapy: in those)

@@ -1,4 +1,4 @@
-"""One BLAS thread, set before numpy is imported; tests that take long are marked as slow."""
+"""One BLAS thread, set before numpy is imported; a folder of records and an installed package that tests share."""
 
 import os
 import shutil
@@ -23,7 +23,6 @@ FOLDER = "WFSOBS_TEST_RECORDS"
 """Environment variable: the folder of this session's records, for `tests.records`."""
 
 HERE = Path(__file__).parent
-SLOW = tuple(line for line in (HERE / "slow.txt").read_text().splitlines() if line and not line.startswith("#"))
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -36,24 +35,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Do not even read the files of tests/slow.txt where what is slow is left out."""
-    if config.option.markexpr != "not slow" or HERE not in collection_path.parents:
+    """Do not import files that are slow as a whole where what is slow is left out."""
+    if config.option.markexpr != "not slow" or not collection_path.match("test_*.py"):
         return None
-    file = collection_path.relative_to(HERE).as_posix()
-    return file in SLOW or f"{file}/" in SLOW or None
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what tests/slow.txt names: whole files, or single tests with all their parameters."""
-    for item in items:
-        if HERE in item.path.parents:
-            file = item.path.relative_to(HERE).as_posix()
-            if (
-                file.startswith(tuple(s for s in SLOW if s.endswith("/")))
-                or file in SLOW
-                or (f"{file}::{getattr(item, 'originalname', item.name)}" in SLOW)
-            ):
-                item.add_marker(pytest.mark.slow)
+    return "\npytestmark = pytest.mark.slow\n" in collection_path.read_text(encoding="utf-8") or None
 
 
 @pytest.fixture(scope="session")

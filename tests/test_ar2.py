@@ -126,6 +126,7 @@ SAMPLED = [  # omega dt, damping: the paper's two, slow and fast extremes, criti
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("angle", "damping"), SAMPLED)
 def test_samples_are_stationary_from_the_first_step(angle: float, damping: float) -> None:
     """Over 6000 independent sequences of 12 steps: covariance of the steps 0, 1, 2 and 11 as in closed form."""

@@ -20,6 +20,8 @@ from wfsobs.observers.gpr.kernels import SquaredExponential
 from wfsobs.observers.gpr.online import predict_sliding
 from wfsobs.observers.gpr.trained import train
 
+pytestmark = pytest.mark.slow
+
 TINY = Sizes(
     settings={
         "run.warm_up": 0.1,

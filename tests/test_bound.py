@@ -84,6 +84,7 @@ def best_estimates(spectra: TrueSpectra, z: Array) -> dict[str, Array]:
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_the_best_observer_there_is_scatters_as_the_interval_says(case: str) -> None:
     s = BASE.replace(CASES[case])

@@ -152,6 +152,7 @@ def exact_errors(spectra: TrueSpectra, cycles: int, phase: int, ahead: int) -> d
     return dict(zip([*names, "total"], np.sqrt(left).tolist(), strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", RECORDS)
 def test_the_best_estimate_of_a_long_record_comes_near_from_above(case: str) -> None:
     spectra = true_spectra(SLOW_RATE.replace(RECORDS[case]), 0)
@@ -165,6 +166,7 @@ def test_the_best_estimate_of_a_long_record_comes_near_from_above(case: str) -> 
             assert least[name].phases[phase] == pytest.approx(endless, rel=2e-3 if case == "slow flow" else 1e-3), (name, phase)
 
 
+@pytest.mark.slow
 def test_regression_on_a_long_record_comes_near_from_above() -> None:
     """The synthesis, both sensors and the spectra together: 200 s to learn from, 200 s to be scored on."""
     scenario = SLOW_RATE.replace(
@@ -195,6 +197,7 @@ FIGURES = {
 """(preset, steps ahead) -> tip and tilt of lifted Wiener filters of 10 to 40 s, computed apart from this project [nm]."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("preset", "ahead"), FIGURES)
 def test_filters_of_many_seconds_come_near_from_above(preset: str, ahead: int) -> None:
     scenario = PRESETS[preset]()
@@ -234,6 +237,7 @@ def test_events_have_none_and_no_bound_is_best() -> None:
     assert {bound.row for bound in found} == set(COMMON_BOUNDS) and not can_be_best(BOUND_BOTH, False)
 
 
+@pytest.mark.slow
 def test_what_is_remembered_is_of_these_settings() -> None:
     scenario = PRESETS["paper"]().replace({"run.duration": 2.0})
     for changed in ({"run.seed": 7}, {"turbulence.wind_speed": 30.0}, {"sensors.lgs_noise": 0.01}, {"run.duration": 3.0}):

@@ -88,6 +88,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_the_best_estimate_of_a_long_record_comes_near_from_above(case: str) -> None:
     stars = star_spectra(ASTERISM.replace(CASES[case]), 0)
@@ -101,6 +102,7 @@ def test_the_best_estimate_of_a_long_record_comes_near_from_above(case: str) -> 
             assert found <= both[name].phases[phase]
 
 
+@pytest.mark.slow
 def test_regression_on_a_long_record_finds_the_same() -> None:
     """The synthesis, every star and the spectra together, on the last 0.4 s: 200 s to learn from, 200 s to be scored on."""
     s = ASTERISM.replace({"vibration.source": "none", "sensors.lgs_radius": 60.0})
@@ -143,6 +145,7 @@ def test_stars_that_see_the_same_tell_no_more_than_their_mean() -> None:
         assert least == pytest.approx(both[target], rel=1e-3), target
 
 
+@pytest.mark.slow
 def test_records_have_it_where_stars_differ() -> None:
     for changes, expected in (({}, True), ({"sensors.lgs_radius": 0.0}, False), ({"sensors.lgs_count": 1}, False)):
         s = ASTERISM.replace({**changes, "run.duration": 2.0})

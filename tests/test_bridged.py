@@ -21,6 +21,8 @@ from wfsobs.telemetry.intake import LONGEST, WINDOW, find_bridged, without_bridg
 from wfsobs.telemetry.records import load, save_record
 from wfsobs.typing import Array
 
+pytestmark = pytest.mark.slow
+
 SCENARIO = PRESETS["laser-dropout"]().replace(
     {
         "run.duration": 6.5,

@@ -67,6 +67,7 @@ SOON = {
 """What happens in these presets, in a record of 3 s."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["paper", "ut4", "galacsi-nfm", "lost-frames", "laser-dropout"])
 def test_the_terms_add_up_to_the_mean_square_error_of_the_table(preset: str) -> None:
     scenario = PRESETS[preset]().replace({"run.duration": 3.0, "events": SOON.get(preset, [])})
@@ -86,6 +87,7 @@ def test_a_filter_of_many_lines_adds_up_and_has_none_that_is_not_modelled() -> N
     assert max(abs(b.terms["lines"]) for b in found) < 1e-15
 
 
+@pytest.mark.slow
 def test_observers_that_are_not_linear_add_up_too_if_they_are_named() -> None:
     scenario = PRESETS["paper"]().replace(
         {"run.duration": 3.0, "gpr_offline.training_size": 100, "gpr_offline.depth": 60, "adaptive.window": 1.0}
@@ -110,6 +112,7 @@ def only(term: str, found: Iterable[Budget], least: float = 1.0 - 1e-9) -> None:
         assert all(abs(value) <= (1.0 - least + 1e-9) * it.total for name, value in it.terms.items() if name != term), it
 
 
+@pytest.mark.slow
 def test_noise_alone_is_noise_of_the_size_that_the_gain_gives() -> None:
     scenario = quiet(sensors__lgs_noise=0.02, sensors__ngs_noise=0.01, run__duration=100.0)
     found = budgets(scenario, *LINEAR[:4])
@@ -128,6 +131,7 @@ def test_the_slow_error_of_the_lgs_alone_is_cone_effect() -> None:
     only("cone", (b for b in budgets(quiet(sensors__lgs_low_frequency_rms=0.049, run__duration=3.0), "kf-lgs", "multirate")))
 
 
+@pytest.mark.slow
 def test_a_line_that_is_not_modelled_is_that() -> None:
     peak = [{"frequency": 20.0, "damping": 0.01, "rms": [0.02, 0.02]}]
     only("lines", budgets(quiet(vibration__source="peaks", vibration__peaks=peak, run__duration=3.0), "kf-lgs", "kf-ngs"))
@@ -235,6 +239,7 @@ def call(*arguments: str):
 SHORT = ("--set", "run.duration=1.5", "--set", "run.warm_up=0.5")
 
 
+@pytest.mark.slow
 def test_the_command_prints_a_table_and_adds_to_the_rows() -> None:
     out = call("run", *SHORT, "--budget-of", "kf-lgs")
     assert out.exit_code == 0 and "Error budget: parts of the mean square error" in out.stdout

@@ -53,6 +53,7 @@ def call(*arguments):
     return CliRunner().invoke(main, arguments, catch_exceptions=False)
 
 
+@pytest.mark.slow
 def test_json_is_nothing_but_the_rows_of_the_library():
     result = call("run", "--preset", "ut4", *QUICK, "--seeds", "2", "--set", "run.seed=4", "--json")
     assert result.exit_code == 0
@@ -64,6 +65,7 @@ def test_json_is_nothing_but_the_rows_of_the_library():
     assert got == [(s.observer, s.target, s.mode, s.rms, s.truth_rms) for s in expected.scores]
 
 
+@pytest.mark.slow
 def test_table_names_every_observer():
     result = call("run", *QUICK)
     assert result.exit_code == 0
@@ -77,6 +79,7 @@ def observed(result):
     return [row for row in json.loads(result.stdout) if row["observer"] not in BOUNDS]
 
 
+@pytest.mark.slow
 def test_observers_are_chosen_by_name_in_every_command_that_runs_them(tmp_path):
     """The rows are those of these observers and of the bounds."""
     names = ("--observer", "persistence", "--observer", "zero")
@@ -92,6 +95,7 @@ def test_observers_are_chosen_by_name_in_every_command_that_runs_them(tmp_path):
         assert (result.exit_code, result.stderr.count("\n")) == (2, 1) and "'nobody': no such observer" in result.stderr
 
 
+@pytest.mark.slow
 def test_a_saved_record_gives_the_same_numbers(tmp_path):
     record, estimates = tmp_path / "r.npz", tmp_path / "e.npz"
     first = call("run", *QUICK, "--json", "--save", str(record))
@@ -109,6 +113,7 @@ def test_a_saved_record_gives_the_same_numbers(tmp_path):
         assert {file[k].shape for k in keys} == {(2000, 2)}
 
 
+@pytest.mark.slow
 def test_observers_that_lack_something_are_left_out_with_a_line(tmp_path):
     simulated = wfsobs.simulate(paper().replace(SHORT))
     np.savez(tmp_path / "bare.npz", y_lgs=simulated.y_lgs, u=simulated.u, dt=simulated.dt)
@@ -132,6 +137,7 @@ def test_observers_that_lack_something_are_left_out_with_a_line(tmp_path):
         assert "kf-ngs/turbulence" not in file.files
 
 
+@pytest.mark.slow
 def test_the_record_overrides_the_scenario(tmp_path):
     """A record at 500 Hz with a frame every 4 steps is scored as such, whatever the preset says."""
     scenario = paper().replace(SHORT | {"sensors.lgs_rate": 500.0, "sensors.exposure_ratio": 4})
@@ -168,6 +174,7 @@ def test_errors_are_one_line_and_status_2(arguments, message, tmp_path, monkeypa
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_an_unstable_multirate_cycle_leaves_only_that_observer_out():
     weights = ("measurement_noise=manual", "lgs_noise=0.04", "ngs_noise=0.001")
     result = call("run", *QUICK, *(x for w in weights for x in ("--set", f"multirate.{w}")), "--json")
@@ -184,12 +191,14 @@ def test_presets_lists_and_prints():
     assert configfile.from_toml(call("presets", "ut4").stdout) == configfile.preset("ut4")
 
 
+@pytest.mark.slow
 def test_as_a_program():
     done = subprocess.run([sys.executable, "-m", "wfsobs", "run", "--set", "run.seed=-1"], capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "wfsobs: run.seed = -1: takes a whole number from 0 to 4294967295\n"
 
 
+@pytest.mark.slow
 def test_the_core_needs_numpy_scipy_and_param_alone():
     code = (
         "import sys\n"
@@ -208,6 +217,7 @@ def test_loop_takes_seeds_or_a_record():
     assert result.exit_code == 2 and result.stderr == "wfsobs: --seeds: only for simulated records, not with --record\n"
 
 
+@pytest.mark.slow
 def test_the_file_of_an_identification_is_all_that_telemetry_needs(tmp_path):
     """As a prior it gives what it gives as settings; who is told nothing is as without it."""
     record, found = str(tmp_path / "night.npz"), str(tmp_path / "found.toml")

@@ -25,6 +25,7 @@ def test_peaks_are_tables():
     assert text.count("[[vibration.peaks]]") == len(paper().vibration.peaks)
 
 
+@pytest.mark.slow
 @settings(deadline=None, derandomize=True, max_examples=50)
 @given(
     frequency=st.floats(0.01, 5000),

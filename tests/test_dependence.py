@@ -107,6 +107,7 @@ def same(one: Record, other: Record) -> bool:
 
 
 class TestSettingsWithoutEffect:
+    @pytest.mark.slow
     @pytest.mark.parametrize("name", SOURCES)
     def test_record_priors_and_bounds_stay(self, name: str) -> None:
         scenario = scenario_of(name)
@@ -152,6 +153,7 @@ def given(observer: Any, record: Record, scenario: Scenario) -> str:
         return str(error)
 
 
+@pytest.mark.slow
 def test_what_is_known_is_what_a_whole_run_gives() -> None:
     """Change every setting with an effect that the record does not depend on, one at a time."""
     memo, idle = Memo(), idle_settings(BASE)
@@ -173,6 +175,7 @@ def test_what_is_known_is_what_a_whole_run_gives() -> None:
     assert digest(record_bounds(told_otherwise, record)) == digest(record_bounds(BASE, record))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["ut4", "higher-orders"])
 def test_no_setting_of_a_preset_changes_an_estimate_that_is_known(preset: str) -> None:
     """Of the observers that a change may reach, those that do not run again have what a run of their own gives, bit by bit.

@@ -44,6 +44,7 @@ def follows(values: Array, poles: Array) -> bool:
     return np.abs(windows @ recursion).max() < 1e-8 * np.abs(values).max() * np.abs(recursion).sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("observer", "gain", "at"),
     [
@@ -62,11 +63,13 @@ def test_gains_are_first_answers(scenario: Scenario, told: Description, observer
     assert np.allclose(answer, told.filters[observer].gains[gain][[0, 2]][: answer.size], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_ngs_gain(scenario: Scenario, told: Description) -> None:
     answer = impulse_response("kf-ngs", scenario, 20, ngs=5)
     assert np.allclose(answer[5:10, 0], told.filters["kf-ngs"].gains["NGS"][0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("observer", "every"), [("kf-lgs", 1), ("kf-ngs", 5), ("multirate", 5), ("multirate-optimal", 5)])
 def test_poles_are_those_of_the_answer(scenario: Scenario, told: Description, observer: str, every: int) -> None:
     facts = told.filters[observer]
@@ -109,6 +112,7 @@ def test_edges() -> None:
     assert set(told.filters["multirate-optimal"].gains) == {"LGS with NGS", "NGS"}
 
 
+@pytest.mark.slow
 def test_sensors_by_themselves() -> None:
     """A coarse NGS on frozen flow takes the mean gradient for the tip, 166 nm off; AR(2) turbulence is seen as it is."""
     s = PRESETS["ut4"]().replace({"sensors.lenslets.ngs_subapertures": 2, "sensors.ngs_noise": 0.03})

@@ -105,6 +105,7 @@ def test_nothing_above_the_cutoff(cutoff: float, source: str) -> None:
     assert above.max() < 1e-30 and below.min() > 1e-12
 
 
+@pytest.mark.slow
 def test_a_gaussian_record_has_the_covariance_of_its_spectrum_and_does_not_repeat() -> None:
     """Over records: at every lag that of the resonance, at the last one too, where an inverse DFT of the record's own length has
     all but its variance."""
@@ -162,6 +163,7 @@ def test_pure_lines_keep_their_own_frequency_and_rms() -> None:
     assert vibration_variance(scenario({"vibration.peaks": lines}), 1) == pytest.approx(3 * 0.02**2, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_phases_of_lines_are_uniform_over_seeds() -> None:
     s = scenario({"vibration.peaks": [{"frequency": 25.0, "damping": 0.0, "rms": [1.0, 1.0]}]})
     starts = np.array([make_disturbance(s, 40, np.random.default_rng(seed)).vibration for seed in range(300)])
@@ -231,6 +233,7 @@ def test_every_source_has_its_shape(source: str) -> None:
 # ---------------------------------------------------------------------- random streams
 
 
+@pytest.mark.slow
 def test_modes_and_sources_are_independent() -> None:
     s = scenario({"vibration.cutoff": 500.0})
     runs = [make_disturbance(s, N, np.random.default_rng(seed)) for seed in range(30)]

@@ -35,6 +35,8 @@ from wfsobs.scenario.presets import PRESETS
 from wfsobs.streams.shared_image import SharedImage, stream_path
 from wfsobs.telemetry.formats.contents import Contents
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
 DOCS = ROOT / "docs"

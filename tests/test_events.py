@@ -28,6 +28,8 @@ from wfsobs.simulation.guide_stars import lgs_weights
 from wfsobs.simulation.loop import integrate_commands
 from wfsobs.telemetry.records import load_record, save_record
 
+pytestmark = pytest.mark.slow
+
 SHORT = {"run.duration": 3.0, "run.warm_up": 0.5, "gpr_online.training_size": 100, "gpr_offline.training_size": 100}
 
 

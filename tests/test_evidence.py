@@ -106,6 +106,7 @@ def test_rows_that_are_missing_or_apart_in_a_seed_say_nothing() -> None:
     assert set(found.errors) == {("kf-lgs", "vibration", "tip")}
 
 
+@pytest.mark.slow
 def test_the_verdict_over_seeds_has_their_mean_and_says_how_many() -> None:
     scenario = PRESETS["paper"]().replace({"run.duration": 3.0, "run.warm_up": 1.0})
     observers = ["kf-lgs", "kf-multi", "ridge-30", "zero"]

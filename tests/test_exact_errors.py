@@ -66,6 +66,7 @@ def test_a_line_is_left_as_the_filter_passes_it() -> None:
     assert added == pytest.approx(np.full(5, 0.04**2), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_records_confirm_it() -> None:
     """Twenty records of 10 s, most models wrong: mean square errors within three of their standard errors."""
     scenario = PRESETS["paper"]().replace({"vibration.synthesis": "gaussian", "loop.closed": False})

@@ -13,6 +13,8 @@ from typing import Any
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 SHORT = (
     *("--set", "run.duration=1.2", "--set", "run.warm_up=0.3", "--set", "adaptive.window=0.25"),

@@ -55,6 +55,7 @@ def test_the_integral_over_frequency_is_the_variance(changes: dict) -> None:
         assert np.sqrt(error) == pytest.approx(np.sqrt(lgs_error_variance(s, mode)), rel=0.02)
 
 
+@pytest.mark.slow
 def test_simulated_records_have_these_spectra() -> None:
     """Above the resolution of the estimate and below the noise's floor; a lone guide star off the axis sees the layer later."""
     s = FLOW.replace(
@@ -93,6 +94,7 @@ def test_true_spectra_carry_them() -> None:
     assert spectra.measurement.min() == pytest.approx(noise, rel=0.01), "beyond the knee there is nothing but noise"
 
 
+@pytest.mark.slow
 def test_on_frozen_flow_a_third_order_model_is_within_a_tenth_of_the_bound() -> None:
     """Second order is not: its filter takes too much of the noise for turbulence."""
     s = FLOW.replace({"sensors.lgs_altitude": 1e6, "sensors.lgs_noise": 0.05})  # no cone: the error of the filter alone
@@ -109,6 +111,7 @@ def test_on_frozen_flow_a_third_order_model_is_within_a_tenth_of_the_bound() -> 
     assert np.mean(errors[2]) > np.mean(errors[3])
 
 
+@pytest.mark.slow
 def test_too_slow_a_flow_has_no_bound_rather_than_a_wrong_one() -> None:
     slow = FLOW.replace({"turbulence.wind_speed": 0.2})
     assert not has_known_spectra(slow) and record_bounds(slow, simulate(slow)) == []

@@ -68,6 +68,7 @@ def tip_of(k: np.ndarray, scale: float = 1.0) -> np.ndarray:
 # ---------------------------------------------------------------------- covariances, exact
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("duration", [0.05, 3.0])
 @pytest.mark.parametrize("speed", [0.1, 15.0, 90.0])
 @pytest.mark.parametrize("outer_scale", [2.0, 25.0, 3000.0])
@@ -85,6 +86,7 @@ def test_the_size_that_everyone_quotes() -> None:
     assert 1e3 * np.sqrt(np.diag(found)) == pytest.approx(529.3, abs=0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("outer_scale", "speed", "duration"), [(25.0, 15.0, 4.0), (25.0, 2.0, 1.0), (1000.0, 15.0, 4.0), (5.0, 40.0, 2.0)]
 )
@@ -157,6 +159,7 @@ def sampled(
     return frozen_flow(layers, outer_scale, D, views, n_steps, dt, np.random.default_rng(seed))
 
 
+@pytest.mark.slow
 def test_size_and_cone_effect_of_samples_from_the_first_step() -> None:
     """First and last of 500 records of 1 s: 529 nm to 5 %, and NGS - LGS 49.4 nm to 10 %, both without a mean."""
     views = [View(TIP_TILT, (NGS,)), View(TIP_TILT, (lgs(8000.0),))]
@@ -170,6 +173,7 @@ def test_size_and_cone_effect_of_samples_from_the_first_step() -> None:
         assert abs(np.mean(tip[:, 0] * tip[:, 1])) < 4.5 * 0.529**2 / np.sqrt(500)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("height", [8e3, 10e3])
 def test_cone_effect_of_samples_on_each_axis(height: float) -> None:
     layers = [TurbulenceLayer(STRENGTH, height, 15.0, 0.0)]
@@ -189,6 +193,7 @@ def test_temporal_slope_beyond_the_knee(speed: float, band: tuple[float, float])
     assert slope == pytest.approx(-17 / 3, abs=0.3)
 
 
+@pytest.mark.slow
 def test_a_record_does_not_repeat() -> None:
     """The two ends of a record are as far apart as the structure function says, 1.4 times the rms: an FFT's are not."""
     ends = np.array([sampled(seed, 500, dt=0.02)[0][[0, -1]] for seed in range(60)])

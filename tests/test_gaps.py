@@ -124,6 +124,7 @@ def test_bridging_is_causal(k: int) -> None:
     np.testing.assert_array_equal(a.y_ngs[: k + 1], b.y_ngs[: k + 1])
 
 
+@pytest.mark.slow
 def test_no_observer_sees_behind_a_gap() -> None:
     """Within a gap of the LGS and of a frame: what comes later changes no causal estimate."""
     s, k = scenario(), 405
@@ -142,6 +143,7 @@ def test_no_observer_sees_behind_a_gap() -> None:
         np.testing.assert_allclose(two.values[: k + 1], one.values[: k + 1], rtol=0, atol=1e-9 * size, err_msg=one.observer)
 
 
+@pytest.mark.slow
 def test_every_observer_runs_on_a_record_with_gaps_nearly_as_well() -> None:
     """5 % of the frames gone: the errors of causal observers grow by a few per cent, never by half."""
     s = scenario()

@@ -35,6 +35,7 @@ def make(path: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(["make", "-C", str(path), "test"], capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "controller", ["integrator", "lqg-kf-lgs", "lqg-kf-multi", "lqg-multirate", "lqg-multirate-optimal", "lqg-multirate-multi"]
 )

@@ -41,6 +41,8 @@ from wfsobs.spectral.search import PAD, search_peaks
 from wfsobs.spectral.whittle import fit_spectrum, spectrum_information, spectrum_negative_log_likelihood
 from wfsobs.telemetry.records import save_record
 
+pytestmark = pytest.mark.slow
+
 DT = 1e-3
 TURBULENCE = Ar2(7.0, 0.9, 0.5, DT)
 MODEL = Spectrum(0.014, DT, TURBULENCE, (Ar2(2 * pi * 30.0, 0.02, 0.004, DT),))

@@ -19,6 +19,8 @@ from wfsobs.spectral.periodogram import Cells, periodogram_frequencies
 from wfsobs.spectral.whittle import spectrum_information
 from wfsobs.typing import Array
 
+pytestmark = pytest.mark.slow
+
 DT = 1e-3
 N = 600
 PROCESSES = Ar2(30.0, 0.9, 0.05, DT), Ar2(2 * pi * 120.0, 0.02, 0.01, DT)

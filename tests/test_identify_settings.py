@@ -32,6 +32,8 @@ from wfsobs.simulation.turbulence import turbulence_rms
 from wfsobs.telemetry.records import save_record
 from wfsobs.typing import Array
 
+pytestmark = pytest.mark.slow
+
 DT = 1e-3
 QUICK = ("kf-lgs", "kf-multi", "butterworth-cl")
 

@@ -12,6 +12,8 @@ import pytest
 from wfsobs.progress import Watch
 from wfsobs.scenario.presets import PRESETS
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def script() -> Any:

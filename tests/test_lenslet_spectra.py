@@ -15,6 +15,8 @@ from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.sensor_noise import shack_hartmann
 from wfsobs.typing import Array
 
+pytestmark = pytest.mark.slow
+
 FLOW = Scenario().replace(
     {
         "turbulence.source": "frozen-flow",

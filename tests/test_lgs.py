@@ -41,6 +41,7 @@ def error_of_samples(s: Scenario, seeds: int = 20, n: int = 200) -> np.ndarray:
     return np.sqrt(np.mean(np.square(errors), axis=(0, 1)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changes", [{}, BESIDE, {"sensors.lgs_count": 3, "turbulence.source": "ar2"}])
 def test_error_and_noise_are_those_of_samples(changes: dict[str, Any]) -> None:
     """Both combinations: the variance of the model against 20 records, to 15 %: each holds some twenty independent numbers."""

@@ -11,6 +11,8 @@ from wfsobs.scenario.configfile import load_scenario
 from wfsobs.stepping import design
 from wfsobs.telemetry.records import save_record
 
+pytestmark = pytest.mark.slow
+
 HORIZON = 3
 
 

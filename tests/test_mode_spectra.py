@@ -73,6 +73,7 @@ def test_their_integral_is_the_covariance() -> None:
     assert np.abs(star - np.diag(np.diag(star))).max() > 0.05 * star[0, 0] ** 0.5 * star[-1, -1] ** 0.5
 
 
+@pytest.mark.slow
 def test_phase_and_coherence_of_a_simulated_record() -> None:
     """Of tip and defocus, of which the one leads: over 0.5 to 6 Hz, from 300 s in pieces of 4 s, to four standard deviations."""
     scenario = FLOW.replace({"run.duration": 300.0, "sensors.lgs_noise": 0.0})

@@ -19,6 +19,8 @@ from wfsobs.observers.estimates import Estimate
 from wfsobs.pipeline import run
 from wfsobs.record import Record
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("n", [1, 2, 7, 100, 240])
 def test_trailing_rms_is_that_of_the_last_n(n: int) -> None:

@@ -81,6 +81,7 @@ def test_every_table_of_a_reproduction_has_a_marker() -> None:
     assert {m[2] for m in MARKER.finditer(text("closed_loop"))} == set(script("closed_loop").TABLES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("page", "name", "table", "tolerance", "shown"), [pytest.param(*c, id=f"{c[1]}-{c[2]}") for c in checked()]
 )

@@ -87,6 +87,7 @@ def test_the_late_adaptive_filter_is_scored_with_the_others_or_apart(window: flo
         assert s.start == pytest.approx(begins if own or not apart else 0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [
@@ -107,6 +108,7 @@ def test_every_observer_on_every_turbulence_and_mode(changes: dict[str, Any]) ->
         assert np.array_equal(one.values, other.values, equal_nan=True)
 
 
+@pytest.mark.slow
 def test_same_seed_same_result_and_a_subset_is_part_of_it() -> None:
     one, same = run(scenario()), run(scenario())
     some = run(scenario(), observers=["gpr-online", "multirate"])

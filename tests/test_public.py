@@ -21,6 +21,8 @@ from wfsobs.closed_loop.run import closed_loop
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.telemetry.records import save_record
 
+pytestmark = pytest.mark.slow
+
 FUNCTIONS = (
     "bound",
     "close_loop",

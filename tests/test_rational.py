@@ -70,6 +70,7 @@ def test_lines_and_continuum_are_all_of_the_vibration() -> None:
     assert sum(p.rms**2 for p in told) == pytest.approx(whole.sum(), rel=0.1)
 
 
+@pytest.mark.slow
 def test_the_floor_brings_no_observer_far_from_its_bound() -> None:
     """`multirate-multi` on `ut4-floor`: within a quarter of the bound in all targets, and not below it."""
     s = PRESETS["ut4-floor"]()

@@ -132,6 +132,7 @@ print({s.observer for s in wfsobs.run(wfsobs.PRESETS["paper"]().replace({"run.du
 """
 
 
+@pytest.mark.slow
 def test_a_scenario_made_before_has_the_settings_too() -> None:
     done = subprocess.run([sys.executable, "-c", LATE], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -68,6 +68,7 @@ def check(model: DisturbanceModel, noise: float, found: SteadyState, tolerance: 
     assert np.trace(found.posterior) <= np.trace(P) * (1 + 1e-12) + rounding
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(models())
 def test_every_telescope_has_a_filter(problem: tuple[DisturbanceModel, float]) -> None:
@@ -122,6 +123,7 @@ def test_scipy_is_often_there_to_compare_with() -> None:
     assert solved == 40
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [1e-3, 0.0141, 1.0])
 @pytest.mark.parametrize(
     "peaks",

@@ -35,6 +35,7 @@ def test_modes_made_one_by_one_are_seen_as_they_are() -> None:
     assert np.array_equal(records[0].y_lgs, records[1].y_lgs)
 
 
+@pytest.mark.slow
 def test_the_truth_is_nearly_the_same_whatever_looks_at_it() -> None:
     """Waves that only a Shack-Hartmann sensor asks for differ: 2e-3 of the variance of order 6, 1e-6 of tip's."""
     truth = [simulate(scenario({"sensors.kind": kind})).turbulence for kind in ("shack-hartmann", "zernike")]
@@ -42,6 +43,7 @@ def test_the_truth_is_nearly_the_same_whatever_looks_at_it() -> None:
     assert np.sqrt(np.mean((truth[0] - truth[1]) ** 2)) < 3e-3 * 0.529
 
 
+@pytest.mark.slow
 def test_coarse_ngs_measures_the_mean_gradient() -> None:
     """NGS of 2 x 2 less truth on the axis: 166 nm of rms to 40 % in eight seeds of two axes, each but one draw."""
     s = scenario({"sensors.lenslets.ngs_subapertures": 2, "sensors.lenslets.lgs_subapertures": 2})
@@ -122,6 +124,7 @@ def test_settings_that_do_not_go_together(changes: dict, told: str) -> None:
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("obscuration", [0.0, 0.3, 0.5])
 def test_every_number_of_subapertures_has_a_fit(obscuration: float) -> None:
     for across in (1, 2, 3, 4, 5, 6, 7, 8, 9, 13, 50):

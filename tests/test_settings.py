@@ -83,6 +83,7 @@ def test_the_walk_reaches_every_group() -> None:
     assert "vibration.peaks.0.rms" in ALL and "vibration.psd.tilt" in ALL
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", ALL)
 def test_every_setting_refuses_what_it_does_not_take(path: str) -> None:
     scenario = full()
@@ -253,6 +254,7 @@ def types_in(value: Any) -> set[type]:
     return set().union(*map(types_in, value)) if isinstance(value, list) else {type(value)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", ALL)
 def test_numbers_of_numpy_become_plain_on_every_way_in(path: str) -> None:
     p = next(p for found, _, p in full().walk() if found == path)
@@ -309,6 +311,7 @@ def trees(group: type[Group]) -> st.SearchStrategy[dict[str, Any]]:
 SCENARIOS = trees(Scenario)
 
 
+@pytest.mark.slow
 @EXAMPLES
 @given(SCENARIOS)
 def test_plain_values_come_back_exactly(values: dict[str, Any]) -> None:
@@ -319,6 +322,7 @@ def test_plain_values_come_back_exactly(values: dict[str, Any]) -> None:
     assert hash(scenario.copy()) == hash(scenario)
 
 
+@pytest.mark.slow
 @EXAMPLES
 @given(SCENARIOS, SCENARIOS)
 def test_base_plus_difference_is_the_scenario(one: dict[str, Any], other: dict[str, Any]) -> None:
@@ -335,6 +339,7 @@ def test_a_difference_holds_only_what_differs() -> None:
     assert scenario.difference(Scenario()) == {"telescope": {"diameter": 39.0}, "vibration": {"peaks": [peak]}}
 
 
+@pytest.mark.slow
 @EXAMPLES
 @given(SCENARIOS, st.sampled_from(ALL), st.data())
 def test_setting_one_leaves_the_others(values: dict[str, Any], path: str, data: st.DataObject) -> None:

@@ -22,6 +22,8 @@ from wfsobs.sensors.shack_hartmann import ShackHartmann, TrigonometricSum, lagra
 from wfsobs.sensors.spots import ARCSEC, SpotModel
 from wfsobs.sensors.zernike import ZernikeProjection, up_to_order
 
+pytestmark = pytest.mark.slow
+
 D, R0, L0 = 8.0, 0.157, 25.0
 STRENGTH = R0 ** (-5 / 3)
 COARSE = Lenslets(D, across=6)

@@ -57,6 +57,7 @@ def test_views_that_share_nothing_have_no_common_process() -> None:
     assert nothing.second == (), "a laser that sees no tip"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("preset", "turbulence", "vibration"), [("paper", 1.01, 1.01), ("ut4", 1.10, 1.20), ("galacsi-wfm", 1.25, 1.25)]
 )

@@ -23,6 +23,7 @@ def resonance(f: mp.mpf, f0: mp.mpf, xi: mp.mpf) -> mp.mpf:
     return 1 / ((f0**2 - f**2) ** 2 + (2 * xi * f0 * f) ** 2) * 4 * xi * f0**3 / mp.pi
 
 
+@pytest.mark.slow
 @EXAMPLES
 @given(frequencies, dampings, st.lists(st.floats(-3.0, 3.0), min_size=2, max_size=5, unique=True))
 def test_resonance_power_is_the_integral_over_each_bin(f0: float, xi: float, positions: list[float]) -> None:

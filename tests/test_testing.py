@@ -90,16 +90,19 @@ def observer(run: Any, **given: Any) -> Observer:
     return Observer("mine", "Mine", (VIBRATION,), run, **given)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ON_PAPER)
 def test_ours_pass(name: str) -> None:
     check_observer(OBSERVERS[name], alone=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["kf-multi", "gpr-offline"])
 def test_ours_are_the_same_in_a_fresh_process(name: str) -> None:
     check_observer(OBSERVERS[name])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("run", "reason"),
     [

@@ -95,16 +95,19 @@ def predicting(predict: Any) -> Controller:
     return Controller("mine", "Mine", half, predict=predict, prior=(Bands,), settings=("control",))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_ours_pass(name: str) -> None:
     check_controller(CONTROLLERS[name], alone=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["lqg-multirate-multi", "integrator+gpr-offline"])
 def test_ours_are_the_same_in_a_fresh_process(name: str) -> None:
     check_controller(CONTROLLERS[name])
 
 
+@pytest.mark.slow
 def test_one_of_a_few_lines_passes() -> None:
     check_controller(Controller("mine", "Mine", half))
 
@@ -143,6 +146,7 @@ def test_a_prediction_that_breaks_a_rule_is_refused_with_the_reason(predict: Any
         check_controller(predicting(predict), alone=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("predict", "reason"),
     [

@@ -122,6 +122,7 @@ class TestRms:
             Theory().predict(PRESETS["peak-jump"](), 0, "vibration")
 
 
+@pytest.mark.slow
 def test_what_is_kept_from_the_last_frame_changes_nothing() -> None:
     theory, base = Theory(), RIGHT.replace({"multipeak.turbulence_order": 3})
     changes = [
@@ -169,6 +170,7 @@ class TestSpectrum:
         np.testing.assert_allclose(frequency, np.fft.rfftfreq(n, dt))
         np.testing.assert_allclose(density, expected, rtol=1e-9, atol=1e-12 * expected.max())
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("of_error", [True, False])
     def test_is_that_of_a_long_simulation(self, of_error: bool) -> None:
         changes = {"vibration.synthesis": "gaussian", "run.duration": 200.0, "loop.closed": False}

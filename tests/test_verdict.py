@@ -23,6 +23,8 @@ from wfsobs.simulation.disturbance import vibration_lines
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
 
+pytestmark = pytest.mark.slow
+
 QUICK = ("kf-lgs", "kf-multi", "multirate-optimal", "ridge-30", "butterworth-cl", "persistence", "zero")
 SCENARIOS = {
     "paper": PRESETS["paper"](),

@@ -148,6 +148,7 @@ class Counted:
         return table
 
 
+@pytest.mark.slow
 def test_as_many_rows_are_held_whatever_the_number_of_scenarios(tmp_path, monkeypatch):
     """Counted, and by tracemalloc, which sees numpy and Python; the memory of a process has libraries and freed pages in it."""
     seeds, held, peaks = 16, [], []

@@ -11,6 +11,8 @@ from distributed import Client
 
 from tests.campaign.test_run import BATCHES, COMMAND, ENVIRONMENT, RUNS, SEEDS, SHORT_BATCHES, TINY
 
+pytestmark = pytest.mark.slow
+
 
 class Cluster:
     """A scheduler and its workers, each with a nanny that starts it again."""

@@ -7,6 +7,8 @@ import pytest
 from scripts.store_physics import FILE, numbers
 from wfsobs.campaign.keys import PHYSICS_VERSION
 
+pytestmark = pytest.mark.slow
+
 TOLERANCE = 1e-5
 """Relative. BLAS kernels differ by up to 4e-7 (fits of models; HASWELL, ZEN, SKYLAKEX); another formula moves more."""
 

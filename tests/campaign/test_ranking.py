@@ -53,6 +53,7 @@ def test_first_places_are_shares_of_samples():
     assert shares == first_places(table, np.random.default_rng(1))[0, "vibration", "tip"]
 
 
+@pytest.mark.slow
 def test_a_report_of_1e5_rows_is_one_file_below_ten_megabytes(tmp_path):
     grid = "[grid]\nturbulence.wind_speed = [5, 10, 15, 20, 25]\nsensors.exposure_ratio = [2, 5, 10, 20, 40]\n"
     plan = parse_plan(f'name = "<Big>"\nseeds = 500\nobservers = {NAMES}\n{grid}'.replace("'", '"'), tmp_path)

@@ -14,6 +14,8 @@ import wfsobs
 from wfsobs.campaign.keys import row_key, scenario_digest
 from wfsobs.campaign.store import ROWS, batch_files, read_results, write_batch
 
+pytestmark = pytest.mark.slow
+
 TINY = """
 name = "Tiny"
 seeds = {seeds}

@@ -36,6 +36,7 @@ def results(base: Scenario) -> SweepResults:
     return run_sweep(plan_sweep(base, axes, 3, FEW))
 
 
+@pytest.mark.slow
 def test_a_cell_is_a_run_of_the_library(results: SweepResults, base: Scenario) -> None:
     assert [dict(c) for c in results.sweep.cells] == [
         {"turbulence.wind_speed": v, "sensors.exposure_ratio": r} for v in (5, 20) for r in (5, 10)
@@ -152,6 +153,7 @@ def test_time_is_that_of_the_observers_chosen(base: Scenario) -> None:
     assert 4 * EACH_RUN < few.seconds < every.seconds / 1.5
 
 
+@pytest.mark.slow
 def test_command_line(results: SweepResults, tmp_path: Path) -> None:
     file = tmp_path / "errors.csv"
     words = [f"--set={path}={value}" for path, value in SHORT.items()] + [f"--observer={name}" for name in FEW]

@@ -197,6 +197,7 @@ def test_a_vibration_that_is_predicted_is_not_corrected_twice(changes: dict[str,
     assert (got.limited_share[0] > 0.01) == ("control.stroke" in changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("controller", list(CONTROLLERS))
 def test_limits_that_are_never_reached_change_nothing_and_others_do(controller: str) -> None:
     free = outcome(run(QUICK, (controller,)), controller)
@@ -333,6 +334,7 @@ def test_strehl_is_that_of_all_modes() -> None:
     assert strehl([0.1, 0.1], 2.2) == pytest.approx(0.92167**2, abs=2e-5)
 
 
+@pytest.mark.slow
 def test_on_ut4_lqg_on_every_peak_leaves_a_quarter_less_than_the_best_integrator() -> None:
     """With both sensors as the preset is; on the LGS alone where these see what is on the axis (AR(2), no slow error)."""
     ut4 = PRESETS["ut4"]().replace({"run.duration": 5.0})

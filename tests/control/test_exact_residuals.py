@@ -54,6 +54,7 @@ def test_records_leave_it_at_every_step_of_a_cycle() -> None:
     assert np.abs(mean - found).max() < 4.0 * scatter.max(), "ten figures, at four standard errors"
 
 
+@pytest.mark.slow
 def test_ut4_with_two_frames_is_near_the_bound() -> None:
     s = PRESETS["ut4"]()
     for mode, found in enumerate(exact_residuals("lqg-multirate-multi", s)):

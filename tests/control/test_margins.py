@@ -64,6 +64,7 @@ def polynomials(law: Law, mirror: Mirror) -> tuple[Any, Any]:
     return np.polymul(numerator, taps), np.concatenate([denominator, np.zeros(taps.size - 1)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "delay"), [("paper", 2.0), ("paper", 2.5), ("ut4", 2.0), ("ut4", 3.0)])
 def test_the_gain_margin_of_lqg_is_where_a_pole_reaches_the_circle(name: str, delay: float) -> None:
     """With the loop gain times kappa the poles are the roots of (den - num) + kappa num."""

@@ -28,6 +28,7 @@ def commands(name: str, record: Record, scenario: Scenario) -> Array:
     return controller.commands(laws, measured, prior, plant, settings)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [2.0, 2.4])
 @pytest.mark.parametrize("name", LQG)
 def test_it_commands_by_the_exact_filter(name: str, delay: float) -> None:
@@ -70,6 +71,7 @@ def test_a_design_that_takes_over_in_a_gap_knows_of_it(name: str) -> None:
                 np.testing.assert_allclose(other.update_open_loop(z[k], ngs), want, rtol=0, atol=1e-12 * np.std(record.u))
 
 
+@pytest.mark.slow
 def test_an_integrator_holds_the_last_measurement_of_the_disturbance() -> None:
     """Its command goes to minus that and stays there."""
     record, scenario = _dropout()

@@ -43,12 +43,14 @@ def difference(name: str, record: Record, scenario: Scenario) -> float:
     return float(np.abs(got - want).max() / (want.std() or 1.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "preset"), third_of_pairs(CONTROLLERS, PRESETS))
 def test_steps_are_the_run_over_the_record(name: str, preset: str) -> None:
     record, scenario = with_gaps(preset)
     assert difference(name, record, scenario) <= (GPR if "gpr" in name else ROUNDING)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CONTROLLERS)
 @pytest.mark.parametrize(
     "changes", [{"control.delay": 2.4}, {"control.stroke": 0.1, "control.rate": 0.01}], ids=["delay", "limits"]

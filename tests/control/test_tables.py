@@ -25,6 +25,7 @@ def call(*arguments: str) -> Result:
     return CliRunner().invoke(main, ["loop", *arguments], catch_exceptions=False)
 
 
+@pytest.mark.slow
 def test_json_is_the_rows_of_every_controller_mode_and_seed() -> None:
     result = call(*QUICK, "--seeds", "2", "--set", "run.seed=4", "--json")
     assert result.exit_code == 0 and result.stderr == ""
@@ -67,6 +68,7 @@ def test_an_unstable_gain_is_a_row_and_not_a_warning() -> None:
     assert "unstable" in table and "nan" not in table
 
 
+@pytest.mark.slow
 def test_the_table_names_every_controller_and_what_it_needs() -> None:
     table = call(*QUICK).stdout
     for name in (*CONTROLLERS, *COMMON_BOUNDS):
@@ -77,6 +79,7 @@ def test_the_table_names_every_controller_and_what_it_needs() -> None:
     assert "95 %, nm" in spread and "mean over seeds" in spread
 
 
+@pytest.mark.slow
 def test_where_a_limit_acts_there_is_neither_theory_nor_margins() -> None:
     """A stroke far below the turbulence of 500 nm; one that is never reached changes nothing but the settings."""
     one = [*QUICK, "--controller", "integrator"]

@@ -41,6 +41,7 @@ def disturbance(request: pytest.FixtureRequest) -> Array:
     return record.turbulence + record.vibration
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("delay", [1, 2, 3])
 def test_of_a_loop_that_is_known(disturbance: Array, sign: int, delay: int) -> None:
@@ -55,6 +56,7 @@ def test_of_a_loop_that_is_known(disturbance: Array, sign: int, delay: int) -> N
         assert found.shares[delay] == pytest.approx(1.0, abs=0.1), "nothing else jumps"
 
 
+@pytest.mark.slow
 def test_what_the_simulator_records(disturbance: Array) -> None:
     """The loop of the simulation has a delay of 2."""
     record = simulate(PRESETS["paper"]().replace({"run.duration": 20.0, "loop.gain": 0.5}))
@@ -133,6 +135,7 @@ def test_commands_beyond_a_rail(rate: float, tmp_path: Path, capsys: pytest.Capt
     assert all(f"wfsobs: {path}: {line}\n" in said for line in lines), "on the command line"
 
 
+@pytest.mark.slow
 def test_no_rail_is_seen_in_loops_without(disturbance: Array) -> None:
     """Outlying samples, missing ones, an offset and commands that are held do not look like one."""
     noise = NOISE * np.random.default_rng(3).standard_normal(disturbance.shape)
@@ -144,6 +147,7 @@ def test_no_rail_is_seen_in_loops_without(disturbance: Array) -> None:
         assert saturation_lines(record) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [2000, 20_000])
 @pytest.mark.parametrize("delay", [1, 2, 3])
 def test_what_the_data_exclude(disturbance: Array, delay: int, steps: int) -> None:
@@ -167,6 +171,7 @@ def test_what_does_not_decide_is_not_excluded() -> None:
             assert contradiction(Record(y, sign * commands, 1e-3)) == ""
 
 
+@pytest.mark.slow
 def test_every_way_in_refuses_a_wrong_sign_unless_it_is_trusted(tmp_path: Path) -> None:
     record = simulate(PRESETS["paper"]().replace({"run.duration": 5.0}))
     wrong = tmp_path / "wrong.npz"

@@ -105,6 +105,7 @@ def test_the_wrong_kind(ending: str) -> None:
     assert "its name ends in none of .npz" in refused(CONTENT[ending], "a.exe")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_any_byte_changed(ending: str) -> None:
     """Read or refused: no other error, whatever becomes of a byte."""

@@ -92,6 +92,7 @@ def test_every_record_comes_back(ending: str, record: Record) -> None:
     same(record, read_record(written(record, ending), f"r{ending}"))
 
 
+@pytest.mark.slow
 @settings(max_examples=6, deadline=None)  # aotpy takes a tenth of a second
 @given(record=records())
 @example(record=Record(np.zeros((2, 1)), np.zeros((2, 1)), 5.5734074831433874e-05))  # of 17 digits

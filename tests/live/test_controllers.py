@@ -17,6 +17,8 @@ from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.scenario.presets import paper
 from wfsobs.settings.group import SettingError
 
+pytestmark = pytest.mark.slow
+
 NAMES = ("none", "integrator", "lqg-kf-multi", "lqg-multirate-multi", "integrator+gpr-online")
 SMALL = {"run.duration": 2.0, "run.warm_up": 0.5, "gpr_online.training_size": 40, "gpr_online.depth": 10}
 

@@ -22,6 +22,8 @@ from wfsobs.scenario.presets import paper
 from wfsobs.streams.shared_image import SharedImage
 from wfsobs.telemetry.records import save_record
 
+pytestmark = pytest.mark.slow
+
 TRACKER, SOURCE, LINEAR = "the resource tracker of Python was killed", "the source", "the observers (linear)"
 PROCESSES = {
     "simulation": (TRACKER, "the simulation", SOURCE, LINEAR, "the observers (learning)", "the observers (long)"),

@@ -16,6 +16,8 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.scenario.presets import paper
 from wfsobs.telemetry.records import save_record
 
+pytestmark = pytest.mark.slow
+
 
 def frames(n, length, seed=1, **changes):
     scenario = paper().replace(changes)

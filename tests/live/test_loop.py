@@ -220,6 +220,7 @@ def test_counts_and_traces_are_those_of_the_batch_run(stage):
     assert view.rms("kf-multi", "next") == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_a_new_design_goes_on_without_a_bump(stage):
     names = ("kf-multi", "gpr-online")
     live, other = stage(names), stage(names)
@@ -255,6 +256,7 @@ def test_observers_come_and_go(stage):
     assert [event.line for event in live.said.queue] == ["kf-lgs off", "multirate on"]
 
 
+@pytest.mark.slow
 def test_a_live_loop_from_start_to_stop():
     scenario = paper().replace({"run.warm_up": 0.2, "gpr_online.training_size": 40, "gpr_online.depth": 10})
     loop = LiveLoop(SimulatedLoop(scenario), scenario, ["kf-multi", "gp-both"], speed=0.5)
@@ -366,6 +368,7 @@ def test_the_next_look_at_the_ring_is_when_a_frame_is_due(monkeypatch):
     assert slept == pytest.approx([0.0006 + POLL, POLL, 0.0019 + POLL, REST], abs=1e-9)
 
 
+@pytest.mark.slow
 def test_nothing_is_left_of_a_loop_whose_owner_is_killed():
     code = (
         "import time\n"

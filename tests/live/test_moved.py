@@ -10,6 +10,8 @@ from wfsobs.live.loop import Alarms
 from wfsobs.live.recording import open_loop_record
 from wfsobs.live.ring import LiveFrame
 
+pytestmark = pytest.mark.slow
+
 PART = 20_000
 """Frames of which peaks are identified."""
 

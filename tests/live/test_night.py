@@ -12,6 +12,8 @@ from wfsobs.live.simulated import SimulatedFrames
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.stepping import sampling_of
 
+pytestmark = pytest.mark.slow
+
 FASTER = 3.0
 
 

@@ -134,6 +134,7 @@ class Maker:
     get_nowait = get
 
 
+@pytest.mark.slow
 def test_live_numbers_are_those_of_the_recording():
     scenario = scenario_of(
         {"kind": "wind", "start": 0.5, "wind_factor": 2.0},

@@ -17,6 +17,8 @@ from wfsobs.live.paced import Desk, LiveEvent
 from wfsobs.scenario.presets import paper
 from wfsobs.streams.shared_image import SharedImage
 
+pytestmark = pytest.mark.slow
+
 SPAN = 8
 """Length of what is identified [s], in place of a minute."""
 

@@ -64,6 +64,7 @@ def stream(tmp_path):
     ring.release()
 
 
+@pytest.mark.slow
 def test_a_stream_is_followed_through_whatever_happens_to_it(stream, monkeypatch):
     path, image, ring, inbox, news, frames = stream
 
@@ -229,6 +230,7 @@ def test_two_streams_by_network_are_the_rows_of_the_record(is_late_to_look):
     ring.release()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lag", "jitter"), [(0, 0), (0, 1), (2, 1)])
 def test_two_streams_are_the_rows_of_the_record(tmp_path, lag, jitter):
     """Once the NGS frames have found their place each is in its row, a multiple of the ratio; frames that are missing as well."""

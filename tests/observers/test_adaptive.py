@@ -60,6 +60,7 @@ def rms(x: np.ndarray) -> float:
     return float(np.sqrt(np.mean(x**2)))
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(frequency=st.floats(0.05, 450.0), damping=st.floats(1e-4, 0.99), size=st.floats(1e-4, 10.0))
 @example(346.1512841333145, 1e-4, 1.0)
@@ -76,6 +77,7 @@ def test_densities_are_those_of_the_process_and_slopes_their_derivatives(frequen
         np.testing.assert_allclose(slopes[0, i], slope, rtol=1e-4, atol=1e-3 * np.abs(slope).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("n", "peaks"),
     [
@@ -242,6 +244,7 @@ def _jump() -> tuple[Record, dict[str, np.ndarray]]:
     return record, run_observer("kf-adaptive", record, with_window(4.0, 0.5))
 
 
+@pytest.mark.slow
 def test_error_on_a_stationary_record_is_near_what_theory_says_of_the_true_model(
     jump: tuple[Record, dict[str, np.ndarray]],
 ) -> None:
@@ -261,6 +264,7 @@ def test_error_on_a_stationary_record_is_near_what_theory_says_of_the_true_model
         assert 0.98 < adaptive / best < 1.08
 
 
+@pytest.mark.slow
 def test_after_a_jump_it_is_back_within_window_and_interval(jump: tuple[Record, dict[str, np.ndarray]]) -> None:
     """Errors of 8 modes over 2 s are known to 13 %; the filter that knew the old peak stays 60 % worse."""
     record, got = jump

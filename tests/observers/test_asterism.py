@@ -154,6 +154,7 @@ def test_shares_are_those_of_a_simulation(lost: int) -> None:
         np.testing.assert_allclose(found[phase].exposure, mixed, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_what_it_states_is_near_the_bounds_and_below_that_of_the_mean() -> None:
     """With lines as wide as those of the record. Modes tell of one another: it may lie below the bound of single modes."""
     scenario = STARS.replace({"multipeak.line_width": line_width(STARS)})
@@ -166,6 +167,7 @@ def test_what_it_states_is_near_the_bounds_and_below_that_of_the_mean() -> None:
             assert 0.95 * alone < least[mode][target].rms < 1.001 * alone
 
 
+@pytest.mark.slow
 def test_errors_are_as_it_states() -> None:
     """Records of 3 s from eight seeds, after the first second: within three standard errors of the mean square."""
     squares: dict[str, list[np.ndarray]] = {"turbulence": [], "vibration": []}
@@ -220,6 +222,7 @@ def test_what_is_there_is_weighed_as_dense_algebra_does() -> None:
             np.testing.assert_allclose(sd[phase] ** 2, variance - np.sum(dense * b, axis=1), rtol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("combination", ["mean", "minimum-variance"])
 def test_the_next_measurement_is_missed_as_it_states(combination: str) -> None:
     """With all LGS and, of the mean, with one out: six seeds, within three standard errors of the mean square."""
@@ -283,6 +286,7 @@ def test_a_star_that_is_always_out_leaves_the_filter_of_the_others() -> None:
                 np.testing.assert_allclose(sd, other_sd, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lasers", [1, 3])
 def test_errors_while_lasers_are_out_are_as_it_states(lasers: int) -> None:
     """From eight seeds, half a second after they went: within three standard errors of the mean square."""

@@ -116,6 +116,7 @@ def test_the_change_is_seen_afterwards(name: str, record: Record) -> None:
         assert (np.abs(other[target] - values)[405:460] > 1e-6).mean() > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inputs", ["u-y", "z"])
 @pytest.mark.parametrize("name", CAUSAL)
 def test_the_command_of_the_step_itself_is_used_only_where_the_paper_has_it(name: str, inputs: str, record: Record) -> None:
@@ -130,6 +131,7 @@ def test_the_command_of_the_step_itself_is_used_only_where_the_paper_has_it(name
         assert moved == (name in WINDOWS and inputs == "u-y")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ON_PAPER)
 def test_no_observer_reads_the_truth(name: str, record: Record) -> None:
     """Poisoned with NaN, or absent, it makes no difference at all."""
@@ -152,6 +154,7 @@ NEEDED: dict[str, Callable[[Record], Record]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ON_PAPER)
 @pytest.mark.parametrize("field", NEEDED)
 def test_what_an_observer_does_not_need_it_does_not_read(name: str, field: str, record: Record) -> None:

@@ -43,6 +43,7 @@ def stated(scenario: Scenario, target: str = "turbulence") -> np.ndarray:
     return model_of(scenario).plan(0.0, target)[1]
 
 
+@pytest.mark.slow
 def test_the_bound_is_that_of_dense_algebra() -> None:
     """From 400 measurements of each of five modes, in which the wind crosses the aperture four times, to 1 %; more of the past
     helps tilt, across the wind, by 5 %.
@@ -80,6 +81,7 @@ def test_its_bound_is_a_row_of_its_table_and_of_no_other() -> None:
     assert said is not None and "the theoretical limit using the LGS in all modes" in said.sentences()[0]
 
 
+@pytest.mark.slow
 def test_what_it_states_is_near_the_bound_and_below_the_independent_filters() -> None:
     alone = exact_errors(OBSERVERS["kf-multi"], SHAKEN)
     least = bound(SHAKEN, information="modes")
@@ -90,6 +92,7 @@ def test_what_it_states_is_near_the_bound_and_below_the_independent_filters() ->
             assert found[mode] < alone[mode][target].rms
 
 
+@pytest.mark.slow
 def test_errors_are_as_it_states() -> None:
     """On records of 60 s through ideal sensors: errors go on for a second or so, so that each rms is known to some 5 %."""
     scenario = SHAKEN.replace({"run.duration": 60.0, "run.seed": 3})

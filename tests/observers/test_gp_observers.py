@@ -35,6 +35,7 @@ def test_as_told_they_are_the_filters_of_sampled_processes(name: str, filter_: s
         np.testing.assert_allclose(ours.sd[1000:], other.sd[1000:], rtol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", ["as told", "matern-1/2", "matern-3/2", "matern-5/2", "squared-exponential"])
 @pytest.mark.parametrize("background", [0.0, 0.01])
 def test_the_estimate_is_that_of_the_dense_regression(kernel: str, background: float) -> None:

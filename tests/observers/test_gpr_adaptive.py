@@ -181,6 +181,7 @@ def test_what_cannot_be_identified_leaves_what_was_learnt_last() -> None:
     assert learn(np.full(200, np.nan), DT, 10, 20, 5.0, last) is last
 
 
+@pytest.mark.slow
 def test_it_learns_the_vibration_ahead() -> None:
     """A line far above the noise: five frames ahead its error is that of the truth's own innovations, not that of the lag."""
     rng = np.random.default_rng(9)
@@ -207,6 +208,7 @@ def test_refusals() -> None:
         wfsobs.design("gpr-adaptive", scenario, sampling=record.sampling, horizon=600)
 
 
+@pytest.mark.slow
 def test_in_strong_turbulence_it_beats_thirty_taps_and_zero() -> None:
     """Tip and tilt, rms over seeds 1 to 10; nothing beats the bound of 13.17 and 11.72 nm by more than its scatter."""
     squares: dict[str, list[np.ndarray]] = {"gpr-adaptive": [], "ridge-30": [], "zero": []}

@@ -92,6 +92,7 @@ def test_training_and_prediction_are_those_of_a_plain_solve(
     assert np.abs(got[ends] - wanted).max() <= bound * scale + 10 * EPS * (np.nanstd(f) + np.abs(wanted).max())
 
 
+@pytest.mark.slow
 def test_the_papers_size() -> None:
     kernel = SquaredExponential(10.0, 300.0, 0.13)
     known, new = record_like(1500, 2, 0.3, 0), record_like(2000, 2, 0.3, 1)

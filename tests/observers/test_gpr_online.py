@@ -155,6 +155,7 @@ def test_where_the_printed_formula_is_well_conditioned_all_three_agree(
 # ---------------------------------------------------------------------- the recursion against the plain solve
 
 
+@pytest.mark.slow
 @settings(max_examples=45, deadline=None, derandomize=True)
 @given(
     kernels | st.just(PAPER),

@@ -56,6 +56,7 @@ def split_direct(signals, targets, depth, m, kernel, steps):
     return np.array(out), worst
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["raw", "high-pass", "standardised"])
 @pytest.mark.parametrize("inputs", ["u-y", "z"])
 @pytest.mark.parametrize("enough", [0.0, ENOUGH])
@@ -99,6 +100,7 @@ def test_estimate_comes_before_update_and_z_windows_need_no_command():
         OnlineGprStream(paper().gpr_online, bands_of(paper()), paper().dt).estimate(0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("amplitude", [0.03, 0.3, 3.0])
 def test_no_drift_over_60000_steps(amplitude):
     """Error over the estimates' std at the end of a minute at 1 kHz, within ten times that of one direct solve."""

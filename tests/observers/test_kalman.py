@@ -195,6 +195,7 @@ def test_propagating_beats_holding_where_the_model_is_true() -> None:
 # ---------------------------------------------------------------------- theory
 
 
+@pytest.mark.slow
 def test_error_of_the_matched_filter_is_what_the_riccati_equation_says() -> None:
     """Where the truth is the model, AR(2) turbulence and one AR(2) peak in white noise, the error is `posterior`."""
     s = Scenario()

@@ -149,6 +149,7 @@ def test_more_peaks_in_the_model_than_the_papers_one_help() -> None:
     assert errors[0] < 0.8 * errors[1]
 
 
+@pytest.mark.slow
 def test_every_mode_is_filtered_for_its_own_noise() -> None:
     """Oracle: the textbook filter of each mode, noise from the sensor's own covariance."""
     s = lines(

@@ -111,6 +111,7 @@ def dropout(**more: object) -> tuple[Record, Scenario]:
 STRETCHES = {"gap": slice(5000, 5500), "after": slice(5500, 5700), "later": slice(5700, 7000), "lost frames": slice(7000, 8000)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILTERS)
 def test_it_is_the_filter_without_what_is_missing(name: str) -> None:
     """Within 1 % of its standard deviation in rms, from the first frame after the gap: the filter is taken for steady again
@@ -134,6 +135,7 @@ def test_it_is_the_filter_without_what_is_missing(name: str) -> None:
                     assert np.abs(found.sd[target][at, mode] / sd[at, i] - 1).max() < 0.005
 
 
+@pytest.mark.slow
 def test_both_lasers_out_leave_the_ngs() -> None:
     """What the multi-rate filters have without the LGS is what one of the NGS has, not a drift after bridged values."""
     record, scenario = dropout()
@@ -149,6 +151,7 @@ def test_both_lasers_out_leave_the_ngs() -> None:
 GAPS = [slice(start, start + 60) for start in range(1000, 3000, 200)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WITH_MODEL)
 def test_bands_hold_what_they_say_in_a_gap(name: str) -> None:
     """200 records of the observer's own model with ten gaps each, in and after them: within 2 percentage points.
@@ -179,6 +182,7 @@ def test_bands_hold_what_they_say_in_a_gap(name: str) -> None:
     assert STEPS >= GAPS[-1].stop
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*WITH_MODEL, "kf-adaptive", "multirate-adaptive"])
 def test_stated_frame_by_frame_as_over_a_record(name: str) -> None:
     """And a state saved within a gap goes on."""

@@ -121,6 +121,7 @@ def test_turbulence_that_falls_steeply() -> None:
     assert off[0] < 0.45 and off[1] > 0.9
 
 
+@pytest.mark.slow
 def test_near_the_filter_that_is_told_and_far_from_the_lgs_alone() -> None:
     """On the same two records, from 8 s on: the told filter is the optimum of this model but for the width of lines, which a
     record of 16 s may favour by 3 %; who learns loses 4 to 10 % where 20 records of 30 s are scored."""
@@ -261,6 +262,7 @@ def test_the_samples_behind_the_last_long_gap_by_hand() -> None:
     assert behind_gaps(v, SHORT, 0) is None
 
 
+@pytest.mark.slow
 def test_in_a_gap_of_either_sensor_it_is_near_the_filter_that_is_told() -> None:
     """Both lasers out for 0.5 s, then half of the frames of either sensor lost: over the filter of the true lines, whose errors
     grow alike, as where nothing is missing (above)."""

@@ -72,6 +72,7 @@ def run_cycle(cycle, z, outputs):
     return estimates, z - np.einsum("kij,kj->ki", C, predicted), S, states
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_error", [False, True])
 def test_innovations_are_white_and_errors_as_predicted(with_error):
     """Ljung-Box over 20 lags at 1 % on 1e6 steps; covariances against Monte Carlo within 3 standard errors."""

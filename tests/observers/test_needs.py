@@ -55,6 +55,7 @@ def estimates(observer: Observer, record: Record, s: Scenario) -> np.ndarray:
     return np.concatenate([values.ravel() for values in run_observer(observer.id, record, s).values()])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ON_PAPER)
 def test_an_observer_depends_on_what_it_is_said_to_need(name: str, record: Record) -> None:
     observer = OBSERVERS[name]

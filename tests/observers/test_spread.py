@@ -76,6 +76,7 @@ def own_record(name: str, prior: Prior, rng: np.random.Generator) -> tuple[Measu
     return Measurements(y, np.zeros_like(y), dt, y_ngs, RATIO), truth
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "between"), [(name, "hold") for name in WITH_MODEL] + [("kf-ngs", "propagate")])
 def test_bands_hold_what_they_say_where_the_model_is_true(name: str, between: str) -> None:
     """200 records of the observer's own model, per target and phase of the NGS frame: within 2 percentage points."""
@@ -116,6 +117,7 @@ def test_stated_frame_by_frame_as_over_a_record(name: str) -> None:
         assert np.isfinite(sd[estimate.target][350:]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ON_PAPER)
 def test_every_observer_with_a_model_states_something(name: str) -> None:
     changes = {"run.duration": 2.0, "gpr_online.training_size": 20, "gpr_offline.training_size": 50, "adaptive.window": 0.5}
@@ -173,6 +175,7 @@ def online(x: Array, f: Array) -> tuple[Array, Array]:
     return mean[110:], np.sqrt(variance[110:] - KERNEL.noise_std**2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("regression", [offline, online])
 def test_a_gpr_is_right_about_itself(regression: Callable[[Array, Array], tuple[Array, Array]]) -> None:
     """200 functions drawn from its prior, learnt from noisy targets, with its own hyper-parameters."""

@@ -30,6 +30,8 @@ from wfsobs.telemetry.records import load_record, save_record
 from wfsobs.testing.steps import run_loop, run_steps
 from wfsobs.typing import Array
 
+pytestmark = pytest.mark.slow
+
 LGS_ALONE, BOTH = ("kf-lgs", "kf-multi", "gp-lgs"), ("multirate-optimal", "multirate-multi", "gp-both")
 RATIO, STARS = 5, 4
 

@@ -67,6 +67,7 @@ def whole(preset: str) -> tuple[Record, Scenario]:
     return record, scenario.before_events
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("record_of", [whole, with_gaps])
 @pytest.mark.parametrize(("name", "preset"), third_of_pairs(STEPS, PRESETS))
 def test_steps_are_the_run_over_the_record(name: str, preset: str, record_of: Callable[[str], tuple[Record, Scenario]]) -> None:
@@ -169,6 +170,7 @@ def test_a_power_composes() -> None:
     np.testing.assert_allclose(matrix_power(A, 0.25) @ matrix_power(A, 0.75), A, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_design_takes_over_without_a_bump() -> None:
     """The same processes, other strengths: each goes on where it was. Fewer lines: the sums do."""
     record, scenario = with_gaps("ut4")

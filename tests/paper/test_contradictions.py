@@ -25,6 +25,8 @@ from wfsobs.signal.spectrum import random_phase_signal
 from wfsobs.signal.statespace import paper_matrices
 from wfsobs.simulation.loop import simulate
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module", name="case")
 def _case() -> tuple[Scenario, Record]:

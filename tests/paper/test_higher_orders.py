@@ -8,6 +8,8 @@ from typing import Any
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 SCRIPT = Path(__file__).parents[2] / "docs" / "scripts" / "higher_orders.py"
 QUICK: dict[str, Any] = {"run.duration": 4.0, "sensors.kind": "zernike"}
 

@@ -15,6 +15,8 @@ import pytest
 from wfsobs import PRESETS, Record, observe, simulate
 from wfsobs.record import Training
 
+pytestmark = pytest.mark.slow
+
 SEEDS = range(1, 9)
 OBSERVERS = ["kf-lgs", "kf-ngs", "multirate", "butterworth-ol", "butterworth-cl", "gpr-offline", "gpr-online", "zero"]
 

@@ -11,6 +11,8 @@ import wfsobs
 from wfsobs.evaluation.scores import BOUNDS, Score
 from wfsobs.observers import OBSERVERS
 
+pytestmark = pytest.mark.slow
+
 PAGE = (Path(__file__).parents[2] / "docs" / "reproduction.md").read_text(encoding="utf-8").partition("## UT4")[2]
 QUICK = (
     "kf-lgs",

@@ -27,6 +27,8 @@ from wfsobs.streams.shared_image import SharedImage
 from wfsobs.streams.watchdog import BEYOND, Fallback, Safety
 from wfsobs.streams.wiring import NgsWiring, Wiring
 
+pytestmark = pytest.mark.slow
+
 SINGLE = 2e-7
 """Rounding of float32 over the size of a number, three times over: measurement, estimate, comparison."""
 

@@ -81,6 +81,7 @@ def subscribed(loop: Loop, say: Callable[[str], None], first: int = 0) -> Iterat
         yield found[0]
 
 
+@pytest.mark.slow
 def test_the_numbers_of_the_run_over_the_record_through_the_command() -> None:
     """Modes 3 and 1 of five; nm; frames are lost on the way; a message that is none is counted."""
     z = measurements(1000)

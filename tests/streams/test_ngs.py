@@ -22,6 +22,8 @@ from wfsobs.streams.shared_image import SharedImage
 from wfsobs.streams.watchdog import Safety
 from wfsobs.streams.wiring import NgsWiring, Wiring
 
+pytestmark = pytest.mark.slow
+
 RATIO = 5
 FIRST = 2
 """Row of the record that is sent first, so that the NGS frames have another place than they have in a record from there on."""

@@ -16,6 +16,8 @@ from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
 from wfsobs.tuning.trials import likelihood, log_marginal_likelihood
 
+pytestmark = pytest.mark.slow
+
 
 def windows(signals: np.ndarray, depth: int, first: int, m: int) -> np.ndarray:
     return sliding_window_view(signals, depth, axis=0)[first - depth + 1 : first - depth + 1 + m].reshape(m, -1)

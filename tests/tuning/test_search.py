@@ -16,6 +16,8 @@ from wfsobs.scenario.presets import PRESETS
 from wfsobs.tuning.space import numbers, space
 from wfsobs.tuning.trials import NoEvaluationLeft, minimise
 
+pytestmark = pytest.mark.slow
+
 BASES = {name: PRESETS[name]() for name in ("paper", "ut4", "strong-turbulence")}
 
 

@@ -31,6 +31,8 @@ from wfsobs.tuning.records import NEXT, REFERENCE, TRUTH, cut_record, piece, sim
 from wfsobs.tuning.report import tuning_dict, tuning_toml
 from wfsobs.tuning.space import space
 
+pytestmark = pytest.mark.slow
+
 
 def short(**more: Any) -> Scenario:
     return PRESETS["paper"]().replace({"run.duration": 4.0, "run.warm_up": 0.5, **more})
