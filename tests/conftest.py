@@ -1,5 +1,6 @@
 """One BLAS thread, set before numpy is imported; a folder of records and an installed package that tests share."""
 
+import gc
 import os
 import shutil
 import subprocess
@@ -39,6 +40,12 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     if config.option.markexpr != "not slow" or not collection_path.match("test_*.py"):
         return None
     return "\npytestmark = pytest.mark.slow\n" in collection_path.read_text(encoding="utf-8") or None
+
+
+def pytest_collection_finish() -> None:
+    """Have the collector pass over the half million objects of the tests and of what they import, each time it looks through all."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

@@ -74,7 +74,7 @@ def full() -> Scenario:
     return Scenario.from_dict({"events": [{}]})
 
 
-ALL = [path for path, _, _ in full().walk()]
+ALL = {path: p for path, _, p in full().walk()}
 
 
 def test_the_walk_reaches_every_group() -> None:
@@ -83,59 +83,55 @@ def test_the_walk_reaches_every_group() -> None:
     assert "vibration.peaks.0.rms" in ALL and "vibration.psd.tilt" in ALL
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("path", ALL)
-def test_every_setting_refuses_what_it_does_not_take(path: str) -> None:
+def test_every_setting_refuses_what_it_does_not_take(subtests: pytest.Subtests) -> None:
     scenario = full()
     before = scenario.to_dict()
-    p = next(p for found, _, p in scenario.walk() if found == path)
-    bad = list(refused(p))
-    assert len(bad) >= 6
-    for value in bad:
-        with pytest.raises(SettingError) as caught:
-            scenario.set(path, value)
-        message = str(caught.value)
-        assert message.startswith(f"{path} = "), message
-        assert "\n" not in message and len(message) < 400
-        shown = repr(value)
-        assert (shown if len(shown) <= 80 else shown[:60]) in message
-        after = message.split(": ", 1)[1]
-        for limit in limits(p):
-            assert limit in after, (limit, message)
-        assert scenario.to_dict() == before  # a refused value leaves no trace
+    for path, p in ALL.items():
+        with subtests.test(path):
+            bad = list(refused(p))
+            assert len(bad) >= 6
+            for value in bad:
+                with pytest.raises(SettingError) as caught:
+                    scenario.set(path, value)
+                message = str(caught.value)
+                assert message.startswith(f"{path} = "), message
+                assert "\n" not in message and len(message) < 400
+                shown = repr(value)
+                assert (shown if len(shown) <= 80 else shown[:60]) in message
+                after = message.split(": ", 1)[1]
+                for limit in limits(p):
+                    assert limit in after, (limit, message)
+            assert scenario.to_dict() == before, "a refused value leaves no trace"
 
 
-@pytest.mark.parametrize("path", ALL)
-def test_every_setting_takes_its_own_bounds(path: str) -> None:
-    p = next(p for found, _, p in full().walk() if found == path)
+def bounds_of(p: param.Parameter) -> list[Any]:
+    """The first and the last value that a setting takes, or all of them."""
     if isinstance(p, Reals):
-        fine: list[Any] = [[v] * max(p.bounds[0], 1) for v in p.item_bounds]
-    elif isinstance(p, param.Number):
+        return [[v] * max(p.bounds[0], 1) for v in p.item_bounds]
+    if isinstance(p, param.Number):
         step = 1 if isinstance(p, param.Integer) else 0
         low, high = p.bounds
         at_low, at_high = p.inclusive_bounds
-        fine = [
+        return [
             low if at_low or step else math.nextafter(low, math.inf),
             high if at_high or step else math.nextafter(high, -math.inf),
         ]
-    elif isinstance(p, param.Boolean):
-        fine = [True, False]
-    else:
-        fine = list(p.objects)
-    for value in fine:
-        scenario = full()
-        scenario.set(path, value)
-        found = next(getattr(owner, q.name) for at, owner, q in scenario.walk() if at == path)
-        assert found == value
-        is_real = isinstance(p, param.Number) and not isinstance(p, param.Integer)
-        assert type(found) is (float if is_real else type(value))
+    return [True, False] if isinstance(p, param.Boolean) else list(p.objects)
 
 
-@pytest.mark.parametrize("path", ALL)
-def test_every_number_states_its_unit_or_has_none(path: str) -> None:
+def test_every_setting_takes_its_own_bounds(subtests: pytest.Subtests) -> None:
+    base = full()
+    for path, p in ALL.items():
+        with subtests.test(path):
+            is_real = isinstance(p, param.Number) and not isinstance(p, param.Integer)
+            for value in bounds_of(p):
+                found = _flat(_with(base, path, value))[path]
+                assert found == value
+                assert type(found) is (float if is_real else type(value))
+
+
+def test_every_number_states_its_unit_or_has_none(subtests: pytest.Subtests) -> None:
     """A quantity's documentation starts or goes on with its unit in [brackets]; pure numbers have none."""
-    p = next(p for found, _, p in full().walk() if found == path)
-    assert p.doc and p.label
     pure = {
         "damping",
         "fraction",
@@ -163,10 +159,13 @@ def test_every_number_states_its_unit_or_has_none(path: str) -> None:
         "share",
         "third_corner",
     }
-    is_quantity = isinstance(p, (param.Number, Reals)) and path.rsplit(".", 1)[-1] not in pure
-    assert bool(unit_of(p)) == is_quantity
-    if is_quantity:
-        assert allowed_values(p).endswith(unit_of(p))
+    for path, p in ALL.items():
+        with subtests.test(path):
+            assert p.doc and p.label
+            is_quantity = isinstance(p, (param.Number, Reals)) and path.rsplit(".", 1)[-1] not in pure
+            assert bool(unit_of(p)) == is_quantity
+            if is_quantity:
+                assert allowed_values(p).endswith(unit_of(p))
 
 
 @pytest.mark.parametrize(("path", "value"), [("telescope.diameter", 0.01), ("loop.closed", 1), ("run.seed", True)])
@@ -254,18 +253,18 @@ def types_in(value: Any) -> set[type]:
     return set().union(*map(types_in, value)) if isinstance(value, list) else {type(value)}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("path", ALL)
-def test_numbers_of_numpy_become_plain_on_every_way_in(path: str) -> None:
-    p = next(p for found, _, p in full().walk() if found == path)
-    for value in of_numpy(p):
-        by_path, by_attribute = full(), full()
-        by_path.set(path, value)
-        owner = next(owner for at, owner, _ in by_attribute.walk() if at == path)
-        setattr(owner, path.split(".")[-1], value)
-        for scenario in (by_path, by_attribute, full().replace({path: value})):
-            assert scenario == full()
-            assert types_in(scenario.to_dict()) <= {float, int, bool, str}
+def test_numbers_of_numpy_become_plain_on_every_way_in(subtests: pytest.Subtests) -> None:
+    base = full()
+    by_path, by_attribute = base.copy(), base.copy()
+    owners = {path: owner for path, owner, _ in by_attribute.walk()}
+    for path, p in ALL.items():
+        with subtests.test(path):
+            for value in of_numpy(p):
+                by_path.set(path, value)
+                setattr(owners[path], p.name, value)
+                for scenario in (by_path, by_attribute, base.replace({path: value})):
+                    assert scenario == base
+                    assert types_in(scenario.to_dict()) <= {float, int, bool, str}
 
 
 def test_numbers_of_numpy_in_peaks_and_events() -> None:
@@ -341,7 +340,7 @@ def test_a_difference_holds_only_what_differs() -> None:
 
 @pytest.mark.slow
 @EXAMPLES
-@given(SCENARIOS, st.sampled_from(ALL), st.data())
+@given(SCENARIOS, st.sampled_from(list(ALL)), st.data())
 def test_setting_one_leaves_the_others(values: dict[str, Any], path: str, data: st.DataObject) -> None:
     scenario = Scenario.from_dict(values)
     known = {found: p for found, _, p in scenario.walk()}
@@ -353,6 +352,12 @@ def test_setting_one_leaves_the_others(values: dict[str, Any], path: str, data: 
     assert flat.pop(path) == value
     base.pop(path)
     assert flat == base
+
+
+def _with(base: Scenario, path: str, value: Any) -> Scenario:
+    scenario = base.copy()
+    scenario.set(path, value)
+    return scenario
 
 
 def _flat(scenario: Scenario) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import queue
 from collections.abc import Callable, Iterator
 from time import monotonic
@@ -57,6 +58,14 @@ class Loop:
     def finish(self, store: Store) -> None:
         """Do what is posted until the run is over."""
         self.until(lambda: store.run.state != RUNNING)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def frozen() -> Iterator[None]:
+    """The end of a session looks through what was made in it, not through what was there before all tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gc, "unfreeze", lambda: None)
+        yield
 
 
 @pytest.fixture(autouse=True)
