@@ -9,7 +9,7 @@ import psutil
 import pytest
 from distributed import Client
 
-from tests.campaign.test_run import BATCHES, COMMAND, ENVIRONMENT, RUNS, SEEDS, SHORT_BATCHES, TINY
+from tests.campaign.test_run import BATCHES, ENVIRONMENT, RUNS, SEEDS, SHORT_BATCHES, TINY, campaign
 
 pytestmark = pytest.mark.slow
 
@@ -52,12 +52,12 @@ def cluster(tmp_path):
 
 
 def start_campaign(cluster, tmp_path, seeds=SEEDS):
-    """Start a campaign of batches of two runs; return its process, the plan and its folder."""
+    """Start a campaign of batches of two runs; return its process and its folder."""
     plan, out = tmp_path / "plan.toml", tmp_path / "out"
     plan.write_text(TINY.format(seeds=seeds), encoding="utf-8")
     command = [sys.executable, "-c", SHORT_BATCHES, "campaign", "run", str(plan), "--out", str(out)]
     command += ["--scheduler", cluster.address]
-    return subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE), plan, out
+    return subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE), out
 
 
 def wait_for_batch(running, out):
@@ -66,24 +66,21 @@ def wait_for_batch(running, out):
         time.sleep(0.01)
 
 
-def is_as_undisturbed(plan, out, alone):
-    """Return whether the table is that of a run on one process, byte for byte."""
-    subprocess.run([*COMMAND, "campaign", "run", str(plan), "--out", str(alone), "--workers", "1"], env=ENVIRONMENT, check=True)
-    tables = [
-        subprocess.run(
-            [*COMMAND, "campaign", "table", str(folder), "--csv"], env=ENVIRONMENT, check=True, capture_output=True
-        ).stdout
-        for folder in (out, alone)
-    ]
-    return tables[0] == tables[1]
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """The table of the same campaign on one process."""
+    plan, out = tmp_path_factory.mktemp("plan") / "plan.toml", tmp_path_factory.mktemp("alone")
+    plan.write_text(TINY.format(seeds=SEEDS), encoding="utf-8")
+    campaign("run", plan, "--out", out, "--workers", 1)
+    return campaign("table", out, "--csv").stdout
 
 
-def test_a_worker_that_dies_changes_nothing(cluster, tmp_path):
+def test_a_worker_that_dies_changes_nothing(cluster, tmp_path, alone):
     cluster.start_scheduler()
     nannies = [cluster.start_worker() for _ in range(2)]
     with Client(cluster.address, timeout=60) as client:
         client.wait_for_workers(2, timeout=60)
-    running, plan, out = start_campaign(cluster, tmp_path)
+    running, out = start_campaign(cluster, tmp_path)
     wait_for_batch(running, out)
     worker = max(psutil.Process(nannies[0].pid).children(recursive=True), key=lambda p: p.memory_info().rss)  # not its tracker
     worker.kill()
@@ -91,13 +88,13 @@ def test_a_worker_that_dies_changes_nothing(cluster, tmp_path):
     _, said = running.communicate(timeout=200)
     assert running.returncode == 0, said
     assert f"{RUNS} of {RUNS} runs are done".encode() in said
-    assert is_as_undisturbed(plan, out, tmp_path / "alone")
+    assert campaign("table", out, "--csv").stdout == alone, "byte for byte"
 
 
-def test_a_scheduler_that_is_started_again_changes_nothing(cluster, tmp_path):
+def test_a_scheduler_that_is_started_again_changes_nothing(cluster, tmp_path, alone):
     scheduler = cluster.start_scheduler()
     cluster.start_worker()
-    running, plan, out = start_campaign(cluster, tmp_path)
+    running, out = start_campaign(cluster, tmp_path)
     wait_for_batch(running, out)
     scheduler.kill()
     scheduler.wait()
@@ -109,18 +106,18 @@ def test_a_scheduler_that_is_started_again_changes_nothing(cluster, tmp_path):
     assert running.returncode == 0, said
     assert f"{RUNS} of {RUNS} runs are done, {RUNS} of them now; workers or their scheduler were lost".encode() in said
     assert b"Traceback" not in said and b"ERROR" not in said
-    assert is_as_undisturbed(plan, out, tmp_path / "alone")
+    assert campaign("table", out, "--csv").stdout == alone, "byte for byte"
 
 
 def test_a_scheduler_without_workers_is_told_and_waited_for(cluster, tmp_path):
     cluster.start_scheduler()
-    running, _, out = start_campaign(cluster, tmp_path, seeds=2)
+    running, out = start_campaign(cluster, tmp_path, seeds=2)
     line = f"wfsobs: no worker at {cluster.address}: waiting; start one with: dask worker {cluster.address} --nthreads 1\n"
     assert running.stderr.readline().decode() == line
     running.terminate()  # it does not wait for ever
     _, said = running.communicate(timeout=60)
     assert running.returncode == 143 and b"0 of 4 runs are done" in said
-    running, _, out = start_campaign(cluster, tmp_path, seeds=2)
+    running, out = start_campaign(cluster, tmp_path, seeds=2)
     assert running.stderr.readline().decode() == line
     cluster.start_worker()
     _, said = running.communicate(timeout=200)

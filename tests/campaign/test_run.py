@@ -9,10 +9,12 @@ from pathlib import Path
 
 import psutil
 import pytest
+from click.testing import CliRunner
 
 import wfsobs
 from wfsobs.campaign.keys import row_key, scenario_digest
 from wfsobs.campaign.store import ROWS, batch_files, read_results, write_batch
+from wfsobs.cli import main
 
 pytestmark = pytest.mark.slow
 
@@ -53,17 +55,24 @@ def plan(tmp_path_factory):
 
 
 def campaign(*arguments, check=True):
-    done = subprocess.run(
-        [*COMMAND, "campaign", *map(str, arguments)], capture_output=True, text=True, env=ENVIRONMENT, timeout=250
-    )
-    assert not check or done.returncode == 0, done.stderr
+    """Return what the command gives in this process; its workers are processes of their own."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        done = CliRunner().invoke(main, ["campaign", *map(str, arguments)], catch_exceptions=False)
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    assert not check or done.exit_code == 0, done.stderr
     return done
 
 
 @pytest.fixture(scope="module")
 def undisturbed(plan, tmp_path_factory):
+    """The folder of a campaign that was left alone, run as a command."""
     out = tmp_path_factory.mktemp("undisturbed")
-    assert f"{RUNS} of {RUNS} runs are done, {RUNS} of them now" in campaign("run", plan, "--out", out, "--workers", 2).stderr
+    command = [*COMMAND, "campaign", "run", str(plan), "--out", str(out), "--workers", "2"]
+    done = subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT, timeout=250)
+    assert done.returncode == 0 and f"{RUNS} of {RUNS} runs are done, {RUNS} of them now" in done.stderr, done.stderr
     return out
 
 
@@ -148,7 +157,7 @@ def test_more_seeds_continue_and_another_plan_is_refused(tmp_path):
     campaign("run", small, "--out", out, "--workers", 1)
     assert "6 of 6 runs are done, 2 of them now" in campaign("run", large, "--out", out, "--workers", 1).stderr
     refused = campaign("run", other, "--out", out, check=False)
-    assert refused.returncode == 2 and "holds another campaign" in refused.stderr and refused.stderr.count("\n") == 1
+    assert refused.exit_code == 2 and "holds another campaign" in refused.stderr and refused.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -160,7 +169,7 @@ def test_more_seeds_continue_and_another_plan_is_refused(tmp_path):
 )
 def test_what_cannot_be_used_is_one_line(plan, tmp_path, arguments, line):
     refused = campaign("run", plan, "--out", tmp_path / "out", *arguments, check=False)
-    assert refused.returncode == 2 and line in refused.stderr and refused.stderr.count("\n") == 1
+    assert refused.exit_code == 2 and line in refused.stderr and refused.stderr.count("\n") == 1
 
 
 def test_an_observer_that_ends_in_an_error_is_a_failure_of_its_own(monkeypatch):

@@ -60,7 +60,7 @@ def options(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("source", "name"), [*(("simulation", name) for name in PROCESSES["simulation"]), ("record", SOURCE), ("stream", SOURCE)]
+    ("source", "name"), [("simulation", TRACKER), ("simulation", "the simulation"), ("record", SOURCE), ("stream", LINEAR)]
 )
 def test_a_process_that_is_killed_ends_the_command_in_one_line_that_names_it(options, source, name):
     names = PROCESSES[source]
@@ -98,46 +98,37 @@ def wait(condition, seconds=120.0):
         time.sleep(0.02)
 
 
-@pytest.fixture
-def loop():
-    """A loop with every kind of process: some observers, controllers, and what is made beside them."""
+def test_every_process_that_is_killed_is_named():
+    """Every kind of process there is, one after the other: observers of every crew, controllers, and what is made beside them."""
     scenario = paper().replace({"run.warm_up": 0.2})
-    loop = LiveLoop(SimulatedLoop(scenario), scenario, ["persistence"])
-    loop.control("none", True)
-    wait(lambda: loop.is_ready and len(loop._processes.pids) == 5)
-    yield loop
-    loop.stop()
-
-
-@pytest.mark.parametrize("name", ["the controllers", "the designs"])
-def test_a_process_beside_the_loop_that_is_killed_is_named_too(loop, name):
-    (pid,) = [process.pid for process in loop._processes.processes if process.name == name]
-    assert loop.failure() == ""
-    os.kill(pid, signal.SIGKILL)
-    wait(loop.failure)
-    assert loop.failure() == f"live: the process of {name} ({pid}) was ended by signal 9 (SIGKILL)"
-    for _ in range(100):  # no more than a pipe holds waits for the one that is gone
-        loop._processes.tell_controllers({"id": "none", "design": bytes(4096)})
-    wait_for([loop._processes.workshop.submit(abs, -1)])
-    pids = loop._processes.pids
-    loop.stop()
-    wait(lambda: not any(map(psutil.pid_exists, pids)))
-
-
-def test_all_that_are_killed_are_named(loop):
-    for pid in loop._processes.pids:
-        os.kill(pid, signal.SIGKILL)
-    wait(lambda: loop.failure().count("SIGKILL") == 5)
-    assert all(f"({pid})" in loop.failure() for pid in loop._processes.pids) and "\n" not in loop.failure()
-
-
-def test_what_is_computed_beside_a_loop_is_the_result_or_the_exception(loop):
-    workshop = loop._processes.workshop
-    assert workshop.submit(abs, -3).result(60) == 3
-    with pytest.raises(ZeroDivisionError):
-        workshop.submit(divmod, 1, 0).result(60)
-    loop.stop()
-    assert workshop.submit(abs, -3).cancelled()
+    loop = LiveLoop(SimulatedLoop(scenario), scenario, ["kf-lgs", "gpr-online", "gpr-adaptive"])
+    try:
+        loop.control("none", True)
+        wait(lambda: loop.is_ready and len(loop._processes.pids) == 7)
+        workshop, pids = loop._processes.workshop, loop._processes.pids
+        assert workshop.submit(abs, -3).result(60) == 3
+        with pytest.raises(ZeroDivisionError):
+            workshop.submit(divmod, 1, 0).result(60)
+        assert loop.failure() == ""
+        first, *others = ["the controllers", "the designs", *PROCESSES["simulation"][1:]]
+        process = {process.name: process for process in loop._processes.processes}
+        assert process.keys() == {first, *others}
+        os.kill(process[first].pid, signal.SIGKILL)
+        wait(loop.failure)
+        assert loop.failure() == f"live: the process of {first} ({process[first].pid}) was ended by signal 9 (SIGKILL)"
+        for _ in range(100):  # no more than a pipe holds waits for the one that is gone
+            loop._processes.tell_controllers({"id": "none", "design": bytes(4096)})
+        for name in others:
+            os.kill(process[name].pid, signal.SIGKILL)
+        wait(lambda: loop.failure().count("SIGKILL") == len(pids))
+        assert "\n" not in loop.failure()
+        assert all(f"{name} ({one.pid})" in loop.failure() for name, one in process.items())
+        wait_for([workshop.submit(abs, -1)])
+        loop.stop()
+        wait(lambda: not any(map(psutil.pid_exists, pids)))
+        assert workshop.submit(abs, -3).cancelled()
+    finally:
+        loop.stop()
 
 
 def test_numbers_that_are_not_known_are_null_in_json():
