@@ -43,7 +43,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_collection_finish() -> None:
-    """Have the collector pass over the half million objects of the tests and of what they import, each time it looks through all."""
+    """Have the collector, when it looks through all, pass over the half million objects of tests and imports."""
     gc.collect()
     gc.freeze()
 

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow
 
 SCENARIO = PRESETS["laser-dropout"]().replace(
     {
-        "run.duration": 6.5,
+        "run.duration": 5.7,
         "events": [
             {"kind": "laser", "start": 2.0, "duration": 1.5, "lasers": 1},
             {"kind": "laser", "start": 4.5, "duration": 1.0, "lasers": 2},
@@ -56,7 +56,7 @@ def test_observers_of_bridged_values_are_those_of_missing_ones(tmp_path: Path) -
     """Within 10 % of the filter that is told which frames are missing, and of how many lasers the others are the mean, from the
     first frame after the gap; it was 5 to 12 times worse where a prediction was taken for measurements."""
     squares: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
-    for seed in (1, 2, 3):
+    for seed in (1, 2):
         record = simulate(SCENARIO.replace({"run.seed": seed}))
         gone = np.isnan(record.y_lgs[:, 0])
         exact = {name: run_observer(name, record, SCENARIO) for name in NAMES}

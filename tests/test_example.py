@@ -39,8 +39,9 @@ def said(done: subprocess.CompletedProcess[str]) -> str:
 
 
 def errors(python: Run, *more: str) -> dict[str, float]:
-    """RMS error of tip turbulence by observer."""
-    rows = json.loads(said(python("-m", "wfsobs", *more, *SHORT, "--json")))
+    """RMS error of tip turbulence of the observer and of two of ours."""
+    names = ("low-pass", "persistence", "kf-lgs")
+    rows = json.loads(said(python("-m", "wfsobs", *more, *SHORT, *(f"--observer={name}" for name in names), "--json")))
     return {row["observer"]: row["rms_um"] for row in rows if (row["target"], row["mode"]) == ("turbulence", "tip")}
 
 
@@ -78,7 +79,8 @@ def test_it_observes_a_record_and_is_tuned(python: Run, tmp_path: Path) -> None:
 
 def test_a_report_has_its_line_and_its_setting(python: Run, tmp_path: Path) -> None:
     made = tmp_path / "report.html"
-    said(python("-m", "wfsobs", "export", str(made), *SHORT, "--set", "low_pass.corner=80"))
+    chosen = ("--observer", "low-pass", "--observer", "kf-lgs")
+    said(python("-m", "wfsobs", "export", str(made), *SHORT, *chosen, "--set", "low_pass.corner=80"))
     page = made.read_text(encoding="utf-8")
     assert "--line-low-pass:#8A4B00" in page and "--line-low-pass:#E0A050" in page
     assert '"label":"Low-pass"' in page and "low_pass.corner" in page

@@ -91,7 +91,7 @@ def test_the_late_adaptive_filter_is_scored_with_the_others_or_apart(window: flo
 @pytest.mark.parametrize(
     "changes",
     [
-        {"turbulence.source": "frozen-flow", "sensors.kind": "zernike", "telescope.radial_order": 3},
+        {"turbulence.source": "frozen-flow", "sensors.kind": "zernike", "telescope.radial_order": 2},
         {"turbulence.source": "frozen-flow", "sensors.lgs_radius": 30.0, "sensors.lgs_combination": "minimum-variance"},
         {"telescope.radial_order": 2, "sensors.tip_tilt_indetermination": True},
         {"turbulence.source": "psd", "turbulence.psd": {"frequency": [0.5, 50.0], "tip": [1e-2, 1e-3], "tilt": [1e-2, 1e-3]}},

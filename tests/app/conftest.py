@@ -12,12 +12,12 @@ import numpy as np
 import panel as pn
 import pytest
 
-from wfsobs.app.cache import freeze, key_of
+from wfsobs.app.cache import freeze
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.jobs import RUNNING, Tell
 from wfsobs.app.limits import NONE, Limits
-from wfsobs.app.service import Service, Session
-from wfsobs.app.sources import Source
+from wfsobs.app.service import Service, Session, run_key
+from wfsobs.app.sources import LoadedRecord, Source
 from wfsobs.app.store import Store
 from wfsobs.app.work import RunResults, compute
 from wfsobs.progress import Watch
@@ -111,19 +111,20 @@ def make_store(loop: Loop, short: Scenario, enter: Callable[..., Session]) -> Ca
     return make
 
 
-FIRST = key_of(PRESETS["paper"]().replace(SHORT))
+MOST = 12
 KEPT: dict[str, RunResults] = {}
-"""Results by the scenario's key, their arrays read-only."""
+"""The last MOST results of simulations by what they are of, their arrays read-only."""
 
 
 def compute_once(scenario: Scenario, watch: Watch, tell: Tell, source: Source | None = None) -> RunResults:
-    """`compute`, and for the scenario that every dashboard starts with what it gave the first time."""
-    key = key_of(scenario)
-    if source is None and key in KEPT:
-        return KEPT[key]
-    shown = compute(scenario, watch, tell, source)
-    if source is None and key == FIRST:
-        KEPT[key] = freeze(shown)
+    """`compute`, and what it gave the last time where that is kept; records that are loaded have any key in the tests."""
+    if isinstance(source, LoadedRecord):
+        return compute(scenario, watch, tell, source)
+    key = run_key(scenario, source)
+    shown = KEPT.pop(key, None) or freeze(compute(scenario, watch, tell, source))
+    KEPT[key] = shown
+    for oldest in list(KEPT)[:-MOST]:
+        KEPT.pop(oldest, None)
     return shown
 
 
