@@ -55,6 +55,7 @@ SHORT = (
     "--set",
     "gpr_offline.training_size=50",
 )
+FEW = ("--observer", "kf-lgs", "--observer", "multirate-multi")
 
 
 def script(name: str) -> ModuleType:
@@ -155,7 +156,7 @@ def test_the_page_of_observers_lists_them() -> None:
 
 @pytest.mark.parametrize("page", COMMANDS, ids=lambda p: p.name)
 def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every line of a ```sh block that starts with wfsobs, in order, in one folder, on short records."""
+    """Every line of a ```sh block that starts with wfsobs, in order, in one folder, on short records and with few observers."""
     monkeypatch.chdir(tmp_path)
     shutil.copy(ROOT / "examples" / "wind.toml", tmp_path)
     monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path))
@@ -170,6 +171,8 @@ def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
             words[words.index("--seeds") + 1] = "2"
         short = SHORT if words[1] in ("run", "observe", "tune", "loop", "export", "sweep") else ()
         short = ("--seconds", "0.1") if words[1] == "attach" else short
+        if words[1] in ("run", "observe", "export", "sweep", "live") and "--observer" not in words:
+            short = (*short, *FEW)
         result = CliRunner().invoke(main, [*words[1:], *short])
         assert result.exit_code == 0, (line, result.output)
         if out:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import csv
-import os
 import re
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from wfsobs.app.copies import CAMPAIGN as COPIED
 from wfsobs.app.copies import CopiedTask, to_command, to_python
@@ -27,6 +26,7 @@ from wfsobs.campaign.follow import CampaignFolder
 from wfsobs.campaign.plan import Campaign, parse_plan
 from wfsobs.campaign.store import batch_files, open_folder, read_results, write_batch
 from wfsobs.campaign.work import run_rows
+from wfsobs.cli import main
 from wfsobs.scenario import Scenario
 
 PLAN = """
@@ -204,9 +204,14 @@ def test_without_a_campaign_there_is_no_such_page(loop: Any, short: Scenario, en
     assert dashboard.view_state.open("view.page=campaign")[0].startswith("view.page = campaign: takes one of explore, ")
 
 
-def in_a_shell(command: str) -> subprocess.CompletedProcess[str]:
-    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
-    return subprocess.run(command, shell=True, capture_output=True, text=True, env={**os.environ, "PATH": path})
+def in_a_shell(command: str) -> str:
+    """Return what a command prints, split into words by a shell."""
+    words = subprocess.run(f"printf '%s\\0' {command}", shell=True, capture_output=True, text=True, check=True).stdout
+    program, *arguments = words.split("\0")[:-1]
+    assert program == "wfsobs"
+    done = CliRunner().invoke(main, arguments, catch_exceptions=False)
+    assert done.exit_code == 0, done.stderr
+    return done.stdout
 
 
 @pytest.mark.parametrize(
@@ -237,9 +242,8 @@ def test_what_is_copied_has_the_numbers_of_the_page(
         page.filters[path].value = value
     dashboard.display.mode = mode
     monkeypatch.chdir(tmp_path.parent)
-    done = in_a_shell(f"{dashboard.actions.toolbar.command} --csv")
-    assert done.returncode == 0, done.stderr
-    rows = {row["name"]: row for row in csv.DictReader(done.stdout.splitlines())}
+    printed = in_a_shell(f"{dashboard.actions.toolbar.command} --csv")
+    rows = {row["name"]: row for row in csv.DictReader(printed.splitlines())}
     assert [*rows] == re.findall(r'<tr data-name="([^"]*)"', page.table.object), "the same rows in the same order"
     squares: dict[str, list[float]] = {}
     for one in compare(read_results(tmp_path)):
@@ -260,7 +264,7 @@ def test_what_is_copied_has_the_numbers_of_the_page(
     printed = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert [(words[0], words[1]) for words in printed] == [(name, row["rms_nm"]) for name, row in rows.items()]
     said = f"Tiny: 8 of 8 runs, {len(cells)} of 4 scenarios"
-    assert said in in_a_shell(dashboard.actions.toolbar.command).stdout
+    assert said in in_a_shell(dashboard.actions.toolbar.command)
 
 
 def test_a_copy_without_results_has_all_of_them(
