@@ -95,16 +95,18 @@ def test_a_file_is_one_step(actions: Actions, loop: Any) -> None:
     assert store.scenario == before
 
 
-@pytest.mark.parametrize("text", ["loop.gain = 9", "nonsense", "run.warm_up = 20", "#" * (LARGEST + 1), None, 3])
-def test_a_bad_file_changes_nothing_and_has_one_line(actions: Actions, loop: Any, text: Any) -> None:
-    before = actions.store.scenario
-    actions.open_file("mine.toml", text)
-    loop.until(lambda: actions.toolbar.notes != [])
-    assert actions.store.scenario is before
-    (note,) = actions.toolbar.notes
-    assert note.startswith("mine.toml: ") and "\n" not in note
-    actions.open_file("mine.toml", "loop.gain = 0.2")
-    loop.until(lambda: actions.toolbar.notes == [])
+def test_a_bad_file_changes_nothing_and_has_one_line(actions: Actions, loop: Any, subtests: pytest.Subtests) -> None:
+    texts: list[Any] = ["loop.gain = 9", "nonsense", "run.warm_up = 20", "#" * (LARGEST + 1), None, 3]
+    for text in texts:
+        with subtests.test(str(text)[:20]):
+            before = actions.store.scenario
+            actions.open_file("mine.toml", text)
+            loop.until(lambda: actions.toolbar.notes != [])
+            assert actions.store.scenario is before
+            (note,) = actions.toolbar.notes
+            assert note.startswith("mine.toml: ") and "\n" not in note
+            actions.open_file("mine.toml", "loop.gain = 0.2")
+            loop.until(lambda: actions.toolbar.notes == [])
 
 
 def test_the_scenario_file(actions: Actions) -> None:

@@ -165,26 +165,25 @@ def test_a_whole_number_stays_whole(controls: Controls, loop: Any) -> None:
     loop.finish(controls.store)
 
 
-@pytest.mark.parametrize(
-    ("path", "text", "value"),
-    [
+def test_a_typed_value_runs(controls: Controls, loop: Any, subtests: pytest.Subtests) -> None:
+    cases: list[tuple[str, str, Any]] = [
         ("turbulence.wind_speed", "12.5", 12.5),
         ("run.seed", " 7 ", 7),
         ("gpr_online.noise_std", "1e-2", 0.01),
         ("butterworth.frequencies", "20, 30; 40", [20.0, 30.0, 40.0]),
         ("telescope.diameter", "39", 39.0),
-    ],
-)
-def test_a_typed_value_runs(controls: Controls, loop: Any, path: str, text: str, value: Any) -> None:
-    field_of(controls, path).widgets[-1].value = text
-    assert controls.store.value(path) == value and error_of(controls, path) == ""
-    loop.finish(controls.store)
-    assert controls.store.run.result.scenario == controls.store.scenario
+    ]
+    for path, text, value in cases:
+        with subtests.test(path):
+            field_of(controls, path).widgets[-1].value = text
+            assert controls.store.value(path) == value and error_of(controls, path) == ""
+            loop.finish(controls.store)
+            assert controls.store.run.result.scenario == controls.store.scenario
 
 
-@pytest.mark.parametrize(
-    ("path", "text", "says"),
-    [
+def test_a_bad_value_shows_beside_its_setting(controls: Controls, subtests: pytest.Subtests) -> None:
+    shown, scenario = controls.store.run.result, controls.store.scenario
+    for path, text, says in [
         ("turbulence.wind_speed", "200", "Wind speed V₀ = 200: takes a number from 0.1 to 100 m/s"),
         ("turbulence.wind_speed", "15,5", "use a point: 15.5"),
         ("turbulence.wind_speed", "fast", "a number"),
@@ -194,16 +193,16 @@ def test_a_typed_value_runs(controls: Controls, loop: Any, path: str, text: str,
         ("butterworth.frequencies", "20, x", "a list of"),
         ("kalman.frequency", "900", "half the LGS rate"),
         ("run.warm_up", "3", "Duration"),
-    ],
-)
-def test_a_bad_value_shows_beside_its_setting(controls: Controls, path: str, text: str, says: str) -> None:
-    shown, scenario = controls.store.run.result, controls.store.scenario
-    field = field_of(controls, path)
-    field.widgets[-1].value = text
-    assert says in error_of(controls, path)
-    assert field.widgets[-1].error_state and field.widgets[-1].value == text, "what was typed stays, to be corrected"
-    assert controls.store.run.result is shown and controls.store.scenario is scenario
-    assert status_of(controls.store)[2] == f"Not accepted: {setting_name(path)}" == controls.status.note
+    ]:
+        with subtests.test(path, text=text):
+            field = field_of(controls, path)
+            good, field.widgets[-1].value = field.widgets[-1].value, text
+            assert says in error_of(controls, path)
+            assert field.widgets[-1].error_state and field.widgets[-1].value == text, "what was typed stays, to be corrected"
+            assert controls.store.run.result is shown and controls.store.scenario is scenario
+            assert status_of(controls.store)[2] == f"Not accepted: {setting_name(path)}" == controls.status.note
+            field.widgets[-1].value = good
+            assert error_of(controls, path) == ""
 
 
 def test_what_is_being_typed_stays_when_another_setting_changes(controls: Controls) -> None:
@@ -337,25 +336,24 @@ class TestPeaks:
         assert controls.lists[PATH].table.rows == [["17.2512", "0.01235", "0.00841", "0.02"]]
         assert controls.store.value(PATH)[0].to_dict() == peak
 
-    @pytest.mark.parametrize(
-        ("key", "text", "says"),
-        [
+    def test_bad_cell(self, controls: Controls, subtests: pytest.Subtests) -> None:
+        shown, table = controls.store.run.result, controls.lists[PATH].table
+        rows = table.rows
+        for key, text, says in [
             ("frequency", "-3", "from 0.01"),
             ("frequency", "600", "half the LGS rate"),
             ("damping", "two", "Peak 3: ξ = 'two': takes a number"),
             ("rms.1", "-1", "Peak 3: rms = [0.0025, -1]: takes"),
             ("rms.1", "0,5", "use a point: 0.5"),
-        ],
-    )
-    def test_bad_cell(self, controls: Controls, key: str, text: str, says: str) -> None:
-        shown, rows = controls.store.run.result, controls.lists[PATH].table.rows
-        controls.lists[PATH].table._handle_msg({"action": "edit", "row": 2, "key": key, "text": text})
-        error = controls.lists[PATH].table.errors[f"2.{key}"]
-        assert error["text"] == text and says in error["reason"]
-        assert controls.store.run.result is shown and controls.lists[PATH].table.rows == rows
-        good = {"frequency": rows[2][0], "damping": rows[2][1], "rms.1": rows[2][3]}[key]
-        controls.lists[PATH].table._handle_msg({"action": "edit", "row": 2, "key": key, "text": good})
-        assert controls.lists[PATH].table.errors == {} and controls.store.run.result is shown
+        ]:
+            with subtests.test(key, text=text):
+                table._handle_msg({"action": "edit", "row": 2, "key": key, "text": text})
+                error = table.errors[f"2.{key}"]
+                assert error["text"] == text and says in error["reason"]
+                assert controls.store.run.result is shown and table.rows == rows
+                good = {"frequency": rows[2][0], "damping": rows[2][1], "rms.1": rows[2][3]}[key]
+                table._handle_msg({"action": "edit", "row": 2, "key": key, "text": good})
+                assert table.errors == {} and controls.store.run.result is shown
 
     def test_removing_a_bad_row_removes_its_error(self, controls: Controls, loop: Any) -> None:
         controls.lists[PATH].table._handle_msg({"action": "edit", "row": 0, "key": "damping", "text": "7"})

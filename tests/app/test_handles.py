@@ -172,9 +172,8 @@ class TestMessages:
         assert numbers(editor) == before and editor.theory.most is None
         assert not editor.store.can_undo
 
-    @pytest.mark.parametrize(
-        "wrong",
-        [
+    def test_what_cannot_be_is_refused_in_one_line(self, editor: SpectrumEditor, subtests: pytest.Subtests) -> None:
+        wrongs: list[dict[str, Any]] = [
             {"frequency": -1.0},
             {"frequency": float("nan")},
             {"frequency": "x"},
@@ -182,14 +181,14 @@ class TestMessages:
             {"strength": 1e12},
             {"id": "peak-99"},
             {"id": None},
-        ],
-    )
-    def test_what_cannot_be_is_refused_in_one_line(self, editor: SpectrumEditor, wrong: dict[str, Any]) -> None:
-        scenario = editor.store.scenario
-        editor.layer._handle_msg(drag(1, "release", **wrong))
-        assert editor.store.scenario is scenario
-        assert editor.layer.frame["answered"] == 1
-        assert editor.layer.frame["note"] and "\n" not in editor.layer.frame["note"]
+        ]
+        for number, wrong in enumerate(wrongs, start=1):
+            with subtests.test(str(wrong)):
+                scenario = editor.store.scenario
+                editor.layer._handle_msg(drag(number, "release", **wrong))
+                assert editor.store.scenario is scenario
+                assert editor.layer.frame["answered"] == number
+                assert editor.layer.frame["note"] and "\n" not in editor.layer.frame["note"]
 
     def test_messages_without_sense_are_none(self, editor: SpectrumEditor) -> None:
         frame = editor.layer.frame

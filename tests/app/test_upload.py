@@ -294,27 +294,26 @@ def test_what_is_no_record(dashboard: Dashboard, loop: Any) -> None:
         assert dashboard.store.source is None and dashboard.store.run.result is before
 
 
-@pytest.mark.parametrize(
-    "refused",
-    [
+def test_nothing_of_the_file_before_stays_after_a_refusal(
+    dashboard: Dashboard, loop: Any, short: Scenario, subtests: pytest.Subtests
+) -> None:
+    upload, file = dashboard.upload, file_of(short)
+    refusals: list[dict[str, Any]] = [
         {"action": "large", "name": "a.npz"},
         {"action": "part", "name": "a.npz", "index": 0, "count": 1, "data": "%%%"},
         {"action": "part", "name": "a.npz", "index": 0, "count": 1, "data": ""},
         {"action": "part", "name": "a.npz", "index": 0, "count": 1, "data": "AAAA"},
-    ],
-)
-def test_nothing_of_the_file_before_stays_after_a_refusal(
-    dashboard: Dashboard, loop: Any, short: Scenario, refused: dict
-) -> None:
-    upload = dashboard.upload
-    previewed(dashboard, loop, file_of(short))
-    assert upload.room.visible and not upload.use.disabled
-    upload.handle(refused)
-    loop.until(lambda: not upload.picker.message.startswith(("Reading", "Waiting")))
-    assert upload.picker.message.startswith("a.npz") or "choose the file again" in upload.picker.message
-    assert not upload.room.visible or ("night.csv" not in upload.content.text.object and upload.use.disabled)
-    upload.confirm()
-    assert dashboard.store.source is None
+    ]
+    for refused in refusals:
+        with subtests.test(str(refused)):
+            previewed(dashboard, loop, file)
+            assert upload.room.visible and not upload.use.disabled
+            upload.handle(refused)
+            loop.until(lambda: not upload.picker.message.startswith(("Reading", "Waiting")))
+            assert upload.picker.message.startswith("a.npz") or "choose the file again" in upload.picker.message
+            assert not upload.room.visible or ("night.csv" not in upload.content.text.object and upload.use.disabled)
+            upload.confirm()
+            assert dashboard.store.source is None
 
 
 def test_a_record_that_is_too_short_cannot_be_used(dashboard: Dashboard, loop: Any) -> None:

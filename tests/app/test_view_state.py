@@ -36,9 +36,8 @@ class TestViewState:
         assert dashboard.explore.strips["vibration"].cards.hidden_lines == ["truth", "kf-lgs"]
         assert dashboard.seeds.count == 3
 
-    @pytest.mark.parametrize(
-        ("field", "reason"),
-        [
+    def test_what_makes_no_sense_is_named(self, dashboard: Dashboard, subtests: pytest.Subtests) -> None:
+        for field, reason in [
             ("view.page=moon", "view.page = moon: takes one of explore, identify"),
             ("view.window=3,1", "view.window = 3,1: takes two times [s], the first one smaller"),
             ("view.window=nan,1", "view.window = nan,1: takes two times"),
@@ -46,13 +45,13 @@ class TestViewState:
             ("view.seeds=0", "view.seeds = 0: takes a whole number from 1 to 50"),
             ("view.seeds=many", "view.seeds = many: takes a whole number from 1 to 50"),
             ("view.colour=red", "view.colour: there is no such part of a view"),
-        ],
-    )
-    def test_what_makes_no_sense_is_named(self, dashboard: Dashboard, field: str, reason: str) -> None:
-        dashboard.actions.handle({"action": "view", "query": f"?{field}&view.mode=tilt"})
-        (note,) = dashboard.actions.toolbar.notes
-        assert note.startswith("Not used from the link: ") and reason in note
-        assert dashboard.display.mode == "tilt", "the rest is used"
+        ]:
+            with subtests.test(field):
+                dashboard.display.mode, dashboard.actions.toolbar.notes = "tip", []
+                dashboard.actions.handle({"action": "view", "query": f"?{field}&view.mode=tilt"})
+                (note,) = dashboard.actions.toolbar.notes
+                assert note.startswith("Not used from the link: ") and reason in note
+                assert dashboard.display.mode == "tilt", "the rest is used"
 
     def test_a_theme_that_was_chosen(self, dashboard: Dashboard) -> None:
         dashboard.view_state.choose_theme(True)
