@@ -27,6 +27,8 @@ from wfsobs.record import Record
 from wfsobs.settings.errors import SettingError
 from wfsobs.telemetry.records import save_record
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def arena() -> Arena:

@@ -19,6 +19,8 @@ from wfsobs.prior import Prior
 from wfsobs.record import Measurements
 from wfsobs.settings.errors import SettingError
 
+pytestmark = pytest.mark.slow
+
 HERE = Path(__file__).parent
 
 pytestmark = pytest.mark.slow
