@@ -33,7 +33,6 @@ from wfsobs.observers.base import Observer
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.streams.shared_image import SharedImage, stream_path
-from wfsobs.telemetry.formats.contents import Contents
 
 pytestmark = pytest.mark.slow
 
@@ -249,14 +248,14 @@ def test_the_new_format_brings_a_record_back(tmp_path: Path) -> None:
         names["write"](file, arrays)
         size = file.seek(0, 2)
         file.seek(0)
-        back = names["read"](file, size, Contents()).arrays
+        back = names["read"](file, size).contents.arrays
         assert back.keys() == arrays.keys()
         assert all(np.array_equal(back[name], arrays[name], equal_nan=True) for name in arrays)
         file.seek(0)
         with pytest.raises(RecordError, match="holds more than"):
-            names["read"](file, size - 1, Contents())
+            names["read"](file, size - 1)
     with pytest.raises(RecordError, match="is no JSON"):
-        names["read"](io.BytesIO(b"{"), 100, Contents())
+        names["read"](io.BytesIO(b"{"), 100)
 
 
 def test_telemetry_is_read_as_the_page_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -33,6 +33,7 @@ FUNCTIONS = (
     "load",
     "observe",
     "run",
+    "save",
     "score",
     "simulate",
     "tune",

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from wfsobs.settings.errors import SettingError
     from wfsobs.simulation.loop import simulate
     from wfsobs.stepping import design
-    from wfsobs.telemetry.records import load
+    from wfsobs.telemetry.records import load, save
     from wfsobs.tuning.tuning import tune
 
 
@@ -55,6 +55,7 @@ _HOMES = {
     "SettingError": "settings.errors",
     "simulate": "simulation.loop",
     "load": "telemetry.records",
+    "save": "telemetry.records",
     "tune": "tuning.tuning",
 }
 """Public name -> the module below wfsobs that defines it."""
@@ -77,6 +78,7 @@ __all__ = [
     "observe",
     "register",
     "run",
+    "save",
     "score",
     "simulate",
     "tune",

@@ -17,8 +17,11 @@ LENGTHS = {"um": 1.0, "nm": 1e-3, "m": 1e6}
 ANGLES = {"rad": 1.0, "arcsec": math.radians(1.0 / 3600.0), "mas": math.radians(1.0 / 3.6e6)}
 """Radians per unit."""
 
-SECONDS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+SECONDS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "d": 86400.0}
 """Seconds per unit of time."""
+
+DAYS = ("mjd", "jd")
+"""Names of a time in days."""
 
 UNITS = ("um", "nm", "mas", "arcsec", "rad")
 """Units that a user can give for a file."""
@@ -50,6 +53,8 @@ def split_unit(heading: str, beside: str = "") -> tuple[str, str]:
     >>> split_unit("slope x [nm]"), split_unit("t_ms"), split_unit("cmd_x"), split_unit("T", "ns")
     (('slope x', 'nm'), ('t', 'ms'), ('cmd_x', ''), ('T', 'ns'))
     """
+    if heading.lower() in DAYS:
+        return heading, "d"
     match = _ENDING.search(heading)
     ending = _parse_any(match["unit"]) if match else ""
     name = heading[: match.start()] if match and ending else heading

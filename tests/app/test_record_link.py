@@ -52,8 +52,8 @@ def test_what_is_said_of_a_record_survives_a_link(declaration: DeclaredFormat) -
     [
         ("record.unit=furlong", "record.unit = furlong: takes one of "),
         ("record.sign=2", "record.sign = 2: takes 1 or -1"),
-        ("record.delay=0", "record.delay = 0: takes a whole number of steps from 1"),
-        ("record.delay=one", "record.delay = one: takes a whole number of steps from 1"),
+        ("record.delay=0", "record.delay = 0: takes a number of steps from 1"),
+        ("record.delay=one", "record.delay = one: takes a number of steps from 1"),
         ("record.rate=nan", "record.rate = nan: takes a rate above 0 Hz"),
         ("record.column.y_lgs/piston=a", "record.column.y_lgs/piston = a: there is no such part of a record"),
         (f"record.column.u/tip={'a' * 2001}", "record.column.u/tip = aaa"),

@@ -154,7 +154,7 @@ def test_columns_that_nobody_names_keep_their_names(ending: str) -> None:
         columns += [fits.Column(name, "D", array=u) for name, u in zip("ab", U.T, strict=True)]
         fits.BinTableHDU.from_columns(columns).writeto(file)
     file.seek(0)
-    is_as_clean(read_record(file, f"a{ending}", declaration=stated), "unit nm")
+    is_as_clean(read_record(file, f"a{ending}", declaration=stated), "unit nm" + ", column cube not used" * (ending == ".npz"))
 
 
 @pytest.mark.parametrize("name", ["frame", "FrameCounter", "frame_no", "wfs frame counter"])

@@ -236,8 +236,8 @@ def test_a_frame_that_lacks_a_mode_is_lost() -> None:
     [
         ({"unit": "V"}, "unit is 'V', which is no unit"),
         ({"command_sign": 0}, "command_sign takes 1 or -1, not 0"),
-        ({"delay": 0}, "delay takes a whole number from 1, not 0"),
-        ({"delay": 1.5}, "delay takes a whole number, not 1.5"),
+        ({"delay": 0}, "delay takes a number of steps from 1 to 100, not 0"),
+        ({"delay": "two"}, "delay takes a number, not 'two'"),
         ({"dt": NONE}, "has no dt and no time"),
         ({"y_ngs": np.zeros((N, 2))}, "y_ngs needs ratio"),
         ({"y_ngs": np.zeros((N, 1)), "ratio": 1}, r"y_ngs has shape \(40, 1\); expected \(40, 2\)"),

@@ -36,11 +36,13 @@ def stated_options(source: LoadedRecord) -> list[str]:
         "unit": stated.unit,
         "command-sign": sign,
         "command-delay": stated.command_delay,
+        "command-gain": stated.command_gain and ",".join(map(str, stated.command_gain)),
+        "rail": stated.rail,
         "rate": stated.rate,
         "sha256": source.sha256 or None,
     }
     words = [word for name, value in named.items() if value is not None for word in (f"--{name}", str(value))]
-    words += ["--trust"] * stated.trust
+    words += ["--trust"] * stated.trust + ["--open-loop"] * stated.open_loop
     return words + [word for role, name in stated.columns.items() for word in ("--column", f"{role}={name}")]
 
 

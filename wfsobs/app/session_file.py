@@ -14,6 +14,7 @@ import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
+from math import inf
 from typing import Any, TypeVar
 
 from wfsobs.app.cache import owners_in
@@ -29,7 +30,7 @@ from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.errors import SettingError
 from wfsobs.telemetry.columns import to_contents
 from wfsobs.telemetry.formats import npz
-from wfsobs.telemetry.intake import DeclaredFormat, to_record
+from wfsobs.telemetry.intake import LONGEST_DELAY, DeclaredFormat, to_record
 from wfsobs.telemetry.preview import safe_name
 from wfsobs.telemetry.records import record_arrays
 from wfsobs.units import UNITS
@@ -48,19 +49,23 @@ class SessionError(ValueError):
 def read_declaration(values: Mapping[str, Any]) -> DeclaredFormat:
     """Read what was said of a record's file. Raises SessionError."""
     unit, sign, delay, rate = (values.get(name) for name in ("unit", "command_sign", "command_delay", "rate"))
-    columns, trust = get_value(values, "columns", dict), values.get("trust", False)
+    columns, trust, at_rest = get_value(values, "columns", dict), values.get("trust", False), values.get("open_loop", False)
+    gain, rail = values.get("command_gain"), values.get("rail")
     valid = (
         (unit is None or unit in UNITS)
         and sign in (None, 1, -1)
-        and (delay is None or (type(delay) is int and 1 <= delay < 1e6))
+        and (delay is None or (type(delay) in (int, float) and 1 <= delay <= LONGEST_DELAY))
         and (rate is None or (type(rate) in (int, float) and 0 < rate < 1e6))
+        and (rail is None or (type(rail) in (int, float) and 0 < rail < inf))
+        and (gain is None or (len(gain) <= 64 and all(type(g) in (int, float) and 0 < g < inf for g in gain)))
         and isinstance(trust, bool)
+        and isinstance(at_rest, bool)
         and len(columns) <= 64
         and all(isinstance(name, str) and len(name) <= LONGEST_TEXT for name in columns.values())
     )
     if not valid:
         raise SessionError("what is said of a record makes no sense")
-    return DeclaredFormat(unit, sign, delay, rate, columns, trust)
+    return DeclaredFormat(unit, sign, delay, rate, columns, trust, None if gain is None else tuple(gain), rail, at_rest)
 
 
 def read_score(values: Any) -> Score:

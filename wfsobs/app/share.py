@@ -24,7 +24,7 @@ from wfsobs.scenario.configfile import from_toml, parse_toml, reference_preset, 
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.errors import SettingError
 from wfsobs.settings.group import holds_groups, settings_of
-from wfsobs.telemetry.columns import ROLES
+from wfsobs.telemetry.columns import ROLES, SIGNALS
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.preview import safe_name
 from wfsobs.units import UNITS
@@ -37,7 +37,10 @@ DIGITS = 64
 STATEMENTS: dict[str, tuple[str, Callable[[str], Any], str]] = {
     "unit": ("unit", str, f"takes one of {', '.join(UNITS)}"),
     "sign": ("command_sign", int, "takes 1 or -1"),
-    "delay": ("command_delay", int, "takes a whole number of steps from 1"),
+    "delay": ("command_delay", float, "takes a number of steps from 1"),
+    "gain": ("command_gain", lambda text: tuple(map(float, text.split(","))), "takes a number above 0, or one per mode"),
+    "rail": ("rail", float, "takes a number above 0"),
+    "open_loop": ("open_loop", lambda text: bool(("False", "True").index(text)), "takes True"),
     "rate": ("rate", float, "takes a rate above 0 Hz"),
     "trust": ("trust", lambda text: bool(("False", "True").index(text)), "takes True"),
 }
@@ -55,9 +58,15 @@ def record_fields(record: NamedRecord) -> dict[str, str]:
     """Write a record as fields of a link."""
     said = {key: getattr(record.declaration, part) for key, (part, _, _) in STATEMENTS.items()}
     fields = {"name": record.name, "sha256": record.sha256}
-    fields |= {key: f"{value:.17g}" if key == "rate" else str(value) for key, value in said.items() if value not in (None, False)}
+    fields |= {key: _write(value) for key, value in said.items() if value not in (None, False)}
     fields |= {COLUMN + role: name for role, name in record.declaration.columns.items()}
     return {PREFIX + key: text for key, text in fields.items()}
+
+
+def _write(value: Any) -> str:
+    return (
+        ",".join(map(_write, value)) if isinstance(value, tuple) else f"{value:.17g}" if isinstance(value, float) else str(value)
+    )
 
 
 def read_record_fields(fields: Mapping[str, str]) -> tuple[NamedRecord | None, dict[str, str]]:
@@ -80,7 +89,7 @@ def read_record_fields(fields: Mapping[str, str]) -> tuple[NamedRecord | None, d
 def _with(declaration: DeclaredFormat, key: str, text: str) -> DeclaredFormat:
     """Add what one field says. Raises SessionError, ValueError."""
     role = key.removeprefix(COLUMN)
-    if key.startswith(COLUMN) and role in ROLES:
+    if key.startswith(COLUMN) and role in ROLES | SIGNALS:
         changed = replace(declaration, columns={**declaration.columns, role: text})
     elif key in STATEMENTS:
         part, read, takes = STATEMENTS[key]

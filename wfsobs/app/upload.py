@@ -59,7 +59,8 @@ class UploadFields:
     def read(self, roles: dict[str, str]) -> DeclaredFormat:
         """Read the fields; roles : of columns that have been chosen. Raises RecordError where a field holds no number."""
         unit = None if self.unit.value == SILENT else self.unit.value
-        delay, rate = _number(self.delay, int, 1), _number(self.rate, float, 1e-3)
+        delay, rate = _number(self.delay, float, 1), _number(self.rate, float, 1e-3)
+        delay = int(delay) if delay and delay % 1 == 0 else delay
         return DeclaredFormat(unit, self.sign.value or None, delay, rate, roles, self.trust.value)
 
     def take_proposals(self, preview: Preview) -> None:

@@ -27,7 +27,7 @@ function takeDrops(model, root) {
   model.on("remove", () => { for (const [name, act] of Object.entries(listeners)) document.removeEventListener(name, act) })
 }
 
-const FORMAT = "CSV, NPZ, FITS or AOT: a row per step, measurements, commands and the time or the rate; or a vibration spectrum. A file may also be dropped anywhere on the page; columns with other names can be mapped after loading."
+const FORMAT = "CSV or other text, NPZ, MATLAB, HDF5, FITS, AOT, Parquet or IDL: a row per step, measurements, commands and the time or the rate; or a vibration spectrum. A file may also be dropped anywhere on the page; columns with other names can be mapped after loading."
 
 // What a file looks like, a template to fill in, a sample, and the button that chooses one.
 function dialog(model, el, choose) {
@@ -49,7 +49,7 @@ function dialog(model, el, choose) {
 export function render({model, el}) {
   const bar = document.createElement("div")
   bar.className = "bar"
-  const input = Object.assign(document.createElement("input"), {type: "file", hidden: true, accept: ".npz,.csv,.txt,.fits,.fit,.fts"})
+  const input = Object.assign(document.createElement("input"), {type: "file", hidden: true, accept: ".npz,.npy,.csv,.txt,.dat,.tsv,.asc,.fits,.fit,.fts,.mat,.h5,.hdf5,.hdf,.he5,.sav,.idl,.parquet,.pq"})
   input.setAttribute("aria-label", "Record file")
   input.onchange = () => {
     if (input.files[0]) send(model, input.files[0])

@@ -23,12 +23,13 @@ COMMANDS = {
     "attach": Place("attach", "Run an observer on the streams of a running loop, in shared memory or by ZeroMQ."),
     "bench": Place("bench", "Time the observers beside textbook versions."),
     "campaign": Place("campaign", "Run many scenarios and seeds, on many processes or machines."),
+    "convert": Place("telemetry", "Write a record in another format: .npz, .aot.fits, .fits, .h5, .mat, .csv or .parquet."),
     "design": Place("design", "Write a controller for a program elsewhere: C99 with a test, arrays, python-control."),
     "export": Place("export", "Write a report: one HTML file with figures and numbers that opens without a network."),
     "identify": Place("telemetry", "Find noise, turbulence and vibration peaks in a record."),
     "live": Place("live", "Run a loop by the clock, every observer beside it, frame by frame, and show it on a page."),
     "loop": Place("simulate", "Close the loop with every controller on the same disturbance and print what is left of it."),
-    "observe": Place("telemetry", "Run the observers on a record: .npz, .csv, .fits or AOT."),
+    "observe": Place("telemetry", "Run the observers on a record of any format."),
     "presets": Place("presets", "List the presets, or print one as TOML."),
     "rt-check": Place(
         "realtime", "Tell what this machine can hold: how late a loop at the LGS rate wakes, and what a step takes in it."

@@ -43,7 +43,7 @@ from wfsobs.units import micrometres_per
 
 @click.command()
 @scenario_options
-@click.option("--replay", "replay_file", metavar="RECORD", help="Frames of a record, once: .npz, .csv, .fits or AOT.")
+@click.option("--replay", "replay_file", metavar="RECORD", help="Frames of a record of any format, once.")
 @click.option(
     "--in",
     "stream",
@@ -63,7 +63,7 @@ from wfsobs.units import micrometres_per
 )
 @click.option("--no-controllers", is_flag=True, help="Run no controller beside it.")
 @click.option("--speed", type=click.FloatRange(0.1, 20), default=1.0, metavar="X", help="1 is real time, the default.")
-@click.option("--record", "record_file", metavar="RECORD", help="Also save what was sent: .npz, .csv, .fits or .aot.fits.")
+@click.option("--record", "record_file", metavar="RECORD", help="Also save what was sent, in the format of its ending.")
 @click.option("--log", "log_file", metavar="FILE", help="Append what happens and alarms, a line each.")
 @click.option(
     "--port", type=click.IntRange(0, 65535), default=5006, show_default=True, help="Port of the page; 0 for a free one."

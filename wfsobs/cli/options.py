@@ -16,7 +16,7 @@ from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.errors import SettingError
 from wfsobs.streams.wiring import STUCK, NgsWiring
 from wfsobs.telemetry.command_response import saturation_lines
-from wfsobs.telemetry.intake import DeclaredFormat
+from wfsobs.telemetry.intake import LONGEST_DELAY, DeclaredFormat
 from wfsobs.telemetry.records import load_record
 from wfsobs.units import UNITS, micrometres_per
 
@@ -92,40 +92,53 @@ def record_options(command: Callable) -> Callable:
     @wraps(command)
     def with_declaration(
         *,
-        unit: str | None,
         command_sign: str | None,
-        command_delay: int | None,
-        rate: float | None,
         columns: Sequence[str],
-        trust: bool,
+        command_gain: str | None,
         **values: Any,
     ) -> Any:
-        roles = {}
+        config = click.get_current_context().params.get("config")
+        roles = {} if config is None else configfile.load_columns(config)
         for text in columns:
             role, equals, name = text.partition("=")
             if not equals:
                 raise SettingError(f"--column {text}: takes ROLE=NAME, such as y_lgs/tip=slope_x")
             roles[role.strip()] = name
+        try:
+            gain = tuple(map(float, command_gain.split(","))) if command_gain else None
+        except ValueError:
+            raise SettingError(f"--command-gain {command_gain}: takes a number, or one per mode with commas") from None
+        stated = {name: values.pop(name) for name in ("unit", "command_delay", "rate", "trust", "rail", "open_loop")}
         sign = int(command_sign) if command_sign else None
-        return command(declaration=DeclaredFormat(unit, sign, command_delay, rate, roles, trust), **values)
+        return command(declaration=DeclaredFormat(command_sign=sign, columns=roles, command_gain=gain, **stated), **values)
 
     return add_options(
         with_declaration,
-        click.option("--trust", is_flag=True, help="Go on though the data exclude the sign or the delay of the commands."),
+        click.option(
+            "--trust", is_flag=True, help="Take sign and delay of the commands as stated, whatever the file or the data say."
+        ),
         click.option("--sha256", metavar="HEX", help="Refuse the record unless its file has this SHA-256."),
         click.option(
             "--column",
             "columns",
             multiple=True,
             metavar="ROLE=NAME",
-            help="Which column of the file is what, such as y_lgs/tip=slope_x; can be repeated.",
+            help="Which column or array of the file is what, such as y_lgs/tip=slope_x or u=commands; can be repeated.",
         ),
         click.option("--rate", type=click.FloatRange(0, min_open=True), metavar="HZ", help="Rate of rows without time stamps."),
+        click.option("--open-loop", is_flag=True, help="The mirror was at rest; commands are not needed, and not used."),
+        click.option(
+            "--rail",
+            type=click.FloatRange(0, min_open=True),
+            metavar="U",
+            help="Largest command that the mirror follows, in the unit of the commands.",
+        ),
+        click.option("--command-gain", metavar="G[,G]", help="What the mirror does of a command, one or per mode; by default 1."),
         click.option(
             "--command-delay",
-            type=click.IntRange(1, 100),
+            type=click.FloatRange(1, LONGEST_DELAY),
             metavar="N",
-            help=f"Steps from a command to the first measurement that sees it; by default {DELAY}.",
+            help=f"Steps from a command to the first measurement that sees it, such as 1.5; by default {DELAY}.",
         ),
         click.option(
             "--command-sign",

@@ -123,7 +123,7 @@ def _order(rows: Sequence[Row]):
     "--seeds", type=click.IntRange(1, 100_000), default=1, metavar="N", help="Repeat with seeds run.seed ... run.seed + N - 1."
 )
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
-@click.option("--save", metavar="RECORD", help="Also save the record of the (one) run: .npz, .csv, .fits or .aot.fits.")
+@click.option("--save", metavar="RECORD", help="Also save the record of the (one) run, in the format of its ending.")
 @click.option("--vibration-psd", metavar="FILE", help="Vibration with the spectrum of a CSV or FITS file (docs/data.md).")
 @click.option(
     "--over-time",

@@ -1,4 +1,4 @@
-"""`wfsobs observe` and `wfsobs identify`: work on a record."""
+"""`wfsobs observe`, `wfsobs identify` and `wfsobs convert`: work on a record."""
 
 from __future__ import annotations
 
@@ -31,7 +31,24 @@ from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.spectral.search import LOWEST
 from wfsobs.telemetry.intake import DeclaredFormat
-from wfsobs.telemetry.records import save_arrays
+from wfsobs.telemetry.records import load_record, name_differences, save_arrays, save_record
+
+
+@click.command()
+@click.argument("record_file", metavar="IN")
+@click.argument("out", metavar="OUT")
+@scenario_options
+@record_options
+def convert(record_file: str, out: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None) -> None:
+    """Write a record in another format: .npz, .aot.fits, .fits, .h5, .mat, .csv or .parquet.
+
+    What is written is read back and compared; parts that the format has no place for are named.
+    """
+    check_writable(out)
+    record = load_declared(record_file, scenario, declaration, sha256)
+    save_record(out, record)
+    if lost := name_differences(record, load_record(out, scenario, DeclaredFormat(trust=True))):
+        click.echo(f"wfsobs: {out}: has no place for {', '.join(lost)}", err=True)
 
 
 def identification_table(result: Identification) -> Table:
@@ -75,7 +92,7 @@ def observe(
     out: str | None,
     as_json: bool,
 ) -> None:
-    """Run the observers on a record: .npz, .csv, .fits or AOT (by default preset paper)."""
+    """Run the observers on a record of any format (by default preset paper)."""
     if out:
         check_writable(out)
     scenario = told_scenario(prior, scenario)

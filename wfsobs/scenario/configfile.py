@@ -106,12 +106,12 @@ def add_comments(text: str, notes: Mapping[str, str]) -> str:
 def from_toml(text: str, base: Scenario | None = None, where: str = "TOML") -> Scenario:
     """Return a scenario with the settings of a (partial) TOML text on top of `base`.
 
-    Without `base`, a top-level `preset = "name"` gives the base, else the defaults. Lists are replaced as a
-    whole. Raises SettingError, its line starting with `where`.
+    A table [columns], which is of a record's file, is left alone. Without `base`, a top-level `preset = "name"` gives the base,
+    else the defaults. Lists are replaced as a whole. Raises SettingError, its line starting with `where`.
     """
     try:
         values = parse_toml(text)
-        name = values.pop("preset", None)
+        name, _ = values.pop("preset", None), values.pop("columns", None)
         scenario = base.copy() if base is not None else preset(name) if name is not None else Scenario()
         scenario.update(values)
     except SettingError as error:
@@ -122,6 +122,17 @@ def from_toml(text: str, base: Scenario | None = None, where: str = "TOML") -> S
 def load_scenario(path: str | Path, base: Scenario | None = None) -> Scenario:
     """Return the scenario of a TOML file (see `from_toml`). Raises SettingError, also where it cannot be read."""
     return from_toml(_text(path), base, str(path))
+
+
+def load_columns(path: str | Path) -> dict[str, str]:
+    """Return the table [columns] of a TOML file, {role: name in a record's file}. Raises SettingError."""
+    try:
+        columns = parse_toml(_text(path)).get("columns", {})
+        if not isinstance(columns, dict) or not all(isinstance(name, str) for name in columns.values()):
+            raise SettingError('columns: takes a table such as "y_lgs/tip" = "slope_x"')
+    except NotToml as error:
+        raise SettingError(f"{path}: {error}") from None
+    return columns
 
 
 def _text(path: str | Path) -> str:

@@ -9,7 +9,17 @@ import numpy as np
 
 from wfsobs.record import RecordError
 from wfsobs.sensors.modes import TIP_TILT
-from wfsobs.telemetry.formats.contents import FRAME, NGS, TIME, Contents, FileColumns, from_columns, parse_heading
+from wfsobs.telemetry.formats.contents import (
+    FRAME,
+    NGS,
+    TIME,
+    Contents,
+    FileColumns,
+    column_mode,
+    from_columns,
+    is_rate,
+    parse_heading,
+)
 from wfsobs.typing import Array
 from wfsobs.units import SECONDS, split_unit
 
@@ -30,14 +40,27 @@ WORDS = {
     "turbulence": {"turbulence", "turb", "atmosphere", "atm"},
     "vibration": {"vibration", "vib"},
     NGS: {"ngs"},
-    "u": {"u", "command", "commands", "cmd", "cmds", "com", "dm", "mirror", "ttm", "ftm", "actuator", "volts"},
-    "y_lgs": {"measurement", "measurements", "meas", "slope", "slopes", "centroid", "centroids", "wfs", "residual", "res", "err"}
+    "u": {"u", "command", "commands", "cmd", "cmds", "com", "dm", "mirror", "ttm", "ftm", "actuator", "volts", "positions"},
+    "y_lgs": {
+        "measurement",
+        "measurements",
+        "meas",
+        "slope",
+        "slopes",
+        "gradients",
+        "centroid",
+        "centroids",
+        "wfs",
+        "residual",
+        "res",
+        "err",
+    }
     | {"error", "lgs", "y"},
 }
 """Words in the name of a column that tell a signal, those that tell most first."""
 
 AXES = {"tip": {"tip", "x", "0"}, "tilt": {"tilt", "y", "1"}}
-TIMES = {"time", "t", "timestamp", "stamp", "seconds", "clock"}
+TIMES = {"time", "t", "timestamp", "stamp", "seconds", "clock", "mjd", "jd"}
 COUNTERS = {"frame", "framecounter", "framecount", "framenumber", "frameno", "frameid", "counter"}
 OTHER_COUNTS = {"rate", "lost", "missing", "skipped"}
 """Words beside those of a counter, of what it does not count."""
@@ -54,9 +77,11 @@ def to_contents(file: FileColumns, roles: Mapping[str, str]) -> Contents:
         There is no such role or no such column, or a column has a unit that is none.
     """
     found: dict[str, tuple[Array, str]] = {}
+    if unknown := [role for role in roles if role not in ROLES | SIGNALS]:
+        columns, arrays = ", ".join(ROLES), ", ".join(SIGNALS)
+        raise RecordError(f"{unknown[0][:80]!r} is no part of a record; a column is one of {columns}, an array one of {arrays}")
+    roles = dict(pair for role, name in roles.items() for pair in _each_mode(file, role, name))
     for role, name in roles.items():
-        if role not in ROLES:
-            raise RecordError(f"{role[:80]!r} is no part of a record; a column is one of {', '.join(ROLES)}")
         if name in file.texts:
             raise RecordError(file.texts[name])
         if name not in file.columns:
@@ -87,8 +112,53 @@ def to_contents(file: FileColumns, roles: Mapping[str, str]) -> Contents:
         unused.remove(counters[0])
         contents.arrays[FRAME] = file.columns[counters[0]]
         contents.guesses.append(f"frames counted by {counters[0]}")
-    contents.leftovers = [*unused, *(f"{name} (text)" for name in file.texts)]
+    rates = {name: rate for name, rate in file.numbers.items() if is_rate(name) and rate > 0}
+    if not contents.arrays.keys() & {"dt", TIME} and len(set(rates.values())) == 1:
+        name, rate = rates.popitem()
+        contents.arrays["dt"] = np.array(1.0 / rate)
+        contents.guesses.append(f"{rate:g} Hz by {name}")
+    contents.leftovers = [*unused, *(f"{name} (text)" if why.endswith("number") else name for name, why in file.texts.items())]
+    suggested = {role: name for role, name in suggest_roles(unused).items() if role not in roles}
+    if suggested:
+        contents.hint = "; as its names suggest: " + " ".join(f"--column '{role}={name}'" for role, name in _by_array(suggested))
+    elif unused:
+        contents.hint = f"; which of its columns is what? It has {', '.join(unused[:20])}"
     return contents
+
+
+def _each_mode(file: FileColumns, role: str, name: str) -> list[tuple[str, str]]:
+    """Return the roles and names of the columns of an array that is a signal of all modes; of a column, that itself."""
+    if role not in SIGNALS:
+        return [(role, name)]
+    parts = [key for key in file.columns if key == name or re.fullmatch(rf"{re.escape(name)}\[\d+\]", key)]
+    return [(f"{role}/{column_mode(i)}", key) for i, key in enumerate(parts or [name])]
+
+
+def _by_array(roles: Mapping[str, str]) -> list[tuple[str, str]]:
+    """Return roles and names with those of one array, tip and tilt, as one."""
+    whole = {role.partition("/")[0]: name.removesuffix("[0]") for role, name in roles.items() if name.endswith("[0]")}
+    whole = {signal: name for signal, name in whole.items() if roles.get(f"{signal}/tilt") == f"{name}[1]"}
+    return [*whole.items(), *((role, name) for role, name in roles.items() if role.partition("/")[0] not in whole)]
+
+
+PART = re.compile(r"(?P<stem>.*?)(?P<unit>u|micro|n|nano|milli)(?P<word>_?sec(?:ond)?s?)", re.I)
+"""Name of a count of parts of a second; without the unit it is that of the whole ones beside it."""
+
+PARTS = {"u": 1e-6, "micro": 1e-6, "n": 1e-9, "nano": 1e-9, "milli": 1e-3}
+
+
+def join_clock(file: FileColumns) -> FileColumns:
+    """Return the columns of a file, one of whole seconds and one of parts beside it as their sum, the time; this is a guess."""
+    names = {name.lower(): name for name in file.columns}
+    if any((parse_heading(name) or "")[:1] == (TIME,) for name in names):
+        return file
+    for match in filter(None, map(PART.fullmatch, file.columns)):
+        if (whole := names.get((match["stem"] + match["word"]).lower())) is not None:
+            parts = PARTS[match["unit"].lower()] * file.columns.pop(match[0])
+            file.columns[f"{TIME}_s"] = file.columns.pop(whole) + parts
+            file.contents.guesses.append(f"time by {whole} and {match[0]}")
+            break
+    return file
 
 
 def is_counter(values: Array, n: int) -> bool:

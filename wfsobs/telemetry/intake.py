@@ -21,6 +21,7 @@ longer than LONGEST is no gap but what the sensor measures.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -145,33 +146,46 @@ class DeclaredFormat:
         Of y_lgs, u and the rest, one of wfsobs.units.UNITS; by default that of the signals that have one, or um.
     command_sign : int or None
         +1, y = disturbance + u, or -1, y = disturbance - u.
-    command_delay : int or None
-        Steps from a command to the first measurement that sees it, 1 or more.
+    command_delay : float or None
+        Steps from a command to the first measurement that sees it, 1 or more; with parts of a step the mirror holds each command
+        for a step, and a measurement is the mean over one.
     rate : float or None
         Rate of the fast steps [Hz].
     columns : mapping
         Which column of the file is what, {one of `wfsobs.telemetry.columns.ROLES`: name in the file}.
     trust : bool
-        Whether sign and delay of the commands hold whatever the data say.
+        Whether sign and delay of the commands hold whatever the data and the file say.
+    command_gain : tuple of float or None
+        What the mirror does of a command, one number or one per mode.
+    rail : float or None
+        Largest command that the mirror follows, in the unit of the commands; it stays there for larger ones.
+    open_loop : bool
+        Whether the mirror was at rest, whatever the commands are.
     """
 
     unit: str | None = None
     command_sign: int | None = None
-    command_delay: int | None = None
+    command_delay: float | None = None
     rate: float | None = None
     columns: Mapping[str, str] = field(default_factory=dict)
     trust: bool = False
+    command_gain: tuple[float, ...] | None = None
+    rail: float | None = None
+    open_loop: bool = False
 
 
 def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredFormat) -> Record:
     """Return the record of a file's contents. Raises RecordError with one line naming what, where and what is expected."""
-    arrays = contents.arrays
-    for name in ("y_lgs", "u"):
+    arrays, most = contents.arrays, len(scenario.modes)
+    for name in ("y_lgs", "u")[: 1 if declaration.open_loop else 2]:
         if name not in arrays:
-            raise RecordError(f"has no {name}; a record needs y_lgs, u and dt")
+            raise RecordError(f"has no {name}; a record needs y_lgs, u and dt{contents.hint}")
     signals = {name: _signal(name, arrays[name]) for name in SIGNALS if name in arrays}
+    swapped = [name for name, values in signals.items() if values.shape[0] < values.shape[1] > most]
+    signals |= {name: np.ascontiguousarray(signals[name].T) for name in swapped}
+    if declaration.open_loop:
+        signals["u"] = np.zeros_like(signals["y_lgs"])
     n, n_modes = signals["y_lgs"].shape
-    most = len(scenario.modes)
     if not 1 <= n_modes <= most or n < 2:
         order = order_of(n_modes) if n_modes > most else None
         needed = f": {n_modes} modes need telescope.radial_order = {order}" if order else ""
@@ -183,23 +197,26 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
             raise RecordError(f"{name} has shape {signals[name].shape}; expected ({rows}, {n_modes})")
     if APART in arrays:
         signals[APART] = _stars_apart(arrays[APART], n, n_modes)
+    delay = _number_of("delay", arrays, declaration.command_delay, DELAY, declaration.trust)
+    if not 1 <= delay <= LONGEST_DELAY:
+        raise RecordError(f"delay takes a number of steps from 1 to {LONGEST_DELAY}, not {delay:g}")
+    mirror = _limit(signals, declaration)
     origin, sign = _into_micrometres(signals, contents, declaration, scenario.telescope.diameter)
     for name in {"u", "training_u"} & signals.keys():
         signals[name] *= sign
     if STARS in arrays:
         signals[STARS] = _star_counts(arrays[STARS], n)
     dt, ratio, timing = _apply_timestamps(signals, contents, declaration)
-    origin = ", ".join(filter(None, (origin, *contents.guesses, timing, _name_unused(contents.leftovers))))
+    mirror += _apply_mirror(signals, delay, declaration)
+    mirror += [f"{' and '.join(swapped)} with a row per mode"] if swapped else []
+    origin = ", ".join(filter(None, (origin, *mirror, *contents.guesses, timing, _name_unused(contents.leftovers))))
     if np.isnan(signals["y_lgs"]).all(axis=0).any():
         raise RecordError("y_lgs holds no measurement of one of its modes")
-    delay = _whole("delay", arrays, declaration.command_delay, DELAY)
-    if delay < 1:
-        raise RecordError(f"delay takes a whole number from 1, not {delay}")
     fields = {name: signals[name] for name in (*FAST, NGS) if name in signals}
     stars = np.nan_to_num(signals[STARS][:, 0]).astype(int) if STARS in signals else None
     apart = signals[APART].reshape(len(signals["y_lgs"]), -1, n_modes) if APART in signals else None
     beside = {"lgs_stars": stars, "y_stars": apart}
-    record = Record(**fields, dt=dt, ratio=ratio, training=_training(signals), delay=delay, origin=origin, **beside)
+    record = Record(**fields, dt=dt, ratio=ratio, training=_training(signals), delay=int(delay + WHOLE), origin=origin, **beside)
     return record if stars is not None or record.missing else without_bridged(record)
 
 
@@ -252,17 +269,18 @@ def _into_micrometres(
         raise RecordError("angles are units of tip and tilt alone, which are two modes")
     for name, unit in units.items():
         signals[name] *= micrometres_per(unit, diameter)
-    sign = _whole("command_sign", arrays, declaration.command_sign, 1)
+    sign = _number_of("command_sign", arrays, declaration.command_sign, 1, declaration.trust)
     if sign not in (1, -1):
-        raise RecordError(f"command_sign takes 1 or -1, not {sign}")
+        raise RecordError(f"command_sign takes 1 or -1, not {sign:g}")
     said = [f"unit {unit}" for unit in dict.fromkeys(units.values()) if unit != "um"]
     said += [f"aperture {diameter:g} m"] * bool(set(units.values()) & set(ANGLES))
     said += ["command sign -1"] if sign < 0 else []
-    return ", ".join([*([str(arrays["origin"])] if "origin" in arrays else []), *said]), sign
+    return ", ".join([*([str(arrays["origin"])] if "origin" in arrays else []), *said]), int(sign)
 
 
 def _name_unused(columns: Sequence[str]) -> str:
     """Say which columns are no part of the record, in a few words; nothing where there is none."""
+    columns = [*dict.fromkeys(re.sub(r"\[\d+\]$", "", name) for name in columns)]
     more = f" and {len(columns) - MOST_NAMED} more" if len(columns) > MOST_NAMED else ""
     named = ", ".join(name[:40] for name in columns[:MOST_NAMED])
     return f"column{'s' * (len(columns) > 1)} {named}{more} not used" if columns else ""
@@ -302,7 +320,7 @@ def _apply_timestamps(
     if "time_ngs" in arrays:
         ratio = _stamped_frames(signals, arrays, start, dt)
     else:
-        ratio = _whole("ratio", arrays)
+        ratio = _ratio(arrays)
         signals[NGS] = place_frames(signals[NGS], signals["y_lgs"].shape[0], ratio)
     signals[NGS] = drop_partial_frames(signals[NGS], ratio)
     return dt, ratio, said
@@ -313,7 +331,7 @@ def _stamped_frames(signals: dict[str, Array], arrays: Mapping[str, Array], star
     frames, n = signals[NGS], signals["y_lgs"].shape[0]
     steps = frames_at(_clock("time_ngs", arrays["time_ngs"], frames.shape[0]), start, dt)
     between = int(np.median(np.diff(steps))) if steps.size > 1 else None
-    ratio = _whole("ratio", arrays, None, between)
+    ratio = _ratio(arrays, between)
     late = np.flatnonzero((steps - steps[0]) % ratio)
     if late.size:
         raise RecordError(f"time_ngs: the frame in row {late[0]} is not a whole number of {ratio} steps after the first")
@@ -345,18 +363,62 @@ def _number(name: str, raw: Array) -> float:
     return float(raw)
 
 
-def _whole(name: str, arrays: Mapping[str, Array], declaration: int | None = None, default: int | None = None) -> int:
-    """Return an integer of the file, else the declared one, else the default."""
-    if name not in arrays:
+def _number_of(
+    name: str, arrays: Mapping[str, Array], declaration: float | None, default: float | None, trust: bool = False
+) -> float:
+    """Return a number of the file, else the declared one, which comes first where it is trusted, else the default."""
+    if name not in arrays or (trust and declaration is not None):
         if declaration is None and default is None:
             raise RecordError("y_ngs needs ratio, the number of fast steps per NGS frame")
-        return int(declaration if declaration is not None else default)  # type: ignore[arg-type]
+        return declaration if declaration is not None else default  # type: ignore[return-value]
     value = float(raw) if (raw := arrays[name]).ndim == 0 and raw.dtype.kind in "fiu" else np.nan
-    if value != round(value, 0) or (name == "ratio" and value <= 0):
-        raise RecordError(f"{name} takes a whole number, not {value:g}")
+    if not np.isfinite(value):
+        raise RecordError(f"{name} takes a number, not {np.array2string(raw, threshold=4)[:40]}")
     if declaration is not None and value != declaration:
-        raise RecordError(f"{name} is {value:g}, but {declaration} is stated")
+        raise RecordError(f"{name} is {value:g}, but {declaration:g} is stated" + "; --trust takes that" * (name != "ratio"))
+    return value
+
+
+def _ratio(arrays: Mapping[str, Array], default: int | None = None) -> int:
+    value = _number_of("ratio", arrays, None, default)
+    if value <= 0 or value % 1:
+        raise RecordError(f"ratio takes a whole number, not {value:g}")
     return int(value)
+
+
+LONGEST_DELAY = 100
+"""Of a command [steps]."""
+
+WHOLE = 1e-6
+"""Part of a step that is none."""
+
+
+def _limit(signals: dict[str, Array], declaration: DeclaredFormat) -> list[str]:
+    """Limit the commands, in their own unit, to what the mirror follows; return in a few words what was done."""
+    said = ["open loop"] * declaration.open_loop
+    if declaration.rail is not None:
+        beyond = np.abs(signals["u"]) > declaration.rail
+        for name in {"u", "training_u"} & signals.keys():
+            signals[name] = np.clip(signals[name], -declaration.rail, declaration.rail)
+        said.append(f"{beyond.any(axis=1).sum()} commands beyond the rail of {declaration.rail:g}")
+    return said
+
+
+def _apply_mirror(signals: dict[str, Array], delay: float, declaration: DeclaredFormat) -> list[str]:
+    """Turn commands into what a measurement sees of them `int(delay)` steps later, the mirror's mean over a step.
+
+    With the part p of a step that is (1 - p) u[k] + p u[k-1], times the gain; what was before the record is taken as its first.
+    """
+    part, gain = delay - int(delay + WHOLE), np.array(declaration.command_gain or (1.0,))
+    if gain.size not in (1, signals["y_lgs"].shape[1]) or not (np.isfinite(gain) & (gain > 0)).all():
+        raise RecordError(f"a command gain takes a number above 0, or {signals['y_lgs'].shape[1]}, one per mode")
+    for name in {"u", "training_u"} & signals.keys():
+        u = signals[name]
+        signals[name] = gain * (u if part < WHOLE else (1.0 - part) * u + part * np.concatenate([u[:1], u[:-1]]))
+    if declaration.open_loop:
+        signals["u"][:] = 0.0
+    said = [f"delay {delay:g}"] if part >= WHOLE else []
+    return said + ([f"command gain {', '.join(f'{g:g}' for g in gain)}"] if declaration.command_gain else [])
 
 
 JITTER = 0.3

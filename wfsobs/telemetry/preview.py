@@ -190,7 +190,7 @@ def preview_any(
             raise
         no_record = error
     shown, diameter = safe_name(name), (scenario or Scenario()).telescope.diameter
-    if shown.lower().endswith(".npz"):  # which no spectrum comes in
+    if not shown.lower().endswith((".csv", ".txt", ".fits", ".fit", ".fts")):  # which no spectrum comes in
         return _preview_columns(data, shown, no_record)
     try:
         table = read_psd(io.BytesIO(data), shown, declaration.unit if declaration else None, diameter)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +27,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.simulation.loop import simulate
-from wfsobs.telemetry.columns import to_contents
+from wfsobs.telemetry.columns import join_clock, to_contents
 from wfsobs.telemetry.command_response import LONGEST, MOST_STEPS, command_response
 from wfsobs.telemetry.formats import format_of
 from wfsobs.telemetry.formats.contents import Contents, FileColumns
@@ -100,10 +101,42 @@ MOST_BYTES = 4_000_000_000
 def save_record(path: str | Path, record: Record, scenario_toml: str | None = None) -> None:
     """Write a record in the format of the name's ending. Raises OSError, RecordError."""
     try:
-        fmt = format_of(str(path))
-        write_whole(path, lambda file: fmt.write(file, record_arrays(record, scenario_toml)))
+        if (write := format_of(str(path)).write) is None:
+            raise RecordError("files of its ending are read, not written")
+        write_whole(path, lambda file: write(file, record_arrays(record, scenario_toml)))
     except RecordError as error:
         raise RecordError(f"{path}: {error}") from None
+
+
+def save(path: str | Path, record: Record) -> None:
+    """Write a record: .npz, .csv, .fits, .aot.fits, .h5, .mat or .parquet (docs/data.md).
+
+    Parameters
+    ----------
+    path : str or Path
+        The file, whose ending gives the format; one that is there is replaced once the new one is whole.
+    record : Record
+        Measurements and commands [um], and the truth where the format has a place for it.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+    RecordError
+        There is no such format, or it is only read.
+    """
+    save_record(path, record)
+
+
+def name_differences(record: Record, other: Record) -> list[str]:
+    """Return the parts of a record that another does not have, or has otherwise."""
+
+    def differs(one: object, two: object) -> bool:
+        if one is None or two is None or not hasattr(one, "__dict__"):
+            return one is not two if one is None or two is None else not np.array_equal(one, two, equal_nan=True)  # type: ignore[arg-type]
+        return any(differs(part, vars(two)[name]) for name, part in vars(one).items())
+
+    return [name for name, part in vars(record).items() if name != "origin" and differs(part, vars(other)[name])]
 
 
 def record_arrays(record: Record, scenario_toml: str | None = None) -> dict[str, Array]:
@@ -135,15 +168,29 @@ def load_record(
     sha256 : of the file, in hexadecimal digits; another file is refused
     """
     try:
-        with open(path, "rb") as file:
+        folder = Path(path).is_dir()
+        with _open_folder(Path(path)) if folder else open(path, "rb") as file:
             if sha256 is not None:
                 found = hashlib.file_digest(file, "sha256").hexdigest()
                 if found != sha256.lower():
                     raise RecordError(f"{path}: is another file: its SHA-256 is {found}, not {sha256[:64]}")
                 file.seek(0)
-            return read_record(file, str(path), scenario, declaration)
+            return read_record(file, f"{path}.npz" if folder else str(path), scenario, declaration)
     except OSError as error:
         raise RecordError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+def _open_folder(path: Path) -> io.BytesIO:
+    """Return a folder of .npy files as the .npz of them. Raises RecordError where there are none, or too many bytes of them."""
+    members = sorted(path.glob("*.npy"))
+    if not members or sum(member.stat().st_size for member in members) > MOST_BYTES:
+        raise RecordError(f"{path}: is a folder; it takes one of .npy files, of {MOST_BYTES / 1e9:g} GB at most")
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for member in members:
+            archive.write(member, member.name)
+    file.seek(0)
+    return file
 
 
 def load(
@@ -152,11 +199,15 @@ def load(
     scenario: Scenario | None = None,
     unit: str | None = None,
     command_sign: int | None = None,
-    command_delay: int | None = None,
+    command_delay: float | None = None,
     rate: float | None = None,
     trust: bool = False,
+    columns: Mapping[str, str] | None = None,
+    command_gain: float | Sequence[float] | None = None,
+    rail: float | None = None,
+    open_loop: bool = False,
 ) -> Record:
-    """Read the record of a file: .npz, .csv, .fits or AOT (docs/data.md).
+    """Read the record of a file of any format, or of a folder of .npy files (docs/data.md).
 
     Parameters
     ----------
@@ -168,12 +219,20 @@ def load(
         Unit of the signals where the file gives none, one of `wfsobs.units.UNITS`; um by default.
     command_sign : {1, -1}, optional
         +1 where y = disturbance + u, -1 where y = disturbance - u.
-    command_delay : int, optional
-        Steps from a command to the first measurement that sees it.
+    command_delay : float, optional
+        Steps from a command to the first measurement that sees it, also parts of one.
     rate : float, optional
         Rate of rows without time stamps [Hz].
     trust : bool
-        Whether sign and delay of the commands hold though the data exclude them.
+        Whether sign and delay of the commands hold though the file says others, or the data exclude them.
+    columns : mapping, optional
+        Which column or array of the file is what, such as {"y_lgs/tip": "slope_x"} or {"u": "commands"}.
+    command_gain : float or sequence of float, optional
+        What the mirror does of a command, for all modes or each.
+    rail : float, optional
+        Largest command that the mirror follows, in the unit of the commands.
+    open_loop : bool
+        Whether the mirror was at rest; commands are then not needed, and not used.
 
     Returns
     -------
@@ -185,7 +244,9 @@ def load(
     RecordError
         The file cannot be used; one line naming what, where and what is expected.
     """
-    return load_record(path, scenario, DeclaredFormat(unit, command_sign, command_delay, rate, trust=trust))
+    gain = None if command_gain is None else tuple(np.atleast_1d(command_gain).tolist())
+    stated = DeclaredFormat(unit, command_sign, command_delay, rate, columns or {}, trust, gain, rail, open_loop)
+    return load_record(path, scenario, stated)
 
 
 def read_record(
@@ -209,7 +270,8 @@ def read_record(
 
 def stated_sign(contents: Contents, declaration: DeclaredFormat) -> int:
     """Return the sign of the commands as the file or the user states it, 1 where neither does."""
-    return int(contents.arrays.get("command_sign", declaration.command_sign or 1))
+    stated = declaration.command_sign or 1
+    return stated if declaration.trust and declaration.command_sign else int(contents.arrays.get("command_sign", stated))
 
 
 def contradiction_of(record: Record, contents: Contents, declaration: DeclaredFormat) -> str:
@@ -224,7 +286,7 @@ def read_contents(file: IO[bytes], name: str, roles: Mapping[str, str], most: in
 
 def read_columns(file: IO[bytes], name: str, most: int = MOST_BYTES) -> FileColumns:
     """Read the columns of an open file under its own names; its name gives the format. Raises RecordError."""
-    return format_of(name).read(file, most)
+    return join_clock(format_of(name).read(file, most))
 
 
 TEMPLATE = """\

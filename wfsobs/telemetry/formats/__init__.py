@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import IO
 
 from wfsobs.record import RecordError
-from wfsobs.telemetry.formats import aot, csv, fits, npz
+from wfsobs.telemetry.formats import aot, csv, fits, libraries, npz
 from wfsobs.telemetry.formats.contents import FileColumns
 from wfsobs.typing import Array
 
@@ -26,20 +26,25 @@ class Format:
         Endings of file names.
     read : callable
         (open file, maximum bytes of numbers) -> FileColumns, under the file's own names.
-    write : callable
-        (open file, arrays) -> None.
+    write : callable or None
+        (open file, arrays) -> None; None of a format that is only read.
     """
 
     endings: tuple[str, ...]
     read: Callable[[IO[bytes], int], FileColumns]
-    write: Callable[[IO[bytes], Mapping[str, Array]], None]
+    write: Callable[[IO[bytes], Mapping[str, Array]], None] | None = None
 
 
 FORMATS = (
     Format((".npz",), npz.read, npz.write),
-    Format((".csv", ".txt"), csv.read, csv.write),
+    Format((".csv", ".txt", ".dat", ".tsv", ".asc"), csv.read, csv.write),
     Format((".aot.fits",), aot.read, aot.write),
     Format((".fits", ".fit", ".fts"), aot.read_fits, fits.write),
+    Format((".h5", ".hdf5", ".hdf", ".he5"), libraries.read_hdf5, libraries.write_hdf5),
+    Format((".mat",), libraries.read_matlab, libraries.write_matlab),
+    Format((".parquet", ".pq"), libraries.read_parquet, libraries.write_parquet),
+    Format((".npy",), npz.read_npy),
+    Format((".sav", ".idl"), libraries.read_sav),
 )
 
 

@@ -109,7 +109,7 @@ def _contents(system: Any, aotpy: Any) -> Contents:
         contents.arrays["dt"] = np.array(1.0 / loop.framerate)
     if loop.delay is not None and np.isfinite(loop.delay):
         # both count from the middle of an exposure to the middle of the step in which its command acts
-        contents.arrays["delay"] = np.array(max(1, round(float(loop.delay))))
+        contents.arrays["delay"] = np.array(max(1.0, float(loop.delay)))
     for entry in system.metadata:
         if entry.key.upper().startswith(PREFIX):
             name = entry.key[len(PREFIX) :].lower()
@@ -131,7 +131,7 @@ def _take(contents: Contents, name: str, image: Any, matrix: Array | None) -> No
 def write(file: IO[bytes], arrays: Mapping[str, Array]) -> None:
     """Write measurements and commands as one control loop."""
     aotpy = _aotpy()
-    plain = numbers_and_texts(arrays)
+    plain = numbers_and_texts(arrays, "ascii")
     n_modes = arrays["y_lgs"].shape[1]
     telescope = aotpy.MainTelescope(uid="telescope")
 

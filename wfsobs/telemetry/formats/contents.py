@@ -11,7 +11,7 @@ import numpy as np
 from wfsobs.record import RecordError
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.typing import Array
-from wfsobs.units import SECONDS, parse_unit, split_unit
+from wfsobs.units import DAYS, SECONDS, parse_unit, split_unit
 
 FAST = ("y_lgs", "u", "turbulence", "vibration", "open_loop_y")
 """Arrays with one row per fast step."""
@@ -62,12 +62,15 @@ class Contents:
         What was guessed of the file, a few words each.
     leftovers : list of str
         Columns that are no part of the record.
+    hint : str
+        What the names of columns suggest, where a record lacks a part.
     """
 
     arrays: dict[str, Array] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
     guesses: list[str] = field(default_factory=list)
     leftovers: list[str] = field(default_factory=list)
+    hint: str = ""
 
     def state_unit(self, name: str, text: str) -> None:
         """Note the unit of a signal. Raises RecordError for an unknown one, or one that differs from that of its other modes."""
@@ -80,7 +83,7 @@ class Contents:
 
 @dataclass
 class FileColumns:
-    """Columns of a file under its own names.
+    """What a file holds under its own names, whatever its format.
 
     Attributes
     ----------
@@ -90,6 +93,8 @@ class FileColumns:
         Name in the file -> unit beside it, as written.
     texts : dict of str to str
         Name in the file -> why it holds no numbers.
+    numbers : dict of str to float
+        Name in the file -> number that stands alone.
     contents : Contents
         Whole arrays, numbers and texts of the names of a record (NAMES).
     """
@@ -97,18 +102,108 @@ class FileColumns:
     columns: dict[str, Array] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
     texts: dict[str, str] = field(default_factory=dict)
+    numbers: dict[str, float] = field(default_factory=dict)
     contents: Contents = field(default_factory=Contents)
 
-    def add(self, name: str, values: Array, unit: str = "") -> None:
-        """Add an array of one or two dimensions; the columns of two are name[0], name[1], ..., the longer axis being time."""
-        if values.ndim == 2:
-            for i, column in enumerate(values.T if values.shape[0] >= values.shape[1] else values):
-                if i < MOST_COLUMNS:
-                    self.add(f"{name}[{i}]", column, unit)
-        elif values.ndim == 1 and values.size > 1 and values.dtype.kind in "fiu":
-            self.columns[name] = values.astype(np.float64)
+    def add(self, name: str, data: object, unit: str = "") -> None:
+        """Add what a file holds under a name: as part of a record where it has the name of one, and numbers as columns.
+
+        Columns of two dimensions are name[0], name[1], ..., the longest axis being time; fields of a structure are name.field.
+        Raises RecordError where a part of a record holds no numbers.
+        """
+        values, known = np.asarray(data), name.lower()
+        if values.dtype.names and name.count(".") < DEEPEST:
+            for key in values.dtype.names:
+                self.add(f"{name}.{key}", values[key], unit)
+        elif values.dtype.kind == "O" and values.size == 1 and not isinstance(values.item(), (bool, type(None))):
+            self.add(name, values.item(), unit)
+        elif values.dtype.kind == "M":
+            self.add(name, np.where(np.isnat(values), np.nan, values.astype("M8[ns]").astype(np.int64) * 1e-9), "s")
+        elif values.dtype.kind in "SU":
+            self._add_texts(name, [x.decode("utf-8", "replace") if isinstance(x, bytes) else x for x in values.ravel().tolist()])
+        elif values.dtype.kind not in "fiu":
+            self.leave(name, f"{name} holds {KINDS.get(values.dtype.kind, values.dtype)}, not numbers")
+        elif values.size == 1 and known in (*NUMBERS, *TEXTS):
+            self.contents.arrays[known] = values.reshape(())
+        elif values.size == 1 and known not in NAMES and not parse_heading(name):
+            self.numbers[name] = float(values.item())
+        elif values.size:
+            self._add_numbers(name, values, unit)
+
+    def _add_numbers(self, name: str, values: Array, unit: str) -> None:
+        known, longest = name.lower(), int(np.argmax(values.shape))
+        rows = np.moveaxis(values, longest, 0).reshape(values.shape[longest], -1)
+        if known in self.contents.arrays:
+            raise RecordError(f"two parts are named {known}")
+        if known in CLOCKS:
+            self.contents.arrays[known] = values.reshape(rows.shape if rows.shape[1] > 1 else -1) * SECONDS.get(unit.strip(), 1.0)
+        elif known in SIGNALS:
+            self.contents.arrays[known] = values if values.ndim == 2 else rows
             if unit:
-                self.units[name] = unit
+                self.contents.state_unit(known, unit)
+        elif known in (STARS, APART):
+            self.contents.arrays[known] = rows.ravel() if known == STARS else values
+        for i, column in enumerate(rows.T[:MOST_COLUMNS]):
+            key = f"{name}[{i}]" if rows.shape[1] > 1 else name
+            self.columns[key] = column.astype(np.float64)
+            if unit:
+                self.units[key] = unit
+
+    def _add_texts(self, name: str, texts: list[str]) -> None:
+        if name.lower() in TEXTS and len(texts) == 1:
+            self.contents.arrays[name.lower()] = np.array(texts[0])
+        elif len(texts) > 1 and STAMP.fullmatch(texts[0].strip()):
+            self.add(name, np.array([parse_cell(text) for text in texts]), "s")
+        else:
+            self.leave(name, f"{name} holds text, not numbers")
+
+    def leave(self, name: str, why: str) -> None:
+        """Leave out what holds no numbers. Raises RecordError with that reason where it has the name of a part of a record."""
+        if name.lower() in (*SIGNALS, *CLOCKS, STARS, APART, *NUMBERS) or parse_heading(name):
+            raise RecordError(why)
+        self.texts[name] = why
+
+
+RATE = re.compile(
+    r"(?:.*[/.])?(?:(?:frame|loop|sampl(?:e|ing)|wfs|lgs)?[_ ]?(?:rate|freq(?:uency)?)|fs|fps)(?:[_ ]?[\[(]?hz[\])]?)?", re.I
+)
+"""Name of the number of frames per second."""
+
+
+def is_rate(name: str) -> bool:
+    """Return whether a number of this name is the rate of the frames.
+
+    >>> [is_rate(name) for name in ("frame_rate_hz", "loop/fs", "LOOPFREQ", "ngs_rate", "strehl")]
+    [True, True, True, False, False]
+    """
+    return RATE.fullmatch(name) is not None
+
+
+KINDS = {"O": "objects", "b": "yes or no", "c": "complex numbers", "V": "structures too deep"}
+"""Kinds of array that are not read, by numpy's letter."""
+
+DEEPEST = 6
+"""Maximum depth of structures."""
+
+STAMP = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(?:[.,](\d{1,9}))?\d*(?:Z|[+-]\d\d:?\d\d)?")
+"""A time stamp of ISO 8601; the time zone is that of all."""
+
+
+def parse_cell(text: str) -> float:
+    """Return the number of a cell, also with a decimal comma, or the seconds since 1970 of a stamp; NaN of an empty one.
+
+    >>> parse_cell("0,5"), parse_cell("1970-01-02 00:00:00.25Z")
+    (0.5, 86400.25)
+
+    Raises ValueError.
+    """
+    try:
+        return float(text.strip() or "nan")
+    except ValueError:
+        if (match := STAMP.fullmatch(text.strip())) is None:
+            return float(text.replace(",", "."))
+    day, clock, part = match.groups("0")
+    return float(np.datetime64(f"{day}T{clock}").astype(np.int64) + float(f"0.{part}"))
 
 
 def parse_heading(heading: str, beside: str = "") -> tuple[str, str] | None:
@@ -121,7 +216,8 @@ def parse_heading(heading: str, beside: str = "") -> tuple[str, str] | None:
     if match and match["array"] in SIGNALS:
         return f"{match['array']}/{match['mode']}", match["unit"] or beside.strip()
     name, unit = split_unit(heading, beside)
-    return (name.lower(), unit) if name.lower() in CLOCKS else None
+    name = TIME if name.lower() in DAYS else name.lower()
+    return (name, unit) if name in CLOCKS else None
 
 
 def from_columns(columns: Mapping[str, tuple[Array, str]]) -> Contents:
@@ -174,9 +270,10 @@ def column_mode(column: int) -> str:
     return TIP_TILT[column].name if column < len(TIP_TILT) else f"Z{column + 2}"
 
 
-def numbers_and_texts(arrays: Mapping[str, Array]) -> dict[str, float | int | str]:
-    """Return all that is neither a signal nor a clock, as plain values."""
-    return {name: np.asarray(arrays[name]).item() for name in (*NUMBERS, *TEXTS) if name in arrays}
+def numbers_and_texts(arrays: Mapping[str, Array], encoding: str = "utf-8") -> dict[str, float | int | str]:
+    """Return all that is neither a signal nor a clock, as plain values; what the encoding has no letter for is `?`."""
+    plain = {name: np.asarray(arrays[name]).item() for name in (*NUMBERS, *TEXTS) if name in arrays}
+    return {name: x.encode(encoding, "replace").decode(encoding) if isinstance(x, str) else x for name, x in plain.items()}
 
 
 def _pad(x: Array, n: int) -> Array:

@@ -1,7 +1,7 @@
 """Records as CSV: one row per step, one column per signal and mode, such as y_lgs/tip_um.
 
-Lines before the heading that start with # can hold numbers and texts, such as `# dt: 0.001`. `nan` and an empty cell are a
-missing sample; where a column is empty to the end, it ends there.
+Lines before the heading that start with #, %, ! or // can hold numbers and texts, such as `# dt: 0.001`. `nan` and an empty
+cell are a missing sample; where a column is empty to the end, it ends there.
 """
 
 from __future__ import annotations
@@ -18,18 +18,22 @@ import numpy as np
 from wfsobs.record import RecordError
 from wfsobs.telemetry.formats.contents import (
     NUMBERS,
+    STAMP,
     TEXTS,
     Contents,
     FileColumns,
     TooLargeError,
     numbers_and_texts,
-    parse_heading,
+    parse_cell,
     to_columns,
 )
 from wfsobs.typing import Array
 
 SEPARATORS: dict[str | None, str] = {"\t": "tabs", ";": "semicolons", ",": "commas", None: "blanks"}
 """What separates cells: the first of these that makes numbers of the first line, or that is in the heading."""
+
+COMMENTS = ("#", "%", "!", "//")
+"""What a comment begins with."""
 
 CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f\x7f-\x9f]")
 """What is in no text."""
@@ -45,7 +49,7 @@ def read(file: IO[bytes], most: int) -> FileColumns:
     TooLargeError.
     """
     out = FileColumns()
-    heading, separator, rows = _head(file, out.contents)
+    heading, separator, rows, named = _head(file, out.contents)
     if len(set(heading)) < len(heading):
         raise RecordError("two columns have the same heading")
     width, commas = len(heading), False
@@ -61,16 +65,21 @@ def read(file: IO[bytes], most: int) -> FileColumns:
                 ends[i] = step + 1
             try:
                 column.append(float(text or "nan"))
+                continue
             except ValueError:
-                try:
-                    column.append(float(text.replace(",", ".")))
-                    commas = True
-                except ValueError:
-                    out.texts[heading[i]] = f"line {line}, {heading[i]}: {text[:40]!r} is not a number"
-                    if parse_heading(heading[i]):
-                        raise RecordError(out.texts[heading[i]]) from None
-                    del cells_of[i]
+                pass
+            try:
+                column.append(parse_cell(text))
+            except ValueError:
+                out.leave(heading[i], f"line {line}, {heading[i]}: {text[:40]!r} is not a number")
+                del cells_of[i]
+                continue
+            if STAMP.fullmatch(text):
+                out.units[heading[i]] = "s"
+            else:
+                commas = True
     out.columns = {heading[i]: np.array(column[: ends[i]]) for i, column in cells_of.items()}
+    out.contents.guesses += ["heading of the comment above"] * named
     out.contents.guesses += [f"cells separated by {separator}"] * (separator != "commas") + ["decimal commas"] * commas
     return out
 
@@ -93,19 +102,26 @@ def numbered_lines(file: IO[bytes]) -> Iterator[tuple[int, str]]:
             yield number, text
 
 
-def _head(file: IO[bytes], contents: Contents) -> tuple[list[str], str, Iterator[tuple[int, list[str]]]]:
-    """Return the heading, what separates cells, and the rows as (line, cells); numbers and texts of comments go to `contents`."""
-    lines = numbered_lines(file)
+def _head(file: IO[bytes], contents: Contents) -> tuple[list[str], str, Iterator[tuple[int, list[str]]], bool]:
+    """Return the heading, what separates cells, the rows as (line, cells), and whether a comment is taken for the heading.
+
+    Numbers and texts of comments go to `contents`.
+    """
+    lines, comment = numbered_lines(file), ""
     for number, text in lines:
-        if not text.startswith("#"):
+        if not text.startswith(COMMENTS):
             signs = [sign for sign in SEPARATORS if sign is None or sign in text]
             sign = next((sign for sign in signs if all(map(_is_number, _cells(text, sign)))), signs[0])
             heading = [cell.strip().strip('"') for cell in _cells(text, sign)]
-            rows = ((n, _cells(t, sign)) for n, t in lines if not t.startswith("#"))
+            rows = ((n, _cells(t, sign)) for n, t in lines if not t.startswith(COMMENTS))
             if not all(map(_is_number, heading)):
-                return heading, SEPARATORS[sign], rows
-            return [f"column {i + 1}" for i in range(len(heading))], SEPARATORS[sign], chain([(number, heading)], rows)
-        name, colon, value = text.lstrip("# ").partition(":")
+                return heading, SEPARATORS[sign], rows, False
+            rows, names = chain([(number, heading)], rows), [cell.strip() for cell in _cells(comment, sign)]
+            if len(names) == len(heading) and len(names) > 1 and not any(map(_is_number, names)):
+                return names, SEPARATORS[sign], rows, True
+            return [f"column {i + 1}" for i in range(len(heading))], SEPARATORS[sign], rows, False
+        comment = text.lstrip("#%!/ ")
+        name, colon, value = comment.partition(":")
         if colon and name in TEXTS:
             contents.arrays[name] = np.array(value.strip())
         elif colon and name in NUMBERS:
@@ -123,7 +139,7 @@ def _cells(text: str, sign: str | None) -> list[str]:
 
 def _is_number(text: str) -> bool:
     try:
-        float(text.replace(",", "."))
+        parse_cell(text)
     except ValueError:
         return False
     return True

@@ -23,11 +23,10 @@ from wfsobs.telemetry.formats.contents import (
     TRAINING,
     FileColumns,
     TooLargeError,
+    is_rate,
     numbers_and_texts,
-    parse_heading,
 )
 from wfsobs.typing import Array
-from wfsobs.units import SECONDS
 
 HDUList = Any
 """Astropy's, which is imported only when needed."""
@@ -112,39 +111,21 @@ def tables_and_images(hdus: HDUList) -> FileColumns:
         if isinstance(hdu, fits.BinTableHDU):
             for column in hdu.columns:
                 if "P" in column.format or "Q" in column.format:
-                    _leave(out, column.name, f"{column.name} is a column of rows of unlike lengths")
+                    out.leave(column.name, f"{column.name} is a column of rows of unlike lengths")
                 else:
-                    _add(out, column.name, data[column.name], column.null, column.unit or "")
+                    out.add(column.name, _native(data[column.name], column.null), column.unit or "")
         elif data is not None:
-            _add(out, hdu.name or f"image {number}", data, hdu.header.get("BLANK"), str(hdu.header.get("BUNIT", "")))
+            unit = str(hdu.header.get("BUNIT", ""))
+            out.add(hdu.name or f"image {number}", _native(data, hdu.header.get("BLANK")), unit)
+        for key in filter(is_rate, hdu.header):
+            out.add(key, hdu.header[key])
     return out
-
-
-def _add(out: FileColumns, name: str, data: Any, blank: int | None, unit: str) -> None:
-    """Add a column or an image; one with the name of a part of a record whole as well, in the unit beside it."""
-    known = name.lower()
-    if np.asarray(data).dtype.kind not in "fiu":
-        _leave(out, name, f"{name} does not hold numbers")
-        return
-    values = _native(data, blank)
-    out.add(name, values, unit)
-    if known in SIGNALS:
-        out.contents.arrays[known] = values[:, None] if values.ndim == 1 else values  # of one mode
-        if unit:
-            out.contents.state_unit(known, unit)
-    elif known in CLOCKS:
-        out.contents.arrays[known] = values * SECONDS.get(unit.strip(), 1.0)
-
-
-def _leave(out: FileColumns, name: str, why: str) -> None:
-    """Leave out what holds no numbers, unless it has the name of a part of a record."""
-    if name.lower() in (*SIGNALS, *CLOCKS) or parse_heading(name):
-        raise RecordError(why)
-    out.texts[name] = why
 
 
 def _native(data: Any, blank: int | None) -> Array:
     """Return numbers in native byte order, integers scaled as the header says; the integer `blank` is a missing one."""
+    if np.asarray(data).dtype.kind not in "fiu":
+        return np.asarray(data)
     out = np.array(data, dtype=np.float64)
     if blank is not None and np.asarray(data).dtype.kind in "iu":
         out[np.asarray(data) == blank] = np.nan
@@ -154,7 +135,7 @@ def _native(data: Any, blank: int | None) -> Array:
 def write(file: IO[bytes], arrays: Mapping[str, Array]) -> None:
     """Write the arrays as tables, numbers as keywords, the scenario as history."""
     fits = astropy_fits()
-    plain = numbers_and_texts(arrays)
+    plain = numbers_and_texts(arrays, "ascii")
     tables = [_table("RECORD", {n: arrays[n] for n in (*SIGNALS, *CLOCKS) if n in arrays and n not in TRAINING})]
     training = {n: arrays[n] for n in TRAINING if n in arrays}
     if training:

@@ -12,11 +12,8 @@ import numpy as np
 from numpy.lib import format as npy
 
 from wfsobs.record import RecordError
-from wfsobs.telemetry.formats.contents import NAMES, NUMBERS, TEXTS, FileColumns, TooLargeError
+from wfsobs.telemetry.formats.contents import NAMES, FileColumns, TooLargeError
 from wfsobs.typing import Array
-
-KINDS = "fiuUb"
-"""Kinds of array that are read: numbers, text, booleans. No objects, so no pickles."""
 
 DAMAGED = "damaged, or holds more than plain arrays"
 DAMAGES = (ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError, RuntimeError, NotImplementedError, MemoryError)
@@ -45,9 +42,7 @@ def read(file: IO[bytes], most: int) -> FileColumns:
             if size > LARGE and size > PACKED * packed:
                 raise RecordError(f"unpacks from {packed / 1e6:.3g} to {size / 1e6:.4g} MB, as no measurements do")
             for name, info in known.items():
-                out.contents.arrays[name] = _array(archive, info, name)
-                if name not in (*NUMBERS, *TEXTS):
-                    out.add(name, out.contents.arrays[name])
+                out.add(name, _array(archive, info, name))
             for name, info in members.items():
                 if name not in known and info.file_size <= room and _is_table(archive, info):
                     room -= info.file_size
@@ -60,13 +55,13 @@ def read(file: IO[bytes], most: int) -> FileColumns:
 
 
 def _is_table(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bool:
-    """Return whether a member holds numbers in one or two dimensions."""
+    """Return whether a member holds numbers or times in three dimensions at most, or fields of them."""
     try:
         with archive.open(info) as stream:
             shape, _, dtype = _header(stream)
     except DAMAGES:
         return False
-    return dtype.kind in "fiu" and len(shape) in (1, 2)
+    return dtype.kind in "fiuMV" and not dtype.hasobject and len(shape) <= 3
 
 
 def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
@@ -78,14 +73,33 @@ def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
 def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str) -> Array:
     """Return an array whose header agrees with the size in the directory: a read without a size would unpack everything."""
     with archive.open(info) as stream:
-        shape, fortran, dtype = _header(stream)
-        if dtype.hasobject or dtype.kind not in KINDS:
-            raise RecordError(DAMAGED if dtype.hasobject else f"{name} holds {dtype}, not numbers")
-        size = math.prod(shape) * dtype.itemsize
-        if min(shape, default=0) < 0 or size != info.file_size - stream.tell():
-            raise RecordError(f"{name} is damaged: not as long as its header says")
-        values = np.frombuffer(stream.read(size), dtype, math.prod(shape))
+        return _values(stream, info.file_size, name)
+
+
+def _values(stream: IO[bytes], length: int, name: str) -> Array:
+    shape, fortran, dtype = _header(stream)
+    if dtype.hasobject:
+        raise RecordError(DAMAGED)
+    size = math.prod(shape) * dtype.itemsize
+    if min(shape, default=0) < 0 or size != length - stream.tell():
+        raise RecordError(f"{name} is damaged: not as long as its header says")
+    values = np.frombuffer(stream.read(size), dtype, math.prod(shape))
     return values.reshape(shape, order="F" if fortran else "C")
+
+
+def read_npy(file: IO[bytes], most: int) -> FileColumns:
+    """Read one array, whose columns are array[0], array[1], ... Raises RecordError, TooLargeError."""
+    out, length = FileColumns(), file.seek(0, 2)
+    if length > most:
+        raise TooLargeError(most)
+    file.seek(0)
+    try:
+        out.add("array", _values(file, length, "array"))
+    except RecordError:
+        raise
+    except DAMAGES:
+        raise RecordError(DAMAGED) from None
+    return out
 
 
 def write(file: IO[bytes], arrays: Mapping[str, Array]) -> None:

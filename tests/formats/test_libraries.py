@@ -1,0 +1,374 @@
+"""Files of other programs: MATLAB, HDF5, IDL, Parquet, numpy's .npy, text of any dialect, tables of a real-time computer."""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import scipy.io
+from astropy.io import fits
+from click.testing import CliRunner
+
+import wfsobs
+from wfsobs.cli import main
+from wfsobs.record import Record, RecordError, Training
+from wfsobs.telemetry.formats import FORMATS
+from wfsobs.telemetry.formats.contents import TooLargeError
+from wfsobs.telemetry.intake import DeclaredFormat
+from wfsobs.telemetry.records import name_differences, read_columns, read_record
+
+RNG = np.random.default_rng(4)
+N = 400
+PHI = np.cumsum(RNG.standard_normal((N, 2)), axis=0)
+"""A disturbance [nm]; the noise of its measurement is a tenth of its step."""
+
+
+def loop(delay: float = 2.0, gain: float = 1.0, rail: float = np.inf) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Measurements and commands of an integrator, and what is measured without a mirror; the mirror holds every command."""
+    rng = np.random.default_rng(5)
+    z, u, y = PHI + 0.1 * rng.standard_normal((N, 2)), np.zeros((N, 2)), np.zeros((N, 2))
+    d, part = int(delay), delay % 1
+    for k in range(N):
+        held = [np.clip(u[k - d - i], -rail, rail) if k >= d + i else np.zeros(2) for i in (0, 1)]
+        y[k] = z[k] + gain * ((1 - part) * held[0] + part * held[1])
+        u[k] = (u[k - 1] if k else 0.0) - 0.3 * y[k]
+    return y, u, z
+
+
+Y, U, Z = loop()
+
+
+def saved(write: Callable[[io.BytesIO], Any]) -> bytes:
+    file = io.BytesIO()
+    write(file)
+    return file.getvalue()
+
+
+def matlab(**arrays: Any) -> bytes:
+    return saved(lambda file: scipy.io.savemat(file, arrays, do_compression=True))
+
+
+def hdf5(fill: Callable[[h5py.File], Any], userblock: int = 0) -> bytes:
+    def write(file: io.BytesIO) -> None:
+        with h5py.File(file, "w", userblock_size=userblock) as f:
+            fill(f)
+
+    content = saved(write)
+    return b"MATLAB 7.3 MAT-file".ljust(userblock)[:userblock] + content[userblock:]
+
+
+def parquet(**columns: Any) -> bytes:
+    return saved(lambda file: pq.write_table(pa.table(columns), file))
+
+
+def sav(**arrays: np.ndarray) -> bytes:
+    """Write a save file as IDL does: records of a kind and where the next one is, of big-endian words."""
+    content = b"SR\x00\x04"
+
+    def add(kind: int, body: bytes) -> None:
+        nonlocal content
+        content += struct.pack(">iIIi", kind, len(content) + 16 + len(body), 0, 0) + body
+
+    def text(value: str) -> bytes:
+        return struct.pack(">i", len(value)) + value.encode() + b"\0" * (-len(value) % 4)
+
+    for name, values in arrays.items():
+        dims = [*values.shape[::-1]] + [1] * (8 - values.ndim)
+        sizes = (8, 8, values.nbytes, values.size, values.ndim, 0, 0, 8)
+        add(2, text(name.upper()) + struct.pack(">ii", 5, 4) + struct.pack(">8i", *sizes) + struct.pack(">8i", *dims)
+            + struct.pack(">i", 7) + values.astype(">f8").tobytes())  # fmt: skip
+    return content + struct.pack(">iIIi", 6, 0, 0, 0)
+
+
+def table(head: str, rows: Any, separator: str = ",") -> bytes:
+    lines = [separator.join(x if isinstance(x, str) else repr(float(x)) for x in row) for row in rows]
+    return "\n".join([*([head] if head else []), *lines]).encode()
+
+
+def sparta(file: io.BytesIO) -> None:
+    k = np.arange(N)
+    columns = [("FrameCounter", "J", k + 100), ("Seconds", "J", 1762145600 + k // 1000), ("USeconds", "J", k % 1000 * 1000)]
+    columns += [("Gradients", "2D", Y), ("ITTM_Positions", "2D", U)]
+    fits.BinTableHDU.from_columns([fits.Column(n, f, array=a) for n, f, a in columns]).writeto(file)
+
+
+def cubes(file: io.BytesIO) -> None:
+    hdus = [fits.PrimaryHDU(), fits.ImageHDU(Y.reshape(N, 1, 2), name="SLOPES"), fits.ImageHDU(U.T, name="COMMANDS")]
+    hdus[0].header["LOOPFREQ"] = 1000.0
+    fits.HDUList(hdus).writeto(file)
+
+
+def structured(f: h5py.File) -> None:
+    f["loop"] = np.rec.fromarrays([*Y.T, *U.T], names="y0,y1,u0,u1")
+    f.attrs["fs"] = 1000.0
+
+
+def mapped(f: h5py.File) -> None:
+    f["loop/slopes_tt"], f["loop/commands_tt"], f.attrs["frame_rate_hz"] = Y, U, 1000.0
+
+
+def of_matlab_73(f: h5py.File) -> None:
+    f["y_lgs"], f["u"], f["dt"] = Y.T, U.T, np.array([[1e-3]])
+
+
+def array(kind: str) -> bytes:
+    rows = np.c_[Y, U] if kind == "plain" else np.rec.fromarrays([*Y.T, *U.T], names="a,b,c,d")
+    return saved(lambda file: np.save(file, rows))
+
+
+STEPS = np.arange(N)
+NOON = datetime(2026, 11, 3, 12, tzinfo=UTC)
+STAMPS = [(NOON + timedelta(milliseconds=int(k))).isoformat(timespec="milliseconds") for k in STEPS]
+HEAD = "y_lgs/tip_nm,y_lgs/tilt_nm,u/tip_nm,u/tilt_nm"
+COLUMNS = {f"{signal}/{mode}": f"{signal}/{mode}_nm" for signal in ("y_lgs", "u") for mode in ("tip", "tilt")}
+OWN = {"y_lgs": Y, "u": U, "dt": 1e-3, "unit": "nm"}
+NM, KHZ = {"unit": "nm"}, {"unit": "nm", "rate": 1000.0}
+
+CASES: list[tuple[str, bytes, dict[str, Any], str]] = [
+    ("a.mat", matlab(**OWN, delay=2), {}, "unit nm"),
+    ("a.mat", matlab(y_lgs=Y.T, u=U.T, time=1e-3 * STEPS), NM, "unit nm, y_lgs and u with a row per mode"),
+    ("a.mat", matlab(d={"s": Y, "c": U, "fs": 1000}), NM | {"columns": {"y_lgs": "d.s", "u": "d.c"}}, "unit nm, 1000 Hz by d.fs"),
+    ("a.mat", hdf5(of_matlab_73, 512), NM, "unit nm, y_lgs and u with a row per mode"),
+    (
+        "a.h5",
+        hdf5(mapped),
+        NM | {"columns": {"y_lgs": "loop/slopes_tt", "u": "loop/commands_tt"}},
+        "unit nm, 1000 Hz by frame_rate_hz",
+    ),
+    (
+        "a.hdf5",
+        hdf5(structured),
+        NM | {"columns": dict(zip(COLUMNS, ("loop.y0", "loop.y1", "loop.u0", "loop.u1"), strict=True))},
+        "unit nm, 1000 Hz by fs",
+    ),
+    ("a.sav", sav(y=Y, c=U.T), KHZ | {"columns": {"y_lgs": "y", "u": "c"}}, "unit nm"),
+    ("a.npy", array("plain"), KHZ | {"columns": dict(zip(COLUMNS, (f"array[{i}]" for i in range(4)), strict=True))}, "unit nm"),
+    ("a.npy", array("fields"), KHZ | {"columns": dict(zip(COLUMNS, (f"array.{i}" for i in "abcd"), strict=True))}, "unit nm"),
+    (
+        "a.parquet",
+        parquet(when=[NOON + timedelta(milliseconds=int(k)) for k in STEPS], **dict(zip("abcd", [*Y.T, *U.T], strict=True))),
+        NM | {"columns": dict(zip(("time", *COLUMNS), ("when", *"abcd"), strict=True))},
+        "unit nm",
+    ),
+    ("a.parquet", parquet(y=Y.tolist(), c=U.tolist(), time=STAMPS), NM | {"columns": {"y_lgs": "y", "u": "c"}}, "unit nm"),
+    (
+        "a.fits",
+        saved(sparta),
+        NM | {"columns": {"y_lgs": "Gradients", "u": "ITTM_Positions"}},
+        "unit nm, time by Seconds and USeconds, frames counted by FrameCounter",
+    ),
+    ("a.fits", saved(cubes), NM | {"columns": {"y_lgs": "SLOPES", "u": "COMMANDS"}}, "unit nm, 1000 Hz by LOOPFREQ"),
+    ("a.csv", table(f"time,{HEAD}", ([s, *r] for s, r in zip(STAMPS, np.c_[Y, U], strict=True))), {}, "unit nm"),
+    ("a.csv", table(f"MJD,{HEAD}", np.c_[60982.5 + STEPS * 1e-3 / 86400, Y, U]), KHZ, "unit nm"),
+    (
+        "a.dat",
+        table("% taken at night\n% a b c d", np.c_[Y, U], "  "),
+        KHZ | {"columns": dict(zip(COLUMNS, "abcd", strict=True))},
+        "unit nm, heading of the comment above, cells separated by blanks",
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "content", "stated", "origin"), CASES, ids=[f"{i}{case[0]}" for i, case in enumerate(CASES)])
+def test_every_file_gives_the_record_and_says_what_is_guessed(name: str, content: bytes, stated: dict, origin: str) -> None:
+    """All numbers are written with all digits; a modified Julian date resolves 1 us."""
+    record = read_record(io.BytesIO(content), name, declaration=DeclaredFormat(**stated))
+    np.testing.assert_allclose(record.y_lgs, 1e-3 * Y, rtol=1e-12)
+    np.testing.assert_allclose(record.u, 1e-3 * U, rtol=1e-12)
+    assert (record.dt, record.delay, record.missing, record.origin) == (0.001, 2, 0, origin)
+
+
+def test_a_folder_of_arrays_on_the_command_line(tmp_path: Path) -> None:
+    """Which column is what by --column, or by a table of a settings file."""
+    (tmp_path / "night").mkdir()
+    np.save(tmp_path / "night" / "slopes.npy", Y)
+    np.save(tmp_path / "night" / "commands.npy", U)
+    (tmp_path / "f.toml").write_text('preset = "ut4"\n[columns]\ny_lgs = "slopes"\nu = "commands"\n')
+    words = ["convert", str(tmp_path / "night"), str(tmp_path / "out.h5"), "--unit", "nm", "--rate", "1000"]
+    for given in (["--column", "y_lgs=slopes", "--column", "u=commands"], ["--config", str(tmp_path / "f.toml")]):
+        done = CliRunner().invoke(main, [*words, *given])
+        assert done.exit_code == 0 and "has no place" not in done.output, done.output
+        np.testing.assert_allclose(wfsobs.load(tmp_path / "out.h5").y_lgs, 1e-3 * Y, rtol=1e-12)
+        (tmp_path / "out.h5").unlink()
+    done = CliRunner().invoke(main, words)
+    assert done.exit_code == 2 and "as its names suggest: --column 'u=commands' --column 'y_lgs=slopes'" in done.output
+    assert not (tmp_path / "out.h5").exists()
+
+
+# ---------------------------------------------------------------------- what the loop is
+
+
+@pytest.mark.parametrize("delay", [1.0, 1.5, 2.0, 2.4])
+@pytest.mark.parametrize("gain", [1.0, (1.2, 0.8)])
+@pytest.mark.parametrize("rail", [None, 12.0])
+def test_the_loop_as_stated_gives_what_no_mirror_has_touched(tmp_path: Path, delay: float, gain: Any, rail: float | None) -> None:
+    """But for the frames whose commands came before the record."""
+    y, u, z = loop(delay, np.asarray(gain), rail or np.inf)
+    np.savez(tmp_path / "a.npz", y_lgs=y, u=u, dt=1e-3, unit="nm", delay=delay)
+    record = wfsobs.load(tmp_path / "a.npz", command_gain=gain, rail=rail)
+    np.testing.assert_allclose(1e3 * record.z[4:], z[4:], rtol=0, atol=1e-9)
+    assert record.delay == int(delay) and ("delay" in record.origin) == (delay % 1 > 0)
+
+
+def test_a_stated_delay_comes_before_that_of_the_file_where_it_is_trusted(tmp_path: Path) -> None:
+    y, u, z = loop(1.5)
+    np.savez(tmp_path / "a.npz", y_lgs=y, u=u, dt=1e-3, unit="nm", delay=2, command_sign=-1)
+    with pytest.raises(RecordError, match=r"delay is 2, but 1\.5 is stated; --trust takes that"):
+        wfsobs.load(tmp_path / "a.npz", command_delay=1.5)
+    record = wfsobs.load(tmp_path / "a.npz", command_delay=1.5, command_sign=1, trust=True)
+    np.testing.assert_allclose(1e3 * record.z[4:], z[4:], rtol=0, atol=1e-9)
+
+
+def test_open_loop_needs_no_commands(tmp_path: Path) -> None:
+    for arrays in ({}, {"u": U}):
+        np.savez(tmp_path / "a.npz", y_lgs=Z, dt=1e-3, unit="nm", **arrays)
+        record = wfsobs.load(tmp_path / "a.npz", open_loop=True)
+        np.testing.assert_allclose(1e3 * record.z, Z, rtol=1e-12)
+        assert record.origin == "unit nm, open loop"
+    with pytest.raises(RecordError, match="a command gain takes a number above 0, or 2, one per mode"):
+        wfsobs.load(tmp_path / "a.npz", command_gain=[1.0, 1.0, 1.0])
+
+
+# ---------------------------------------------------------------------- what is refused
+
+
+def referring(f: h5py.File) -> None:
+    f["u"] = U
+    f.create_dataset("y_lgs", (2,), dtype=h5py.ref_dtype)
+
+
+def linked(link: Any) -> Callable[[h5py.File], None]:
+    def fill(f: h5py.File) -> None:
+        f["u"], f["y_lgs"] = U, link
+
+    return fill
+
+
+def outside(f: h5py.File) -> None:
+    f.create_dataset("y_lgs", (N, 2), dtype="f8", external=[("/etc/passwd", 0, 16 * N)])
+
+
+def virtual(f: h5py.File) -> None:
+    layout = h5py.VirtualLayout(shape=(N, 2), dtype="f8")
+    layout[:] = h5py.VirtualSource("other.h5", "y", shape=(N, 2))
+    f.create_virtual_dataset("y_lgs", layout)
+
+
+def endless(f: h5py.File) -> None:
+    f.create_group("a")["again"] = f["/"]
+
+
+def bomb() -> bytes:
+    """A MATLAB file whose packed part says that it is of 200 MB, and is."""
+    packed = zlib.compress(struct.pack("<II", 14, 200_000_000) + bytes(200_000_000), 9)
+    return b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM" + struct.pack("<II", 15, len(packed)) + packed
+
+
+CELLS = np.empty(2, dtype=object)
+CELLS[:] = [Y, U]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "line"),
+    [
+        ("a.mat", matlab(y_lgs=CELLS, u=U), "y_lgs is a MATLAB cell of shape (1, 2), which is not read"),
+        ("a.mat", matlab(y_lgs=np.rec.fromarrays([[1, 2]], names="a"), u=U), "y_lgs is a MATLAB struct of shape (1, 2), which"),
+        ("a.mat", b"MATLAB 5.0 MAT-file" + bytes(9), "damaged, or not a MATLAB file"),
+        ("a.h5", hdf5(referring), "y_lgs holds objects or references, not numbers"),
+        ("a.h5", hdf5(linked(h5py.ExternalLink("other.h5", "/y"))), "y_lgs is a link, which is not followed"),
+        ("a.h5", hdf5(linked(h5py.SoftLink("/u"))), "y_lgs is a link, which is not followed"),
+        ("a.h5", hdf5(outside), "y_lgs lies in another file, which is not opened"),
+        ("a.h5", hdf5(virtual), "y_lgs lies in another file, which is not opened"),
+        ("a.h5", hdf5(endless), "has more than 1000 groups and arrays"),
+        ("a.h5", b"no", "damaged, or not an HDF5 file"),
+        ("a.sav", b"SR\x00\x04", "damaged, or not a save file of IDL"),
+        ("a.sav", b"no", "damaged, or not a save file of IDL"),
+        ("a.parquet", b"PAR1", "damaged, or not a Parquet file"),
+        ("a.parquet", parquet(y_lgs=[{"a": 1}]), "y_lgs holds struct<a: int64>, not numbers"),
+        ("a.npy", saved(lambda file: np.save(file, CELLS, allow_pickle=True)), "damaged, or holds more than plain arrays"),
+    ],
+)
+def test_what_is_refused_in_a_line(name: str, content: bytes, line: str) -> None:
+    with pytest.raises(RecordError) as caught:
+        read_record(io.BytesIO(content), name)
+    assert str(caught.value).startswith(f"{name}: {line}") and "\n" not in str(caught.value)
+
+
+def packed_sav() -> bytes:
+    content = zlib.compress(bytes(200_000_000), 9)
+    return b"SR\x00\x06" + struct.pack(">iIIi", 2, 20 + len(content), 0, 0) + content
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.mat", bomb()),
+        ("a.sav", packed_sav()),
+        ("a.h5", hdf5(lambda f: f.create_dataset("y", (30_000_000,), dtype="f8", compression="gzip"))),
+        ("a.h5", hdf5(lambda f: f.create_dataset("y", (1,), "f8", maxshape=(None,), chunks=(30_000_000,), compression="gzip"))),
+        ("a.parquet", parquet(y=np.zeros(8_000_000))),
+        ("a.npy", saved(lambda file: np.save(file, np.zeros(8_000_000)))),
+    ],
+)
+def test_sizes_are_known_before_anything_grows(name: str, content: bytes) -> None:
+    """Of 60 MB at most where more would be unpacked."""
+    with pytest.raises(TooLargeError):
+        read_columns(io.BytesIO(content), name, 60_000_000)
+
+
+# ---------------------------------------------------------------------- from one format to another
+
+
+def of_everything() -> Record:
+    y, y_ngs = Y.copy(), np.full((N, 2), np.nan)
+    y[17], y[40, 1] = np.nan, np.nan
+    y_ngs[5::5] = Y[5::5]
+    y_ngs[25] = np.nan
+    stars = RNG.standard_normal((N, 3, 2))
+    training = Training(Y[:50], U[:50], Z[:50])
+    truth = {"turbulence": 0.9 * Z, "vibration": 0.1 * Z, "open_loop_y": Z}
+    apart = {"lgs_stars": np.full(N, 3), "y_stars": stars}
+    return Record(y, U, 1 / 997, y_ngs, 5, delay=3, training=training, origin="unit µm", **truth, **apart)
+
+
+NO_PLACE = {
+    ".aot.fits": {"turbulence", "vibration", "open_loop_y", "training", "lgs_stars", "y_stars"},
+    ".csv": {"lgs_stars", "y_stars"},
+    ".fits": {"lgs_stars", "y_stars"},
+    ".parquet": {"lgs_stars", "y_stars"},
+}
+
+
+@pytest.mark.parametrize("ending", [fmt.endings[0] for fmt in FORMATS if fmt.write])
+def test_what_is_converted_is_what_it_was(tmp_path: Path, ending: str) -> None:
+    """Or what has no place is named; no temporary file is left."""
+    record = of_everything()
+    wfsobs.save(tmp_path / "a.npz", record)
+    assert name_differences(record, wfsobs.load(tmp_path / "a.npz", trust=True)) == []
+    out = tmp_path / f"b{ending}"
+    done = CliRunner().invoke(main, ["convert", str(tmp_path / "a.npz"), str(out), "--trust"])
+    assert done.exit_code == 0, done.output
+    again = wfsobs.load(out, trust=True)
+    lost = NO_PLACE.get(ending, set())
+    assert set(name_differences(record, again)) == lost and (not lost or "has no place for" in done.output)
+    assert again.origin == ("unit ?m" if ".fits" in ending else "unit µm") and {path.name for path in tmp_path.iterdir()} == {
+        "a.npz",
+        f"b{ending}",
+    }
+
+
+def test_formats_that_are_only_read(tmp_path: Path) -> None:
+    for ending in (".npy", ".sav"):
+        with pytest.raises(RecordError, match="files of its ending are read, not written"):
+            wfsobs.save(tmp_path / f"a{ending}", Record(Y, U, 1e-3))
+    assert not [*tmp_path.iterdir()]
