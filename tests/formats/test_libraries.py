@@ -170,6 +170,26 @@ CASES: list[tuple[str, bytes, dict[str, Any], str]] = [
     ("a.fits", saved(cubes), NM | {"columns": {"y_lgs": "SLOPES", "u": "COMMANDS"}}, "unit nm, 1000 Hz by LOOPFREQ"),
     ("a.csv", table(f"time,{HEAD}", ([s, *r] for s, r in zip(STAMPS, np.c_[Y, U], strict=True))), {}, "unit nm"),
     ("a.csv", table(f"MJD,{HEAD}", np.c_[60982.5 + STEPS * 1e-3 / 86400, Y, U]), KHZ, "unit nm"),
+    ("a.csv", table(f"time,{HEAD}", np.c_[1e-3 * STEPS, Y, U]).decode().encode("utf-16"), {}, "unit nm"),
+    (
+        "a.txt",
+        table("t|a|b|c|d\nms|nm|nm|nm|nm", np.c_[STEPS, Y, U], "|"),
+        {"columns": dict(zip(("time", *COLUMNS), "tabcd", strict=True))},
+        "unit nm, cells separated by bars",
+    ),
+    ("a.csv", table(f"time,{HEAD},", ([s[11:], *r, ""] for s, r in zip(STAMPS, np.c_[Y, U], strict=True))), {}, "unit nm"),
+    (
+        "a.csv",
+        table(f"time,{HEAD}", ([str(1762145600 * 10**6 + 1000 * int(k)), *r] for k, r in zip(STEPS, np.c_[Y, U], strict=True))),
+        {},
+        "unit nm, time in us",
+    ),
+    (
+        "a.csv",
+        table(f"t,{HEAD}", np.c_[60982.5 + STEPS * 1e-3 / 86400, Y, U]),
+        KHZ | {"columns": {"time": "t"}},
+        "unit nm, time in d",
+    ),
     (
         "a.dat",
         table("% taken at night\n% a b c d", np.c_[Y, U], "  "),

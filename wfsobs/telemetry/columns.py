@@ -13,6 +13,7 @@ from wfsobs.telemetry.formats.contents import (
     FRAME,
     NGS,
     TIME,
+    TIME_NGS,
     Contents,
     FileColumns,
     column_mode,
@@ -112,6 +113,10 @@ def to_contents(file: FileColumns, roles: Mapping[str, str]) -> Contents:
         unused.remove(counters[0])
         contents.arrays[FRAME] = file.columns[counters[0]]
         contents.guesses.append(f"frames counted by {counters[0]}")
+    for name in {TIME, TIME_NGS} & contents.arrays.keys():
+        if unit := _guess_unit(contents.arrays[name]):
+            contents.arrays[name] = contents.arrays[name] * SECONDS[unit]
+            contents.guesses.append(f"{name} in {unit}")
     rates = {name: rate for name, rate in file.numbers.items() if is_rate(name) and rate > 0}
     if not contents.arrays.keys() & {"dt", TIME} and len(set(rates.values())) == 1:
         name, rate = rates.popitem()
@@ -124,6 +129,14 @@ def to_contents(file: FileColumns, roles: Mapping[str, str]) -> Contents:
     elif unused:
         contents.hint = f"; which of its columns is what? It has {', '.join(unused[:20])}"
     return contents
+
+
+def _guess_unit(time: Array) -> str:
+    """Return the unit of stamps that can be no seconds: those since 1970 of our time, or days; empty of any others."""
+    size = float(np.median(time)) if time.size > 1 and time.dtype.kind in "fiu" else 0.0
+    if 4e4 < size < 9e4 and 0 < np.median(np.diff(time)) < 1e-6:
+        return "d"
+    return next((unit for unit in ("ms", "us", "ns") if 1e9 < size * SECONDS[unit] < 4.2e9), "")
 
 
 def _each_mode(file: FileColumns, role: str, name: str) -> list[tuple[str, str]]:
@@ -185,9 +198,11 @@ def suggest_roles(names: Iterable[str]) -> dict[str, str]:
     {'y_lgs/tip': 'tip_res_nm', 'u/tilt': 'tilt_cmd_nm'}
     """
     found: dict[str, str] = {}
+    names = [*names]
+    many = {name.removesuffix("[2]") for name in names if name.endswith("[2]")}
     for name in names:
         role = _role_of(name)
-        if role is not None:
+        if role is not None and re.sub(r"\[\d+\]$", "", name) not in many:  # of many columns it is not known which
             found.setdefault(role, name)
     return found
 

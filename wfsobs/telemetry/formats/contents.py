@@ -185,25 +185,28 @@ KINDS = {"O": "objects", "b": "yes or no", "c": "complex numbers", "V": "structu
 DEEPEST = 6
 """Maximum depth of structures."""
 
-STAMP = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(?:[.,](\d{1,9}))?\d*(?:Z|[+-]\d\d:?\d\d)?")
-"""A time stamp of ISO 8601; the time zone is that of all."""
+STAMP = re.compile(r"(?:(\d{4}[-/]\d\d[-/]\d\d)[T ])?(\d\d:\d\d:\d\d)(?:[.,](\d{1,9}))?\d*(?:Z|[+-]\d\d:?\d\d)?")
+"""A time stamp of ISO 8601, or the time of a day; the time zone is that of all."""
+
+ABSENT = frozenset(("", "na", "n/a", "null", "none", "-", "--"))
+"""What stands in a cell for a missing number."""
 
 
 def parse_cell(text: str) -> float:
-    """Return the number of a cell, also with a decimal comma, or the seconds since 1970 of a stamp; NaN of an empty one.
+    """Return the number of a cell, also with a decimal comma, or the seconds since 1970 of a stamp; NaN where there is none.
 
-    >>> parse_cell("0,5"), parse_cell("1970-01-02 00:00:00.25Z")
-    (0.5, 86400.25)
+    >>> parse_cell("0,5"), parse_cell("1970-01-02 00:00:00.25Z"), parse_cell("N/A")
+    (0.5, 86400.25, nan)
 
     Raises ValueError.
     """
-    try:
-        return float(text.strip() or "nan")
-    except ValueError:
-        if (match := STAMP.fullmatch(text.strip())) is None:
-            return float(text.replace(",", "."))
-    day, clock, part = match.groups("0")
-    return float(np.datetime64(f"{day}T{clock}").astype(np.int64) + float(f"0.{part}"))
+    if text.strip().lower() in ABSENT:
+        return np.nan
+    if (match := STAMP.fullmatch(text.strip())) is None:
+        return float(text.replace(",", "."))
+    day, clock, part = match.groups()
+    whole = np.datetime64(f"{(day or '1970-01-01').replace('/', '-')}T{clock}").astype(np.int64)
+    return float(whole + float(f"0.{part or 0}"))
 
 
 def parse_heading(heading: str, beside: str = "") -> tuple[str, str] | None:

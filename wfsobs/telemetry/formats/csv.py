@@ -7,8 +7,10 @@ cell are a missing sample; where a column is empty to the end, it ends there.
 from __future__ import annotations
 
 import csv
+import io
 import re
 from array import array
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterator, Mapping
 from itertools import chain
 from typing import IO
@@ -28,8 +30,9 @@ from wfsobs.telemetry.formats.contents import (
     to_columns,
 )
 from wfsobs.typing import Array
+from wfsobs.units import SECONDS, parse_unit
 
-SEPARATORS: dict[str | None, str] = {"\t": "tabs", ";": "semicolons", ",": "commas", None: "blanks"}
+SEPARATORS: dict[str | None, str] = {"\t": "tabs", ";": "semicolons", "|": "bars", ",": "commas", None: "blanks"}
 """What separates cells: the first of these that makes numbers of the first line, or that is in the heading."""
 
 COMMENTS = ("#", "%", "!", "//")
@@ -49,11 +52,20 @@ def read(file: IO[bytes], most: int) -> FileColumns:
     TooLargeError.
     """
     out = FileColumns()
+    if file.read(2) in (BOM_UTF16_LE, BOM_UTF16_BE):
+        file.seek(0)
+        file = io.BytesIO(file.read(most).decode("utf-16", "replace").encode())
+    file.seek(0)
     heading, separator, rows, named = _head(file, out.contents)
     if len(set(heading)) < len(heading):
         raise RecordError("two columns have the same heading")
     width, commas = len(heading), False
     cells_of, ends = {i: array("d") for i in range(width)}, [0] * width
+    first = next(rows, None)
+    if first and any(cell.strip() for cell in first[1]) and all(x.strip() in ("", *SECONDS) or parse_unit(x) for x in first[1]):
+        out.units = {name: cell.strip() for name, cell in zip(heading, first[1], strict=False)}
+    elif first:
+        rows = chain([first], rows)
     for step, (line, cells) in enumerate(rows):
         if len(cells) != width:
             raise RecordError(f"line {line} has {len(cells)} cells, the heading {width}; cells are separated by {separator}")
@@ -76,9 +88,8 @@ def read(file: IO[bytes], most: int) -> FileColumns:
                 continue
             if STAMP.fullmatch(text):
                 out.units[heading[i]] = "s"
-            else:
-                commas = True
-    out.columns = {heading[i]: np.array(column[: ends[i]]) for i, column in cells_of.items()}
+            commas |= np.isfinite(column[-1]) and heading[i] not in out.units
+    out.columns = {heading[i]: np.array(column[: ends[i]]) for i, column in cells_of.items() if heading[i] or ends[i]}
     out.contents.guesses += ["heading of the comment above"] * named
     out.contents.guesses += [f"cells separated by {separator}"] * (separator != "commas") + ["decimal commas"] * commas
     return out

@@ -110,10 +110,12 @@ def tables_and_images(hdus: HDUList) -> FileColumns:
         data: Any = hdu.data
         if isinstance(hdu, fits.BinTableHDU):
             for column in hdu.columns:
+                twice = column.name in out.columns or f"{column.name}[0]" in out.columns
+                name = f"{hdu.name or number}.{column.name}" if twice else column.name
                 if "P" in column.format or "Q" in column.format:
-                    out.leave(column.name, f"{column.name} is a column of rows of unlike lengths")
+                    out.leave(name, f"{name} is a column of rows of unlike lengths")
                 else:
-                    out.add(column.name, _native(data[column.name], column.null), column.unit or "")
+                    out.add(name, _native(data[column.name], column.null), column.unit or "")
         elif data is not None:
             unit = str(hdu.header.get("BUNIT", ""))
             out.add(hdu.name or f"image {number}", _native(data, hdu.header.get("BLANK")), unit)
