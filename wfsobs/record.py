@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wfsobs.notebook import html_table
+from wfsobs.notebook import PlotAccessor, html_table
 from wfsobs.typing import Array
 
 DELAY = 2
@@ -162,6 +162,7 @@ class Record(Signals):
     vibration: Array | None = None
     training: Training | None = None
     origin: str = ""
+    plot = PlotAccessor()
 
     def __repr__(self) -> str:
         return f"Record({', '.join(f'{what} {value}' for what, value in self._summary())})"

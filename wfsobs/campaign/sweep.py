@@ -16,6 +16,7 @@ from wfsobs.cost import run_seconds
 from wfsobs.evaluation.evidence import FEWEST, Evidence, Key, gather_evidence
 from wfsobs.evaluation.scores import BOUNDS, Score
 from wfsobs.evaluation.verdict import Verdict, contenders
+from wfsobs.notebook import PlotAccessor
 from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import observe
 from wfsobs.priors_from.selection import common_observers
@@ -275,6 +276,7 @@ class SweepResults:
     scores: Mapping[int, tuple[tuple[Score, ...], ...]] = field(default_factory=dict)
     evidence: Mapping[int, Evidence] = field(default_factory=dict)
     failures: Mapping[int, str] = field(default_factory=dict)
+    plot = PlotAccessor()
 
     def add(self, cell: int, scores: Sequence[Score]) -> SweepResults:
         """Return the results with those of one more seed of a cell."""

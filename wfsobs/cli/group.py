@@ -26,6 +26,7 @@ COMMANDS = {
     "convert": Place("telemetry", "Write a record in another format: .npz, .aot.fits, .fits, .h5, .mat, .csv or .parquet."),
     "design": Place("design", "Write a controller for a program elsewhere: C99 with a test, arrays, python-control."),
     "export": Place("export", "Write a report: one HTML file with figures and numbers that opens without a network."),
+    "figure": Place("figure", "Draw a figure of the paper as a file."),
     "identify": Place("telemetry", "Find noise, turbulence and vibration peaks in a record."),
     "live": Place("live", "Run a loop by the clock, every observer beside it, frame by frame, and show it on a page."),
     "loop": Place("simulate", "Close the loop with every controller on the same disturbance and print what is left of it."),

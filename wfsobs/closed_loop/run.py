@@ -18,6 +18,7 @@ from wfsobs.closed_loop.design import Design, LawDesign, design
 from wfsobs.control.base import Controller
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.dependence import Memo, digest, record_digest
+from wfsobs.notebook import PlotAccessor
 from wfsobs.pipeline import as_stated
 from wfsobs.priors_from.controllers import controller_arguments, own_settings
 from wfsobs.progress import QUIET, Watch, detach_watch
@@ -54,6 +55,7 @@ class ClosedLoop:
     design: Design
     record: Record
     outcomes: tuple[Outcome, ...] = field(default=())
+    plot = PlotAccessor()
 
     def __repr__(self) -> str:
         return f"ClosedLoop({len(self.outcomes)} controllers, {self.record!r})"

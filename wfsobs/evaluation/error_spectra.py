@@ -10,7 +10,7 @@ nor has one that looks ahead.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from math import sqrt
 from time import monotonic
@@ -61,7 +61,9 @@ def scored_samples(record: Record, truth: Array, value: Array, warm_up: float) -
     return truth[start:][known], value[start:][known]
 
 
-def spectra(record: Record, target: str, values: Array, warm_up: float) -> tuple[Array, Array, Array] | None:
+def spectra(
+    record: Record, target: str, values: Array, warm_up: float, modes: Sequence[int] | None = None
+) -> tuple[Array, Array, Array] | None:
     """Compute the spectra of an estimate and of its error.
 
     Over all samples after the warm-up [s] that have an estimate; without a truth the error is zero.
@@ -76,6 +78,8 @@ def spectra(record: Record, target: str, values: Array, warm_up: float) -> tuple
         Estimate, (n_steps, n_modes) [um].
     warm_up : float
         Start of the record that does not count [s].
+    modes : sequence of int, optional
+        Columns; by default all.
 
     Returns
     -------
@@ -84,7 +88,8 @@ def spectra(record: Record, target: str, values: Array, warm_up: float) -> tuple
     """
     truth = record.truth(target)
     truth = values if truth is None else truth
-    columns = [scored_samples(record, truth[:, mode], values[:, mode], warm_up) for mode in range(record.n_modes)]
+    chosen = range(record.n_modes) if modes is None else modes
+    columns = [scored_samples(record, truth[:, mode], values[:, mode], warm_up) for mode in chosen]
     shortest = min(true.size for true, _ in columns)
     if shortest < 16:
         return None

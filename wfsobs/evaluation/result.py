@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from wfsobs.evaluation.rows import score_rows
 from wfsobs.evaluation.scores import Score
-from wfsobs.notebook import html_table
+from wfsobs.notebook import PlotAccessor, html_table
 from wfsobs.observers.estimates import Estimate
 from wfsobs.prior import TRUE, PriorSource
 from wfsobs.record import Record
@@ -51,6 +51,7 @@ class Result:
     scores: tuple[Score, ...]
     failures: tuple[Failure, ...] = ()
     prior_source: PriorSource = TRUE
+    plot = PlotAccessor()
 
     def __repr__(self) -> str:
         left_out = f", {len(self.failures)} left out" if self.failures else ""

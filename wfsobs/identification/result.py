@@ -22,6 +22,7 @@ from wfsobs.identification.process import (
 )
 from wfsobs.identification.settings import MATCHED, base_scenario, model_settings
 from wfsobs.identification.whiteness import Whiteness
+from wfsobs.notebook import PlotAccessor
 from wfsobs.prior import Line, Lines
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2, turbulence_corner
@@ -105,6 +106,7 @@ class Identification:
     dt: float
     n_steps: int
     level: float
+    plot = PlotAccessor()
 
     def __repr__(self) -> str:
         peaks = ", ".join(f"{mode.name} {len(mode.peaks)} peaks" for mode in self.modes)

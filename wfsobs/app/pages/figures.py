@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from html import escape
 
 import numpy as np
@@ -15,81 +14,23 @@ from wfsobs.app.pages.parts import WIDE, Page, boxes, html
 from wfsobs.app.render import number
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, look, swatch
-from wfsobs.app.views.plots import call, envelope, envelope_times, new_figure
+from wfsobs.app.views.plots import call, new_figure
 from wfsobs.app.views.table import find
 from wfsobs.app.work import TRUTH, RunResults
-from wfsobs.observers.base import TURBULENCE, VIBRATION
-from wfsobs.sensors.modes import TIP_TILT
-
-ZOOM_S = 0.5
-"""Length of a zoomed plot [s], in the middle of the record."""
-
-BINS = 700
-PSD_TOP_HZ = 100.0
-WHOLE, ZOOMED, SPECTRUM = "whole record", "zoomed", "power spectrum"
-
-
-@dataclass(frozen=True)
-class Plot:
-    """One plot: what of it (WHOLE, ZOOMED, SPECTRUM), of which column of the arrays."""
-
-    what: str
-    column: int = 0
-
-
-@dataclass(frozen=True)
-class PaperFigure:
-    """A figure of the paper: its number, its lines beside the reference, its plots from the top.
-
-    paper_errors : (observer, the RMS error that the paper states, taken as [um])
-    """
-
-    number: str
-    title: str
-    caption: str
-    target: str
-    observers: tuple[str, ...]
-    plots: tuple[Plot, ...]
-    paper_errors: tuple[tuple[str, float], ...] = ()
-
-
-FIGURES = (
-    PaperFigure(
-        "4a",
-        "Butterworth reference, open loop",
-        "Vibration filtered from open-loop data, the grey stretch enlarged below; tip only.",
-        VIBRATION,
-        ("butterworth-ol",),
-        (Plot(WHOLE), Plot(ZOOMED)),
-        (("butterworth-ol", 7.66e-3),),
-    ),
-    PaperFigure(
-        "4b",
-        "Butterworth reference, closed loop",
-        "Vibration filtered from closed-loop data, the grey stretch enlarged below; tip only.",
-        VIBRATION,
-        ("butterworth-cl",),
-        (Plot(WHOLE), Plot(ZOOMED)),
-        (("butterworth-cl", 13.4e-3),),
-    ),
-    PaperFigure(
-        "5",
-        "Estimation of the atmospheric turbulence",
-        "Tip above, tilt below.",
-        TURBULENCE,
-        ("kf-lgs", "kf-ngs", "multirate"),
-        (Plot(WHOLE, 0), Plot(WHOLE, 1)),
-    ),
-    PaperFigure(
-        "6",
-        "Estimation of structural vibrations",
-        "Traces, the grey stretch enlarged, and power spectra; tip only.",
-        VIBRATION,
-        ("kf-lgs", "gpr-offline", "gpr-online"),
-        (Plot(WHOLE), Plot(ZOOMED), Plot(SPECTRUM)),
-        (("kf-lgs", 16.6e-3), ("gpr-offline", 12.4e-3), ("gpr-online", 13.3e-3)),
-    ),
+from wfsobs.plot.paper import (
+    FIGURES,
+    PSD_TOP_HZ,
+    SPECTRUM,
+    WHOLE,
+    ZOOMED,
+    PaperFigure,
+    Plot,
+    is_dashed,
+    samples_of,
+    spectrum_part,
+    trace_of,
 )
+from wfsobs.sensors.modes import TIP_TILT
 
 
 class Figures(Page):
@@ -128,7 +69,7 @@ class _Sheet:
     def draw(self, results: RunResults, display: Display) -> None:
         """Every plot and the texts."""
         legend = "".join(
-            f'<span class="mark">{swatch(n, display.dark, with_dash=_is_dashed(n, self.figure))}{escape(_label(n))}</span>'
+            f'<span class="mark">{swatch(n, display.dark, with_dash=is_dashed(n, self.figure))}{escape(_label(n))}</span>'
             for n in self.names
         )
         title = escape(f"Figure {self.figure.number} of the paper: {self.figure.title}")
@@ -174,7 +115,7 @@ class _PlotLines:
                 "y",
                 source=source,
                 line_width=1.6,
-                line_dash=list(look(name).dash) if _is_dashed(name, of) else [],
+                line_dash=list(look(name).dash) if is_dashed(name, of) else [],
                 name=name,
             )
             for name, source in self.sources.items()
@@ -197,18 +138,14 @@ class _PlotLines:
             self._draw_traces(results, scale)
 
     def _draw_traces(self, results: RunResults, scale: float) -> None:
-        dt, n = results.result.record.dt, results.result.record.n_steps
-        begin = min(round(results.scenario.run.warm_up / dt), n - 2)
-        middle, half = (begin + n) // 2, min(round(ZOOM_S / dt), n - begin) // 2
-        zoomed = (middle - half, middle + half)
-        first, last = zoomed if self.plot.what == ZOOMED else (begin, n)
-        times = envelope_times(first, last, BINS, dt)
+        record, dt = results.result.record, results.result.record.dt
+        shown = samples_of(record, results.scenario.run.warm_up)
+        first, last = shown[self.plot.what]
         for name, source in self.sources.items():
-            values = results.values(name, self.of.target)
-            lines = np.full(last - first, np.nan) if values is None else values[first:last, self.plot.column]
-            source.data = {"x": times, "y": (scale * envelope(lines, BINS)).astype(np.float32)}
+            x, y = trace_of(record, results.values(name, self.of.target), self.plot.column, first, last)
+            source.data = {"x": x, "y": (scale * y).astype(np.float32)}
         self.figure.x_range.update(start=first * dt, end=last * dt, reset_start=first * dt, reset_end=last * dt)
-        self.window.update(left=zoomed[0] * dt, right=zoomed[1] * dt)
+        self.window.update(left=shown[ZOOMED][0] * dt, right=shown[ZOOMED][1] * dt)
 
     def _draw_spectra(self, results: RunResults, scale: float) -> None:
         tops: list[float] = []
@@ -217,9 +154,8 @@ class _PlotLines:
             if spectrum is None:
                 source.data = {"x": [], "y": []}
                 continue
-            within = (spectrum.frequency > 0) & (spectrum.frequency <= PSD_TOP_HZ)
-            y = scale * spectrum.signal[within, self.plot.column]
-            source.data = {"x": spectrum.frequency[within], "y": y}
+            x, y = spectrum_part(spectrum.frequency, scale * spectrum.signal[:, self.plot.column])
+            source.data = {"x": x, "y": y}
             tops.append(float(y.max()))
         if tops and max(tops) > 0:
             self.figure.y_range.update(start=1e-5 * max(tops), end=2 * max(tops))
@@ -227,8 +163,3 @@ class _PlotLines:
 
 def _label(name: str) -> str:
     return "Reference" if name == TRUTH else look(name).label
-
-
-def _is_dashed(name: str, of: PaperFigure) -> bool:
-    """Whether a line has its dashes; one alone with the reference needs none."""
-    return name == TRUTH or len(of.observers) > 1

@@ -1,0 +1,280 @@
+"""Figures by their data: an element's arrays are the result's numbers, its labels have units, both backends draw it."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import holoviews as hv
+import numpy as np
+import pytest
+from bokeh.models import Plot
+from click.testing import CliRunner
+
+import wfsobs
+from wfsobs.campaign.sweep import SweepResults, parse_axis, plan_sweep, run_sweep
+from wfsobs.cli import main
+from wfsobs.closed_loop.run import ClosedLoop, residual_rms
+from wfsobs.evaluation.error_spectra import cumulative_rms, spectra
+from wfsobs.identification.result import Identification
+from wfsobs.plot.elements import BINS, save_figure, to_matplotlib
+from wfsobs.plot.looks import look
+from wfsobs.plot.paper import NUMBERS, draw_paper_figure, observers_in, samples_of
+from wfsobs.signal.welch import welch_psd
+
+SHORT = {"run.duration": 3.0, "gpr_offline.training_size": 30, "gpr_online.training_size": 30}
+SCENARIO = wfsobs.PRESETS["paper"]().replace(SHORT)
+ARGUMENTS = [word for path, value in SHORT.items() for word in ("--set", f"{path}={value}")]
+
+
+@pytest.fixture(scope="module")
+def result() -> wfsobs.Result:
+    return wfsobs.run(SCENARIO, observers=["kf-lgs", "kf-ngs", "multirate", "kf-multi", "gpr-online", "zero"])
+
+
+@pytest.fixture(scope="module")
+def loop() -> ClosedLoop:
+    return wfsobs.close_loop(SCENARIO, controllers=["none", "integrator", "lqg-kf-lgs"])
+
+
+@pytest.fixture(scope="module")
+def found(result: wfsobs.Result) -> Identification:
+    return wfsobs.identify(result.record)
+
+
+def sweep_over(*axes: str) -> SweepResults:
+    plan = plan_sweep(SCENARIO.replace({"run.duration": 2.0}), [*map(parse_axis, axes)], 3, ["kf-lgs", "kf-multi", "zero"])
+    return run_sweep(plan)
+
+
+@pytest.fixture(scope="module")
+def sweep() -> SweepResults:
+    return sweep_over("turbulence.wind_speed=5:20:3")
+
+
+@pytest.fixture(scope="module")
+def field() -> SweepResults:
+    return sweep_over("turbulence.wind_speed=5,20", "sensors.lgs_noise=0.01,0.02")
+
+
+PLOTS: dict[str, Callable[..., Any]] = {
+    "record traces": lambda it: it("result").record.plot.traces(),
+    "record spectra": lambda it: it("result").record.plot.spectra(mode="tilt"),
+    "traces": lambda it: it("result").plot.traces(),
+    "error traces": lambda it: it("result").plot.traces(of_error=True, target="vibration", start=1.0, stop=2.0),
+    "spectra": lambda it: it("result").plot.spectra(),
+    "cumulative": lambda it: it("result").plot.cumulative(),
+    "errors": lambda it: it("result").plot.errors(),
+    "budget": lambda it: it("result").plot.budget(),
+    "identification": lambda it: it("found").plot.spectra(it("result").record),
+    "model alone": lambda it: it("found").plot.spectra(),
+    "sweep": lambda it: it("sweep").plot.errors(),
+    "map": lambda it: it("field").plot.errors(),
+    "residuals": lambda it: it("loop").plot.residuals(),
+    "loop errors": lambda it: it("loop").plot.errors(),
+    "rejection": lambda it: it("loop").plot.rejection(),
+    "nyquist": lambda it: it("loop").plot.nyquist(),
+    **{name: lambda it, name=name: it(name) for name in NUMBERS},
+}
+
+
+@pytest.fixture
+def drawn(request: pytest.FixtureRequest) -> Callable[[str], Any]:
+    return lambda name: paper_figure(name, request) if name in NUMBERS else request.getfixturevalue(name)
+
+
+def paper_figure(name: str, request: pytest.FixtureRequest) -> Any:
+    return draw_paper_figure(name, request.getfixturevalue("of_paper"))
+
+
+@pytest.fixture(scope="module")
+def of_paper() -> wfsobs.Result:
+    return wfsobs.run(SCENARIO, observers=[o for name in NUMBERS for o in observers_in(name)])
+
+
+def curves(figure: Any) -> dict[str, Any]:
+    return {curve.label: curve for curve in figure.traverse(lambda x: x, [hv.Curve])}
+
+
+@pytest.mark.parametrize("name", PLOTS)
+def test_both_backends_draw_every_figure_with_units(name: str, drawn: Callable[[str], Any], tmp_path: Path) -> None:
+    """By Bokeh on axes of the figure's own labels; by Matplotlib in one column."""
+    figure = PLOTS[name](drawn)
+    overlays = figure.traverse(lambda x: x, [hv.Overlay])
+    made = [m for m in hv.renderer("bokeh").get_plot(figure).state.references() if isinstance(m, Plot)]
+    assert len(made) == len(overlays)
+    for one in made:
+        labels = " ".join(str(axis.axis_label) for axis in (*one.xaxis, *one.yaxis))
+        assert one.renderers and ("[" in labels or name in ("map", "nyquist")), labels
+    paper = to_matplotlib(figure)
+    paper.savefig(BytesIO())  # which places its axes
+    assert paper.get_size_inches()[0] == pytest.approx(88.0 / 25.4)  # as it is set, to rounding
+    axes = [a for a in paper.axes if a.get_subplotspec() is not None]
+    assert len(axes) == len(overlays)
+    for one in axes:
+        labels = one.get_xlabel() + one.get_ylabel()
+        assert "[" in labels or name in ("map", "nyquist"), labels
+        box = one.get_tightbbox()
+        assert box.x0 >= -1.0 and box.x1 <= paper.bbox.width + 1.0  # a pixel: nothing is cut off
+    save_figure(figure, tmp_path / "figure.html")
+    assert b"Bokeh" in (tmp_path / "figure.html").read_bytes()
+
+
+def test_traces_are_the_numbers_of_the_result(result: wfsobs.Result) -> None:
+    record, estimate = result.record, result.estimate("gpr-online", "vibration")
+    assert record.vibration is not None and estimate is not None
+    lines = curves(result.plot.traces(target="vibration", mode="tilt", start=1.0, stop=1.5))
+    part = slice(1000, 1500)
+    for label, values in (("Truth", record.vibration), ("Online GPR", estimate.values)):
+        np.testing.assert_array_equal(lines[label].dimension_values(1), 1e3 * values[part, 1])
+        np.testing.assert_array_equal(lines[label].dimension_values(0), record.dt * np.arange(1000, 1500))
+    errors = curves(result.plot.traces(target="vibration", of_error=True, start=1.0, stop=1.5))
+    assert "Truth" not in errors
+    error = 1e3 * (estimate.values - record.vibration)[part, 0]
+    np.testing.assert_array_equal(errors["Online GPR"].dimension_values(1), error)
+
+
+def test_long_traces_keep_their_extremes(result: wfsobs.Result) -> None:
+    lines = curves(result.plot.traces(target="turbulence", observers=["kf-lgs"]))
+    assert lines.keys() == {"LGS KF", "Truth"}
+    truth = result.record.turbulence
+    assert truth is not None
+    drawn = lines["Truth"].dimension_values(1)
+    assert drawn.size == 2 * BINS < len(truth)
+    assert (drawn.min(), drawn.max()) == (1e3 * truth[:, 0].min(), 1e3 * truth[:, 0].max())
+
+
+def test_spectra_are_those_of_the_scores(result: wfsobs.Result) -> None:
+    estimate = result.estimate("kf-lgs", "vibration")
+    assert estimate is not None
+    known = spectra(result.record, "vibration", estimate.values, SCENARIO.run.warm_up)
+    assert known is not None
+    frequency, signal, error = known
+    line = curves(result.plot.spectra(target="vibration", mode="tilt"))["LGS KF"]
+    np.testing.assert_array_equal(line.dimension_values(0), frequency[1:])
+    np.testing.assert_allclose(line.dimension_values(1), 1e6 * signal[1:, 1], rtol=1e-12)  # one column or two at once
+    line = curves(result.plot.cumulative(target="vibration"))["LGS KF"]
+    np.testing.assert_allclose(line.dimension_values(1), 1e3 * cumulative_rms(frequency[1:], error[1:, 0]), rtol=1e-12)
+
+
+def test_bars_are_the_scores_and_their_intervals(result: wfsobs.Result) -> None:
+    figure = result.plot.errors(target="vibration")
+    (bars,) = figure.traverse(lambda x: x, [hv.Rectangles])
+    (ends,) = figure.traverse(lambda x: x, [hv.Segments])
+    scores = sorted((s for s in result.scores if (s.target, s.mode) == ("vibration", "tip")), key=lambda s: s.rms)
+    np.testing.assert_array_equal(bars.dimension_values(2), [1e3 * s.rms for s in scores])
+    np.testing.assert_array_equal(ends.dimension_values(0), [1e3 * s.interval[0] for s in scores if s.interval])
+    colours = list(bars.dimension_values(4))
+    assert colours == [look(s.observer).light for s in scores]
+
+
+def test_a_budget_adds_up_to_the_error(result: wfsobs.Result) -> None:
+    figure = result.plot.budget(observers=["kf-lgs"], target="vibration")
+    (bars,) = figure.traverse(lambda x: x, [hv.Rectangles])
+    (score,) = (s for s in result.scores if (s.observer, s.target, s.mode) == ("kf-lgs", "vibration", "tip"))
+    assert bars.dimension_values(2)[-1] == pytest.approx(1e6 * score.rms**2, rel=1e-9)  # of sums of thousands of samples
+
+
+def test_the_loop_is_drawn_with_its_own_numbers(loop: ClosedLoop) -> None:
+    (bars,) = loop.plot.errors(mode="tilt").traverse(lambda x: x, [hv.Rectangles])
+    left = [residual_rms(it, loop.record, loop.design.start) for it in loop.outcomes]
+    np.testing.assert_array_equal(bars.dimension_values(2), sorted(1e3 * rms[1] for rms in left if rms))
+    outcome = loop.outcomes[1]
+    assert outcome.residual is not None
+    density = welch_psd(outcome.residual[round(loop.design.start / loop.record.dt) :], loop.record.dt)[1]
+    line = curves(loop.plot.residuals())[look(outcome.controller).label]
+    np.testing.assert_array_equal(line.dimension_values(1), 1e6 * density[1:, 0])
+    rejection = curves(loop.plot.rejection())["Integrator"].dimension_values(1)
+    gain = curves(loop.plot.nyquist())["Integrator"]
+    L = gain.dimension_values(0) + 1j * gain.dimension_values(1)
+    np.testing.assert_allclose(rejection, -20 * np.log10(np.abs(1 + L)), atol=1e-6)  # E = 1 / (1 + L), L up to 1e4
+
+
+def test_the_model_is_drawn_over_what_was_measured(found: Identification, result: wfsobs.Result) -> None:
+    lines = curves(found.plot.spectra(result.record, mode="tilt"))
+    model = lines["Model"]
+    expected = 1e6 * found.modes[1].spectrum.psd(model.dimension_values(0))
+    np.testing.assert_array_equal(model.dimension_values(1), expected)
+    z = result.record.z[result.record.delay :]
+    np.testing.assert_array_equal(lines["Measured"].dimension_values(1), 1e6 * welch_psd(z, result.record.dt)[1][1:, 1])
+
+
+def test_a_sweep_is_drawn_with_its_own_numbers(sweep: SweepResults, field: SweepResults) -> None:
+    line = curves(sweep.plot.errors(target="turbulence"))["LGS KF"]
+    errors = [sweep.error(i, ("kf-lgs", "turbulence", "tip")) for i in range(3)]
+    np.testing.assert_array_equal(line.dimension_values(0), [5.0, 12.5, 20.0])
+    np.testing.assert_array_equal(line.dimension_values(1), [1e3 * error[0] for error in errors if error])
+    (names,) = field.plot.errors().traverse(lambda x: x, [hv.Labels])
+    best = [field.winner(i, "vibration", "tip") for i in range(4)]
+    assert {text.split("\n")[0] for text in names.dimension_values("best")} == {look(it.name).label for it in best if it}
+
+
+def test_a_paper_figure_is_the_result(of_paper: wfsobs.Result) -> None:
+    """Its zoomed plot has every sample of half a second."""
+    figure = draw_paper_figure("paper-4", of_paper)
+    zoomed = list(figure)[1]
+    estimate = of_paper.estimate("butterworth-ol", "vibration")
+    first, last = samples_of(of_paper.record, SCENARIO.run.warm_up)["zoomed"]
+    assert estimate is not None and last - first == 500
+    lines = curves(zoomed)
+    assert lines.keys() == {"Filtered vibration, open loop", "Real vibration"}
+    np.testing.assert_array_equal(lines["Filtered vibration, open loop"].dimension_values(1), estimate.values[first:last, 0])
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+@pytest.mark.parametrize("suffix", ["pdf", "svg", "png", "pgf", "html"])
+def test_a_paper_figure_is_written_as_every_kind_of_file(name: str, suffix: str, of_paper: wfsobs.Result, tmp_path: Path) -> None:
+    path, figure = tmp_path / f"figure.{suffix}", draw_paper_figure(name, of_paper)
+    if suffix == "pgf" and not shutil.which("xelatex"):
+        with pytest.raises(wfsobs.SettingError, match="PGF needs LaTeX"):
+            save_figure(figure, path)
+        return
+    save_figure(figure, path)
+    content = path.read_bytes()
+    begins = {"pdf": b"%PDF", "svg": b"<?xml", "png": b"\x89PNG", "pgf": b"%% Creator", "html": b"<!DOCTYPE html>"}[suffix]
+    assert content.startswith(begins)
+    if suffix == "pdf":  # 88 mm in points, and a TrueType font inside
+        assert b"/MediaBox [ 0 0 249.44" in content and b"/FontFile2" in content
+
+
+def test_the_command_draws_from_a_record_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert CliRunner().invoke(main, ["run", *ARGUMENTS, "--observer", "zero", "--save", "own.npz"]).exit_code == 0
+    done = CliRunner().invoke(main, ["figure", "paper-5", "--record", "own.npz", "--out", "own.pdf"])
+    assert done.exit_code == 0, done.output
+    assert Path("own.pdf").read_bytes().startswith(b"%PDF")
+    for out, why in (("own.doc", "is written as"), ("nowhere/own.pdf", "No such file")):
+        refused = CliRunner().invoke(main, ["figure", "paper-5", "--out", out, *ARGUMENTS])
+        assert refused.exit_code == 2 and why in refused.output and "Traceback" not in refused.output
+
+
+def test_two_columns_have_legends_beside(result: wfsobs.Result) -> None:
+    paper = to_matplotlib(result.plot.traces(), 180.0, 100.0)
+    assert tuple(25.4 * paper.get_size_inches()) == pytest.approx((180.0, 100.0))
+    assert all(axes.get_legend() for axes in paper.axes)
+
+
+def test_what_cannot_be_drawn_is_one_line(result: wfsobs.Result, loop: ClosedLoop) -> None:
+    for draw, why in (
+        (lambda: result.plot.traces(mode="focus"), "mode 'focus': there are tip, tilt"),
+        (lambda: result.plot.spectra(target="noise"), "target 'noise': there are turbulence, vibration"),
+        (lambda: loop.plot.rejection(controllers=["none"]), "nothing to draw"),
+    ):
+        with pytest.raises(ValueError, match=why):
+            draw()
+
+
+def test_without_holoviews_the_extra_is_named() -> None:
+    code = (
+        "import sys; sys.modules['holoviews'] = None\nimport wfsobs\n"
+        "record = wfsobs.simulate(wfsobs.Scenario().replace({'run.duration': 2.0}))\n"
+        "try: record.plot\nexcept ImportError as error: print(error)\n"
+        "print(sorted({'holoviews', 'matplotlib', 'bokeh', 'wfsobs.plot'} & {n for n, m in sys.modules.items() if m}))\n"
+    )
+    said = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.splitlines()
+    assert said[0].endswith("pip install wfsobs[plot]")

@@ -1,0 +1,1 @@
+"""Figures of what the library returns, for notebooks and papers."""

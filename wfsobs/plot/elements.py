@@ -1,0 +1,229 @@
+"""One description of a figure for two backends: lines, bars and marks of HoloViews, and their file.
+
+Elements carry the options of Bokeh and of Matplotlib, so that either draws them. Compose them with `+` and `*`; `hv.extension`
+chooses what a notebook shows.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import holoviews as hv
+import holoviews.plotting.bokeh
+import holoviews.plotting.mpl
+import matplotlib as mpl
+import numpy as np
+from bokeh.embed import file_html
+from bokeh.resources import INLINE
+
+from wfsobs.files import check_writable, write_whole
+from wfsobs.observers.base import Look
+from wfsobs.plot.looks import look
+from wfsobs.settings.errors import SettingError
+from wfsobs.signal.envelope import envelope, envelope_times
+from wfsobs.typing import Array
+
+TIME, FREQUENCY = hv.Dimension("time", unit="s"), hv.Dimension("frequency", unit="Hz")
+
+BINS = 500
+"""Pairs of extremes that are drawn of a long line: more than a column of a paper, or half a screen, can show."""
+
+COLUMN, PAGE = 88.0, 180.0
+"""Width of one and of two columns of a paper [mm]."""
+
+HEIGHT = 36.0
+"""Height of one plot in a file [mm]."""
+
+PIXELS = (900, 280)
+"""Width and height of one plot by Bokeh."""
+
+PAPER: Any = {
+    "font.size": 7,
+    "axes.labelsize": 7,
+    "axes.titlesize": 7,
+    "xtick.labelsize": 6,
+    "ytick.labelsize": 6,
+    "legend.fontsize": 6,
+    "axes.linewidth": 0.6,
+    "pdf.fonttype": 42,  # fonts embedded, their text selectable
+    "svg.fonttype": "path",
+}
+"""Matplotlib's settings of a file."""
+
+SUFFIXES = (".pdf", ".svg", ".pgf", ".png", ".html")
+"""What a figure can be written as."""
+
+
+def quantity(name: str, unit: str, label: str = "") -> hv.Dimension:
+    """Return what an axis is of; plots that share it are linked."""
+    return hv.Dimension((name, label or name), unit=unit)
+
+
+def style(element: Any, *, bokeh: Mapping[str, Any], matplotlib: Mapping[str, Any], **both: Any) -> Any:
+    """Return an element of one's own with the options of each backend, and of both."""
+    element.opts(**both, **bokeh, clone=False, backend="bokeh")
+    element.opts(**both, **matplotlib, clone=False, backend="matplotlib")
+    return element
+
+
+def draw_line(x: Array, y: Array, of: tuple[hv.Dimension, hv.Dimension], name: str | Look) -> hv.Curve:
+    """Draw a line in the look of an observer, a controller or the truth; of : its axes."""
+    it = look(name) if isinstance(name, str) else name
+    dash = {"linestyle": (0, tuple(d / it.width for d in it.dash))} if it.dash else {}
+    return style(
+        hv.Curve((x, y), *of, label=it.label),
+        color=it.light,
+        bokeh={"line_width": it.width, "line_dash": list(it.dash) or "solid"},
+        matplotlib={"linewidth": 0.5 * it.width, **dash},
+    )
+
+
+def draw_trace(values: Array, dt: float, of: hv.Dimension, name: str | Look, samples: slice) -> hv.Curve:
+    """Draw some samples of a signal (n,) every `dt` [s] over time, the extremes of bins where they are many."""
+    first, last, _ = samples.indices(values.size)
+    return draw_line(envelope_times(first, last, BINS, dt), envelope(values[first:last], BINS), (TIME, of), name)
+
+
+def overlay(
+    parts: Iterable[Any], *, log: str = "", legend: str = "right", rows: int = 0, decades: int = 8, **both: Any
+) -> hv.Overlay:
+    """Lay elements over each other.
+
+    log : axes that are logarithmic, of "xy"; rows : number of bars, where they are what is drawn; decades :
+    the most that a logarithmic axis of y spans; both : further options
+    """
+    drawn = hv.Overlay(list(parts))
+    x, y = next(iter(drawn)).dimensions()[:2]
+    both = {"xlabel": _axis_label(x), "ylabel": _axis_label(y), "logx": "x" in log, "logy": "y" in log, "show_grid": True} | both
+    if "y" in log:
+        highest = max(float(np.nanmax(part.dimension_values(1))) for part in drawn)
+        lowest = min(float(np.nanmin(part.dimension_values(1))) for part in drawn)
+        both["ylim"] = (max(lowest, highest * 10.0**-decades) / 2.0, 2.0 * highest)
+    width, height = PIXELS
+    if rows:
+        both |= {"ylabel": "", "invert_yaxis": True, "ylim": (-0.6, rows - 0.4), "show_grid": False}
+        height = 90 + 22 * rows
+    return style(
+        drawn,
+        **both,
+        legend_position="right",
+        bokeh={"width": width, "height": height, "click_policy": "hide"},
+        matplotlib={"aspect": width / height},
+    )
+
+
+def _axis_label(of: hv.Dimension) -> str:
+    return f"{of.label} [{of.unit}]" if of.unit else str(of.label)
+
+
+def stack(figures: Sequence[hv.Overlay], columns: int = 1) -> hv.Layout:
+    """Place figures below each other."""
+    return style(hv.Layout(list(figures)).cols(columns), bokeh={}, matplotlib={"sublabel_format": ""})
+
+
+Bar = tuple[str, Sequence[float], Sequence[str]]
+"""Name of a row, lengths of its pieces from the left, their colours."""
+
+
+def draw_bars(rows: Sequence[Bar], of: hv.Dimension) -> hv.Rectangles:
+    """Draw horizontal bars, each of one or more pieces; `overlay` with `rows` names them."""
+    boxes = []
+    for i, (_, lengths, colours) in enumerate(rows):
+        ends = np.cumsum([0.0, *lengths])
+        boxes += [(a, i - 0.38, b, i + 0.38, colour) for a, b, colour in zip(ends[:-1], ends[1:], colours, strict=True)]
+    drawn = hv.Rectangles(boxes, [of, "row", f"end of {of.name}", "top"], "colour")
+    ticks = [(i, name) for i, (name, *_) in enumerate(rows)]
+    looks = {"color": hv.dim("colour"), "yticks": ticks, "show_legend": False}
+    return style(drawn, **looks, bokeh={"line_color": None}, matplotlib={"linewidth": 0})
+
+
+def draw_intervals(ends: Sequence[tuple[float, float] | None], of: hv.Dimension) -> hv.Segments:
+    """Draw the interval of each bar, where there is one."""
+    return _segments([(e[0], i, e[1], i) for i, e in enumerate(ends) if e is not None], of)
+
+
+def draw_marks(at: Sequence[float | None], of: hv.Dimension) -> hv.Segments:
+    """Draw a line across each bar, where there is a number."""
+    return _segments([(x, i - 0.48, x, i + 0.48) for i, x in enumerate(at) if x is not None], of)
+
+
+def _segments(lines: Sequence[tuple[float, float, float, float]], of: hv.Dimension) -> hv.Segments:
+    drawn = hv.Segments(list(lines), [of, "row", f"end of {of.name}", "top"])
+    return style(drawn, color="black", bokeh={"line_width": 1.2}, matplotlib={"linewidth": 0.8})
+
+
+def legend_of(colours: Mapping[str, str], of: hv.Dimension) -> list[hv.Curve]:
+    """Draw nothing but entries of a legend, label -> colour: neither backend has any of bars."""
+    nowhere = np.full(1, np.nan)
+    return [
+        draw_line(nowhere, nowhere, (of, hv.Dimension("row")), Look(label, colour, width=6)) for label, colour in colours.items()
+    ]
+
+
+def check_suffix(path: str | Path) -> None:
+    """Raise SettingError or OSError for a file that `save_figure` could not write."""
+    path = Path(path)
+    if path.suffix not in SUFFIXES:
+        raise SettingError(f"{path}: a figure is written as {', '.join(SUFFIXES)}, not {path.suffix or 'without a suffix'}")
+    if path.suffix == ".pgf" and shutil.which(mpl.rcParams["pgf.texsystem"]) is None:
+        raise SettingError(f"{path}: PGF needs LaTeX, {mpl.rcParams['pgf.texsystem']} on the path, which measures the text")
+    check_writable(path)
+
+
+def save_figure(figure: Any, path: str | Path, *, width: float = COLUMN, height: float = 0.0) -> None:
+    """Write a figure to a file: .pdf, .svg, .pgf or .png by Matplotlib, .html by Bokeh.
+
+    Parameters
+    ----------
+    figure : HoloViews object
+        What `result.plot` and its like return, or a composition of them.
+    path : str or Path
+        File to write; its suffix says how.
+    width : float
+        Width [mm]; 88 and 180 are one and two columns of a paper. HTML has its own.
+    height : float
+        Height [mm]; by default 36 for each row of plots.
+
+    Raises
+    ------
+    SettingError
+        The suffix is another, or PGF is asked for without LaTeX, by which Matplotlib measures its text.
+    OSError
+        The file cannot be written.
+    """
+    path = Path(path)
+    check_suffix(path)
+    if path.suffix == ".html":
+        page = file_html(hv.renderer("bokeh").get_plot(figure).state, INLINE, path.stem)
+        write_whole(path, lambda file: file.write(page.encode()))
+        return
+    drawn = to_matplotlib(figure, width, height)
+    with mpl.rc_context(PAPER):
+        write_whole(path, lambda file: drawn.savefig(file, format=path.suffix[1:], dpi=300))
+
+
+@mpl.rc_context(PAPER)
+def to_matplotlib(figure: Any, width: float = COLUMN, height: float = 0.0) -> Any:
+    """Return a figure of Matplotlib of this width and height [mm]."""
+    layout: Any = figure if isinstance(figure, hv.Layout) else stack([figure])
+    inches = width / 25.4, (height or HEIGHT * layout.shape[0]) / 25.4
+    drawn: Any = hv.renderer("matplotlib").get_plot(layout.opts(fig_inches=inches, backend="matplotlib")).state
+    drawn.set_size_inches(inches)
+    grid, above = drawn.add_gridspec(*layout.shape), None
+    for i, axes in enumerate(axes for axes in drawn.axes if axes.get_subplotspec() is not None):
+        axes.set_subplotspec(grid[i])  # of a grid that the layout below can move
+        axes.set_box_aspect(None)
+        axes.set_aspect("auto")
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.label.set_size(mpl.rcParams["axes.labelsize"])
+        if (legend := axes.get_legend()) and width < PAGE:  # there is no room beside
+            legend.remove()
+            handles, names = axes.get_legend_handles_labels()
+            if names != above:
+                axes.legend(handles, names, loc="lower center", ncols=2, bbox_to_anchor=(0.45, 1.0), frameon=False)
+            above = names
+    drawn.set_layout_engine("constrained")
+    return drawn

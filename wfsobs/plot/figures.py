@@ -1,0 +1,354 @@
+"""Figures of records, results, identifications, sweeps and closed loops: the attribute `plot` of each.
+
+Every function returns an object of HoloViews. Lines are the numbers of the result itself in nanometres, long ones as the
+extremes of bins. `mode` is the name of a mode, by default the first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import singledispatch
+from typing import Any
+
+import holoviews as hv
+import numpy as np
+
+from wfsobs.campaign.sweep import SweepResults
+from wfsobs.closed_loop.run import ClosedLoop, residual_rms
+from wfsobs.control.curves import Curves, curves
+from wfsobs.evaluation.budget import TERMS, error_budget
+from wfsobs.evaluation.error_spectra import TRUTH, cumulative_rms, spectra
+from wfsobs.evaluation.result import Result
+from wfsobs.evaluation.rows import NO_ESTIMATE, row_label
+from wfsobs.identification.result import Identification
+from wfsobs.observers.base import TARGETS, Look
+from wfsobs.plot.elements import (
+    FREQUENCY,
+    draw_bars,
+    draw_intervals,
+    draw_line,
+    draw_marks,
+    draw_trace,
+    legend_of,
+    overlay,
+    quantity,
+    stack,
+    style,
+)
+from wfsobs.plot.looks import TERM_COLOURS, look
+from wfsobs.record import Record, hold_last
+from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
+from wfsobs.signal.welch import welch_psd
+from wfsobs.typing import Array
+
+NM = 1e3
+"""Nanometres in a micrometre."""
+
+SIGNALS = {
+    "z": Look("Pseudo-open-loop LGS", "#8A8A8A"),
+    "y_lgs": Look("Residual LGS", "#FF6600"),
+    "turbulence": Look("Turbulence", "#003DE6", dash=(8, 2)),
+    "vibration": Look("Vibration", "#B40000", dash=(6, 3)),
+}
+"""What is drawn of a record."""
+
+Samples = tuple[float, float | None]
+
+
+class RecordPlots:
+    """Figures of a record: `record.plot`."""
+
+    def __init__(self, record: Record):
+        self.record = record
+        self.names = [m.name for m in modes_up_to(HIGHEST_ORDER)][: record.n_modes]
+
+    def traces(self, *, mode: str | None = None, start: float = 0.0, stop: float | None = None) -> hv.Overlay:
+        """Draw measurements and truth over time, from `start` to `stop` [s]."""
+        name, dt = _one_of(self.names, mode, "mode"), self.record.dt
+        y, part = quantity(f"signal {name}", "nm", name), _samples(start, stop, dt)
+        return overlay(draw_trace(NM * x, dt, y, SIGNALS[key], part) for key, x in self._signals(name).items())
+
+    def spectra(self, *, mode: str | None = None) -> hv.Overlay:
+        """Draw power spectral densities of measurements and truth; a missing sample has the value of the one before."""
+        name, dt = _one_of(self.names, mode, "mode"), self.record.dt
+        y, lines = quantity(f"PSD {name}", "nm²/Hz", f"PSD, {name}"), []
+        for key, x in self._signals(name).items():
+            frequency, density = welch_psd(hold_last(x[:, None]), dt)
+            lines.append(draw_line(frequency[1:], NM**2 * density[1:, 0], (FREQUENCY, y), SIGNALS[key]))
+        return overlay(lines, log="xy")
+
+    def _signals(self, mode: str) -> dict[str, Array]:
+        column = self.names.index(mode)
+        every = {key: getattr(self.record, key) for key in SIGNALS}
+        return {key: x[:, column] for key, x in every.items() if x is not None}
+
+
+class ResultPlots:
+    """Figures of a result: `result.plot`.
+
+    `observers` are ids, by default all that gave an estimate; `target` is "turbulence" or "vibration", by default both, one below
+    the other.
+    """
+
+    def __init__(self, result: Result):
+        self.result = result
+        self.names = [m.name for m in result.scenario.modes][: result.record.n_modes]
+
+    def traces(
+        self,
+        *,
+        observers: Sequence[str] | None = None,
+        target: str | None = None,
+        mode: str | None = None,
+        of_error: bool = False,
+        start: float = 0.0,
+        stop: float | None = None,
+    ) -> hv.Layout:
+        """Draw truth and estimates over time, or the errors of the estimates, from `start` to `stop` [s]."""
+        name, dt, figures = _one_of(self.names, mode, "mode"), self.result.record.dt, []
+        for of, signals in self._signals(observers, target, of_error).items():
+            y = quantity(f"{of} {name} {of_error}", "nm", f"{'error of ' if of_error else ''}{of}, {name}")
+            column, part = self.names.index(name), _samples(start, stop, dt)
+            figures.append(overlay(draw_trace(NM * x[:, column], dt, y, key, part) for key, x in signals.items()))
+        return stack(figures)
+
+    def spectra(
+        self,
+        *,
+        observers: Sequence[str] | None = None,
+        target: str | None = None,
+        mode: str | None = None,
+        of_error: bool = False,
+    ) -> hv.Layout:
+        """Draw power spectral densities of truth and estimates, or of the errors, after the warm-up."""
+        return self._of_frequency("PSD", "nm²/Hz", lambda _, density: NM**2 * density, observers, target, mode, of_error)
+
+    def cumulative(
+        self,
+        *,
+        observers: Sequence[str] | None = None,
+        target: str | None = None,
+        mode: str | None = None,
+        of_error: bool = True,
+    ) -> hv.Layout:
+        """Draw the rms above each frequency of the errors after the warm-up, or of truth and estimates."""
+        return self._of_frequency(
+            "cumulative rms", "nm", lambda f, density: NM * cumulative_rms(f, density), observers, target, mode, of_error
+        )
+
+    def errors(self, *, observers: Sequence[str] | None = None, target: str | None = None, mode: str | None = None) -> hv.Layout:
+        """Draw the errors of the table as bars, the least on top, each with its 95 % interval; limits among them."""
+        name = _one_of(self.names, mode, "mode")
+        figures = []
+        for of in dict.fromkeys(s.target for s in self.result.scores):
+            rows = [s for s in self.result.scores if (s.target, s.mode) == (of, name)]
+            rows = sorted((s for s in rows if observers is None or s.observer in observers), key=lambda s: s.rms)
+            if rows and target in (None, of):
+                x = quantity(f"rms {of} {name}", "nm", f"rms error, {of}, {name}")
+                of_rows = [(row_label(s.observer), [NM * s.rms], [look(s.observer).light]) for s in rows]
+                ends = [None if s.interval is None else (NM * s.interval[0], NM * s.interval[1]) for s in rows]
+                figures.append(overlay([draw_bars(of_rows, x), draw_intervals(ends, x)], rows=len(rows)))
+        return stack(_some(figures, f"errors of {target}"))
+
+    def budget(self, *, observers: Sequence[str] | None = None, target: str | None = None, mode: str | None = None) -> hv.Layout:
+        """Draw the error budgets as stacked bars of mean squares, the least on top, and the limit of each as a line.
+
+        Those that are not linear have one only where they are named in `observers`. Raises ValueError where there is none.
+        """
+        name, figures = _one_of(self.names, mode, "mode"), []
+        found = [it for it in error_budget(self.result, observers=observers, mode=name) if it.terms]
+        for of in dict.fromkeys(it.target for it in found):
+            rows = sorted((it for it in found if it.target == of), key=lambda it: it.total)
+            if target in (None, of):
+                x = quantity(f"budget {of} {name}", "nm²", f"mean square, {of}, {name}")
+                colours = [TERM_COLOURS[term] for term in TERMS]
+                boxes = [(row_label(it.observer), [NM**2 * it.terms[term] for term in TERMS], colours) for it in rows]
+                at = [None if it.bound is None else NM**2 * it.bound for it in rows]
+                legend = legend_of({label: TERM_COLOURS[term] for term, label in TERMS.items()}, x)
+                figures.append(overlay([draw_bars(boxes, x), draw_marks(at, x), *legend], rows=len(rows)))
+        return stack(_some(figures, f"an error budget of {target or 'any target'}"))
+
+    def _signals(self, observers: Sequence[str] | None, target: str | None, of_error: bool) -> dict[str, dict[str, Array]]:
+        """Return target -> what is drawn of it -> (n_steps, n_modes) [um]: the truth, last and so on top, where there is one."""
+        out: dict[str, dict[str, Array]] = {}
+        for of in TARGETS if target is None else (_one_of(TARGETS, target, "target"),):
+            truth = self.result.record.truth(of)
+            own = {e.observer: e.values for e in self.result.estimates if e.target == of and e.observer != NO_ESTIMATE}
+            own = {key: x for key, x in own.items() if observers is None or key in observers}
+            if of_error and truth is None:
+                raise ValueError(f"the record has no true {of}, so that there is no error of an estimate")
+            if of_error:
+                out[of] = {key: x - truth for key, x in own.items()}
+            else:
+                out[of] = own if truth is None else {**own, TRUTH: truth}
+        return {of: signals for of, signals in out.items() if signals}
+
+    def _of_frequency(
+        self,
+        what: str,
+        unit: str,
+        curve: Any,
+        observers: Sequence[str] | None,
+        target: str | None,
+        mode: str | None,
+        of_error: bool,
+    ) -> hv.Layout:
+        name, record, figures = _one_of(self.names, mode, "mode"), self.result.record, []
+        for of in self._signals(observers, target, of_error):
+            y = quantity(f"{what} {of} {name}", unit, f"{what}{' of error' if of_error else ''}, {of}, {name}")
+            lines = []
+            for key, x in self._signals(observers, of, False)[of].items():
+                found = spectra(record, of, x, self.result.scenario.run.warm_up, [self.names.index(name)])
+                if found and not (of_error and key == TRUTH):
+                    frequency, density = found[0][1:], found[1 + of_error][1:, 0]
+                    lines.append(draw_line(frequency, curve(frequency, density), (FREQUENCY, y), key))
+            figures.append(overlay(_some(lines, f"a spectrum of {of}"), log="xy"))
+        return stack(figures)
+
+
+class IdentificationPlots:
+    """Figures of an identification: `identification.plot`."""
+
+    def __init__(self, identification: Identification):
+        self.identification = identification
+
+    def spectra(self, record: Record | None = None, *, mode: str | None = None) -> hv.Overlay:
+        """Draw the spectrum of the model and its peaks, over that of z where the record is given."""
+        it, names = self.identification, [m.name for m in self.identification.modes]
+        name = _one_of(names, mode, "mode")
+        found = it.modes[names.index(name)]
+        y, lines = quantity(f"PSD of z {name}", "nm²/Hz", f"PSD of z, {name}"), []
+        if record is not None:
+            frequency, density = welch_psd(hold_last(record.z[record.delay :]), record.dt)
+            lines.append(draw_line(frequency[1:], NM**2 * density[1:, names.index(name)], (FREQUENCY, y), "measured"))
+        peaks = np.array([p.frequency.value for p in found.peaks])
+        f = np.unique(np.concatenate([np.geomspace(1.0 / it.duration, 0.5 / it.dt, 4000), peaks]))
+        lines.append(draw_line(f, NM**2 * found.spectrum.psd(f), (FREQUENCY, y), "fitted"))
+        points = hv.Scatter((peaks, NM**2 * found.spectrum.psd(peaks)), FREQUENCY, y, label=look("found").label)
+        shape = {"size": 7, "marker": "inverted_triangle"}, {"s": 14, "marker": "v"}
+        return overlay([*lines, style(points, color=look("found").light, bokeh=shape[0], matplotlib=shape[1])], log="xy")
+
+
+class SweepPlots:
+    """Figures of a sweep: `results.plot`."""
+
+    def __init__(self, results: SweepResults):
+        self.results = results
+
+    def errors(self, *, observers: Sequence[str] | None = None, target: str = "vibration", mode: str | None = None) -> hv.Overlay:
+        """Draw mean errors over the setting, each with its 95 % interval; over two settings, the best observer and its error."""
+        known = self.results.known_keys()
+        name = _one_of(list(dict.fromkeys(key[2] for key in known)), mode, "mode")
+        _one_of(list(dict.fromkeys(key[1] for key in known)), target, "target")
+        y = quantity(f"mean rms {target} {name}", "nm", f"mean rms error of {target}, {name}")
+        if len(self.results.sweep.axes) == 2:
+            return self._map(target, name, y)
+        (axis,) = self.results.sweep.axes
+        x, parts = quantity(axis.path, ""), []
+        for key in [k for k in known if k[1:] == (target, name) and (observers is None or k[0] in observers)]:
+            cells = [(value, self.results.error(i, key)) for i, value in enumerate(axis.values)]
+            points = np.array([(value, *(NM * e for e in error)) for value, error in cells if error is not None])
+            if key[0] != NO_ESTIMATE and len(points):
+                at, mean, low, high = points.T
+                band = hv.Spread((at, mean, mean - low, high - mean), x, [y, "below", "above"])
+                colour = look(key[0]).light
+                style(band, alpha=0.15, show_legend=False, bokeh={"color": colour}, matplotlib={"facecolor": colour})
+                parts += [band, draw_line(at, mean, (x, y), key[0])]
+        return overlay(_some(parts, f"an error of {target}"))
+
+    def _map(self, target: str, mode: str, y: hv.Dimension) -> hv.Overlay:
+        first, second = self.results.sweep.axes
+        best = {i: self.results.winner(i, target, mode) for i in range(len(self.results.sweep.cells))}
+        cells = [(*self.results.sweep.cells[i].values(), NM * it.rms, look(it.name).label) for i, it in best.items() if it]
+        axes = [quantity(first.path, ""), quantity(second.path, "")]
+        field = hv.HeatMap([cell[:3] for cell in cells], axes, y)
+        style(field, cmap="cividis", alpha=0.5, bokeh={}, matplotlib={"show_values": False})
+        names = hv.Labels([(a, b, f"{name}\n{error:.1f} nm") for a, b, error, name in cells], axes, "best")
+        style(names, bokeh={"text_font_size": "8pt", "text_color": "black"}, matplotlib={"size": 6, "color": "black"})
+        return overlay([field, names], xlabel=first.path, ylabel=second.path)
+
+
+class LoopPlots:
+    """Figures of a closed loop: `loop.plot`. `controllers` are ids, by default all for which there is something to draw."""
+
+    def __init__(self, loop: ClosedLoop):
+        self.loop = loop
+        self.names = [m.name for m in loop.scenario.modes]
+
+    def residuals(self, *, controllers: Sequence[str] | None = None, mode: str | None = None) -> hv.Overlay:
+        """Draw power spectral densities of what every controller left."""
+        name, dt = _one_of(self.names, mode, "mode"), self.loop.record.dt
+        y, lines = quantity(f"PSD of residual {name}", "nm²/Hz", f"PSD of residual, {name}"), []
+        for it in self.loop.outcomes:
+            if it.residual is not None and (controllers is None or it.controller in controllers):
+                frequency, density = welch_psd(it.residual[round(self.loop.design.start / dt) :], dt)
+                lines.append(draw_line(frequency[1:], NM**2 * density[1:, self.names.index(name)], (FREQUENCY, y), it.controller))
+        return overlay(_some(lines, "a residual"), log="xy")
+
+    def errors(self, *, controllers: Sequence[str] | None = None, mode: str | None = None) -> hv.Overlay:
+        """Draw the rms of what every controller left as bars, the least on top."""
+        name = _one_of(self.names, mode, "mode")
+        left = {it.controller: residual_rms(it, self.loop.record, self.loop.design.start) for it in self.loop.outcomes}
+        known = {key: NM * rms[self.names.index(name)] for key, rms in left.items() if rms is not None}
+        known = {key: known[key] for key in sorted(known, key=known.__getitem__) if controllers is None or key in controllers}
+        x = quantity(f"rms of residual {name}", "nm", f"rms of residual, {name}")
+        _some(list(known), "a residual")
+        return overlay([draw_bars([(look(k).label, [v], [look(k).light]) for k, v in known.items()], x)], rows=len(known))
+
+    def rejection(self, *, controllers: Sequence[str] | None = None, mode: str | None = None) -> hv.Overlay:
+        """Draw the gain from the disturbance to the residual of every time-invariant loop."""
+        y = quantity("rejection", "dB")
+        found = self._curves(controllers, mode).items()
+        lines = [draw_line(c.frequency, 20.0 * np.log10(np.abs(c.rejection)), (FREQUENCY, y), key) for key, c in found]
+        return overlay(_some(lines, "a time-invariant loop"), log="x")
+
+    def nyquist(self, *, controllers: Sequence[str] | None = None, mode: str | None = None) -> hv.Overlay:
+        """Draw the loop gain of every time-invariant loop in the complex plane, around the point -1."""
+        axes = quantity("real part of loop gain", ""), quantity("imaginary part of loop gain", "")
+        parts: list[Any] = []
+        for key, c in self._curves(controllers, mode).items():
+            gain = c.loop_gain[np.isfinite(c.loop_gain)]
+            parts.append(draw_line(gain.real, gain.imag, axes, key))
+        _some(parts, "a time-invariant loop")
+        point = hv.Scatter(([-1.0], [0.0]), *axes, label="-1")
+        style(point, color="black", bokeh={"marker": "star", "size": 9}, matplotlib={"marker": "*", "s": 30})
+        return overlay([*parts, point], xlim=(-3.0, 1.5), ylim=(-2.0, 2.0))
+
+    def _curves(self, controllers: Sequence[str] | None, mode: str | None) -> dict[str, Curves]:
+        column, plan = self.names.index(_one_of(self.names, mode, "mode")), self.loop.design
+        laws = {key: of[column] for key, of in plan.laws.items() if controllers is None or key in controllers}
+        return {key: curves(it.law, plan.mirror, self.loop.record.dt) for key, it in laws.items() if it.law and it.margins}
+
+
+@singledispatch
+def plots_of(source: object) -> Any:
+    """Return the figures of an object."""
+    raise TypeError(f"no figures of {type(source).__name__}")
+
+
+for _kind, _plots in {
+    Record: RecordPlots,
+    Result: ResultPlots,
+    Identification: IdentificationPlots,
+    SweepResults: SweepPlots,
+    ClosedLoop: LoopPlots,
+}.items():
+    plots_of.register(_kind, _plots)
+
+
+def _one_of(names: Sequence[str], name: str | None, what: str) -> str:
+    """Return a name, by default the first. Raises ValueError for one that is not there."""
+    if name is not None and name not in names:
+        raise ValueError(f"{what} {name!r}: there are {', '.join(names)}")
+    return names[0] if name is None else name
+
+
+def _some(parts: list[Any], what: str) -> list[Any]:
+    """Return a list that is not empty. Raises ValueError."""
+    if not parts:
+        raise ValueError(f"nothing to draw: there is not {what}")
+    return parts
+
+
+def _samples(start: float, stop: float | None, dt: float) -> slice:
+    return slice(round(start / dt), None if stop is None else round(stop / dt))
