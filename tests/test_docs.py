@@ -208,6 +208,15 @@ def test_python_of_readme_and_its_page(page: Path) -> None:
     assert "gpr-online vibration tip" in said.getvalue()
 
 
+@pytest.mark.slow
+def test_python_of_the_page_of_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = run_page(DOCS / "figures.md")
+    assert Path("vibration.pdf").exists() and Path("errors.html").exists()
+    assert list(names["signals"].observer) == ["kf-lgs", "kf-multi", "gpr-online"]
+    assert names["density"].shape == (names["frequency"].size, 2)
+
+
 def test_page_of_python_names_the_public_functions() -> None:
     """With their first arguments, by name and in order."""
     listed = re.findall(r"^\| `wfsobs\.(\w+)\(([^)]*)\)`", prose(DOCS / "python.md"), flags=re.M)

@@ -32,6 +32,7 @@ FUNCTIONS = (
     "identify",
     "load",
     "observe",
+    "psd",
     "run",
     "save",
     "score",

@@ -12,7 +12,7 @@ from wfsobs.evaluation.scores import lag, supervised_scores, unsupervised_scores
 from wfsobs.observers.estimates import TOTAL, Estimate
 from wfsobs.record import Record
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.welch import rms, welch_psd
+from wfsobs.signal.welch import psd, rms
 
 NAMES = ["tip", "tilt"]
 
@@ -238,7 +238,7 @@ def test_welch_integrates_to_the_variance(n: int) -> None:
     """White noise, and AR(2) vibration slow against nothing: the mean of the windows' variances is the variance."""
     rng = np.random.default_rng(1)
     x = np.column_stack([rng.standard_normal(n), Ar2(298.4, 0.03, 0.02, 1e-3).sample(n, rng)])
-    f, density = welch_psd(x, 1e-3)
+    f, density = psd(x, 1e-3)
     assert f[1] - f[0] == pytest.approx(0.5) and f[-1] == pytest.approx(500.0)
     assert density.shape == (f.size, 2)
     # Hann windows weigh the ends of the record less: the variance of 2 s pieces, spread sqrt(2 / dof), 4.5 of it
@@ -249,7 +249,7 @@ def test_welch_integrates_to_the_variance(n: int) -> None:
 
 def test_welch_follows_the_closed_form() -> None:
     p = Ar2(298.4, 0.1, 0.02, 1e-3)
-    f, density = welch_psd(p.sample(200_000, np.random.default_rng(2))[:, None], 1e-3)
+    f, density = psd(p.sample(200_000, np.random.default_rng(2))[:, None], 1e-3)
     ratio = density[2:-2, 0] / p.psd(f[2:-2])
     # 199 half-overlapping windows are worth 105 independent ones: a spread of 1 / sqrt(105) per bin
     assert abs(ratio.mean() - 1) < 4.5 / np.sqrt(105 * ratio.size / 1.5)
@@ -258,14 +258,14 @@ def test_welch_follows_the_closed_form() -> None:
 
 def test_a_tone_has_its_power_at_its_frequency() -> None:
     t = np.arange(8000) * 1e-3
-    f, density = welch_psd((0.1 * np.sqrt(2) * np.sin(2 * np.pi * 40.0 * t))[:, None], 1e-3)
+    f, density = psd((0.1 * np.sqrt(2) * np.sin(2 * np.pi * 40.0 * t))[:, None], 1e-3)
     assert f[np.argmax(density[:, 0])] == 40.0
     assert density[:, 0].sum() * 0.5 == pytest.approx(0.01, rel=1e-6)
 
 
 @pytest.mark.parametrize("n", [2, 10, 999])
 def test_a_record_shorter_than_a_window_is_one_window(n: int) -> None:
-    f, density = welch_psd(np.random.default_rng(0).standard_normal((n, 2)), 1e-3)
+    f, density = psd(np.random.default_rng(0).standard_normal((n, 2)), 1e-3)
     assert f.size == n // 2 + 1 == len(density) and np.isfinite(density).all()
 
 

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from wfsobs.scenario.presets import PRESETS
     from wfsobs.scenario.scenario import register
     from wfsobs.settings.errors import SettingError
+    from wfsobs.signal.welch import psd
     from wfsobs.simulation.loop import simulate
     from wfsobs.stepping import design
     from wfsobs.telemetry.records import load, save
@@ -54,6 +55,7 @@ _HOMES = {
     "Scenario": "scenario",
     "PRESETS": "scenario.presets",
     "SettingError": "settings.errors",
+    "psd": "signal.welch",
     "simulate": "simulation.loop",
     "load": "telemetry.records",
     "save": "telemetry.records",
@@ -77,6 +79,7 @@ __all__ = [
     "identify",
     "load",
     "observe",
+    "psd",
     "register",
     "run",
     "save",

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from wfsobs.notebook import PlotAccessor, html_table
+from wfsobs.notebook import PlotAccessor, html_table, import_extra
 from wfsobs.typing import Array
+
+if TYPE_CHECKING:
+    import xarray
 
 DELAY = 2
 """The paper's delay: a command is computed once y_lgs[k] is known, acts during step k + 1, and is seen at k + 2."""
@@ -181,6 +184,29 @@ class Record(Signals):
             ("truth", " and ".join(name for name, x in parts if x is not None) or "none"),
             ("missing", str(self.missing)),
         ]
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return measurements, commands and truth as labelled arrays.
+
+        Returns
+        -------
+        xarray.Dataset
+            Every signal that there is, over `time` [s] and `mode` (Noll index); `y_stars` over `star`, too.
+
+        Raises
+        ------
+        ImportError
+            xarray is not installed.
+        """
+        names = ("y_lgs", "u", "y_ngs", "open_loop_y", "turbulence", "vibration")
+        signals = {name: (("time", "mode"), x, {"units": "um"}) for name in names if (x := getattr(self, name)) is not None}
+        stars = {} if self.y_stars is None else {"y_stars": (("time", "star", "mode"), self.y_stars, {"units": "um"})}
+        coordinates = {
+            "time": ("time", self.dt * np.arange(self.n_steps), {"units": "s"}),
+            "mode": ("mode", np.arange(2, self.n_modes + 2), {"long_name": "Noll index of the Zernike mode"}),
+        }
+        about = {"time_step_s": self.dt, "steps_per_ngs_frame": self.ratio or 0, "delay_steps": self.delay, "origin": self.origin}
+        return import_extra("xarray", "arrays").Dataset(signals | stars, coordinates, about)
 
     def measurements(self, open_loop: bool = False, *, sensors: Collection[str] = SENSORS) -> Measurements:
         """Return copies of the signals alone: no array is a view of another.

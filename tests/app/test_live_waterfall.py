@@ -10,7 +10,7 @@ from wfsobs.app.pages.live_figures import COLUMNS, LOWEST, MEASUREMENT, ROWS, Wa
 from wfsobs.live.crew import trace_width
 from wfsobs.live.ring import LiveFrame
 from wfsobs.live.view import LiveView
-from wfsobs.signal.welch import welch_psd
+from wfsobs.signal.welch import psd
 
 DT = 1e-3
 EDGES = np.geomspace(LOWEST, 500.0, ROWS + 1)
@@ -26,7 +26,7 @@ def test_power_is_kept_and_a_line_is_where_it_is() -> None:
     top = int(np.argmax(rows))
     assert EDGES[top] < 48.5 and EDGES[top + 1] > 47.5
     noise = np.random.default_rng(1).normal(size=1000)
-    frequency, density = welch_psd(noise[:, None], DT, 1.0)
+    frequency, density = psd(noise[:, None], DT, resolution=1.0)
     # bands end in the middle between two frequencies: half the first and none of the mean
     rest = density[1, 0] * 0.5 + density[2:-1].sum() + 0.5 * density[-1, 0]
     assert np.sum(second_spectrum(noise, DT) * np.diff(EDGES)) == pytest.approx(rest, rel=1e-9)

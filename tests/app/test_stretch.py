@@ -11,7 +11,7 @@ from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.render import number
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.error_spectra import band_rms, cumulative_rms
-from wfsobs.signal.welch import welch_psd
+from wfsobs.signal.welch import psd
 
 
 def lines(dashboard: Dashboard, target: str = "vibration") -> list[str]:
@@ -23,7 +23,7 @@ def test_a_band_holds_the_line_that_lies_in_it() -> None:
     dt, n = 1e-3, 8000
     t = dt * np.arange(n)
     x = 0.3 * np.sqrt(2.0) * np.sin(2.0 * np.pi * 40.0 * t) + 0.1 * np.sqrt(2.0) * np.sin(2.0 * np.pi * 100.0 * t)
-    frequency, density = welch_psd(x[:, None], dt)
+    frequency, density = psd(x[:, None], dt)
     # rms 0.3 at 40 Hz, 0.1 at 100 Hz; the window spreads a line over a few bins of 1 / 2 s, well inside the bands
     assert band_rms(frequency, density[:, 0], 30.0, 50.0) == pytest.approx(0.3, rel=0.01)
     assert band_rms(frequency, density[:, 0], 90.0, 110.0) == pytest.approx(0.1, rel=0.01)
@@ -74,7 +74,7 @@ def test_the_spectra_of_the_time_in_view(dashboard: Dashboard) -> None:
     dashboard.display.window_spectra = True
     results = dashboard.store.run.result
     error = (results.values("kf-lgs", "vibration") - results.values(TRUTH, "vibration"))[1000:1601, :1]
-    frequency, density = welch_psd(error, 1e-3)
+    frequency, density = psd(error, 1e-3)
     np.testing.assert_allclose(source.data["x"], frequency[1:], rtol=1e-12)
     np.testing.assert_allclose(source.data["y"], 1e6 * density[1:, 0], rtol=1e-9)
     dashboard.explore.traces.x_range.update(start=1.2, end=1.6)

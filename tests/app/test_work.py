@@ -16,7 +16,7 @@ from wfsobs.dependence import Memo
 from wfsobs.evaluation.error_spectra import scored_samples
 from wfsobs.progress import QUIET, Cancelled, Watch
 from wfsobs.scenario import Scenario
-from wfsobs.signal.welch import welch_psd
+from wfsobs.signal.welch import psd
 
 
 def keys(shown: RunResults) -> set[tuple[str, str]]:
@@ -101,10 +101,10 @@ def test_spectra_are_of_what_is_scored(reports: Any) -> None:
     truth, values = final.values(TRUTH, "vibration"), final.values(*key)
     assert truth is not None and values is not None
     true, value = scored_samples(record, truth[:, 0], values[:, 0], final.scenario.run.warm_up)
-    frequency, density = welch_psd(value, record.dt)
+    frequency, density = psd(value, record.dt)
     assert np.array_equal(final.spectra[key].frequency, frequency)
     assert np.allclose(final.spectra[key].signal[:, 0], density, rtol=1e-10)
-    assert np.allclose(final.spectra[key].error[:, 0], welch_psd(value - true, record.dt)[1], rtol=1e-10)
+    assert np.allclose(final.spectra[key].error[:, 0], psd(value - true, record.dt)[1], rtol=1e-10)
     assert np.all(final.spectra[TRUTH, "vibration"].error == 0)
 
 

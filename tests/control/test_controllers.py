@@ -28,7 +28,7 @@ from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.errors import SettingError
 from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.statespace import paper_matrices
-from wfsobs.signal.welch import welch_psd
+from wfsobs.signal.welch import psd
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
 
@@ -239,7 +239,7 @@ def test_what_is_rejected_is_what_the_rejection_function_says(controller: str) -
     )
     residual = outcome(closed_loop(white, plan), controller).residual
     assert residual is not None
-    frequency, density = welch_psd(residual, record.dt, 1.0)
+    frequency, density = psd(residual, record.dt, resolution=1.0)
     omega = 2 * np.pi * frequency * record.dt
     law = plan.laws[controller][0].law
     assert law is not None

@@ -25,7 +25,7 @@ from wfsobs.identification.result import Identification
 from wfsobs.plot.elements import BINS, save_figure, to_matplotlib
 from wfsobs.plot.looks import look
 from wfsobs.plot.paper import NUMBERS, draw_paper_figure, observers_in, samples_of
-from wfsobs.signal.welch import welch_psd
+from wfsobs.signal.welch import psd
 
 SHORT = {"run.duration": 3.0, "gpr_offline.training_size": 30, "gpr_online.training_size": 30}
 SCENARIO = wfsobs.PRESETS["paper"]().replace(SHORT)
@@ -101,6 +101,7 @@ def curves(figure: Any) -> dict[str, Any]:
     return {curve.label: curve for curve in figure.traverse(lambda x: x, [hv.Curve])}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PLOTS)
 def test_both_backends_draw_every_figure_with_units(name: str, drawn: Callable[[str], Any], tmp_path: Path) -> None:
     """By Bokeh on axes of the figure's own labels; by Matplotlib in one column."""
@@ -186,7 +187,7 @@ def test_the_loop_is_drawn_with_its_own_numbers(loop: ClosedLoop) -> None:
     np.testing.assert_array_equal(bars.dimension_values(2), sorted(1e3 * rms[1] for rms in left if rms))
     outcome = loop.outcomes[1]
     assert outcome.residual is not None
-    density = welch_psd(outcome.residual[round(loop.design.start / loop.record.dt) :], loop.record.dt)[1]
+    density = psd(outcome.residual[round(loop.design.start / loop.record.dt) :], loop.record.dt)[1]
     line = curves(loop.plot.residuals())[look(outcome.controller).label]
     np.testing.assert_array_equal(line.dimension_values(1), 1e6 * density[1:, 0])
     rejection = curves(loop.plot.rejection())["Integrator"].dimension_values(1)
@@ -201,7 +202,7 @@ def test_the_model_is_drawn_over_what_was_measured(found: Identification, result
     expected = 1e6 * found.modes[1].spectrum.psd(model.dimension_values(0))
     np.testing.assert_array_equal(model.dimension_values(1), expected)
     z = result.record.z[result.record.delay :]
-    np.testing.assert_array_equal(lines["Measured"].dimension_values(1), 1e6 * welch_psd(z, result.record.dt)[1][1:, 1])
+    np.testing.assert_array_equal(lines["Measured"].dimension_values(1), 1e6 * psd(z, result.record.dt)[1][1:, 1])
 
 
 def test_a_sweep_is_drawn_with_its_own_numbers(sweep: SweepResults, field: SweepResults) -> None:
@@ -226,6 +227,7 @@ def test_a_paper_figure_is_the_result(of_paper: wfsobs.Result) -> None:
     np.testing.assert_array_equal(lines["Filtered vibration, open loop"].dimension_values(1), estimate.values[first:last, 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NUMBERS)
 @pytest.mark.parametrize("suffix", ["pdf", "svg", "png", "pgf", "html"])
 def test_a_paper_figure_is_written_as_every_kind_of_file(name: str, suffix: str, of_paper: wfsobs.Result, tmp_path: Path) -> None:
@@ -278,3 +280,41 @@ def test_without_holoviews_the_extra_is_named() -> None:
     )
     said = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.splitlines()
     assert said[0].endswith("pip install wfsobs[plot]")
+
+
+def test_arrays_are_those_of_the_result(result: wfsobs.Result) -> None:
+    data, record = result.to_xarray(), result.record
+    assert dict(data.sizes) == {"time": record.n_steps, "mode": 2, "observer": 6}
+    assert list(data.mode.values) == ["tip", "tilt"] and data.time.attrs["units"] == "s"
+    for e in result.estimates:
+        here = data[f"{e.target}_estimate"].sel(observer=e.observer)
+        assert here.attrs["units"] == "um"
+        np.testing.assert_array_equal(here, e.values)
+    assert np.isnan(data["vibration_estimate"].sel(observer="kf-ngs")).all()  # which has none
+    np.testing.assert_array_equal(data["vibration"], record.vibration)
+    np.testing.assert_array_equal(record.to_xarray()["y_lgs"].sel(mode=3), record.y_lgs[:, 1])
+
+
+def test_arrays_and_table_of_a_sweep(field: SweepResults) -> None:
+    data = field.to_xarray()
+    assert data["rms"].dims == ("turbulence.wind_speed", "sensors.lgs_noise", "observer", "target", "mode")
+    for cell, changes in enumerate(field.sweep.cells):
+        for key in field.known_keys():
+            known = field.error(cell, key)
+            here = data.sel({**changes, **dict(zip(("observer", "target", "mode"), key, strict=True))})
+            assert known == tuple(float(here[name]) for name in ("rms", "low", "high"))
+    assert list(field.to_dataframe()["mean_rms_nm"]) == [row["mean_rms_nm"] for row in field.rows()]
+
+
+def test_an_identification_is_a_table(found: Identification) -> None:
+    frame = found.to_dataframe()
+    peaks = frame[(frame["mode"] == "tip") & frame["what"].isin(["line", "resonance"])]
+    assert list(peaks["frequency_hz"]) == [p.frequency.value for p in found.modes[0].peaks]
+    html = found._repr_html_()
+    assert html.count("<tr>") == len(frame) + 1 and "<td>white noise</td>" in html
+
+
+def test_without_xarray_the_extra_is_named(result: wfsobs.Result, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(ImportError, match=r"^xarray is not installed: pip install wfsobs\[arrays\]$"):
+        result.to_xarray()

@@ -19,7 +19,7 @@ from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.rows import score_rows
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.grid import Variation
-from wfsobs.signal.welch import welch_psd
+from wfsobs.signal.welch import psd
 
 
 @given(st.integers(2, 30_000), st.integers(10, 800), st.sampled_from([1e-2, 1e-3, 2e-4]))
@@ -101,7 +101,7 @@ def test_a_state_has_the_lines_of_the_result(result: Result) -> None:
     np.testing.assert_array_equal(state.lines["signal/vibration/gpr-online/tilt"], estimate.values[:, 1].astype(np.float32))
     error = (estimate.values - truth)[:, 1]
     np.testing.assert_array_equal(state.lines["error/vibration/gpr-online/tilt"], error.astype(np.float32))
-    frequency, density = welch_psd(error[500:, None], result.record.dt)
+    frequency, density = psd(error[500:, None], result.record.dt)
     total = cumulative_rms(frequency[1:], density[1:, 0])
     kept, shown = state.lines["frequency"], state.lines["psd-error/vibration/gpr-online/tilt"]
     np.testing.assert_allclose(shown[:399], density[1:400, 0], rtol=1e-6)

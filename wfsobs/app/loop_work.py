@@ -17,7 +17,7 @@ from wfsobs.dependence import Memo
 from wfsobs.priors_from.controllers import own_settings
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
-from wfsobs.signal.welch import welch_psd
+from wfsobs.signal.welch import psd
 from wfsobs.typing import Array
 
 PATIENCE = 60.0
@@ -64,7 +64,7 @@ def compute(of: RunResults, watch: Watch, tell: Tell, memo: Memo | None = None) 
     for outcome in each_outcome(record, plan, watch, memo=memo):
         outcomes.append(outcome)
         if outcome.residual is not None:
-            spectra[outcome.controller] = welch_psd(outcome.residual[start:], record.dt)
+            spectra[outcome.controller] = psd(outcome.residual[start:], record.dt)
         if outcome.controller not in quick[:-1]:
             result = ClosedLoop(plan, record, tuple(outcomes))
             table = tuple(rows(result, None, source=of.result.prior_source))

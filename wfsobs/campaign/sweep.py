@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import isfinite
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from wfsobs.cost import run_seconds
 from wfsobs.evaluation.evidence import FEWEST, Evidence, Key, gather_evidence
 from wfsobs.evaluation.scores import BOUNDS, Score
 from wfsobs.evaluation.verdict import Verdict, contenders
-from wfsobs.notebook import PlotAccessor
+from wfsobs.notebook import PlotAccessor, import_extra
 from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import observe
 from wfsobs.priors_from.selection import common_observers
@@ -26,6 +26,10 @@ from wfsobs.scenario.grid import Variation, parse_variation
 from wfsobs.scenario.idle import idle_settings, why_idle_at
 from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.loop import simulate
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
 
 MOST_CELLS = 400
 """Maximum number of scenarios."""
@@ -338,6 +342,29 @@ class SweepResults:
         """Return (observer, target, mode) of all that is known in some cell, in the order of the scores."""
         known = {(s.observer, s.target, s.mode): None for seeds in self.scores.values() for s in seeds[0]}
         return list(known)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return mean errors `rms` and the ends `low` and `high` of their intervals [um], as `error` does, as labelled arrays.
+
+        Dimensions are the settings, observer, target and mode; NaN is not known. Raises ImportError without xarray.
+        """
+        known = self.known_keys()
+        labels = [list(dict.fromkeys(key[i] for key in known)) for i in range(3)]
+        dims = {axis.path: list(axis.values) for axis in self.sweep.axes} | dict(
+            zip(("observer", "target", "mode"), labels, strict=True)
+        )
+        values = np.full((len(self.sweep.cells), *map(len, labels), 3), np.nan)
+        for cell in range(len(self.sweep.cells)):
+            for key in known:
+                if (error := self.error(cell, key)) is not None:
+                    values[(cell, *(of.index(name) for of, name in zip(labels, key, strict=True)))] = error
+        shaped = values.reshape(*map(len, dims.values()), 3)
+        ends = {name: (tuple(dims), shaped[..., i], {"units": "um"}) for i, name in enumerate(("rms", "low", "high"))}
+        return import_extra("xarray", "arrays").Dataset(ends, dims)
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Return `rows` as a pandas table. Raises ImportError without pandas."""
+        return import_extra("pandas", "arrays").DataFrame(self.rows())
 
     def rows(self) -> list[dict[str, Any]]:
         """Return one plain dictionary per cell, target, mode and observer, errors in [nm]."""

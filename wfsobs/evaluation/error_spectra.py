@@ -37,7 +37,7 @@ from wfsobs.priors_from.turbulence import beams_of, lgs_error_of, lines_turbulen
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar3 import Ar3Fits
-from wfsobs.signal.welch import expected_psd, welch_psd
+from wfsobs.signal.welch import expected_psd, psd
 from wfsobs.signal.wiener import circle_mean
 from wfsobs.simulation.guide_stars import MEAN
 from wfsobs.simulation.true_spectra import MOST, TrueSpectra, has_known_spectra, n_frequencies, true_spectra
@@ -94,7 +94,7 @@ def spectra(
     if shortest < 16:
         return None
     true, value = (np.column_stack([x[-shortest:] for x in of]) for of in zip(*columns, strict=True))
-    frequency, density = welch_psd(np.hstack([value, value - true]), record.dt)
+    frequency, density = psd(np.hstack([value, value - true]), record.dt)
     signal, error = np.hsplit(density, 2)
     return frequency, signal, error
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from wfsobs.evaluation.rows import score_rows
 from wfsobs.evaluation.scores import Score
-from wfsobs.notebook import PlotAccessor, html_table
+from wfsobs.notebook import PlotAccessor, html_table, import_extra
 from wfsobs.observers.estimates import Estimate
 from wfsobs.prior import TRUE, PriorSource
 from wfsobs.record import Record
@@ -15,6 +17,7 @@ from wfsobs.scenario import Scenario
 
 if TYPE_CHECKING:
     import pandas
+    import xarray
 
 
 @dataclass(frozen=True)
@@ -75,9 +78,36 @@ class Result:
         ImportError
             pandas is not installed.
         """
-        import pandas
+        return import_extra("pandas", "arrays").DataFrame(
+            score_rows(self.scores, self.scenario.run.seed, source=self.prior_source)
+        )
 
-        return pandas.DataFrame(score_rows(self.scores, self.scenario.run.seed, source=self.prior_source))
+    def to_xarray(self) -> xarray.Dataset:
+        """Return the record and the estimates as labelled arrays.
+
+        Returns
+        -------
+        xarray.Dataset
+            That of the record; `turbulence_estimate` and `vibration_estimate` over `observer`, `time` [s] and `mode` (its name),
+            NaN where there is none, and `..._sd`, the standard deviation that an observer states.
+
+        Raises
+        ------
+        ImportError
+            xarray is not installed.
+        """
+        out = self.record.to_xarray()
+        out = out.assign_coords(mode=[m.name for m in self.scenario.modes][: self.record.n_modes])
+        names = list(dict.fromkeys(e.observer for e in self.estimates))
+        nothing = np.full_like(self.record.y_lgs, np.nan)
+        for target in dict.fromkeys(e.target for e in self.estimates):
+            own = {e.observer: e for e in self.estimates if e.target == target}
+            for name, what in ((f"{target}_estimate", "values"), (f"{target}_sd", "sd")):
+                found = {key: x for key, e in own.items() if (x := getattr(e, what)) is not None}
+                if found:
+                    stacked = np.stack([found.get(key, nothing) for key in names])
+                    out[name] = (("observer", "time", "mode"), stacked, {"units": "um"})
+        return out.assign_coords(observer=names)
 
     def estimate(self, observer: str, target: str) -> Estimate | None:
         """Return the estimate of one observer and target.

@@ -37,7 +37,7 @@ from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import Estimate
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.signal.welch import welch_psd
+from wfsobs.signal.welch import psd
 from wfsobs.simulation.disturbance import vibration_lines
 from wfsobs.typing import Array
 
@@ -316,7 +316,7 @@ def explain_harm(result: Result, mode: str | None = None) -> list[Budget]:
 
 def _shares(error: Array, dt: float, lines: Sequence[float], given_lines: Sequence[float]) -> tuple[float, float]:
     """Shares of an error's variance at the lines [Hz] that an observer is given, and at the others."""
-    frequency, density = welch_psd(error[~np.isnan(error)][:, None], dt)
+    frequency, density = psd(error[~np.isnan(error)][:, None], dt)
     total = density.sum()
     if not total > 0:
         return 0.0, 0.0

@@ -26,6 +26,24 @@ class Number(NamedTuple):
     std: float
 
 
+def format_number(n: Number) -> str:
+    """Format a number to two digits of its standard deviation, or to three of its own where it has none.
+
+    The damping of an undamped line, which is not estimated, is 0.
+
+    >>> format_number(Number(47.43812, 0.0264)), format_number(Number(502.3, 25.1)), format_number(Number(0.0, 0.0))
+    ('47.438 +- 0.026', '502 +- 25', '0')
+    >>> format_number(Number(0.1412, float("nan")))
+    '0.141 +- -'
+    """
+    if n == (0.0, 0.0):
+        return "0"
+    if isnan(n.std):
+        return f"{n.value:.3g} +- -"
+    digits = max(0, 1 - int(f"{n.std:e}".split("e")[1])) if n.std > 0 else 4
+    return f"{n.value:.{digits}f} +- {n.std:.{digits}f}"
+
+
 @dataclass(frozen=True)
 class IdentifiedProcess:
     """Turbulence, background or a peak.

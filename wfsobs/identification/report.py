@@ -6,13 +6,12 @@ from math import isnan, sqrt
 from typing import Any
 
 from wfsobs.identification.process import IdentifiedProcess, Number
+from wfsobs.identification.process import format_number as format_number
 from wfsobs.identification.result import Identification, IdentifiedMode
+from wfsobs.identification.result import mode_rows as mode_rows
 from wfsobs.identification.whiteness import LEVEL
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import add_comments, to_toml
-
-Row = tuple[str, Number | None, Number | None, Number | None]
-"""Name, frequency [Hz], damping, rms [um]."""
 
 
 def identification_dict(result: Identification) -> dict[str, Any]:
@@ -57,25 +56,6 @@ def identification_dict(result: Identification) -> dict[str, Any]:
     }
 
 
-def mode_rows(mode: IdentifiedMode) -> list[Row]:
-    """Return all processes of a mode, peaks by frequency."""
-    out: list[Row] = [("white noise", None, None, mode.noise)]
-    if (t := mode.turbulence) is not None:
-        out.append(("turbulence", t.frequency, t.damping, t.rms))
-        if (third := t.third_corner) is not None:
-            out.append(("its third corner", Number(*(x * t.frequency.value for x in third)), None, None))
-    else:
-        out.append(("no turbulence", None, None, None))
-    if (b := mode.background) is not None:
-        out.append(("background, up to", b.frequency, None, b.rms))
-    if (d := mode.difference) is not None:
-        out.append(("white noise of an NGS frame", None, None, d.noise))
-        if (e := d.error) is not None:
-            out.append(("slow error of the LGS", e.frequency, e.damping, e.rms))
-    out += [("broad, of the continuum", p.frequency, p.damping, p.rms) for p in mode.broad]
-    return out + [("line" if p.pure else "resonance", p.frequency, p.damping, p.rms) for p in mode.peaks]
-
-
 def whiteness_lines(result: Identification) -> list[str]:
     """Return one line per mode on the residual."""
     out = []
@@ -88,24 +68,6 @@ def whiteness_lines(result: Identification) -> list[str]:
         why = "".join(f"; {remark}" for remark in w.remarks)
         out.append(f"{m.name}: residual is {'white' if w.white else 'NOT white'} at {LEVEL:.0%} ({tests}{rest}){why}")
     return out
-
-
-def format_number(n: Number) -> str:
-    """Format a number to two digits of its standard deviation, or to three of its own where it has none.
-
-    The damping of an undamped line, which is not estimated, is 0.
-
-    >>> format_number(Number(47.43812, 0.0264)), format_number(Number(502.3, 25.1)), format_number(Number(0.0, 0.0))
-    ('47.438 +- 0.026', '502 +- 25', '0')
-    >>> format_number(Number(0.1412, float("nan")))
-    '0.141 +- -'
-    """
-    if n == (0.0, 0.0):
-        return "0"
-    if isnan(n.std):
-        return f"{n.value:.3g} +- -"
-    digits = max(0, 1 - int(f"{n.std:e}".split("e")[1])) if n.std > 0 else 4
-    return f"{n.value:.{digits}f} +- {n.std:.{digits}f}"
 
 
 def identification_toml(result: Identification, scenario: Scenario) -> str:

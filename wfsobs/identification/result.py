@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import nan, pi, sqrt
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from wfsobs.identification.both_sensors import SensorDifference, error_of_a_star, without_error
 from wfsobs.identification.one_mode import OneMode, is_continuum
@@ -12,6 +12,7 @@ from wfsobs.identification.process import (
     IdentifiedPeak,
     IdentifiedProcess,
     Number,
+    format_number,
     mean,
     merge_peaks,
     read_line,
@@ -22,17 +23,24 @@ from wfsobs.identification.process import (
 )
 from wfsobs.identification.settings import MATCHED, base_scenario, model_settings
 from wfsobs.identification.whiteness import Whiteness
-from wfsobs.notebook import PlotAccessor
+from wfsobs.notebook import PlotAccessor, html_table, import_extra
 from wfsobs.prior import Line, Lines
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2, turbulence_corner
 from wfsobs.simulation.layers import relative_cone_error, relative_rms
 from wfsobs.spectral.model import Spectrum
 
+if TYPE_CHECKING:
+    import pandas
+
 SLOWEST = 10.0
 """Minimum periods of turbulence in a record for a standard deviation of its corner: a slower one is not resolved."""
 LARGEST = 100.0
 """Maximum strength of turbulence [um] in a scenario's settings."""
+
+
+Row = tuple[str, Number | None, Number | None, Number | None]
+"""Name, frequency [Hz], damping, rms [um]."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +120,29 @@ class Identification:
         peaks = ", ".join(f"{mode.name} {len(mode.peaks)} peaks" for mode in self.modes)
         return f"Identification({peaks}, length {self.duration:g} s, rate {1.0 / self.dt:g} Hz)"
 
+    def _repr_html_(self) -> str:
+        cells = [
+            (mode.name, what, *("" if n is None else format_number(n) for n in (f, damping, rms and scale_number(rms, 1e3))))
+            for mode in self.modes
+            for what, f, damping, rms in mode_rows(mode)
+        ]
+        return html_table(("Mode", "What", "frequency, Hz", "damping", "rms, nm"), cells)
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Return a pandas table of noise, turbulence and peaks, a row each, with standard deviations; NaN where there is none.
+
+        Raises ImportError without pandas.
+        """
+        columns = ("frequency_hz", "damping", "rms_um")
+        rows = []
+        for mode in self.modes:
+            for what, *numbers in mode_rows(mode):
+                row: dict[str, Any] = {"mode": mode.name, "what": what}
+                for column, n in zip(columns, numbers, strict=True):
+                    row[column], row[f"{column}_std"] = (nan, nan) if n is None else n
+                rows.append(row)
+        return import_extra("pandas", "arrays").DataFrame(rows)
+
     @property
     def duration(self) -> float:
         """Length of the part of the record that was used [s]."""
@@ -176,6 +207,25 @@ class Identification:
             out["sensors.lgs_low_frequency_rms"] = _within(mean(slow), 0.0, 10.0)
             out["sensors.ngs_noise"] = _within(mean([d.noise for d in differences]), 0.0, 10.0)
         return out
+
+
+def mode_rows(mode: IdentifiedMode) -> list[Row]:
+    """Return all processes of a mode, peaks by frequency."""
+    out: list[Row] = [("white noise", None, None, mode.noise)]
+    if (t := mode.turbulence) is not None:
+        out.append(("turbulence", t.frequency, t.damping, t.rms))
+        if (third := t.third_corner) is not None:
+            out.append(("its third corner", Number(*(x * t.frequency.value for x in third)), None, None))
+    else:
+        out.append(("no turbulence", None, None, None))
+    if (b := mode.background) is not None:
+        out.append(("background, up to", b.frequency, None, b.rms))
+    if (d := mode.difference) is not None:
+        out.append(("white noise of an NGS frame", None, None, d.noise))
+        if (e := d.error) is not None:
+            out.append(("slow error of the LGS", e.frequency, e.damping, e.rms))
+    out += [("broad, of the continuum", p.frequency, p.damping, p.rms) for p in mode.broad]
+    return out + [("line" if p.pure else "resonance", p.frequency, p.damping, p.rms) for p in mode.peaks]
 
 
 def read_mode(name: str, mode: OneMode, lowest: float, whiteness: Whiteness) -> IdentifiedMode:

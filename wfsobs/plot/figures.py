@@ -38,7 +38,7 @@ from wfsobs.plot.elements import (
 from wfsobs.plot.looks import TERM_COLOURS, look
 from wfsobs.record import Record, hold_last
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
-from wfsobs.signal.welch import welch_psd
+from wfsobs.signal.welch import psd
 from wfsobs.typing import Array
 
 NM = 1e3
@@ -73,7 +73,7 @@ class RecordPlots:
         name, dt = _one_of(self.names, mode, "mode"), self.record.dt
         y, lines = quantity(f"PSD {name}", "nm²/Hz", f"PSD, {name}"), []
         for key, x in self._signals(name).items():
-            frequency, density = welch_psd(hold_last(x[:, None]), dt)
+            frequency, density = psd(hold_last(x[:, None]), dt)
             lines.append(draw_line(frequency[1:], NM**2 * density[1:, 0], (FREQUENCY, y), SIGNALS[key]))
         return overlay(lines, log="xy")
 
@@ -219,7 +219,7 @@ class IdentificationPlots:
         found = it.modes[names.index(name)]
         y, lines = quantity(f"PSD of z {name}", "nm²/Hz", f"PSD of z, {name}"), []
         if record is not None:
-            frequency, density = welch_psd(hold_last(record.z[record.delay :]), record.dt)
+            frequency, density = psd(hold_last(record.z[record.delay :]), record.dt)
             lines.append(draw_line(frequency[1:], NM**2 * density[1:, names.index(name)], (FREQUENCY, y), "measured"))
         peaks = np.array([p.frequency.value for p in found.peaks])
         f = np.unique(np.concatenate([np.geomspace(1.0 / it.duration, 0.5 / it.dt, 4000), peaks]))
@@ -281,7 +281,7 @@ class LoopPlots:
         y, lines = quantity(f"PSD of residual {name}", "nm²/Hz", f"PSD of residual, {name}"), []
         for it in self.loop.outcomes:
             if it.residual is not None and (controllers is None or it.controller in controllers):
-                frequency, density = welch_psd(it.residual[round(self.loop.design.start / dt) :], dt)
+                frequency, density = psd(it.residual[round(self.loop.design.start / dt) :], dt)
                 lines.append(draw_line(frequency[1:], NM**2 * density[1:, self.names.index(name)], (FREQUENCY, y), it.controller))
         return overlay(_some(lines, "a residual"), log="xy")
 

@@ -13,7 +13,7 @@ def rms(x: Array) -> float:
     return float(np.sqrt(np.mean(np.square(x)))) if x.size else 0.0
 
 
-def welch_psd(x: Array, dt: float, resolution: float = 0.5) -> tuple[Array, Array]:
+def psd(x: Array, dt: float, *, resolution: float = 0.5) -> tuple[Array, Array]:
     """Estimate the power spectral density by Welch's method.
 
     Averages half-overlapping Hann windows of 1 / resolution seconds, or of the whole record if that is shorter.
@@ -21,7 +21,7 @@ def welch_psd(x: Array, dt: float, resolution: float = 0.5) -> tuple[Array, Arra
     Parameters
     ----------
     x : Array
-        Signals, (n, n_columns).
+        Signals, (n, n_columns), without NaN.
     dt : float
         Time step [s].
     resolution : float
@@ -40,7 +40,7 @@ def welch_psd(x: Array, dt: float, resolution: float = 0.5) -> tuple[Array, Arra
 
 
 def expected_psd(spectrum: Array, dt: float, n_steps: int, resolution: float = 0.5) -> tuple[Array, Array]:
-    """Return the expectation of `welch_psd` for a stationary signal of this spectrum.
+    """Return the expectation of `psd` for a stationary signal of this spectrum.
 
     The autocovariance times that of the window, transformed: the spectrum as smooth as the window makes it. Taking off the mean
     of each window, which changes the lowest two frequencies, is left out.

@@ -14,7 +14,7 @@ import numpy as np
 
 from wfsobs.record import Record, RecordError, hold_last
 from wfsobs.scenario import Scenario
-from wfsobs.signal.welch import rms, welch_psd
+from wfsobs.signal.welch import psd, rms
 from wfsobs.telemetry.columns import describe_values, suggest_clock, suggest_roles
 from wfsobs.telemetry.command_response import CommandResponse, command_response, saturation_lines
 from wfsobs.telemetry.formats.contents import TIME, Contents
@@ -228,7 +228,7 @@ def preview(data: bytes, name: str, scenario: Scenario | None = None, declaratio
         raise RecordError(f"{shown}: {error}") from None
     signals = {"y_lgs": record.y_lgs, "u": record.u, "z": (z := record.z[record.delay :])}.items()
     values = {key: tuple(rms(column[~np.isnan(column)]) for column in signal.T) for key, signal in signals}
-    frequency, spectrum = welch_psd(hold_last(z), record.dt)
+    frequency, spectrum = psd(hold_last(z), record.dt)
     return Preview(record, shown, values, frequency, spectrum, _read_off(record, contents, stated, scenario, max(values["z"])))
 
 

@@ -35,7 +35,7 @@ from wfsobs.live.finding import Bounds, bridge_missing
 from wfsobs.live.paced import LiveEvent
 from wfsobs.live.view import LiveView
 from wfsobs.scenario import Scenario
-from wfsobs.signal.welch import welch_psd
+from wfsobs.signal.welch import psd
 from wfsobs.typing import Array
 
 PATIENCE = 10.0
@@ -312,7 +312,7 @@ def _last_spectrum(view: LiveView, name: str, target: str, display: Display, n: 
     x = bridge_missing(shown_signal(view, name, target, display)[-n:, display.column])
     if x is None:
         return None
-    frequency, density = welch_psd(x[:, None], view.dt, 1.0 / (n * view.dt))
+    frequency, density = psd(x[:, None], view.dt, resolution=1.0 / (n * view.dt))
     return frequency, density[:, 0]
 
 
@@ -440,7 +440,7 @@ def second_spectrum(x: Array, dt: float) -> Array:
     whole = bridge_missing(x)
     if whole is None:
         return np.full(ROWS, np.nan)
-    frequency, density = welch_psd(whole[:, None], dt, 1.0 / LENGTH)
+    frequency, density = psd(whole[:, None], dt, resolution=1.0 / LENGTH)
     half = 0.5 * frequency[1]
     edges = np.geomspace(LOWEST, 0.5 / dt, ROWS + 1)
     power = np.concatenate([[0.0], np.cumsum(density[:, 0] * 2.0 * half)])
