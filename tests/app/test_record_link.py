@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import io
+import json
 from collections.abc import Callable
 from typing import Any
 
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.service import Session
+from wfsobs.app.session_file import read_declaration
 from wfsobs.app.share import from_query, to_query
 from wfsobs.app.sources import NamedRecord
 from wfsobs.scenario import Scenario
@@ -31,9 +33,13 @@ DECLARATIONS = st.builds(
     DeclaredFormat,
     st.none() | st.sampled_from(list(UNITS)),
     st.sampled_from([None, 1, -1]),
-    st.none() | st.integers(1, 50),
+    st.none() | st.floats(1, 50),
     st.none() | st.floats(1e-3, 9e5),
-    st.dictionaries(st.sampled_from(list(ROLES)), st.text(max_size=20).filter(lambda text: text.isprintable()), max_size=4),
+    st.dictionaries(st.sampled_from([*ROLES, "u"]), st.text(max_size=20).filter(lambda text: text.isprintable()), max_size=4),
+    st.booleans(),
+    st.none() | st.lists(st.floats(0.1, 3), min_size=1, max_size=3).map(tuple),
+    st.none() | st.floats(1e-3, 1e6),
+    st.booleans(),
 )
 
 
@@ -45,6 +51,7 @@ def test_what_is_said_of_a_record_survives_a_link(declaration: DeclaredFormat) -
     assert query is not None
     link = from_query(f"?{query}")
     assert (link.record, link.errors, link.scenario) == (record, (), PRESETS["ut4"]())
+    assert read_declaration(json.loads(json.dumps(vars(declaration)))) == declaration, "and a session"
 
 
 @pytest.mark.parametrize(

@@ -151,6 +151,22 @@ def test_what_is_said_of_it(dashboard: Dashboard, loop: Any, short: Scenario) ->
     assert not dashboard.upload.use.disabled and dashboard.upload.fields.unit.value != SILENT
 
 
+def test_what_is_said_of_the_mirror(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
+    """A measurement alone is a record in open loop; of commands, parts of a step, a gain and a rail can be said."""
+    content = file_of(short).replace(b"# delay: 2\n", b"")
+    previewed(dashboard, loop, content)
+    fields = dashboard.upload.fields
+    for widget, value in ((fields.delay, "1.5"), (fields.gain, "1.2"), (fields.rail, "0.1"), (fields.trust, True)):
+        widget.value = value
+        loop.until(lambda: not dashboard.upload.picker.message.startswith(("Reading", "Waiting")))
+    found = dashboard.upload._preview
+    assert re.fullmatch(r"\d+ commands beyond the rail of 0\.1, delay 1\.5, command gain 1\.2", found.record.origin)
+    assert np.abs(found.record.u).max() == pytest.approx(0.12)
+    fields.open_loop.value = True
+    loop.until(lambda: not dashboard.upload.picker.message.startswith(("Reading", "Waiting")))
+    assert not dashboard.upload._preview.record.u.any() and not dashboard.upload.use.disabled
+
+
 def test_a_vibration_spectrum(dashboard: Dashboard, loop: Any) -> None:
     """10 um^2/Hz over 1 Hz about 30 Hz on tip, nothing on tilt; without a unit it is asked for."""
     rows = "29.4,0,0\n29.5,10,0\n30.5,10,0\n30.6,0,0\n"

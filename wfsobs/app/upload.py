@@ -51,8 +51,12 @@ class UploadFields:
         self.unit = _select("Unit", [SILENT, *UNITS])
         self.sign = _select("Commands", {SILENT: 0, "are added to the measurement (+1)": 1, "are subtracted (-1)": -1})
         self.delay, self.rate = _text("Delay of commands [steps]", 240), _text("Rate [Hz]")
-        self.trust = pmui.Checkbox(label="Trust sign and delay as stated", value=False, size="small", margin=(4, 0))
-        self.widgets = (self.unit, self.sign, self.delay, self.rate, self.trust)
+        self.gain, self.rail = _text("Gain of commands"), _text("Rail: largest command")
+        self.trust, self.open_loop = (
+            pmui.Checkbox(label=label, value=False, size="small", margin=(4, 0))
+            for label in ("Trust sign and delay as stated", "Open loop: the mirror was at rest")
+        )
+        self.widgets = (self.unit, self.sign, self.delay, self.rate, self.gain, self.rail, self.trust, self.open_loop)
         for widget in self.widgets:
             widget.param.watch(lambda _event: on_change(), "value")
 
@@ -61,7 +65,9 @@ class UploadFields:
         unit = None if self.unit.value == SILENT else self.unit.value
         delay, rate = _number(self.delay, float, 1), _number(self.rate, float, 1e-3)
         delay = int(delay) if delay and delay % 1 == 0 else delay
-        return DeclaredFormat(unit, self.sign.value or None, delay, rate, roles, self.trust.value)
+        gain, rail = _number(self.gain, float, 1e-3), _number(self.rail, float, 1e-9)
+        mirror = {"command_gain": None if gain is None else (gain,), "rail": rail, "open_loop": self.open_loop.value}
+        return DeclaredFormat(unit, self.sign.value or None, delay, rate, roles, self.trust.value, **mirror)
 
     def take_proposals(self, preview: Preview) -> None:
         """Fill in the sign and the delay that the data propose."""
@@ -148,8 +154,8 @@ def read_stranger(content: bytes, name: str, scenario: Scenario, declaration: De
 
 
 HINT = (
-    "Assign the columns. Likely matches are preselected. A record needs a measurement and a command of the same modes, and a "
-    "time or a rate."
+    "Assign the columns. Likely matches are preselected. A record needs a measurement and, but in open loop, a command of the "
+    "same modes, and a time or a rate."
 )
 
 
