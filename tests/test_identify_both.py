@@ -46,6 +46,7 @@ def assert_near(number: Number, truth: float, unsure: float) -> None:
     assert number.std == pytest.approx(unsure * truth, rel=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.05])
 def test_the_numbers_are_those_of_the_simulation(found: Identification, share: float) -> None:
     """Noise of m frames is known to 1 / sqrt(2 m); the slow error to half of that of as many periods of its corner, 1.1 Hz."""
@@ -74,6 +75,7 @@ def test_of_a_difference_that_is_known(ratio: int, noise: float) -> None:
     assert result.process is not None and result.process.dt == dt
 
 
+@pytest.mark.slow
 def test_filters_of_both_sensors_are_near_those_that_are_told_the_truth(found: Identification) -> None:
     """On another record. An identification of the LGS alone takes their slow error for turbulence: 35 nm are then left of it."""
     record, names = of_seed(6), ["multirate-multi", "gp-both"]

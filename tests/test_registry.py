@@ -155,6 +155,7 @@ print("mine" in OBSERVERS, list(Scenario.settings())[:2])
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "is_kept"), [('"kalman"', True), ('"no_group"', False), ('Section("turbulence", "Turbulence", Own)', False)]
 )

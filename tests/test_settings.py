@@ -83,6 +83,7 @@ def test_the_walk_reaches_every_group() -> None:
     assert "vibration.peaks.0.rms" in ALL and "vibration.psd.tilt" in ALL
 
 
+@pytest.mark.slow
 def test_every_setting_refuses_what_it_does_not_take(subtests: pytest.Subtests) -> None:
     scenario = full()
     before = scenario.to_dict()

@@ -146,6 +146,7 @@ def test_what_is_kept_from_the_last_frame_changes_nothing() -> None:
                 np.testing.assert_allclose(kept[name].density, it.density, rtol=1e-3, atol=1e-9 * it.density.max())
 
 
+@pytest.mark.slow
 def test_a_drag_of_the_corner_ends_where_a_jump_does() -> None:
     """The fits of the turbulence start from the last frame's; in each frame a theory without one starts from afar."""
     theory, base, of = Theory(most=2**14, left=0.001), PRESETS["ut4"](), {"observers": ["kf-multi", "multirate-multi"]}

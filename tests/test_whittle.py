@@ -100,6 +100,7 @@ def test_the_fit_to_frozen_flow_is_at_its_minimum_from_wherever_it_starts(mode: 
         assert np.abs((vector(other) - vector(found)) / std).max() < 100.0 * TOLERANCE
 
 
+@pytest.mark.slow
 def test_fits_that_follow_a_corner_are_those_from_afar() -> None:
     """Twice the wind in steps of 12 %, more than between two frames of a drag: what both see, and what the LGS alone see."""
     s, fits, noise = PRESETS["ut4"](), Ar3Fits(), 4e-4

@@ -210,6 +210,7 @@ def test_limits_that_are_never_reached_change_nothing_and_others_do(controller: 
     assert (max(tight.limited_share) > 0.0) == (controller != "none")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("controller", list(CONTROLLERS))
 def test_a_command_knows_nothing_of_what_comes_later(controller: str) -> None:
     scenario = MATCHED.replace(QUICK | {"control.stroke": 1.0})

@@ -41,6 +41,7 @@ def before() -> tuple[Memo, Record, list[Outcome]]:
     return memo, record, list(each_outcome(record, design(BASE), memo=memo))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_what_a_change_reaches_runs_and_nothing_else(case: str, before: tuple[Memo, Record, list[Outcome]]) -> None:
     memo, record, kept = before

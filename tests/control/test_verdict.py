@@ -9,6 +9,7 @@ from wfsobs.closed_loop.rows import loop_verdict, rows
 from wfsobs.evaluation.scores import BOUND_BOTH
 
 
+@pytest.mark.slow
 def test_the_verdict_is_the_least_residual_of_each_kind_of_prior_knowledge_and_the_limit() -> None:
     result = close_loop(PRESETS["paper"]().replace({"run.duration": 3.0}))
     for mode in ("tip", "tilt"):

@@ -106,6 +106,7 @@ def limited_loop(disturbance: Array, rail: float, recorded: bool) -> Record:
     return Record(y, np.clip(u, -rail, rail) if recorded else u, 1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [0.02, 0.1])
 def test_commands_beyond_a_rail(rate: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Smooth disturbances of 0.4 um; the level is that of the rail, and without one nothing is said."""

@@ -82,6 +82,7 @@ def test_only_the_reference_looks_ahead() -> None:
     assert [name for name in ON_PAPER if name not in CAUSAL] == ["butterworth-ol"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CAUSAL)
 def test_nothing_after_a_step_changes_its_estimate(name: str, record: Record, subtests: pytest.Subtests) -> None:
     """48 is a border of the filters' blocks, 5 and 300 are NGS frames."""

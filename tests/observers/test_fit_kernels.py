@@ -41,6 +41,7 @@ def dense(kernel: Kernel, noise: float, z: Array) -> float:
     return float(-0.5 * e @ e - np.log(np.diag(L)).sum() - 0.5 * len(e) * np.log(2.0 * np.pi))
 
 
+@pytest.mark.slow
 def test_numbers_are_within_their_standard_deviations() -> None:
     record = drawn(Sum((AIR, LINE)), 1200, 3, 1)
     record.y_lgs[500:560] = np.nan  # the lasers are out

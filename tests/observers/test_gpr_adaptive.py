@@ -250,6 +250,7 @@ def test_what_is_missed_between_the_lines() -> None:
     assert missed_variance(spectrum, noise, 90.0) == 0.0  # no whole octave below 100 Hz
 
 
+@pytest.mark.slow
 def test_it_is_about_as_sure_as_it_may_be() -> None:
     """Vibration hidden in turbulence: 68 and 95 % within the bands, tip and tilt of four seeds, whose scatter is 3 and 2 %."""
     shares = []

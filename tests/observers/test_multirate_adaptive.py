@@ -150,6 +150,7 @@ def test_what_a_window_adds_to_a_width_is_taken_off_again() -> None:
     assert [p.damping * p.omega for p in back] == pytest.approx([shown[0], 0.5 * (shown[1] + bin_)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["paper", "ut4"])
 def test_filters_that_learn_are_about_as_sure_as_they_may_be(preset: str) -> None:
     """Vibration, and turbulence and all of both sensors, tip and tilt of two seeds, whose scatter is 4 and 2 %.

@@ -116,6 +116,7 @@ def test_it_keeps_the_rules_of_observers() -> None:
     check_observer(OBSERVER, SHAKEN.replace({"run.duration": 1.5}), alone=False)
 
 
+@pytest.mark.slow
 def test_without_the_lgs_it_goes_on_with_the_ngs() -> None:
     """For 0.4 s of every second: from 0.2 s on errors are as stated; steps are the run, with NGS frames lost as well."""
     record = simulate(LONG)

@@ -192,6 +192,7 @@ def test_a_gpr_is_right_about_itself(regression: Callable[[Array, Array], tuple[
     np.testing.assert_allclose(np.mean(inside, axis=0), [0.68, 0.95], atol=0.02)
 
 
+@pytest.mark.slow
 def test_a_gpr_is_right_about_itself_with_numbers_fitted_by_likelihood() -> None:
     """The same of 100 training windows each, of whose kernel nothing is known but the depth: within two percentage points. The
     three numbers are those of the greatest marginal likelihood; about them they scatter, the noise by a tenth."""
