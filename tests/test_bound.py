@@ -104,6 +104,7 @@ def test_the_best_observer_there_is_scatters_as_the_interval_says(case: str) -> 
         assert low < rms(found) < high
 
 
+@pytest.mark.slow
 def test_more_information_leaves_less() -> None:
     """Every LGS by itself has all that their mean has, and a bound of some modes is that of all."""
     scenario = PRESETS["galacsi-nfm"]()

@@ -36,6 +36,7 @@ def test_many_tests_are_those_of_a_table_done_by_hand() -> None:
     assert holm(np.array([0.03, 0.001, 0.04, 0.012])).tolist() == [False, True, False, True]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("names", "seeds"), [(8, 8), (12, 3), (20, 20)])
 def test_of_equals_any_is_called_worse_in_at_most_five_per_cent(names: int, seeds: int) -> None:
     """Without a correction for their number: 43 to 60 % of cases."""

@@ -105,6 +105,7 @@ def test_its_scenario_has_both_and_the_same_variance_of_z(found: Identification)
         assert parts == pytest.approx(sum(p.rms**2 for p in mode.prior.turbulence), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_without_ngs_or_with_few_frames_nothing_is_said_of_it() -> None:
     record, base = of_seed(5), Scenario().replace({"sensors.ngs_noise": 0.033})
     assert record.ratio is not None

@@ -166,6 +166,7 @@ def test_a_record_without_truth_is_scored_by_prediction_and_residual() -> None:
         assert found["kf-lgs"].normalised_rms == pytest.approx(found["kf-lgs"].rms / found["zero"].rms, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_a_single_mode_record() -> None:
     whole = simulate(scenario())
     assert whole.y_ngs is not None and whole.turbulence is not None and whole.training is not None

@@ -78,6 +78,7 @@ def test_guide_stars_are_independent_and_stay_when_one_is_added() -> None:
             assert (np.abs(correlations) < 0.8).all()
 
 
+@pytest.mark.slow
 def test_low_frequency_error_has_its_rms_and_falls_with_the_number_of_stars() -> None:
     for count in (1, 4):
         # One number per seed, mode and end of the record, 4 s apart: exp(-0.9 * 7.07 * 4) = 1e-11, independent.

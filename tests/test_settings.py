@@ -120,6 +120,7 @@ def bounds_of(p: param.Parameter) -> list[Any]:
     return [True, False] if isinstance(p, param.Boolean) else list(p.objects)
 
 
+@pytest.mark.slow
 def test_every_setting_takes_its_own_bounds(subtests: pytest.Subtests) -> None:
     base = full()
     for path, p in ALL.items():
@@ -254,6 +255,7 @@ def types_in(value: Any) -> set[type]:
     return set().union(*map(types_in, value)) if isinstance(value, list) else {type(value)}
 
 
+@pytest.mark.slow
 def test_numbers_of_numpy_become_plain_on_every_way_in(subtests: pytest.Subtests) -> None:
     base = full()
     by_path, by_attribute = base.copy(), base.copy()

@@ -81,6 +81,7 @@ def test_a_model_is_the_sum_of_its_processes(n_turbulence: int, n_vibration: int
     assert np.allclose(model.A @ model.A.T + model.Q, np.eye(len(state)), atol=1e-13)
 
 
+@pytest.mark.slow
 def test_samples_of_third_order_have_its_autocovariance_from_the_first_on() -> None:
     """Against the integral of the density, over many short runs: at steps 0, 1, 4 and 40, with the first and with themselves."""
     p = Ar3(200.0, 0.6, 400.0, 0.5, 1e-3)

@@ -126,6 +126,7 @@ def _files(night: Record, other: Record, tmp_path_factory: pytest.TempPathFactor
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
@@ -150,6 +151,7 @@ def test_what_cannot_be_trained_on_is_refused_with_a_line(
     assert "wfsobs: training data:" not in done.stderr
 
 
+@pytest.mark.slow
 def test_observe_says_what_it_was_trained_on(night: Record, files: Path) -> None:
     done = call("observe", files / "night.npz", "--train-until", "0.8", "--json", *SET)
     assert done.exit_code == 0 and "training data: the first 0.8 s of 2 s; estimates and scores begin after" in done.stderr

@@ -83,6 +83,7 @@ def test_the_bound_of_the_two_frame_loop() -> None:
     assert bound_rms(MATCHED, 0, ahead=1) == pytest.approx(riccati_errors(MATCHED)[1], rel=1e-7)
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @example(wind=11.75, rms=2.0, frequency=5.0, damping=0.5, vibration=0.125, noise=0.0023, duration=1.0)
 @given(

@@ -35,6 +35,7 @@ def add_batch(plan, folder, cells, seeds, written):
     write_batch(folder, rows, {"host": "here", "process": 1, "written": written})
 
 
+@pytest.mark.slow
 def test_what_is_followed_is_what_is_compared(plan, tmp_path, monkeypatch):
     open_folder(plan, tmp_path)
     followed = CampaignFolder(tmp_path)
@@ -108,6 +109,7 @@ def test_nothing_is_tied_without_a_test():
         assert not found.winners[1].is_decided, "there is nothing beside it"
 
 
+@pytest.mark.slow
 def test_many_values_are_put_into_bins(tmp_path):
     plan = parse_plan("[grid]\nturbulence.wind_speed = " + str([5 + i / 10 for i in range(100)]), tmp_path)
     (axis,) = plan_axes(plan)

@@ -56,6 +56,7 @@ def test_what_a_change_reaches_runs_and_nothing_else(case: str, before: tuple[Me
         np.testing.assert_array_equal(one.u, alone.u)
 
 
+@pytest.mark.slow
 def test_another_record_runs_them_all(before: tuple[Memo, Record, list[Outcome]]) -> None:
     memo, _, kept = before
     other = simulate(BASE.replace({"run.seed": 2}))

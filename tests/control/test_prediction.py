@@ -40,6 +40,7 @@ def _record() -> Record:
     return simulate(LINE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [1.0, 2.0, 2.5])
 @pytest.mark.parametrize("name", ["integrator+gpr-offline", "integrator+gpr-online"])
 def test_a_prediction_is_the_vibration_while_the_command_acts(name: str, delay: float, record: Record) -> None:

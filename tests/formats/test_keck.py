@@ -28,6 +28,7 @@ def convert(folder: Path, out: Path) -> None:
     load_script("keck_record").convert(folder, out)
 
 
+@pytest.mark.slow
 def test_the_record_of_a_keck_like_loop(tmp_path, capsys) -> None:
     """An integrator of gain 0.1 on a line of 20 Hz and noise, in arcsec; commands are taken off, seen one row later."""
     rng = np.random.default_rng(4)

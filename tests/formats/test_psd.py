@@ -107,6 +107,7 @@ def test_decimal_commas(separator: str) -> None:
     assert read_psd(io.BytesIO(text.encode()), "a.csv")["tip"] == pytest.approx([1.5e-6, 2e-6])
 
 
+@pytest.mark.slow
 def test_the_command_runs_on_it(tmp_path) -> None:
     """The shipped table is such a file; the vibration's rms is that of its bins, joined by straight lines."""
     path = tmp_path / "eris.csv"

@@ -76,6 +76,7 @@ def test_nothing_is_told_where_too_much_is_missing():
     assert told(minute((10, 0.02)), unknown, minute((10, 0.02))) == [[], [], []]
 
 
+@pytest.mark.slow
 def test_chance_makes_no_peaks():
     """Densities of minutes are exponential about one spectrum. Nothing rises in 400 pairs, 3 peaks and 2 modes, at 1e-5 each."""
     rng = np.random.default_rng(1)

@@ -141,6 +141,7 @@ def test_slopes_of_a_fit_with_a_background(turbulence: Ar2 | Ar3) -> None:
         np.testing.assert_allclose(slope, expected, atol=1e-6 * max(1.0, np.abs(slope).max()), rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("peaks", [(), (PEAK,)])
 def test_a_coloured_background_is_found(peaks: tuple[Ar2, ...]) -> None:
     """The loss of log-likelihood as above; a fit without a background loses more than BACKGROUND_WORTH of it."""
@@ -170,6 +171,7 @@ def test_a_background_is_kept_while_it_is_there(hiss: Ar2 | None) -> None:
     assert np.median(rms_found) == (0.0 if hiss is None else pytest.approx(hiss.rms, rel=0.12))
 
 
+@pytest.mark.slow
 def test_the_filter_of_a_window_with_a_background_is_nearly_that_of_the_truth() -> None:
     """A peak of 60 nm in a background of 60 nm: within 12 % of the filter that is told the spectrum, behind the first window. It
     learns ten numbers from 4 s, and takes a bit of turbulence for a peak now and then. A filter that is told all but the

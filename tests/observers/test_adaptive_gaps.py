@@ -37,6 +37,7 @@ def lost_in_a_row(length: float, rng: np.random.Generator) -> Array:
     return (k >= 1500) & (k < 1500 + length)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lost", "size", "more", "first"),
     [

@@ -182,6 +182,7 @@ def test_errors_are_as_it_states() -> None:
         assert (np.abs(mean - stated(STARS, target) ** 2) < 3.0 * error).all(), target
 
 
+@pytest.mark.slow
 def test_it_keeps_the_rules_of_observers() -> None:
     check_observer(OBSERVERS["kf-asterism"], STARS.replace({"run.duration": 1.5}), alone=False)
 
@@ -241,6 +242,7 @@ def test_the_next_measurement_is_missed_as_it_states(combination: str) -> None:
     assert within[1].all() if combination == "mean" else np.isnan(mean[1]).all()
 
 
+@pytest.mark.slow
 def test_its_bands_hold_what_they_say() -> None:
     """80 s at 250 Hz, in which errors are independent some 1000 times: 68 and 95 % within 2 percentage points in every phase."""
     scenario = STARS.replace({"sensors.lgs_rate": 250.0, "run.duration": 80.0, "vibration.synthesis": "gaussian"})

@@ -68,6 +68,7 @@ def test_the_bound_is_that_of_dense_algebra() -> None:
     assert (least < 0.95 * np.array(alone)).all() and least[0] < 0.6 * alone[0]
 
 
+@pytest.mark.slow
 def test_its_bound_is_a_row_of_its_table_and_of_no_other() -> None:
     short = SHAKEN.replace({"run.duration": 2.0, "run.warm_up": 1.0})
     result = run(short, observers=["kf-coupled"])
@@ -104,6 +105,7 @@ def test_errors_are_as_it_states() -> None:
     assert (found["vibration"][:, 2:] == 0.0).all()  # tip and tilt alone vibrate
 
 
+@pytest.mark.slow
 def test_its_bands_hold_what_they_say() -> None:
     """300 s of tip and tilt: 68 and 95 % within 2 percentage points."""
     scenario = SHAKEN.replace({"telescope.radial_order": 1, "run.duration": 300.0})
@@ -140,6 +142,7 @@ def test_who_names_no_observer_has_it_where_modes_are_coupled() -> None:
         assert ("kf-coupled" in parse_plan(text, Path()).observers) == has
 
 
+@pytest.mark.slow
 def test_it_keeps_the_rules_of_observers() -> None:
     check_observer(OBSERVERS["kf-coupled"], SHAKEN.replace({"run.duration": 1.5}), alone=False)
 

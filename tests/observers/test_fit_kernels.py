@@ -84,6 +84,7 @@ TOLD = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TOLD)
 def test_observers_are_told_of_what_was_found(name: str) -> None:
     """Learnt on one record, used on another."""
@@ -105,6 +106,7 @@ def test_observers_are_told_of_what_was_found(name: str) -> None:
     assert NOISE < left < 0.5 * other.y_lgs.std()
 
 
+@pytest.mark.slow
 def test_what_cannot_be_fitted_is_refused_in_one_line() -> None:
     record = drawn(AIR, 150, 1, 5)
     with pytest.raises(ValueError, match="there is no kernel to fit"):

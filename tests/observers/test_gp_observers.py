@@ -62,6 +62,7 @@ FAST = {"turbulence.wind_speed": 100.0, "turbulence.rms": 0.05, "vibration.peaks
 """Processes and noises with which a filter at rest has forgotten its start to 1e-11 after a second."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", ["as told", "matern-1/2", "matern-3/2", "matern-5/2"])
 def test_of_both_sensors_it_is_the_dense_regression_with_frames_as_means(kernel: str) -> None:
     """On 1000 measurements of the LGS and the 200 NGS frames among them, in three phases: the estimates to 1e-10 of the rms of

@@ -71,6 +71,7 @@ LGS_VARIANTS: list[dict[str, Any]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changes", LGS_VARIANTS)
 def test_lgs_filter_is_the_textbook_filter_of_six_states(changes: dict[str, Any]) -> None:
     s = scenario(changes)

@@ -97,6 +97,7 @@ def test_a_gain_of_the_lgs_for_the_vibration_is_known() -> None:
     np.testing.assert_allclose(np.sqrt(np.mean(missed**2, axis=0)), stated, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_its_bands_hold_what_they_say() -> None:
     """160 s of tip and tilt at 250 Hz: 68 and 95 % within 2 percentage points, in every phase of the frames."""
     record, ratio = simulate(LONG), LONG.sensors.exposure_ratio
@@ -112,6 +113,7 @@ def test_its_bands_hold_what_they_say() -> None:
                 assert abs(inside - share) < 0.02, (target, phase)
 
 
+@pytest.mark.slow
 def test_it_keeps_the_rules_of_observers() -> None:
     check_observer(OBSERVER, SHAKEN.replace({"run.duration": 1.5}), alone=False)
 
@@ -137,6 +139,7 @@ def test_without_the_lgs_it_goes_on_with_the_ngs() -> None:
     assert step_difference(OBSERVER, *arguments(OBSERVER, lossy, short)) <= 1e-12
 
 
+@pytest.mark.slow
 def test_with_ngs_frames_lost_it_is_as_sure_as_it_says() -> None:
     """Half of them at random, then ten in a row: errors are as stated to 10 %, whatever the number that are lost in a row up to
     four; ten in a row leave no more than a tenth above what the LGS alone do."""

@@ -91,6 +91,7 @@ def is_told(name: str, scenario: Scenario) -> bool:
         return False
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STEPS)
 def test_without_a_prior_there_is_no_design_and_one_line_says_why(name: str, subtests: pytest.Subtests) -> None:
     for preset, make in PRESETS.items():
@@ -102,6 +103,7 @@ def test_without_a_prior_there_is_no_design_and_one_line_says_why(name: str, sub
                 wfsobs.design(name, make().before_events)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in STEPS if name in ON_PAPER])
 def test_a_design_goes_on_in_another_process(name: str) -> None:
     """As it is sent there: what shares memory here is apart when it arrives."""
@@ -245,6 +247,7 @@ def test_wrong_input_is_one_line_and_takes_no_frame() -> None:
         observer.take_over(wfsobs.design("kf-lgs", PRESETS["paper"]()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STEPS)
 def test_a_state_without_numbers_is_refused_and_leaves_the_old_one(name: str) -> None:
     scenario = next(made for make in PRESETS.values() if has_prior(OBSERVERS[name], made := make()))

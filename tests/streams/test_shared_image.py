@@ -62,6 +62,7 @@ def test_one_axis_of_which_the_size_is_left_out(tmp_path: Path) -> None:
     assert SharedImage(path).n == 6
 
 
+@pytest.mark.slow
 def test_no_frame_is_half_of_one_and_half_of_another(tmp_path: Path, peer: Path) -> None:
     """A C program writes frames of equal numbers, one right after the other: what is read is one number all over."""
     path, seen = tmp_path / "fast.im.shm", set()

@@ -48,6 +48,7 @@ def test_entries_on_the_same_records_are_told_apart_where_intervals_overlap() ->
     assert first.interval is not None and third.interval is not None and first.interval[1] > third.interval[0]
 
 
+@pytest.mark.slow
 def test_of_ten_equal_entries_any_is_ranked_below_another_in_at_most_five_per_cent() -> None:
     """Without a correction for the 45 comparisons: in 66 %."""
     rng, n, unequal = np.random.default_rng(7), 150, 0

@@ -40,6 +40,7 @@ def test_what_entries_are_told_counts_as_well() -> None:
     assert of["ut4"].digest != of["late"].digest  # the records are the same, the mirror is not
 
 
+@pytest.mark.slow
 def test_fewer_seeds_are_the_first_ones_of_the_same_arena() -> None:
     few, all_ = load_arena(seeds=3), WHOLE
     assert few.digest == all_.digest and list(few.cases[0].seeds) == list(all_.cases[0].seeds)[:3]

@@ -77,6 +77,7 @@ def test_code_of_wfsobs_that_an_observer_uses_counts(monkeypatch: pytest.MonkeyP
         assert [code_version(OBSERVERS[name]) == was for name, was in zip(names, before, strict=True)] == same
 
 
+@pytest.mark.slow
 def test_what_is_told_counts_and_what_people_read_does_not() -> None:
     nothing, kf = CONTROLLERS["none"], OBSERVERS["kf-lgs"]
     assert code_version(nothing) == code_version(replace(nothing, label="Still")) != code_version(CONTROLLERS["integrator"])
