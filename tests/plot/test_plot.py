@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,8 @@ from wfsobs.cli import main
 from wfsobs.closed_loop.run import ClosedLoop, residual_rms
 from wfsobs.evaluation.error_spectra import cumulative_rms, spectra
 from wfsobs.identification.result import Identification
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.estimates import Estimate
 from wfsobs.plot.elements import BINS, save_figure, to_matplotlib
 from wfsobs.plot.looks import look
 from wfsobs.plot.paper import NUMBERS, draw_paper_figure, observers_in, samples_of
@@ -122,6 +125,8 @@ def test_both_backends_draw_every_figure_with_units(name: str, drawn: Callable[[
         assert "[" in labels or name in ("map", "nyquist"), labels
         box = one.get_tightbbox()
         assert box.x0 >= -1.0 and box.x1 <= paper.bbox.width + 1.0  # a pixel: nothing is cut off
+        label = one.yaxis.label.get_window_extent()
+        assert box.y0 >= -1.0 and max(box.y1, label.y1) <= paper.bbox.height + 1.0
     save_figure(figure, tmp_path / "figure.html")
     assert b"Bokeh" in (tmp_path / "figure.html").read_bytes()
 
@@ -259,6 +264,18 @@ def test_two_columns_have_legends_beside(result: wfsobs.Result) -> None:
     paper = to_matplotlib(result.plot.traces(), 180.0, 100.0)
     assert tuple(25.4 * paper.get_size_inches()) == pytest.approx((180.0, 100.0))
     assert all(axes.get_legend() for axes in paper.axes)
+
+
+@pytest.mark.parametrize("width", [88.0, 180.0])
+def test_a_legend_of_all_observers_has_room(width: float, result: wfsobs.Result) -> None:
+    truth = result.record.vibration
+    assert truth is not None
+    estimates = tuple(Estimate(o.id, "vibration", truth, 0.0) for o in OBSERVERS.values() if "vibration" in o.targets)
+    paper = to_matplotlib(replace(result, estimates=estimates).plot.spectra(target="vibration"), width)
+    paper.savefig(BytesIO())
+    legend, own = paper.axes[0].get_legend().get_window_extent(), paper.bbox
+    assert len(estimates) > 15 and own.y0 <= legend.y0 and legend.y1 <= own.y1 and legend.x1 <= own.x1
+    assert paper.axes[0].get_position().height * own.height / paper.dpi > 0.8  # inches: the plot keeps its height
 
 
 def test_what_cannot_be_drawn_is_one_line(result: wfsobs.Result, loop: ClosedLoop) -> None:

@@ -24,7 +24,7 @@ from wfsobs.telemetry.intake import DeclaredFormat
 @click.option(
     "--width", type=click.FloatRange(40, 400), default=88.0, show_default=True, metavar="MM", help="One column; 180 are two."
 )
-@click.option("--height", type=click.FloatRange(20, 1000), metavar="MM", help="By default 36 for each plot.")
+@click.option("--height", type=click.FloatRange(20, 1000), metavar="MM", help="By default 40 for each plot, and legends.")
 def figure(
     name: str,
     scenario: Scenario,

@@ -34,8 +34,8 @@ BINS = 500
 COLUMN, PAGE = 88.0, 180.0
 """Width of one and of two columns of a paper [mm]."""
 
-HEIGHT = 36.0
-"""Height of one plot in a file [mm]."""
+HEIGHT, LINE = 40.0, 3.3
+"""Height of one plot in a file, and of a line of its legend or a bar [mm]."""
 
 PIXELS = (900, 280)
 """Width and height of one plot by Bokeh."""
@@ -134,7 +134,7 @@ def draw_bars(rows: Sequence[Bar], of: hv.Dimension) -> hv.Rectangles:
     for i, (_, lengths, colours) in enumerate(rows):
         ends = np.cumsum([0.0, *lengths])
         boxes += [(a, i - 0.38, b, i + 0.38, colour) for a, b, colour in zip(ends[:-1], ends[1:], colours, strict=True)]
-    drawn = hv.Rectangles(boxes, [of, "row", f"end of {of.name}", "top"], "colour")
+    drawn = hv.Rectangles(boxes, [of, f"row of {of.name}", f"end of {of.name}", "top"], "colour")
     ticks = [(i, name) for i, (name, *_) in enumerate(rows)]
     looks = {"color": hv.dim("colour"), "yticks": ticks, "show_legend": False}
     return style(drawn, **looks, bokeh={"line_color": None}, matplotlib={"linewidth": 0})
@@ -151,7 +151,7 @@ def draw_marks(at: Sequence[float | None], of: hv.Dimension) -> hv.Segments:
 
 
 def _segments(lines: Sequence[tuple[float, float, float, float]], of: hv.Dimension) -> hv.Segments:
-    drawn = hv.Segments(list(lines), [of, "row", f"end of {of.name}", "top"])
+    drawn = hv.Segments(list(lines), [of, f"row of {of.name}", f"end of {of.name}", "top"])
     return style(drawn, color="black", bokeh={"line_width": 1.2}, matplotlib={"linewidth": 0.8})
 
 
@@ -159,7 +159,8 @@ def legend_of(colours: Mapping[str, str], of: hv.Dimension) -> list[hv.Curve]:
     """Draw nothing but entries of a legend, label -> colour: neither backend has any of bars."""
     nowhere = np.full(1, np.nan)
     return [
-        draw_line(nowhere, nowhere, (of, hv.Dimension("row")), Look(label, colour, width=6)) for label, colour in colours.items()
+        draw_line(nowhere, nowhere, (of, hv.Dimension(f"row of {of.name}")), Look(label, colour, width=6))
+        for label, colour in colours.items()
     ]
 
 
@@ -185,7 +186,7 @@ def save_figure(figure: Any, path: str | Path, *, width: float = COLUMN, height:
     width : float
         Width [mm]; 88 and 180 are one and two columns of a paper. HTML has its own.
     height : float
-        Height [mm]; by default 36 for each row of plots.
+        Height [mm]; by default 40 for each row of plots, and what legends and bars need.
 
     Raises
     ------
@@ -209,21 +210,30 @@ def save_figure(figure: Any, path: str | Path, *, width: float = COLUMN, height:
 def to_matplotlib(figure: Any, width: float = COLUMN, height: float = 0.0) -> Any:
     """Return a figure of Matplotlib of this width and height [mm]."""
     layout: Any = figure if isinstance(figure, hv.Layout) else stack([figure])
-    inches = width / 25.4, (height or HEIGHT * layout.shape[0]) / 25.4
+    inches = width / 25.4, HEIGHT / 25.4  # both given, so that the width stays; the height comes below
     drawn: Any = hv.renderer("matplotlib").get_plot(layout.opts(fig_inches=inches, backend="matplotlib")).state
-    drawn.set_size_inches(inches)
-    grid, above = drawn.add_gridspec(*layout.shape), None
-    for i, axes in enumerate(axes for axes in drawn.axes if axes.get_subplotspec() is not None):
-        axes.set_subplotspec(grid[i])  # of a grid that the layout below can move
+    rows, columns = layout.shape
+    above, heights = None, np.full(rows, HEIGHT)
+    every = [axes for axes in drawn.axes if axes.get_subplotspec() is not None]
+    for i, axes in enumerate(every):
         axes.set_box_aspect(None)
         axes.set_aspect("auto")
         for axis in (axes.xaxis, axes.yaxis):
             axis.label.set_size(mpl.rcParams["axes.labelsize"])
-        if (legend := axes.get_legend()) and width < PAGE:  # there is no room beside
-            legend.remove()
+        tall = LINE * (len(axes.get_yticks()) + 4) if axes.yaxis_inverted() else HEIGHT  # of bars, a line of text each
+        if (legend := axes.get_legend()) is not None:
             handles, names = axes.get_legend_handles_labels()
-            if names != above:
-                axes.legend(handles, names, loc="lower center", ncols=2, bbox_to_anchor=(0.45, 1.0), frameon=False)
-            above = names
+            if width >= PAGE:
+                tall = max(tall, LINE * (len(names) + 2))
+            else:  # there is no room beside
+                legend.remove()
+                if names != above:
+                    axes.legend(handles, names, loc="lower center", ncols=2, bbox_to_anchor=(0.45, 1.0), frameon=False)
+                    tall = max(tall, HEIGHT) + LINE * ((len(names) + 1) // 2)
+                above = names
+        heights[i // columns] = max(heights[i // columns], tall)
+    for axes, place in zip(every, drawn.add_gridspec(rows, columns, height_ratios=heights), strict=False):
+        axes.set_subplotspec(place)  # of a grid that the layout can move
+    drawn.set_size_inches(width / 25.4, (height or heights.sum()) / 25.4)
     drawn.set_layout_engine("constrained")
     return drawn

@@ -195,7 +195,7 @@ class ResultPlots:
     ) -> hv.Layout:
         name, record, figures = _one_of(self.names, mode, "mode"), self.result.record, []
         for of in self._signals(observers, target, of_error):
-            y = quantity(f"{what} {of} {name}", unit, f"{what}{' of error' if of_error else ''}, {of}, {name}")
+            y = quantity(f"{what} {of} {name}", unit, f"{what}{' of error' if of_error else ''}\n{of}, {name}")
             lines = []
             for key, x in self._signals(observers, of, False)[of].items():
                 found = spectra(record, of, x, self.result.scenario.run.warm_up, [self.names.index(name)])
@@ -240,7 +240,7 @@ class SweepPlots:
         known = self.results.known_keys()
         name = _one_of(list(dict.fromkeys(key[2] for key in known)), mode, "mode")
         _one_of(list(dict.fromkeys(key[1] for key in known)), target, "target")
-        y = quantity(f"mean rms {target} {name}", "nm", f"mean rms error of {target}, {name}")
+        y = quantity(f"mean rms {target} {name}", "nm", f"mean rms error\n{target}, {name}")
         if len(self.results.sweep.axes) == 2:
             return self._map(target, name, y)
         (axis,) = self.results.sweep.axes
@@ -252,7 +252,7 @@ class SweepPlots:
                 at, mean, low, high = points.T
                 band = hv.Spread((at, mean, mean - low, high - mean), x, [y, "below", "above"])
                 colour = look(key[0]).light
-                style(band, alpha=0.15, show_legend=False, bokeh={"color": colour}, matplotlib={"facecolor": colour})
+                style(band, alpha=0.15, color=colour, show_legend=False, bokeh={}, matplotlib={"facecolor": colour})
                 parts += [band, draw_line(at, mean, (x, y), key[0])]
         return overlay(_some(parts, f"an error of {target}"))
 
@@ -278,7 +278,7 @@ class LoopPlots:
     def residuals(self, *, controllers: Sequence[str] | None = None, mode: str | None = None) -> hv.Overlay:
         """Draw power spectral densities of what every controller left."""
         name, dt = _one_of(self.names, mode, "mode"), self.loop.record.dt
-        y, lines = quantity(f"PSD of residual {name}", "nm²/Hz", f"PSD of residual, {name}"), []
+        y, lines = quantity(f"PSD of residual {name}", "nm²/Hz", f"PSD of residual\n{name}"), []
         for it in self.loop.outcomes:
             if it.residual is not None and (controllers is None or it.controller in controllers):
                 frequency, density = psd(it.residual[round(self.loop.design.start / dt) :], dt)
@@ -304,7 +304,7 @@ class LoopPlots:
 
     def nyquist(self, *, controllers: Sequence[str] | None = None, mode: str | None = None) -> hv.Overlay:
         """Draw the loop gain of every time-invariant loop in the complex plane, around the point -1."""
-        axes = quantity("real part of loop gain", ""), quantity("imaginary part of loop gain", "")
+        axes = quantity("loop gain, real", ""), quantity("loop gain, imaginary", "")
         parts: list[Any] = []
         for key, c in self._curves(controllers, mode).items():
             gain = c.loop_gain[np.isfinite(c.loop_gain)]
