@@ -6,6 +6,7 @@ import io
 import struct
 import zlib
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -322,6 +323,26 @@ def test_what_is_refused_in_a_line(name: str, content: bytes, line: str) -> None
     with pytest.raises(RecordError) as caught:
         read_record(io.BytesIO(content), name)
     assert str(caught.value).startswith(f"{name}: {line}") and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.mat", saved(lambda file: scipy.io.savemat(file, {"s": {"y": Y[:40], "c": "x"}, "fs": 1000}))),
+        ("a.sav", sav(y_lgs=Y[:60], u=U[:60])),
+        ("a.npy", array("fields")),
+        ("a.parquet", parquet(y=Y[:50].tolist(), time=STAMPS[:50])),
+    ],
+)
+def test_a_damaged_file_is_read_or_refused(name: str, content: bytes) -> None:
+    """Whatever becomes of its bytes; libraries may end the process at some."""
+    rng = np.random.default_rng(6)
+    for _ in range(100):
+        data = bytearray(content)
+        for place in rng.integers(0, min(len(data), 4000), size=rng.integers(1, 5)):
+            data[place] = rng.integers(256)
+        with suppress(RecordError):
+            read_columns(io.BytesIO(bytes(data)), name)
 
 
 def packed_sav() -> bytes:

@@ -220,7 +220,7 @@ def test_a_huge_table(monkeypatch) -> None:
     assert f"at most {MOST_FILE / 1e6:.0f} MB are taken" in refused(bytes(MOST_FILE + 1), "a.csv")
 
 
-@pytest.mark.parametrize("data", [b"y_lgs/tip_um\xff\x80\n", "y_lgs/tip_um,u/tip_um\n1,2".encode("utf-16"), b"a,b\n\x00,1\n"])
+@pytest.mark.parametrize("data", [b"y_lgs/tip_um\xff\x80\n", b"a,b\n\x00,1\n"])
 def test_a_table_that_is_not_text(data: bytes) -> None:
     assert "is not text" in refused(data, "a.csv")
 

@@ -84,7 +84,9 @@ def written(record: Record, ending: str) -> io.BytesIO:
     return file
 
 
-@pytest.mark.parametrize("ending", [ending for ending in ENDINGS if ending != AOT])
+@pytest.mark.parametrize(
+    "ending", [pytest.param(e, marks=pytest.mark.slow) if e == ".h5" else e for e in ENDINGS if e != AOT]
+)  # a process for every file of HDF5
 @settings(max_examples=25, deadline=None)
 @given(record=records())
 @example(record=Record(np.zeros((2, 1)), np.zeros((2, 1)), 5.5734074831433874e-05))  # of 17 digits

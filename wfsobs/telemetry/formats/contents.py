@@ -115,7 +115,7 @@ class FileColumns:
         if values.dtype.names and name.count(".") < DEEPEST:
             for key in values.dtype.names:
                 self.add(f"{name}.{key}", values[key], unit)
-        elif values.dtype.kind == "O" and values.size == 1 and not isinstance(values.item(), (bool, type(None))):
+        elif values.dtype.kind == "O" and isinstance(values.item() if values.size == 1 else None, HOLDS):
             self.add(name, values.item(), unit)
         elif values.dtype.kind == "M":
             self.add(name, np.where(np.isnat(values), np.nan, values.astype("M8[ns]").astype(np.int64) * 1e-9), "s")
@@ -181,6 +181,9 @@ def is_rate(name: str) -> bool:
 
 KINDS = {"O": "objects", "b": "yes or no", "c": "complex numbers", "V": "structures too deep"}
 """Kinds of array that are not read, by numpy's letter."""
+
+HOLDS = (np.ndarray, np.number, str, bytes, float)
+"""What a cell for objects may hold."""
 
 DEEPEST = 6
 """Maximum depth of structures."""

@@ -6,11 +6,16 @@ Sizes are known before anything grows. Objects, references, links and data kept 
 from __future__ import annotations
 
 import io
+import json
+import os
 import struct
+import subprocess
+import sys
 import tempfile
 import warnings
+import zipfile
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib import import_module
 from math import prod
 from typing import IO, Any
@@ -19,6 +24,7 @@ import numpy as np
 
 from wfsobs.record import RecordError
 from wfsobs.telemetry.formats.contents import (
+    DEEPEST,
     NUMBERS,
     STAMP,
     TEXTS,
@@ -35,14 +41,24 @@ HDF5 = b"\x89HDF\r\n\x1a\n"
 USERBLOCK = 512
 """Bytes before the HDF5 of a MATLAB file of version 7.3."""
 
-WRONG = (OSError, ValueError, TypeError, LookupError, RuntimeError, MemoryError, AttributeError, ArithmeticError)
+WRONG = (OSError, ValueError, TypeError, LookupError, RuntimeError, MemoryError, AttributeError, ArithmeticError, NameError)
 """What libraries raise of a damaged file."""
+
+LONGEST_READING = 600.0
+"""Time that a file is given to be read [s]."""
 
 MOST_PARTS = 1000
 """Maximum arrays of a file."""
 
-PACKED = 15
-"""Type of a packed element of a MATLAB file."""
+MATRIX, PACKED = 14, 15
+"""Types of an element of a MATLAB file."""
+
+STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+"""Types of numbers in it -> numpy's."""
+
+STRUCT, TEXT, NUMBERS_OR_TEXT, COMPLEX = 2, 4, {4, *range(6, 16)}, 0x800
+CLASSES = {1: "cell", 2: "struct", 3: "object", 5: "sparse matrix", 16: "function", 17: "object"}
+"""Classes of its arrays, and a flag."""
 
 
 def _import(name: str, extra: str) -> Any:
@@ -56,50 +72,93 @@ def _import(name: str, extra: str) -> Any:
 
 
 def read_matlab(file: IO[bytes], most: int) -> FileColumns:
-    """Read the arrays of a MATLAB file and the fields of its structures. Raises RecordError, TooLargeError."""
+    """Read the arrays of a MATLAB file and the fields of its structures. Raises RecordError, TooLargeError.
+
+    Version 5 is read here: scipy may end the process at a damaged one.
+    """
     head = file.read(USERBLOCK + len(HDF5))
     if head.endswith(HDF5) or head.startswith(HDF5):
         return read_hdf5(file, most)
-    from scipy.io import matlab
-
-    def opened() -> Any:
-        return io.BytesIO(content)
-
     file.seek(0)
-    out = FileColumns()
+    out, content = FileColumns(), file.read(most + 1)
+    if len(content) > most:
+        raise TooLargeError(most)
     try:
-        content = _unpack_mat(file.read(most + 1), most)
-        for name, shape, kind in matlab.whosmat(opened()):
-            if kind in ("cell", "object", "opaque", "function", "sparse", "unknown") or (kind == "struct" and prod(shape) != 1):
-                out.leave(name, f"{name} is a MATLAB {kind} of shape {shape}, which is not read: save it as arrays of numbers")
-            else:
-                out.add(name, matlab.loadmat(opened(), variable_names=[name])[name])
+        if (order := {b"IM": "<", b"MI": ">"}.get(content[126:128])) is None:
+            _add_version_4(out, content)
+        else:
+            for kind, body in _elements(memoryview(content)[128:], order):
+                if kind == PACKED:
+                    unpacked = zlib.decompressobj().decompress(body, most + 1)
+                    if len(unpacked) > most:
+                        raise TooLargeError(most)
+                    kind, body = next(_elements(memoryview(unpacked), order))
+                if kind == MATRIX:
+                    _add_matrix(out, body, order, most)
+                if sum(values.nbytes for values in out.columns.values()) > most:
+                    raise TooLargeError(most)
     except RecordError:
         raise
-    except (*WRONG, matlab.MatReadError, zlib.error, struct.error):
+    except (*WRONG, StopIteration, zlib.error, struct.error):
         raise RecordError("damaged, or not a MATLAB file") from None
     return out
 
 
-def _unpack_mat(content: bytes, most: int) -> bytes:
-    """Return a MATLAB file of version 5 with no packed element: what it unpacks to is bounded here."""
-    if len(content) > most:
-        raise TooLargeError(most)
-    order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
-    if order is None:  # of version 4, which packs nothing
-        return content
-    parts, place = [content[:128]], 128
-    while place + 8 <= len(content) and len(parts) < MOST_PARTS:
+def _add_version_4(out: FileColumns, content: bytes) -> None:
+    from scipy.io import matlab
+
+    source: Any = io.BytesIO(content)
+    try:
+        if matlab.matfile_version(source)[0] != 0:  # of a version 5 that is damaged
+            raise ValueError(content[:128])
+        arrays = matlab.loadmat(source)
+    except matlab.MatReadError as error:
+        raise ValueError(str(error)) from None
+    for name, values in arrays.items():
+        if not name.startswith("__"):
+            out.add(name, values)
+
+
+def _elements(content: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
+    """Yield the type and the bytes of every element of MATLAB's version 5."""
+    place = 0
+    while place + 8 <= len(content):
         kind, size = struct.unpack_from(f"{order}II", content, place)
-        element = content[place : place + 8 + size + (-size % 8 if kind != PACKED else 0)]
-        place += len(element)
-        if kind == PACKED:
-            room = most - sum(map(len, parts))
-            element = zlib.decompressobj().decompress(element[8:], max(room, 0) + 1)
-            if len(element) > room:
-                raise TooLargeError(most)
-        parts.append(element)
-    return b"".join(parts)
+        if kind >> 16:  # small: its bytes are in the place of the size
+            yield kind & 0xFFFF, content[place + 4 : place + 4 + min(kind >> 16, 4)]
+            size = 0
+        else:
+            yield kind, content[place + 8 : place + 8 + size]
+        place += 8 + size + (-size % 8 if kind != PACKED else 0)
+
+
+def _add_matrix(out: FileColumns, body: memoryview, order: str, most: int, name: str = "") -> None:
+    """Add an array, or the fields of a structure; name : of a field, which has none of its own."""
+    parts = _elements(body, order)
+    (flags,) = struct.unpack_from(f"{order}I", next(parts)[1])
+    shape = tuple(np.frombuffer(next(parts)[1], f"{order}i4").tolist())
+    name = bytes(next(parts)[1]).decode("latin-1") or name
+    kind = flags & 0xFF
+    if kind == STRUCT and prod(shape) == 1 and name.count(".") < DEEPEST:
+        (length,) = struct.unpack_from(f"{order}i", next(parts)[1])
+        names = bytes(next(parts)[1])
+        for place, (_, field) in zip(range(0, len(names), length), parts, strict=False):
+            key = names[place : place + length].partition(b"\0")[0].decode("latin-1")
+            _add_matrix(out, field, order, most, f"{name}.{key}")
+    elif kind in NUMBERS_OR_TEXT and not flags & COMPLEX:
+        stored, data = next(parts, (1, b""))
+        if kind == TEXT:
+            out.add(
+                name, bytes(data).decode({16: "utf-8", 4: f"utf-16{'lb'[order == '>']}e", 17: "utf-16"}.get(stored, "latin-1"))
+            )
+            return
+        values = np.frombuffer(data, order + STORED[stored])
+        if values.size * 8 > most:
+            raise TooLargeError(most)
+        out.add(name, values.reshape(shape, order="F"))
+    else:
+        what = CLASSES.get(kind, "array of complex numbers")
+        out.leave(name, f"{name} is a MATLAB {what} of shape {shape}, which is not read: save it as arrays of numbers")
 
 
 def write_matlab(file: IO[bytes], arrays: Mapping[str, Array]) -> None:
@@ -115,10 +174,66 @@ def write_matlab(file: IO[bytes], arrays: Mapping[str, Array]) -> None:
 
 
 def read_hdf5(file: IO[bytes], most: int) -> FileColumns:
-    """Read the arrays of an HDF5 file under their paths, of MATLAB with the axes as it shows them. Raises RecordError."""
-    h5py = _import("h5py", "hdf5")
-    out, room, paths = FileColumns(), most, ["/"]
+    """Read the arrays of an HDF5 file under their paths, of MATLAB with the axes as it shows them. Raises RecordError.
+
+    This is done in a process of its own, since the HDF5 library may end it at a damaged file.
+    """
     file.seek(0)
+    out, content = FileColumns(), file.read(most + 1)
+    if len(content) > most:
+        raise TooLargeError(most)
+    command = [sys.executable, "-c", f"import {__name__} as of; of.send_hdf5({most})"]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    try:
+        done = subprocess.run(command, input=content, capture_output=True, timeout=LONGEST_READING, env=environment, check=True)
+        with np.load(io.BytesIO(done.stdout), allow_pickle=False) as found:
+            said = json.loads(str(found["said"]))
+            arrays = {key: found[key] for key in found}
+    except (*WRONG, subprocess.SubprocessError, zipfile.BadZipFile):
+        raise RecordError("damaged, or not an HDF5 file") from None
+    if "error" in said:
+        raise TooLargeError(most) if said["error"] == "large" else RecordError(said["error"])
+    for key, (name, unit) in said["arrays"].items():
+        out.add(name, arrays[key], unit)
+    for name, why in said["left"]:
+        out.leave(name, why)
+    return out
+
+
+class _Parts:
+    """What a file holds, on its way to another process."""
+
+    def __init__(self) -> None:
+        self.arrays: dict[str, Array] = {}
+        self.names: dict[str, tuple[str, str]] = {}
+        self.left: list[tuple[str, str]] = []
+
+    def add(self, name: str, data: object, unit: str = "") -> None:
+        self.names[key := f"a{len(self.names)}"] = name, unit
+        self.arrays[key] = np.asarray(data)
+
+    def leave(self, name: str, why: str) -> None:
+        self.left.append((name, why))
+
+
+def send_hdf5(most: int) -> None:
+    """Write what the HDF5 file on the standard input holds to the standard output, as `.npz`."""
+    parts = _Parts()
+    try:
+        _read_parts(parts, io.BytesIO(sys.stdin.buffer.read()), most)
+        said: dict[str, Any] = {"arrays": parts.names, "left": parts.left}
+    except TooLargeError:
+        said = {"error": "large"}
+    except RecordError as error:
+        said = {"error": str(error)}
+    content = io.BytesIO()
+    np.savez(content, allow_pickle=False, said=np.array(json.dumps(said)), **parts.arrays)
+    sys.stdout.buffer.write(content.getvalue())
+
+
+def _read_parts(out: _Parts, file: IO[bytes], most: int) -> None:
+    h5py = _import("h5py", "hdf5")
+    room, paths = most, ["/"]
     try:
         with h5py.File(file, "r") as source:
             for count, path in enumerate(paths):
@@ -142,10 +257,9 @@ def read_hdf5(file: IO[bytes], most: int) -> FileColumns:
         raise
     except WRONG:
         raise RecordError("damaged, or not an HDF5 file") from None
-    return out
 
 
-def _add_attributes(out: FileColumns, item: Any) -> None:
+def _add_attributes(out: _Parts, item: Any) -> None:
     """Add the numbers and texts of a record, or its rate, among the attributes of a group or of an array."""
     for key in item.attrs:
         is_text = key.lower() in TEXTS and item.name == "/"
@@ -153,13 +267,15 @@ def _add_attributes(out: FileColumns, item: Any) -> None:
             out.add(key, item.attrs[key])
 
 
-def _add_dataset(out: FileColumns, name: str, item: Any, is_plain: bool) -> None:
+def _add_dataset(out: _Parts, name: str, item: Any, is_plain: bool) -> None:
     if item.external or item.is_virtual:
         out.leave(name, f"{name} lies in another file, which is not opened")
     elif item.shape is None or not is_plain:
         out.leave(name, f"{name} holds objects or references, not numbers")
     else:
         values, of_matlab = item[()], _text(item.attrs.get("MATLAB_class", ""))
+        if item.dtype.hasobject:
+            values = _text(np.ravel(values)[0])
         if of_matlab == "char":
             values = "".join(map(chr, np.transpose(values).ravel().tolist()))
         out.add(name, np.transpose(values) if of_matlab else values, _text(item.attrs.get("units", item.attrs.get("unit", ""))))
@@ -186,22 +302,22 @@ def read_sav(file: IO[bytes], most: int) -> FileColumns:
     """Read the variables of an IDL save file and the fields of its structures. Raises RecordError, TooLargeError."""
     from scipy.io import readsav
 
-    out, content, found = FileColumns(), file.read(most + 1), None
+    out, content, is_whole = FileColumns(), file.read(most + 1), False
     with warnings.catch_warnings(), tempfile.NamedTemporaryFile() as copy:
         warnings.simplefilter("ignore")
         try:
             _check_sav(content, most)
             copy.write(content)
             copy.flush()
-            found = readsav(copy.name, python_dict=True)
+            for name, values in readsav(copy.name, python_dict=True).items():
+                out.add(name, values)
+            is_whole = True
         except RecordError:
             raise
         except Exception:  # scipy raises bare ones
             pass
-    if found is None:  # here, for scipy leaves the file open to its traceback
+    if not is_whole:  # here, for scipy leaves the file open to its traceback
         raise RecordError("damaged, or not a save file of IDL")
-    for name, values in found.items():
-        out.add(name, values)
     return out
 
 

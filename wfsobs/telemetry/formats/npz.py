@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -16,7 +17,17 @@ from wfsobs.telemetry.formats.contents import NAMES, FileColumns, TooLargeError
 from wfsobs.typing import Array
 
 DAMAGED = "damaged, or holds more than plain arrays"
-DAMAGES = (ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError, RuntimeError, NotImplementedError, MemoryError)
+DAMAGES = (
+    ValueError,
+    EOFError,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+    KeyError,
+    RuntimeError,
+    NotImplementedError,
+    MemoryError,
+)
 LARGE, PACKED = 100_000_000, 200
 """Bytes from which arrays are not unpacked where they are packed in so many times less: those of noise hardly shrink."""
 
