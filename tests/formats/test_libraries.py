@@ -59,6 +59,18 @@ def matlab(**arrays: Any) -> bytes:
     return saved(lambda file: scipy.io.savemat(file, arrays, do_compression=True))
 
 
+def with_object(content: bytes) -> bytes:
+    """Return a MATLAB file with an object, such as a string of today, and the unnamed array that it is made of."""
+
+    def element(kind: int, data: bytes) -> bytes:
+        return struct.pack("<II", kind, len(data)) + data + b"\0" * (-len(data) % 8)
+
+    flags = [element(6, struct.pack("<II", of, 0)) for of in (17, 9)]
+    names = b"".join(element(1, word) for word in (b"night", b"MCOS", b"string"))
+    unnamed = flags[1] + element(5, struct.pack("<ii", 1, 8)) + element(1, b"") + element(2, bytes(8))
+    return content + element(14, flags[0] + names) + element(14, unnamed)
+
+
 def hdf5(fill: Callable[[h5py.File], Any], userblock: int = 0) -> bytes:
     def write(file: io.BytesIO) -> None:
         with h5py.File(file, "w", userblock_size=userblock) as f:
@@ -137,6 +149,7 @@ NM, KHZ = {"unit": "nm"}, {"unit": "nm", "rate": 1000.0}
 
 CASES: list[tuple[str, bytes, dict[str, Any], str]] = [
     ("a.mat", matlab(**OWN, delay=2), {}, "unit nm"),
+    ("a.mat", with_object(matlab(**OWN)), {}, "unit nm, column night not used"),
     ("a.mat", matlab(y_lgs=Y.T, u=U.T, time=1e-3 * STEPS), NM, "unit nm, y_lgs and u with a row per mode"),
     ("a.mat", matlab(d={"s": Y, "c": U, "fs": 1000}), NM | {"columns": {"y_lgs": "d.s", "u": "d.c"}}, "unit nm, 1000 Hz by d.fs"),
     ("a.mat", hdf5(of_matlab_73, 512), NM, "unit nm, y_lgs and u with a row per mode"),
@@ -302,8 +315,8 @@ CELLS[:] = [Y, U]
 @pytest.mark.parametrize(
     ("name", "content", "line"),
     [
-        ("a.mat", matlab(y_lgs=CELLS, u=U), "y_lgs is a MATLAB cell of shape (1, 2), which is not read"),
-        ("a.mat", matlab(y_lgs=np.rec.fromarrays([[1, 2]], names="a"), u=U), "y_lgs is a MATLAB struct of shape (1, 2), which"),
+        ("a.mat", matlab(y_lgs=CELLS, u=U), "y_lgs is a MATLAB cell, which is not read"),
+        ("a.mat", matlab(y_lgs=np.rec.fromarrays([[1, 2]], names="a"), u=U), "y_lgs is a MATLAB struct, which is not read"),
         ("a.mat", b"MATLAB 5.0 MAT-file" + bytes(9), "damaged, or not a MATLAB file"),
         ("a.h5", hdf5(referring), "y_lgs holds objects or references, not numbers"),
         ("a.h5", hdf5(linked(h5py.ExternalLink("other.h5", "/y"))), "y_lgs is a link, which is not followed"),

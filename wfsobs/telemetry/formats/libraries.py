@@ -56,8 +56,8 @@ MATRIX, PACKED = 14, 15
 STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 """Types of numbers in it -> numpy's."""
 
-STRUCT, TEXT, NUMBERS_OR_TEXT, COMPLEX = 2, 4, {4, *range(6, 16)}, 0x800
-CLASSES = {1: "cell", 2: "struct", 3: "object", 5: "sparse matrix", 16: "function", 17: "object"}
+STRUCT, TEXT, NUMBERS_OR_TEXT, OBJECT, COMPLEX = 2, 4, {4, *range(6, 16)}, 17, 0x800
+CLASSES = {1: "cell", 2: "struct", 3: "object", 5: "sparse matrix", 16: "function", OBJECT: "object"}
 """Classes of its arrays, and a flag."""
 
 
@@ -136,9 +136,11 @@ def _add_matrix(out: FileColumns, body: memoryview, order: str, most: int, name:
     """Add an array, or the fields of a structure; name : of a field, which has none of its own."""
     parts = _elements(body, order)
     (flags,) = struct.unpack_from(f"{order}I", next(parts)[1])
-    shape = tuple(np.frombuffer(next(parts)[1], f"{order}i4").tolist())
-    name = bytes(next(parts)[1]).decode("latin-1") or name
     kind = flags & 0xFF
+    shape = () if kind == OBJECT else tuple(np.frombuffer(next(parts)[1], f"{order}i4").tolist())
+    name = bytes(next(parts)[1]).decode("latin-1") or name
+    if not name:  # what its objects are made of
+        return
     if kind == STRUCT and prod(shape) == 1 and name.count(".") < DEEPEST:
         (length,) = struct.unpack_from(f"{order}i", next(parts)[1])
         names = bytes(next(parts)[1])
@@ -158,7 +160,7 @@ def _add_matrix(out: FileColumns, body: memoryview, order: str, most: int, name:
         out.add(name, values.reshape(shape, order="F"))
     else:
         what = CLASSES.get(kind, "array of complex numbers")
-        out.leave(name, f"{name} is a MATLAB {what} of shape {shape}, which is not read: save it as arrays of numbers")
+        out.leave(name, f"{name} is a MATLAB {what}, which is not read: save it as arrays of numbers")
 
 
 def write_matlab(file: IO[bytes], arrays: Mapping[str, Array]) -> None:
