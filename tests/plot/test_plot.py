@@ -255,6 +255,11 @@ def test_the_command_draws_from_a_record_of_ones_own(tmp_path: Path, monkeypatch
     done = CliRunner().invoke(main, ["figure", "paper-5", "--record", "own.npz", "--out", "own.pdf"])
     assert done.exit_code == 0, done.output
     assert Path("own.pdf").read_bytes().startswith(b"%PDF")
+    bare = np.load("own.npz")
+    np.savez("bare.npz", y_lgs=bare["y_lgs"], u=bare["u"], dt=bare["dt"])  # no open loop, NGS, training or truth
+    for name in NUMBERS:
+        done = CliRunner().invoke(main, ["figure", name, "--record", "bare.npz", "--out", f"{name}.pdf"])
+        assert (done.exit_code, "left out" in done.output) == (0, True), done.output
     for out, why in (("own.doc", "is written as"), ("nowhere/own.pdf", "No such file")):
         refused = CliRunner().invoke(main, ["figure", "paper-5", "--out", out, *ARGUMENTS])
         assert refused.exit_code == 2 and why in refused.output and "Traceback" not in refused.output
@@ -282,6 +287,8 @@ def test_what_cannot_be_drawn_is_one_line(result: wfsobs.Result, loop: ClosedLoo
     for draw, why in (
         (lambda: result.plot.traces(mode="focus"), "mode 'focus': there are tip, tilt"),
         (lambda: result.plot.spectra(target="noise"), "target 'noise': there are turbulence, vibration"),
+        (lambda: result.plot.traces(observers=["kf"]), "observer 'kf': there are kf-lgs, "),
+        (lambda: result.plot.traces(observers=["gpr-online"], target="turbulence", of_error=True), "no estimate of turbulence"),
         (lambda: loop.plot.rejection(controllers=["none"]), "nothing to draw"),
     ):
         with pytest.raises(ValueError, match=why):

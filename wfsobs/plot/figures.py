@@ -138,8 +138,8 @@ class ResultPlots:
 
     def errors(self, *, observers: Sequence[str] | None = None, target: str | None = None, mode: str | None = None) -> hv.Layout:
         """Draw the errors of the table as bars, the least on top, each with its 95 % interval; limits among them."""
-        name = _one_of(self.names, mode, "mode")
-        figures = []
+        name, figures = _one_of(self.names, mode, "mode"), []
+        self._check(observers)
         for of in dict.fromkeys(s.target for s in self.result.scores):
             rows = [s for s in self.result.scores if (s.target, s.mode) == (of, name)]
             rows = sorted((s for s in rows if observers is None or s.observer in observers), key=lambda s: s.rms)
@@ -156,6 +156,7 @@ class ResultPlots:
         Those that are not linear have one only where they are named in `observers`. Raises ValueError where there is none.
         """
         name, figures = _one_of(self.names, mode, "mode"), []
+        self._check(observers)
         found = [it for it in error_budget(self.result, observers=observers, mode=name) if it.terms]
         for of in dict.fromkeys(it.target for it in found):
             rows = sorted((it for it in found if it.target == of), key=lambda it: it.total)
@@ -171,6 +172,7 @@ class ResultPlots:
     def _signals(self, observers: Sequence[str] | None, target: str | None, of_error: bool) -> dict[str, dict[str, Array]]:
         """Return target -> what is drawn of it -> (n_steps, n_modes) [um]: the truth, last and so on top, where there is one."""
         out: dict[str, dict[str, Array]] = {}
+        self._check(observers)
         for of in TARGETS if target is None else (_one_of(TARGETS, target, "target"),):
             truth = self.result.record.truth(of)
             own = {e.observer: e.values for e in self.result.estimates if e.target == of and e.observer != NO_ESTIMATE}
@@ -181,7 +183,15 @@ class ResultPlots:
                 out[of] = {key: x - truth for key, x in own.items()}
             else:
                 out[of] = own if truth is None else {**own, TRUTH: truth}
+        if not any(out.values()):
+            raise ValueError(f"nothing to draw: there is no estimate of {target or 'any target'}")
         return {of: signals for of, signals in out.items() if signals}
+
+    def _check(self, observers: Sequence[str] | None) -> None:
+        """Raise ValueError for an observer that has neither an estimate nor a score."""
+        known = list(dict.fromkeys([e.observer for e in self.result.estimates] + [s.observer for s in self.result.scores]))
+        for name in observers or ():
+            _one_of(known, name, "observer")
 
     def _of_frequency(
         self,

@@ -126,7 +126,7 @@ def observers_in(name: str) -> tuple[str, ...]:
 
 
 def draw_paper_figure(name: str, result: Result) -> hv.Layout:
-    """Draw a figure of the paper from a result; without a truth there is no reference.
+    """Draw a figure of the paper from a result: what it has estimates for, with a reference where it has a truth.
 
     Parameters
     ----------
@@ -148,8 +148,10 @@ def draw_paper_figure(name: str, result: Result) -> hv.Layout:
     """
     from wfsobs.plot.elements import stack
 
-    figures = [_draw_plot(it, plot, result) for it in NUMBERS[name] for plot in it.plots]
-    return stack(figures)
+    known = [it for it in NUMBERS[name] if any(result.estimate(observer, it.target) for observer in it.observers)]
+    if not known:
+        raise RecordError(f"{name}: the record allows no estimate of {', '.join(observers_in(name))}")
+    return stack([_draw_plot(it, plot, result) for it in known for plot in it.plots])
 
 
 def _draw_plot(of: PaperFigure, plot: Plot, result: Result) -> hv.Overlay:
@@ -157,8 +159,6 @@ def _draw_plot(of: PaperFigure, plot: Plot, result: Result) -> hv.Overlay:
 
     record, warm_up, mode = result.record, result.scenario.run.warm_up, TIP_TILT[plot.column].name
     values = {name: it.values for name in of.observers if (it := result.estimate(name, of.target))}
-    if not values:
-        raise RecordError(f"figure {of.number}: the record allows no estimate of {', '.join(of.observers)}")
     if (truth := record.truth(of.target)) is not None:
         values[TRUTH] = truth
     label, unit = (f"PSD, {mode}", "µm²/Hz") if plot.what == SPECTRUM else (f"{of.target}, {mode}", "µm")
