@@ -30,20 +30,7 @@ def given_options(scenario: Scenario, preset: str, file: str) -> list[str]:
 
 def stated_options(source: LoadedRecord) -> list[str]:
     """List what the user stated about a file, and what tells the file from others."""
-    stated = source.declaration
-    sign = None if stated.command_sign is None else f"{stated.command_sign:+d}"
-    named = {
-        "unit": stated.unit,
-        "command-sign": sign,
-        "command-delay": stated.command_delay,
-        "command-gain": stated.command_gain and ",".join(map(str, stated.command_gain)),
-        "rail": stated.rail,
-        "rate": stated.rate,
-        "sha256": source.sha256 or None,
-    }
-    words = [word for name, value in named.items() if value is not None for word in (f"--{name}", str(value))]
-    words += ["--trust"] * stated.trust + ["--open-loop"] * stated.open_loop
-    return words + [word for role, name in stated.columns.items() for word in ("--column", f"{role}={name}")]
+    return source.declaration.options({"sha256": source.sha256} if source.sha256 else {})
 
 
 def record_code(source: LoadedRecord) -> str:

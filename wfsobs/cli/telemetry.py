@@ -1,11 +1,14 @@
-"""`wfsobs observe`, `wfsobs identify` and `wfsobs convert`: work on a record."""
+"""`wfsobs check`, `wfsobs convert`, `wfsobs identify` and `wfsobs observe`: work on a record."""
 
 from __future__ import annotations
 
 import json
+import shlex
+from dataclasses import asdict
 
 import click
 from rich.table import Table
+from rich.text import Text
 
 from wfsobs.cli.options import (
     load_declared,
@@ -21,6 +24,7 @@ from wfsobs.evaluation.rows import score_rows
 from wfsobs.files import check_writable, write_whole
 from wfsobs.identification import identify as identify_record
 from wfsobs.identification import report as identified
+from wfsobs.identification.check import Check, check_record
 from wfsobs.identification.identification import LEVEL
 from wfsobs.identification.process import Number
 from wfsobs.identification.report import format_number, mode_rows
@@ -28,10 +32,12 @@ from wfsobs.identification.result import Identification
 from wfsobs.pipeline import as_stated
 from wfsobs.pipeline import observe as observe_record
 from wfsobs.progress import Watch
+from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.spectral.search import LOWEST
-from wfsobs.telemetry.intake import DeclaredFormat
-from wfsobs.telemetry.records import load_record, name_differences, save_arrays, save_record
+from wfsobs.telemetry.intake import DeclaredFormat, to_record
+from wfsobs.telemetry.preview import read_off
+from wfsobs.telemetry.records import load_record, name_differences, open_record, read_contents, save_arrays, save_record
 
 
 @click.command()
@@ -161,3 +167,50 @@ def identify(
     show_table(identification_table(result))
     for line in identified.whiteness_lines(result):
         click.echo(line)
+
+
+COLOURS = {"ok": "green", "note": "yellow", "undecided": "yellow", "excluded": "red"}
+
+
+@click.command()
+@click.argument("record_file", metavar="RECORD")
+@scenario_options
+@record_options
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+def check(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None, as_json: bool) -> None:
+    """Say what a record is, and whether its commands and an identification of it can be relied on (docs/data.md)."""
+    with open_record(record_file, sha256) as (file, name):
+        try:
+            contents = read_contents(file, name, declaration.columns)
+            record = to_record(contents, scenario, declaration)
+        except RecordError as error:
+            raise RecordError(f"{record_file}: {error}") from None
+    reading = read_off(record, contents, declaration, scenario)
+    with progress_bar("sweeps") as update:
+        result = check_record(record, reading, Watch(progress=update))
+    command = shlex.join(["wfsobs", "identify", record_file, *declaration.options(result.corrections)])
+    if as_json:
+        found = {
+            "steps": record.n_steps,
+            "rate": 1.0 / record.dt,
+            "missing": record.missing,
+            "read_as": record.origin,
+            "findings": [asdict(f) for f in result.findings],
+            "identification": result.identification and identified.identification_dict(result.identification),
+            "trusted": result.trusted,
+            "next": command,
+        }
+        click.echo(json.dumps(found, allow_nan=False))
+        return
+    show_table(check_table(result, record_file))
+    click.echo(f"{result.summary} Go on with:\n  {command}")
+
+
+def check_table(result: Check, name: str) -> Table:
+    """Return the findings of a check, a row each."""
+    out = Table(title=name, title_justify="left", show_edge=False)
+    for column in ("", "What", "Found"):
+        out.add_column(column, no_wrap=column == "")
+    for f in result.findings:
+        out.add_row(Text(f.verdict, COLOURS[f.verdict]), f.subject, Text(f.text))
+    return out

@@ -173,6 +173,20 @@ class DeclaredFormat:
     rail: float | None = None
     open_loop: bool = False
 
+    def options(self, corrections: Mapping[str, str] | None = None) -> list[str]:
+        """List the options of the command line that state this, with corrections by the names of options."""
+        named = {
+            "unit": self.unit,
+            "command-sign": None if self.command_sign is None else f"{self.command_sign:+d}",
+            "command-delay": self.command_delay,
+            "command-gain": self.command_gain and ",".join(map(str, self.command_gain)),
+            "rail": self.rail,
+            "rate": self.rate,
+        } | dict(corrections or {})
+        words = [word for name, value in named.items() if value is not None for word in (f"--{name}", str(value))]
+        words += ["--trust"] * self.trust + ["--open-loop"] * self.open_loop
+        return words + [word for role, name in self.columns.items() for word in ("--column", f"{role}={name}")]
+
 
 def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredFormat) -> Record:
     """Return the record of a file's contents. Raises RecordError with one line naming what, where and what is expected."""

@@ -229,11 +229,13 @@ def preview(data: bytes, name: str, scenario: Scenario | None = None, declaratio
     signals = {"y_lgs": record.y_lgs, "u": record.u, "z": (z := record.z[record.delay :])}.items()
     values = {key: tuple(rms(column[~np.isnan(column)]) for column in signal.T) for key, signal in signals}
     frequency, spectrum = psd(hold_last(z), record.dt)
-    return Preview(record, shown, values, frequency, spectrum, _read_off(record, contents, stated, scenario, max(values["z"])))
+    return Preview(record, shown, values, frequency, spectrum, read_off(record, contents, stated, scenario))
 
 
-def _read_off(record: Record, contents: Contents, declaration: DeclaredFormat, scenario: Scenario, size: float) -> Reading:
-    """Return what the data say of sign, delay and unit; size : rms of z, as read [um]."""
+def read_off(record: Record, contents: Contents, declaration: DeclaredFormat, scenario: Scenario) -> Reading:
+    """Return what the data say of sign, delay and unit of a record and the contents of its file."""
+    z = record.z[record.delay :]
+    size = max(rms(column[~np.isnan(column)]) for column in z.T)
     sign, known = stated_sign(contents, declaration), declaration.unit or contents.units or "unit" in contents.arrays
     response, excluded = command_response(replace(record, u=sign * record.u)), contradiction_of(record, contents, declaration)
     units = {} if known else {unit: size * micrometres_per(unit, scenario.telescope.diameter) for unit in UNITS}

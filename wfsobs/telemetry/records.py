@@ -10,7 +10,8 @@ from __future__ import annotations
 import hashlib
 import io
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import IO
@@ -167,6 +168,16 @@ def load_record(
 
     sha256 : of the file, in hexadecimal digits; another file is refused
     """
+    with open_record(path, sha256) as (file, name):
+        return read_record(file, name, scenario, declaration)
+
+
+@contextmanager
+def open_record(path: str | Path, sha256: str | None = None) -> Iterator[tuple[IO[bytes], str]]:
+    """Open a file, or a folder of arrays, whose SHA-256 is this one; yield it and the name whose ending gives the format.
+
+    Raises RecordError, also where it cannot be read later.
+    """
     try:
         folder = Path(path).is_dir()
         with _open_folder(Path(path)) if folder else open(path, "rb") as file:
@@ -175,7 +186,7 @@ def load_record(
                 if found != sha256.lower():
                     raise RecordError(f"{path}: is another file: its SHA-256 is {found}, not {sha256[:64]}")
                 file.seek(0)
-            return read_record(file, f"{path}.npz" if folder else str(path), scenario, declaration)
+            yield file, f"{path}.npz" if folder else str(path)
     except OSError as error:
         raise RecordError(f"{path}: cannot be read: {error.strerror or error}") from None
 

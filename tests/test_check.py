@@ -1,0 +1,106 @@
+"""What `wfsobs check` finds in records whose faults are known."""
+
+from __future__ import annotations
+
+import json
+from math import pi
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy.stats import binom
+
+from wfsobs import PRESETS, simulate
+from wfsobs.cli import main
+from wfsobs.identification.check import LEVEL, find_changes
+from wfsobs.record import Record
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.telemetry.records import save_record
+from wfsobs.typing import Array
+
+DT = 1e-3
+
+
+def disturbance(n: int, rng: np.random.Generator) -> Array:
+    """Turbulence, a narrow and a broad resonance in white noise (n,)."""
+    processes = (Ar2(2.0 * pi * 0.5, 0.9, 30.0, DT), Ar2(2.0 * pi * 47.0, 0.002, 10.0, DT), Ar2(2.0 * pi * 18.0, 0.05, 3.0, DT))
+    return rng.standard_normal(n) + sum(p.sample(n, rng) for p in processes)
+
+
+def test_a_stationary_record_has_no_changes() -> None:
+    """In no more records than the level says: at most as many as binomial chance allows once in 10^4."""
+    rng, count = np.random.default_rng(5), 300
+    found = sum(bool(find_changes(disturbance(8000, rng), DT)) for _ in range(count))
+    assert found <= binom.isf(1e-4, count, LEVEL)
+
+
+@pytest.mark.parametrize("section", [0, 3, 7])
+def test_a_vibration_that_comes_for_a_while_is_found_where_it_is(section: int) -> None:
+    rng = np.random.default_rng(section)
+    z = disturbance(8000, rng)
+    z[1000 * section : 1000 * (section + 1)] += 5.0 * np.sin(2.0 * pi * 150.0 * DT * np.arange(1000))
+    # 12.5 of power beside that of white noise of one in 128 of 500 Hz
+    ((low, high, where, ratio),) = find_changes(z, DT)
+    assert (low, high, where) == (128.0, 256.0, section)
+    assert ratio == pytest.approx(1.0 + 12.5 / 0.256, rel=0.15)  # 128 bins: 9 % and their mean
+
+
+@pytest.fixture(scope="module")
+def record() -> Record:
+    return simulate(PRESETS["paper"]().replace({"run.duration": 10.0, "sensors.lgs_low_frequency_rms": 0.0}))
+
+
+def checked(tmp_path: Path, record: Record, *options: str) -> dict[str, Any]:
+    file = tmp_path / "r.npz"
+    save_record(file, record)
+    done = CliRunner().invoke(main, ["check", str(file), "--json", *options])
+    assert done.exit_code == 0, done.output
+    return json.loads(done.stdout)
+
+
+def verdicts(found: dict[str, Any]) -> dict[str, str]:
+    return {f["subject"]: f["verdict"] for f in found["findings"]}
+
+
+def test_a_right_record_can_be_relied_on(tmp_path: Path, record: Record) -> None:
+    found = checked(tmp_path, record)
+    assert found["trusted"]
+    assert not {"note", "excluded"} & set(verdicts(found).values())
+    assert (found["steps"], found["rate"], found["missing"]) == (record.n_steps, pytest.approx(1000.0), 0)
+    assert found["next"] == f"wfsobs identify {tmp_path / 'r.npz'}"
+
+
+def test_a_wrong_sign_is_excluded_and_put_right_by_the_next_command(tmp_path: Path, record: Record) -> None:
+    file, data = tmp_path / "r.npz", {"y_lgs": record.y_lgs, "u": -record.u, "dt": np.array(record.dt), "unit": np.array("um")}
+    np.savez(file, allow_pickle=False, **data)
+    done = CliRunner().invoke(main, ["check", str(file), "--json"])
+    found = json.loads(done.stdout)
+    assert not found["trusted"]
+    assert verdicts(found)["commands"] == "excluded"
+    assert found["next"].endswith("--command-sign -1")
+    again = json.loads(CliRunner().invoke(main, ["check", *found["next"].split()[2:], "--json"]).stdout)
+    assert again["trusted"]
+
+
+def test_faults_are_named(tmp_path: Path, record: Record) -> None:
+    """Lost frames, a level of outliers and a change of the disturbance."""
+    rng = np.random.default_rng(3)
+    y = record.y_lgs.copy()
+    y[rng.choice(len(y), 200, replace=False)] = np.nan
+    late = slice(len(y) // 2, None)
+    y[late] += 0.05 * np.sin(2.0 * pi * 200.0 * record.dt * np.arange(len(y)))[late, None]
+    y[rng.choice(len(y), 120, replace=False), 0] += 1.5
+    found = checked(tmp_path, Record(y, record.u, record.dt, delay=record.delay))
+    assert not found["trusted"]
+    seen = verdicts(found)
+    assert (seen["frames"], seen["stationarity"], seen["outlying samples"]) == ("note", "note", "note")
+
+
+def test_too_little_is_said(tmp_path: Path, record: Record) -> None:
+    short = Record(record.y_lgs[:300], record.u[:300], record.dt, delay=record.delay)
+    seen = verdicts(checked(tmp_path, short))
+    assert (seen["commands"], seen["stationarity"], seen["identification"]) == ("undecided", "undecided", "excluded")
+    done = CliRunner().invoke(main, ["check", str(tmp_path / "no.npz")])
+    assert (done.exit_code, done.output.count("\n")) == (2, 1)
