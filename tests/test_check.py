@@ -66,7 +66,7 @@ def verdicts(found: dict[str, Any]) -> dict[str, str]:
 
 def test_a_right_record_can_be_relied_on(tmp_path: Path, record: Record) -> None:
     found = checked(tmp_path, record)
-    assert found["trusted"]
+    assert found["reliable"]
     assert not {"note", "excluded"} & set(verdicts(found).values())
     assert (found["steps"], found["rate"], found["missing"]) == (record.n_steps, pytest.approx(1000.0), 0)
     assert found["next"] == f"wfsobs identify {tmp_path / 'r.npz'}"
@@ -77,11 +77,11 @@ def test_a_wrong_sign_is_excluded_and_put_right_by_the_next_command(tmp_path: Pa
     np.savez(file, allow_pickle=False, **data)
     done = CliRunner().invoke(main, ["check", str(file), "--json"])
     found = json.loads(done.stdout)
-    assert not found["trusted"]
+    assert not found["reliable"]
     assert verdicts(found)["commands"] == "excluded"
     assert found["next"].endswith("--command-sign -1")
     again = json.loads(CliRunner().invoke(main, ["check", *found["next"].split()[2:], "--json"]).stdout)
-    assert again["trusted"]
+    assert again["reliable"]
 
 
 def test_faults_are_named(tmp_path: Path, record: Record) -> None:
@@ -93,7 +93,7 @@ def test_faults_are_named(tmp_path: Path, record: Record) -> None:
     y[late] += 0.05 * np.sin(2.0 * pi * 200.0 * record.dt * np.arange(len(y)))[late, None]
     y[rng.choice(len(y), 120, replace=False), 0] += 1.5
     found = checked(tmp_path, Record(y, record.u, record.dt, delay=record.delay))
-    assert not found["trusted"]
+    assert not found["reliable"]
     seen = verdicts(found)
     assert (seen["frames"], seen["stationarity"], seen["outlying samples"]) == ("note", "note", "note")
 

@@ -197,7 +197,7 @@ def check(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha
             "read_as": record.origin,
             "findings": [asdict(f) for f in result.findings],
             "identification": result.identification and identified.identification_dict(result.identification),
-            "trusted": result.trusted,
+            "reliable": result.is_reliable,
             "next": command,
         }
         click.echo(json.dumps(found, allow_nan=False))

@@ -42,7 +42,7 @@ Verdict = Literal["ok", "note", "undecided", "excluded"]
 
 
 @dataclass(frozen=True)
-class Finding:
+class Remark:
     """One thing that was looked at.
 
     Attributes
@@ -66,7 +66,7 @@ class Check:
 
     Attributes
     ----------
-    findings : tuple of Finding
+    findings : tuple of Remark
         In the order in which they matter: what comes first decides on what follows.
     identification : Identification or None
         Model of the record, None where it could not be identified.
@@ -74,19 +74,19 @@ class Check:
         Option of the command line -> value with which to read it again; empty where it is read as the data say.
     """
 
-    findings: tuple[Finding, ...]
+    findings: tuple[Remark, ...]
     identification: Identification | None
     corrections: Mapping[str, str]
 
     @property
-    def trusted(self) -> bool:
+    def is_reliable(self) -> bool:
         """Whether an identification of the record can be relied on, if what the data do not decide is as stated."""
         return self.identification is not None and not any(f.verdict in ("note", "excluded") for f in self.findings)
 
     @property
     def summary(self) -> str:
-        """What `trusted` says, as a sentence."""
-        if not self.trusted:
+        """What `is_reliable` says, as a sentence."""
+        if not self.is_reliable:
             return "An identification of it is to be taken with care."
         undecided = [f.subject for f in self.findings if f.verdict == "undecided"]
         given = f", if its {' and '.join(undecided)} {'are' if len(undecided) > 1 else 'is'} as stated" if undecided else ""
@@ -120,59 +120,59 @@ def check_record(record: Record, reading: Reading, watch: Watch = QUIET) -> Chec
     try:
         result = identify(record, watch=watch)
     except RecordError as error:
-        findings.append(Finding("identification", "excluded", str(error)))
+        findings.append(Remark("identification", "excluded", str(error)))
     else:
         findings += _residual(result)
     return Check(tuple(findings), result, _corrections(record, reading))
 
 
-def _frames(record: Record) -> Iterator[Finding]:
+def _frames(record: Record) -> Iterator[Remark]:
     n = record.n_steps
     share = record.missing / n
     text = f"{n} at {1.0 / record.dt:.6g} Hz, {n * record.dt:.4g} s; {record.missing} missing ({100.0 * share:.2g} %)"
-    yield Finding("frames", "note" if share > OUTLYING else "ok", text)
+    yield Remark("frames", "note" if share > OUTLYING else "ok", text)
     if record.origin:
-        yield Finding("read as", "ok", record.origin)
+        yield Remark("read as", "ok", record.origin)
 
 
-def _unit(reading: Reading) -> Iterator[Finding]:
+def _unit(reading: Reading) -> Iterator[Remark]:
     if reading.units == {}:
         return
     ways = " or ".join(f"{unit} ({1e3 * rms:.3g} nm rms of z)" for unit, rms in reading.units.items())
     sure = set(reading.units) == {"um"}
-    yield Finding("unit", "ok" if sure else "undecided", f"not in the file, taken for um; plausible are {ways}")
+    yield Remark("unit", "ok" if sure else "undecided", f"not in the file, taken for um; plausible are {ways}")
 
 
-def _commands(record: Record, reading: Reading) -> Iterator[Finding]:
+def _commands(record: Record, reading: Reading) -> Iterator[Remark]:
     response = reading.response
     if response is None:
-        yield Finding("commands", "undecided", "sign and delay not identifiable: too few steps, or commands that do not move")
+        yield Remark("commands", "undecided", "sign and delay not identifiable: too few steps, or commands that do not move")
     else:
         looked_at = (("sign", response.sign, reading.sign), ("delay", response.delay, record.delay))
         for (subject, found, stated), text in zip(looked_at, response.lines(), strict=False):
             other = f"; {stated} is stated" if found not in (None, stated) else ""
             verdict = "undecided" if found is None else "note" if other else "ok"
-            yield Finding(f"command {subject}", verdict, text.removeprefix(f"{subject} ") + other)
+            yield Remark(f"command {subject}", verdict, text.removeprefix(f"{subject} ") + other)
     if reading.contradiction:
-        yield Finding("commands", "excluded", reading.contradiction)
+        yield Remark("commands", "excluded", reading.contradiction)
     for line in reading.limits:
-        yield Finding("mirror", "note", line)
+        yield Remark("mirror", "note", line)
 
 
-def _stationarity(record: Record) -> Iterator[Finding]:
+def _stationarity(record: Record) -> Iterator[Remark]:
     names = [mode.name for mode in modes_up_to(HIGHEST_ORDER)]
     z = hold_last(record.z[record.delay :])
     length = len(z) // SECTIONS
     if length < 8 * FEWEST_BINS:
-        yield Finding("stationarity", "undecided", f"{record.n_steps} frames are too few to compare {SECTIONS} sections")
+        yield Remark("stationarity", "undecided", f"{record.n_steps} frames are too few to compare {SECTIONS} sections")
         return
     changes = [(name, *change) for name, column in zip(names, z.T, strict=False) for change in find_changes(column, record.dt)]
     for name, low, high, section, ratio in changes:
         start, end = section * length * record.dt, (section + 1) * length * record.dt
         where = f"{name}, {low:.3g} to {high:.3g} Hz: from {start:.3g} to {end:.3g} s {ratio:.2g} times the power of the rest"
-        yield Finding("stationarity", "note", where)
+        yield Remark("stationarity", "note", where)
     if not changes:
-        yield Finding("stationarity", "ok", f"the spectra of {SECTIONS} sections differ no more than those of one process")
+        yield Remark("stationarity", "ok", f"the spectra of {SECTIONS} sections differ no more than those of one process")
 
 
 def find_changes(z: Array, dt: float) -> list[tuple[float, float, int, float]]:
@@ -206,16 +206,16 @@ def find_changes(z: Array, dt: float) -> list[tuple[float, float, int, float]]:
     return out
 
 
-def _residual(result: Identification) -> Iterator[Finding]:
+def _residual(result: Identification) -> Iterator[Remark]:
     for mode in result.modes:
         w = mode.whiteness
         share = mode.outlying / result.n_steps
         if mode.outlying:
             text = f"{mode.name}: {mode.outlying} far from what those around them predict ({100.0 * share:.2g} %)"
-            yield Finding("outlying samples", "note" if share > OUTLYING else "ok", text)
+            yield Remark("outlying samples", "note" if share > OUTLYING else "ok", text)
         left = f", {w.left} candidates that no peak explains" if w.left else ""
         text = f"{mode.name}: residual is {'' if w.white else 'not '}white{left}{''.join(f'; {x}' for x in w.remarks)}"
-        yield Finding("identification", "ok" if w.white else "note", text)
+        yield Remark("identification", "ok" if w.white else "note", text)
 
 
 def _corrections(record: Record, reading: Reading) -> dict[str, str]:
