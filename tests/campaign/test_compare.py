@@ -154,7 +154,7 @@ def test_as_many_rows_are_held_whatever_the_number_of_scenarios(tmp_path, monkey
     """Counted, and by tracemalloc, which sees numpy and Python; the memory of a process has libraries and freed pages in it."""
     seeds, held, peaks = 16, [], []
     monkeypatch.setattr("wfsobs.campaign.plan.HELD", 10 * 2 * seeds)  # ten scenarios of two observers
-    for n_cells in (20, 160):
+    for n_cells in (20, 80):
         winds = ", ".join(str(5 + i / 10) for i in range(n_cells))
         text = f'observers = ["kf-lgs", "kf-multi"]\n[grid]\nturbulence.wind_speed = [{winds}]\n[stop]\nfirst = 4\n'
         plan, rng = parse_plan(f"seeds = {seeds}\n{text}", tmp_path), np.random.default_rng(4)
