@@ -32,27 +32,8 @@ assert importlib.util.find_spec("panel") is None, "panel came with the core"
 print(len(rows), "rows")
 PY
 
-echo "Wheel with [app]: modules, assets, dashboard"
+echo "Wheel with [app]: dashboard"
 "${install[@]}" "$wheel[app]"
-venv/bin/python - "$checkout" <<'PY'
-import importlib, pathlib, pkgutil, sys
-import wfsobs, wfsobs.app, wfsobs.assets
-checkout = pathlib.Path(sys.argv[1])
-names = [m.name for m in pkgutil.walk_packages(wfsobs.__path__, "wfsobs.") if not m.name.endswith(("__main__", "app.main"))]
-for name in names:
-    importlib.import_module(name)
-inside = [name for name, m in sys.modules.items() if checkout in pathlib.Path(getattr(m, "__file__", None) or "/").parents]
-assert not inside, f"imported from the checkout: {inside}"
-
-def files(folder):
-    return {str(f.relative_to(folder)) for f in folder.rglob("*") if f.is_file() and "__pycache__" not in f.parts}
-
-installed = pathlib.Path(wfsobs.__file__).parent
-lost = files(checkout / "wfsobs") - files(installed)
-assert not lost, f"not in the wheel: {lost}"
-print(len(names), "modules,", len(files(installed / "assets")), "assets")
-PY
-
 port=$(venv/bin/python -c 'import socket; s = socket.socket(); s.bind(("localhost", 0)); print(s.getsockname()[1])')
 venv/bin/wfsobs serve --port "$port" >serve.log 2>&1 &
 server=$!
@@ -86,4 +67,26 @@ if grep -q Traceback serve.log; then
     cat serve.log >&2
     exit 1
 fi
+
+echo "Wheel with [app,plot]: modules, assets"
+"${install[@]}" "$wheel[app,plot]"
+venv/bin/python - "$checkout" <<'PY'
+import importlib, pathlib, pkgutil, sys
+import wfsobs, wfsobs.app, wfsobs.assets
+checkout = pathlib.Path(sys.argv[1])
+names = [m.name for m in pkgutil.walk_packages(wfsobs.__path__, "wfsobs.") if not m.name.endswith(("__main__", "app.main"))]
+for name in names:
+    importlib.import_module(name)
+inside = [name for name, m in sys.modules.items() if checkout in pathlib.Path(getattr(m, "__file__", None) or "/").parents]
+assert not inside, f"imported from the checkout: {inside}"
+
+def files(folder):
+    return {str(f.relative_to(folder)) for f in folder.rglob("*") if f.is_file() and "__pycache__" not in f.parts}
+
+installed = pathlib.Path(wfsobs.__file__).parent
+lost = files(checkout / "wfsobs") - files(installed)
+assert not lost, f"not in the wheel: {lost}"
+print(len(names), "modules,", len(files(installed / "assets")), "assets")
+PY
+
 echo "Wheel: all is well"

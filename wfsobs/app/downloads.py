@@ -16,7 +16,7 @@ from wfsobs.observers.base import TARGETS
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import to_toml
-from wfsobs.telemetry.formats import format_of
+from wfsobs.telemetry.formats import writer_of
 from wfsobs.telemetry.records import record_arrays
 
 Array = NDArray[np.float64]
@@ -62,7 +62,7 @@ def data_csv(results: RunResults) -> bytes:
 def record_file(name: str, record: Record, scenario: Scenario) -> bytes:
     """Write a record in the format of the name's ending, as `wfsobs observe` reads it, with the scenario. Raises RecordError."""
     file = io.BytesIO()
-    format_of(name).write(file, record_arrays(record, to_toml(scenario)))
+    writer_of(name)(file, record_arrays(record, to_toml(scenario)))
     return file.getvalue()
 
 

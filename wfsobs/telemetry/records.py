@@ -30,7 +30,7 @@ from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.columns import join_clock, to_contents
 from wfsobs.telemetry.command_response import LONGEST, MOST_STEPS, command_response
-from wfsobs.telemetry.formats import format_of
+from wfsobs.telemetry.formats import format_of, writer_of
 from wfsobs.telemetry.formats.contents import Contents, FileColumns
 from wfsobs.telemetry.formats.csv import write
 from wfsobs.telemetry.formats.npz import write as write_npz
@@ -102,8 +102,7 @@ MOST_BYTES = 4_000_000_000
 def save_record(path: str | Path, record: Record, scenario_toml: str | None = None) -> None:
     """Write a record in the format of the name's ending. Raises OSError, RecordError."""
     try:
-        if (write := format_of(str(path)).write) is None:
-            raise RecordError("files of its ending are read, not written")
+        write = writer_of(str(path))
         write_whole(path, lambda file: write(file, record_arrays(record, scenario_toml)))
     except RecordError as error:
         raise RecordError(f"{path}: {error}") from None

@@ -54,3 +54,10 @@ def format_of(name: str) -> Format:
         if name.lower().endswith(fmt.endings):
             return fmt
     raise RecordError(f"its name ends in none of {', '.join(ending for fmt in FORMATS for ending in fmt.endings)}")
+
+
+def writer_of(name: str) -> Callable[[IO[bytes], Mapping[str, Array]], None]:
+    """Return what writes the format of a file name. Raises RecordError, also of formats that are only read."""
+    if (write := format_of(name).write) is None:
+        raise RecordError("files of its ending are read, not written")
+    return write
