@@ -207,6 +207,11 @@ def made(rate: float, modes: Modes, scale: float, turbulent: bool, seed: int) ->
 )
 @example(rate=1000.0, modes=[[(0.97, 0.4, 30.0)]], scale=0.02, turbulent=True, seed=1, name="paper")  # a hump near half the rate
 @example(rate=100.0, modes=[[], []], scale=0.02, turbulent=True, seed=1, name="paper")  # bands beyond half the rate
+@example(  # a line whose image beyond half the rate is as near
+    rate=100.0, modes=[[(1.0006520763472604, 0.0, 0.5016705845531291)],
+                       [(0.75, 0.1, 1.0), (1.0006520763472604, 0.0, 22.23014577716402), (0.75, 0.1, 1.0)]],
+    scale=0.001, turbulent=False, seed=65536, name="paper",
+)  # fmt: skip
 @example(  # a broad process that is found beyond half the rate
     rate=137.5, modes=[[(1.095703125, 0.4, 14.125), (0.75, 0.0, 1.0), (0.7234266661676317, 0.02, 11.5)]],
     scale=0.02, turbulent=False, seed=23910, name="paper",

@@ -131,7 +131,9 @@ def line_in_record(x: Array, dt: float, near: float, floor: Callable[[Array], Ar
     expected = float(np.sum(weight * mean))
     std = sqrt(float(np.sum(weight * (around + (mean - expected) ** 2))))
     rms = sqrt(expected * float(S[0]) / T)
-    return near + centre / T, spread / T, rms, 0.5 * rms * std / expected
+    frequency = abs(near + centre / T)
+    frequency = min(frequency, 1.0 / dt - frequency)  # below half the rate, not its image above
+    return frequency, spread / T, rms, 0.5 * rms * std / expected
 
 
 def short_taper(n: int, dt: float, frequency: float) -> Array:
