@@ -98,9 +98,20 @@ def test_faults_are_named(tmp_path: Path, record: Record) -> None:
     assert (seen["frames"], seen["stationarity"], seen["outlying samples"]) == ("note", "note", "note")
 
 
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_a_size_that_no_telescope_has_is_named(tmp_path: Path, record: Record, scale: float) -> None:
+    """As of nanometres read as micrometres, or the reverse."""
+    found = checked(tmp_path, Record(scale * record.y_lgs, scale * record.u, record.dt, delay=record.delay))
+    assert verdicts(found)["unit"] == "note"
+    assert not found["reliable"]
+
+
 def test_too_little_is_said(tmp_path: Path, record: Record) -> None:
+    at_rest = verdicts(checked(tmp_path, Record(record.z[2:], np.zeros_like(record.z[2:]), record.dt)))
+    assert at_rest["commands"] == "ok"
     short = Record(record.y_lgs[:300], record.u[:300], record.dt, delay=record.delay)
     seen = verdicts(checked(tmp_path, short))
-    assert (seen["commands"], seen["stationarity"], seen["identification"]) == ("undecided", "undecided", "excluded")
+    subjects = ("command sign and delay", "stationarity", "identification")
+    assert [seen[subject] for subject in subjects] == ["undecided", "undecided", "excluded"]
     done = CliRunner().invoke(main, ["check", str(tmp_path / "no.npz")])
     assert (done.exit_code, done.output.count("\n")) == (2, 1)

@@ -23,7 +23,7 @@ COMMANDS = {
     "attach": Place("attach", "Run an observer on the streams of a running loop, in shared memory or by ZeroMQ."),
     "bench": Place("bench", "Time the observers beside textbook versions."),
     "campaign": Place("campaign", "Run many scenarios and seeds, on many processes or machines."),
-    "check": Place("telemetry", "Say what a record is, and whether its commands and an identification of it can be relied on."),
+    "check": Place("telemetry", "Check a record: what was read, and what of it can be relied on."),
     "convert": Place("telemetry", "Write a record in another format: .npz, .aot.fits, .fits, .h5, .mat, .csv or .parquet."),
     "design": Place("design", "Write a controller for a program elsewhere: C99 with a test, arrays, python-control."),
     "export": Place("export", "Write a report: one HTML file with figures and numbers that opens without a network."),

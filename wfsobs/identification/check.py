@@ -20,7 +20,7 @@ from wfsobs.identification.result import Identification
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError, hold_last
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
-from wfsobs.telemetry.preview import Reading
+from wfsobs.telemetry.preview import PLAUSIBLE, Reading
 from wfsobs.typing import Array
 
 SECTIONS = 8
@@ -89,8 +89,8 @@ class Check:
         if not self.is_reliable:
             return "An identification of it is to be taken with care."
         undecided = [f.subject for f in self.findings if f.verdict == "undecided"]
-        given = f", if its {' and '.join(undecided)} {'are' if len(undecided) > 1 else 'is'} as stated" if undecided else ""
-        return f"An identification of it can be relied on{given}."
+        but = f"; not decided by the data: {', '.join(undecided)}" if undecided else ""
+        return f"An identification of it can be relied on{but}."
 
 
 def check_record(record: Record, reading: Reading, watch: Watch = QUIET) -> Check:
@@ -115,7 +115,7 @@ def check_record(record: Record, reading: Reading, watch: Watch = QUIET) -> Chec
     Cancelled
         `watch` asks to stop.
     """
-    findings = [*_frames(record), *_unit(reading), *_commands(record, reading), *_stationarity(record)]
+    findings = [*_frames(record), *_unit(record, reading), *_commands(record, reading), *_stationarity(record)]
     result = None
     try:
         result = identify(record, watch=watch)
@@ -135,24 +135,29 @@ def _frames(record: Record) -> Iterator[Remark]:
         yield Remark("read as", "ok", record.origin)
 
 
-def _unit(reading: Reading) -> Iterator[Remark]:
-    if reading.units == {}:
-        return
-    ways = " or ".join(f"{unit} ({1e3 * rms:.3g} nm rms of z)" for unit, rms in reading.units.items())
-    sure = set(reading.units) == {"um"}
-    yield Remark("unit", "ok" if sure else "undecided", f"not in the file, taken for um; plausible are {ways}")
+def _unit(record: Record, reading: Reading) -> Iterator[Remark]:
+    size, (least, most) = float(np.sqrt(np.nanmean(record.z[record.delay :] ** 2, axis=0).max())), PLAUSIBLE
+    if not least <= size <= most:
+        usual = f"turbulence and vibration have {1e3 * least:g} to {1e3 * most:g} nm: check the unit"
+        yield Remark("unit", "note", f"z has {1e3 * size:.3g} nm rms, where {usual}")
+    elif reading.units:
+        ways = " or ".join(f"{unit} ({1e3 * rms:.3g} nm rms of z)" for unit, rms in reading.units.items())
+        verdict = "ok" if set(reading.units) == {"um"} else "undecided"
+        yield Remark("unit", verdict, f"not in the file, taken for um; plausible are {ways}")
 
 
 def _commands(record: Record, reading: Reading) -> Iterator[Remark]:
     response = reading.response
-    if response is None:
-        yield Remark("commands", "undecided", "sign and delay not identifiable: too few steps, or commands that do not move")
+    if not record.u.any():
+        yield Remark("commands", "ok", "none: the mirror is at rest")
+    elif response is None:
+        yield Remark("command sign and delay", "undecided", "not identifiable: too few steps, or commands that do not move")
     else:
         looked_at = (("sign", response.sign, reading.sign), ("delay", response.delay, record.delay))
         for (subject, found, stated), text in zip(looked_at, response.lines(), strict=False):
             other = f"; {stated} is stated" if found not in (None, stated) else ""
             verdict = "undecided" if found is None else "note" if other else "ok"
-            yield Remark(f"command {subject}", verdict, text.removeprefix(f"{subject} ") + other)
+            yield Remark(f"command {subject}", verdict, text.removeprefix(f"{subject} ").removeprefix("undecided: ") + other)
     if reading.contradiction:
         yield Remark("commands", "excluded", reading.contradiction)
     for line in reading.limits:
