@@ -178,7 +178,7 @@ COLOURS = {"ok": "green", "note": "yellow", "undecided": "yellow", "excluded": "
 @record_options
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
 def check(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None, as_json: bool) -> None:
-    """Check a record: what was read, and whether its commands and an identification of it can be relied on."""
+    """Check a record: what was read, and what of it can be relied on."""
     with open_record(record_file, sha256) as (file, name):
         try:
             contents = read_contents(file, name, declaration.columns)
