@@ -162,6 +162,9 @@ def opened(open_shared: Any) -> Page:
 @pytest.fixture
 def page(opened: Page) -> Iterator[Page]:
     """That page with the settings of the preset, from whose beginning the Tab key goes on."""
+    answered(opened)
+    trace = opened.get_by_role("figure", name="Turbulence time trace", exact=True)
+    expect(trace).to_be_visible()  # the test before may have left another page
     opened.evaluate("() => { document.body.tabIndex = -1; document.body.focus(); scrollTo(0, 0) }")
     yield opened
     undo = opened.get_by_role("button", name="Undo", exact=True)
