@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import json
 import re
 import subprocess
 import sys
@@ -176,6 +177,26 @@ def test_a_report_is_written(tmp_path: Path) -> None:
     wfsobs.export(tmp_path / "report.html", wfsobs.PRESETS["paper"]().replace(QUICK), on_result=done.append)
     assert len(done) == 1
     assert (tmp_path / "report.html").read_text(encoding="utf-8").startswith("<!doctype html>")
+
+
+def test_every_file_that_names_the_version_names_this_one() -> None:
+    root = Path(__file__).parents[1]
+    recipe = (root / "conda" / "recipe.yaml").read_text(encoding="utf-8")
+    named = {
+        "CITATION.cff": re.search(r"^version: (.+)$", (root / "CITATION.cff").read_text(encoding="utf-8"), flags=re.M)[1],
+        ".zenodo.json": json.loads((root / ".zenodo.json").read_text(encoding="utf-8"))["version"],
+        "recipe": re.search(r'^  version: "(.+)"$', recipe, flags=re.M)[1],
+        "arena": tomllib.loads((root / "packages/wfsobs-arena/pyproject.toml").read_text(encoding="utf-8"))["project"]["version"],
+    }
+    assert named == dict.fromkeys(named, wfsobs.__version__)
+
+
+def test_the_conda_recipe_needs_what_the_package_needs() -> None:
+    root = Path(__file__).parents[1]
+    project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    run = (root / "conda" / "recipe.yaml").read_text(encoding="utf-8").split("  run:\n")[1].split("\n\n")[0]
+    found = {str(Requirement(line.strip(" -"))) for line in run.splitlines()}
+    assert found == {str(Requirement(line)) for line in [f"python{project['requires-python']}", *project["dependencies"]]}
 
 
 def requirements() -> dict[str, Requirement]:
