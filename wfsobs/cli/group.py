@@ -32,6 +32,7 @@ COMMANDS = {
     "live": Place("live", "Run a loop by the clock, every observer beside it, frame by frame, and show it on a page."),
     "loop": Place("simulate", "Close the loop with every controller on the same disturbance and print what is left of it."),
     "observe": Place("telemetry", "Run the observers on a record of any format."),
+    "plant": Place("telemetry", "Identify what the commands of a closed loop do: delay, gain and rotation."),
     "presets": Place("presets", "List the presets, or print one as TOML."),
     "rt-check": Place(
         "realtime", "Tell what this machine can hold: how late a loop at the LGS rate wakes, and what a step takes in it."

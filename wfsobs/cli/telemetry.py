@@ -1,4 +1,4 @@
-"""`wfsobs check`, `wfsobs convert`, `wfsobs identify` and `wfsobs observe`: work on a record."""
+"""`wfsobs check`, `wfsobs convert`, `wfsobs identify`, `wfsobs observe` and `wfsobs plant`: work on a record."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from wfsobs.identification import identify as identify_record
 from wfsobs.identification import report as identified
 from wfsobs.identification.check import Check, check_record
 from wfsobs.identification.identification import LEVEL
+from wfsobs.identification.plant import identify_plant, plant_dict, plant_lines
 from wfsobs.identification.process import Number
 from wfsobs.identification.report import format_number, mode_rows
 from wfsobs.identification.result import Identification
@@ -166,6 +167,32 @@ def identify(
         return
     show_table(identification_table(result))
     for line in identified.whiteness_lines(result):
+        click.echo(line)
+
+
+@click.command()
+@click.argument("record_file", metavar="RECORD")
+@scenario_options
+@record_options
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+def plant(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None, as_json: bool) -> None:
+    """Identify what the commands of a closed loop do: delay, gain and rotation."""
+    record = load_declared(record_file, scenario, declaration.as_commanded, sha256)
+    with progress_bar("groups of modes") as update:
+        groups = identify_plant(record, Watch(progress=update))
+    if as_json:
+        click.echo(json.dumps(plant_dict(groups), allow_nan=False))
+        return
+    table = Table(title="The plant, with standard deviations")
+    for column in ("Modes", "delay, frames", "gain", "rotation, degrees"):
+        table.add_column(column, no_wrap=True)
+    for group in groups:
+        for name, delay, gain in zip(group.modes, group.delay, group.gain, strict=True):
+            table.add_row(name, delay.text(), gain.text(), "")
+        if group.rotation is not None:
+            table.add_row(" and ".join(group.modes), group.common_delay.text(), group.common_gain.text(), group.degrees.text())
+    show_table(table)
+    for line in plant_lines(groups):
         click.echo(line)
 
 

@@ -173,6 +173,11 @@ class DeclaredFormat:
     rail: float | None = None
     open_loop: bool = False
 
+    @property
+    def as_commanded(self) -> DeclaredFormat:
+        """What is stated but for delay and gain of the mirror: with it the commands are read as they were given."""
+        return replace(self, command_delay=1.0, command_gain=None, trust=True)
+
     def options(self, corrections: Mapping[str, str] | None = None) -> list[str]:
         """List the options of the command line that state this, with corrections by the names of options."""
         named = {

@@ -23,7 +23,7 @@ from scipy.optimize import isotonic_regression
 
 from wfsobs.files import write_whole
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Record, RecordError, hold_last
+from wfsobs.record import DELAY, Record, RecordError, hold_last
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
 from wfsobs.sensors.modes import TIP_TILT
@@ -282,6 +282,12 @@ def stated_sign(contents: Contents, declaration: DeclaredFormat) -> int:
     """Return the sign of the commands as the file or the user states it, 1 where neither does."""
     stated = declaration.command_sign or 1
     return stated if declaration.trust and declaration.command_sign else int(contents.arrays.get("command_sign", stated))
+
+
+def stated_delay(contents: Contents, declaration: DeclaredFormat) -> float:
+    """Return the delay of the commands as the file or the user states it [steps], with its fraction."""
+    stated = declaration.command_delay or DELAY
+    return stated if declaration.trust and declaration.command_delay else float(contents.arrays.get("delay", stated))
 
 
 def contradiction_of(record: Record, contents: Contents, declaration: DeclaredFormat) -> str:

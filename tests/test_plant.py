@@ -1,0 +1,152 @@
+"""The plant of loops whose plant is known: delay with a fraction, gain, rotation, and how well they can be known."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from math import pi, sqrt
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from wfsobs.cli import main
+from wfsobs.identification.plant import GroupPlant, Number, identify_plant
+from wfsobs.record import Record, RecordError
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.telemetry.records import save_record
+from wfsobs.typing import Array
+
+DT, NOISE = 1e-3, 0.02
+
+
+def rotation(angle: float) -> Array:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s], [s, c]])
+
+
+def closed_loop(
+    n: int, delay: float, matrix: Array, seed: int = 1, gain: float = 0.3, probe: float = 0.0, turned: Array | None = None
+) -> Record:
+    """An integrator in turbulence, a line and noise, written out; turned : what it takes the mirror's matrix for."""
+    rng = np.random.default_rng(seed)
+    slow, line = Ar2(4.0 * pi, 0.9, 0.3, DT), Ar2(94.0 * pi, 0.01, 0.06, DT)
+    seen = np.column_stack([slow.sample(n, rng) + line.sample(n, rng) for _ in range(2)])
+    seen += NOISE * rng.standard_normal((n, 2))
+    d, p, back = int(delay), delay % 1.0, np.linalg.inv(matrix if turned is None else turned)
+    y, integral, u = (np.zeros((n + d + 1, 2)) for _ in range(3))
+    excitation = probe * rng.standard_normal((n + d + 1, 2))
+    for k in range(d + 1, n + d + 1):
+        y[k] = seen[k - d - 1] + matrix @ ((1.0 - p) * u[k - d] + p * u[k - d - 1])
+        integral[k] = integral[k - 1] - gain * back @ y[k]
+        u[k] = integral[k] + excitation[k]
+    return Record(y[d + 1 :], u[d + 1 :], DT)
+
+
+def right(n: Number, value: float, sds: float = 4.0) -> bool:
+    """Whether a number is known, and the value within 4 of its standard deviations: once in 16 000 it is not."""
+    return n.value is not None and n.sd is not None and abs(n.value - value) < sds * n.sd
+
+
+def test_errors_are_those_of_the_cramer_rao_bound() -> None:
+    """White commands s in white noise w, half a frame: sd of delay w / (g s sqrt(2 n)), of the gain w / s sqrt(2 / n).
+
+    The derivatives of g (u[k-d] + u[k-d-1]) / 2 by delay and gain, g (u[k-d-1] - u[k-d]) and their mean, are not correlated.
+    """
+    rng, n, s, gain = np.random.default_rng(2), 8000, 0.05, 1.2
+    u = s * rng.standard_normal((n, 2))
+    y = NOISE * rng.standard_normal((n, 2))
+    y[3:] += gain * 0.5 * (u[1:-2] + u[:-3])
+    (found,) = identify_plant(Record(y, u, DT))
+    assert right(found.common_delay, 2.5) and right(found.common_gain, gain)
+    assert all(right(g, gain) for g in found.gain) and found.rotation is not None and right(found.rotation, 0.0)
+    # 6 %: a taper over 5 % of the record, a length whose Fourier transform is fast, the scatter of the spectrum that is fitted
+    assert found.common_delay.sd == pytest.approx(NOISE / (gain * s * sqrt(4.0 * n)), rel=0.06)
+    assert found.common_gain.sd == pytest.approx(NOISE / s / sqrt(n), rel=0.06)
+    assert found.rotation.sd == pytest.approx(NOISE / s / gain / sqrt(n), rel=0.06)
+    assert found.excited == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("delay", "gain", "angle"),
+    [(2.0, (1.0, 1.0), 0.0), (1.5, (1.0, 1.0), 180.0), (2.4, (1.2, 1.2), 96.0), (3.0, (0.8, 1.1), -20.0)],
+)
+def test_of_a_loop_without_a_probe(delay: float, gain: tuple[float, float], angle: float) -> None:
+    record = closed_loop(20_000, delay, rotation(np.radians(angle)) * gain)
+    (found,) = identify_plant(record)
+    assert all(right(n, delay) for n in found.delay)
+    assert all(right(n, g) for n, g in zip(found.gain, gain, strict=True))
+    assert right(found.common_gain, gain[0]) or (gain[0] != gain[1] and found.common_gain.value is None)
+    off = np.angle(np.exp(1j * (np.radians(angle) - (found.rotation or Number()).value)))
+    assert found.rotation is not None and right(replace(found.rotation, value=0.0), float(off))
+    assert found.excited < 1e-6 and 0.0 < found.uncertainty < 1.0 and not found.flipped
+
+
+@pytest.mark.slow
+def test_a_probe_makes_it_sharper() -> None:
+    """And a rotation is found that the controller does not know of."""
+    matrix = rotation(np.radians(8.0))
+    quiet, probed = (identify_plant(closed_loop(20_000, 1.3, matrix, probe=size, turned=np.eye(2)))[0] for size in (0.0, 0.01))
+    for found in (quiet, probed):
+        assert right(found.common_delay, 1.3) and found.rotation is not None and right(found.rotation, np.radians(8.0))
+    assert quiet.common_gain.sd is not None and probed.common_gain.sd is not None
+    assert probed.common_gain.sd < 0.5 * quiet.common_gain.sd and probed.excited > 1e-3
+    assert probed.uncertainty < quiet.uncertainty
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("flip", "name"), [((1.0, -1.0), "tilt"), ((-1.0, 1.0), "tip")])
+def test_a_flipped_axis(flip: tuple[float, float], name: str) -> None:
+    (found,) = identify_plant(closed_loop(10_000, 2.0, np.diag(flip)))
+    assert found.flipped == name
+
+
+@pytest.mark.slow
+def test_what_is_not_identifiable() -> None:
+    """A loop so slow that its commands are lost in the noise; one too short; a mirror at rest."""
+    (slow,) = identify_plant(closed_loop(6000, 2.0, np.eye(2), gain=0.002))
+    assert slow.common_delay == slow.common_gain == Number() and slow.uncertainty == np.inf
+    record = closed_loop(1200, 2.0, np.eye(2))
+    with pytest.raises(RecordError, match="has 900 frames, the plant needs 1000"):
+        identify_plant(Record(record.y_lgs[:900], record.u[:900], DT))
+    with pytest.raises(RecordError, match="the commands of tip and tilt do not move"):
+        identify_plant(Record(record.y_lgs, 0.0 * record.u, DT))
+
+
+@pytest.mark.slow
+def test_bad_samples_and_other_units_do_not_matter() -> None:
+    record = closed_loop(20_000, 2.4, np.eye(2))
+    y, rng = record.y_lgs.copy(), np.random.default_rng(3)
+    y[rng.choice(len(y), 200, replace=False)] += 0.8
+    y[rng.choice(len(y), 200, replace=False)] = np.nan
+    (found,) = identify_plant(Record(y, 1e3 * record.u, DT))
+    assert right(found.common_delay, 2.4) and right(found.common_gain, 1e-3)
+
+
+@pytest.mark.slow
+def test_command(tmp_path: Path) -> None:
+    """Delay and gain are those of the commands in the file, whatever is stated; it ends with what they rest on."""
+    file = tmp_path / "r.npz"
+    save_record(file, closed_loop(12_000, 2.4, np.eye(2)))
+    plain = json.loads(CliRunner().invoke(main, ["plant", str(file), "--json"]).stdout)
+    stated = ["plant", str(file), "--json", "--command-delay", "1.5", "--command-gain", "1.1", "--trust"]
+    assert json.loads(CliRunner().invoke(main, stated).stdout) == plain
+    assert (plain["modes"], plain["pairs"]) == (["tip", "tilt"], [["tip", "tilt"]])
+    assert plain["delay_frames"] == pytest.approx([2.4, 2.4], abs=4.0 * max(plain["delay_frames_sd"]))
+    assert plain["rotation_deg"] == pytest.approx([0.0], abs=4.0 * plain["rotation_deg_sd"][0])
+    assert not plain["excited"] and 0.0 < plain["trustworthy_to_percent"] < 50.0
+    told = CliRunner().invoke(main, ["plant", str(file)]).stdout
+    assert all(line in told for line in plain["remarks"])
+
+
+def test_text() -> None:
+    assert Number(2.0123, 0.0234).text() == "2.012 +- 0.023" and Number(170.0, 12.0).text(" nm") == "170 +- 12 nm"
+    assert Number().text() == "not identifiable"
+
+
+def test_flipped_without_an_angle() -> None:
+    known = Number(1.0, 0.1)
+    group = GroupPlant(("tip", "tilt"), (known, known), (known, known), Number(), known, known, 1.0, (0, 0), False, 0.0)
+    assert not group.flipped and group.degrees == Number()
