@@ -152,6 +152,9 @@ class RecordMemo:
     record : digest of the record;  known_observers : observers whose estimates were known
     """
 
+    memo: Memo
+    record: str
+
     def __init__(self, memo: Memo, record: Record):
         self.memo, self.record = memo, record_digest(record)
         self.known_observers: set[str] = set()

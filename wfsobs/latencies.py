@@ -19,7 +19,7 @@ class Latencies:
     """
 
     def __init__(self, counts: NDArray[np.int64] | None = None) -> None:
-        self.counts = np.zeros(len(EDGES) + 1, dtype=np.int64) if counts is None else counts
+        self.counts: NDArray[np.int64] = np.zeros(len(EDGES) + 1, dtype=np.int64) if counts is None else counts
 
     def clear(self) -> None:
         """Begin anew."""

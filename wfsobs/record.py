@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -165,7 +165,7 @@ class Record(Signals):
     vibration: Array | None = None
     training: Training | None = None
     origin: str = ""
-    plot = PlotAccessor()
+    plot: ClassVar[PlotAccessor] = PlotAccessor()
 
     def __repr__(self) -> str:
         return f"Record({', '.join(f'{what} {value}' for what, value in self._summary())})"

@@ -17,7 +17,7 @@ import param
 
 from wfsobs.settings.group import Group, Section
 
-log = logging.getLogger(__name__)
+log: logging.Logger = logging.getLogger(__name__)
 
 OBSERVERS, CONTROLLERS = "wfsobs.observers", "wfsobs.controllers"
 """Groups of entry points."""
@@ -69,6 +69,9 @@ class Registry(MutableMapping[str, E]):
     reserved_ids : iterable of str
         Ids that are used for something else.
     """
+
+    group: str
+    reserved_ids: frozenset[str]
 
     def __init__(self, kind: type[E], group: str, built_in: Iterable[E], reserved_ids: Iterable[str] = ()):
         self.kind, self.group, self.reserved_ids = kind, group, frozenset(reserved_ids)

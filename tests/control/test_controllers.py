@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs.closed_loop.design import Design, design
-from wfsobs.closed_loop.run import ClosedLoop, Outcome, closed_loop, residual_rms, strehl
+from wfsobs.closed_loop.rows import ClosedLoop, Outcome, residual_rms, strehl
+from wfsobs.closed_loop.run import closed_loop
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.integrator import best_gain, highest_stable_gain, integrator_law, limited_integrator
 from wfsobs.control.mirror import Mirror

@@ -9,8 +9,8 @@ from typing import Any
 from wfsobs.app.jobs import Tell
 from wfsobs.app.work import RunResults
 from wfsobs.closed_loop.design import design
-from wfsobs.closed_loop.rows import Row, rows
-from wfsobs.closed_loop.run import ClosedLoop, each_outcome
+from wfsobs.closed_loop.rows import ClosedLoop, Row, rows
+from wfsobs.closed_loop.run import each_outcome
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.curves import Curves, curves
 from wfsobs.dependence import Memo

@@ -74,6 +74,9 @@ def predict_online(X: Array, f: Array, rows: Array, m: int, kernel: SquaredExpon
 class OnlineStream:
     """The same one step at a time, with all that does not need the newest sample done before it comes."""
 
+    m: int
+    kernel: SquaredExponential
+
     def __init__(self, X: Array, m: int, kernel: SquaredExponential):
         self.X, self.m, self.kernel = X, m, kernel
 

@@ -109,6 +109,8 @@ class DaskCluster:
         distributed is not installed, or there is no scheduler.
     """
 
+    address: str
+
     def __init__(self, address: str, tell: Callable[[str], None] = lambda _line: None):
         try:
             import distributed

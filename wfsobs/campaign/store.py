@@ -156,6 +156,8 @@ class BatchIndex:
         Number of rows, those computed twice included.
     """
 
+    n_rows: Any
+
     COLUMNS = ("key", "cell", "scenario", "seed", "name", "target", "mode", "rms_nm", "apart")
 
     def __init__(self, folder: Path):

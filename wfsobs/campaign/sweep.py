@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import isfinite
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -280,7 +280,7 @@ class SweepResults:
     scores: Mapping[int, tuple[tuple[Score, ...], ...]] = field(default_factory=dict)
     evidence: Mapping[int, Evidence] = field(default_factory=dict)
     failures: Mapping[int, str] = field(default_factory=dict)
-    plot = PlotAccessor()
+    plot: ClassVar[PlotAccessor] = PlotAccessor()
 
     def add(self, cell: int, scores: Sequence[Score]) -> SweepResults:
         """Return the results with those of one more seed of a cell."""

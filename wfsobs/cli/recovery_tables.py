@@ -25,6 +25,9 @@ class OverTime:
     window : of the running rms [s];  rows : of every run, at the end of every window, the keys of `wfsobs run --over-time --json`
     """
 
+    scenario: Scenario
+    window: float
+
     def __init__(self, scenario: Scenario, window: float):
         if not scenario.dt <= window < scenario.run.duration:
             raise SettingError(

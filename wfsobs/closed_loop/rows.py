@@ -1,31 +1,77 @@
-"""The closed loop as plain rows, and what is said of a row in every table."""
+"""What comes of a closed loop, as plain rows too, and what is said of a row in every table."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from math import degrees, log10
-from typing import Any
+from dataclasses import dataclass, field, replace
+from math import degrees, log10, pi
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from wfsobs.closed_loop.run import ClosedLoop, residual_rms, strehl
+from wfsobs.closed_loop.design import Design
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.evidence import means_differ
 from wfsobs.evaluation.known_lines import SPECTRA, knowledge_of
 from wfsobs.evaluation.rows import NOT_OBSERVERS, Row
 from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS, batch_means, rms_interval
 from wfsobs.evaluation.verdict import Contender, Verdict
+from wfsobs.notebook import PlotAccessor, import_extra
 from wfsobs.prior import TRUE, PriorSource, Spectra, words_for
 from wfsobs.priors_from.controllers import own_settings
+from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import rms
+from wfsobs.typing import Array
 from wfsobs.units import micrometres_per
+
+if TYPE_CHECKING:
+    import pandas
 
 LIMITED = "theory and margins are not applicable: a limit of the mirror acts, and the loop is no longer linear"
 """Why a row has neither."""
 
 NOT_APPLICABLE = "n/a"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one controller left.
+
+    residual      : (n_steps, n_modes) [um], or None where the loop is not stable or could not run
+    u             : (n_steps, n_modes) commands that the mirror took [um], or None
+    limited_share : share of the steps after the warm-up in which a limit changed a command, per mode
+    note          : why there is no residual
+    """
+
+    controller: str
+    stable: tuple[bool | None, ...]
+    residual: Array | None = None
+    u: Array | None = None
+    limited_share: tuple[float, ...] = ()
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class ClosedLoop:
+    """All of a run in closed loop; outcomes in the order of the registry."""
+
+    design: Design
+    record: Record
+    outcomes: tuple[Outcome, ...] = field(default=())
+    plot: ClassVar[PlotAccessor] = PlotAccessor()
+
+    def __repr__(self) -> str:
+        return f"ClosedLoop({len(self.outcomes)} controllers, {self.record!r})"
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Return `rows` as a pandas table. Raises ImportError without pandas."""
+        return import_extra("pandas", "arrays").DataFrame(rows(self, self.scenario.run.seed))
+
+    @property
+    def scenario(self) -> Scenario:
+        """The settings."""
+        return self.design.scenario
 
 
 def rows(result: ClosedLoop, seed: int | None, *, source: PriorSource = TRUE) -> list[Row]:
@@ -139,3 +185,21 @@ def label(controller: str) -> str:
 def linear(same: Sequence[Row], value: str) -> str:
     """Return the text of a number of the linear loop: not applicable where a limit of the mirror acts in any of the rows."""
     return NOT_APPLICABLE if any(r["limited"] for r in same) else value
+
+
+def residual_rms(outcome: Outcome, record: Record, warm_up: float) -> list[float] | None:
+    """Return the rms [um] of the residual after the warm-up [s], one per mode; None without a residual."""
+    if outcome.residual is None:
+        return None
+    return [rms(column) for column in outcome.residual[round(warm_up / record.dt) :].T]
+
+
+def strehl(rms_per_mode: Sequence[float], wavelength: float) -> float:
+    """Return the Strehl ratio exp(-(2 pi sigma / lambda)^2), the extended Marechal approximation (Mahajan 1983).
+
+    sigma^2 is the variance of the simulated modes together: no other error counts. rms and wavelength [um].
+
+    >>> round(strehl([0.1, 0.1], 2.2), 4)
+    0.8495
+    """
+    return float(np.exp(-((2.0 * pi / wavelength) ** 2) * np.sum(np.square(rms_per_mode))))

@@ -8,62 +8,21 @@ A controller sees z and knows what it commanded; what the mirror does of it is `
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from functools import partial
-from math import pi
-
-import numpy as np
 
 from wfsobs.closed_loop.design import Design, LawDesign, design
+from wfsobs.closed_loop.rows import ClosedLoop, Outcome
 from wfsobs.control.base import Controller
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.dependence import Memo, digest, record_digest
-from wfsobs.notebook import PlotAccessor
 from wfsobs.pipeline import as_stated
 from wfsobs.priors_from.controllers import controller_arguments, own_settings
 from wfsobs.progress import QUIET, Watch, detach_watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.idle import used_settings
-from wfsobs.signal.welch import rms
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What one controller left.
-
-    residual      : (n_steps, n_modes) [um], or None where the loop is not stable or could not run
-    u             : (n_steps, n_modes) commands that the mirror took [um], or None
-    limited_share : share of the steps after the warm-up in which a limit changed a command, per mode
-    note          : why there is no residual
-    """
-
-    controller: str
-    stable: tuple[bool | None, ...]
-    residual: Array | None = None
-    u: Array | None = None
-    limited_share: tuple[float, ...] = ()
-    note: str = ""
-
-
-@dataclass(frozen=True)
-class ClosedLoop:
-    """All of a run in closed loop; outcomes in the order of the registry."""
-
-    design: Design
-    record: Record
-    outcomes: tuple[Outcome, ...] = field(default=())
-    plot = PlotAccessor()
-
-    def __repr__(self) -> str:
-        return f"ClosedLoop({len(self.outcomes)} controllers, {self.record!r})"
-
-    @property
-    def scenario(self) -> Scenario:
-        """The settings."""
-        return self.design.scenario
 
 
 def close_loop(scenario: Scenario, *, controllers: Sequence[str] | None = None, watch: Watch = QUIET) -> ClosedLoop:
@@ -170,21 +129,3 @@ def _outcome(
     start = round(plan.start / record.dt)
     residual = disturbance + plan.mirror.correction(u)
     return Outcome(controller.id, stable, residual, u, tuple(limited[start:].mean(axis=0).tolist()))
-
-
-def residual_rms(outcome: Outcome, record: Record, warm_up: float) -> list[float] | None:
-    """Return the rms [um] of the residual after the warm-up [s], one per mode; None without a residual."""
-    if outcome.residual is None:
-        return None
-    return [rms(column) for column in outcome.residual[round(warm_up / record.dt) :].T]
-
-
-def strehl(rms_per_mode: Sequence[float], wavelength: float) -> float:
-    """Return the Strehl ratio exp(-(2 pi sigma / lambda)^2), the extended Marechal approximation (Mahajan 1983).
-
-    sigma^2 is the variance of the simulated modes together: no other error counts. rms and wavelength [um].
-
-    >>> round(strehl([0.1, 0.1], 2.2), 4)
-    0.8495
-    """
-    return float(np.exp(-((2.0 * pi / wavelength) ** 2) * np.sum(np.square(rms_per_mode))))

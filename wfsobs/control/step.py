@@ -37,6 +37,15 @@ class StepController:
         Frames that it has taken.
     """
 
+    id: str
+    plant: Plant
+    sampling: Sampling
+    law: StepLaw | None
+    ahead: VibrationAhead | None
+    frame: int
+    uses_ngs: bool
+    bridges: tuple[Bridge, Bridge] | None
+
     def __init__(
         self,
         id: str,

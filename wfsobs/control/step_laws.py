@@ -46,11 +46,11 @@ class StepLaw(Stateful, Protocol):
 class LinearLaws(StateArrays):
     """Laws as filters of z."""
 
-    state_names = ("bank",)
+    state_names: tuple[str, ...] = ("bank",)
 
     def __init__(self, laws: Sequence[Law]):
-        self.laws = tuple(laws)
-        self.bank = FilterBank([Recursion(law.cycle.steps, law.first) for law in laws])
+        self.laws: tuple[Law, ...] = tuple(laws)
+        self.bank: FilterBank = FilterBank([Recursion(law.cycle.steps, law.first) for law in laws])
         self._v = np.zeros((len(laws), laws[0].cycle.steps[0][1].shape[1]))
         self.mark_start()
 
@@ -80,11 +80,13 @@ class LinearLaws(StateArrays):
 class KalmanLaws(StateArrays):
     """Laws as rows of what Kalman filters estimate; a measurement that is missing, NaN, is none to them."""
 
-    state_names = ("filters",)
+    laws: tuple[Law, ...]
+
+    state_names: tuple[str, ...] = ("filters",)
 
     def __init__(self, laws: Sequence[Law]):
         self.laws, known = tuple(laws), [law for law in laws if law.filter is not None and law.row is not None]
-        self.filters = KalmanEstimator([law.filter for law in known if law.filter is not None])
+        self.filters: KalmanEstimator = KalmanEstimator([law.filter for law in known if law.filter is not None])
         self._rows = np.zeros_like(self.filters.bank.x)
         for row, law in zip(self._rows, known, strict=True):
             assert law.row is not None
@@ -118,10 +120,10 @@ class KalmanLaws(StateArrays):
 class Integrators(StateArrays):
     """Integrators whose state are their own commands, so that a limit of the mirror stops them (anti-windup)."""
 
-    state_names = ("_own",)
+    state_names: tuple[str, ...] = ("_own",)
 
     def __init__(self, laws: Sequence[Law], mirror: Mirror):
-        self.laws = tuple(laws)
+        self.laws: tuple[Law, ...] = tuple(laws)
         self._gain = np.array([law.gain for law in laws])
         self._leak = np.array([law.leak for law in laws])
         self._taps = mirror.taps[1:]
@@ -165,7 +167,7 @@ class VibrationAhead:
 
     def __init__(self, estimator: Estimator, bands: Bands, sampling: Sampling):
         self.estimator = estimator
-        self.bank = FilterBank(
+        self.bank: FilterBank = FilterBank(
             [bank_recursion(bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, sampling.dt))]
             * sampling.n_modes
         )

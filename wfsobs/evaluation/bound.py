@@ -105,7 +105,11 @@ MEANS = running_means([0.0, *(1.6**i for i in range(20))], turns=(0.0, 2.0, 4.0,
 MEANS_OF_BOTH, FRAME_MEANS = (running_means([0.0, *(2.0**i for i in range(n))], (0.0, 2.0, 4.0)) for n in (12, 9))
 """Means over 1 to 2048 steps and over 1 to 256 frames, of modes of all sensors together."""
 
-TRUE_MODEL = {"kalman.process_noise": "matched", "kalman.measurement_noise": "matched", "multipeak.turbulence_order": 3}
+TRUE_MODEL: dict[str, str | int] = {
+    "kalman.process_noise": "matched",
+    "kalman.measurement_noise": "matched",
+    "multipeak.turbulence_order": 3,
+}
 """Settings of the filters whose states stand beside the means: a row does not depend on what the observers are set to."""
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -54,7 +54,7 @@ class Result:
     scores: tuple[Score, ...]
     failures: tuple[Failure, ...] = ()
     prior_source: PriorSource = TRUE
-    plot = PlotAccessor()
+    plot: ClassVar[PlotAccessor] = PlotAccessor()
 
     def __repr__(self) -> str:
         left_out = f", {len(self.failures)} left out" if self.failures else ""

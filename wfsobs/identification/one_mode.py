@@ -256,11 +256,18 @@ class OneMode:
         Frequencies of resonances that were removed for their uncertainty [Hz].
     """
 
+    measurement: Array
+    dt: float
+    n: int
+    missing_power: Array
+    strong: Array
+    left: Array
+
     def __init__(self, z: Array, dt: float, lowest: float = LOWEST, rng: np.random.Generator | None = None):
         self.lowest = lowest
         self.measurement, self.dt, self.n = z - np.nanmean(z), dt, len(z)
-        self.missing = MissingSamples(np.isnan(z), dt, rng or np.random.default_rng(0))
-        self.f = periodogram_frequencies(self.n, dt)
+        self.missing: MissingSamples = MissingSamples(np.isnan(z), dt, rng or np.random.default_rng(0))
+        self.f: Array = periodogram_frequencies(self.n, dt)
         self.share, self.unknown, self.missing_power = np.ones(len(self.f)), np.zeros((0, self.n)), np.zeros(len(self.f))
         self.z = self.missing.interpolate(self.measurement)
         self.lines: list[Sinusoid] = []
@@ -275,10 +282,10 @@ class OneMode:
         """Fill z by the expectation of the present model."""
         if self.missing.any:
             S, lines = self.spectrum.psd(self.f), self._signal()
-            self.unknown = self.missing.draw_errors(S)
-            self.share = self.missing.measured_share(S, self.unknown)
+            self.unknown: Array = self.missing.draw_errors(S)
+            self.share: Array = self.missing.measured_share(S, self.unknown)
             self.missing_power = (1.0 - self.share) * S
-            self.z = self.missing.fill(self.measurement - lines, S) + lines
+            self.z: Array = self.missing.fill(self.measurement - lines, S) + lines
             self._subtract_lines()
 
     def _signal(self) -> Array:
@@ -425,7 +432,7 @@ class OneMode:
             if misfit_of(fit_spectrum(rest, self.cells(everything=True)), self.f, self.I) - before > WORTH:
                 continue
             frequency = p.omega / (2 * pi)
-            self.spectrum = rest
+            self.spectrum: Spectrum = rest
             self.removals.append(frequency)
             self.rejections.append(Candidate(frequency, max(round(2.0 * p.damping * frequency / self.f[0]), WIDEST_LINE), 0.0))
             self.refit()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import nan, pi, sqrt
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from wfsobs.identification.both_sensors import SensorDifference, error_of_a_star, without_error
 from wfsobs.identification.one_mode import OneMode, is_continuum
@@ -114,7 +114,7 @@ class Identification:
     dt: float
     n_steps: int
     level: float
-    plot = PlotAccessor()
+    plot: ClassVar[PlotAccessor] = PlotAccessor()
 
     def __repr__(self) -> str:
         peaks = ", ".join(f"{mode.name} {len(mode.peaks)} peaks" for mode in self.modes)

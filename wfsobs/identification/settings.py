@@ -14,7 +14,7 @@ from wfsobs.signal.ar3 import Ar3
 
 HIGHEST, LARGEST, LEAST = 50_000.0, 1e4, 1e-6
 """Limits of a scenario's settings: frequency of a peak [Hz], rms [um], minimum damping of a process."""
-MATCHED = {
+MATCHED: dict[str, Any] = {
     "sensors.noise_from": "nm",
     "sensors.lgs_combination": "mean",
     "sensors.tip_tilt_indetermination": False,

@@ -96,6 +96,15 @@ class Board:
         As in `Counts`, of all observers, in the order of SLOTS.
     """
 
+    losses: Array
+    is_ready: Array
+    progress: Array
+    squares: Array
+    samples: Array
+    histograms: Array
+    late: Array
+    frames: Array
+
     def __init__(self, n_modes: int, name: str | None = None):
         n, scored, bins = len(SLOTS), len(SCORED) * n_modes, len(EDGES) + 1
         size = 3 * len(CREWS) + n * (2 * scored + bins + 3)

@@ -75,6 +75,8 @@ class Crew(Generic[D, M]):
         Receives events.
     """
 
+    ratio: int
+
     def __init__(self, sampling: Sampling, warm_up: int, say: Callable[[LiveEvent], None]):
         self.ratio, self._warm_up, self._say = sampling.ratio or 1, warm_up, say
         self._active: dict[str, M] = {}
@@ -132,6 +134,9 @@ class Follower:
     estimates : Array
         Where its estimates go, (len(TARGETS), n_modes) [um].
     """
+
+    observer: StepObserver
+    slot: int
 
     def __init__(self, observer: StepObserver, slot: int, estimates: Array):
         self.observer, self.slot = observer, slot

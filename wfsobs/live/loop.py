@@ -210,6 +210,9 @@ class LiveLoop:
         An observer is unknown or does not run frame by frame, or an event cannot be played.
     """
 
+    source: LiveSource
+    readings: SharedView
+
     def __init__(
         self, source: LiveSource, scenario: Scenario, observers: Sequence[str], *, speed: float = 1.0, n_frames: int | None = None
     ):
@@ -223,9 +226,9 @@ class LiveLoop:
         self._log_file, self.readings, self._tending = "", SharedView(), Lock()
         self._processes = LiveProcesses(source, told.before_events, tuple(dict.fromkeys(observers)), self._speed, n_frames)
         self.feed, self.board, self.delivery = self._processes.feed, self._processes.board, self._processes.delivery
-        self.programme = Programme(told, self.feed.tell)
-        self.recorder = Recorder(self.feed.ring, self.sampling, self.say, source.name == SIMULATION)
-        self.workshop = Workshop(self._processes, self.sampling, self.say)
+        self.programme: Programme = Programme(told, self.feed.tell)
+        self.recorder: Recorder = Recorder(self.feed.ring, self.sampling, self.say, source.name == SIMULATION)
+        self.workshop: Workshop = Workshop(self._processes, self.sampling, self.say)
         self._release = finalize(self, self._processes.release)
         Thread(target=_keep, args=(ref(self), self._processes.is_over), daemon=True, name="wfsobs-live").start()
 

@@ -152,7 +152,7 @@ class Pace:
     def take(self, command: Command) -> None:
         """Follow a command about the clock: "play", "step", "speed"."""
         was_running = self.runs
-        self.is_playing = command.get("play", self.is_playing)
+        self.is_playing: Any = command.get("play", self.is_playing)
         self._steps += command.get("step", 0)
         self._speed = command.get("speed", self._speed)
         if self.runs and not was_running:

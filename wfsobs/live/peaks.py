@@ -60,12 +60,14 @@ class Change:
         known: list[PeakFinding] = []
         for minute in findings[-2::-1]:
             known += [peak for peak in distinct_peaks(minute) if not any(is_close(peak, one) for one in known)]
-        self.peaks = distinct_peaks(now)
-        self.same = paired_peaks(known, self.peaks)
-        self.drifts = {peak: one for peak, one in self.same.items() if _has_drifted(peak, one, before, now)}
-        self.new = [peak for peak in self.peaks if peak not in self.same and has_risen(peak, before, now)]
+        self.peaks: tuple[PeakFinding, ...] = distinct_peaks(now)
+        self.same: dict[PeakFinding, PeakFinding] = paired_peaks(known, self.peaks)
+        self.drifts: dict[PeakFinding, PeakFinding] = {
+            peak: one for peak, one in self.same.items() if _has_drifted(peak, one, before, now)
+        }
+        self.new: list[PeakFinding] = [peak for peak in self.peaks if peak not in self.same and has_risen(peak, before, now)]
         was = self.same.values()
-        self.losses = [peak for peak in known if peak not in was and has_risen(peak, now, before)]
+        self.losses: list[PeakFinding] = [peak for peak in known if peak not in was and has_risen(peak, now, before)]
 
 
 def peak_changes(findings: Sequence[Finding]) -> list[tuple[str, str]]:

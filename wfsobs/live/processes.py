@@ -151,7 +151,7 @@ class CrewProcess:
     """
 
     def __init__(self, context: SpawnContext, name: str, width: int, work: Callable[..., None], site: Site, *more: object):
-        self.rows = Rows(width, ROOM)
+        self.rows: Rows = Rows(width, ROOM)
         inbox, self._outbox = context.Pipe(duplex=False)
         self.process = context.Process(target=work, args=(site, self.rows.name, inbox, *more), name=name, daemon=True)
         self.process.start()
@@ -198,6 +198,10 @@ class LiveProcesses:
         Whether all has ended.
     """
 
+    feed: SourceProcess
+    is_over: Event
+    board: Board
+
     def __init__(
         self, source: LiveSource, scenario: Scenario, observers: tuple[str, ...], speed: float, n_frames: int | None = None
     ):
@@ -212,8 +216,8 @@ class LiveProcesses:
             own = tuple(name for name in observers if crew_of(name) == place)
             if own or not place:
                 self._start_crew(place, own)
-        self.delivery = Delivery(self.feed.ring, self.board, self.traces, self.count)
-        self.workshop = SideProcess(self._context)
+        self.delivery: Delivery = Delivery(self.feed.ring, self.board, self.traces, self.count)
+        self.workshop: SideProcess = SideProcess(self._context)
 
     def _start_crew(self, place: int, observers: tuple[str, ...], *, joins_late: bool = False) -> None:
         if joins_late:

@@ -65,6 +65,8 @@ class Programme:
         An event cannot be played, or settings exclude each other.
     """
 
+    scenario: Scenario
+
     def __init__(self, scenario: Scenario, tell: Callable[[Command], None]):
         self.scenario, self._acts = scenario, acts_of(scenario)
         self._tell, self._lock = tell, Lock()

@@ -35,6 +35,8 @@ class Rows:
         There is no ring of this name.
     """
 
+    capacity: int
+
     def __init__(self, width: int, capacity: int, name: str | None = None):
         self._memory = SharedMemory(name=name, create=name is None, size=HEAD + 8 * capacity * width if name is None else 0)
         self._head = np.ndarray(3, dtype=np.int64, buffer=self._memory.buf)

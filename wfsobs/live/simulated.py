@@ -301,6 +301,9 @@ class Losses:
         Shares of the measurements of the two sensors that are lost, 0 to 1.
     """
 
+    lgs: float
+    ngs: float
+
     def __init__(self, n_modes: int):
         self.lgs = self.ngs = 0.0
         self._missing, self._rng = np.full(n_modes, np.nan), np.random.default_rng(0)

@@ -63,6 +63,8 @@ class SourceProcess:
         That which writes the ring is the last one.
     """
 
+    ring: Ring
+
     def __init__(self, source: LiveSource, speed: float = 1.0, n_frames: int | None = None):
         os.environ["OPENBLAS_NUM_THREADS"] = "1"  # read by the processes
         context = get_context("spawn")
@@ -71,7 +73,7 @@ class SourceProcess:
         inbox, self._outbox = context.Pipe(duplex=False)
         desk = Desk(self.ring.name, n_modes, inbox, self._news, speed, n_frames)
         self._staff = source.staff(context, desk)
-        self.processes = [*self._staff.others, self._staff.sender]
+        self.processes: list[BaseProcess] = [*self._staff.others, self._staff.sender]
         for process in self.processes:
             process.start()
 

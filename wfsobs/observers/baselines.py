@@ -60,12 +60,12 @@ def zero(measurements: Measurements, _prior: Prior, _settings: None, watch: Watc
 class BankEstimator(HeldEstimate):
     """The causal band-passes of all modes, one frame at a time. They predict nothing."""
 
-    state_names = ("filters", "_mean")
+    state_names: tuple[str, ...] = ("filters", "_mean")
 
     def __init__(self, bands: Bands, sampling: Sampling):
         super().__init__(sampling.n_modes, 0.0, 0.0)
         bank = bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, sampling.dt)
-        self.filters = FilterBank([bank_recursion(bank)] * sampling.n_modes)
+        self.filters: FilterBank = FilterBank([bank_recursion(bank)] * sampling.n_modes)
         self.mark_start()
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:

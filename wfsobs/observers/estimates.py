@@ -29,7 +29,7 @@ class Estimates(dict[str, Array]):
 
     def __init__(self, values: Mapping[str, Array], sd: Mapping[str, Array] | None = None):
         super().__init__(values)
-        self.sd = dict(sd or {})
+        self.sd: dict[str, Array] = dict(sd or {})
 
 
 def by_name(x: Array) -> dict[str, Array]:

@@ -82,11 +82,11 @@ class Bridge(StateArrays):
     gains : of the filters that predict, by mode; other modes hold their last value
     """
 
-    state_names = ("_last", "_bank")
+    state_names: tuple[str, ...] = ("_last", "_bank")
 
     def __init__(self, n_modes: int, predictors: Sequence[Predictor] = ()):
         found = [(mode, gains) for mode, one in enumerate(predictors) if (gains := _gains(one)) is not None]
-        self.gains = dict(found)
+        self.gains: dict[int, GainCycle] = dict(found)
         self._modes = np.array([mode for mode, _ in found], dtype=int)
         self._bank = FilterBank([gains.estimator() for _, gains in found]) if found else None
         self._rows = expected_rows([gains for _, gains in found])

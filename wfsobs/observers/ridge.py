@@ -94,7 +94,11 @@ class LinearPredictor(HeldEstimate):
         Frames ahead that it was trained for.
     """
 
-    state_names = ("windows", "_mean")
+    windows: Windows
+    needs_command: bool
+    fits: Sequence[tuple[Array, float]]
+
+    state_names: tuple[str, ...] = ("windows", "_mean")
 
     def __init__(self, windows: Windows, fits: Sequence[tuple[Array, float]], horizon: float):
         super().__init__(len(fits), horizon)

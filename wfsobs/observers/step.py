@@ -80,7 +80,7 @@ class HeldEstimate(StateArrays):
         The mean before the first one [um].
     """
 
-    state_names = ("_mean",)
+    state_names: tuple[str, ...] = ("_mean",)
     needs_command = False
 
     def __init__(self, n_modes: int, horizon: float | None, before: float = np.nan):
@@ -157,6 +157,11 @@ class StepObserver:
     frame : int
         Frames that it has taken.
     """
+
+    id: str
+    targets: tuple[str, ...]
+    sampling: Sampling
+    estimator: Estimator
 
     def __init__(
         self,
@@ -309,7 +314,7 @@ class StepObserver:
         for new, was in ((self._lgs, old._lgs), (self._ngs, old._ngs)):
             if new is not None and was is not None:
                 new.take_over(was)
-        self.frame = old.frame
+        self.frame: int = old.frame
 
     def _check(self, x: ArrayLike, name: str) -> tuple[Array, bool]:
         return check_frame(self.id, x, name, self.sampling.n_modes, self.frame)

@@ -192,12 +192,17 @@ class FilterBank:
         Which of the maps came last.
     """
 
+    phase: int
+    last: int
+    x: Array
+    v: Array
+
     def __init__(self, modes: Sequence[Recursion]):
         first = modes[0].first is not None
         cycles = [[*([] if mode.first is None else [mode.first]), *mode.steps] for mode in modes]
         n = max(steps[0][0].shape[0] for steps in cycles)
         p, m = cycles[0][0][3].shape
-        self.maps = [np.zeros((len(modes), n + p, n + m)) for _ in cycles[0]]
+        self.maps: list[Array] = [np.zeros((len(modes), n + p, n + m)) for _ in cycles[0]]
         for j, stacked in enumerate(self.maps):
             for one, (F, G, H, J) in zip(stacked, (steps[j] for steps in cycles), strict=True):
                 size = len(F)

@@ -51,6 +51,10 @@ class SecondSensorOptions:
 class SlopeStream:
     """A stream of slopes, read as residual modes. Raises StreamError where there is none, or no matrix for it."""
 
+    path: str
+    n: int
+    first: int
+
     def __init__(self, path: str, matrix: Array):
         self.path, self._matrix = path, matrix
         self._stream = open_stream(path)
@@ -119,7 +123,7 @@ class SecondSensor:
         self._commands, self._elements, self._unit, self._delay = open_stream(options.wfc), elements, unit, delay
         self._history: deque[Array] = deque(maxlen=delay + 2 * options.ratio)
         self._count = 0
-        self.ratio = options.ratio
+        self.ratio: int = options.ratio
         stuck = max(STUCK, 3 * options.ratio / rate)
         wiring = NgsWiring(tuple(map(int, elements)), unit, options.ratio, options.lag, stuck)
         self._frames = NgsStream(slopes, wiring, say)
@@ -177,7 +181,7 @@ class CommandAhead:
         Frames from a command to the first measurement that sees it.
     """
 
-    targets = ("disturbance",)
+    targets: tuple[str, ...] = ("disturbance",)
 
     def __init__(self, controller: StepController, n_modes: int, delay: int):
         self._controller, self._commands = controller, np.zeros((delay, n_modes))
@@ -263,6 +267,9 @@ class LoopPredictor:
         The file or a setting is refused.
     """
 
+    num_modes: int
+    horizon: int
+
     def __init__(
         self,
         num_modes: int,
@@ -316,7 +323,7 @@ class LoopPredictor:
             self._put_in(self._design(identify(record), record))
         for row in history:
             self._take(row, None)
-        self.fitted = True
+        self.fitted: bool = True
         return self
 
     def update(self, pol: ArrayLike) -> None:

@@ -40,6 +40,9 @@ HEIGHT, LINE = 40.0, 3.3
 PIXELS = (900, 280)
 """Width and height of one plot by Bokeh."""
 
+NOTEBOOK = 200
+"""Size of Matplotlib's plots in a notebook, in percent of its usual one."""
+
 PAPER: Any = {
     "font.size": 7,
     "axes.labelsize": 7,
@@ -111,7 +114,7 @@ def overlay(
         **both,
         legend_position="right",
         bokeh={"width": width, "height": height, "click_policy": "hide"},
-        matplotlib={"aspect": width / height},
+        matplotlib={"aspect": width / height, "fig_size": NOTEBOOK},
     )
 
 
@@ -121,7 +124,8 @@ def _axis_label(of: hv.Dimension) -> str:
 
 def stack(figures: Sequence[hv.Overlay], columns: int = 1) -> hv.Layout:
     """Place figures below each other."""
-    return style(hv.Layout(list(figures)).cols(columns), bokeh={}, matplotlib={"sublabel_format": ""})
+    looks = {"sublabel_format": "", "fig_size": NOTEBOOK, "vspace": 0.5}
+    return style(hv.Layout(list(figures)).cols(columns), bokeh={}, matplotlib=looks)
 
 
 Bar = tuple[str, Sequence[float], Sequence[str]]
@@ -211,7 +215,7 @@ def to_matplotlib(figure: Any, width: float = COLUMN, height: float = 0.0) -> An
     """Return a figure of Matplotlib of this width and height [mm]."""
     layout: Any = figure if isinstance(figure, hv.Layout) else stack([figure])
     inches = width / 25.4, HEIGHT / 25.4  # both given, so that the width stays; the height comes below
-    drawn: Any = hv.renderer("matplotlib").get_plot(layout.opts(fig_inches=inches, backend="matplotlib")).state
+    drawn: Any = hv.renderer("matplotlib").get_plot(layout.opts(fig_inches=inches, fig_size=100, backend="matplotlib")).state
     rows, columns = layout.shape
     above, heights = None, np.full(rows, HEIGHT)
     every = [axes for axes in drawn.axes if axes.get_subplotspec() is not None]

@@ -14,7 +14,7 @@ import holoviews as hv
 import numpy as np
 
 from wfsobs.campaign.sweep import SweepResults
-from wfsobs.closed_loop.run import ClosedLoop, residual_rms
+from wfsobs.closed_loop.rows import ClosedLoop, residual_rms
 from wfsobs.control.curves import Curves, curves
 from wfsobs.evaluation.budget import TERMS, error_budget
 from wfsobs.evaluation.error_spectra import TRUTH, cumulative_rms, spectra
@@ -60,7 +60,7 @@ class RecordPlots:
 
     def __init__(self, record: Record):
         self.record = record
-        self.names = [m.name for m in modes_up_to(HIGHEST_ORDER)][: record.n_modes]
+        self.names: list[str] = [m.name for m in modes_up_to(HIGHEST_ORDER)][: record.n_modes]
 
     def traces(self, *, mode: str | None = None, start: float = 0.0, stop: float | None = None) -> hv.Overlay:
         """Draw measurements and truth over time, from `start` to `stop` [s]."""
@@ -92,7 +92,7 @@ class ResultPlots:
 
     def __init__(self, result: Result):
         self.result = result
-        self.names = [m.name for m in result.scenario.modes][: result.record.n_modes]
+        self.names: list[str] = [m.name for m in result.scenario.modes][: result.record.n_modes]
 
     def traces(
         self,
@@ -283,7 +283,7 @@ class LoopPlots:
 
     def __init__(self, loop: ClosedLoop):
         self.loop = loop
-        self.names = [m.name for m in loop.scenario.modes]
+        self.names: list[str] = [m.name for m in loop.scenario.modes]
 
     def residuals(self, *, controllers: Sequence[str] | None = None, mode: str | None = None) -> hv.Overlay:
         """Draw power spectral densities of what every controller left."""

@@ -68,16 +68,18 @@ class Scenario(Group):
     wfsobs.settings.errors.SettingError: turbulence.wind_speed = 200: takes a number from 0.1 to 100 m/s
     """
 
-    telescope = section(Telescope, "Telescope")
-    turbulence = section(Turbulence, "Turbulence")
-    vibration = section(Vibration, "Vibration")
-    sensors = section(Sensors, "Sensors")
-    loop = section(Loop, "Loop")
-    kalman = section(Kalman, "Kalman filters")
-    butterworth = section(Butterworth, "Butterworth reference")
-    control = section(Control, "Controllers")
-    run = section(Run, "Run")
-    events = param.List([], item_type=Event, bounds=(0, 20), label="Events", doc="What changes during the record.")
+    telescope: Telescope = section(Telescope, "Telescope")
+    turbulence: Turbulence = section(Turbulence, "Turbulence")
+    vibration: Vibration = section(Vibration, "Vibration")
+    sensors: Sensors = section(Sensors, "Sensors")
+    loop: Loop = section(Loop, "Loop")
+    kalman: Kalman = section(Kalman, "Kalman filters")
+    butterworth: Butterworth = section(Butterworth, "Butterworth reference")
+    control: Control = section(Control, "Controllers")
+    run: Run = section(Run, "Run")
+    events: param.List[list[Event]] = param.List(
+        [], item_type=Event, bounds=(0, 20), label="Events", doc="What changes during the record."
+    )
 
     if TYPE_CHECKING:  # what observers of wfsobs bring along
         multipeak: MultiPeak
@@ -87,7 +89,7 @@ class Scenario(Group):
         gpr_online: OnlineGpr
 
     @classmethod
-    def settings(cls) -> dict[str, param.Parameter]:
+    def settings(cls) -> dict[str, param.Parameter[Any]]:
         """Name -> param.Parameter of every setting; the groups that observers and controllers bring along before `control`."""
         from wfsobs.observers import OBSERVERS  # late, as what is in it takes its time
 
@@ -100,7 +102,7 @@ class Scenario(Group):
 
     @classmethod
     @lru_cache(maxsize=4)
-    def _with(cls, own: tuple[Section, ...]) -> dict[str, param.Parameter]:
+    def _with(cls, own: tuple[Section, ...]) -> dict[str, param.Parameter[Any]]:
         known = declared_settings(cls)
         for name, label, group in own:
             if name not in known:

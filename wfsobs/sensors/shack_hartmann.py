@@ -135,10 +135,12 @@ class ShackHartmann:
         The slopes do not determine the modes.
     """
 
+    reconstructor: Array
+
     def __init__(self, lenslets: Lenslets, nolls: Sequence[int], order: int | None = None) -> None:
         self.lenslets = lenslets
-        self.nolls = tuple(nolls)
-        self.order = noll(max(nolls))[0] if order is None else order
+        self.nolls: tuple[int, ...] = tuple(nolls)
+        self.order: int = noll(max(nolls))[0] if order is None else order
         self.reconstructor = reconstructor(lenslets, self.order)[[j - 2 for j in self.nolls]]
         weights = lenslets.spread(np.concatenate(np.split(self.reconstructor, 2, axis=1)))
         self._sums = TrigonometricSum(weights)

@@ -17,6 +17,9 @@ from wfsobs.settings.errors import SettingError, shorten
 from wfsobs.settings.parameters import allowed_values, hint, settings_once
 from wfsobs.settings.tree import Plain, leaves, put_value, to_native
 
+UsedWhen = Mapping[str, tuple[str, tuple[Any, ...]]]
+"""Setting -> another one of its group, and the values of it with which it has an effect."""
+
 SHOWN = 3
 """Maximum number of settings in the representation of a group."""
 
@@ -59,7 +62,7 @@ class Group(param.Parameterized):
     used_when : setting -> another one of the group, and the values of it with which it has an effect
     """
 
-    used_when: ClassVar[Mapping[str, tuple[str, tuple[Any, ...]]]] = MappingProxyType({})
+    used_when: ClassVar[UsedWhen] = MappingProxyType({})
 
     def __init_subclass__(cls) -> None:
         """Make a declaration that of the class: without this param copies it for every object whose value is set."""
@@ -117,7 +120,7 @@ class Group(param.Parameterized):
     # ------------------------------------------------------------------ plain values
 
     @classmethod
-    def settings(cls) -> dict[str, param.Parameter]:
+    def settings(cls) -> dict[str, param.Parameter[Any]]:
         """Return name -> param.Parameter of every setting, in order of declaration; not to be changed."""
         return settings_once(cls)
 
@@ -215,7 +218,7 @@ class Group(param.Parameterized):
                 trial = type(self).from_dict(trial).to_dict()  # a new item has its other settings, too
         return type(self).from_dict(trial)
 
-    def walk(self, prefix: str = "") -> Iterator[tuple[str, Group, param.Parameter]]:
+    def walk(self, prefix: str = "") -> Iterator[tuple[str, Group, param.Parameter[Any]]]:
         """Yield (dotted path, group that owns it, parameter) of every setting that is a value or a list."""
         for name, p in self.settings().items():
             value = getattr(self, name)
@@ -227,7 +230,7 @@ class Group(param.Parameterized):
             else:
                 yield f"{prefix}{name}", self, p
 
-    def lists(self, prefix: str = "") -> Iterator[tuple[str, param.List]]:
+    def lists(self, prefix: str = "") -> Iterator[tuple[str, param.List[Any]]]:
         """Yield (dotted path, parameter) of every list of groups."""
         for name, p in self.settings().items():
             value = getattr(self, name)
@@ -252,17 +255,17 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def holds_groups(p: param.List) -> bool:
+def holds_groups(p: param.List[Any]) -> bool:
     """Return whether a list's items are groups of settings."""
     return isinstance(p.item_type, type) and issubclass(p.item_type, Group)
 
 
-def settings_of(p: param.List) -> dict[str, param.Parameter]:
+def settings_of(p: param.List[Any]) -> dict[str, param.Parameter[Any]]:
     """Return the settings of an item of a list of groups."""
     return cast(type[Group], p.item_type).settings()
 
 
-def _groups(p: param.List, value: Any, path: str) -> list[Group]:
+def _groups(p: param.List[Any], value: Any, path: str) -> list[Group]:
     if not isinstance(value, (list, tuple)):
         raise SettingError(f"{path} = {shorten(value)}: takes a list of tables")
     _, high = p.bounds or (0, None)

@@ -6,16 +6,17 @@ import math
 import re
 from collections.abc import Sequence
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import param
 
 
-class Real(param.Number):
+class Real(param.Number[float]):
     """A finite number; integers become floats, booleans and NaN are refused."""
 
-    __get__ = param.Parameter.__get__
-    """Without param's look for a function that makes the number, which takes most of the time of reading settings."""
+    if not TYPE_CHECKING:
+        __get__ = param.Parameter.__get__
+        """Without param's look for a function that makes the number, which takes most of the time of reading settings."""
 
     def __set__(self, obj: Any, val: Any) -> None:
         super().__set__(obj, _as_float(val))
@@ -26,10 +27,11 @@ class Real(param.Number):
         super()._validate_value(val, allow_None)
 
 
-class Whole(param.Integer):
+class Whole(param.Integer[int]):
     """A whole number; booleans are refused."""
 
-    __get__ = param.Parameter.__get__
+    if not TYPE_CHECKING:
+        __get__ = param.Parameter.__get__
 
     def _validate_value(self, val: Any, allow_None: bool) -> None:
         if isinstance(val, bool):
@@ -37,7 +39,7 @@ class Whole(param.Integer):
         super()._validate_value(val, allow_None)
 
 
-class Reals(param.List):
+class Reals(param.List[list[float]]):
     """A list of finite numbers, each within `item_bounds`; its length within `bounds`."""
 
     __slots__ = ["item_bounds"]
@@ -70,7 +72,7 @@ def _as_float(value: Any) -> Any:
     return value
 
 
-def allowed_values(p: param.Parameter) -> str:
+def allowed_values(p: param.Parameter[Any]) -> str:
     """Return the values that a setting takes, as the end of a one-line message."""
     unit = f" {u}" if (u := unit_of(p)) else ""
     if isinstance(p, Reals):
@@ -103,18 +105,18 @@ def hint(value: object) -> str:
     return ""
 
 
-def unit_of(p: param.Parameter) -> str:
+def unit_of(p: param.Parameter[Any]) -> str:
     """Return the unit of a setting: the text in [brackets] in its documentation, or nothing."""
     match = re.search(r"(?<=\s)\[([^\]]+)\]", p.doc or "")
     return match.group(1) if match else ""
 
 
-def declared_settings(cls: type[param.Parameterized]) -> dict[str, param.Parameter]:
+def declared_settings(cls: type[param.Parameterized]) -> dict[str, param.Parameter[Any]]:
     """Return name -> param.Parameter of every setting of a class, in order of declaration."""
     return {name: p for name, p in cls.param.objects("existing").items() if name != "name"}
 
 
 @cache
-def settings_once(cls: type[param.Parameterized]) -> dict[str, param.Parameter]:
+def settings_once(cls: type[param.Parameterized]) -> dict[str, param.Parameter[Any]]:
     """Return `declared_settings` of a class that gets no more of them: asked some thousand times for a change of one."""
     return declared_settings(cls)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from types import MappingProxyType
+from typing import ClassVar
 
 import param
 
-from wfsobs.settings.group import Group
+from wfsobs.settings.group import Group, UsedWhen
 from wfsobs.settings.parameters import Real, Reals, Whole
 
 PAPER_PEAK_HZ = 47.4969
@@ -16,7 +17,7 @@ PAPER_PEAK_HZ = 47.4969
 class Kalman(Group):
     """The model inside the Kalman filters: AR(2) turbulence plus one vibration peak."""
 
-    used_when = MappingProxyType(
+    used_when: ClassVar[UsedWhen] = MappingProxyType(
         {
             "turbulence_rms": ("process_noise", ("manual",)),
             "vibration_rms": ("process_noise", ("manual",)),
@@ -25,14 +26,14 @@ class Kalman(Group):
         }
     )
 
-    peak = param.Selector(
+    peak: param.Selector[str] = param.Selector(
         default="manual",
         objects=["manual", "matched"],
         label="Vibration peak",
         doc="manual: the frequency and damping below in every mode; matched: those of the strongest line that the scenario's "
         "vibration has in each, the ones below where it has none.",
     )
-    frequency = Real(
+    frequency: Real = Real(
         PAPER_PEAK_HZ,
         bounds=(0.01, 50_000.0),
         softbounds=(5.0, 80.0),
@@ -40,7 +41,7 @@ class Kalman(Group):
         label="Model frequency f_f",
         doc="Natural frequency of the modelled vibration [Hz] (paper, Table 2).",
     )
-    damping = Real(
+    damping: Real = Real(
         0.03,
         bounds=(0.0, 1.0),
         softbounds=(0.0, 0.1),
@@ -48,13 +49,13 @@ class Kalman(Group):
         label="Model damping ξ_f",
         doc="Damping of the modelled vibration (paper, Table 2); the model never goes below 1e-4.",
     )
-    process_noise = param.Selector(
+    process_noise: param.Selector[str] = param.Selector(
         default="matched",
         objects=["matched", "manual"],
         label="Process noise Q",
         doc="matched: Q from the rms of the scenario's turbulence and vibration; manual: from the two numbers below.",
     )
-    turbulence_rms = Real(
+    turbulence_rms: Real = Real(
         0.5,
         bounds=(1e-6, 100.0),
         softbounds=(0.001, 2.0),
@@ -62,34 +63,34 @@ class Kalman(Group):
         doc="Standard deviation of the modelled turbulence in tip and tilt [um], for process noise manual; a "
         "higher order has it in the ratio that r0 and L0 give.",
     )
-    vibration_rms = Real(
+    vibration_rms: Real = Real(
         0.015,
         bounds=(1e-6, 100.0),
         softbounds=(0.001, 0.2),
         label="Model vibration rms",
         doc="Standard deviation of the modelled vibration in tip and tilt [um], for process noise manual.",
     )
-    measurement_noise = param.Selector(
+    measurement_noise: param.Selector[str] = param.Selector(
         default="matched",
         objects=["matched", "manual"],
         label="Measurement noise R",
         doc="matched: R from the white noise of the scenario's sensors; manual: from the two numbers below.",
     )
-    lgs_noise = Real(
+    lgs_noise: Real = Real(
         0.0141,
         bounds=(1e-6, 100.0),
         softbounds=(0.001, 0.2),
         label="Model LGS noise",
         doc="Noise of the mean LGS measurement, rms [um], for measurement noise manual.",
     )
-    ngs_noise = Real(
+    ngs_noise: Real = Real(
         0.01,
         bounds=(1e-6, 100.0),
         softbounds=(0.001, 0.2),
         label="Model NGS noise",
         doc="Noise of an NGS frame, rms [um], for measurement noise manual.",
     )
-    ngs_between_frames = param.Selector(
+    ngs_between_frames: param.Selector[str] = param.Selector(
         default="hold",
         objects=["hold", "propagate"],
         label="NGS KF between frames",
@@ -100,14 +101,14 @@ class Kalman(Group):
 class Butterworth(Group):
     """The sum of band-passes that isolates vibration, as reference and as GPR target."""
 
-    frequencies = Reals(
+    frequencies: Reals = Reals(
         [17.1, 24.3, 34.1, 47.7, 54.3, 61.5],
         item_bounds=(0.01, 50_000.0),
         bounds=(1, 100),
         label="Centre frequencies",
         doc="Centres of the band-passes [Hz] (paper, Table 4).",
     )
-    bandwidth_offline = Real(
+    bandwidth_offline: Real = Real(
         3.0,
         bounds=(0.01, 1000.0),
         softbounds=(0.5, 10.0),
@@ -115,7 +116,7 @@ class Butterworth(Group):
         label="Bandwidth, open loop",
         doc="Width of each band on open-loop data [Hz] (paper, Table 4).",
     )
-    bandwidth_online = Real(
+    bandwidth_online: Real = Real(
         2.0,
         bounds=(0.01, 1000.0),
         softbounds=(0.5, 10.0),
@@ -123,4 +124,4 @@ class Butterworth(Group):
         label="Bandwidth, closed loop",
         doc="Width of each band on closed-loop data [Hz] (paper, Table 4).",
     )
-    order = Whole(1, bounds=(1, 4), label="Filter order", doc="Order of each band-pass (paper, Table 4).")
+    order: Whole = Whole(1, bounds=(1, 4), label="Filter order", doc="Order of each band-pass (paper, Table 4).")

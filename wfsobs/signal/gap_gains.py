@@ -64,6 +64,10 @@ class GapStep:
         What its owner states of the errors after it, once asked for; kept with it.
     """
 
+    is_last: bool
+    posterior: Array
+    update: Array
+
     __slots__ = ("following", "is_last", "posterior", "sd", "update")
 
     def __init__(self, posterior: Array, update: Array, is_last: bool):
@@ -94,6 +98,9 @@ class GapGains:
     mean : SensorMean
         The sensors of the first measurement.
     """
+
+    weights: Array
+    most: float
 
     def __init__(self, cycle: Sequence[Step], posteriors: Sequence[Array], rows: Array, scale: float, mean: SensorMean = ONE):
         e = len(mean.A)

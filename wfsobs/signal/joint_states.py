@@ -130,6 +130,8 @@ def real_product(a: Complex, b: Complex) -> Array:
 class LeastVariance:
     """Estimates of least variance that are linear in states of this covariance, (n, n) [um^2]; size : n."""
 
+    size: int
+
     def __init__(self, covariance: Array):
         variance, self.size = np.diag(covariance), len(covariance)
         self._scale = np.sqrt(np.where(variance > 0.0, variance, 1.0))

@@ -158,6 +158,12 @@ def _mirror(above: Array, below: Array | None = None) -> Array:
 class PlaneWaves:
     """Waves of a block, `kx` along and `ky` across the wind, (n_kx,) and (n_ky, 1) [rad/m]; the latter symmetric about 0."""
 
+    kx: Array
+    ky: Array
+    c: float
+    s: float
+    above: Array
+
     def __init__(self, kx: Array, ky: Array, angle: float) -> None:
         self.kx, self.ky, self.c, self.s = kx, ky[:, None], np.cos(angle), np.sin(angle)
         self.above = self.ky[ky.size // 2 :]

@@ -98,7 +98,7 @@ def ideal_sensor(scenario: Scenario) -> ZernikeProjection:
 
 # ---------------------------------------------------------------------- covariances
 
-LOG_K = np.linspace(np.log(1e-9), np.log(1e4), 6000)
+LOG_K: Array = np.linspace(np.log(1e-9), np.log(1e4), 6000)
 """Spatial frequencies, times D / 2, of integrals over all directions; the smallest lie below any outer scale."""
 
 

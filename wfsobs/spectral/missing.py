@@ -52,9 +52,14 @@ class MissingSamples:
         For the records drawn; who only fills has none.
     """
 
+    is_missing: Array
+    dt: float
+    n: int
+    noise: Array
+
     def __init__(self, is_missing: Array, dt: float, rng: np.random.Generator | None = None):
         self.is_missing, self.dt, self.n = is_missing, dt, len(is_missing)
-        self.any = bool(is_missing.any())
+        self.any: bool = bool(is_missing.any())
         self.noise = rng.standard_normal((DRAWS, self.n)) if self.any and rng is not None else np.zeros((0, self.n))
 
     def rounds(self, left: float) -> int:

@@ -83,6 +83,12 @@ class Cells:
         Frequency [Hz], mean of the periodogram, number of bins and measured share, each (cells,).
     """
 
+    bin_width: float
+    count: Array
+    frequency: Array
+    mean: Array
+    share: Array
+
     def __init__(
         self,
         f: Array,

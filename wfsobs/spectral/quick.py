@@ -95,6 +95,19 @@ class WindowFit:
     shown, `spectrum` without.
     """
 
+    extra: Ar2 | Ar3 | None
+    narrowest: float
+    sizes: tuple[int, int]
+    dt: float
+    fine_f: Array
+    fine: Array
+    f: Array
+    df: float
+    blur: float
+    third: bool
+    has_background: bool
+    x: Array
+
     def __init__(
         self,
         z: Array,
@@ -113,7 +126,7 @@ class WindowFit:
         self.blur = 2.0 * pi * blur * self.df
         smooth = [numbers_of(p) for p in (start.turbulence, start.background) if p is not None]
         self.third, self.has_background = isinstance(start.turbulence, Ar3), start.background is not None
-        self.first = 1 + 3 * len(smooth) + self.third
+        self.first: int = 1 + 3 * len(smooth) + self.third
         corner = smooth[0][3:] if self.third else []
         resonances = [numbers_of(self._show(p)) for p in start.resonances]
         self.x = np.concatenate([[log(start.noise)], *(numbers[:3] for numbers in smooth), corner, *resonances])
@@ -233,9 +246,9 @@ class WindowFit:
     def _average(self) -> None:
         """Average the periodogram in cells that are narrow near the resonances."""
         centres = np.exp(self.resonances[:, 0]) / (2.0 * pi)
-        self.cells = Cells(self.f, self.I, np.ones(len(self.f)), centres, sizes=self.sizes)
+        self.cells: Cells = Cells(self.f, self.I, np.ones(len(self.f)), centres, sizes=self.sizes)
         if self.extra is not None:
-            self.extra_density = self.extra.psd(self.cells.frequency)
+            self.extra_density: Array = self.extra.psd(self.cells.frequency)
 
     def improve(self) -> None:
         """Take Newton steps with the expected second derivatives, damped (Levenberg, Marquardt) where they lead uphill."""

@@ -280,7 +280,7 @@ class Attachment:
         self._count, self._alive = source.first, 0.0
         self._is_stuck = self._is_overtaken = False
         self._ngs, self._frames = ngs, GoingBack(observer)
-        self.tally = Tally(observer.sampling.dt)
+        self.tally: Tally = Tally(observer.sampling.dt)
 
     def run(
         self, seconds: float, *, report: Callable[[str], None] = lambda _: None, stop: Callable[[], bool] = lambda: False

@@ -103,7 +103,7 @@ VERSION, NAME, AXES, COUNT_OF_ELEMENTS, DATATYPE, IMAGE_TYPE, TIMES = 0, 32, 112
 """Offsets that both layouts have; the times are those of creation, last access, acquisition and writing."""
 
 LONGEST_NAME = 79
-DATATYPES = {9: np.dtype("<f4"), 10: np.dtype("<f8")}
+DATATYPES: dict[int, np.dtype[Any]] = {9: np.dtype("<f4"), 10: np.dtype("<f8")}
 MATHEMATICAL = 2
 """Type of an image that is a vector or matrix."""
 

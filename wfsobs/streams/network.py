@@ -17,7 +17,7 @@ from wfsobs.typing import Array
 if TYPE_CHECKING:
     import zmq
 
-DTYPES = {"float32": np.dtype("<f4"), "float64": np.dtype("<f8")}
+DTYPES: dict[str, np.dtype[Any]] = {"float32": np.dtype("<f4"), "float64": np.dtype("<f8")}
 HEADER = 256
 """Longest header [bytes]."""
 
@@ -93,6 +93,11 @@ class Subscription:
     is_current : bool
         True: ZeroMQ connects again by itself.
     """
+
+    path: str
+    n: int
+    dtype: str
+    n_refused: int
 
     is_current = True
 
@@ -220,7 +225,7 @@ class Publication:
 
     def __init__(self, path: str, n: int, dtype: str = "float32"):
         self._socket = _open_socket(path, "PUB")
-        self.path = self._socket.get_string(_zmq(path).LAST_ENDPOINT)
+        self.path: str = self._socket.get_string(_zmq(path).LAST_ENDPOINT)
         self._values, self._count = np.zeros(n, DTYPES[dtype]), 0
 
     @property

@@ -56,7 +56,7 @@ class NgsStream:
         check_elements(stream, wiring.elements)
         self._stream, self._wiring, self._say = stream, wiring, say
         self._elements, self._count, self._alive = np.array(wiring.elements), stream.first, monotonic()
-        self.ratio = wiring.ratio
+        self.ratio: int = wiring.ratio
         self.phase: int | None = None
         self._write_time = 0
         self._first = 0  # counter of the NGS frame that belongs to the LGS frame `phase`

@@ -73,7 +73,7 @@ class SharedImage:
     """
 
     def __init__(self, path: str | Path):
-        self.path = str(path)
+        self.path: str = str(path)
         try:
             with open(path, "r+b") as file:
                 self._map = mmap.mmap(file.fileno(), 0)
@@ -89,7 +89,7 @@ class SharedImage:
         self._semaphores = self._find_semaphores()
         readers = self.header.readers
         self._readers = None if readers is None else np.ndarray(self.header.n_semaphores, "<i4", self._map, readers)
-        self.first = self.count
+        self.first: int = self.count
 
     @classmethod
     def create(cls, path: str | Path, shape: Sequence[int], *, dtype: str = "float32", layout: Layout = CURRENT) -> SharedImage:

@@ -67,6 +67,10 @@ class Gate:
         Measurements out of their band in a row, (n_modes,).
     """
 
+    mean: Array
+    sd: Array
+    beyond: Array
+
     def __init__(self, spread: Array, largest: Array):
         self._spread, self._possible = spread, largest + SIGMAS * spread
         self.restart()
@@ -110,6 +114,8 @@ class Watchdog:
     trips : int
         Times that it fell back.
     """
+
+    trips: int
 
     def __init__(self, largest: Array, safety: Safety, say: Callable[[str], None], warm_up: int = 0):
         self.reason, self.trips = ("the observer starts" if warm_up else ""), 0

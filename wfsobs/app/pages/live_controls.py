@@ -16,7 +16,7 @@ from wfsobs.app.pages.live_figures import MEASUREMENT
 from wfsobs.app.pages.parts import WIDE, LinkedFields, line
 from wfsobs.app.render import NOTHING, Row, number, table
 from wfsobs.app.style import look, swatch
-from wfsobs.closed_loop.run import strehl
+from wfsobs.closed_loop.rows import strehl
 from wfsobs.evaluation.rows import row_label, target_title
 from wfsobs.live.board import ADAPTIVE, NEXT, SCORED, SLOTS
 from wfsobs.live.checks import has_error, speed_of

@@ -44,20 +44,20 @@ NOTHING = (Matern(0.0, 1.0, 1),)
 class GaussianProcess(Group):
     """Gaussian process regression in time, with a sum of kernels."""
 
-    turbulence = param.Selector(
+    turbulence: param.Selector[str] = param.Selector(
         default=POLES,
         objects=[POLES, *MATERN, SMOOTH],
         label="Kernel of the turbulence",
         doc="as told: the poles of the model; the others have its rms and its corner frequency.",
     )
-    background_rms = Real(
+    background_rms: Real = Real(
         0.0,
         bounds=(0.0, 100.0),
         softbounds=(0.0, 0.1),
         label="Coloured background",
         doc="RMS of a Matern 1/2 background of the measurement [um]; 0 for none.",
     )
-    background_scale = Real(
+    background_scale: Real = Real(
         1.5,
         bounds=(0.01, 1e4),
         softbounds=(0.1, 100.0),

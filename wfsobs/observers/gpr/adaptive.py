@@ -61,12 +61,16 @@ class AdaptiveGprEstimator(HeldEstimate):
     Raises StepError where the horizon leaves too few targets.
     """
 
-    state_names = ("_samples", "_recent", "_filters", "_mean", "_sd", "count")
+    settings: Adaptive
+    sampling: Sampling
+    count: int
+
+    state_names: tuple[str, ...] = ("_samples", "_recent", "_filters", "_mean", "_sd", "count")
 
     def __init__(self, settings: Adaptive, sampling: Sampling, horizon: int = 0):
         super().__init__(sampling.n_modes, float(horizon))
         self.settings, self.sampling, self._ahead = settings, sampling, horizon
-        self.schedule = schedule_of(settings, sampling.dt)
+        self.schedule: Schedule = schedule_of(settings, sampling.dt)
         if horizon >= self.schedule.first // 4:
             raise StepError(f"gpr-adaptive: {horizon} frames ahead: takes less than an eighth of adaptive.window")
         n = sampling.n_modes
@@ -155,7 +159,7 @@ class AdaptiveGprEstimator(HeldEstimate):
         super().load(state)
         self._pending = False
         packed = zip(state["spectra"], state["means"].tolist(), state["weights"], strict=True)
-        self.learnt = [
+        self.learnt: list[Learnt] = [
             Learnt(unpack_spectrum(table, self.sampling.dt), mean, weights.copy(), sd) for table, (mean, sd), weights in packed
         ]
         self._use()

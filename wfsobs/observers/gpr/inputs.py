@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import param
@@ -19,28 +19,29 @@ from wfsobs.observers.step import StepError
 from wfsobs.observers.stepping import SampleHistory, StateArrays
 from wfsobs.record import Measurements, RecordError, Sampling, Training, pseudo_open_loop
 from wfsobs.settings import Group, Real, Whole
+from wfsobs.settings.group import UsedWhen
 from wfsobs.typing import Array
 
 
 class Gpr(Group):
     """What both GPR share; the numbers are those of Table 4."""
 
-    used_when = MappingProxyType({"highpass": ("inputs_filter", ("high-pass",))})
+    used_when: ClassVar[UsedWhen] = MappingProxyType({"highpass": ("inputs_filter", ("high-pass",))})
 
-    inputs = param.Selector(
+    inputs: param.Selector[str] = param.Selector(
         default="u-y",
         objects=["u-y", "z"],
         label="Inputs",
         doc="Contents of a window: commands and LGS measurements (paper, eq. 14) or pseudo-open-loop measurements z.",
     )
-    inputs_filter = param.Selector(
+    inputs_filter: param.Selector[str] = param.Selector(
         default="raw",
         objects=["raw", "high-pass", "standardised"],
         label="Filter of the inputs",
         doc="Processing of the inputs. raw: none (paper); high-pass: without turbulence below the corner; "
         "standardised: each channel over its standard deviation in the training record, so that l has no unit.",
     )
-    highpass = Real(
+    highpass: Real = Real(
         10.0,
         bounds=(0.1, 1000.0),
         softbounds=(1.0, 30.0),
@@ -48,16 +49,18 @@ class Gpr(Group):
         label="High-pass corner",
         doc="Corner of the inputs' high-pass, a second-order Butterworth filter [Hz]; not in the paper.",
     )
-    training_size = Whole(1000, bounds=(2, 2048), label="Training size m", doc="Number of training windows (paper, Table 4).")
-    depth = Whole(407, bounds=(1, 2000), label="Depth d", doc="Samples in a window (paper, Table 4).")
-    signal_std = Real(
+    training_size: Whole = Whole(
+        1000, bounds=(2, 2048), label="Training size m", doc="Number of training windows (paper, Table 4)."
+    )
+    depth: Whole = Whole(407, bounds=(1, 2000), label="Depth d", doc="Samples in a window (paper, Table 4).")
+    signal_std: Real = Real(
         10.0,
         bounds=(1e-3, 1e4),
         softbounds=(0.1, 100.0),
         label="Output scale σ_SE",
         doc="Output scale sigma_SE of the squared-exponential kernel [um] (paper, eq. 13 and Table 4).",
     )
-    length_scale = Real(
+    length_scale: Real = Real(
         300.0,
         bounds=(0.1, 1e5),
         softbounds=(1.0, 1000.0),
@@ -65,7 +68,7 @@ class Gpr(Group):
         doc="Length scale l of the squared-exponential kernel [um] (paper, eq. 13 and Table 4). Far above the norm of "
         "the windows the kernel is linear: ridge regression with weight (sigma_n l / sigma_SE)^2.",
     )
-    noise_std = Real(
+    noise_std: Real = Real(
         0.13,
         bounds=(1e-4, 10.0),
         softbounds=(0.01, 1.0),
@@ -142,7 +145,7 @@ def _channels(settings: Gpr, y: Array, u: Array, z: Array, mode: int) -> Array:
 class StreamingInputs(StateArrays):
     """`window_signals`, one sample at a time, of so many channels."""
 
-    state_names = ("_filter", "_is_started")
+    state_names: tuple[str, ...] = ("_filter", "_is_started")
 
     def __init__(self, settings: Gpr, dt: float, scale: Scale | None = None, channels: int = 1):
         if settings.inputs_filter == "standardised" and scale is None:
@@ -177,7 +180,9 @@ class Windows(StateArrays):
         Of standardised inputs, one per mode; empty for others.
     """
 
-    state_names = ("_samples", "_commands", "_held_value", "count", "_inputs")
+    depth: int
+
+    state_names: tuple[str, ...] = ("_samples", "_commands", "_held_value", "count", "_inputs")
 
     def __init__(self, settings: Gpr | None, sampling: Sampling, depth: int, scales: Sequence[Scale] = ()):
         self._of_record = settings, sampling.dt, tuple(scales)
@@ -237,7 +242,7 @@ class Windows(StateArrays):
             raise StepError("the designs have windows of other channels")
         self.load(state)
         if self.depth > old.depth:
-            self.count = min(old.count, old.depth)
+            self.count: int = min(old.count, old.depth)
 
 
 def tunable(group: str) -> tuple[str, ...]:

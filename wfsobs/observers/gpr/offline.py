@@ -84,7 +84,11 @@ def step_gpr_offline(prior: Prior, settings: OfflineGpr, sampling: Sampling, hor
 class OfflineEstimator(HeldEstimate):
     """Trained GPR of all modes, one frame at a time; `train_mode` made them for `horizon` frames ahead."""
 
-    state_names = ("windows", "_mean")
+    windows: Windows
+    models: tuple[TrainedGpr, ...]
+    needs_command: bool
+
+    state_names: tuple[str, ...] = ("windows", "_mean")
 
     def __init__(self, windows: Windows, models: Sequence[TrainedGpr], horizon: float | None):
         super().__init__(len(models), horizon)

@@ -32,16 +32,18 @@ from wfsobs.typing import Array
 class OnlineGpr(Gpr):
     """Online GPR: retrained at every step on the last windows."""
 
-    training_size = Whole(511, bounds=(2, 2048), label="Training size m", doc="Number of training windows (paper, Table 4).")
-    depth = Whole(170, bounds=(1, 2000), label="Depth d", doc="Samples in a window (paper, Table 4).")
-    signal_std = Real(
+    training_size: Whole = Whole(
+        511, bounds=(2, 2048), label="Training size m", doc="Number of training windows (paper, Table 4)."
+    )
+    depth: Whole = Whole(170, bounds=(1, 2000), label="Depth d", doc="Samples in a window (paper, Table 4).")
+    signal_std: Real = Real(
         30.0,
         bounds=(1e-3, 1e4),
         softbounds=(0.1, 100.0),
         label="Output scale σ_SE",
         doc="sigma_SE of the squared-exponential kernel [um] (paper, eq. 13 and Table 4).",
     )
-    noise_std = Real(
+    noise_std: Real = Real(
         0.1,
         bounds=(1e-4, 10.0),
         softbounds=(0.01, 1.0),
@@ -174,7 +176,11 @@ class OnlineEstimator(HeldEstimate):
         Of the vibration now, one frame ahead and so on in what it learns; fewer than m.
     """
 
-    state_names = ("windows", "bank", "_mean", "_band_signals", "regression")
+    windows: Windows
+    weights: Array
+    needs_command: bool
+
+    state_names: tuple[str, ...] = ("windows", "bank", "_mean", "_band_signals", "regression")
 
     def __init__(
         self, windows: Windows, bands: Bands, sampling: Sampling, depth: int, m: int, kernel: SquaredExponential, weights: Array
@@ -184,9 +190,11 @@ class OnlineEstimator(HeldEstimate):
         self._band_signals = np.zeros((len(weights), sampling.n_modes))  # oldest first
         self._size = depth, m, 2 if windows.needs_command else 1, kernel
         bank = bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, sampling.dt)
-        self.bank = FilterBank([bank_recursion(bank)] * sampling.n_modes)
+        self.bank: FilterBank = FilterBank([bank_recursion(bank)] * sampling.n_modes)
         self._pending, late, n = False, len(weights) - 1, sampling.n_modes
-        self.regression = LateRegression(*self._size, late, n) if late else SlidingRegression(*self._size, n)
+        self.regression: LateRegression | SlidingRegression = (
+            LateRegression(*self._size, late, n) if late else SlidingRegression(*self._size, n)
+        )
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame."""

@@ -46,6 +46,11 @@ class SlidingRegression:
     depth, m : samples in a window, windows in the training set; channels : numbers per sample; n_modes : streams side by side
     """
 
+    depth: int
+    m: int
+    kernel: SquaredExponential
+    step: int
+
     def __init__(self, depth: int, m: int, channels: int, kernel: SquaredExponential, n_modes: int = 1):
         self.depth, self.m, self.kernel, n = depth, m, kernel, n_modes
         self._span = m + depth + 1

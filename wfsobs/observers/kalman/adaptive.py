@@ -87,6 +87,14 @@ class ModeWindow:
         Squared innovations over their variances since the last check, NaN where z is missing, (interval,); of both sensors.
     """
 
+    lengths: Lengths
+    due: int
+    began: int
+    last_change: int
+    size: int
+    means: Array
+    surprise: Array
+
     def __init__(self, lengths: Lengths):
         self.lengths, self.model = lengths, WindowModel()
         self.due, self.began, self.last_change, self.size = lengths.first + lengths.window, 0, 0, 0
@@ -243,7 +251,7 @@ class ModeWindow:
         fit, spectrum, error = (unpack_spectrum(table, step) for table, step in zip(state["spectra"], steps, strict=True))
         ngs, hidden_rms = state["noise"].tolist()
         filter_ = None if spectrum is None else model_filter(spectrum, error, ngs, self.lengths.ratio)
-        self.model = WindowModel(fit, spectrum, filter_, hidden_rms, error, ngs)
+        self.model: WindowModel = WindowModel(fit, spectrum, filter_, hidden_rms, error, ngs)
         kalman = self.put_in_charge()
         if kalman is not None:
             n = kalman.bank.x.shape[1]
@@ -265,8 +273,15 @@ class AdaptiveEstimator(StateArrays):
         Of the loop; its ratio is None for the LGS alone.
     """
 
+    horizon: None
+    needs_command: bool
+    settings: Adaptive
+    sampling: Sampling
+    lengths: Lengths
+    count: int
+
     horizon, needs_command = None, False
-    state_names = ("_samples", "count")
+    state_names: tuple[str, ...] = ("_samples", "count")
 
     def __init__(self, settings: Adaptive, sampling: Sampling):
         self.settings, self.sampling = settings, sampling
@@ -274,7 +289,7 @@ class AdaptiveEstimator(StateArrays):
         self.lengths.check(settings, sampling.dt)
         self._n_sensors = 1 if sampling.ratio is None else 2
         self.count, self._samples = 0, SampleHistory(sampling.n_modes * self._n_sensors, self.lengths.longest)
-        self.windows = [ModeWindow(self.lengths) for _ in range(sampling.n_modes)]
+        self.windows: list[ModeWindow] = [ModeWindow(self.lengths) for _ in range(sampling.n_modes)]
         self._outputs: dict[tuple[float, str], Array] = {}
         self.mark_start()
 

@@ -67,6 +67,10 @@ class AsterismModel:
         The prior has no asterism, or another ratio.
     """
 
+    basis: Array
+    ratio: int
+    n_states: int
+
     def __init__(
         self,
         prior: Prior,
@@ -85,8 +89,8 @@ class AsterismModel:
         self._again = partial(AsterismModel, prior, settings, ratio, means, frame_means)
         self.basis, self.ratio, self._asterism = asterism.basis, asterism.ratio, asterism
         self._age, self._steps = age, range(age, age + asterism.ratio)
-        self.fast = [with_means(one, means) for one in independent_filters(prior, settings)]
-        self.slow = [with_means(one, frame_means) for one in frame_filters(prior, settings, asterism)]
+        self.fast: list[Beginning] = [with_means(one, means) for one in independent_filters(prior, settings)]
+        self.slow: list[Beginning] = [with_means(one, frame_means) for one in frame_filters(prior, settings, asterism)]
         silent = Ar2(1.0, 1.0, 0.0, prior.lines[0].dt)
         self._peaks = [disturbance_model((), one.vibration(settings.line_width) or [silent]) for one in prior.lines]
         omega = asterism.omega

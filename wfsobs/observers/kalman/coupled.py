@@ -67,6 +67,8 @@ class CoupledModel:
         The prior has no flow.
     """
 
+    filters: list[ModeFilter]
+
     def __init__(self, prior: Prior, settings: MultiPeak, means: StateFilter = MEANS):
         if prior.flow is None:
             raise ValueError(INDEPENDENT)
@@ -155,9 +157,13 @@ class CoupledEstimator(StateArrays):
         The running means, (n_spans, n_modes) [um].
     """
 
+    model: CoupledModel
+    kalman: KalmanEstimator
+    means: Array
+
     horizon: float | None = None
     needs_command = False
-    state_names = ("kalman", "means", "_is_first")
+    state_names: tuple[str, ...] = ("kalman", "means", "_is_first")
 
     def __init__(self, model: CoupledModel):
         self.model, self.kalman = model, KalmanEstimator(model.filters)

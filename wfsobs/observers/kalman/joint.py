@@ -89,9 +89,13 @@ class JointEstimator(StateArrays):
         Steps since the last NGS frame, or what stands for one; WITHOUT before the first that came, FIRST before the first step.
     """
 
+    frames: Array
+    stand_in_frames: Array
+    phase: int
+
     horizon: float | None = None
     needs_command = False
-    state_names = ("x", "frames", "stand_in_frames", "phase", "present")
+    state_names: tuple[str, ...] = ("x", "frames", "stand_in_frames", "phase", "present")
 
     def __init__(self, model: AsterismModel):
         self.model = model
@@ -117,7 +121,7 @@ class JointEstimator(StateArrays):
         if self.phase == FIRST:
             self.x, self.phase = self._fast.begin(seen), WITHOUT
         else:
-            self.x = self._fast.advance(self.x, seen)
+            self.x: Array = self._fast.advance(self.x, seen)
         if ngs is not None:
             self._take_frame(ngs)
         elif self.phase >= 0:

@@ -27,7 +27,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import param
@@ -40,6 +40,7 @@ from wfsobs.observers.stepping import Gain, GainCycle
 from wfsobs.prior import Beams, LgsError, LgsStars, Lines, Model, Noise, NoiselessModel, Part, Prior
 from wfsobs.record import Sampling
 from wfsobs.settings import Group, Real, Section
+from wfsobs.settings.group import UsedWhen
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.filter_covariance import Step, posteriors_of_gains
@@ -53,31 +54,31 @@ from wfsobs.typing import Array
 class MultiRate(Group):
     """Noise weights of the multi-rate Kalman filter."""
 
-    used_when = MappingProxyType(
+    used_when: ClassVar[UsedWhen] = MappingProxyType(
         {"lgs_noise": ("measurement_noise", ("manual",)), "ngs_noise": ("measurement_noise", ("manual",))}
     )
 
-    measurement_noise = param.Selector(
+    measurement_noise: param.Selector[str] = param.Selector(
         default="matched",
         objects=["matched", "manual"],
         label="Measurement noise R",
         doc="matched: as in the Kalman filters; manual: the two numbers below, r_NGS < r_LGS (paper, section 2.2.1).",
     )
-    lgs_noise = Real(
+    lgs_noise: Real = Real(
         0.05,
         bounds=(1e-6, 100.0),
         softbounds=(0.001, 0.2),
         label="Weight of LGS",
         doc="Square root of r_LGS [um], for measurement noise manual.",
     )
-    ngs_noise = Real(
+    ngs_noise: Real = Real(
         0.01,
         bounds=(1e-6, 100.0),
         softbounds=(0.001, 0.2),
         label="Weight of NGS",
         doc="Square root of r_NGS [um], for measurement noise manual.",
     )
-    model_lgs_error = param.Boolean(
+    model_lgs_error: param.Boolean[bool] = param.Boolean(
         True,
         label="LGS error in the optimal filter",
         doc="Include the slow LGS error in the model of the optimal multi-rate filter, as a state of its own; without "

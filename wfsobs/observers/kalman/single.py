@@ -162,13 +162,13 @@ KF_NGS = Observer(
 class MultiPeak(Group):
     """The Kalman filters with every peak of the scenario in their models."""
 
-    turbulence_order = Whole(
+    turbulence_order: Whole = Whole(
         2,
         bounds=(2, 3),
         label="Order of the turbulence model",
         doc="2: the AR(2) of the paper; 3: one more pole, fitted to the scenario's true spectrum.",
     )
-    line_width = Real(
+    line_width: Real = Real(
         0.025,
         bounds=(1e-4, 10.0),
         softbounds=(0.005, 1.0),

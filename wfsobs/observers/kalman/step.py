@@ -49,6 +49,9 @@ class GapBank(FilterBank):
         The sensors of the first measurement, by mode.
     """
 
+    has_first: bool
+    is_near: bool
+
     def __init__(self, gains: Sequence[GainCycle], make_gaps: Callable[[int], GapGains], means: Sequence[SensorMean]):
         super().__init__([one.estimator() for one in gains])
         self._sizes = [len(one.steps[0].A) for one in gains]
@@ -164,11 +167,11 @@ class LinearEstimator(StateArrays):
 
     horizon: float | None = None
     needs_command = False
-    state_names = ("bank",)
+    state_names: tuple[str, ...] = ("bank",)
 
     def __init__(self, modes: Sequence[ModeFilter]):
-        self.modes = tuple(modes)
-        self.bank = GapBank([mode.gains for mode in modes], self._gaps, [mode.mean for mode in modes])
+        self.modes: tuple[ModeFilter, ...] = tuple(modes)
+        self.bank: GapBank = GapBank([mode.gains for mode in modes], self._gaps, [mode.mean for mode in modes])
         self._of_equal: dict[bytes, GapGains] = {}
         self.mark_start()
 
@@ -312,8 +315,11 @@ class FrameEstimator(LinearEstimator):
         Whether an estimate is held until the next frame, so that any fraction of a frame is defined.
     """
 
+    truths: Sequence[DisturbanceModel]
+    errors: Sequence[FrameErrors]
+
     uses_ngs = True
-    state_names = ("bank", "_since", "_pairs")
+    state_names: tuple[str, ...] = ("bank", "_since", "_pairs")
 
     def __init__(
         self,
@@ -426,7 +432,7 @@ class FrameErrors:
         for _ in range(ratio):
             Phi, W = A @ Phi, A @ W @ A.T + Q
         self._A, self._Phi, self._W, self._noise = model.A, Phi, W, noise
-        self.steady = lyapunov(*self._map((np.eye(len(slow.L)) - slow.L @ slow.C) @ slow.A, slow.L))
+        self.steady: Array = lyapunov(*self._map((np.eye(len(slow.L)) - slow.L @ slow.C) @ slow.A, slow.L))
 
     def _map(self, F: Array, L: Array) -> tuple[Array, Array]:
         """Return transition and drive of the pair; F (n, n), L (n, 1): x_hat[i+1] = F x_hat[i] + L z[i+1]."""

@@ -34,7 +34,7 @@ from wfsobs.typing import Array
 class Adaptive(Group):
     """The Kalman filter whose model is re-identified all the time."""
 
-    window = Real(
+    window: Real = Real(
         4.0,
         bounds=(0.1, 100.0),
         softbounds=(0.5, 10.0),
@@ -43,7 +43,7 @@ class Adaptive(Group):
         doc="Length of the identification window [s]. Peaks closer than two over it are one; a peak that moves is "
         "followed after this time.",
     )
-    longest = Real(
+    longest: Real = Real(
         30.0,
         bounds=(0.1, 1000.0),
         softbounds=(4.0, 60.0),
@@ -51,7 +51,7 @@ class Adaptive(Group):
         label="Longest window",
         doc="Length to which the window of the multi-rate filter grows while the record is still [s].",
     )
-    interval = Real(
+    interval: Real = Real(
         0.5,
         bounds=(0.01, 100.0),
         softbounds=(0.1, 5.0),
@@ -59,13 +59,13 @@ class Adaptive(Group):
         label="Interval",
         doc="Time from one identification to the next [s].",
     )
-    peak_count = Whole(
+    peak_count: Whole = Whole(
         20,
         bounds=(0, 60),
         label="Maximum peaks",
         doc="Maximum number of vibration peaks in the model of one mode; twice as many where the window has grown to twice.",
     )
-    lowest = Real(
+    lowest: Real = Real(
         5.0,
         bounds=(0.1, 1000.0),
         softbounds=(1.0, 20.0),
@@ -73,7 +73,7 @@ class Adaptive(Group):
         label="Minimum frequency",
         doc="Minimum frequency of a peak [Hz]; at least 15 over the window.",
     )
-    depth = Whole(
+    depth: Whole = Whole(
         400,
         bounds=(1, 2000),
         label="Depth of the GPR",

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from types import MappingProxyType
+from typing import ClassVar
 
 import param
 
 from wfsobs.sensors.modes import HIGHEST_ORDER
-from wfsobs.settings.group import Group, section
+from wfsobs.settings.group import Group, UsedWhen, section
 from wfsobs.settings.parameters import Real, Reals, Whole
 
 
 class Telescope(Group):
     """The aperture, its pointing, and the simulated modes."""
 
-    diameter = Real(8.0, bounds=(0.1, 100.0), label="Aperture diameter D", doc="Diameter of the aperture [m] (paper, Table 1).")
-    radial_order = Whole(
+    diameter: Real = Real(
+        8.0, bounds=(0.1, 100.0), label="Aperture diameter D", doc="Diameter of the aperture [m] (paper, Table 1)."
+    )
+    radial_order: Whole = Whole(
         1,
         bounds=(1, HIGHEST_ORDER),
         softbounds=(1, HIGHEST_ORDER),
@@ -23,7 +26,7 @@ class Telescope(Group):
         doc="Zernike modes up to this radial order, without piston: 1 is tip and tilt (paper), 2 to 6 are 5, 9, 14, 20 "
         "and 27 modes.",
     )
-    zenith_angle = Real(
+    zenith_angle: Real = Real(
         0.0,
         bounds=(0.0, 70.0),
         softbounds=(0.0, 60.0),
@@ -37,17 +40,17 @@ class Telescope(Group):
 class PsdTable(Group):
     """A one-sided power spectral density given as a table."""
 
-    frequency = Reals(
+    frequency: Reals = Reals(
         [], item_bounds=(0.0, 5000.0), bounds=(0, 100_000), label="Frequencies", doc="Frequencies [Hz], increasing."
     )
-    tip = Reals(
+    tip: Reals = Reals(
         [],
         item_bounds=(0.0, 1e6),
         bounds=(0, 100_000),
         label="PSD of tip",
         doc="One-sided power spectral density of tip [um^2/Hz], one number per frequency.",
     )
-    tilt = Reals(
+    tilt: Reals = Reals(
         [],
         item_bounds=(0.0, 1e6),
         bounds=(0, 100_000),
@@ -59,7 +62,7 @@ class PsdTable(Group):
 class Layer(Group):
     """One layer of frozen flow."""
 
-    height = Real(
+    height: Real = Real(
         8000.0,
         bounds=(0.0, 40_000.0),
         softbounds=(0.0, 20_000.0),
@@ -67,7 +70,7 @@ class Layer(Group):
         label="Height h",
         doc="Height above the telescope [m].",
     )
-    fraction = Real(
+    fraction: Real = Real(
         1.0,
         bounds=(0.0, 100.0),
         softbounds=(0.0, 1.0),
@@ -75,7 +78,7 @@ class Layer(Group):
         label="Share of the turbulence",
         doc="Share of the turbulence, of r0^(-5/3); the shares of all layers are normalised to a sum of one.",
     )
-    wind_factor = Real(
+    wind_factor: Real = Real(
         1.0,
         bounds=(0.05, 20.0),
         softbounds=(0.2, 4.0),
@@ -83,7 +86,7 @@ class Layer(Group):
         label="Wind over V₀",
         doc="Wind speed of the layer over turbulence.wind_speed.",
     )
-    wind_direction = Real(
+    wind_direction: Real = Real(
         0.0,
         bounds=(-360.0, 360.0),
         softbounds=(-180.0, 180.0),
@@ -96,7 +99,7 @@ class Layer(Group):
 class Process(Group):
     """One coloured noise in the turbulence of some modes."""
 
-    frequency = Real(
+    frequency: Real = Real(
         1.1,
         bounds=(1e-9, 1e6),
         softbounds=(0.1, 10.0),
@@ -104,10 +107,10 @@ class Process(Group):
         label="Corner",
         doc="Corner frequency of the AR(2) process, omega / 2 pi [Hz].",
     )
-    damping = Real(
+    damping: Real = Real(
         0.9, bounds=(1e-6, 1.0), softbounds=(0.1, 1.0), step=0.01, label="Damping ξ", doc="Damping ratio of the process."
     )
-    third_corner = Real(
+    third_corner: Real = Real(
         0.0,
         bounds=(0.0, 1e6),
         softbounds=(0.0, 10.0),
@@ -115,7 +118,7 @@ class Process(Group):
         label="Third corner / first",
         doc="Corner beyond which the spectrum falls as f^-6 instead of f^-4, over the frequency; 0 is none.",
     )
-    rms = Reals(
+    rms: Reals = Reals(
         [0.5, 0.5],
         item_bounds=(0.0, 1e4),
         bounds=(1, 64),
@@ -127,7 +130,7 @@ class Process(Group):
 class Turbulence(Group):
     """Atmospheric turbulence."""
 
-    used_when = MappingProxyType(
+    used_when: ClassVar[UsedWhen] = MappingProxyType(
         {
             "third_corner": ("source", ("ar3",)),
             "rms": ("source", ("ar2", "ar3")),
@@ -138,7 +141,7 @@ class Turbulence(Group):
         }
     )
 
-    source = param.Selector(
+    source: param.Selector[str] = param.Selector(
         default="ar2",
         objects=["ar2", "ar3", "processes", "frozen-flow", "psd", "none"],
         label="Source",
@@ -146,7 +149,7 @@ class Turbulence(Group):
         "processes: a sum of such processes in every mode; frozen-flow: von Karman layers, with a beam of its own "
         "for every guide star; psd: inverse DFT of the PSD table; none: no turbulence.",
     )
-    wind_speed = Real(
+    wind_speed: Real = Real(
         15.0,
         bounds=(0.1, 100.0),
         softbounds=(1.0, 40.0),
@@ -155,10 +158,10 @@ class Turbulence(Group):
         doc="Wind speed [m/s]; sets the corner w0 = 0.6 pi (n + 1) V0 / D (paper, eq. 1d and Table 1), and "
         "scales the wind of every layer of frozen flow.",
     )
-    damping = Real(
+    damping: Real = Real(
         0.9, bounds=(0.01, 1.0), step=0.01, label="Damping ξ", doc="Damping ratio of the AR(2) process (paper, Table 1)."
     )
-    third_corner = Real(
+    third_corner: Real = Real(
         3.0,
         bounds=(1.0, 1000.0),
         softbounds=(1.0, 10.0),
@@ -167,7 +170,7 @@ class Turbulence(Group):
         doc="Corner beyond which the spectrum falls as f^-6 instead of f^-4, over the corner w0, for source ar3; not "
         "in the paper.",
     )
-    rms = Real(
+    rms: Real = Real(
         0.5,
         bounds=(0.0, 100.0),
         softbounds=(0.0, 2.0),
@@ -176,7 +179,7 @@ class Turbulence(Group):
         doc="Standard deviation of tip and of tilt [um], for sources ar2 and ar3. Not given in the paper; r0 = 0.157 m "
         "and L0 = 25 m on 8 m give 0.529 um. Higher orders follow from the ratio that r0 and L0 give.",
     )
-    r0 = Real(
+    r0: Real = Real(
         0.157,
         bounds=(0.01, 5.0),
         softbounds=(0.05, 0.4),
@@ -184,7 +187,7 @@ class Turbulence(Group):
         label="Fried parameter r₀",
         doc="Fried parameter at 500 nm at the zenith [m], for source frozen-flow. The seeing is 0.98 x 500 nm / r0: 0.64 arcsec.",
     )
-    outer_scale = Real(
+    outer_scale: Real = Real(
         25.0,
         bounds=(1.0, 1e6),
         softbounds=(5.0, 100.0),
@@ -192,14 +195,14 @@ class Turbulence(Group):
         label="Outer scale L₀",
         doc="Outer scale of the von Karman spectrum [m].",
     )
-    layers = param.List(
+    layers: param.List[list[Layer]] = param.List(
         [Layer()], item_type=Layer, bounds=(0, 40), label="Layers", doc="Layers of frozen flow, for source frozen-flow."
     )
-    processes = param.List(
+    processes: param.List[list[Process]] = param.List(
         [Process()],
         item_type=Process,
         bounds=(0, 500),
         label="Processes",
         doc="Processes whose sum is the turbulence, for source processes.",
     )
-    psd = section(PsdTable, "PSD table", "Spectrum of the turbulence as a table, for source psd.")
+    psd: PsdTable = section(PsdTable, "PSD table", "Spectrum of the turbulence as a table, for source psd.")

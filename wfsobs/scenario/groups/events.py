@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
+from typing import ClassVar
 
 import numpy as np
 import param
 
-from wfsobs.settings.group import Group
+from wfsobs.settings.group import Group, UsedWhen
 from wfsobs.settings.parameters import Real, Whole
 from wfsobs.typing import Array
 
@@ -25,16 +26,18 @@ class Event(Group):
     Changes of a peak and of the wind ramp up over `duration` and stay; a laser outage and missing frames end after it.
     """
 
-    used_when = MappingProxyType({name: ("kind", (kind,)) for kind, names in OF_KIND.items() for name in names})
+    used_when: ClassVar[UsedWhen] = MappingProxyType(
+        {name: ("kind", (kind,)) for kind, names in OF_KIND.items() for name in names}
+    )
 
-    kind = param.Selector(
+    kind: param.Selector[str] = param.Selector(
         default=PEAK,
         objects=[PEAK, WIND, LASER, FRAMES],
         label="Kind",
         doc="peak: a vibration peak changes in frequency and strength; wind: the wind changes; laser: laser guide "
         "stars drop out; frames: frames are missing at random.",
     )
-    start = Real(
+    start: Real = Real(
         5.0,
         bounds=(0.0, 3600.0),
         softbounds=(0.0, 60.0),
@@ -42,7 +45,7 @@ class Event(Group):
         label="Start",
         doc="Start of the event, from the start of the record [s].",
     )
-    duration = Real(
+    duration: Real = Real(
         0.0,
         bounds=(0.0, 3600.0),
         softbounds=(0.0, 60.0),
@@ -50,8 +53,8 @@ class Event(Group):
         label="Duration",
         doc="Duration of the event [s]; 0 is a jump of a peak or of the wind.",
     )
-    peak = Whole(0, bounds=(0, 99), label="Peak", doc="For kind peak: number of the peak in vibration.peaks, from 0.")
-    frequency_shift = Real(
+    peak: Whole = Whole(0, bounds=(0, 99), label="Peak", doc="For kind peak: number of the peak in vibration.peaks, from 0.")
+    frequency_shift: Real = Real(
         0.0,
         bounds=(-5000.0, 5000.0),
         softbounds=(-10.0, 10.0),
@@ -59,7 +62,7 @@ class Event(Group):
         label="Frequency shift",
         doc="For kind peak: change of its frequency [Hz].",
     )
-    strength = Real(
+    strength: Real = Real(
         1.0,
         bounds=(0.0, 100.0),
         softbounds=(0.0, 4.0),
@@ -67,7 +70,7 @@ class Event(Group):
         label="Strength factor",
         doc="For kind peak: factor on its rms.",
     )
-    wind_factor = Real(
+    wind_factor: Real = Real(
         1.0,
         bounds=(0.1, 10.0),
         softbounds=(0.2, 4.0),
@@ -75,16 +78,18 @@ class Event(Group):
         label="Wind factor",
         doc="For kind wind: factor on the wind speed of every layer.",
     )
-    lasers = Whole(
+    lasers: Whole = Whole(
         1,
         bounds=(1, 16),
         label="Lasers lost",
         doc="For kind laser: number of LGS that drop out, the last ones first; with none left there is no LGS measurement.",
     )
-    sensor = param.Selector(
+    sensor: param.Selector[str] = param.Selector(
         default="lgs", objects=["lgs", "ngs"], label="Sensor", doc="For kind frames: sensor with missing frames."
     )
-    share = Real(0.1, bounds=(0.0, 1.0), step=0.01, label="Share of frames", doc="For kind frames: share of missing frames.")
+    share: Real = Real(
+        0.1, bounds=(0.0, 1.0), step=0.01, label="Share of frames", doc="For kind frames: share of missing frames."
+    )
 
 
 def progress_of_change(event: Event, t: Array) -> Array:

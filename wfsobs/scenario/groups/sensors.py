@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 from types import MappingProxyType
+from typing import ClassVar
 
 import param
 
-from wfsobs.settings.group import Group, section
+from wfsobs.settings.group import Group, UsedWhen, section
 from wfsobs.settings.parameters import Real, Reals, Whole
 
 
 class LensletArrays(Group):
     """Geometry of the Shack-Hartmann sensors and of their modal fit."""
 
-    lgs_subapertures = Whole(
+    lgs_subapertures: Whole = Whole(
         40,
         bounds=(1, 100),
         softbounds=(2, 60),
         label="LGS subapertures",
         doc="Subapertures of an LGS sensor across the aperture.",
     )
-    ngs_subapertures = Whole(
+    ngs_subapertures: Whole = Whole(
         40,
         bounds=(1, 100),
         softbounds=(2, 60),
@@ -28,21 +29,21 @@ class LensletArrays(Group):
         doc="Subapertures of the NGS sensor across the aperture, such as 40 or 2. Fewer than 3 measure the mean "
         "gradient instead of tip and tilt: an error of 166 nm where these have 529 nm.",
     )
-    fitted_order = Whole(
+    fitted_order: Whole = Whole(
         8,
         bounds=(1, 12),
         label="Fitted radial order",
         doc="Radial order up to which modes are fitted to the slopes; lower where a sensor has fewer subapertures "
         "across, or cannot resolve so many modes.",
     )
-    illumination = Real(
+    illumination: Real = Real(
         0.5,
         bounds=(0.01, 1.0),
         step=0.05,
         label="Minimum lit fraction",
         doc="Minimum lit fraction of a valid subaperture.",
     )
-    obscuration = Real(
+    obscuration: Real = Real(
         0.0,
         bounds=(0.0, 0.5),
         step=0.01,
@@ -55,24 +56,24 @@ class LensletArrays(Group):
 class Spots(Group):
     """Light and detectors behind the lenslets, for noise from photons."""
 
-    lgs_photons = Real(
+    lgs_photons: Real = Real(
         100.0,
         bounds=(0.1, 1e7),
         softbounds=(10.0, 1000.0),
         label="LGS photons",
         doc="Photons that a fully lit subaperture detects in an LGS frame [e-]; not given in the paper.",
     )
-    ngs_photons = Real(
+    ngs_photons: Real = Real(
         100.0,
         bounds=(0.1, 1e7),
         softbounds=(10.0, 1000.0),
         label="NGS photons",
         doc="Photons that a fully lit subaperture detects in an NGS frame [e-]; not given in the paper.",
     )
-    read_noise = Real(
+    read_noise: Real = Real(
         0.5, bounds=(0.0, 100.0), softbounds=(0.0, 10.0), step=0.1, label="Read noise", doc="Read noise of a pixel, rms [e-]."
     )
-    lgs_fwhm = Real(
+    lgs_fwhm: Real = Real(
         1.2,
         bounds=(0.01, 100.0),
         softbounds=(0.5, 5.0),
@@ -80,7 +81,7 @@ class Spots(Group):
         label="LGS spot size",
         doc="Full width at half maximum of an LGS spot, assumed round [arcsec].",
     )
-    ngs_fwhm = Real(
+    ngs_fwhm: Real = Real(
         0.8,
         bounds=(0.01, 100.0),
         softbounds=(0.3, 3.0),
@@ -88,7 +89,7 @@ class Spots(Group):
         label="NGS spot size",
         doc="Full width at half maximum of an NGS spot [arcsec].",
     )
-    pixel_scale = Real(
+    pixel_scale: Real = Real(
         0.8,
         bounds=(0.01, 20.0),
         softbounds=(0.2, 2.0),
@@ -96,7 +97,7 @@ class Spots(Group):
         label="Pixel scale",
         doc="Angle of a detector pixel on the sky [arcsec].",
     )
-    pixels = Whole(
+    pixels: Whole = Whole(
         6,
         bounds=(2, 64),
         softbounds=(2, 20),
@@ -108,7 +109,7 @@ class Spots(Group):
 class Sensors(Group):
     """Wavefront sensors: a natural guide star (NGS) and laser guide stars (LGS)."""
 
-    used_when = MappingProxyType(
+    used_when: ClassVar[UsedWhen] = MappingProxyType(
         {
             "lgs_noise": ("noise_from", ("nm",)),
             "lgs_noise_per_mode": ("noise_from", ("nm",)),
@@ -117,42 +118,42 @@ class Sensors(Group):
         }
     )
 
-    lgs_rate = Real(
+    lgs_rate: Real = Real(
         1000.0,
         bounds=(10.0, 100_000.0),
         label="LGS rate 1/T",
         doc="Frame rate of the LGS sensors and of the loop [Hz] (paper, Table 3: 1000 Hz).",
     )
-    exposure_ratio = Whole(
+    exposure_ratio: Whole = Whole(
         5,
         bounds=(1, 100),
         softbounds=(1, 20),
         label="Exposure ratio n",
         doc="NGS exposure over LGS exposure, n = T_NGS / T_LGS (paper: 5 ms over 1 ms).",
     )
-    lgs_count = Whole(2, bounds=(1, 16), label="Number of LGS", doc="Number of laser guide stars (paper: 2).")
-    lgs_combination = param.Selector(
+    lgs_count: Whole = Whole(2, bounds=(1, 16), label="Number of LGS", doc="Number of laser guide stars (paper: 2).")
+    lgs_combination: param.Selector[str] = param.Selector(
         default="mean",
         objects=["mean", "minimum-variance"],
         label="LGS combined by",
         doc="Guide-star combination. mean: the mean over the LGS (paper); minimum-variance: the linear combination of "
         "all their modes that is nearest to the disturbance on the axis, from the covariances of the model.",
     )
-    kind = param.Selector(
+    kind: param.Selector[str] = param.Selector(
         default="shack-hartmann",
         objects=["shack-hartmann", "zernike"],
         label="Kind",
         doc="Sensor of frozen flow. shack-hartmann: modes fitted to slopes; zernike: the modes themselves. Turbulence "
         "from other sources is measured without a sensor model.",
     )
-    noise_from = param.Selector(
+    noise_from: param.Selector[str] = param.Selector(
         default="nm",
         objects=["nm", "photons"],
         label="Noise from",
         doc="nm: white noise of the rms below in every mode; photons: photon and read noise of the slopes of the "
         "Shack-Hartmann sensors, correlated between modes.",
     )
-    lgs_noise = Real(
+    lgs_noise: Real = Real(
         0.02,
         bounds=(0.0, 10.0),
         softbounds=(0.0, 0.2),
@@ -160,14 +161,14 @@ class Sensors(Group):
         label="LGS noise",
         doc="White measurement noise of each LGS and mode, rms [um], for noise from nm; not given in the paper.",
     )
-    lgs_noise_per_mode = Reals(
+    lgs_noise_per_mode: Reals = Reals(
         [],
         item_bounds=(0.0, 1e4),
         bounds=(0, 64),
         label="LGS noise per mode",
         doc="Noise of each LGS per mode, rms [um], where modes differ; modes beyond the list have the noise above.",
     )
-    ngs_noise = Real(
+    ngs_noise: Real = Real(
         0.01,
         bounds=(0.0, 10.0),
         softbounds=(0.0, 0.2),
@@ -175,7 +176,7 @@ class Sensors(Group):
         label="NGS noise",
         doc="White measurement noise of an NGS frame and mode, rms [um], for noise from nm; not given in the paper.",
     )
-    lgs_low_frequency_rms = Real(
+    lgs_low_frequency_rms: Real = Real(
         0.049,
         bounds=(0.0, 10.0),
         softbounds=(0.0, 0.2),
@@ -185,7 +186,7 @@ class Sensors(Group):
         "uplink turbulence where turbulence is not frozen flow. 0.049 um is the cone effect of one layer at 8 km "
         "and a guide star at 90 km.",
     )
-    lgs_altitude = Real(
+    lgs_altitude: Real = Real(
         90_000.0,
         bounds=(1000.0, 1e6),
         softbounds=(80_000.0, 100_000.0),
@@ -194,7 +195,7 @@ class Sensors(Group):
         doc="Height of the laser guide stars above the telescope [m], for frozen flow: a beam is narrower by 1 - h / H "
         "in a layer at height h.",
     )
-    lgs_radius = Real(
+    lgs_radius: Real = Real(
         0.0,
         bounds=(0.0, 120.0),
         softbounds=(0.0, 70.0),
@@ -202,7 +203,7 @@ class Sensors(Group):
         label="LGS asterism, radius",
         doc="Angle between each LGS and the axis [arcsec], for frozen flow; 0 is on the axis.",
     )
-    lgs_angle = Real(
+    lgs_angle: Real = Real(
         0.0,
         bounds=(-360.0, 360.0),
         softbounds=(-180.0, 180.0),
@@ -210,17 +211,19 @@ class Sensors(Group):
         label="LGS asterism, first at",
         doc="Direction of the first LGS from the axis of tip to that of tilt [deg]; the others are evenly spaced.",
     )
-    ngs_direction = Reals(
+    ngs_direction: Reals = Reals(
         [0.0, 0.0],
         item_bounds=(-120.0, 120.0),
         bounds=(2, 2),
         label="NGS direction",
         doc="Direction of the NGS along the axes of tip and tilt [arcsec], for frozen flow; the truth is on the axis.",
     )
-    tip_tilt_indetermination = param.Boolean(
+    tip_tilt_indetermination: param.Boolean[bool] = param.Boolean(
         False,
         label="Tip-tilt indetermination",
         doc="The LGS cannot see turbulent tip and tilt, as in reality; off in the paper, whose simulator does not model it.",
     )
-    lenslets = section(LensletArrays, "Shack-Hartmann", "Lenslets of the Shack-Hartmann sensors, and the fit to their slopes.")
-    spots = section(Spots, "Spots", "Light and detectors of the Shack-Hartmann sensors, for noise from photons.")
+    lenslets: LensletArrays = section(
+        LensletArrays, "Shack-Hartmann", "Lenslets of the Shack-Hartmann sensors, and the fit to their slopes."
+    )
+    spots: Spots = section(Spots, "Spots", "Light and detectors of the Shack-Hartmann sensors, for noise from photons.")
