@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from math import pi
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 from click.testing import CliRunner
 from scipy.stats import binom
 
+from tests.test_plant import closed_loop, rotation
 from wfsobs import PRESETS, simulate
 from wfsobs.cli import main
 from wfsobs.identification.check import LEVEL, find_changes
@@ -84,6 +86,31 @@ def test_a_wrong_sign_is_excluded_and_put_right_by_the_next_command(tmp_path: Pa
     assert again["reliable"]
 
 
+@pytest.mark.slow
+def test_delay_and_gain_are_put_right_by_the_next_command(tmp_path: Path) -> None:
+    """Half a frame and a mirror that does 1.2 times what it is told; a rotation has no option."""
+    file, done = tmp_path / "r.npz", closed_loop(20_000, 1.5, 1.2 * np.eye(2), gain=0.4)
+    save_record(file, replace(done, delay=2))
+    found = json.loads(CliRunner().invoke(main, ["check", str(file), "--json"]).stdout)
+    seen = verdicts(found)
+    assert (seen["command sign"], seen["command rotation"], seen["command delay"]) == ("ok", "ok", "note")
+    words = found["next"].split()
+    assert float(words[words.index("--command-delay") + 1]) == pytest.approx(1.5, abs=0.1)
+    if seen["command gain"] == "note":
+        assert float(words[words.index("--command-gain") + 1]) == pytest.approx(1.2, abs=0.1)
+    stated = ["check", str(file), "--json", "--command-delay", "1.5", "--command-gain", "1.2", "--trust"]
+    again = verdicts(json.loads(CliRunner().invoke(main, stated).stdout))
+    assert again["command delay"] == "ok" and again["command gain"] in ("ok", "undecided")
+
+
+@pytest.mark.slow
+def test_a_rotation_and_a_flipped_axis_are_excluded(tmp_path: Path) -> None:
+    seen = verdicts(checked(tmp_path, closed_loop(10_000, 2.0, rotation(np.radians(96.0)))))
+    assert (seen["command sign"], seen["command rotation"]) == ("ok", "excluded")
+    seen = verdicts(checked(tmp_path, closed_loop(10_000, 2.0, np.diag([1.0, -1.0]))))
+    assert (seen["command sign"], seen["command rotation"]) == ("excluded", "ok")
+
+
 def test_faults_are_named(tmp_path: Path, record: Record) -> None:
     """Lost frames, a level of outliers and a change of the disturbance."""
     rng = np.random.default_rng(3)
@@ -111,7 +138,7 @@ def test_too_little_is_said(tmp_path: Path, record: Record) -> None:
     assert at_rest["commands"] == "ok"
     short = Record(record.y_lgs[:300], record.u[:300], record.dt, delay=record.delay)
     seen = verdicts(checked(tmp_path, short))
-    subjects = ("command sign and delay", "stationarity", "identification")
+    subjects = ("command sign, delay, gain, rotation", "stationarity", "identification")
     assert [seen[subject] for subject in subjects] == ["undecided", "undecided", "excluded"]
     done = CliRunner().invoke(main, ["check", str(tmp_path / "no.npz")])
     assert (done.exit_code, done.output.count("\n")) == (2, 1)

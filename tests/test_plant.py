@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from wfsobs.cli import main
-from wfsobs.identification.plant import GroupPlant, Number, identify_plant
+from wfsobs.identification.plant import GroupPlant, PlantNumber, identify_plant
 from wfsobs.record import Record, RecordError
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.telemetry.records import save_record
@@ -44,7 +44,7 @@ def closed_loop(
     return Record(y[d + 1 :], u[d + 1 :], DT)
 
 
-def right(n: Number, value: float, sds: float = 4.0) -> bool:
+def right(n: PlantNumber, value: float, sds: float = 4.0) -> bool:
     """Whether a number is known, and the value within 4 of its standard deviations: once in 16 000 it is not."""
     return n.value is not None and n.sd is not None and abs(n.value - value) < sds * n.sd
 
@@ -65,7 +65,7 @@ def test_errors_are_those_of_the_cramer_rao_bound() -> None:
     assert found.common_delay.sd == pytest.approx(NOISE / (gain * s * sqrt(4.0 * n)), rel=0.06)
     assert found.common_gain.sd == pytest.approx(NOISE / s / sqrt(n), rel=0.06)
     assert found.rotation.sd == pytest.approx(NOISE / s / gain / sqrt(n), rel=0.06)
-    assert found.excited == pytest.approx(1.0, abs=0.02)
+    assert found.own_share == pytest.approx(1.0, abs=0.02)
 
 
 @pytest.mark.slow
@@ -79,9 +79,9 @@ def test_of_a_loop_without_a_probe(delay: float, gain: tuple[float, float], angl
     assert all(right(n, delay) for n in found.delay)
     assert all(right(n, g) for n, g in zip(found.gain, gain, strict=True))
     assert right(found.common_gain, gain[0]) or (gain[0] != gain[1] and found.common_gain.value is None)
-    off = np.angle(np.exp(1j * (np.radians(angle) - (found.rotation or Number()).value)))
+    off = np.angle(np.exp(1j * (np.radians(angle) - (found.rotation or PlantNumber()).value)))
     assert found.rotation is not None and right(replace(found.rotation, value=0.0), float(off))
-    assert found.excited < 1e-6 and 0.0 < found.uncertainty < 1.0 and not found.flipped
+    assert found.own_share < 1e-6 and 0.0 < found.uncertainty < 1.0 and not found.flipped_mode
 
 
 @pytest.mark.slow
@@ -92,7 +92,7 @@ def test_a_probe_makes_it_sharper() -> None:
     for found in (quiet, probed):
         assert right(found.common_delay, 1.3) and found.rotation is not None and right(found.rotation, np.radians(8.0))
     assert quiet.common_gain.sd is not None and probed.common_gain.sd is not None
-    assert probed.common_gain.sd < 0.5 * quiet.common_gain.sd and probed.excited > 1e-3
+    assert probed.common_gain.sd < 0.5 * quiet.common_gain.sd and probed.own_share > 1e-3
     assert probed.uncertainty < quiet.uncertainty
 
 
@@ -100,14 +100,14 @@ def test_a_probe_makes_it_sharper() -> None:
 @pytest.mark.parametrize(("flip", "name"), [((1.0, -1.0), "tilt"), ((-1.0, 1.0), "tip")])
 def test_a_flipped_axis(flip: tuple[float, float], name: str) -> None:
     (found,) = identify_plant(closed_loop(10_000, 2.0, np.diag(flip)))
-    assert found.flipped == name
+    assert found.flipped_mode == name
 
 
 @pytest.mark.slow
 def test_what_is_not_identifiable() -> None:
     """A loop so slow that its commands are lost in the noise; one too short; a mirror at rest."""
     (slow,) = identify_plant(closed_loop(6000, 2.0, np.eye(2), gain=0.002))
-    assert slow.common_delay == slow.common_gain == Number() and slow.uncertainty == np.inf
+    assert slow.common_delay == slow.common_gain == PlantNumber() and slow.uncertainty == np.inf
     record = closed_loop(1200, 2.0, np.eye(2))
     with pytest.raises(RecordError, match="has 900 frames, the plant needs 1000"):
         identify_plant(Record(record.y_lgs[:900], record.u[:900], DT))
@@ -142,11 +142,11 @@ def test_command(tmp_path: Path) -> None:
 
 
 def test_text() -> None:
-    assert Number(2.0123, 0.0234).text() == "2.012 +- 0.023" and Number(170.0, 12.0).text(" nm") == "170 +- 12 nm"
-    assert Number().text() == "not identifiable"
+    assert PlantNumber(2.0123, 0.0234).text() == "2.012 +- 0.023" and PlantNumber(170.0, 12.0).text(" nm") == "170 +- 12 nm"
+    assert PlantNumber().text() == "not identifiable"
 
 
 def test_flipped_without_an_angle() -> None:
-    known = Number(1.0, 0.1)
-    group = GroupPlant(("tip", "tilt"), (known, known), (known, known), Number(), known, known, 1.0, (0, 0), False, 0.0)
-    assert not group.flipped and group.degrees == Number()
+    known = PlantNumber(1.0, 0.1)
+    group = GroupPlant(("tip", "tilt"), (known, known), (known, known), PlantNumber(), known, known, 1.0, (0, 0), False, 0.0)
+    assert not group.flipped_mode and group.degrees == PlantNumber()

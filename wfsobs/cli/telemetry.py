@@ -209,12 +209,12 @@ def check(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha
     with open_record(record_file, sha256) as (file, name):
         try:
             contents = read_contents(file, name, declaration.columns)
-            record = to_record(contents, scenario, declaration)
+            record, raw = (to_record(contents, scenario, way) for way in (declaration, declaration.as_commanded))
         except RecordError as error:
             raise RecordError(f"{record_file}: {error}") from None
     reading = read_off(record, contents, declaration, scenario)
     with progress_bar("sweeps") as update:
-        result = check_record(record, reading, Watch(progress=update))
+        result = check_record(record, reading, raw, Watch(progress=update))
     command = shlex.join(["wfsobs", "identify", record_file, *declaration.options(result.corrections)])
     if as_json:
         found = {
@@ -222,6 +222,7 @@ def check(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha
             "rate": 1.0 / record.dt,
             "missing": record.missing,
             "read_as": record.origin,
+            "plant": plant_dict(result.plant) if result.plant else None,
             "findings": [asdict(f) for f in result.findings],
             "identification": result.identification and identified.identification_dict(result.identification),
             "reliable": result.is_reliable,

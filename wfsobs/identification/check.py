@@ -5,7 +5,7 @@ Nothing is concluded that the data do not decide: a finding is `ok`, `note` (loo
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
@@ -16,6 +16,7 @@ from scipy.signal import detrend
 from scipy.stats import f as fisher
 
 from wfsobs.identification.identification import identify
+from wfsobs.identification.plant import GroupPlant, PlantNumber, identify_plant
 from wfsobs.identification.result import Identification
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError, hold_last
@@ -72,11 +73,14 @@ class Check:
         Model of the record, None where it could not be identified.
     corrections : mapping of str to str
         Option of the command line -> value with which to read it again; empty where it is read as the data say.
+    plant : tuple of GroupPlant
+        Delay, gain and rotation of the commands; empty where they were not looked for.
     """
 
     findings: tuple[Remark, ...]
     identification: Identification | None
     corrections: Mapping[str, str]
+    plant: tuple[GroupPlant, ...] = ()
 
     @property
     def is_reliable(self) -> bool:
@@ -93,7 +97,7 @@ class Check:
         return f"An identification of it can be relied on{but}."
 
 
-def check_record(record: Record, reading: Reading, watch: Watch = QUIET) -> Check:
+def check_record(record: Record, reading: Reading, raw: Record | None = None, watch: Watch = QUIET) -> Check:
     """Look at all that has to be right before an identification of a record can be relied on.
 
     Parameters
@@ -101,7 +105,9 @@ def check_record(record: Record, reading: Reading, watch: Watch = QUIET) -> Chec
     record : Record
         Measurements and commands.
     reading : Reading
-        What the data say of unit, sign, delay and limits of the commands.
+        How it was read, and what the data say of the unit and of limits of the commands.
+    raw : Record, optional
+        The record with the commands as they were given, without delay and gain; by default `record`.
     watch : Watch, optional
         Receives the progress of the identification, and is asked whether to stop.
 
@@ -115,7 +121,8 @@ def check_record(record: Record, reading: Reading, watch: Watch = QUIET) -> Chec
     Cancelled
         `watch` asks to stop.
     """
-    findings = [*_frames(record), *_unit(record, reading), *_commands(record, reading), *_stationarity(record)]
+    plant, commands = _plant(raw or record, reading)
+    findings = [*_frames(record), *_unit(record, reading), *commands, *_stationarity(record)]
     result = None
     try:
         result = identify(record, watch=watch)
@@ -123,7 +130,7 @@ def check_record(record: Record, reading: Reading, watch: Watch = QUIET) -> Chec
         findings.append(Remark("identification", "excluded", str(error)))
     else:
         findings += _residual(result)
-    return Check(tuple(findings), result, _corrections(record, reading))
+    return Check(tuple(findings), result, _corrections(reading, plant), plant)
 
 
 def _frames(record: Record) -> Iterator[Remark]:
@@ -146,22 +153,79 @@ def _unit(record: Record, reading: Reading) -> Iterator[Remark]:
         yield Remark("unit", verdict, f"not in the file, taken for um; plausible are {ways}")
 
 
-def _commands(record: Record, reading: Reading) -> Iterator[Remark]:
-    response = reading.response
+def _plant(record: Record, reading: Reading) -> tuple[tuple[GroupPlant, ...], list[Remark]]:
+    """Return the plant, as far as it can be looked for, and the findings on the commands."""
+    found = [Remark("commands", "excluded", reading.contradiction)] if reading.contradiction else []
+    found += [Remark("mirror", "note", line) for line in reading.limits]
     if not record.u.any():
-        yield Remark("commands", "ok", "none: the mirror is at rest")
-    elif response is None:
-        yield Remark("command sign and delay", "undecided", "not identifiable: too few steps, or commands that do not move")
+        return (), [*found, Remark("commands", "ok", "none: the mirror is at rest")]
+    if reading.limits:
+        return (), [*found, Remark(PLANT, "undecided", "not looked at while commands are beyond what the mirror follows")]
+    try:
+        plant = identify_plant(record)
+    except RecordError as error:
+        return (), [*found, Remark(PLANT, "undecided", f"not identifiable: {error}")]
+    return plant, [*(remark for group in plant for remark in _commands(group, reading, len(plant) > 1)), *found]
+
+
+PLANT = "command sign, delay, gain, rotation"
+"""What is looked for together."""
+
+
+def _commands(group: GroupPlant, reading: Reading, several: bool) -> Iterator[Remark]:
+    """Yield what the data say of the commands of a group of modes."""
+    of = f" of {' and '.join(group.modes)}" if several else ""
+    degrees, sign = group.degrees, sign_of(group)
+    if group.flipped_mode:
+        yield Remark(f"command sign{of}", "excluded", f"that of {group.flipped_mode} is reversed, and no other")
+    elif sign is None:
+        yield Remark(f"command sign{of}", "undecided", "not identifiable")
     else:
-        looked_at = (("sign", response.sign, reading.sign), ("delay", response.delay, record.delay))
-        for (subject, found, stated), text in zip(looked_at, response.lines(), strict=False):
-            other = f"; {stated} is stated" if found not in (None, stated) else ""
-            verdict = "undecided" if found is None else "note" if other else "ok"
-            yield Remark(f"command {subject}", verdict, text.removeprefix(f"{subject} ").removeprefix("undecided: ") + other)
-    if reading.contradiction:
-        yield Remark("commands", "excluded", reading.contradiction)
-    for line in reading.limits:
-        yield Remark("mirror", "note", line)
+        other = f"; {reading.sign:+d} is stated" if sign < 0 else ""
+        yield Remark(f"command sign{of}", "note" if other else "ok", f"{sign * reading.sign:+d}{other}")
+    if degrees.value is not None and degrees.sd is not None:
+        off = abs(degrees.value) if sign != -1 else 180.0 - abs(degrees.value)
+        verdict = "ok" if off < max(SURE * degrees.sd, TURNED) else "excluded" if off > 45.0 else "note"
+        yield Remark(f"command rotation{of}", verdict, f"{degrees.text(' degrees')}, y = R u")
+    elif group.rotation is not None:
+        yield Remark(f"command rotation{of}", "undecided", "not identifiable")
+    for subject, one, each, stated, least in (
+        ("delay", group.common_delay, group.delay, (reading.delay,), OFF_DELAY),
+        ("gain", group.common_gain, group.gain, reading.gain or (1.0,), OFF_GAIN),
+    ):
+        numbers = known_numbers(one, each, least)
+        text = " and ".join(n.text() for n in ((one,) if one.value is not None else each))
+        if numbers is None:
+            yield Remark(f"command {subject}{of}", "undecided", f"{text}: more than the data decide")
+            continue
+        wrong = any(_is_off(n, s, least) for n in numbers for s in stated)
+        told = f"; {', '.join(f'{s:g}' for s in stated)} is stated"
+        yield Remark(f"command {subject}{of}", "note" if wrong else "ok", text + told * wrong)
+
+
+SURE, TURNED = 3.0, 2.0
+"""Standard deviations by which a number has to be off what is stated; and minimum angle that matters [degrees]."""
+
+OFF_DELAY, OFF_GAIN = 0.1, 0.06
+"""Minimum distance of a delay [frames] and of a gain from what is stated; a number is decided that is known to half of it."""
+
+
+def sign_of(group: GroupPlant) -> int | None:
+    """Return the sign of the commands, -1 where they are turned beyond 135 degrees; None where it is not identifiable."""
+    turn = group.degrees.value if group.rotation is not None else group.gain[0].value
+    if turn is None or group.flipped_mode:
+        return None
+    return -1 if (abs(turn) > 135.0 if group.rotation is not None else turn < 0) else 1
+
+
+def known_numbers(one: PlantNumber, each: Sequence[PlantNumber], least: float) -> list[PlantNumber] | None:
+    """Return the numbers of a group, one where its modes have one, if they are known well enough; else None."""
+    numbers = [one] if one.value is not None else list(each)
+    return numbers if all(n.sd is not None and n.sd < 0.5 * least for n in numbers) else None
+
+
+def _is_off(n: PlantNumber, right: float, least: float) -> bool:
+    return n.value is not None and n.sd is not None and abs(abs(n.value) - right) > max(SURE * n.sd, least)
 
 
 def _stationarity(record: Record) -> Iterator[Remark]:
@@ -223,13 +287,19 @@ def _residual(result: Identification) -> Iterator[Remark]:
         yield Remark("identification", "ok" if w.white else "note", text)
 
 
-def _corrections(record: Record, reading: Reading) -> dict[str, str]:
-    response, out = reading.response, {}
+def _corrections(reading: Reading, plant: Sequence[GroupPlant]) -> dict[str, str]:
+    out = {}
     if reading.units and set(reading.units) != {"um"}:
         out["unit"] = "|".join(reading.units)
-    if reading.contradiction and response is not None:
-        if response.sign == -1:
-            out["command-sign"] = f"{-reading.sign:+d}"
-        if response.delay is not None and response.delay != record.delay:
-            out["command-delay"] = str(response.delay)
+    if any(sign_of(group) == -1 for group in plant):
+        out["command-sign"] = f"{-reading.sign:+d}"
+    delays = [known_numbers(group.common_delay, group.delay, OFF_DELAY) for group in plant]
+    known = [n for numbers in delays if numbers is not None and len(numbers) == 1 for n in numbers]
+    if known and _is_off(best := min(known, key=lambda n: n.sd or 0.0), reading.delay, OFF_DELAY):
+        out["command-delay"] = f"{best.value:.3g}"
+    gains = [known_numbers(group.common_gain, group.gain, OFF_GAIN) for group in plant]
+    each = [n for g, group in zip(gains, plant, strict=True) if g is not None for n in (g * len(group.modes))[: len(group.modes)]]
+    if each and None not in gains and any(_is_off(n, s, OFF_GAIN) for n in each for s in reading.gain or (1.0,)):
+        text = [f"{abs(n.value or 1.0):.3g}" for n in each]
+        out["command-gain"] = text[0] if len(set(text)) == 1 else ",".join(text)
     return out

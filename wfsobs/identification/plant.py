@@ -49,9 +49,9 @@ is a polynomial of this degree."""
 PEAKS, MOST_PEAKS, LOWEST = 10, 40, 5.0
 """Maximum number of resonances per mode, while a maximum is looked for and then; their minimum frequency [Hz]."""
 
-STARTS, REFINED, SAME = (1.25, 2.25, 3.25, 4.5), 2, 0.05
-"""Delays at which a search starts [frames]; how many of the likeliest maxima are then fitted with all peaks; distance below which
-two maxima are one."""
+STARTS, REFINED, SAME, REFINEMENTS = (1.25, 2.25, 3.25, 4.5), 2, 0.05, 3
+"""Delays at which a search starts [frames]; how many of the likeliest maxima are then fitted with all peaks, and how often;
+distance below which two maxima are one."""
 
 STEPS, REACH, ENOUGH = 25, 0.3, 0.02
 """Newton steps; maximum change of a number of the plant in one; gain of log-likelihood below which they end."""
@@ -61,7 +61,7 @@ NARROW, BAND, LOOSE = 10.0, 0.1, 0.1
 each number of a spectrum beside that of the data, which keeps those that the data say nothing of.
 """
 
-FAR = 0.2
+FAR = 0.05
 """Gain of the first guess below which, or over whose inverse, it is not taken for 1."""
 
 RIVAL, APART = 4.0, 4.0
@@ -78,7 +78,7 @@ EXCITED = 1e-3
 
 
 @dataclass(frozen=True)
-class Number:
+class PlantNumber:
     """A number and its standard deviation; both None where it is not identifiable."""
 
     value: float | None = None
@@ -100,43 +100,43 @@ class GroupPlant:
     ----------
     modes : tuple of str
         Their names.
-    delay, gain : tuple of Number
+    delay, gain : tuple of PlantNumber
         Of every mode [frames], one delay for both where they do not differ; the gain is that of mirror and sensor together,
         negative for an axis that is flipped.
-    rotation : Number or None
+    rotation : PlantNumber or None
         Angle of y = R u [rad], in (-pi, pi]; None for one mode.
-    common_delay, common_gain : Number
+    common_delay, common_gain : PlantNumber
         Those of the modes together, where they do not differ; the gain above zero.
     uncertainty : float
         95 % limit of the rms of what the uncertainty of the plant puts into z, over the rms of z, in the worst octave between
         1 Hz and a quarter of the rate; infinite where the plant is not identifiable.
     peaks : tuple of int
         Resonances in the spectrum of every mode.
-    coloured : bool
+    has_background : bool
         Whether the spectrum of a mode has a coloured background.
-    excited : float
+    own_share : float
         Share of what is new in the commands that the measurements do not explain: of a probe, or a change of the controller.
     """
 
     modes: tuple[str, ...]
-    delay: tuple[Number, ...]
-    gain: tuple[Number, ...]
-    rotation: Number | None
-    common_delay: Number
-    common_gain: Number
+    delay: tuple[PlantNumber, ...]
+    gain: tuple[PlantNumber, ...]
+    rotation: PlantNumber | None
+    common_delay: PlantNumber
+    common_gain: PlantNumber
     uncertainty: float
     peaks: tuple[int, ...]
-    coloured: bool
-    excited: float
+    has_background: bool
+    own_share: float
 
     @property
-    def degrees(self) -> Number:
+    def degrees(self) -> PlantNumber:
         """The rotation [degrees]."""
-        angle = self.rotation or Number()
-        return Number(*(None if x is None else float(np.degrees(x)) for x in (angle.value, angle.sd)))
+        angle = self.rotation or PlantNumber()
+        return PlantNumber(*(None if x is None else float(np.degrees(x)) for x in (angle.value, angle.sd)))
 
     @property
-    def flipped(self) -> str:
+    def flipped_mode(self) -> str:
         """Name of the mode whose commands act the other way round while those of the other do not; empty where none is."""
         if self.rotation is None or self.gain[1].value is None or self.gain[1].value > 0 or self.rotation.value is None:
             return ""
@@ -195,7 +195,7 @@ def plant_dict(groups: Sequence[GroupPlant]) -> dict[str, Any]:
         **{key: [n.value for n in found] for key, found in numbers.items()},
         **{f"{key}_sd": [n.sd for n in found] for key, found in numbers.items()},
         "trustworthy_to_percent": 100.0 * worst if np.isfinite(worst) else None,
-        "excited": all(group.excited > EXCITED for group in groups),
+        "excited": all(group.own_share > EXCITED for group in groups),
         "remarks": plant_lines(groups),
     }
 
@@ -203,9 +203,9 @@ def plant_dict(groups: Sequence[GroupPlant]) -> dict[str, Any]:
 def plant_lines(groups: Sequence[GroupPlant]) -> list[str]:
     """Return what a plant means and what it rests on, a line each."""
     worst, peaks = max(group.uncertainty for group in groups), [n for group in groups for n in group.peaks]
-    colour = "a coloured background, " if any(group.coloured for group in groups) else ""
+    colour = "a coloured background, " if any(group.has_background for group in groups) else ""
     form = f"white noise, turbulence of second order, {colour}{min(peaks)} to {max(peaks)} resonances per mode"
-    new = min(group.excited for group in groups)
+    new = min(group.own_share for group in groups)
     basis = (
         f"the commands are excited: {100.0 * new:.2g} % of what is new in them does not follow from the measurements"
         if new > EXCITED
@@ -241,14 +241,19 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
     spectra: Sequence[Spectrum] = ()
     for delay in STARTS:
         start = np.concatenate([np.full(k, delay), guess[k:]])
-        fits.append(data.fit(data.shaped(start, spectra), pooled, STEPS))
+        fits.append(data.fit(data.with_spectra(start, spectra), pooled, STEPS))
         spectra = fits[-1].spectra
     first, *others = sorted(fits, key=lambda fit: fit.criterion)
     fits = [first, *(fit for fit in others if abs(fit.theta[0] - first.theta[0]) > SAME)][:REFINED]
     gains = np.column_stack([pooled[:, 0], np.eye(len(pooled))[:, k:]])
-    fits = [data.fit(data.shaped(fit.theta, fit.spectra, MOST_PEAKS), gains, STEPS) for fit in fits]
+    for again in range(REFINEMENTS):
+        more = [data.fit(data.with_spectra(fit.theta, fit.spectra, MOST_PEAKS), gains, STEPS) for fit in fits]
+        better = [new.criterion < old.criterion - 1.0 for old, new in zip(fits, more, strict=True)]
+        fits = [new if again == 0 or new.criterion < old.criterion else old for old, new in zip(fits, more, strict=True)]
+        if not any(better):
+            break
     each = min(fits, key=lambda fit: fit.criterion)
-    coloured = data.shaped(each.theta, each.spectra, MOST_PEAKS, plain=False)
+    coloured = data.with_spectra(each.theta, each.spectra, MOST_PEAKS, plain=False)
     if any(s.background for s in coloured.spectra):
         each = min(each, data.fit(coloured, gains, STEPS), key=lambda fit: fit.criterion)
     apart = data.fit(each, np.eye(len(pooled)), STEPS)
@@ -263,20 +268,20 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
     rivals = [fit.theta - each.theta for fit in fits if fit.criterion - each.criterion < RIVAL]
     each = each if one_delay else apart
 
-    def number(fit: _Fit, i: int) -> Number:
+    def number(fit: _Fit, i: int) -> PlantNumber:
         """Return a number of the plant, if it is near enough to that of every other plant that is as likely."""
         value, sd = float(fit.theta[i]), float(np.sqrt(max(fit.covariance[i, i], 0.0)))
         widest = WIDEST_DELAY if i < k else WIDEST_GAIN * abs(value) if i < 2 * k else WIDEST_ANGLE
         near = all(abs(rival[i]) <= APART * sd for rival in rivals)
-        return Number(value, sd) if near and 0.0 < sd < widest else Number()
+        return PlantNumber(value, sd) if near and 0.0 < sd < widest else PlantNumber()
 
-    def positive(n: Number) -> Number:
+    def positive(n: PlantNumber) -> PlantNumber:
         return n if n.value is None else replace(n, value=abs(n.value))
 
     delay, gain = tuple(number(each, i) for i in range(k)), tuple(number(each, k + i) for i in range(k))
     rotation = number(each, 2 * k) if k == 2 else None
-    common_delay = number(common, 0) if one_delay else Number()
-    common_gain = positive(number(common, k)) if one_delay and one_gain else Number()
+    common_delay = number(common, 0) if one_delay else PlantNumber()
+    common_gain = positive(number(common, k)) if one_delay and one_gain else PlantNumber()
     if rotation is not None and rotation.value is not None:
         rotation = replace(rotation, value=float(-((np.pi - rotation.value) % (2.0 * np.pi) - np.pi)))
     uncertainty = data.uncertainty(each) if all(n.value is not None for n in (*delay, *gain)) else np.inf
@@ -324,12 +329,12 @@ class _Data:
         """Return the Fourier transform of the columns (k, bins), such that its square is the periodogram."""
         return np.sqrt(2.0 * self.dt / self.n) * rfft(taper(self.n)[:, None] * x, axis=0)[1 : (self.n + 1) // 2].T
 
-    def shaped(self, theta: Array, spectra: Sequence[Spectrum] = (), most: int = PEAKS, *, plain: bool = True) -> _Fit:
+    def with_spectra(self, theta: Array, spectra: Sequence[Spectrum] = (), most: int = PEAKS, *, plain: bool = True) -> _Fit:
         """Return a plant with first guesses of the spectra; missing samples are filled by those before.
 
         plain : without a background, which the commands of a wrong plant look like
         """
-        seen = self._seen(theta)
+        seen = self._mirror_signal(theta)
         z = self.y - seen
         for i, missing in enumerate(self.missing):
             z[:, i] = missing.interpolate(z[:, i]) if not spectra else missing.fill(z[:, i], spectra[i].psd(self.f))
@@ -339,15 +344,15 @@ class _Data:
         found = [quick_spectrum(x, self.dt, most, LOWEST, s) for x, s in zip(z.T, before, strict=True)]
         return _Fit(theta, [replace(s, background=None) if plain else s for s in found])
 
-    def _seen(self, theta: Array) -> Array:
+    def _mirror_signal(self, theta: Array) -> Array:
         """Return the commands as the measurements see them, (n, k)."""
         whole = np.minimum(theta[: self.k].astype(int), LONGEST)
         part = theta[: self.k] - whole
         m = [(1.0 - p) * self.u[d, :, j] + p * self.u[d + 1, :, j] for j, (d, p) in enumerate(zip(whole, part, strict=True))]
         return np.array(m).T @ self._matrix(theta).T
 
-    def _matrix(self, theta: Array, turned: float = 0.0) -> Array:
-        return _rotation((theta[-1] if self.k == 2 else 0.0) + turned)[: self.k, : self.k] * theta[self.k : 2 * self.k]
+    def _matrix(self, theta: Array, turn: float = 0.0) -> Array:
+        return _rotation((theta[-1] if self.k == 2 else 0.0) + turn)[: self.k, : self.k] * theta[self.k : 2 * self.k]
 
     def z(self, theta: Array, lower: Array) -> tuple[Array, Array]:
         """Return the transform of z (k, bins) and its derivatives by theta (p, k, bins); lower : whole part of the delays."""
@@ -424,14 +429,14 @@ class _Data:
             gradient[:q] += by_cell.sum(axis=1)
             gradient[own] = slopes @ (cell.count * (1.0 - cell.mean / S))
             F[:q, :q] += 2.0 * np.real(weighted @ dZ[:, i].conj().T)
-            smooth = np.array([np.interp(cell.frequency, *self._smoothed(x / cell.count, cell)) for x in by_cell])
+            smooth = np.array([np.interp(cell.frequency, *self._band_means(x / cell.count, cell)) for x in by_cell])
             F[:q, own] = -(smooth * cell.count) @ slopes.T
             F[own, own] = (slopes * cell.count) @ slopes.T + LOOSE * np.eye(len(free))
             at += len(free)
         F[q:, :q] = F[:q, q:].T
         return F, gradient
 
-    def _smoothed(self, x: Array, cell: Cells) -> tuple[Array, Array]:
+    def _band_means(self, x: Array, cell: Cells) -> tuple[Array, Array]:
         """Return frequencies and means of x over bands: as Z times its derivatives over S, it is smooth but for its scatter."""
         band = np.cumsum(cell.count / (NARROW + BAND * self.n * self.dt * cell.frequency)).astype(int)
         weight = np.bincount(band, cell.count)

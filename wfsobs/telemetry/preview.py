@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from wfsobs.record import Record, RecordError, hold_last
+from wfsobs.record import DELAY, Record, RecordError, hold_last
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import psd, rms
 from wfsobs.telemetry.columns import describe_values, suggest_clock, suggest_roles
@@ -20,7 +20,7 @@ from wfsobs.telemetry.command_response import CommandResponse, command_response,
 from wfsobs.telemetry.formats.contents import TIME, Contents
 from wfsobs.telemetry.formats.psd import NoSpectrumError, read_psd
 from wfsobs.telemetry.intake import DeclaredFormat, to_record
-from wfsobs.telemetry.records import contradiction_of, read_columns, read_contents, stated_sign
+from wfsobs.telemetry.records import contradiction_of, read_columns, read_contents, stated_delay, stated_sign
 from wfsobs.typing import Array
 from wfsobs.units import UNITS, micrometres_per
 
@@ -54,6 +54,10 @@ class Reading:
         What the data say of commands at the limit of the mirror, a line per mode.
     contradiction : str
         Why the data exclude its sign or delay, unless that is trusted.
+    delay : float
+        Delay of the commands as the file or the user states it, with its fraction [steps].
+    gain : tuple of float or None
+        What the mirror does of a command as the user states it, one number or one per mode.
     """
 
     sign: int = 1
@@ -61,6 +65,8 @@ class Reading:
     units: dict[str, float] = field(default_factory=dict)
     limits: list[str] = field(default_factory=list)
     contradiction: str = ""
+    delay: float = DELAY
+    gain: tuple[float, ...] | None = None
 
     def lines(self) -> list[str]:
         """Return the evidence, a line each."""
@@ -240,7 +246,8 @@ def read_off(record: Record, contents: Contents, declaration: DeclaredFormat, sc
     response, excluded = command_response(replace(record, u=sign * record.u)), contradiction_of(record, contents, declaration)
     units = {} if known else {unit: size * micrometres_per(unit, scenario.telescope.diameter) for unit in UNITS}
     plausible = {unit: x for unit, x in units.items() if PLAUSIBLE[0] <= x <= PLAUSIBLE[1]}
-    return Reading(sign, response, plausible, saturation_lines(record), excluded)
+    stated = stated_delay(contents, declaration), declaration.command_gain
+    return Reading(sign, response, plausible, saturation_lines(record), excluded, *stated)
 
 
 def safe_name(name: str) -> str:
