@@ -40,7 +40,7 @@ PICTURE = """() => {
   const look = () => {
     const views = [...(window.Bokeh?.index?.query?.((it) => it.model.type === "Figure") ?? [])].filter(inWindow)
     if (views.length > 1 && views.every((it) => it.has_finished() && it.model.renderers.some(points))) {
-      at.models = Bokeh.index.roots[0].model.document._all_models.size
+      at.models = Bokeh.index.roots[0].model.document.all_models.size
       requestAnimationFrame(() => requestAnimationFrame(() => { at.picture = performance.now() }))
     } else setTimeout(look, 10)
   }
@@ -49,7 +49,7 @@ PICTURE = """() => {
 
 # A clock that starts at a release and notes when what it waits for has been painted: a function of the page that says so.
 CLOCK = """() => {
-  const models = () => [...(window.Bokeh?.index?.roots?.[0]?.model.document._all_models.values() ?? [])]
+  const models = () => [...(window.Bokeh?.index?.roots?.[0]?.model.document.all_models ?? [])]
   const deep = (selector, root = document) => {
     const found = root.querySelector(selector)
     if (found) return found

@@ -228,7 +228,7 @@ def open_shared(server: Server, contexts: Contexts) -> Iterator[Any]:
         yield open_it
 
 
-DONE = """() => [...(window.Bokeh?.index?.roots?.[0]?.model.document._all_models.values() ?? [])]
+DONE = """() => [...(window.Bokeh?.index?.roots?.[0]?.model.document.all_models ?? [])]
     .some(m => typeof m.text === "string" && m.text.startsWith("Done in"))"""
 """Asked of the models: on a phone the line that says so may be in a drawer that has not been opened."""
 
@@ -242,14 +242,14 @@ DRAWN = """() => {
       if (below) return below
     }
   }
-  const models = [...Bokeh.index.roots[0].model.document._all_models.values()]
+  const models = [...Bokeh.index.roots[0].model.document.all_models]
   const said = models.map((m) => m.text).find((text) => typeof text === "string" && /table class=.{1,6}rms/.test(text))
   return said && table(document)?.textContent === table(parse(parse(said).textContent))?.textContent
 }"""
 """Whether the table stands on the page as its model has it: on a busy machine that takes a while."""
 
 
-SETTINGS = """() => [...(window.Bokeh?.index?.roots?.[0]?.model.document._all_models.values() ?? [])]
+SETTINGS = """() => [...(window.Bokeh?.index?.roots?.[0]?.model.document.all_models ?? [])]
     .some((m) => m.type === "panel.models.esm.ReactComponent" && m.data?.label === "Preset")"""
 """Whether the drawer has its settings: they come after the first picture."""
 
@@ -261,8 +261,9 @@ ANSWERED = """() => {
 }"""
 
 
-CHANGED = """() => [...new URLSearchParams(location.search).keys()].some((it) => !it.startsWith("view."))"""
-"""Whether the link has settings."""
+CHANGED = f"""() => [...new URLSearchParams(location.search).keys()]
+    .some((it) => !it.startsWith("view.") && !new URLSearchParams("{QUICK}").has(it))"""
+"""Whether the link has settings beside those of `QUICK`."""
 
 
 def answered(page: Page) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
+from tests.browser.conftest import QUICK
 from wfsobs.observers import OBSERVERS
 
 
@@ -119,7 +120,7 @@ def test_the_tour_is_offered_once_and_observers_are_described(browser: Browser, 
     """To a browser that was not here before; pointing at a card and its focus say what the observer is."""
     context = browser.new_context(viewport={"width": 1280, "height": 720})
     page = context.new_page()
-    page.goto(server.url)
+    page.goto(server.url + QUICK)
     offer = page.get_by_role("dialog", name="Tour offer")
     offer.get_by_role("button", name="Take the tour").click()
     expect(page.get_by_role("dialog", name="Tour", exact=True)).to_contain_text("1 of 5")
@@ -169,6 +170,25 @@ def test_run_and_status_stay_in_sight(wide: Page) -> None:
     page.get_by_role("heading", name="RMS errors").scroll_into_view_if_needed()
     expect(page.get_by_role("button", name="Run", exact=True).first).to_be_in_viewport()
     expect(page.get_by_role("status").filter(has_text="Done in").first).to_be_in_viewport()
+
+
+def no_wider_than(page: Page, width: int) -> None:
+    page.wait_for_function("width => document.documentElement.scrollWidth <= width", arg=width)
+
+
+def test_other_pages_by_keyboard_on_a_phone(phone: Page) -> None:
+    page = phone
+    expect(page.get_by_role("button", name="Open drawer")).to_be_visible()
+    button = page.get_by_role("button", name="Model", exact=True)
+    button.focus()
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("heading", name="State space: equations 6 and 7")).to_be_visible()
+    no_wider_than(page, 390)
+    page.get_by_role("button", name="Paper figures", exact=True).focus()
+    page.keyboard.press("Space")
+    expect(page.get_by_role("heading", name="Figure 4a of the paper")).to_be_visible()
+    no_wider_than(page, 390)
+    page.get_by_role("button", name="Explore", exact=True).click()
 
 
 def test_a_heading_says_what_differs(phone: Page) -> None:

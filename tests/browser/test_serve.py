@@ -32,18 +32,22 @@ def serve(make_server: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     assert server.errors(0) == []
 
 
+def new_page(contexts: Contexts, serve: Any, query: str) -> Page:
+    page = contexts().new_page()
+    page.set_viewport_size({"width": 1400, "height": 1000})
+    page.set_default_timeout(PATIENCE)
+    page.goto(serve.url + query)
+    return page
+
+
 @pytest.fixture
 def visit(contexts: Contexts, serve: Any) -> Iterator[Callable[..., Page]]:
     """A function that opens the page for one more visitor: every page has a session of its own."""
     opened: list[Page] = []
 
     def open_it(query: str = "") -> Page:
-        page = contexts().new_page()
-        page.set_viewport_size({"width": 1400, "height": 1000})
-        page.set_default_timeout(PATIENCE)
-        opened.append(page)
-        page.goto(serve.url + query)
-        return page
+        opened.append(new_page(contexts, serve, query))
+        return opened[-1]
 
     yield open_it
     for page in opened:
@@ -60,12 +64,6 @@ def start(page: Page) -> None:
     page.get_by_role("button", name="Run", exact=True).first.click()
 
 
-def test_serve(open_page: Any, serve: Any) -> None:
-    page = open_page(url=serve.url)
-    expect(page).to_have_title("wfsobs")
-    assert serve.errors(0) == []
-
-
 @pytest.mark.parametrize("path", ["", "liveness", "static/js/bokeh.min.js", "none"])
 def test_every_answer_has_the_headers_that_protect_a_page(serve: Any, path: str) -> None:
     try:
@@ -77,18 +75,7 @@ def test_every_answer_has_the_headers_that_protect_a_page(serve: Any, path: str)
     assert headers.get_all("Content-Security-Policy") == ["frame-ancestors 'none'"]
 
 
-def test_two_visitors_wait_in_line(visit: Callable[..., Page]) -> None:
-    first, second = visit(LONG + "1"), visit(LONG + "2")
-    start(first)
-    status(first, "Running")
-    start(second)
-    status(second, "Waiting: position 1")
-    first.get_by_role("button", name="Cancel", exact=True).click()
-    status(first, "Cancelled")
-    status(second, "Running")
-
-
-def test_every_kind_of_work_is_in_that_line_and_a_click_goes_first(visit: Callable[..., Page], tmp_path: Path) -> None:
+def test_visitors_wait_in_line_with_every_kind_of_work_and_a_click_goes_first(visit: Callable[..., Page], tmp_path: Path) -> None:
     first, second = visit(LONG + "4"), visit(LONG + "5")
     start(first)
     status(first, "Running")
@@ -99,13 +86,23 @@ def test_every_kind_of_work_is_in_that_line_and_a_click_goes_first(visit: Callab
     expect(second.locator(".said", has_text="Waiting: position 1")).to_be_visible()  # the reading of the file
     status(second, "Waiting: position 2")
     first.get_by_role("button", name="Cancel", exact=True).click()
+    status(first, "Cancelled")
     expect(second.get_by_text("log.csv: has no y_lgs").first).to_be_visible()
     status(second, "Running")
 
 
-def test_more_than_the_limits_is_refused(visit: Callable[..., Page]) -> None:
-    page = visit("?run.duration=101&turbulence.wind_speed=21")
+@pytest.fixture(scope="module")
+def limited(contexts: Contexts, serve: Any) -> Iterator[Page]:
+    """A page whose link has more than the limits, for the tests below."""
+    page = new_page(contexts, serve, "?run.duration=101&turbulence.wind_speed=21")
     status(page, "Done in")
+    yield page
+    leave(page)
+
+
+def test_more_than_the_limits_is_refused(limited: Page) -> None:
+    page = limited
+    expect(page).to_have_title("wfsobs")
     note = page.get_by_text("Not used from the link: run.duration = 101: at most 100 s on this server")
     expect(note).to_be_visible()
     expect(page.get_by_role("textbox", name="m/s")).to_have_value("21")
@@ -123,10 +120,9 @@ def elsewhere() -> Iterator[str]:
     site.server_close()
 
 
-def test_a_page_of_elsewhere_cannot_connect(visit: Callable[..., Page], serve: Any, elsewhere: str) -> None:
+def test_a_page_of_elsewhere_cannot_connect(limited: Page, serve: Any, elsewhere: str) -> None:
     """A page of another origin, which has got hold of a session's token, opens a websocket with it."""
-    page = visit()
-    status(page, "Done in")
+    page = limited
     token = page.evaluate('() => document.documentElement.innerHTML.match(/"token":"([^"]+)"/)[1]')
     connect = """([url, token]) => new Promise((done) => {
         const socket = new WebSocket(url, ["bokeh", token])

@@ -27,6 +27,12 @@ def open_short(open_page: Any, server: Any) -> Callable[..., Page]:
     return open_it
 
 
+@pytest.fixture(scope="module")
+def short(open_shared: Any, server: Any) -> Page:
+    """A page on that record for the tests below, in this order."""
+    return open_shared(url=server.url + QUICK)
+
+
 def speed(page: Page) -> Any:
     return page.get_by_role("textbox", name="m/s")
 
@@ -58,8 +64,42 @@ def copied(page: Page, item: str) -> Locator:
     return page.get_by_role("textbox", name="Copy this by hand")
 
 
-def test_undo_by_key_and_by_button(open_short: Any) -> None:
-    page = open_short()
+WINDOW = re.compile(r"\d\.\d\d – \d\.\d\d s")
+"""Start and end of the time window, as the page writes it."""
+
+
+def test_back_and_reload_return_to_the_view(short: Page) -> None:
+    page = short
+    start = page.evaluate("location.search")
+    page.get_by_role("button", name="Tilt", exact=True).click()
+    page.wait_for_function("location.search.includes('view.mode=tilt')")
+    tilt = page.evaluate("location.search")
+    page.get_by_role("button", name="Model", exact=True).click()
+    page.wait_for_function("location.search.includes('view.page=model')")
+    expect(page.get_by_role("heading", name=re.compile("State space"))).to_be_visible()
+    page.go_back()
+    expect(page.get_by_role("heading", name="RMS errors")).to_be_visible()
+    page.wait_for_function("address => location.search === address", arg=tilt)
+    page.get_by_role("button", name="Time window: 0.2 s").click()
+    page.wait_for_function("location.search.includes('view.window=')")
+    page.locator(".card[data-name=kf-lgs]").first.dblclick()
+    # Not that of the first click of the two, which hides the line.
+    page.wait_for_function("/view.hide.turbulence=/.test(location.search) && !/kf-lgs/.test(location.search)")
+    address, stretch = page.evaluate("location.search"), page.locator("p.stretch").first
+    expect(stretch).to_contain_text(WINDOW)
+    window = WINDOW.search(stretch.inner_text())
+    page.reload()
+    expect(page.get_by_role("button", name="Tilt", exact=True)).to_have_attribute("aria-pressed", "true")
+    expect(page.locator(".card[data-name=kf-multi]").first).to_have_attribute("aria-pressed", "false")
+    expect(stretch).to_contain_text(window[0])
+    page.wait_for_function("address => location.search === address", arg=address)
+    page.go_back()
+    page.wait_for_function("address => location.search === address", arg=start)
+    expect(page.get_by_role("button", name="Tip", exact=True)).to_have_attribute("aria-pressed", "true")
+
+
+def test_undo_by_key_and_by_button(short: Page) -> None:
+    page = short
     set_speed(page, "20")
     page.wait_for_function("location.search.includes('turbulence.wind_speed=20')")
     page.locator("h2", has_text="Turbulence").click()
@@ -102,14 +142,14 @@ def test_a_link_with_one_bad_field(open_short: Any, open_page: Any) -> None:
     expect(page.locator(cell).first).to_have_text(re.compile(rf"(^|\s){re.escape(value)}\s*$"))
 
 
-def test_other_languages(open_short: Any) -> None:
-    page = open_short()
+def test_other_languages(short: Page) -> None:
+    page = short
     expect(copied(page, "Copy as command line")).to_have_value(re.compile("^wfsobs run --preset paper --set "))
     expect(copied(page, "Copy as Python")).to_have_value(re.compile(re.escape('wfsobs.PRESETS["paper"]().replace({')))
 
 
-def test_data_and_figures(open_short: Any, tmp_path: Path) -> None:
-    page = open_short()
+def test_data_and_figures(short: Page, tmp_path: Path) -> None:
+    page = short
     lines = saved(page, "data as CSV", tmp_path).read_text(encoding="utf-8").splitlines()
     names, *rows = [line for line in lines if not line.startswith("#")]
     assert len(rows) == 2000 and {len(row.split(",")) for row in rows} == {len(names.split(","))}
@@ -128,8 +168,10 @@ def test_data_and_figures(open_short: Any, tmp_path: Path) -> None:
         assert png.startswith(b"\x89PNG") and int.from_bytes(png[20:24]) == 3 * int(float(root.get("height", 0))) > 720
 
 
-def test_a_scenario_out_and_in_again(open_short: Any, tmp_path: Path) -> None:
-    page = open_short("&turbulence.wind_speed=22")
+def test_a_scenario_out_and_in_again(short: Page, tmp_path: Path) -> None:
+    page = short
+    set_speed(page, "22")
+    page.wait_for_function("location.search.includes('turbulence.wind_speed=22')")
     path = saved(page, "scenario as TOML", tmp_path)
     assert tomllib.loads(path.read_text(encoding="utf-8"))["turbulence"]["wind_speed"] == 22.0
     page.get_by_role("button", name="Reset", exact=True).click()
@@ -155,8 +197,8 @@ def test_a_long_run_waits(open_short: Any) -> None:
     expect(page.get_by_text("s: press Run.").first).to_be_visible()
 
 
-def test_menus_by_keyboard(open_short: Any) -> None:
-    page = open_short()
+def test_menus_by_keyboard(short: Page) -> None:
+    page = short
     button = page.get_by_role("button", name="Share", exact=True)
     button.focus()
     page.keyboard.press("Enter")
@@ -168,34 +210,6 @@ def test_menus_by_keyboard(open_short: Any) -> None:
     page.keyboard.press("Escape")
     expect(button).to_have_attribute("aria-expanded", "false")
     expect(button).to_be_focused()
-
-
-def test_back_and_reload_return_to_the_view(open_page: Any) -> None:
-    page = open_page()
-    start = page.evaluate("location.search")
-    page.get_by_role("button", name="Tilt", exact=True).click()
-    page.wait_for_function("location.search.includes('view.mode=tilt')")
-    tilt = page.evaluate("location.search")
-    page.get_by_role("button", name="Model", exact=True).click()
-    page.wait_for_function("location.search.includes('view.page=model')")
-    expect(page.get_by_role("heading", name=re.compile("State space"))).to_be_visible()
-    page.go_back()
-    expect(page.get_by_role("heading", name="RMS errors")).to_be_visible()
-    page.wait_for_function("address => location.search === address", arg=tilt)
-    page.get_by_role("button", name="Time window: 0.2 s").click()
-    page.wait_for_function("location.search.includes('view.window=')")
-    page.locator(".card[data-name=kf-lgs]").first.dblclick()
-    # Not that of the first click of the two, which hides the line.
-    page.wait_for_function("/view.hide.turbulence=/.test(location.search) && !/kf-lgs/.test(location.search)")
-    address = page.evaluate("location.search")
-    page.reload()
-    expect(page.get_by_role("button", name="Tilt", exact=True)).to_have_attribute("aria-pressed", "true")
-    expect(page.locator(".card[data-name=kf-multi]").first).to_have_attribute("aria-pressed", "false")
-    expect(page.locator("p.stretch").first).to_contain_text(re.compile(r"5\.40 – 5\.60 s"))
-    page.wait_for_function("address => location.search === address", arg=address)
-    page.go_back()
-    page.wait_for_function("address => location.search === address", arg=start)
-    expect(page.get_by_role("button", name="Tip", exact=True)).to_have_attribute("aria-pressed", "true")
 
 
 def test_back_before_the_page_is_drawn_is_heard(open_page: Any, server: Any) -> None:

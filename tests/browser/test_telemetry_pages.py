@@ -5,13 +5,19 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from playwright.sync_api import expect
+import pytest
+from playwright.sync_api import Page, expect
 
 QUICK = "?run.duration=5&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40"
 
 
-def test_identify_and_use_it(open_page: Any, server: Any) -> None:
-    page = open_page(url=server.url + QUICK)
+@pytest.fixture(scope="module")
+def page(open_shared: Any, server: Any) -> Page:
+    """A page for the tests below, in this order."""
+    return open_shared(url=server.url + QUICK)
+
+
+def test_identify_and_use_it(page: Page) -> None:
     page.get_by_role("button", name="Identify", exact=True).click()
     expect(page.get_by_role("button", name="Filters only")).to_be_disabled()
     page.get_by_role("button", name="Identify the record").click()
@@ -34,8 +40,7 @@ def test_identify_and_use_it(open_page: Any, server: Any) -> None:
     expect(wind).to_have_value(before)
 
 
-def test_tune_stop_and_use_it(open_page: Any, server: Any) -> None:
-    page = open_page(url=server.url + QUICK)
+def test_tune_stop_and_use_it(page: Page) -> None:
     page.get_by_role("button", name="Tune", exact=True).click()
     start, evaluations = page.get_by_role("button", name="Start tuning"), page.get_by_role("textbox", name="Evaluations")
     evaluations.fill("1000")
