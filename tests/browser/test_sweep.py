@@ -7,6 +7,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import pytest
 from playwright.sync_api import Locator, Page, expect
 
 from tests.browser.test_quality import accessible, fits, focused, theme
@@ -40,8 +41,13 @@ def known(page: Page) -> Locator:
     return page.get_by_role("region", name="Best observers, vibration, tip").locator('button:not([data-state="waiting"])')
 
 
-def test_a_map_comes_cell_by_cell_and_one_is_loaded(open_page: Any, server: Any) -> None:
-    page = open_page(url=server.url + QUICK)
+@pytest.fixture(scope="module")
+def page(open_shared: Any, server: Any) -> Page:
+    """A page for the tests below, in this order."""
+    return open_shared(url=server.url + QUICK)
+
+
+def test_a_map_comes_cell_by_cell_and_one_is_loaded(page: Page) -> None:
     page.get_by_role("button", name="Sweep", exact=True).click()
     expect(page.get_by_text(re.compile(r"5 × 4 scenarios × 4 seeds = 80 runs, about \d+ s"))).to_be_visible()
     enter(page, "Values", "25:5:5")
@@ -58,6 +64,7 @@ def test_a_map_comes_cell_by_cell_and_one_is_loaded(open_page: Any, server: Any)
     expect(known(page)).to_have_count(4)
     theme(page)
     look_for_faults(page)
+    theme(page)
     wind = page.get_by_role("textbox", name="Wind speed V₀ [m/s]")
     expect(wind).to_have_value("15")
     page.get_by_role("region", name="Best observers, vibration, tip").get_by_role(
@@ -73,52 +80,8 @@ def test_a_map_comes_cell_by_cell_and_one_is_loaded(open_page: Any, server: Any)
     expect(page.get_by_role("region", name="Best observers, vibration, tip")).to_be_visible()
 
 
-def test_error_over_a_setting_by_keyboard(open_page: Any, server: Any) -> None:
-    page = open_page(url=server.url + QUICK)
-    page.get_by_role("textbox", name="Peak 1: f [Hz]").press("o")  # a letter, and no page of sweeps
-    page.get_by_role("textbox", name="Exposure ratio n").press("Alt+o")
-    expect(page.get_by_role("button", name="Sweep", exact=True)).to_have_attribute("aria-pressed", "true")
-    values = page.get_by_role("textbox", name="Values", exact=True)
-    expect(values).to_have_value("1,6,10,15,20")
-    expect(page.get_by_text(re.compile("5 scenarios × 4 seeds = 20 runs"))).to_be_visible()
-    values.focus()
-    page.keyboard.press("ControlOrMeta+a")
-    page.keyboard.type("5,10")
-    tab_to(page, "Seeds of each")
-    page.keyboard.press("ControlOrMeta+a")
-    page.keyboard.type("1")
-    tab_to(page, "Observers")
-    expect(page.get_by_text("2 scenarios × 1 seed = 2 runs")).to_be_visible()
-    tab_to(page, "Run the sweep")
-    page.keyboard.press("Enter")
-    expect(page.get_by_text("Finished · 2 of 2 runs")).to_be_visible()
-    tab_to(page, "Exposure ratio n 5:")
-    page.keyboard.press("Enter")
-    expect(page.get_by_role("button", name="Explore", exact=True)).to_have_attribute("aria-pressed", "true")
-    expect(page.get_by_role("textbox", name="Exposure ratio n")).to_have_value("5")
-
-
-def test_error_over_a_setting_of_the_drawer(open_page: Any, server: Any) -> None:
-    page = open_page(url=server.url + QUICK)
-    page.get_by_role("textbox", name="Peak 1: f [Hz]").hover()
-    expect(page.get_by_role("button", name="Error over vibration.peaks.0.frequency")).to_be_visible()
-    page.get_by_role("textbox", name="Exposure ratio n").hover()
-    page.get_by_role("button", name="Error over sensors.exposure_ratio").click()
-    expect(page.get_by_role("textbox", name="Values", exact=True)).to_have_value("1,6,10,15,20")
-    enter(page, "Values", "5,10")
-    enter(page, "Seeds of each", "3")
-    expect(page.get_by_text("2 scenarios × 3 seeds = 6 runs")).to_be_visible()
-    page.get_by_role("button", name="Run the sweep").click()
-    expect(page.get_by_text("Finished · 6 of 6 runs")).to_be_visible()
-    expect(page.get_by_role("figure", name="Error over Exposure ratio n, turbulence")).to_be_visible()
-    expect(page.get_by_role("button", name=re.compile(r"^Exposure ratio n 10: .*3 seeds$"))).to_have_count(3)
-    look_for_faults(page)
-
-
-def test_a_sweep_over_one_setting_runs_after_back(open_page: Any, server: Any) -> None:
+def test_a_sweep_over_one_setting_runs_after_back(page: Page) -> None:
     """With no second setting chosen, to Explore and back."""
-    page = open_page(url=server.url + QUICK)
-    page.get_by_role("button", name="Sweep", exact=True).click()
     page.get_by_role("combobox", name="and over").click()
     page.get_by_role("option", name="no second setting").click()
     enter(page, "Values", "5,20")
@@ -136,3 +99,46 @@ def test_a_sweep_over_one_setting_runs_after_back(open_page: Any, server: Any) -
     head, *rows = Path(saved.value.path()).read_text().splitlines()
     assert head.startswith("turbulence.wind_speed,target,mode,observer,seeds,mean_rms_nm")
     assert {row.split(",")[0] for row in rows} == {"5", "20"} and {row.split(",")[4] for row in rows} == {"1"}
+    page.get_by_role("button", name="Explore", exact=True).click()
+
+
+def test_error_over_a_setting_by_keyboard(page: Page) -> None:
+    page.get_by_role("textbox", name="Peak 1: f [Hz]").press("o")  # a letter, and no page of sweeps
+    page.get_by_role("textbox", name="Exposure ratio n").press("Alt+o")
+    expect(page.get_by_role("button", name="Sweep", exact=True)).to_have_attribute("aria-pressed", "true")
+    values = page.get_by_role("textbox", name="Values", exact=True)
+    expect(values).to_have_value("1,6,10,15,20")
+    expect(page.get_by_text(re.compile("5 scenarios × 1 seed = 5 runs"))).to_be_visible()
+    values.focus()
+    page.keyboard.press("ControlOrMeta+a")
+    page.keyboard.type("5,10")
+    tab_to(page, "Seeds of each")
+    page.keyboard.press("ControlOrMeta+a")
+    page.keyboard.type("2")
+    tab_to(page, "Observers")
+    expect(page.get_by_text("2 scenarios × 2 seeds = 4 runs")).to_be_visible()
+    tab_to(page, "Run the sweep")
+    page.keyboard.press("Enter")
+    expect(page.get_by_text("Finished · 4 of 4 runs")).to_be_visible()
+    tab_to(page, "Exposure ratio n 10:")
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("button", name="Explore", exact=True)).to_have_attribute("aria-pressed", "true")
+    expect(page.get_by_role("textbox", name="Exposure ratio n")).to_have_value("10")
+    page.get_by_role("button", name="Undo", exact=True).click()
+    expect(page.get_by_role("textbox", name="Exposure ratio n")).to_have_value("5")
+
+
+def test_error_over_a_setting_of_the_drawer(page: Page) -> None:
+    page.get_by_role("textbox", name="Peak 1: f [Hz]").hover()
+    expect(page.get_by_role("button", name="Error over vibration.peaks.0.frequency")).to_be_visible()
+    page.get_by_role("textbox", name="Exposure ratio n").hover()
+    page.get_by_role("button", name="Error over sensors.exposure_ratio").click()
+    expect(page.get_by_role("textbox", name="Values", exact=True)).to_have_value("1,6,10,15,20")
+    enter(page, "Values", "5,10")
+    enter(page, "Seeds of each", "3")
+    expect(page.get_by_text("2 scenarios × 3 seeds = 6 runs")).to_be_visible()
+    page.get_by_role("button", name="Run the sweep").click()
+    expect(page.get_by_text("Finished · 6 of 6 runs")).to_be_visible()
+    expect(page.get_by_role("figure", name="Error over Exposure ratio n, turbulence")).to_be_visible()
+    expect(page.get_by_role("button", name=re.compile(r"^Exposure ratio n 10: .*3 seeds$"))).to_have_count(3)
+    look_for_faults(page)
