@@ -52,9 +52,12 @@ def rows() -> Array:
     return np.ascontiguousarray(record.z)
 
 
-@pytest.fixture
-def shadow(make_server: Any, rows: Array, tmp_path: Path) -> Iterator[tuple[Any, Path, list[Publisher]]]:
+@pytest.fixture(scope="module")
+def shadow(
+    make_server: Any, rows: Array, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[Any, Path, list[Publisher]]]:
     """A server in shadow, the file of the stream, and who sends; in the end there must be no fault in its log."""
+    tmp_path = tmp_path_factory.mktemp("stream")
     path = tmp_path / "modes.im.shm"
     running = [Publisher(path, rows)]
     settings = [part for name, value in SETTINGS.items() for part in ("--set", f"{name}={value:g}")]
@@ -67,10 +70,23 @@ def shadow(make_server: Any, rows: Array, tmp_path: Path) -> Iterator[tuple[Any,
     assert server.errors(0) == []
 
 
-def test_a_stream_that_fails_is_told_and_followed_again(shadow: Any, open_page: Any, rows: Array) -> None:
-    server, path, running = shadow
-    page = open_page(url=server.url + "?view.page=live", wait=False)
+@pytest.fixture(scope="module")
+def page(shadow: Any, open_shared: Any) -> Page:
+    """A page for the tests below, in this order."""
+    page = open_shared(url=shadow[0].url + "?view.page=live", wait=False)
     expect(page.get_by_role("figure", name="Waterfall")).to_be_visible()
+    return page
+
+
+def test_lines_are_of_observers_that_a_stream_has_errors_of(page: Page) -> None:
+    """Of the usual three the one of both sensors does not run, and the online GPR says nothing of the next measurement."""
+    legend = page.locator(".caption.legend").filter(visible=True)
+    expect(legend).to_have_text(re.compile("^(LGS KF|Multi-peak|GP in time){3}$"))
+    expect(page.get_by_role("combobox", name="Errors of")).to_have_text("Next measurement")
+
+
+def test_a_stream_that_fails_is_told_and_followed_again(shadow: Any, page: Page, rows: Array) -> None:
+    _, path, running = shadow
     events = page.get_by_role("list", name="Events")
     running[0].factor = np.nan
     expect(events).to_contain_text("numbers that are not finite")
@@ -83,15 +99,6 @@ def test_a_stream_that_fails_is_told_and_followed_again(shadow: Any, open_page: 
     before = seconds(page)
     expect(page.get_by_text(RUNNING)).not_to_contain_text(f" {before:.1f} s ")
     assert seconds(page) > before
-
-
-def test_lines_are_of_observers_that_a_stream_has_errors_of(shadow: Any, open_page: Any) -> None:
-    """Of the usual three the one of both sensors does not run, and the online GPR says nothing of the next measurement."""
-    page = open_page(url=shadow[0].url + "?view.page=live", wait=False)
-    expect(page.get_by_role("figure", name="Waterfall")).to_be_visible()
-    legend = page.locator(".caption.legend").filter(visible=True)
-    expect(legend).to_have_text(re.compile("^(LGS KF|Multi-peak|GP in time){3}$"))
-    expect(page.get_by_role("combobox", name="Errors of")).to_have_text("Next measurement")
 
 
 def seconds(page: Page) -> float:
