@@ -1,18 +1,46 @@
-"""The theme of every page: by the address, by the system, and switched on the page."""
+"""A server with all pages, that of a campaign among them: their themes, and a square of the map clicked."""
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.browser.test_campaign import SHORT, make_campaign
 from wfsobs.app.pages.pages import TITLES
 from wfsobs.app.style import labels, look
+from wfsobs.campaign.plan import parse_plan
+from wfsobs.campaign.store import open_folder, write_batch
+from wfsobs.campaign.work import run_rows
 from wfsobs.evaluation.scores import BOUNDS
+
+SHORT = {"run.duration": 1.0, "run.warm_up": 0.2, "gpr_online.training_size": 40, "gpr_offline.training_size": 40}
+PLAN = {
+    "seeds": 2,
+    "observers": ["kf-lgs", "persistence"],
+    "settings": SHORT,
+    "grid": {"turbulence.wind_speed": [5, 20], "sensors.exposure_ratio": [5, 10]},
+}
+
+
+def toml(table: dict[str, Any]) -> str:
+    """Write a plan: in JSON's values, which TOML shares."""
+    plain = [f"{key} = {json.dumps(value)}" for key, value in table.items() if not isinstance(value, dict)]
+    tables = [f"[{key}]\n{toml(value)}" for key, value in table.items() if isinstance(value, dict)]
+    return "\n".join([*plain, *tables])
+
+
+def make_campaign(folder: Path) -> None:
+    """Run a small campaign to its end."""
+    plan = parse_plan(toml(PLAN), folder.parent)
+    open_folder(plan, folder)
+    rows = [row for cell in plan.cells for seed in plan.seeds for row in run_rows(cell, seed, plan.observers, ())]
+    write_batch(folder, rows, {"host": "", "process": 1, "written": 1.0})
+
 
 LOOKS = {name: [look(name).light, look(name).dark] for name in {*labels(), *BOUNDS}}
 
@@ -69,23 +97,34 @@ def all_in(page: Page, dark: bool, titles: list[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("system", "asked", "titles"),
-    [("light", "dark", [*TITLES]), ("dark", "light", SOME), ("dark", "", SOME)],
+    ("system", "asked", "first", "titles"),
+    [
+        ("light", "dark", "Campaign", [*TITLES]),
+        ("dark", "light", "Closed loop", SOME),
+        ("dark", "", "Explore", SOME),
+    ],
     ids=["dark by address", "light by address", "dark by system"],
 )
-def test_every_page_has_the_theme(open_page: Any, server: Any, system: str, asked: str, titles: list[str]) -> None:
+def test_every_page_has_the_theme(open_page: Any, server: Any, system: str, asked: str, first: str, titles: list[str]) -> None:
+    """That which is opened by its address, too."""
     dark = (asked or system) == "dark"
     query = "&".join(f"{path}={value}" for path, value in SHORT.items())
-    page = open_page(url=f"{server.url}?{query}" + f"&theme={asked}" * bool(asked), color_scheme=system)
-    all_in(page, dark, titles)
+    link = f"{server.url}?{query}" + f"&theme={asked}" * bool(asked) + f"&view.page={TITLES[first]}" * (first != "Explore")
+    page = open_page(url=link, color_scheme=system)
+    page.wait_for_function(TURNED, arg=[[], False])
+    all_in(page, dark, [first, *(it for it in titles if it != first)])
     page.get_by_role("button", name=re.compile("theme", re.I)).click()
     all_in(page, not dark, titles[::-1])
     expect(page).to_have_url(re.compile(f"theme={'light' if dark else 'dark'}"))
+    if first == "Campaign":
+        a_square_opens_its_scenario(page)
 
 
-@pytest.mark.parametrize("title", ["Campaign", "Closed loop"])
-def test_a_page_that_is_opened_by_its_address_has_the_theme(open_page: Any, server: Any, title: str) -> None:
-    query = "&".join(f"{path}={value}" for path, value in SHORT.items())
-    page = open_page(url=f"{server.url}?{query}&view.page={TITLES[title]}&theme=dark", color_scheme="light")
-    page.wait_for_function(TURNED, arg=[[], False])
-    page.wait_for_function(f"(it) => ({WRONG})(it).length === 0", arg=[LOOKS, True])
+def a_square_opens_its_scenario(page: Page) -> None:
+    page.get_by_role("button", name="Campaign", exact=True).click()
+    expect(page.get_by_text("8 of 8 runs")).to_be_visible()
+    expect(page.get_by_role("region", name="Observers of the campaign").get_by_text("Persistence")).to_be_visible()
+    page.get_by_role("button", name="Wind speed V₀ [m/s] 20, Exposure ratio n 10: ").click()
+    expect(page.get_by_role("button", name="Explore", exact=True)).to_have_attribute("aria-pressed", "true")
+    expect(page.get_by_role("textbox", name="Wind speed V₀ [m/s]")).to_have_value("20")
+    expect(page.get_by_role("textbox", name="Exposure ratio n")).to_have_value("10")
