@@ -3,7 +3,6 @@
 
 PYTHON ?= python3
 PORT ?= 5006
-TUTORIALS ?= run
 VENV := .venv
 BIN := $(VENV)/bin
 
@@ -34,7 +33,7 @@ define install
 endef
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: help run test setup check check-types wheel wheel-check load container-check bench docs clean test-fast test-peers
+.PHONY: help run test setup check check-types wheel wheel-check load container-check bench docs notebooks clean test-fast test-peers
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' Makefile
@@ -42,10 +41,9 @@ help:  ## list the targets
 run: $(RUN)  ## serve the dashboard on localhost:5006 (another port: make run PORT=5007)
 	@$(BIN)/wfsobs serve --port $(PORT)
 
-test: setup  ## run all tests, then the tutorials, then those in a browser
+test: setup  ## run all tests, then those in a browser
 	@status=0; \
 	$(BIN)/python -m pytest -n auto --dist worksteal || status=1; \
-	$(BIN)/python -m pytest -n auto tests/tutorials || status=1; \
 	$(BIN)/python -m pytest -n auto --dist loadfile tests/browser || status=1; \
 	exit $$status
 
@@ -89,9 +87,12 @@ container-check:  ## run the steps of the Dockerfile in an empty environment, wi
 bench: $(BENCH)  ## time the observers, and compare them with other libraries
 	$(BIN)/python -m benchmarks
 
-docs: $(DOCS)  ## build this documentation in build/site, the tutorials run again (TUTORIALS=shown: as they are)
-	PYTHONPATH=. TUTORIALS=$(TUTORIALS) $(VENV)-docs/bin/properdocs build --strict --quiet --config-file mkdocs.yml
+docs: $(DOCS)  ## build this documentation in build/site, its notebooks run
+	PYTHONPATH=. $(VENV)-docs/bin/properdocs build --strict --quiet --config-file mkdocs.yml
 	$(VENV)-docs/bin/python docs/scripts/check_site.py build/site
+
+notebooks: $(VENV)-notebooks/.made-$(PINS)  ## open the tutorials in JupyterLab
+	PYTHONPATH=. $(VENV)-notebooks/bin/python -m jupyterlab docs/tutorials
 
 clean:  ## remove .venv and all that was built
 	rm -rf $(VENV) $(VENV)-* build dist *.egg-info .pytest_cache .ruff_cache .hypothesis test-output

@@ -9,6 +9,7 @@ import doctest
 import importlib.util
 import inspect
 import io
+import json
 import re
 import shlex
 import shutil
@@ -40,8 +41,9 @@ ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
 DOCS = ROOT / "docs"
 PAGES = [README, *sorted(DOCS.glob("**/*.md"))]
-COMMANDS = [p for p in PAGES if p.parent.name != "tutorials" and p.stem != "read-your-telemetry"]
-"""Pages whose commands stand alone; those of the others go with their code."""
+COMMANDS = [p for p in PAGES if p.stem != "read-your-telemetry"]
+"""Pages whose commands stand alone; those of the other go with its code."""
+NOTEBOOKS = sorted(DOCS.glob("tutorials/*.ipynb"))
 SHORT = (
     "--set",
     "run.duration=1.2",
@@ -92,13 +94,22 @@ def test_settings_page_is_what_the_script_gives() -> None:
     )
 
 
+def test_notebooks_are_kept_without_outputs() -> None:
+    """They are run when the documentation is built; what they claim of their numbers they assert."""
+    assert len(NOTEBOOKS) == 5
+    for path in NOTEBOOKS:
+        code = [cell for cell in json.loads(path.read_text(encoding="utf-8"))["cells"] if cell["cell_type"] == "code"]
+        assert not any(cell["outputs"] or cell["execution_count"] for cell in code)
+        assert any("assert " in "".join(cell["source"]) for cell in code)
+
+
 def test_settings_page_names_every_setting() -> None:
     page = (ROOT / "docs" / "settings.md").read_text(encoding="utf-8")
     missing = [path for path, *_ in Scenario().walk() if f"`{re.sub(r'[.]0[.]', '.N.', path)}`" not in page]
     assert not missing
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+@pytest.mark.parametrize("page", [*PAGES, *NOTEBOOKS], ids=lambda p: p.name)
 def test_relative_links_lead_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\(([^)]+)\)", prose(page)):
         if re.match(r"[a-z]+:", target):

@@ -28,6 +28,7 @@ FUNCTIONS = (
     "bound",
     "close_loop",
     "error_budget",
+    "explore",
     "export",
     "fit_kernels",
     "identify",

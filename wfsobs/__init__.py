@@ -17,6 +17,7 @@ from wfsobs.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from wfsobs.app.report.export import export
+    from wfsobs.app.serve import explore
     from wfsobs.closed_loop.run import close_loop
     from wfsobs.evaluation.bound import bound
     from wfsobs.evaluation.budget import error_budget
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "bound": "evaluation.bound",
+    "explore": "app.serve",
     "export": "app.report.export",
     "close_loop": "closed_loop.run",
     "design": "stepping",
@@ -74,6 +76,7 @@ __all__ = [
     "close_loop",
     "design",
     "error_budget",
+    "explore",
     "export",
     "fit_kernels",
     "identify",

@@ -1,12 +1,11 @@
-"""Adds to the site what is made when it is built: the reference, the plan of the code, the outputs of the tutorials.
+"""Adds to the site what is made when it is built: the reference, the plan of the code, the notebooks of the tutorials.
 
-Run by properdocs (`make docs`). With TUTORIALS=shown in the environment the tutorials stay as they are written.
+Run by properdocs (`make docs`).
 """
 
 from __future__ import annotations
 
 import multiprocessing
-import os
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -14,9 +13,9 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent))
 
 import mkdocs_gen_files
+import notebook
 import reference
 import rooms
-import tutorial
 
 DOCS = Path(__file__).parents[1]
 PLAN = "<!-- rooms -->"
@@ -36,9 +35,7 @@ told = rooms.plan()
 page = (DOCS / "architecture.md").read_text(encoding="utf-8")
 write("architecture.md", page.replace(PLAN, f'<div class="rooms">{rooms.svg(told)}</div>\n\n{rooms.table(told)}'))
 
-if os.environ.get("TUTORIALS") != "shown":
-    pages = sorted((DOCS / "tutorials").glob("*.md"))
-    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
-        for source, (text, figures) in zip(pages, pool.map(tutorial.renewed, pages), strict=True):
-            for name, content in {source.name: text, **figures}.items():
-                write(f"tutorials/{name}", content)
+with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
+    for files in pool.map(notebook.run, sorted((DOCS / "tutorials").glob("*.ipynb"))):
+        for name, content in files.items():
+            write(f"tutorials/{name}", content)
