@@ -1,4 +1,4 @@
-"""Figures by their data: an element's arrays are the result's numbers, its labels have units, both backends draw it."""
+"""Figures by their data and as pictures: an element has the numbers of the result, labels have units, both backends draw it."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 from bokeh.models import Plot
 from click.testing import CliRunner
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
 
 import wfsobs
 from wfsobs.campaign.sweep import SweepResults, parse_axis, plan_sweep, run_sweep
@@ -177,6 +179,35 @@ def test_bars_are_the_scores_and_their_intervals(result: wfsobs.Result) -> None:
     np.testing.assert_array_equal(ends.dimension_values(0), [1e3 * s.interval[0] for s in scores if s.interval])
     colours = list(bars.dimension_values(4))
     assert colours == [look(s.observer).light for s in scores]
+
+
+def pixels(figure: Any) -> tuple[np.ndarray, Any]:
+    """(height, width, 3) colours of a figure in one column, from the bottom, and its first axes."""
+    paper = to_matplotlib(figure)
+    canvas = FigureCanvasAgg(paper)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[::-1, :, :3].astype(float), paper.axes[0]
+
+
+def test_bars_on_the_picture_are_as_long_as_the_errors(result: wfsobs.Result) -> None:
+    """Beside the intervals, pixels of each bar's colour end where its error is on the axis, to 1.5 pixels."""
+    rows = sorted((s for s in result.scores if (s.target, s.mode) == ("vibration", "tip")), key=lambda s: s.rms)
+    picture, axes = pixels(result.plot.errors(target="vibration"))
+    for i, score in enumerate(rows):
+        x, y = axes.transData.transform((1e3 * score.rms, i + 0.25))
+        bar = np.abs(picture[round(y)] - 255.0 * np.array(to_rgb(look(score.observer).light))).max(axis=1) < 3.0
+        assert abs(np.flatnonzero(bar)[-1] + 1.0 - x) < 1.5
+
+
+def test_a_line_on_the_picture_is_where_its_numbers_are(found: Identification) -> None:
+    """Within a pixel of the model there is its colour, blended with white by less than a half where it is steep."""
+    picture, axes = pixels(found.plot.spectra())
+    frequency = np.geomspace(1.0, 10.0, 20)
+    colour = 255.0 * np.array(to_rgb(look("fitted").light))
+    for point in zip(frequency, 1e6 * found.modes[0].spectrum.psd(frequency), strict=True):
+        x, y = np.round(axes.transData.transform(point)).astype(int)
+        near = picture[y - 1 : y + 2, x - 1 : x + 2]
+        assert np.abs(near - colour).max(axis=2).min() < 0.5 * (255.0 - colour).max()
 
 
 def test_a_budget_adds_up_to_the_error(result: wfsobs.Result) -> None:

@@ -215,7 +215,8 @@ def to_matplotlib(figure: Any, width: float = COLUMN, height: float = 0.0) -> An
     """Return a figure of Matplotlib of this width and height [mm]."""
     layout: Any = figure if isinstance(figure, hv.Layout) else stack([figure])
     inches = width / 25.4, HEIGHT / 25.4  # both given, so that the width stays; the height comes below
-    drawn: Any = hv.renderer("matplotlib").get_plot(layout.opts(fig_inches=inches, fig_size=100, backend="matplotlib")).state
+    sized = layout.opts(fig_inches=inches, fig_size=100, sublabel_format="", clone=True, backend="matplotlib")
+    drawn: Any = hv.renderer("matplotlib").get_plot(sized).state
     rows, columns = layout.shape
     above, heights = None, np.full(rows, HEIGHT)
     every = [axes for axes in drawn.axes if axes.get_subplotspec() is not None]
