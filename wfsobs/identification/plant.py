@@ -4,8 +4,8 @@ The mirror holds a command for a frame and the sensor averages over one, so that
 
     y[k] = disturbance[k] + R(angle) diag(gain) m[k] + noise[k],    m[k] = (1 - p) u[k-d] + p u[k-d-1].
 
-The disturbance and the noise of each mode have a spectrum S of a stated form: white noise, turbulence of second order, a coloured
-background where it is worth it, and resonances. Whittle's likelihood of z = y - R diag(gain) m,
+The disturbance and the noise of each mode have a spectrum S of a stated form: white noise, turbulence of second or third order, a
+coloured background where it is worth it, and resonances. Whittle's likelihood of z = y - R diag(gain) m,
 
     - log L = sum log S + |Z|^2 / S    over modes and frequencies,
 
@@ -29,10 +29,11 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError, hold_last
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.sensors.zernike import noll
+from wfsobs.signal.ar2 import Ar2
 from wfsobs.spectral.missing import MissingSamples, find_outlying
 from wfsobs.spectral.model import Spectrum
 from wfsobs.spectral.periodogram import Cells, fast_length, inflation, periodogram_frequencies, taper
-from wfsobs.spectral.quick import quick_spectrum
+from wfsobs.spectral.quick import behind_pole, quick_spectrum
 from wfsobs.spectral.whittle import spectrum_negative_log_likelihood
 from wfsobs.typing import Array
 
@@ -52,6 +53,9 @@ PEAKS, MOST_PEAKS, LOWEST = 10, 40, 5.0
 STARTS, REFINED, SAME, REFINEMENTS = (1.25, 2.25, 3.25, 4.5), 2, 0.05, 3
 """Delays at which a search starts [frames]; how many of the likeliest maxima are then fitted with all peaks, and how often;
 distance below which two maxima are one."""
+
+THIRD = (1.5, 6.0)
+"""Third corners of turbulence, over the first two, that are tried."""
 
 STEPS, REACH, ENOUGH = 25, 0.3, 0.02
 """Newton steps; maximum change of a number of the plant in one; gain of log-likelihood below which they end."""
@@ -204,7 +208,7 @@ def plant_lines(groups: Sequence[GroupPlant]) -> list[str]:
     """Return what a plant means and what it rests on, a line each."""
     worst, peaks = max(group.uncertainty for group in groups), [n for group in groups for n in group.peaks]
     colour = "a coloured background, " if any(group.has_background for group in groups) else ""
-    form = f"white noise, turbulence of second order, {colour}{min(peaks)} to {max(peaks)} resonances per mode"
+    form = f"white noise, turbulence of second or third order, {colour}{min(peaks)} to {max(peaks)} resonances per mode"
     new = min(group.own_share for group in groups)
     basis = (
         f"the commands are excited: {100.0 * new:.2g} % of what is new in them does not follow from the measurements"
@@ -256,6 +260,12 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
     coloured = data.with_spectra(each.theta, each.spectra, MOST_PEAKS, plain=False)
     if any(s.background for s in coloured.spectra):
         each = min(each, data.fit(coloured, gains, STEPS), key=lambda fit: fit.criterion)
+    for corner in THIRD:
+        third = [
+            replace(s, turbulence=behind_pole(t, corner * t.omega)) if isinstance(t := s.turbulence, Ar2) else s
+            for s in each.spectra
+        ]
+        each = min(each, data.fit(replace(each, spectra=third), gains, STEPS), key=lambda fit: fit.criterion)
     apart = data.fit(each, np.eye(len(pooled)), STEPS)
     difference = np.append(-1.0, 1.0) if k == 2 else np.zeros(1)
     signs = np.sign(each.theta[k : 2 * k])
@@ -340,8 +350,8 @@ class _Data:
             z[:, i] = missing.interpolate(z[:, i]) if not spectra else missing.fill(z[:, i], spectra[i].psd(self.f))
         if any(missing.any for missing in self.missing):
             self.Y = self._transform(z + seen)
-        before = spectra or [None] * self.k
-        found = [quick_spectrum(x, self.dt, most, LOWEST, s) for x, s in zip(z.T, before, strict=True)]
+        some = zip(z.T, spectra or [None] * self.k, strict=True)
+        found = [quick_spectrum(x, self.dt, most, LOWEST, s, complete=not plain) for x, s in some]
         return _Fit(theta, [replace(s, background=None) if plain else s for s in found])
 
     def _mirror_signal(self, theta: Array) -> Array:
@@ -471,6 +481,11 @@ def _angle(matrix: Array) -> float:
     return float(np.arctan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1]))
 
 
+def _third_order(s: Spectrum, corner: float) -> Spectrum:
+    """Return a spectrum whose turbulence has a third corner, over the first two."""
+    return replace(s, turbulence=behind_pole(t, corner * t.omega)) if isinstance(t := s.turbulence, Ar2) else s
+
+
 def _free(s: Spectrum) -> list[int]:
     return [i for i in range(s.starts[-1]) if i not in s.fixed_parameters]
 
@@ -518,5 +533,6 @@ def _first_guess(data: _Data) -> tuple[Array, float]:
         product, power = float(np.sum(rough(h[1:]) * seen)), float(np.sum(seen**2))
         if product > 0:
             best = max(best, (product**2 / power, product / power))
-    gain = best[1] if not FAR < best[1] < 1.0 / FAR else 1.0
+    explained = best[0] > 0.5 * np.sum(rough(h[1:]) ** 2)
+    gain = best[1] if explained and not FAR < best[1] < 1.0 / FAR else 1.0
     return np.concatenate([np.zeros(k), gain * np.diag(flip), [angle] * (k == 2)]), excited
