@@ -160,6 +160,7 @@ def test_every_number_states_its_unit_or_has_none(subtests: pytest.Subtests) -> 
         "lasers",
         "share",
         "third_corner",
+        "gate_level",
     }
     for path, p in ALL.items():
         with subtests.test(path):

@@ -78,6 +78,7 @@ def observe(
     watch: Watch = QUIET,
     is_simulated: bool = False,
     memo: RecordMemo | None = None,
+    gate: bool = True,
 ) -> Result:
     """Run observers on a record.
 
@@ -103,6 +104,8 @@ def observe(
         Whether the record was simulated from the scenario, so that its Wiener bounds are known.
     memo : RecordMemo, optional
         Estimates of this record that are known by what they depend on; they do not run, the others are noted there.
+    gate : bool
+        Whether outliers are kept from the observers as `scenario.sensors.gate` says; a simulated record has none.
 
     Returns
     -------
@@ -122,6 +125,7 @@ def observe(
     if prior is not None:
         scenario = as_stated(record, told_by(prior, scenario))
     scenario.validate()
+    record = gated_by(record, scenario) if gate and not is_simulated else record
     if train is not None:
         record = with_training(record, train, scenario)
     start = trained_until(train)
@@ -152,6 +156,11 @@ def _from(estimate: Estimate, first: int) -> Estimate:
 def as_stated(record: Record, scenario: Scenario) -> Scenario:
     """Return the scenario with the time step and exposure ratio of the record."""
     return as_sampled(scenario, record.sampling)
+
+
+def gated_by(record: Record, scenario: Scenario) -> Record:
+    """Return a record that is not a simulation of the scenario with the gate of its settings."""
+    return record if record.gate == scenario.gate else replace(record, gate=scenario.gate)
 
 
 def collect(

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
 from wfsobs.notebook import PlotAccessor, html_table, import_extra
+from wfsobs.signal.gate import Gate, GateSettings
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:
@@ -159,12 +161,15 @@ class Record(Signals):
         Training record of the offline GPR.
     origin : str
         Unit, sign and timing that a file had before conversion, one line.
+    gate : GateSettings or None
+        How outliers are kept from observers and controllers, `wfsobs.signal.gate`; None for a record that has none.
     """
 
     turbulence: Array | None = None
     vibration: Array | None = None
     training: Training | None = None
     origin: str = ""
+    gate: GateSettings | None = field(default=None, kw_only=True)
     plot: ClassVar[PlotAccessor] = PlotAccessor()
 
     def __repr__(self) -> str:
@@ -183,6 +188,7 @@ class Record(Signals):
             ("NGS", "none" if self.ratio is None else f"every {self.ratio} steps"),
             ("truth", " and ".join(name for name, x in parts if x is not None) or "none"),
             ("missing", str(self.missing)),
+            *([("outliers", str(self.outliers))] if self.gate else []),
         ]
 
     def to_xarray(self) -> xarray.Dataset:
@@ -214,18 +220,46 @@ class Record(Signals):
         open_loop : with the open-loop measurement
         sensors   : whose measurements; there is nothing of the NGS without them, and zeros for those of the LGS
         """
-        lgs, ngs = "lgs" in sensors, "ngs" in sensors
+        lgs, ngs, of = "lgs" in sensors, "ngs" in sensors, self.gated
         return Measurements(
-            _own(self.y_lgs) if lgs else np.zeros_like(self.y_lgs),
-            _own(self.u),
-            self.dt,
-            _copy(self.y_ngs) if ngs else None,
-            self.ratio if ngs else None,
-            _copy(self.open_loop_y) if open_loop else None,
-            self.delay,
-            lgs_stars=None if self.lgs_stars is None or not lgs else self.lgs_stars.copy(),
-            y_stars=_copy(self.y_stars) if lgs else None,
+            _own(of.y_lgs) if lgs else np.zeros_like(of.y_lgs),
+            _own(of.u),
+            of.dt,
+            _copy(of.y_ngs) if ngs else None,
+            of.ratio if ngs else None,
+            _copy(of.open_loop_y) if open_loop else None,
+            of.delay,
+            lgs_stars=None if of.lgs_stars is None or not lgs else of.lgs_stars.copy(),
+            y_stars=_copy(of.y_stars) if lgs else None,
         )
+
+    @property
+    def gated(self) -> Record:
+        """The record with outliers missing, or clipped, as observers receive it: of the LGS, of each of them, of NGS frames."""
+        return self if self.gate is None else self._tested
+
+    @cached_property
+    def _tested(self) -> Record:
+        settings = self.gate or GateSettings()
+
+        def gate(y: Array, z: Array, first: int) -> Array:
+            """Test all but the first samples, which lack commands of before the record."""
+            tested = Gate(z[0].size, settings).check_all(z[first:].reshape(len(z[first:]), -1))
+            tested = np.concatenate([z[:first], tested.reshape(z[first:].shape)])
+            return np.where(tested == z, y, tested + (y - z))
+
+        n, y_ngs = self.ratio, self.y_ngs
+        if y_ngs is not None and n is not None:
+            y_ngs = y_ngs.copy()
+            y_ngs[n::n] = gate(y_ngs[n::n], self.z_ngs[n::n], -(-(self.delay - 1) // n))
+        y_lgs = gate(self.y_lgs, self.z, self.delay)
+        y_stars = None if self.y_stars is None else gate(self.y_stars, self.z_stars, self.delay)
+        return replace(self, y_lgs=y_lgs, y_ngs=y_ngs, y_stars=y_stars, gate=None)
+
+    @property
+    def outliers(self) -> int:
+        """Number of steps with an LGS measurement that the gate does not let through as it is."""
+        return int(((self.gated.y_lgs != self.y_lgs) & ~np.isnan(self.y_lgs)).any(axis=1).sum()) if self.gate else 0
 
     def truth(self, target: str) -> Array | None:
         """Return the true signal of `target` ("turbulence", "vibration", or "total", their sum), or None."""

@@ -17,6 +17,7 @@ from wfsobs.priors_from.scenario import SHARED, as_sampled, observer_settings, p
 from wfsobs.record import Record, Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
+from wfsobs.signal.gate import GateSettings
 from wfsobs.simulation.loop import simulate
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ def design(
     sampling: Sampling | None = None,
     horizon: float = 0.0,
     train: Record | Training | None = None,
+    gate: GateSettings | None = None,
 ) -> Any:
     """Design an observer or a controller for a loop that calls it frame by frame.
 
@@ -49,6 +51,8 @@ def design(
         Frames ahead that predictions are wanted for. Observers that are trained for one predict no other.
     train : Record or Training, optional
         Training data, for observers that learn beforehand: a record of the same loop. By default a simulation of `scenario`.
+    gate : GateSettings, optional
+        How it is kept from outliers, such as `scenario.gate`; by default not at all: a simulation has none.
 
     Returns
     -------
@@ -90,13 +94,13 @@ def design(
         observer = OBSERVERS[name]
         own = observer_settings(observer, settings)
         given = prior_in(name, told, observer.parts(own), settings, sampling, train)
-        return observer.design(given, own, sampling, horizon)
+        return observer.design(given, own, sampling, horizon, gate)
     if horizon:
         raise StepError(f"{name}: a controller has the horizon of its mirror, control.delay; leave horizon out")
     controller = CONTROLLERS[name]
     groups = own_settings(controller, settings)
     given = prior_in(name, told, controller.parts(groups), settings, sampling, train)
-    return controller.design(given, plant_of(settings), groups, sampling)
+    return controller.design(given, plant_of(settings), groups, sampling, gate)
 
 
 def prior_in(
@@ -160,5 +164,5 @@ def _training(scenario: Scenario, train: Record | Training | None) -> Training:
         return made
     if isinstance(train, Training):
         return train
-    whole = fill_missing(train, Prior())
+    whole = fill_missing(train.gated, Prior())
     return Training(whole.y_lgs, whole.u, whole.open_loop_y).copy()

@@ -56,7 +56,7 @@ def run_seed(
     memo = Memo() if memo is None else memo
     simulation = (scenario if source is None or source.simulation is None else source.simulation).replace({"run.seed": seed})
     record = simulate_once(simulation, memo, watch)
-    result = observe(record, scenario, watch=watch, memo=RecordMemo(memo, record))
+    result = observe(record, scenario, watch=watch, memo=RecordMemo(memo, record), gate=False)
     errors = np.array([s.rms for s in result.scores])
     return SeedScores(result.scores, errors, result if size_of(result) <= LIGHT else None)
 

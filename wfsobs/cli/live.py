@@ -159,7 +159,7 @@ def _source(
         return SimulatedLoop(scenario)
     elements = stream_elements(modes, len(scenario.modes))
     unit = micrometres_per(declaration.unit or "um", scenario.telescope.diameter)
-    return StreamSource(_place(stream), elements, unit, scenario.dt)
+    return StreamSource(_place(stream), elements, unit, scenario.dt, gate=scenario.gate)
 
 
 def _with_ngs(source: LiveSource, scenario: Scenario, ngs: str, modes: str | None, unit: str, lag: int) -> StreamSource:

@@ -195,6 +195,13 @@ def load_declared(record_file: str, scenario: Scenario, declaration: DeclaredFor
             "prediction and count in no score of one",
             err=True,
         )
+    if record.outliers:
+        what = "missing" if record.gate and record.gate.action == "reject" else "clipped"
+        click.echo(
+            f"wfsobs: {record_file}: {record.outliers} of {record.n_steps} frames have outliers, which are {what} to observers "
+            "(sensors.gate)",
+            err=True,
+        )
     for line in saturation_lines(record):
         click.echo(f"wfsobs: {record_file}: {line}", err=True)
     return record

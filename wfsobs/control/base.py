@@ -32,6 +32,7 @@ from wfsobs.prior import TRUE, Bands, Part, Prior, PriorSource, ask_nothing, ask
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, Sampling, hold_last
 from wfsobs.settings import Section
+from wfsobs.signal.gate import GateSettings
 from wfsobs.typing import Array
 
 Settings = SimpleNamespace
@@ -121,7 +122,9 @@ class Controller:
         """One law per mode, none for control by nothing. Raises ValueError saying why there is none."""
         return () if self.law is None else tuple(self.law(prior, mode, plant, settings) for mode in range(n_modes))
 
-    def design(self, prior: Prior, plant: Plant, settings: Settings, sampling: Sampling) -> StepController:
+    def design(
+        self, prior: Prior, plant: Plant, settings: Settings, sampling: Sampling, gate: GateSettings | None = None
+    ) -> StepController:
         """Return the controller one frame at a time; missing samples are taken as in `commands`.
 
         Parameters
@@ -134,6 +137,8 @@ class Controller:
             Its own groups of settings.
         sampling : Sampling
             Number of modes; its delay is that of the training record.
+        gate : GateSettings, optional
+            How it is kept from outliers; by default not at all.
 
         Returns
         -------
@@ -158,7 +163,7 @@ class Controller:
             ahead = VibrationAhead(self.step_predict(prior, plant, settings, sampling), prior.bands, sampling)
         if not self._takes_missing(found):
             beside = bridges(prior, sampling.n_modes, sampling.dt, sampling.ratio, _line_width(settings))
-        return StepController(self.id, plant, sampling, step_law(found, plant.mirror), ahead, self.ngs, beside)
+        return StepController(self.id, plant, sampling, step_law(found, plant.mirror), ahead, self.ngs, beside, gate)
 
     def commands(
         self,

@@ -14,9 +14,10 @@ from numpy.typing import ArrayLike
 from wfsobs.control.mirror import Plant
 from wfsobs.control.step_laws import StepLaw, VibrationAhead, push_row
 from wfsobs.observers.missing import Bridge
-from wfsobs.observers.step import StepError, check_frame, check_ngs, check_stars, check_state
+from wfsobs.observers.step import StepError, check_frame, check_ngs, check_stars, check_state, make_gates, pass_gate
 from wfsobs.observers.stepping import Stateful, load_parts, save_parts
 from wfsobs.record import Sampling
+from wfsobs.signal.gate import GateSettings
 from wfsobs.typing import Array
 
 
@@ -55,6 +56,7 @@ class StepController:
         ahead: VibrationAhead | None,
         uses_ngs: bool,
         bridges: tuple[Bridge, Bridge] | None,
+        gate: GateSettings | None = None,
     ):
         self.id, self.plant, self.sampling, self.law, self.ahead = id, plant, sampling, law, ahead
         self.frame = 0
@@ -70,6 +72,8 @@ class StepController:
         found = {"lgs": self._lgs, "law": law, "ngs": self._ngs}
         self._parts: dict[str, Stateful] = {name: part for name, part in found.items() if part is not None}
         self._parts |= {} if ahead is None else ahead.parts
+        self._gates = make_gates(gate, sampling, uses_ngs)
+        self._parts |= self._gates
 
     def update(self, y: ArrayLike, ngs: ArrayLike | None = None, *, stars: int | None = None) -> Array:
         """Take the measurements of a frame and return its command.
@@ -128,12 +132,16 @@ class StepController:
         slow = check_ngs(self.id, ngs, due, self.sampling.n_modes, self._ratio, self.frame) if self.uses_ngs else None
         seen = self.correction
         z = x if is_open else x - seen
+        if self._gates:
+            z = pass_gate(self._gates, "gate_lgs", z, self.frame, self.sampling)
+            is_whole = is_whole and not np.isnan(z).any()
         if self._lgs is not None:
             z = self._lgs.complete(z, is_whole)
         if self.uses_ngs:
             push_row(self._mirror, seen)
         if slow is not None:
             slow = slow if is_open else slow - self._mirror.mean(axis=0)
+            slow = pass_gate(self._gates, "gate_ngs", slow, self.frame, self.sampling)
             slow = slow if self._ngs is None else self._ngs.complete(slow)
         forward = self._none
         if self.ahead is not None:
@@ -195,6 +203,8 @@ class StepController:
         for bridge, was in ((self._lgs, old._lgs), (self._ngs, old._ngs)):
             if bridge is not None and was is not None:
                 bridge.take_over(was)
+        for name in self._gates.keys() & old._gates.keys():
+            self._gates[name].load(old._gates[name].save())
         self._commands[...], self._mirror[...], self.frame = old._commands, old._mirror, old.frame
 
     def _clip(self, command: Array) -> Array:

@@ -199,13 +199,13 @@ def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: 
 
     - PREDICTION: rms of z[k+1] - phi_hat[k], one step ahead, since z[k+1] = phi_dist[k] + noise and phi_hat[k] knows y up to
       k. The noise of the measurement is included. Only an observer that estimates both turbulence and vibration predicts
-      z; the others have no such score. Missing samples do not count.
+      z; the others have no such score. Missing samples and outliers do not count.
     - RESIDUAL: rms of y_lgs, the residual of the recorded loop.
     """
     out, both = list[Score](), totals(estimates)
     after = np.arange(record.n_steps) > round(warm_up / record.dt)
     for mode, name in enumerate(mode_names):
-        z, left = record.z[:, mode], record.y_lgs[:, mode]
+        z, left = record.gated.z[:, mode], record.gated.y_lgs[:, mode]
         measured = after & ~np.isnan(z)
         if not rms(z[measured]) > 0:
             continue

@@ -16,6 +16,7 @@ from wfsobs.live.paced import SOURCE, Desk, Staff, enter_process
 from wfsobs.live.ring import Ring
 from wfsobs.live.source import STREAM
 from wfsobs.record import Sampling
+from wfsobs.signal.gate import Gate, GateSettings
 from wfsobs.streams.attach import LONGEST_GAP
 from wfsobs.streams.layout import StreamError
 from wfsobs.streams.network import Subscription, is_address
@@ -121,6 +122,8 @@ class StreamSource:
         File or address of the stream of the NGS, "" for none.
     ngs : NgsWiring, optional
         How that is read.
+    gate : GateSettings, optional
+        How outliers are kept from observers; by default not at all.
     """
 
     path: str
@@ -129,6 +132,7 @@ class StreamSource:
     dt: float
     ngs_path: str = ""
     ngs: NgsWiring | None = None
+    gate: GateSettings | None = None
     name = STREAM
     has_truth = False
 
@@ -170,6 +174,7 @@ class StreamFrames:
         self._count, self._alive, self._steps = 0, monotonic(), 0
         self._is_playing = self._is_stuck = False
         self._spells: dict[str, float] = {}
+        self._gates = source.gate and tuple(Gate(desk.n_modes, source.gate) for _ in range(2))
 
     def run(self) -> None:
         """Follow the stream until the process is ended, or all frames have been sent."""
@@ -224,9 +229,21 @@ class StreamFrames:
     def _write(self, z: Array, ngs: Array) -> None:
         if self._ring.count == self._desk.n_frames:  # of a gap, what is beyond the last frame that was asked for
             return
+        if self._gates:
+            z, ngs = self._pass(z, ngs)
         n = self._desk.n_modes
         self._row[0], self._row[1 : 1 + n], self._row[1 + n : 1 + 2 * n] = self._alive, z, ngs
         self._ring.write(self._row)
+
+    def _pass(self, z: Array, ngs: Array) -> tuple[Array, Array]:
+        """Return the measurements of a frame without outliers."""
+        assert self._gates
+        ratio = self._source.sampling.ratio
+        is_due = ratio is not None and self._ring.count > 0 and self._ring.count % ratio == 0
+        tested = self._gates[0].check(z), self._gates[1].check(ngs) if is_due else ngs
+        if any(np.isnan(new).sum() > np.isnan(old).sum() for new, old in zip(tested, (z, ngs), strict=True)):
+            self._say_once("an outlying measurement is taken for missing")
+        return tested
 
     def _begin_at(self) -> None:
         """Write what is held back: the counter of the stream is another one from now on."""

@@ -20,6 +20,7 @@ from wfsobs.prior import TRUE, Part, Prior, PriorSource, ask_nothing, words_for
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, Record, Sampling, hold_last
 from wfsobs.settings import Group, Section
+from wfsobs.signal.gate import GateSettings
 from wfsobs.typing import Array
 
 SLOW = 50.0
@@ -189,7 +190,14 @@ class Observer:
         found = self.run(given, prior, settings, watch) if self.run else run_design(self, given, prior, settings, watch)
         return found if isinstance(found, Estimates) else Estimates(found)
 
-    def design(self, prior: Prior, settings: Group | None, sampling: Sampling, horizon: float = 0.0) -> StepObserver:
+    def design(
+        self,
+        prior: Prior,
+        settings: Group | None,
+        sampling: Sampling,
+        horizon: float = 0.0,
+        gate: GateSettings | None = None,
+    ) -> StepObserver:
         """Return the observer one frame at a time; missing measurements are taken as in `estimate`.
 
         Parameters
@@ -202,6 +210,8 @@ class Observer:
             Modes, step, NGS ratio and delay of the loop.
         horizon : float
             Frames ahead that predictions are wanted for.
+        gate : GateSettings, optional
+            How it is kept from outliers; by default not at all.
 
         Returns
         -------
@@ -222,7 +232,7 @@ class Observer:
         width = getattr(settings, "line_width", LINE_WIDTH)
         beside = None if self.takes_missing else bridges(prior, sampling.n_modes, sampling.dt, sampling.ratio, width)
         estimator = self.step(prior, settings, sampling, horizon)
-        return StepObserver(self.id, self.targets, estimator, sampling, needs_ngs, beside)
+        return StepObserver(self.id, self.targets, estimator, sampling, needs_ngs, beside, gate)
 
     @property
     def group(self) -> str | None:

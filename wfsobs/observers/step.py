@@ -22,6 +22,7 @@ from wfsobs.observers.stepping import StateArrays, Stateful, load_parts, save_pa
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
+from wfsobs.signal.gate import Gate, GateSettings
 from wfsobs.typing import Array
 
 
@@ -171,6 +172,7 @@ class StepObserver:
         sampling: Sampling,
         needs_ngs: bool,
         bridges: tuple[Bridge, Bridge] | None,
+        gate: GateSettings | None = None,
     ):
         self.id, self.targets, self.sampling, self.estimator = id, targets, sampling, estimator
         self.frame, self._ratio, self._needs_ngs = 0, sampling.ratio or 0, needs_ngs
@@ -179,9 +181,11 @@ class StepObserver:
             self._ngs = None
         found = {id: estimator, "lgs": self._lgs, "ngs": self._ngs}
         self._parts: dict[str, Stateful] = {name: part for name, part in found.items() if part is not None}
+        self._each_shape: tuple[int, int] | None = getattr(estimator, "each_shape", None)
+        self._gates = make_gates(gate, sampling, needs_ngs, self._each_shape)
+        self._parts |= self._gates
         self._allowed_requests: set[tuple[float, str]] = set()
         self._nothing = np.full(sampling.n_modes, np.nan)
-        self._each_shape: tuple[int, int] | None = getattr(estimator, "each_shape", None)
         self._see_stars: Callable[[int | None], None] | None = getattr(estimator, "see_stars", None)
 
     def update(
@@ -226,7 +230,12 @@ class StepObserver:
         else:
             u = None
         if self._each_shape is not None:
-            self.estimator.see_each(check_each(self.id, each, self._each_shape, self.frame))  # type: ignore[attr-defined]
+            stars_apart = check_each(self.id, each, self._each_shape, self.frame)
+            self.estimator.see_each(pass_gate(self._gates, "gate_each", stars_apart, self.frame, self.sampling))  # type: ignore[attr-defined]
+        if self._gates:
+            z = pass_gate(self._gates, "gate_lgs", z, self.frame, self.sampling)
+            is_whole = is_whole and not np.isnan(z).any()
+            slow = None if slow is None else pass_gate(self._gates, "gate_ngs", slow, self.frame, self.sampling)
         if self._lgs is not None:
             z = self._lgs.complete(z, is_whole)
         if slow is not None and self._ngs is not None:
@@ -314,10 +323,31 @@ class StepObserver:
         for new, was in ((self._lgs, old._lgs), (self._ngs, old._ngs)):
             if new is not None and was is not None:
                 new.take_over(was)
+        for name in self._gates.keys() & old._gates.keys():
+            self._gates[name].load(old._gates[name].save())
         self.frame: int = old.frame
 
     def _check(self, x: ArrayLike, name: str) -> tuple[Array, bool]:
         return check_frame(self.id, x, name, self.sampling.n_modes, self.frame)
+
+
+def make_gates(
+    settings: GateSettings | None, sampling: Sampling, uses_ngs: bool, each_shape: tuple[int, int] | None = None
+) -> dict[str, Gate]:
+    """Return the gates of LGS measurements, of NGS frames and of every LGS by itself, by name; none without settings."""
+    if settings is None:
+        return {}
+    sizes = {"gate_lgs": sampling.n_modes, "gate_ngs": sampling.n_modes if uses_ngs else 0}
+    sizes["gate_each"] = each_shape[0] * each_shape[1] if each_shape else 0
+    return {name: Gate(n, settings) for name, n in sizes.items() if n}
+
+
+def pass_gate(gates: Mapping[str, Gate], name: str, z: Array, frame: int, sampling: Sampling) -> Array:
+    """Return a measurement of any shape [um] with outliers missing, or clipped; those that lack earlier commands pass."""
+    first = sampling.delay + (sampling.ratio or 1) - 1 if name == "gate_ngs" else sampling.delay
+    if name not in gates or frame < first:
+        return z
+    return gates[name].check(z.ravel()).reshape(z.shape)
 
 
 KNOWN = frozenset({"beside", "commands", "covariance", "frames", "held_value", "last", "mirror", "sent", "states", "x"})

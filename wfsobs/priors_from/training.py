@@ -38,7 +38,7 @@ def with_training(record: Record, train: Record | float, scenario: Scenario) -> 
         The other record has another rate, number of modes or delay, is the record itself, or either has too few samples or an
         impossible duration.
     """
-    whole = fill_missing(training_part(record, train, scenario), Prior())
+    whole = fill_missing(training_part(record, train, scenario).gated, Prior())
     return replace(record, training=Training(whole.y_lgs, whole.u, whole.open_loop_y).copy())
 
 
@@ -75,4 +75,4 @@ def _first(record: Record, seconds: float) -> Record:
         raise RecordError(f"the first {seconds:g} s as training data: takes more than 0 and less than the record's {length:g} s")
     end = round(seconds / record.dt)
     twin = None if record.open_loop_y is None else record.open_loop_y[:end]
-    return Record(record.y_lgs[:end], record.u[:end], record.dt, open_loop_y=twin, delay=record.delay)
+    return Record(record.y_lgs[:end], record.u[:end], record.dt, open_loop_y=twin, delay=record.delay, gate=record.gate)

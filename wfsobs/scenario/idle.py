@@ -25,6 +25,9 @@ FLOW_ONLY = (
 SIMULATION_ONLY = ("loop", "events", "run.seed")
 """Settings that only the simulation of a record reads."""
 
+RECORD_ONLY = ("sensors.gate", "sensors.gate_level")
+"""Settings that no simulation of a record reads."""
+
 
 def idle_settings(scenario: Scenario, *, is_simulated: bool = True) -> dict[str, str]:
     """Return the settings without effect.
@@ -47,7 +50,9 @@ def idle_settings(scenario: Scenario, *, is_simulated: bool = True) -> dict[str,
     'Used only where Filter of the inputs is high-pass'
     """
     out = dict(_within(scenario, "")) | dict(_across(scenario))
-    if not is_simulated:
+    if is_simulated:
+        out |= dict.fromkeys(RECORD_ONLY, "Used only with a record that is given; a simulated one has no outliers")
+    else:
         out |= dict.fromkeys(SIMULATION_ONLY, "Used only by a simulation; here the record is given")
     return out
 
@@ -61,7 +66,7 @@ def why_idle_at(path: str, idle: Mapping[str, str]) -> str:
 def used_settings(scenario: Scenario) -> Plain:
     """Return the settings that have an effect, as nested plain values."""
     tree = scenario.effective_values()
-    for path, _ in _across(scenario):
+    for path in (*RECORD_ONLY, *(path for path, _ in _across(scenario))):
         *above, name = path.split(".")
         node: Any = tree
         for key in above:

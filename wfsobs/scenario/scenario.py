@@ -27,6 +27,7 @@ from wfsobs.settings.errors import SettingError
 from wfsobs.settings.group import Group, Section, section
 from wfsobs.settings.parameters import declared_settings
 from wfsobs.settings.priors import Butterworth, Kalman
+from wfsobs.signal.gate import GateSettings
 
 if TYPE_CHECKING:
     from wfsobs.observers.gpr.offline import OfflineGpr
@@ -126,6 +127,12 @@ class Scenario(Group):
     def n_steps(self) -> int:
         """Number of steps of the record."""
         return round(self.run.duration * self.sensors.lgs_rate)
+
+    @property
+    def gate(self) -> GateSettings | None:
+        """How outliers of a record that is not a simulation are kept from observers and controllers; None for not at all."""
+        action = self.sensors.gate
+        return None if action == "off" else GateSettings(self.sensors.gate_level, action)
 
     @property
     def before_events(self) -> Scenario:

@@ -236,6 +236,7 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
     apart = signals[APART].reshape(len(signals["y_lgs"]), -1, n_modes) if APART in signals else None
     beside = {"lgs_stars": stars, "y_stars": apart}
     record = Record(**fields, dt=dt, ratio=ratio, training=_training(signals), delay=int(delay + WHOLE), origin=origin, **beside)
+    record = replace(record, gate=scenario.gate)
     return record if stars is not None or record.missing else without_bridged(record)
 
 

@@ -129,7 +129,8 @@ class Preview:
             ngs = f"{self.rate / r.ratio:.6g} Hz, {lost} frames missing"
         truth = [name for name in ("turbulence", "vibration") if getattr(r, name) is not None]
         return [
-            f"{r.n_steps} steps at {self.rate:.6g} Hz, {self.duration:.4g} s, {r.missing} missing",
+            f"{r.n_steps} steps at {self.rate:.6g} Hz, {self.duration:.4g} s, {r.missing} missing"
+            + (f", {r.outliers} outlying" if r.outliers else ""),
             f"{r.n_modes} modes, read as um rms" + (f" ({r.origin})" if r.origin else ""),
             f"a command is seen {r.delay} steps later",
             f"NGS: {ngs}",

@@ -12,7 +12,7 @@ import io
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import IO
 
@@ -136,12 +136,14 @@ def name_differences(record: Record, other: Record) -> list[str]:
             return one is not two if one is None or two is None else not np.array_equal(one, two, equal_nan=True)  # type: ignore[arg-type]
         return any(differs(part, vars(two)[name]) for name, part in vars(one).items())
 
-    return [name for name, part in vars(record).items() if name != "origin" and differs(part, vars(other)[name])]
+    names = [one.name for one in fields(record) if one.name not in ("origin", "gate")]
+    return [name for name in names if differs(getattr(record, name), getattr(other, name))]
 
 
 def record_arrays(record: Record, scenario_toml: str | None = None) -> dict[str, Array]:
     """Return the contents of a record's file, by name."""
-    arrays = {name: np.asarray(value) for name, value in vars(record).items() if name != "training" and value is not None}
+    names = [one.name for one in fields(record) if one.name not in ("training", "gate")]
+    arrays = {name: np.asarray(value) for name in names if (value := getattr(record, name)) is not None}
     arrays |= {"unit": np.array("um"), "command_sign": np.array(1)}
     if not record.origin:
         del arrays["origin"]

@@ -191,9 +191,13 @@ class LinearEstimator(StateArrays):
         """Go on from another design."""
         self.bank.phase, self.bank.last = old.bank.phase, old.bank.last
         for mode, (new, was) in enumerate(zip(self.modes, old.modes, strict=True)):
-            x = old.bank.x[mode, : len(was.model.A)]
-            self.bank.x[mode, : len(new.model.A)] = carry_state(new.model, was.model, x)
-            self.bank.take_near(mode, old.bank if new.digest() == was.digest() else None)
+            is_same, x = new.digest() == was.digest(), old.bank.x[mode]
+            if is_same:
+                n = len(new.gains.steps[0].A)
+                self.bank.x[mode, :n] = x[:n]
+            else:
+                self.bank.x[mode, : len(new.model.A)] = carry_state(new.model, was.model, x[: len(was.model.A)])
+            self.bank.take_near(mode, old.bank if is_same else None)
 
 
 class KalmanEstimator(LinearEstimator):

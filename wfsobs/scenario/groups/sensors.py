@@ -115,6 +115,7 @@ class Sensors(Group):
             "lgs_noise_per_mode": ("noise_from", ("nm",)),
             "ngs_noise": ("noise_from", ("nm",)),
             "spots": ("noise_from", ("photons",)),
+            "gate_level": ("gate", ("reject", "clip")),
         }
     )
 
@@ -185,6 +186,21 @@ class Sensors(Group):
         doc="Slow error of each LGS in tip and tilt, rms [um], independent between LGS. It stands for cone effect and "
         "uplink turbulence where turbulence is not frozen flow. 0.049 um is the cone effect of one layer at 8 km "
         "and a guide star at 90 km.",
+    )
+    gate: param.Selector = param.Selector(
+        default="reject",
+        objects=["reject", "clip", "off"],
+        label="Outliers",
+        doc="Measurements of a loaded record or a stream that their own past excludes. reject: they are missing; clip: they "
+        "are taken at the level below; off: they are taken as they are. A simulation has none.",
+    )
+    gate_level: Real = Real(
+        4.0,
+        bounds=(2.5, 100.0),
+        softbounds=(3.0, 10.0),
+        step=0.5,
+        label="Outliers beyond",
+        doc="Deviation of a measurement from its prediction beyond which it is an outlier, in standard deviations.",
     )
     lgs_altitude: Real = Real(
         90_000.0,

@@ -1,0 +1,206 @@
+"""The gate: outliers are missing, what lasts passes, a clean record stays as it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import sqrt
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.stats import norm
+
+import wfsobs
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.evaluation.scores import rms
+from wfsobs.observers import OBSERVERS
+from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
+from wfsobs.priors_from.scenario import arguments
+from wfsobs.record import Record
+from wfsobs.signal.gate import BLOCK, MEMORY, OPEN, ORDER, RUN, Gate, GateSettings
+from wfsobs.testing.steps import run_loop, run_steps
+from wfsobs.typing import Array
+
+REJECT, CLIP = GateSettings(), GateSettings(action="clip")
+UT4 = wfsobs.PRESETS["ut4"]().replace({"run.duration": 20.0, "run.warm_up": 2.0})
+NOISE = 0.02 / sqrt(2.0)
+"""Of the mean of two LGS [um]."""
+
+
+def noise_with_outliers(seed: int, n: int = 1000, share: float = 0.03) -> Array:
+    """Return an AR(1) of two modes with outliers, gaps and a jump."""
+    rng = np.random.default_rng(seed)
+    z = rng.standard_normal((n, 2)).cumsum(axis=0) * 0.1 + rng.standard_normal((n, 2))
+    z[rng.random((n, 2)) < share] += rng.choice([-30.0, 30.0])
+    z[rng.random((n, 2)) < share] = np.nan
+    z[n // 2 :] += 10.0 * rng.integers(0, 2)
+    return z
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 2**32 - 1), st.sampled_from((REJECT, CLIP, GateSettings(2.5))))
+def test_all_samples_at_once_are_as_one_by_one(seed: int, what: GateSettings) -> None:
+    """Rounding differs, as sums have another order; and a state goes on where it was saved."""
+    z = noise_with_outliers(seed)
+    at_once, by_one, gone_on = Gate(2, what), Gate(2, what), Gate(2, what)
+    expected = np.array([by_one.check(row) for row in z])
+    np.testing.assert_allclose(at_once.check_all(z), expected, rtol=1e-9, atol=1e-9)
+    first = gone_on.check_all(z[:333])
+    later = Gate(2, what)
+    later.load(gone_on.save())
+    np.testing.assert_allclose(np.vstack([first, later.check_all(z[333:])]), expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_array_equal(at_once.caught, by_one.caught)
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 2**32 - 1))
+def test_the_past_alone_decides(seed: int) -> None:
+    z = noise_with_outliers(seed)
+    changed = z.copy()
+    changed[700:] = 1e3
+    np.testing.assert_array_equal(Gate(2, REJECT).check_all(z)[:700], Gate(2, REJECT).check_all(changed)[:700])
+
+
+def test_the_prediction_is_that_of_least_squares() -> None:
+    """Samples without outliers, weighted by exp(-age in blocks / MEMORY): the solution by a QR decomposition of the rows."""
+    z = np.random.default_rng(3).standard_normal(12 * BLOCK).cumsum() * 0.1 + np.random.default_rng(4).standard_normal(12 * BLOCK)
+    gate = Gate(1, GateSettings(50.0))
+    gate.check_all(z[:, None])
+    rows = sliding_window_view(np.concatenate([np.zeros(ORDER), z - z[0]]), ORDER + 1)
+    weights = np.sqrt((1.0 - 1.0 / MEMORY) ** (11 - np.arange(len(z)) // BLOCK))[:, None]
+    solution, *_ = np.linalg.lstsq(weights * rows[:, :-1], (weights * rows[:, -1:])[:, 0], rcond=None)
+    np.testing.assert_allclose(gate.save()["weights"][0], solution, atol=1e-8)
+
+
+@pytest.mark.parametrize("level", [2.5, 3.0, 3.5])
+def test_of_gaussian_noise_as_many_are_rejected_as_lie_beyond_the_level(level: float) -> None:
+    """Within 15 %: the deviation is a median of 128 samples, smoothed over some eight blocks, and the fit has 64 weights."""
+    z = np.random.default_rng(5).standard_normal((100_000, 4))
+    gate = Gate(4, GateSettings(level))
+    gate.check_all(z)
+    expected = 2.0 * norm.sf(level) * z.size
+    assert abs(gate.caught.sum() / expected - 1.0) < 0.15 + 4.0 / sqrt(expected)
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 2**32 - 1), st.floats(-3.0, 3.0), st.floats(0.0, 1.0))
+def test_no_filter_starves(seed: int, size: float, share: float) -> None:
+    """Whatever comes: at most as many in a row are rejected as open the gate, which is open for a while after them."""
+    rng = np.random.default_rng(seed)
+    z = rng.standard_normal(3000)
+    z += np.where(rng.random(3000) < share, 10.0**size, 0.0) * rng.standard_normal(3000)
+    gone = np.isnan(Gate(1, REJECT).check_all(z[:, None])[:, 0])
+    in_a_row = np.diff(np.flatnonzero(np.diff(np.concatenate([[0], gone, [0]]))))[::2]
+    assert in_a_row.max(initial=0) <= RUN
+    assert gone.mean() < 0.3
+
+
+@pytest.mark.parametrize("size", [5.0, 20.0, 1000.0])
+def test_a_jump_is_followed_within_twenty_samples(size: float) -> None:
+    z = np.random.default_rng(6).standard_normal((4000, 3))
+    z[3000:] += size
+    gone = np.isnan(Gate(3, REJECT).check_all(z))
+    assert gone[3000:3020].sum(axis=0).max() <= 2 * RUN
+    assert gone[3000 + OPEN :].sum() <= 3  # 0.2 are expected
+
+
+def with_outliers(record: Record, sigmas: float, seed: int = 1) -> tuple[Record, Array]:
+    """Return a record of which 1 % of frames are off by so many sigma of the noise of the mean, and which."""
+    rng = np.random.default_rng(seed)
+    hit = rng.random(record.n_steps) < 0.01
+    y = record.y_lgs.copy()
+    y[hit] += sigmas * NOISE * rng.choice([-1.0, 1.0], size=(hit.sum(), 1))
+    return replace(record, y_lgs=y), hit
+
+
+FILTERS = "kf-lgs kf-multi kf-coupled gp-lgs gp-both multirate multirate-optimal multirate-multi persistence".split()
+
+
+@pytest.fixture(scope="module")
+def ut4() -> Record:
+    return replace(wfsobs.simulate(UT4), training=None)
+
+
+def errors(record: Record, **settings: str) -> dict[tuple[str, str, str], float]:
+    """Return the error of every filter, target and mode, and of both targets together [um]."""
+    result = wfsobs.observe(
+        record, UT4.replace({f"sensors.{name}": value for name, value in settings.items()}), observers=FILTERS
+    )
+    return {(s.observer, s.target, s.mode): s.rms for s in result.scores if s.target != "residual"}
+
+
+@pytest.mark.slow
+def test_one_percent_of_outliers_costs_less_than_five_percent(ut4: Record) -> None:
+    """Every filter, of 40, 10 and 6 sigma, both targets and their sum; a clean record loses less than 0.1 %."""
+    clean = errors(ut4, gate="off")
+    assert max(abs(e / clean[key] - 1.0) for key, e in errors(ut4).items()) < 1e-3
+    for sigmas in (40.0, 10.0, 6.0):
+        broken, _ = with_outliers(ut4, sigmas)
+        found = errors(broken)
+        assert found.keys() == clean.keys()
+        assert max(e / clean[key] - 1.0 for key, e in found.items()) < 0.05
+    kf = "kf-multi", "vibration", "tilt"
+    assert errors(with_outliers(ut4, 40.0)[0], gate="off")[kf] > 2.0 * clean[kf], "without a gate they ruin it"
+
+
+def test_outliers_are_found_and_counted(ut4: Record) -> None:
+    broken, hit = with_outliers(ut4, 40.0)
+    frames = np.flatnonzero(hit)
+    y_ngs = ut4.y_ngs.copy()  # type: ignore[union-attr]
+    y_ngs[5000] += 1.0
+    broken = replace(broken, y_ngs=y_ngs, gate=REJECT)
+    gone = np.isnan(broken.gated.y_lgs).any(axis=1)
+    settled = frames[frames > 3 * BLOCK]
+    assert gone[settled].all()
+    assert abs(broken.outliers - hit.sum()) <= 12
+    gated_ngs = broken.gated.y_ngs
+    assert gated_ngs is not None and np.isnan(gated_ngs[5000]).all()
+    kept = ~np.isnan(broken.gated.y_lgs)
+    np.testing.assert_array_equal(broken.gated.y_lgs[kept], broken.y_lgs[kept])  # to the last bit
+    clipped = replace(broken, gate=CLIP).gated.y_lgs
+    assert not np.isnan(clipped).any()
+    assert rms((clipped - ut4.y_lgs)[settled]) < 8.0 * NOISE < rms((broken.y_lgs - ut4.y_lgs)[settled])
+    assert replace(broken, gate=None).outliers == 0
+
+
+@pytest.mark.parametrize("name", ["kf-multi", "multirate-multi", "gp-both", "persistence", "kf-ngs"])
+def test_an_observer_with_a_gate_is_the_same_step_by_step(ut4: Record, name: str) -> None:
+    short = replace(ut4, **{key: x[:2000] for key, x in vars(ut4).items() if isinstance(x, np.ndarray)}, gate=REJECT)
+    broken = replace(with_outliers(short, 30.0)[0], gate=REJECT)
+    measurements, prior, own = arguments(OBSERVERS[name], broken, UT4)
+    expected = OBSERVERS[name].estimate(measurements, prior, own)
+    raw = replace(broken, gate=None).measurements()
+    got = run_steps(OBSERVERS[name].design(prior, own, raw.sampling, gate=REJECT), raw)
+    for target in OBSERVERS[name].targets:
+        np.testing.assert_allclose(got[target], expected[target], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["integrator", "lqg-kf-multi"])
+def test_a_controller_with_a_gate_is_the_same_step_by_step(ut4: Record, name: str) -> None:
+    controller = CONTROLLERS[name]
+    own, plant, prior = own_settings(controller, UT4), plant_of(UT4), prior_for(controller, UT4)
+    short = Record(ut4.y_lgs[:2000] - 0.0, np.zeros((2000, 2)), ut4.dt)
+    broken = replace(with_outliers(short, 30.0)[0], gate=REJECT)
+    measured, told = controller_arguments(controller, broken, own, prior)
+    expected, _ = controller.commands(controller.laws(told, plant, own, 2), measured, told, plant, own)
+    step = controller.design(told, plant, own, measured.sampling, REJECT)
+    np.testing.assert_allclose(run_loop(step, replace(broken, gate=None).measurements()), expected, rtol=0, atol=1e-9)
+
+
+def test_the_state_of_a_gate_goes_on(ut4: Record) -> None:
+    """Saved, loaded and taken over with the filter behind it."""
+    z = with_outliers(ut4, 40.0)[0].z
+    one, other, new = (wfsobs.design("kf-multi", UT4, gate=REJECT) for _ in range(3))
+    for row in z[:500]:
+        one.update(row)
+    other.load_state_dict(one.state_dict())
+    new.take_over(one)
+    for row in z[500:900]:
+        for observer in (one, other, new):
+            observer.update(row)
+    np.testing.assert_array_equal(one.predict(0, "vibration")[0], other.predict(0, "vibration")[0])
+    np.testing.assert_array_equal(one.predict(0, "vibration")[0], new.predict(0, "vibration")[0])
+    one.reset()
+    assert not one.state_dict()["gate_lgs.caught"].any()

@@ -1,0 +1,196 @@
+"""A gate: measurements that their own past excludes are missing, or clipped, before any observer or controller receives them.
+
+Every mode of a sensor is predicted one step ahead by an autoregression, fitted by least squares to what has passed so far, anew
+every `BLOCK` samples. A measurement further than `level` deviations from its prediction is an outlier; the deviation is the
+running median of the magnitudes of the prediction errors themselves, since under a wrong model a stated one is wrong. After five
+in a row the level has moved, or a vibration has appeared: the gate is open for `OPEN` samples, and all pass. No filter starves:
+never more than a fifth of the samples of a mode is rejected for long. The prediction is of the measurements alone, so that one
+gate serves every observer.
+
+Least squares with a memory: Ljung, System Identification, section 11.2. The clipped innovation: Huber, Robust Statistics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from wfsobs.typing import Array
+
+ORDER = 64
+"""Past samples that predict the next one."""
+BLOCK = 128
+"""Samples between two fits; before the first one all pass."""
+MEMORY = 64
+"""Blocks after which a sample has 1/e of its weight in the fit."""
+FORGET = 0.1
+"""Part of the count of rejected samples that is forgotten with every sample."""
+LASTING = 4.0
+"""Count beyond which the gate opens: that of RUN in a row."""
+RUN = 5
+"""Outliers in a row that are a new level."""
+OPEN = 20
+"""Samples that pass then, while the deviation is doubled."""
+EARLY = 1.0
+"""Part of itself by which the level is larger after the first block, less with every one: a fit to few samples predicts badly."""
+PACE = 0.25
+"""Weight of the median of a block in the deviation."""
+MEDIAN = 0.6745
+"""Median of the magnitude of a Gaussian variable, over its standard deviation."""
+RIDGE = 1e-12
+"""Part of the trace that is added to the diagonal of the normal equations."""
+FIRST = 2.0
+"""Levels beyond which a sample of the first block is kept out of the fit."""
+
+
+@dataclass(frozen=True)
+class GateSettings:
+    """What a gate does.
+
+    level  : deviations of the prediction error beyond which a measurement is an outlier
+    action : "reject", it is missing, or "clip", it is taken at that level
+    """
+
+    level: float = 4.0
+    action: Literal["reject", "clip"] = "reject"
+
+
+class Gate:
+    """The gate of one sensor, one sample of all modes at a time.
+
+    Attributes
+    ----------
+    caught : Array
+        Outliers so far, (n_modes,).
+    count : int
+        Samples so far.
+
+    Parameters
+    ----------
+    n_modes : int
+        Number of modes.
+    settings : GateSettings
+        What it does.
+    """
+
+    def __init__(self, n_modes: int, settings: GateSettings):
+        self.settings, self._n_modes = settings, n_modes
+        self.reset()
+
+    def reset(self) -> None:
+        """Go back to before the first sample."""
+        n = self._n_modes
+        self.count, self.caught = 0, np.zeros(n, dtype=int)
+        self._offset = np.zeros(n)
+        self._past = np.zeros((n, ORDER + BLOCK))  # ORDER samples before this block, and its own, less the offset
+        self._normal = np.zeros((n, ORDER + 1, ORDER + 1))
+        self._weights = np.zeros((n, ORDER))  # of the oldest sample first
+        self._weights[:, -1] = 1.0  # until there is a fit the last one is held
+        self._deviation, self._rejected, self._open = np.full(n, np.inf), np.zeros(n), np.zeros(n, dtype=int)
+        self._errors, self._passed = np.zeros((n, BLOCK)), np.zeros((n, BLOCK), dtype=bool)
+
+    def check(self, z: Array) -> Array:
+        """Return z (n_modes,) [um] with outliers NaN, or clipped; NaN is missing."""
+        if self.count == 0:
+            self._offset = np.nan_to_num(z)
+        k, limit = self.count % BLOCK, self._limit()
+        expected = self._offset + np.einsum("mi,mi->m", self._weights, self._past[:, k : k + ORDER])
+        error = z - expected
+        is_outlier = (np.abs(error) > limit) & (self._open == 0)
+        is_clipped = self.settings.action == "clip"
+        kept = np.where(is_outlier, np.clip(error, -limit, limit) if is_clipped else np.nan, error)
+        self._errors[:, k], self._passed[:, k] = error, ~np.isnan(error) & ~is_outlier
+        self._past[:, ORDER + k] = expected - self._offset + np.nan_to_num(kept)
+        self._count(is_outlier)
+        return np.where(is_outlier, expected + kept, z)
+
+    def check_all(self, z: Array) -> Array:
+        """Return samples z (n, n_modes) [um] as `check` does one by one; all that pass between two outliers at once."""
+        out, k = z.copy(), 0
+        while k < len(z):
+            n = 0 if self.count == 0 or self._open.any() else self._pass(z[k : k + BLOCK - self.count % BLOCK])
+            if n == 0:
+                out[k] = self.check(z[k])
+            k += max(n, 1)
+        return out
+
+    def save(self) -> dict[str, Array]:
+        """Return a copy of the state."""
+        return {name.lstrip("_"): np.array(getattr(self, name)) for name in STATE}
+
+    def load(self, state: Mapping[str, Array]) -> None:
+        """Take over a state."""
+        for name in STATE:
+            setattr(self, name, np.array(state[name.lstrip("_")]))
+        self.count = int(self.count)
+
+    def _limit(self) -> Array:
+        return self.settings.level * (1.0 + EARLY / max(self.count // BLOCK, 1)) * self._deviation
+
+    def _count(self, is_outlier: Array) -> None:
+        """Count a sample, open the gate where outliers last, and fit at the end of a block.
+
+        Errors that last with one sign are a jump of the level, which the past has had from then on.
+        """
+        self.count += 1
+        self.caught = self.caught + is_outlier
+        self._rejected = (1.0 - FORGET) * self._rejected + is_outlier
+        lasting = self._rejected > LASTING
+        if lasting.any():
+            k = (self.count - 1) % BLOCK
+            errors = self._errors[:, max(k + 1 - RUN, 0) : k + 1]
+            is_jump = lasting & ((errors > 0.0).all(axis=1) | (errors < 0.0).all(axis=1))
+            self._offset = self._offset + np.where(is_jump, np.median(errors, axis=1), 0.0)
+        self._open = np.where(lasting, OPEN, np.maximum(self._open - 1, 0))
+        self._rejected = np.where(lasting, 0.0, self._rejected)
+        self._deviation = np.where(lasting, 2.0, 1.0) * self._deviation
+        if self.count % BLOCK == 0:
+            self._fit()
+
+    def _pass(self, z: Array) -> int:
+        """Take samples (n, n_modes) of one block up to the first that is an outlier or missing; return how many."""
+        k = self.count % BLOCK
+        x = z.T - self._offset[:, None]
+        past = np.hstack([self._past[:, k : ORDER + k], x])
+        error = x - np.einsum("mi,mki->mk", self._weights, sliding_window_view(past[:, :-1], ORDER, axis=1))
+        is_usual = (np.abs(error) <= self._limit()[:, None]).all(axis=0)
+        n = len(z) if is_usual.all() else int(np.argmin(is_usual))
+        self._errors[:, k : k + n], self._passed[:, k : k + n] = error[:, :n], True
+        self._past[:, ORDER + k : ORDER + k + n] = x[:, :n]
+        self._rejected = self._rejected * (1.0 - FORGET) ** n
+        self.count += n
+        if n and k + n == BLOCK:
+            self._fit()
+        return n
+
+    def _fit(self) -> None:
+        """Fit the deviation to the errors of this block, and the autoregression to what has passed."""
+        seen = self._passed.sum(axis=1) > BLOCK // 4
+        median = np.nanmedian(np.where(self._passed | ~seen[:, None], np.abs(self._errors), np.nan), axis=1) / MEDIAN
+        is_first = np.isinf(self._deviation) & seen
+        old = np.where(is_first, median, self._deviation)
+        self._deviation = np.where(seen, old ** (1.0 - PACE) * median**PACE, self._deviation)
+        for mode in np.flatnonzero(is_first).tolist():
+            self._clean(mode)
+        rows = sliding_window_view(self._past, ORDER + 1, axis=1) * self._passed[:, :, None]
+        self._normal = (1.0 - 1.0 / MEMORY) * self._normal + rows.swapaxes(1, 2) @ rows
+        square, cross = self._normal[:, :-1, :-1], self._normal[:, :-1, -1:]
+        trace = np.trace(square, axis1=1, axis2=2)
+        diagonal = np.where(trace > 0.0, RIDGE * trace, 1.0)[:, None, None] * np.eye(ORDER)
+        fitted = np.linalg.solve(square + diagonal, cross)[:, :, 0]
+        self._weights = np.where((trace > 0.0)[:, None], fitted, self._weights)
+        self._past = np.concatenate([self._past[:, BLOCK:], np.zeros((self._n_modes, BLOCK))], axis=1)
+
+    def _clean(self, mode: int) -> None:
+        """Keep what is far out of the first block, in which all pass, out of the fit."""
+        is_far = np.abs(self._errors[mode]) > FIRST * self.settings.level * self._deviation[mode]
+        self._passed[mode] &= ~is_far
+        for k in np.flatnonzero(is_far):
+            self._past[mode, ORDER + k] = self._past[mode, ORDER + k - 1]
+
+
+STATE = ("count", "caught", "_offset", "_past", "_normal", "_weights", "_deviation", "_rejected", "_open", "_errors", "_passed")
