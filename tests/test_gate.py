@@ -19,7 +19,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
 from wfsobs.priors_from.scenario import arguments
 from wfsobs.record import Record
-from wfsobs.signal.gate import BLOCK, MEMORY, OPEN, ORDER, RUN, Gate, GateSettings
+from wfsobs.signal.gate import BLOCK, MEMORY, OPEN, ORDER, RUN, GateSettings, OutlierGate
 from wfsobs.testing.steps import run_loop, run_steps
 from wfsobs.typing import Array
 
@@ -44,14 +44,14 @@ def noise_with_outliers(seed: int, n: int = 1000, share: float = 0.03) -> Array:
 def test_all_samples_at_once_are_as_one_by_one(seed: int, what: GateSettings) -> None:
     """Rounding differs, as sums have another order; and a state goes on where it was saved."""
     z = noise_with_outliers(seed)
-    at_once, by_one, gone_on = Gate(2, what), Gate(2, what), Gate(2, what)
+    at_once, by_one, gone_on = OutlierGate(2, what), OutlierGate(2, what), OutlierGate(2, what)
     expected = np.array([by_one.check(row) for row in z])
     np.testing.assert_allclose(at_once.check_all(z), expected, rtol=1e-9, atol=1e-9)
     first = gone_on.check_all(z[:333])
-    later = Gate(2, what)
+    later = OutlierGate(2, what)
     later.load(gone_on.save())
     np.testing.assert_allclose(np.vstack([first, later.check_all(z[333:])]), expected, rtol=1e-9, atol=1e-9)
-    np.testing.assert_array_equal(at_once.caught, by_one.caught)
+    np.testing.assert_array_equal(at_once.outliers, by_one.outliers)
 
 
 @settings(max_examples=20)
@@ -60,13 +60,13 @@ def test_the_past_alone_decides(seed: int) -> None:
     z = noise_with_outliers(seed)
     changed = z.copy()
     changed[700:] = 1e3
-    np.testing.assert_array_equal(Gate(2, REJECT).check_all(z)[:700], Gate(2, REJECT).check_all(changed)[:700])
+    np.testing.assert_array_equal(OutlierGate(2, REJECT).check_all(z)[:700], OutlierGate(2, REJECT).check_all(changed)[:700])
 
 
 def test_the_prediction_is_that_of_least_squares() -> None:
     """Samples without outliers, weighted by exp(-age in blocks / MEMORY): the solution by a QR decomposition of the rows."""
     z = np.random.default_rng(3).standard_normal(12 * BLOCK).cumsum() * 0.1 + np.random.default_rng(4).standard_normal(12 * BLOCK)
-    gate = Gate(1, GateSettings(50.0))
+    gate = OutlierGate(1, GateSettings(50.0))
     gate.check_all(z[:, None])
     rows = sliding_window_view(np.concatenate([np.zeros(ORDER), z - z[0]]), ORDER + 1)
     weights = np.sqrt((1.0 - 1.0 / MEMORY) ** (11 - np.arange(len(z)) // BLOCK))[:, None]
@@ -78,10 +78,10 @@ def test_the_prediction_is_that_of_least_squares() -> None:
 def test_of_gaussian_noise_as_many_are_rejected_as_lie_beyond_the_level(level: float) -> None:
     """Within 15 %: the deviation is a median of 128 samples, smoothed over some eight blocks, and the fit has 64 weights."""
     z = np.random.default_rng(5).standard_normal((100_000, 4))
-    gate = Gate(4, GateSettings(level))
+    gate = OutlierGate(4, GateSettings(level))
     gate.check_all(z)
     expected = 2.0 * norm.sf(level) * z.size
-    assert abs(gate.caught.sum() / expected - 1.0) < 0.15 + 4.0 / sqrt(expected)
+    assert abs(gate.outliers.sum() / expected - 1.0) < 0.15 + 4.0 / sqrt(expected)
 
 
 @settings(max_examples=20)
@@ -91,7 +91,7 @@ def test_no_filter_starves(seed: int, size: float, share: float) -> None:
     rng = np.random.default_rng(seed)
     z = rng.standard_normal(3000)
     z += np.where(rng.random(3000) < share, 10.0**size, 0.0) * rng.standard_normal(3000)
-    gone = np.isnan(Gate(1, REJECT).check_all(z[:, None])[:, 0])
+    gone = np.isnan(OutlierGate(1, REJECT).check_all(z[:, None])[:, 0])
     in_a_row = np.diff(np.flatnonzero(np.diff(np.concatenate([[0], gone, [0]]))))[::2]
     assert in_a_row.max(initial=0) <= RUN
     assert gone.mean() < 0.3
@@ -101,7 +101,7 @@ def test_no_filter_starves(seed: int, size: float, share: float) -> None:
 def test_a_jump_is_followed_within_twenty_samples(size: float) -> None:
     z = np.random.default_rng(6).standard_normal((4000, 3))
     z[3000:] += size
-    gone = np.isnan(Gate(3, REJECT).check_all(z))
+    gone = np.isnan(OutlierGate(3, REJECT).check_all(z))
     assert gone[3000:3020].sum(axis=0).max() <= 2 * RUN
     assert gone[3000 + OPEN :].sum() <= 3  # 0.2 are expected
 
@@ -151,15 +151,16 @@ def test_outliers_are_found_and_counted(ut4: Record) -> None:
     y_ngs = ut4.y_ngs.copy()  # type: ignore[union-attr]
     y_ngs[5000] += 1.0
     broken = replace(broken, y_ngs=y_ngs, gate=REJECT)
-    gone = np.isnan(broken.gated.y_lgs).any(axis=1)
+    gone = np.any(np.isnan(broken.without_outliers.y_lgs), axis=1)
     settled = frames[frames > 3 * BLOCK]
     assert gone[settled].all()
     assert abs(broken.outliers - hit.sum()) <= 12
-    gated_ngs = broken.gated.y_ngs
+    gated_ngs = broken.without_outliers.y_ngs
     assert gated_ngs is not None and np.isnan(gated_ngs[5000]).all()
-    kept = ~np.isnan(broken.gated.y_lgs)
-    np.testing.assert_array_equal(broken.gated.y_lgs[kept], broken.y_lgs[kept])  # to the last bit
-    clipped = replace(broken, gate=CLIP).gated.y_lgs
+    y_lgs = broken.without_outliers.y_lgs
+    kept = np.logical_not(np.isnan(y_lgs))
+    np.testing.assert_array_equal(broken.without_outliers.y_lgs[kept], broken.y_lgs[kept])  # to the last bit
+    clipped = replace(broken, gate=CLIP).without_outliers.y_lgs
     assert not np.isnan(clipped).any()
     assert rms((clipped - ut4.y_lgs)[settled]) < 8.0 * NOISE < rms((broken.y_lgs - ut4.y_lgs)[settled])
     assert replace(broken, gate=None).outliers == 0
@@ -203,4 +204,4 @@ def test_the_state_of_a_gate_goes_on(ut4: Record) -> None:
     np.testing.assert_array_equal(one.predict(0, "vibration")[0], other.predict(0, "vibration")[0])
     np.testing.assert_array_equal(one.predict(0, "vibration")[0], new.predict(0, "vibration")[0])
     one.reset()
-    assert not one.state_dict()["gate_lgs.caught"].any()
+    assert not one.state_dict()["gate_lgs.outliers"].any()

@@ -125,7 +125,7 @@ def observe(
     if prior is not None:
         scenario = as_stated(record, told_by(prior, scenario))
     scenario.validate()
-    record = gated_by(record, scenario) if gate and not is_simulated else record
+    record = with_gate(record, scenario) if gate and not is_simulated else record
     if train is not None:
         record = with_training(record, train, scenario)
     start = trained_until(train)
@@ -158,7 +158,7 @@ def as_stated(record: Record, scenario: Scenario) -> Scenario:
     return as_sampled(scenario, record.sampling)
 
 
-def gated_by(record: Record, scenario: Scenario) -> Record:
+def with_gate(record: Record, scenario: Scenario) -> Record:
     """Return a record that is not a simulation of the scenario with the gate of its settings."""
     return record if record.gate == scenario.gate else replace(record, gate=scenario.gate)
 

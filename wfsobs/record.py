@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 import numpy as np
 
 from wfsobs.notebook import PlotAccessor, html_table, import_extra
-from wfsobs.signal.gate import Gate, GateSettings
+from wfsobs.signal.gate import GateSettings, OutlierGate
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:
@@ -220,7 +220,7 @@ class Record(Signals):
         open_loop : with the open-loop measurement
         sensors   : whose measurements; there is nothing of the NGS without them, and zeros for those of the LGS
         """
-        lgs, ngs, of = "lgs" in sensors, "ngs" in sensors, self.gated
+        lgs, ngs, of = "lgs" in sensors, "ngs" in sensors, self.without_outliers
         return Measurements(
             _own(of.y_lgs) if lgs else np.zeros_like(of.y_lgs),
             _own(of.u),
@@ -234,17 +234,17 @@ class Record(Signals):
         )
 
     @property
-    def gated(self) -> Record:
+    def without_outliers(self) -> Record:
         """The record with outliers missing, or clipped, as observers receive it: of the LGS, of each of them, of NGS frames."""
-        return self if self.gate is None else self._tested
+        return self if self.gate is None else self._after_gate
 
     @cached_property
-    def _tested(self) -> Record:
+    def _after_gate(self) -> Record:
         settings = self.gate or GateSettings()
 
         def gate(y: Array, z: Array, first: int) -> Array:
             """Test all but the first samples, which lack commands of before the record."""
-            tested = Gate(z[0].size, settings).check_all(z[first:].reshape(len(z[first:]), -1))
+            tested = OutlierGate(z[0].size, settings).check_all(z[first:].reshape(len(z[first:]), -1))
             tested = np.concatenate([z[:first], tested.reshape(z[first:].shape)])
             return np.where(tested == z, y, tested + (y - z))
 
@@ -259,7 +259,7 @@ class Record(Signals):
     @property
     def outliers(self) -> int:
         """Number of steps with an LGS measurement that the gate does not let through as it is."""
-        return int(((self.gated.y_lgs != self.y_lgs) & ~np.isnan(self.y_lgs)).any(axis=1).sum()) if self.gate else 0
+        return int(((self.without_outliers.y_lgs != self.y_lgs) & ~np.isnan(self.y_lgs)).any(axis=1).sum()) if self.gate else 0
 
     def truth(self, target: str) -> Array | None:
         """Return the true signal of `target` ("turbulence", "vibration", or "total", their sum), or None."""

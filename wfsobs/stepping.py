@@ -164,5 +164,5 @@ def _training(scenario: Scenario, train: Record | Training | None) -> Training:
         return made
     if isinstance(train, Training):
         return train
-    whole = fill_missing(train.gated, Prior())
+    whole = fill_missing(train.without_outliers, Prior())
     return Training(whole.y_lgs, whole.u, whole.open_loop_y).copy()

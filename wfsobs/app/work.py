@@ -28,7 +28,7 @@ from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import SLOW, TARGETS
 from wfsobs.observers.estimates import Estimate
-from wfsobs.pipeline import as_stated, collect, gated_by
+from wfsobs.pipeline import as_stated, collect, with_gate
 from wfsobs.prior import GIVEN, TRUE
 from wfsobs.priors_from.selection import usual_observers
 from wfsobs.progress import Watch
@@ -156,7 +156,7 @@ class _Work:
         else:
             record = self.source.make(self.watch, self.memo)
             stated = as_stated(record, stated)
-            record = gated_by(record, stated) if self.simulation is None else record
+            record = with_gate(record, stated) if self.simulation is None else record
             stated.validate()
         self.record, self.known_estimates = record, RecordMemo(self.memo, record)
         self.usual = usual_observers(stated, record)

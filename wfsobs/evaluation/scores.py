@@ -205,7 +205,7 @@ def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: 
     out, both = list[Score](), totals(estimates)
     after = np.arange(record.n_steps) > round(warm_up / record.dt)
     for mode, name in enumerate(mode_names):
-        z, left = record.gated.z[:, mode], record.gated.y_lgs[:, mode]
+        z, left = record.without_outliers.z[:, mode], record.without_outliers.y_lgs[:, mode]
         measured = after & ~np.isnan(z)
         if not rms(z[measured]) > 0:
             continue

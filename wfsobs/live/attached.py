@@ -16,7 +16,7 @@ from wfsobs.live.paced import SOURCE, Desk, Staff, enter_process
 from wfsobs.live.ring import Ring
 from wfsobs.live.source import STREAM
 from wfsobs.record import Sampling
-from wfsobs.signal.gate import Gate, GateSettings
+from wfsobs.signal.gate import GateSettings, OutlierGate
 from wfsobs.streams.attach import LONGEST_GAP
 from wfsobs.streams.layout import StreamError
 from wfsobs.streams.network import Subscription, is_address
@@ -174,7 +174,7 @@ class StreamFrames:
         self._count, self._alive, self._steps = 0, monotonic(), 0
         self._is_playing = self._is_stuck = False
         self._spells: dict[str, float] = {}
-        self._gates = source.gate and tuple(Gate(desk.n_modes, source.gate) for _ in range(2))
+        self._gates = source.gate and tuple(OutlierGate(desk.n_modes, source.gate) for _ in range(2))
 
     def run(self) -> None:
         """Follow the stream until the process is ended, or all frames have been sent."""

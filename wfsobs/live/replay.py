@@ -44,7 +44,7 @@ class Replay:
 
 def frame_rows(record: Record) -> Array:
     """Return z, ngs, u, turbulence and vibration of every frame, (n_steps, 5 n_modes) [um]; NaN where there is none."""
-    record = record.gated
+    record = record.without_outliers
     nothing = np.full_like(record.z, np.nan)
     ngs = nothing if record.y_ngs is None else record.z_ngs
     truth = [nothing if part is None else part for part in (record.turbulence, record.vibration)]

@@ -22,7 +22,7 @@ from wfsobs.observers.stepping import StateArrays, Stateful, load_parts, save_pa
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
-from wfsobs.signal.gate import Gate, GateSettings
+from wfsobs.signal.gate import GateSettings, OutlierGate
 from wfsobs.typing import Array
 
 
@@ -333,16 +333,16 @@ class StepObserver:
 
 def make_gates(
     settings: GateSettings | None, sampling: Sampling, uses_ngs: bool, each_shape: tuple[int, int] | None = None
-) -> dict[str, Gate]:
+) -> dict[str, OutlierGate]:
     """Return the gates of LGS measurements, of NGS frames and of every LGS by itself, by name; none without settings."""
     if settings is None:
         return {}
     sizes = {"gate_lgs": sampling.n_modes, "gate_ngs": sampling.n_modes if uses_ngs else 0}
     sizes["gate_each"] = each_shape[0] * each_shape[1] if each_shape else 0
-    return {name: Gate(n, settings) for name, n in sizes.items() if n}
+    return {name: OutlierGate(n, settings) for name, n in sizes.items() if n}
 
 
-def pass_gate(gates: Mapping[str, Gate], name: str, z: Array, frame: int, sampling: Sampling) -> Array:
+def pass_gate(gates: Mapping[str, OutlierGate], name: str, z: Array, frame: int, sampling: Sampling) -> Array:
     """Return a measurement of any shape [um] with outliers missing, or clipped; those that lack earlier commands pass."""
     first = sampling.delay + (sampling.ratio or 1) - 1 if name == "gate_ngs" else sampling.delay
     if name not in gates or frame < first:

@@ -38,7 +38,7 @@ def with_training(record: Record, train: Record | float, scenario: Scenario) -> 
         The other record has another rate, number of modes or delay, is the record itself, or either has too few samples or an
         impossible duration.
     """
-    whole = fill_missing(training_part(record, train, scenario).gated, Prior())
+    whole = fill_missing(training_part(record, train, scenario).without_outliers, Prior())
     return replace(record, training=Training(whole.y_lgs, whole.u, whole.open_loop_y).copy())
 
 

@@ -59,12 +59,12 @@ class GateSettings:
     action: Literal["reject", "clip"] = "reject"
 
 
-class Gate:
+class OutlierGate:
     """The gate of one sensor, one sample of all modes at a time.
 
     Attributes
     ----------
-    caught : Array
+    outliers : Array
         Outliers so far, (n_modes,).
     count : int
         Samples so far.
@@ -84,14 +84,14 @@ class Gate:
     def reset(self) -> None:
         """Go back to before the first sample."""
         n = self._n_modes
-        self.count, self.caught = 0, np.zeros(n, dtype=int)
+        self.count, self.outliers = 0, np.zeros(n, dtype=int)
         self._offset = np.zeros(n)
         self._past = np.zeros((n, ORDER + BLOCK))  # ORDER samples before this block, and its own, less the offset
         self._normal = np.zeros((n, ORDER + 1, ORDER + 1))
         self._weights = np.zeros((n, ORDER))  # of the oldest sample first
         self._weights[:, -1] = 1.0  # until there is a fit the last one is held
-        self._deviation, self._rejected, self._open = np.full(n, np.inf), np.zeros(n), np.zeros(n, dtype=int)
-        self._errors, self._passed = np.zeros((n, BLOCK)), np.zeros((n, BLOCK), dtype=bool)
+        self._deviation, self._out_count, self._open = np.full(n, np.inf), np.zeros(n), np.zeros(n, dtype=int)
+        self._errors, self._is_usual = np.zeros((n, BLOCK)), np.zeros((n, BLOCK), dtype=bool)
 
     def check(self, z: Array) -> Array:
         """Return z (n_modes,) [um] with outliers NaN, or clipped; NaN is missing."""
@@ -103,7 +103,7 @@ class Gate:
         is_outlier = (np.abs(error) > limit) & (self._open == 0)
         is_clipped = self.settings.action == "clip"
         kept = np.where(is_outlier, np.clip(error, -limit, limit) if is_clipped else np.nan, error)
-        self._errors[:, k], self._passed[:, k] = error, ~np.isnan(error) & ~is_outlier
+        self._errors[:, k], self._is_usual[:, k] = error, ~np.isnan(error) & ~is_outlier
         self._past[:, ORDER + k] = expected - self._offset + np.nan_to_num(kept)
         self._count(is_outlier)
         return np.where(is_outlier, expected + kept, z)
@@ -137,16 +137,16 @@ class Gate:
         Errors that last with one sign are a jump of the level, which the past has had from then on.
         """
         self.count += 1
-        self.caught = self.caught + is_outlier
-        self._rejected = (1.0 - FORGET) * self._rejected + is_outlier
-        lasting = self._rejected > LASTING
+        self.outliers = self.outliers + is_outlier
+        self._out_count = (1.0 - FORGET) * self._out_count + is_outlier
+        lasting = self._out_count > LASTING
         if lasting.any():
             k = (self.count - 1) % BLOCK
             errors = self._errors[:, max(k + 1 - RUN, 0) : k + 1]
             is_jump = lasting & ((errors > 0.0).all(axis=1) | (errors < 0.0).all(axis=1))
             self._offset = self._offset + np.where(is_jump, np.median(errors, axis=1), 0.0)
         self._open = np.where(lasting, OPEN, np.maximum(self._open - 1, 0))
-        self._rejected = np.where(lasting, 0.0, self._rejected)
+        self._out_count = np.where(lasting, 0.0, self._out_count)
         self._deviation = np.where(lasting, 2.0, 1.0) * self._deviation
         if self.count % BLOCK == 0:
             self._fit()
@@ -159,9 +159,9 @@ class Gate:
         error = x - np.einsum("mi,mki->mk", self._weights, sliding_window_view(past[:, :-1], ORDER, axis=1))
         is_usual = (np.abs(error) <= self._limit()[:, None]).all(axis=0)
         n = len(z) if is_usual.all() else int(np.argmin(is_usual))
-        self._errors[:, k : k + n], self._passed[:, k : k + n] = error[:, :n], True
+        self._errors[:, k : k + n], self._is_usual[:, k : k + n] = error[:, :n], True
         self._past[:, ORDER + k : ORDER + k + n] = x[:, :n]
-        self._rejected = self._rejected * (1.0 - FORGET) ** n
+        self._out_count = self._out_count * (1.0 - FORGET) ** n
         self.count += n
         if n and k + n == BLOCK:
             self._fit()
@@ -169,14 +169,14 @@ class Gate:
 
     def _fit(self) -> None:
         """Fit the deviation to the errors of this block, and the autoregression to what has passed."""
-        seen = self._passed.sum(axis=1) > BLOCK // 4
-        median = np.nanmedian(np.where(self._passed | ~seen[:, None], np.abs(self._errors), np.nan), axis=1) / MEDIAN
+        seen = self._is_usual.sum(axis=1) > BLOCK // 4
+        median = np.nanmedian(np.where(self._is_usual | ~seen[:, None], np.abs(self._errors), np.nan), axis=1) / MEDIAN
         is_first = np.isinf(self._deviation) & seen
         old = np.where(is_first, median, self._deviation)
         self._deviation = np.where(seen, old ** (1.0 - PACE) * median**PACE, self._deviation)
         for mode in np.flatnonzero(is_first).tolist():
             self._clean(mode)
-        rows = sliding_window_view(self._past, ORDER + 1, axis=1) * self._passed[:, :, None]
+        rows = sliding_window_view(self._past, ORDER + 1, axis=1) * self._is_usual[:, :, None]
         self._normal = (1.0 - 1.0 / MEMORY) * self._normal + rows.swapaxes(1, 2) @ rows
         square, cross = self._normal[:, :-1, :-1], self._normal[:, :-1, -1:]
         trace = np.trace(square, axis1=1, axis2=2)
@@ -188,9 +188,21 @@ class Gate:
     def _clean(self, mode: int) -> None:
         """Keep what is far out of the first block, in which all pass, out of the fit."""
         is_far = np.abs(self._errors[mode]) > FIRST * self.settings.level * self._deviation[mode]
-        self._passed[mode] &= ~is_far
+        self._is_usual[mode] &= ~is_far
         for k in np.flatnonzero(is_far):
             self._past[mode, ORDER + k] = self._past[mode, ORDER + k - 1]
 
 
-STATE = ("count", "caught", "_offset", "_past", "_normal", "_weights", "_deviation", "_rejected", "_open", "_errors", "_passed")
+STATE = (
+    "count",
+    "outliers",
+    "_offset",
+    "_past",
+    "_normal",
+    "_weights",
+    "_deviation",
+    "_out_count",
+    "_open",
+    "_errors",
+    "_is_usual",
+)

@@ -177,6 +177,6 @@ def piece(record: Record, start: int, stop: int) -> Record:
 
 def reference(record: Record, scenario: Scenario) -> Array:
     """Return the zero-phase Butterworth reference of a record, (n_steps, n_modes) [um], NaN where a measurement is missing."""
-    whole = fill_missing(record.gated, prior_of(scenario, record, (Model,)))
+    whole = fill_missing(record.without_outliers, prior_of(scenario, record, (Model,)))
     twin = whole.z if whole.open_loop_y is None else whole.open_loop_y
     return np.where(np.isnan(record.z), np.nan, open_loop_reference(bands_of(scenario), twin, record.dt))

@@ -175,7 +175,7 @@ def likelihood(observer: str, record: Record, scenario: Scenario, watch: Watch =
     if observer not in GPRS:
         return None
     try:
-        whole = fill_missing(record.gated, prior_of(scenario, record, (Bands,)))
+        whole = fill_missing(record.without_outliers, prior_of(scenario, record, (Bands,)))
         return tuple(_of_mode(observer, whole, scenario, mode, watch) for mode in range(record.n_modes))
     except ValueError:
         return None
