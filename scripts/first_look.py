@@ -46,6 +46,7 @@ COUNT = """() => {
       }
       for (const node of el.childNodes) {
         if (node.nodeType !== Node.TEXT_NODE || ["STYLE", "SCRIPT", "TITLE", "NOSCRIPT"].includes(el.tagName)) continue
+        if (/icon/i.test(getComputedStyle(el).fontFamily)) continue  // the name of a picture
         const text = node.data.split(/\\s+/).filter((it) => it)
         if (!node.data.trim() || !shown(el)) continue
         const range = document.createRange()

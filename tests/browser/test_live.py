@@ -11,27 +11,6 @@ from playwright.sync_api import Locator, Page, expect
 
 from tests.browser.conftest import DONE, QUICK, SETTINGS, eventually, finished
 
-
-def test_a_loop_that_is_changed_while_it_runs(open_page: Any, server: Any) -> None:
-    page = open_page(url=server.url + QUICK + "&view.live.observers=kf-multi,multirate-multi")
-    page.get_by_role("button", name="Live", exact=True).click()
-    page.get_by_role("button", name="Start", exact=True).click()
-    expect(page.get_by_text(re.compile(r"^Running at 1 × real time · [1-9]"))).to_be_visible()
-    table = page.get_by_role("region", name="Live")
-    expect(table.get_by_text("Multi-rate multi-peak", exact=True)).to_be_visible()
-    expect(page.get_by_role("figure", name="Spectra")).to_be_visible()
-    wind = page.get_by_role("textbox", name="Wind speed V₀ [m/s]")
-    wind.fill("20")
-    wind.press("Enter")
-    expect(page.get_by_role("list", name="Events")).to_contain_text("Wind speed V₀ 15 → 20 m/s")
-    page.get_by_role("button", name="Pause", exact=True).click()
-    expect(page.get_by_text(re.compile("^Paused at 1 × real time"))).to_be_visible()
-    page.get_by_role("button", name="Play", exact=True).click()
-    expect(page.get_by_text(re.compile("^Running at 1 × real time"))).to_be_visible()
-    stop(page)
-    expect(page.get_by_role("button", name="Start", exact=True)).to_be_enabled()
-
-
 LIVE = QUICK + "&view.page=live&view.live.observers=kf-multi,multirate-multi,gpr-online&view.live.controllers=integrator"
 """Few beside the page: those whose lines are shown first."""
 
@@ -48,7 +27,7 @@ def stop(page: Page) -> None:
     expect(page.get_by_text("Stopped", exact=True)).to_be_visible()
 
 
-def test_a_page_that_opens_on_live_runs_nothing_until_another_page_needs_it(open_page: Any, server: Any) -> None:
+def test_a_loop_is_changed_and_pauses_and_its_page_runs_nothing_until_another_page_needs_it(open_page: Any, server: Any) -> None:
     page = open_page(url=server.url + LIVE + "&view.mode=tilt&view.live.speed=0.3", wait=False)
     begin(page)
     expect(page.get_by_text(re.compile("^Running at 0.3 × real time"))).to_be_visible()
@@ -57,6 +36,10 @@ def test_a_page_that_opens_on_live_runs_nothing_until_another_page_needs_it(open
     wind.fill("20")
     wind.press("Enter")
     expect(page.get_by_role("list", name="Events")).to_contain_text("Wind speed V₀ 15 → 20 m/s")
+    page.get_by_role("button", name="Pause", exact=True).click()
+    expect(page.get_by_text(re.compile("^Paused at 0.3 × real time"))).to_be_visible()
+    page.get_by_role("button", name="Play", exact=True).click()
+    expect(page.get_by_text(re.compile("^Running at 0.3 × real time"))).to_be_visible()
     assert not page.evaluate(DONE)
     expect(page.get_by_role("button", name="Tilt", exact=True)).to_have_attribute("aria-pressed", "true")
     page.get_by_role("button", name="Explore", exact=True).click()
@@ -64,6 +47,7 @@ def test_a_page_that_opens_on_live_runs_nothing_until_another_page_needs_it(open
     expect(page.get_by_role("button", name="Tilt", exact=True)).to_have_attribute("aria-pressed", "true")
     page.get_by_role("button", name="Live", exact=True).click()
     stop(page)
+    expect(page.get_by_role("button", name="Start", exact=True)).to_be_enabled()
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +55,8 @@ def running(open_shared: Any, server: Any) -> Iterator[Page]:
     """A page with a loop that runs, for all tests below."""
     page = open_shared(url=server.url + LIVE, wait=False)
     begin(page)
+    expect(page.get_by_text(re.compile(r"^Running at 1 × real time · [1-9]"))).to_be_visible()
+    expect(page.get_by_role("figure", name="Spectra")).to_be_visible()
     yield page
     stop(page)
 
@@ -106,7 +92,7 @@ def test_a_page_that_sleeps_and_wakes_shows_now(running: Page) -> None:
 NOTE = """(name) => {
   const [view] = [...Bokeh.index.query((it) => it.model.type === "Figure" && it.model.name === name)]
   const source = view?.model.renderers[0]?.data_source
-  const pulse = Bokeh.documents.flatMap((it) => [...it._all_models.values()]).find((it) => it.data?.properties?.picture)
+  const pulse = Bokeh.documents.flatMap((it) => [...it.all_models]).find((it) => it.data?.properties?.picture)
   if (!source || !pulse || view.el.getBoundingClientRect().top <= innerHeight) return false
   const changes = window.changes = [], pictures = window.pictures = []
   source.properties.data.change.connect(() => changes.push(performance.now()))
@@ -140,7 +126,7 @@ def test_a_figure_out_of_sight_is_changed_once_a_second_and_scrolled_to_with_eve
 
 
 TRACE = """() => {
-  const all = Bokeh.documents.flatMap((it) => [...it._all_models.values()])
+  const all = Bokeh.documents.flatMap((it) => [...it.all_models])
   const lines = (it) => it.renderers.filter((line) => line.glyph?.type === "Line" && line.visible)
   const isTraces = (it) => it.type === "Figure" && it.below.some((axis) => axis.axis_label === "time of the loop [s]")
   const figure = all.filter(isTraces).find((it) => lines(it).length)
@@ -200,7 +186,7 @@ def test_a_peak_that_is_moved_in_the_live_spectrum(running: Page) -> None:
     page = running
     page.get_by_role("combobox", name="Errors of").click()
     page.get_by_role("option", name="Vibration", exact=True).click()
-    page.get_by_role("checkbox", name="Edit on the figure").check()
+    page.get_by_role("checkbox", name="Edit figure").check()
     peak = page.get_by_role("slider", name="Peak 15", exact=True)
     expect(peak).to_have_attribute("aria-valuetext", "47.44 Hz, 7.90 nm rms, damping 0.004")
     peak.focus()
@@ -215,7 +201,7 @@ def test_a_peak_that_is_moved_in_the_live_spectrum(running: Page) -> None:
     expect(page.get_by_role("figure", name="Star: Integrator")).to_be_visible()
 
 
-MARKS = """() => Bokeh.documents.flatMap((it) => [...it._all_models.values()])
+MARKS = """() => Bokeh.documents.flatMap((it) => [...it.all_models])
   .filter((it) => it.type === "ColumnDataSource" && "line" in it.data).flatMap((it) => [...it.data.x])"""
 """Times at which the traces have a mark [s]."""
 

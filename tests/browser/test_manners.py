@@ -39,7 +39,7 @@ def wide(open_shared: Any, server: Any) -> Page:
 
 TOLD_TWICE = """async () => {
   const doc = Bokeh.index.roots[0].model.document
-  const {data} = [...doc._all_models.values()].find((m) => m.type.endsWith("ReactComponent") && m.data?.label === "Preset")
+  const {data} = [...doc.all_models].find((m) => m.type.endsWith("ReactComponent") && m.data?.label === "Preset")
   const tell = (text) => doc.apply_json_patch(
     {events: [{kind: "ModelChanged", model: {id: data.id}, attr: "helper_text", new: text}]})
   tell("the older")
@@ -98,9 +98,6 @@ def test_the_theme_of_the_system_unless_another_is_chosen(open_page: Any, server
     page.get_by_role("button", name=re.compile("theme", re.I)).click()
     becomes(page, True)
     remembered(page, "dark")
-    page.reload()
-    page.locator("[role=status]", has_text="Done in").first.wait_for(state="attached")
-    becomes(page, True)
     page.emulate_media(color_scheme="dark")
     page.get_by_role("button", name=re.compile("theme", re.I)).click()
     becomes(page, False)

@@ -99,7 +99,7 @@ class Display(param.Parameterized):
     dark = param.Boolean(False, doc="Dark mode.")
     spectrum = param.Selector(default=PSD, objects=[PSD, CUMULATIVE], label="Spectrum")
     window_spectra = param.Boolean(False, label="Spectra of the window", doc="Spectra of the stretch of time in view alone.")
-    editing = param.Boolean(False, label="Edit on the figure", doc="Handles on the spectra, and what theory predicts.")
+    editing = param.Boolean(False, label="Edit figure", doc="Handles on the spectra, and what theory predicts.")
     compared_runs = param.List([], item_type=ComparedRun, doc="The runs to compare with, by their letters.")
 
     @property

@@ -13,7 +13,9 @@ from wfsobs.app.component import Component
 from wfsobs.app.render import macro
 from wfsobs.app.style import asset
 from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.evaluation.rows import target_title
 from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import TURBULENCE, VIBRATION
 
 KF, GPR, LGS, NGS, BOUND, NEEDS, LAG, STREHL, RELATIVE, RMS_ERROR, REAL_TIME, STATED = (
     "KF",
@@ -32,6 +34,8 @@ KF, GPR, LGS, NGS, BOUND, NEEDS, LAG, STREHL, RELATIVE, RMS_ERROR, REAL_TIME, ST
 
 TERMS: Mapping[str, str] = MappingProxyType(
     {
+        target_title(TURBULENCE): "Atmospheric tip/tilt, estimated from the guide stars.",
+        target_title(VIBRATION): "Structural vibration, separated from turbulence.",
         KF: (
             "Kalman filter: estimates turbulence and vibration step by step from a state-space model of both. A multi-rate one "
             "uses LGS and NGS, each at its own rate; an adaptive one identifies its model from the measurements."

@@ -21,7 +21,7 @@ function save(name, blob) {
 // ------------------------------------------------------------------ menus
 
 function menu(bar, label, items) {
-  const button = tag("button", bar, {type: "button", textContent: `${label} ▾`},
+  const button = tag("button", bar, {type: "button", textContent: label},
                      {"aria-haspopup": "menu", "aria-expanded": "false", "aria-label": label})
   const list = tag("div", bar, {className: "menu", popover: "auto"}, {role: "menu", "aria-label": label})
   button.popoverTargetElement = list

@@ -80,8 +80,8 @@ function offer(el) {
   note.setAttribute("role", "dialog")
   note.setAttribute("aria-label", "Tour offer")
   const button = (words, act) => Object.assign(document.createElement("button"), {type: "button", textContent: words, onclick: act})
-  const line = Object.assign(document.createElement("p"), {textContent: "New here?"})
-  note.append(line, button("Take the tour", () => { note.hidePopover(); tour(el) }), button("Not now", () => note.hidePopover()))
+  const close = Object.assign(button("×", () => note.hidePopover()), {ariaLabel: "Not now"})
+  note.append(button("Take the tour", () => { note.hidePopover(); tour(el) }), close)
   note.ontoggle = (event) => { if (event.newState === "closed") note.remove() }
   el.append(note)
   note.showPopover()

@@ -65,7 +65,7 @@ def _system() -> Scenario:
 
 
 def paper() -> Scenario:
-    """The paper's system, with every number that it publishes.
+    """The paper's system, as published.
 
     Records are made as the paper makes them, by an inverse DFT of their own length with random phases (`vibration.synthesis`);
     no other preset does. What it leaves open, and what is taken here:

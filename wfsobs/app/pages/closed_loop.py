@@ -417,7 +417,7 @@ class ClosedLoopPage(Page):
 
     def _switch(self) -> pn.FlexBox:
         edit = pmui.Checkbox.from_param(self.display.param.editing, size="small", margin=0, stylesheets=[SMALL_LABEL])
-        return pn.FlexBox(*zoom_buttons(self.trace.zoom, {"Whole record": None, f"{FIRST_S:g} s": FIRST_S}), edit, **WIDE)
+        return pn.FlexBox(*zoom_buttons(self.trace.zoom, {"All": None, f"{FIRST_S:g} s": FIRST_S}), edit, **WIDE)
 
     def _edit(self, *_: object) -> None:
         """Make the handle when it is first wanted, and room for what stands below the figure."""

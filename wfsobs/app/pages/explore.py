@@ -40,23 +40,16 @@ from wfsobs.app.views.traces import Traces
 from wfsobs.app.views.verdict import VerdictLine
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.error_spectra import Theory
-from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION
+from wfsobs.observers.base import TARGETS, VIBRATION
 
 HEAD = grid_style("minmax(0, 2fr) minmax(0, 3fr)")
-ABOUT: Mapping[str, str] = MappingProxyType(
-    {
-        TURBULENCE: "Atmospheric tip/tilt, estimated from the guide stars",
-        VIBRATION: "Structural vibration, separated from turbulence",
-    }
-)
-"""Target -> what it is, for who comes first to the page."""
 GAP = ":host { gap: 10px; }"
 WRAPPED = ":host { flex-wrap: wrap; gap: 8px; align-items: center; }"
 SWITCHES = """
 :host { gap: 8px; align-items: center; width: max-content !important; }
 @media (min-width: 600.05px) and (min-height: 560.05px) { :host { flex-wrap: wrap; max-width: 100%; } }
 """
-ZOOMS: Mapping[str, float | None] = MappingProxyType({"Whole record": None, "2 s": 2.0, "0.2 s": 0.2})
+ZOOMS: Mapping[str, float | None] = MappingProxyType({"All": None, "2 s": 2.0, "0.2 s": 0.2})
 MARKS = macro("marks", PEAKS, MODEL)
 
 
@@ -74,9 +67,7 @@ class Explore(Page):
         self.spectra = SpectraFigures(run, display, self.traces.x_range)
         self.budgets = Budgets(seeds.store, self.lines.names, seeds) if seeds else None
         self.strips = {target: Strip(target, run, display, seeds, self.lines, self.budgets) for target in TARGETS}
-        self.verdicts = {
-            target: VerdictLine(target, run, display, seeds, self.budgets, about=ABOUT[target]) for target in TARGETS
-        }
+        self.verdicts = {target: VerdictLine(target, run, display, seeds, self.budgets) for target in TARGETS}
         axes = self.traces.x_range, self.spectra.x_range
         self.stretches = {target: Stretch(target, run, display, *axes, self.traces.chosen_window) for target in TARGETS}
         self.table = Table(run, display, seeds)

@@ -33,7 +33,7 @@ HEADS = {"note": RELATIVE, "change": "Change", "bar": "Error budget"}
 LEAST = 0.01
 """Share of an error from which on the legend has a cause."""
 
-LIMIT = "theoretical limit"
+LIMIT = "limit"
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from wfsobs.app.budgets import Budgets
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.glossary import BOUND, explain_first
+from wfsobs.app.glossary import BOUND, TERMS, explain_first
 from wfsobs.app.jobs import DONE, RUNNING
 from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
@@ -34,11 +34,8 @@ class VerdictLine:
         display: Display,
         seeds: SeedRuns | None = None,
         budgets: Budgets | None = None,
-        about: str = "",
     ):
-        """Make the pane. about : what the target is, for who comes first to the page."""
         self.target, self.run, self.display, self.seeds, self.budgets = target, run, display, seeds, budgets
-        self.about = about
         self._text: tuple[tuple[str, str], tuple[str, str]] = ("", ""), ("", "")
         self.pane = pn.pane.HTML(self.html(), sizing_mode="stretch_width", margin=0, stylesheets=[asset("style.css")])
         run.param.watch(self._refresh, ["result", "state"])
@@ -61,7 +58,7 @@ class VerdictLine:
         elif self.run.result is not None and self.run.state == DONE:
             title, text = self._sentences(self.run.result, title)
             self._text = of, (title, text)
-        return str(macro("verdict", title, self.about, Markup(text), kind))
+        return str(macro("verdict", title, TERMS[target_title(self.target)], Markup(text), kind))
 
     def _sentences(self, results: RunResults, title: str) -> tuple[str, str]:
         """Return the title and what stands below it as HTML."""
