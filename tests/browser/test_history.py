@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import re
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import pytest
 from playwright.sync_api import Locator, Page, expect
 
 from tests.browser.conftest import QUICK, eventually
-from tests.browser.test_pages import MODELS, PINNED
-from tests.browser.test_quality import accessible, fits, theme
+from tests.browser.test_pages import PINNED
 
 OWN = QUICK + "&run.seed=7"
 
@@ -132,23 +129,3 @@ def test_a_session_from_runs_to_a_file_and_back(open_page: Any, server: Any, tmp
     page.keyboard.press("Escape")
     expect(sheet(page)).to_be_hidden()
     expect(page.get_by_role("button", name="History")).to_be_focused()
-
-
-@pytest.mark.parametrize("width", [1400, 390], ids=["wide", "phone"])
-def test_the_sheet_is_accessible(open_page: Any, server: Any, width: int) -> None:
-    page = open_page(width, 900, url=f"{server.url}{QUICK}")
-    before = page.evaluate(f"() => {MODELS}.length")
-    expect(sheet(page)).to_have_count(0)
-    page.get_by_role("button", name="History").click()
-    page.wait_for_function(f"before => {MODELS}.length > before", arg=before)  # the sheet is made when it is opened
-    rows(page).get_by_role("checkbox").check()
-    expect(page.get_by_text("Compared as A")).to_be_visible()
-    page.evaluate(files("axe_playwright_python").joinpath("axe.min.js").read_text(encoding="utf-8"))
-    accessible(page)
-    fits(page, width)
-    if width > 1000:
-        page.keyboard.press("Escape")
-        theme(page)
-        page.get_by_role("button", name="History").click()
-        expect(sheet(page)).to_be_visible()
-        accessible(page)
