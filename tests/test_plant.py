@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy.signal import lfilter
 
+from wfsobs import PRESETS, simulate
 from wfsobs.cli import main
 from wfsobs.identification.plant import GroupPlant, PlantNumber, identify_plant
 from wfsobs.record import Record, RecordError
@@ -139,6 +141,30 @@ def test_command(tmp_path: Path) -> None:
     assert not plain["excited"] and 0.0 < plain["trustworthy_to_percent"] < 50.0
     told = CliRunner().invoke(main, ["plant", str(file)]).stdout
     assert all(line in told for line in plain["remarks"])
+
+
+@pytest.mark.slow
+def test_a_probe_costs_and_tells_what_its_design_says(tmp_path: Path) -> None:
+    """Beside the integrator of the simulation, y and u change by what the linear loop makes of it."""
+    out = tmp_path / "probe.npz"
+    options = ["--set", "run.duration=20", "--set", "loop.gain=0.4"]
+    design = json.loads(CliRunner().invoke(main, ["probe", *options, "--json", "--out", str(out)]).stdout)
+    assert max(
+        design["bound"]["delay_frames"] / 0.03, design["bound"]["gain"] / 0.02, design["bound"]["rotation_deg"]
+    ) == pytest.approx(1.0)
+    with np.load(out) as data:
+        probe = data["probe"]
+    assert probe.std(axis=0) == pytest.approx(np.full(2, design["rms"]), rel=1e-9)
+    record = simulate(PRESETS["paper"]().replace({"run.duration": 20.0, "loop.gain": 0.4, "run.seed": 3}))
+    more = lfilter([1.0, -1.0], [1.0, -1.0, 0.4], probe, axis=0)
+    left, added = np.asarray(record.truth("total")) + np.roll(record.u, 1, axis=0), np.roll(more, 1, axis=0)
+    cost = np.sqrt((left + added)[500:].var(axis=0) / left[500:].var(axis=0)).max() - 1.0
+    assert cost == pytest.approx(design["cost"], rel=0.4), "to the scatter of the correlation of both, over 20 s"
+    (found,) = identify_plant(replace(record, y_lgs=record.y_lgs + np.roll(more, 2, axis=0), u=record.u + more))
+    numbers = ((found.delay[0], 2.0), (found.gain[0], 1.0), (found.degrees, 0.0))
+    for (n, value), bound in zip(numbers, design["bound"].values(), strict=True):
+        assert right(n, value) and n.sd is not None
+        assert 0.3 * bound < n.sd < 1.1 * bound, "the loop's own motion tells as well, and both modes have one delay"
 
 
 def test_text() -> None:

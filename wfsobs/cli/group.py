@@ -34,6 +34,7 @@ COMMANDS = {
     "observe": Place("telemetry", "Run the observers on a record of any format."),
     "plant": Place("telemetry", "Identify what the commands of a closed loop do: delay, gain and rotation."),
     "presets": Place("presets", "List the presets, or print one as TOML."),
+    "probe": Place("telemetry", "Design a probe: commands by which delay, gain and rotation of a loop are known better."),
     "rt-check": Place(
         "realtime", "Tell what this machine can hold: how late a loop at the LGS rate wakes, and what a step takes in it."
     ),

@@ -1,4 +1,4 @@
-"""`wfsobs check`, `wfsobs convert`, `wfsobs identify`, `wfsobs observe` and `wfsobs plant`: work on a record."""
+"""`wfsobs check`, `wfsobs convert`, `wfsobs identify`, `wfsobs observe`, `wfsobs plant` and `wfsobs probe`: work on a record."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import shlex
 from dataclasses import asdict
 
 import click
+import numpy as np
 from rich.table import Table
 from rich.text import Text
 
@@ -26,7 +27,7 @@ from wfsobs.identification import identify as identify_record
 from wfsobs.identification import report as identified
 from wfsobs.identification.check import Check, check_record
 from wfsobs.identification.identification import LEVEL
-from wfsobs.identification.plant import identify_plant, plant_dict, plant_lines
+from wfsobs.identification.plant import design_probe, identify_plant, plant_dict, plant_lines
 from wfsobs.identification.process import Number
 from wfsobs.identification.report import format_number, mode_rows
 from wfsobs.identification.result import Identification
@@ -194,6 +195,35 @@ def plant(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha
     show_table(table)
     for line in plant_lines(groups):
         click.echo(line)
+
+
+@click.command()
+@scenario_options
+@click.option("--seconds", type=click.FloatRange(1.0, 1e4), default=20.0, show_default=True, help="How long it lasts.")
+@click.option("--delay", type=click.FloatRange(1e-4, 1.0), default=0.03, show_default=True, help="Error of the delay, frames.")
+@click.option("--gain", type=click.FloatRange(1e-4, 1.0), default=0.02, show_default=True, help="Error of the gain.")
+@click.option("--rotation", type=click.FloatRange(1e-3, 90.0), default=1.0, show_default=True, help="Error of it, degrees.")
+@click.option("--out", metavar="PROBE.npz", help="Save its commands, `probe` (steps, modes) [um], with `dt` [s].")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a line.")
+def probe(scenario: Scenario, seconds: float, delay: float, gain: float, rotation: float, out: str | None, as_json: bool) -> None:
+    """Design a probe: commands by which delay, gain and rotation of a loop are known better (by default preset paper)."""
+    if out:
+        check_writable(out)
+    wanted = {"delay_frames": delay, "gain": gain, "rotation_deg": rotation}
+    found = design_probe(scenario, seconds, wanted)
+    if out:
+        rng, n = np.random.default_rng(scenario.run.seed), round(seconds / scenario.dt)
+        save_arrays(out, {"probe": found.commands(n, 2, scenario.dt, rng), "dt": np.array(scenario.dt)})
+    if as_json:
+        click.echo(json.dumps(asdict(found), allow_nan=False))
+        return
+    bound = found.bound
+    click.echo(
+        f"{1e3 * found.rms:.3g} nm rms of tip and of tilt, white from {found.low:g} Hz to half the rate, {seconds:g} s\n"
+        f"Cramer-Rao bound: delay {bound['delay_frames']:.2g} frames, gain {100.0 * bound['gain']:.2g} %, "
+        f"rotation {bound['rotation_deg']:.2g} degrees\n"
+        f"cost: the rms of the residual grows by {100.0 * found.cost:.2g} % while it lasts"
+    )
 
 
 COLOURS = {"ok": "green", "note": "yellow", "undecided": "yellow", "excluded": "red"}
