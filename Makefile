@@ -33,7 +33,7 @@ define install
 endef
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: help run test setup check check-types wheel wheel-check load container-check bench docs notebooks clean test-fast test-peers
+.PHONY: help run test setup check wheel wheel-check load container-check bench docs notebooks clean test-fast test-peers
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' Makefile
@@ -58,7 +58,7 @@ test-peer-%: $(VENV)-%/.made-$(PINS)
 setup: $(TEST)  ## install all that the tests need, the browser included
 	@scripts/need_browser.sh $(VENV)
 
-check: $(TEST)  ## ruff, pyright, names, the walls between the rooms, circles, and calls that go up
+check: $(TEST)  ## ruff, pyright, names, the walls between the rooms, circles, calls that go up, and how much is typed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/python scripts/check_names.py
@@ -66,9 +66,7 @@ check: $(TEST)  ## ruff, pyright, names, the walls between the rooms, circles, a
 	$(BIN)/lint-imports --no-logo --no-cache
 	$(BIN)/python scripts/count_circles.py
 	$(BIN)/python scripts/count_jumps.py
-
-check-types: $(TEST)  ## how much of the library is typed for its users, at least 98 %
-	PATH="$(BIN):$$PATH" $(BIN)/python scripts/check_types.py
+	$(BIN)/python scripts/check_types.py
 
 wheel: $(TEST)  ## build dist/*.tar.gz, and from it dist/*.whl
 	rm -rf dist

@@ -6,14 +6,16 @@ By `pyright --verifytypes wfsobs --ignoreexternal`, without the dashboard, which
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 LEAST = 0.98
 
-run = subprocess.run(
-    ["pyright", "--verifytypes", "wfsobs", "--ignoreexternal", "--outputjson"], capture_output=True, text=True, check=False
-)
+command = [sys.executable, "-m", "pyright", "--verifytypes", "wfsobs", "--ignoreexternal", "--outputjson"]
+place = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}  # an editable installation is not found by pyright
+run = subprocess.run(command, capture_output=True, text=True, check=False, env=place)
 names = [s for s in json.loads(run.stdout)["typeCompleteness"]["symbols"] if s["isExported"]]
 library = [s for s in names if not s["name"].startswith("wfsobs.app.")]
 left = [s for s in library if not s["isTypeKnown"] or s["isTypeAmbiguous"]]

@@ -27,6 +27,23 @@ HUGE = 10**400
 NOT_A_NUMBER: tuple[Any, ...] = (math.nan, math.inf, -math.inf, "3", None, True, [1.0], {}, HUGE, 1j)
 
 
+def groups(of: type[Group] = Group) -> Iterator[type[Group]]:
+    for cls in of.__subclasses__():
+        yield cls
+        yield from groups(cls)
+
+
+def test_every_setting_has_its_type() -> None:
+    """One without, or a generic one that does not say of what, leaves all that takes a scenario untyped for those who use it."""
+    for cls in (cls for cls in groups() if cls.__module__.startswith("wfsobs.")):
+        for name, p in vars(cls).items():
+            if isinstance(p, param.Parameter) and not isinstance(p, param.ClassSelector) and name != "name":
+                assert not re.fullmatch(r"|param[.](Selector|List|Parameter|Dict)", cls.__annotations__.get(name, "")), (
+                    cls,
+                    name,
+                )
+
+
 # ---------------------------------------------------------------------- every setting refuses
 
 

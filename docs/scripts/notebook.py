@@ -52,4 +52,5 @@ def _output(output: NotebookNode, stem: str, figures: dict[str, bytes]) -> str:
     if "<script" in html:  # what a notebook loads for HoloViews
         return ""
     text = output.get("data", {}).get("text/plain", "")
-    return re.sub(r"<style.*?</style>|\n\s*", "", html, flags=re.S) or (f"```text\n{text}\n```" if text else "")
+    html = re.sub(r'<style.*?</style>|\n\s*| border="1" class="dataframe"', "", html, flags=re.S)
+    return html or (f"```text\n{text}\n```" if text else "")

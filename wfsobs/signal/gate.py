@@ -77,6 +77,10 @@ class OutlierGate:
         What it does.
     """
 
+    settings: GateSettings
+    count: int
+    outliers: Array
+
     def __init__(self, n_modes: int, settings: GateSettings):
         self.settings, self._n_modes = settings, n_modes
         self.reset()

@@ -187,7 +187,7 @@ class Sensors(Group):
         "uplink turbulence where turbulence is not frozen flow. 0.049 um is the cone effect of one layer at 8 km "
         "and a guide star at 90 km.",
     )
-    gate: param.Selector = param.Selector(
+    gate: param.Selector[str] = param.Selector(
         default="reject",
         objects=["reject", "clip", "off"],
         label="Outliers",
