@@ -17,7 +17,7 @@ from wfsobs.settings.errors import SettingError
 from wfsobs.streams.wiring import STUCK, NgsWiring
 from wfsobs.telemetry.command_response import saturation_lines
 from wfsobs.telemetry.intake import LONGEST_DELAY, DeclaredFormat
-from wfsobs.telemetry.records import load_record
+from wfsobs.telemetry.records import load_record, read_loop_matrix
 from wfsobs.units import UNITS, micrometres_per
 
 
@@ -95,6 +95,8 @@ def record_options(command: Callable) -> Callable:
         command_sign: str | None,
         columns: Sequence[str],
         command_gain: str | None,
+        reconstructor: str | None,
+        command_modes: str | None,
         **values: Any,
     ) -> Any:
         config = click.get_current_context().params.get("config")
@@ -110,6 +112,7 @@ def record_options(command: Callable) -> Callable:
             raise SettingError(f"--command-gain {command_gain}: takes a number, or one per mode with commas") from None
         stated = {name: values.pop(name) for name in ("unit", "command_delay", "rate", "trust", "rail", "open_loop")}
         sign = int(command_sign) if command_sign else None
+        stated |= {"reconstructor": read_loop_matrix(reconstructor), "command_modes": read_loop_matrix(command_modes)}
         return command(declaration=DeclaredFormat(command_sign=sign, columns=roles, command_gain=gain, **stated), **values)
 
     return add_options(
@@ -124,6 +127,14 @@ def record_options(command: Callable) -> Callable:
             multiple=True,
             metavar="ROLE=NAME",
             help="Which column or array of the file is what, such as y_lgs/tip=slope_x or u=commands; can be repeated.",
+        ),
+        click.option(
+            "--command-modes",
+            metavar="FILE[:NAME]",
+            help="Matrix from modes to commands, where the commands are those of actuators.",
+        ),
+        click.option(
+            "--reconstructor", metavar="FILE[:NAME]", help="Matrix from slopes to modes, where the measurements are slopes."
         ),
         click.option("--rate", type=click.FloatRange(0, min_open=True), metavar="HZ", help="Rate of rows without time stamps."),
         click.option("--open-loop", is_flag=True, help="The mirror was at rest; commands are not needed, and not used."),

@@ -32,6 +32,7 @@ from wfsobs.record import DELAY, Record, RecordError, Training, hold_last
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import order_of
 from wfsobs.telemetry.formats.contents import APART, FAST, FRAME, LARGEST, NGS, SIGNALS, STARS, TIME, TRAINING, Contents
+from wfsobs.telemetry.modal import LoopMatrix, apply_matrices
 from wfsobs.typing import Array
 from wfsobs.units import ANGLES, micrometres_per, parse_unit
 
@@ -161,6 +162,10 @@ class DeclaredFormat:
         Largest command that the mirror follows, in the unit of the commands; it stays there for larger ones.
     open_loop : bool
         Whether the mirror was at rest, whatever the commands are.
+    reconstructor : LoopMatrix or None
+        From slopes to modes, where y_lgs holds slopes.
+    command_modes : LoopMatrix or None
+        From modes to commands, where u holds those of actuators.
     """
 
     unit: str | None = None
@@ -172,6 +177,8 @@ class DeclaredFormat:
     command_gain: tuple[float, ...] | None = None
     rail: float | None = None
     open_loop: bool = False
+    reconstructor: LoopMatrix | None = None
+    command_modes: LoopMatrix | None = None
 
     @property
     def as_commanded(self) -> DeclaredFormat:
@@ -187,6 +194,8 @@ class DeclaredFormat:
             "command-gain": self.command_gain and ",".join(map(str, self.command_gain)),
             "rail": self.rail,
             "rate": self.rate,
+            "reconstructor": self.reconstructor and self.reconstructor.source,
+            "command-modes": self.command_modes and self.command_modes.source,
         } | dict(corrections or {})
         words = [word for name, value in named.items() if value is not None for word in (f"--{name}", str(value))]
         words += ["--trust"] * self.trust + ["--open-loop"] * self.open_loop
@@ -202,12 +211,14 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
     signals = {name: _signal(name, arrays[name]) for name in SIGNALS if name in arrays}
     swapped = [name for name, values in signals.items() if values.shape[0] < values.shape[1] > most]
     signals |= {name: np.ascontiguousarray(signals[name].T) for name in swapped}
+    modes = apply_matrices(signals, declaration.reconstructor, declaration.command_modes)
     if declaration.open_loop:
         signals["u"] = np.zeros_like(signals["y_lgs"])
     n, n_modes = signals["y_lgs"].shape
     if not 1 <= n_modes <= most or n < 2:
         order = order_of(n_modes) if n_modes > most else None
         needed = f": {n_modes} modes need telescope.radial_order = {order}" if order else ""
+        needed += "; slopes need a --reconstructor" if n_modes > most else ""
         raise RecordError(f"y_lgs has shape {(n, n_modes)}; it takes (n_steps >= 2, 1 to {most} modes){needed}")
     for name in signals:
         rows = signals["training_y"].shape[0] if name in TRAINING and "training_y" in signals else n
@@ -219,7 +230,7 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
     delay = _number_of("delay", arrays, declaration.command_delay, DELAY, declaration.trust)
     if not 1 <= delay <= LONGEST_DELAY:
         raise RecordError(f"delay takes a number of steps from 1 to {LONGEST_DELAY}, not {delay:g}")
-    mirror = _limit(signals, declaration)
+    mirror = modes + _limit(signals, declaration)
     origin, sign = _into_micrometres(signals, contents, declaration, scenario.telescope.diameter)
     for name in {"u", "training_u"} & signals.keys():
         signals[name] *= sign

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import IO
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.fft import rfft
 from scipy.ndimage import binary_dilation, median_filter
 from scipy.optimize import isotonic_regression
@@ -35,6 +36,7 @@ from wfsobs.telemetry.formats.contents import Contents, FileColumns
 from wfsobs.telemetry.formats.csv import write
 from wfsobs.telemetry.formats.npz import write as write_npz
 from wfsobs.telemetry.intake import DeclaredFormat, to_record
+from wfsobs.telemetry.modal import LoopMatrix, matrix_of, split_source
 from wfsobs.typing import Array
 
 REVERSED = 0.7
@@ -218,6 +220,8 @@ def load(
     command_gain: float | Sequence[float] | None = None,
     rail: float | None = None,
     open_loop: bool = False,
+    reconstructor: str | ArrayLike | None = None,
+    command_modes: str | ArrayLike | None = None,
 ) -> Record:
     """Read the record of a file of any format, or of a folder of .npy files (docs/data.md).
 
@@ -245,6 +249,10 @@ def load(
         Largest command that the mirror follows, in the unit of the commands.
     open_loop : bool
         Whether the mirror was at rest; commands are then not needed, and not used.
+    reconstructor : str or array_like, optional
+        Matrix from slopes to modes, (n_modes, n_slopes), where y_lgs holds slopes: "FILE", "FILE:NAME", or its numbers.
+    command_modes : str or array_like, optional
+        Matrix from modes to commands, (n_actuators, n_modes), where u holds commands of actuators: likewise.
 
     Returns
     -------
@@ -257,8 +265,26 @@ def load(
         The file cannot be used; one line naming what, where and what is expected.
     """
     gain = None if command_gain is None else tuple(np.atleast_1d(command_gain).tolist())
-    stated = DeclaredFormat(unit, command_sign, command_delay, rate, columns or {}, trust, gain, rail, open_loop)
+    matrices = [read_loop_matrix(matrix) for matrix in (reconstructor, command_modes)]
+    stated = DeclaredFormat(unit, command_sign, command_delay, rate, columns or {}, trust, gain, rail, open_loop, *matrices)
     return load_record(path, scenario, stated)
+
+
+def read_loop_matrix(source: str | ArrayLike | None) -> LoopMatrix | None:
+    """Return a matrix of a loop from "FILE" or "FILE:NAME" of any format, or from its numbers. Raises RecordError."""
+    if source is None:
+        return None
+    if not isinstance(source, str):
+        numbers = np.atleast_2d(np.asarray(source, dtype=float))
+        if numbers.ndim != 2:
+            raise RecordError(f"a matrix takes two dimensions, not {numbers.ndim}")
+        return LoopMatrix("an array", tuple(map(tuple, numbers.tolist())))
+    path, name = split_source(source)
+    with open_record(path) as (file, where):
+        try:
+            return matrix_of(read_columns(file, where), source, name)
+        except RecordError as error:
+            raise RecordError(str(error) if str(error).startswith(source) else f"{source}: {error}") from None
 
 
 def read_record(

@@ -44,7 +44,7 @@ NAMES = (*SIGNALS, *CLOCKS, STARS, APART, *NUMBERS, *TEXTS)
 COLUMN = re.compile(r"(?:truth/)?(?P<array>[a-z_]+)/(?P<mode>[A-Za-z0-9 -]+?)(?:_(?P<unit>[A-Za-zµμ]+))?$")
 """Name of a column of one mode, such as y_lgs/tip_um."""
 
-MOST_COLUMNS = 64
+MOST_COLUMNS = 20_000
 """Maximum columns of one array that a file offers under names of its own."""
 
 
@@ -229,7 +229,8 @@ def parse_heading(heading: str, beside: str = "") -> tuple[str, str] | None:
 def from_columns(columns: Mapping[str, tuple[Array, str]]) -> Contents:
     """Return the contents of columns {role: (values, unit)}, the shorter fast ones with missing samples at their end.
 
-    Modes are tip, tilt and then in the order of the columns of y_lgs. Raises RecordError where an array lacks one of them.
+    Modes are tip, tilt and then in the order of the columns of y_lgs. Raises RecordError where an array lacks one of them, unless
+    it is one of slopes or of commands of actuators, or the other is.
     """
     contents = Contents()
     found: dict[str, dict[str, Array]] = {}
@@ -244,7 +245,9 @@ def from_columns(columns: Mapping[str, tuple[Array, str]]) -> Contents:
     first = [mode.name for mode in TIP_TILT]
     for name, by_mode in found.items():
         modes = sorted(found.get("y_lgs", by_mode), key=lambda mode: first.index(mode) if mode in first else len(first))
-        if set(by_mode) != set(modes):
+        if max(len(by_mode), len(modes)) > len(first) and len(by_mode) != len(modes):  # slopes or actuators
+            modes = sorted(by_mode, key=lambda mode: first.index(mode) if mode in first else len(first))
+        elif set(by_mode) != set(modes):
             raise RecordError(f"{name} has the modes {', '.join(by_mode)}; y_lgs has {', '.join(modes)}")
         longest = max(map(len, by_mode.values()))
         contents.arrays[name] = np.column_stack([_pad(by_mode[mode], longest) for mode in modes])
