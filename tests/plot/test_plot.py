@@ -369,6 +369,17 @@ def test_an_identification_is_a_table(found: Identification) -> None:
     assert html.count("<tr>") == len(frame) + 1 and "<td>white noise</td>" in html
 
 
+def test_a_closed_loop_is_a_table(loop: ClosedLoop) -> None:
+    """A row per controller and mode with the rms of its residual, and one per bound."""
+    frame = loop.to_dataframe().set_index(["controller", "mode"])
+    for outcome in loop.outcomes:
+        left = residual_rms(outcome, loop.record, loop.design.start)
+        assert left == pytest.approx(
+            [1e-3 * frame.loc[(outcome.controller, mode), "residual_rms_nm"] for mode in ("tip", "tilt")]
+        )
+    assert set(frame.index.get_level_values(0)) == {o.controller for o in loop.outcomes} | loop.design.bounds.keys()
+
+
 def test_without_xarray_the_extra_is_named(result: wfsobs.Result, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "xarray", None)
     with pytest.raises(ImportError, match=r"^xarray is not installed: pip install wfsobs\[arrays\]$"):
