@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import wraps
+from math import erfc, sqrt
 from typing import Any
 
 import click
@@ -206,11 +207,12 @@ def load_declared(record_file: str, scenario: Scenario, declaration: DeclaredFor
             "prediction and count in no score of one",
             err=True,
         )
-    if record.outliers:
-        what = "missing" if record.gate and record.gate.action == "reject" else "clipped"
+    if record.gate and record.outliers:
+        what = "missing" if record.gate.action == "reject" else "clipped"
+        expected = erfc(record.gate.level / sqrt(2.0)) * record.n_steps * record.n_modes
         click.echo(
             f"wfsobs: {record_file}: {record.outliers} of {record.n_steps} frames have outliers, which are {what} to observers "
-            "(sensors.gate)",
+            f"(sensors.gate); {expected:.1g} are expected of Gaussian noise",
             err=True,
         )
     for line in saturation_lines(record):
