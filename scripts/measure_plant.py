@@ -13,7 +13,7 @@ from math import pi
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
-from wfsobs.identification.check import OFF_DELAY, OFF_GAIN, known_numbers, sign_of
+from wfsobs.identification.check import known_numbers, sign_of
 from wfsobs.identification.plant import _Data, _Fit, _rotation, identify_plant
 from wfsobs.record import Record
 from wfsobs.signal.ar2 import Ar2
@@ -77,8 +77,8 @@ def main(loops: int) -> None:
         bound = np.sqrt(np.diag(_Data(record.y_lgs, record.u, DT).fit(_Fit(theta, spectra), ties, 1).covariance))
         (found,) = identify_plant(record)
         delay, gain = (
-            known_numbers(found.common_delay, found.delay, OFF_DELAY),
-            known_numbers(found.common_gain, found.gain, OFF_GAIN),
+            known_numbers(found, "delay"),
+            known_numbers(found, "gain"),
         )
         off_delay = None if delay is None else max(abs((n.value or 0.0) - theta[0]) for n in delay)
         off_gain = None if gain is None else max(abs(abs(n.value or 0.0) / theta[2] - 1.0) for n in gain)

@@ -16,7 +16,7 @@ from scipy.signal import detrend
 from scipy.stats import f as fisher
 
 from wfsobs.identification.identification import identify
-from wfsobs.identification.plant import GroupPlant, PlantNumber, identify_plant
+from wfsobs.identification.plant import EXCITED, GroupPlant, PlantNumber, identify_plant
 from wfsobs.identification.result import Identification
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError, hold_last
@@ -193,10 +193,10 @@ def _commands(group: GroupPlant, reading: Reading, several: bool) -> Iterator[Re
         ("delay", group.common_delay, group.delay, (reading.delay,), OFF_DELAY),
         ("gain", group.common_gain, group.gain, reading.gain or (1.0,), OFF_GAIN),
     ):
-        numbers = known_numbers(one, each, least)
+        numbers = known_numbers(group, subject)
         text = " and ".join(n.text() for n in ((one,) if one.value is not None else each))
         if numbers is None:
-            yield Remark(f"command {subject}{of}", "undecided", f"{text}: more than the data decide")
+            yield Remark(f"command {subject}{of}", "undecided", f"{text}: not decided by the data")
             continue
         wrong = any(_is_off(n, s, least) for n in numbers for s in stated)
         told = f"; {', '.join(f'{s:g}' for s in stated)} is stated"
@@ -218,10 +218,16 @@ def sign_of(group: GroupPlant) -> int | None:
     return -1 if (abs(turn) > 135.0 if group.rotation is not None else turn < 0) else 1
 
 
-def known_numbers(one: PlantNumber, each: Sequence[PlantNumber], least: float) -> list[PlantNumber] | None:
-    """Return the numbers of a group, one where its modes have one, if they are known well enough; else None."""
-    numbers = [one] if one.value is not None else list(each)
-    return numbers if all(n.sd is not None and n.sd < 0.5 * least for n in numbers) else None
+def known_numbers(group: GroupPlant, subject: str) -> list[PlantNumber] | None:
+    """Return the delay or the gain of a group, one number where its modes have one, if known well enough; else None.
+
+    Beside a coloured background they are as good as its form is, unless there is a probe.
+    """
+    delay = subject == "delay"
+    one, each = (group.common_delay, group.delay) if delay else (group.common_gain, group.gain)
+    numbers, least = [one] if one.value is not None else list(each), OFF_DELAY if delay else OFF_GAIN
+    sure = not group.has_background or group.own_share > EXCITED
+    return numbers if sure and all(n.sd is not None and n.sd < 0.5 * least for n in numbers) else None
 
 
 def _is_off(n: PlantNumber, right: float, least: float) -> bool:
@@ -293,11 +299,11 @@ def _corrections(reading: Reading, plant: Sequence[GroupPlant]) -> dict[str, str
         out["unit"] = "|".join(reading.units)
     if any(sign_of(group) == -1 for group in plant):
         out["command-sign"] = f"{-reading.sign:+d}"
-    delays = [known_numbers(group.common_delay, group.delay, OFF_DELAY) for group in plant]
+    delays = [known_numbers(group, "delay") for group in plant]
     known = [n for numbers in delays if numbers is not None and len(numbers) == 1 for n in numbers]
     if known and _is_off(best := min(known, key=lambda n: n.sd or 0.0), reading.delay, OFF_DELAY):
         out["command-delay"] = f"{best.value:.3g}"
-    gains = [known_numbers(group.common_gain, group.gain, OFF_GAIN) for group in plant]
+    gains = [known_numbers(group, "gain") for group in plant]
     each = [n for g, group in zip(gains, plant, strict=True) if g is not None for n in (g * len(group.modes))[: len(group.modes)]]
     if each and None not in gains and any(_is_off(n, s, OFF_GAIN) for n in each for s in reading.gain or (1.0,)):
         text = [f"{abs(n.value or 1.0):.3g}" for n in each]
