@@ -187,21 +187,6 @@ class Sensors(Group):
         "uplink turbulence where turbulence is not frozen flow. 0.049 um is the cone effect of one layer at 8 km "
         "and a guide star at 90 km.",
     )
-    gate: param.Selector[str] = param.Selector(
-        default="reject",
-        objects=["reject", "clip", "off"],
-        label="Outliers",
-        doc="Measurements of a loaded record or a stream that their own past excludes. reject: they are missing; clip: they "
-        "are taken at the level below; off: they are taken as they are. A simulation has none.",
-    )
-    gate_level: Real = Real(
-        4.0,
-        bounds=(2.5, 100.0),
-        softbounds=(3.0, 10.0),
-        step=0.5,
-        label="Outliers beyond",
-        doc="Deviation of a measurement from its prediction beyond which it is an outlier, in standard deviations.",
-    )
     lgs_altitude: Real = Real(
         90_000.0,
         bounds=(1000.0, 1e6),
@@ -233,6 +218,21 @@ class Sensors(Group):
         bounds=(2, 2),
         label="NGS direction",
         doc="Direction of the NGS along the axes of tip and tilt [arcsec], for frozen flow; the truth is on the axis.",
+    )
+    gate: param.Selector[str] = param.Selector(
+        default="reject",
+        objects=["reject", "clip", "off"],
+        label="Outliers",
+        doc="Measurements of a loaded record or a stream that their own past excludes. reject: they are missing; clip: they "
+        "are taken at the level below; off: they are taken as they are. A simulation has none.",
+    )
+    gate_level: Real = Real(
+        4.0,
+        bounds=(2.5, 100.0),
+        softbounds=(3.0, 10.0),
+        step=0.5,
+        label="Outliers beyond",
+        doc="Deviation of a measurement from its prediction beyond which it is an outlier, in standard deviations.",
     )
     tip_tilt_indetermination: param.Boolean[bool] = param.Boolean(
         False,
