@@ -174,7 +174,10 @@ def identify_plant(record: Record, watch: Watch = QUIET) -> tuple[GroupPlant, ..
     Cancelled
         `watch` asks to stop.
     """
-    y, u = record.y_lgs[:MOST_STEPS], hold_last(record.u[:MOST_STEPS])
+    y, u = record.y_lgs[:MOST_STEPS].copy(), hold_last(record.u[:MOST_STEPS])
+    lost = np.isnan(record.u[:MOST_STEPS]).sum(axis=1) > 0
+    for lag in range(1, LONGEST + 2):  # z is not known without its command
+        y[lag:][lost[:-lag]] = np.nan
     if len(y) < SHORTEST:
         raise RecordError(f"the record has {len(y)} frames, the plant needs {SHORTEST}")
     out = []
@@ -496,6 +499,7 @@ class _Data:
                 at += len(free)
                 spectra_there.append(s.with_vector(vector))
         covariance = np.linalg.inv(F)[: ties.shape[1], : ties.shape[1]] * inflation(self.n)
+        covariance /= 1.0 - max(missing.is_missing.mean() for missing in self.missing)  # filled ones tell nothing
         return _Fit(theta, spectra, float(best), ties @ covariance @ ties.T, self.f.size)
 
     def _within(self, theta: Array, lower: Array) -> tuple[Array, Array]:
