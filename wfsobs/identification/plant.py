@@ -349,10 +349,7 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
     if any(s.background for s in coloured.spectra):
         each = min(each, data.fit(coloured, gains, STEPS), key=lambda fit: fit.criterion)
     for corner in THIRD:
-        third = [
-            replace(s, turbulence=behind_pole(t, corner * t.omega)) if isinstance(t := s.turbulence, Ar2) else s
-            for s in each.spectra
-        ]
+        third = [_third_order(s, corner) for s in each.spectra]
         each = min(each, data.fit(replace(each, spectra=third), gains, STEPS), key=lambda fit: fit.criterion)
     apart = data.fit(each, np.eye(len(pooled)), STEPS)
     difference = np.append(-1.0, 1.0) if k == 2 else np.zeros(1)
