@@ -54,6 +54,14 @@ def test_c99_is_the_run_over_a_record_and_its_test_notices_one_wrong_number(tmp_
     vector = np.fromfile(path / "output.f64", "<f8")
     vector[2 * 5000 + 1] -= 1e-3 * commands.std()
     vector.tofile(path / "output.f64")
+    gate = np.fromfile(path / "gate.f64", "<f8").reshape(-1, 4)
+    outliers = ~np.isnan(gate[:, :2]) & np.isnan(gate[:, 2:])
+    assert 150 < outliers.sum() < 500  # 200 were put in, a jump, a vibration that appears
+    gate[5000, 2] = np.nan if gate[5000, 2] == gate[5000, 2] else 0.0
+    gate.tofile(path / "gate.f64")
+    assert "the gate differs in 1 measurements" in make(path).stdout
+    gate[5000, 2] = gate[5000, 0]
+    gate.tofile(path / "gate.f64")
     source = (path / "wfsobs_controller.c").read_text()
     tables = re.findall(r"static const real (t\d+)\[\] = \{([^}]*)\}", source)
     name, row = next((name, text) for name, text in tables if re.search(rf"\}}, {name}\}}", source))

@@ -1,4 +1,4 @@
-"""A linear controller as C99 without dependencies: a header, a source, and a test on vectors of the run over a record.
+"""A linear controller and the gate before it as C99 without dependencies, and a test on vectors of the run over a record.
 
 Sparse rows of A and dense C and L are tables of constants; one function runs any of the filters. The state is a struct of the
 caller's. Near gaps the covariance of a Kalman filter goes along, in double precision; it starts from that of the steady state,
@@ -18,7 +18,9 @@ from wfsobs.handover.linear import LinearDesign
 from wfsobs.handover.vectors import Vectors
 from wfsobs.observers.step import StepError
 from wfsobs.observers.stepping import Gain, GainCycle
+from wfsobs.signal import gate
 from wfsobs.signal.gap_gains import GapGains
+from wfsobs.signal.gate import GateSettings
 from wfsobs.signal.riccati import Step
 from wfsobs.typing import Array
 
@@ -100,7 +102,11 @@ class _Tables:
         return f"{{{n}, {len(steps)}, {int(gains.first is not None)}, {name}_steps, {first}}}"
 
 
-def source(design: LinearDesign) -> Mapping[str, str]:
+GATE_NUMBERS = ("ORDER", "BLOCK", "RUN", "OPEN", "FORGET", "LASTING", "EARLY", "MEDIAN", "RIDGE", "FIRST")
+"""Numbers of the gate that its source has."""
+
+
+def source(design: LinearDesign, gate_settings: GateSettings) -> Mapping[str, str]:
     """Return the text files of the design by name."""
     tables, modes = _Tables(), []
     for i, mode in enumerate(design.modes):
@@ -123,11 +129,22 @@ def source(design: LinearDesign) -> Mapping[str, str]:
         "@PRODUCT@": str(tables.most**2 if tables.n_covariances else 1),
         "@TABLES@": "\n".join(tables.lines),
         "@FILTERS@": ",\n    ".join(modes),
+        "@LEVEL@": repr(float(gate_settings.level)),
+        "@MEMORY@": repr(1.0 - 1.0 / gate.MEMORY),
+        **{f"@{name}@": repr(getattr(gate, name)) for name in GATE_NUMBERS},
     }
     return {name: _fill((TEMPLATES / name).read_text(encoding="utf-8"), words) for name in TEXTS}
 
 
-TEXTS: Sequence[str] = ("wfsobs_controller.h", "wfsobs_controller.c", "test.c", "Makefile", "README.txt")
+TEXTS: Sequence[str] = (
+    "wfsobs_controller.h",
+    "wfsobs_controller.c",
+    "wfsobs_gate.h",
+    "wfsobs_gate.c",
+    "test.c",
+    "Makefile",
+    "README.txt",
+)
 
 
 def _fill(text: str, words: Mapping[str, str]) -> str:
@@ -136,14 +153,15 @@ def _fill(text: str, words: Mapping[str, str]) -> str:
     return text
 
 
-def write_c99(path: str | Path, design: LinearDesign, vectors: Vectors) -> None:
+def write_c99(path: str | Path, design: LinearDesign, vectors: Vectors, gate_settings: GateSettings) -> None:
     """Write the design to a new directory. Raises StepError where there is something of that name."""
     path = Path(path)
     if path.exists() and not (path.is_dir() and not any(path.iterdir())):
         raise StepError(f"{path}: exists; c99 takes a new or empty directory")
     path.mkdir(parents=True, exist_ok=True)
-    contents = {name: text.encode() for name, text in source(design).items()}
+    contents = {name: text.encode() for name, text in source(design, gate_settings).items()}
     contents["input.f64"] = np.hstack([vectors.z, vectors.ngs]).astype("<f8").tobytes()
+    contents["gate.f64"] = np.hstack([vectors.with_outliers, vectors.without_outliers]).astype("<f8").tobytes()
     contents["output.f64"] = vectors.u.astype("<f8").tobytes()
     for name, data in contents.items():
         write_whole(path / name, lambda file, data=data: file.write(data))

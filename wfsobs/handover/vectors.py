@@ -10,6 +10,7 @@ from wfsobs.control.base import Controller, Settings
 from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.prior import Prior
 from wfsobs.record import Measurements, Sampling
+from wfsobs.signal.gate import GateSettings, OutlierGate
 from wfsobs.typing import Array
 
 STEPS = 10_240
@@ -17,14 +18,18 @@ SEED = 1
 
 
 class Vectors(NamedTuple):
-    """z, ngs and u (n_steps, n_modes) [um]; NaN is missing, and ngs is NaN where no frame is due."""
+    """z, ngs and u (n_steps, n_modes) [um], NaN where missing, ngs where no frame is due; z with outliers, and without these."""
 
     z: Array
     ngs: Array
     u: Array
+    with_outliers: Array
+    without_outliers: Array
 
 
-def make_vectors(controller: Controller, prior: Prior, plant: Plant, settings: Settings, sampling: Sampling) -> Vectors:
+def make_vectors(
+    controller: Controller, prior: Prior, plant: Plant, settings: Settings, sampling: Sampling, gate: GateSettings
+) -> Vectors:
     """Run a controller over drawn measurements: slow drifts, a line, white noise; single gaps, a long one, gaps of one mode."""
     rng = np.random.default_rng(SEED)
     n, modes, ratio = STEPS, sampling.n_modes, sampling.ratio or 1
@@ -44,4 +49,9 @@ def make_vectors(controller: Controller, prior: Prior, plant: Plant, settings: S
     measurements = Measurements(z, still, sampling.dt, ngs if sampling.ratio else None, sampling.ratio, delay=sampling.delay)
     free = Plant(Mirror(plant.mirror.delay), plant.dt, plant.ratio)
     laws = controller.laws(prior, free, settings, modes)
-    return Vectors(z, ngs, controller.commands(laws, measurements, prior, free, settings)[0])
+    broken = z.copy()
+    broken[rng.random((n, modes)) < 0.01] += 0.5
+    broken[n // 3 :] += 0.2  # a jump
+    broken[n // 4 :] += 0.1 * np.sin(2.0 * np.pi * 0.11 * np.arange(n - n // 4))[:, None]  # a vibration that appears
+    u = controller.commands(laws, measurements, prior, free, settings)[0]
+    return Vectors(z, ngs, u, broken, OutlierGate(modes, gate).check_all(broken))

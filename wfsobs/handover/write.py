@@ -13,6 +13,7 @@ from wfsobs.handover.vectors import make_vectors
 from wfsobs.priors_from.controllers import own_settings, plant_of
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
+from wfsobs.signal.gate import GateSettings
 from wfsobs.stepping import prior_in, sampling_of
 
 FORMATS = ("c99", "compass", "control", "mat", "npz", "specula")
@@ -53,6 +54,7 @@ def write_design(name: str, scenario: Scenario, form: str, path: str | Path) -> 
     prior = prior_in(name, scenario, controller.parts(groups), scenario, sampling, None)
     linear = linear_design(controller.design(prior, plant, groups, sampling))
     if form == "c99":
-        write_c99(path, linear, make_vectors(controller, prior, plant, groups, sampling))
+        gate = GateSettings(scenario.sensors.gate_level)
+        write_c99(path, linear, make_vectors(controller, prior, plant, groups, sampling, gate), gate)
     else:
         ARRAYS[form](path, linear)

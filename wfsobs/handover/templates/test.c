@@ -1,8 +1,9 @@
-/* Compare with the commands of the run over a record: input.f64 holds z and ngs of every step, output.f64 the commands. */
+/* Compare with the commands of the run over a record: input.f64 holds z and ngs of every step, output.f64 the commands. And with
+   what the gate lets through: gate.f64 holds z of every step before and after it. */
 #include <stdio.h>
 #include <time.h>
 
-#include "wfsobs_controller.h"
+#include "wfsobs_gate.h"
 
 #define MODES WFSOBS_MODES
 
@@ -32,6 +33,22 @@ static long run(FILE *input, FILE *output, double *error, double *sum, double *s
     return n;
 }
 
+/* Number of measurements of which the gate makes something else than it should; and of outliers. */
+static long differ(FILE *file, long *outliers)
+{
+    static wfsobs_gate gate;
+    double row[2 * MODES];
+    long wrong = 0;
+    while (fread(row, sizeof row, 1, file) == 1) {
+        wfsobs_real z[MODES];
+        for (int i = 0; i < MODES; i++) z[i] = (wfsobs_real)row[i];
+        wfsobs_gate_check(&gate, z);
+        for (int i = 0; i < MODES; i++) wrong += (z[i] == z[i]) != (row[MODES + i] == row[MODES + i]);
+    }
+    for (int i = 0; i < MODES; i++) *outliers += (long)gate.modes[i].outliers;
+    return wrong;
+}
+
 /* Time of a step [us], every so many of which has no measurement; 0: none. */
 static double time_of(long steps, long gap)
 {
@@ -48,9 +65,12 @@ static double time_of(long steps, long gap)
 int main(void)
 {
     double error = 0, sum = 0, square = 0, variance, limit = sizeof(wfsobs_real) == 8 ? 1e-12 : 1e-5;
-    FILE *input = fopen("input.f64", "rb"), *output = fopen("output.f64", "rb");
-    long n;
-    if (!input || !output) return fprintf(stderr, "input.f64 or output.f64 is missing\n"), 2;
+    FILE *input = fopen("input.f64", "rb"), *output = fopen("output.f64", "rb"), *gated = fopen("gate.f64", "rb");
+    long n, wrong, outliers = 0;
+    if (!input || !output || !gated) return fprintf(stderr, "input.f64, output.f64 or gate.f64 is missing\n"), 2;
+    wrong = differ(gated, &outliers);
+    fclose(gated);
+    if (wrong || !outliers) return printf("the gate differs in %ld measurements, of %ld outliers\n", wrong, outliers), 1;
     wfsobs_reset(&controller);
     n = run(input, output, &error, &sum, &square);
     fclose(input);
