@@ -244,7 +244,8 @@ class Record(Signals):
 
         def gate(y: Array, z: Array, first: int) -> Array:
             """Test all but the first samples, which lack commands of before the record."""
-            tested = OutlierGate(z[0].size, settings).check_all(z[first:].reshape(len(z[first:]), -1))
+            n_columns = int(np.prod(z.shape[1:]))
+            tested = OutlierGate(n_columns, settings).check_all(z[first:].reshape(-1, n_columns))
             tested = np.concatenate([z[:first], tested.reshape(z[first:].shape)])
             return np.where(tested == z, y, tested + (y - z))
 
@@ -254,7 +255,8 @@ class Record(Signals):
             y_ngs[n::n] = gate(y_ngs[n::n], self.z_ngs[n::n], -(-(self.delay - 1) // n))
         y_lgs = gate(self.y_lgs, self.z, self.delay)
         y_stars = None if self.y_stars is None else gate(self.y_stars, self.z_stars, self.delay)
-        return replace(self, y_lgs=y_lgs, y_ngs=y_ngs, y_stars=y_stars, gate=None)
+        y_open = None if self.open_loop_y is None else gate(self.open_loop_y, self.open_loop_y, self.delay)
+        return replace(self, y_lgs=y_lgs, y_ngs=y_ngs, y_stars=y_stars, open_loop_y=y_open, gate=None)
 
     @property
     def outliers(self) -> int:

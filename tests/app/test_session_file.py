@@ -84,7 +84,8 @@ def same(one: SessionContent, other: SessionContent) -> None:
     for mine, theirs in zip(*sources, strict=True):
         assert type(mine) is type(theirs) and (mine is None or mine.key == theirs.key)
         if isinstance(mine, LoadedRecord):
-            np.testing.assert_equal(vars(mine.record), vars(theirs.record) | {"training": mine.record.training})
+            own = {"training": mine.record.training, "gate": mine.record.gate}  # of the settings, not of the file
+            np.testing.assert_equal(vars(mine.record), vars(theirs.record) | own)
             np.testing.assert_equal(vars(mine.record.training), vars(theirs.record.training))
             names = ("name", "what", "declaration", "sha256")
             assert [getattr(mine, name) for name in names] == [getattr(theirs, name) for name in names]

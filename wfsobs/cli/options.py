@@ -207,9 +207,9 @@ def load_declared(record_file: str, scenario: Scenario, declaration: DeclaredFor
             "prediction and count in no score of one",
             err=True,
         )
-    if record.gate and record.outliers:
+    expected = erfc(record.gate.level / sqrt(2.0)) * record.n_steps * record.n_modes if record.gate else 0.0
+    if record.gate and record.outliers > expected + 3.0 * sqrt(expected):
         what = "missing" if record.gate.action == "reject" else "clipped"
-        expected = erfc(record.gate.level / sqrt(2.0)) * record.n_steps * record.n_modes
         click.echo(
             f"wfsobs: {record_file}: {record.outliers} of {record.n_steps} frames have outliers, which are {what} to observers "
             f"(sensors.gate); {expected:.1g} are expected of Gaussian noise",

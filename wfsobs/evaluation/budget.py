@@ -173,7 +173,7 @@ def error_budget(
     >>> abs(sum(budget.terms.values()) / budget.total - 1.0) < 1e-9
     True
     """
-    scenario, record = result.scenario, result.record
+    scenario, record = result.scenario, result.record.without_outliers
     if record.turbulence is None or record.vibration is None or record.n_steps != scenario.n_steps:
         raise ValueError("error budget: takes a record that was simulated from its scenario")
     if scenario.vibration.source == "psd":

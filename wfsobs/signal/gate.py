@@ -32,7 +32,8 @@ FORGET = 0.1
 LASTING = 4.0
 """Count beyond which the gate opens: that of RUN in a row."""
 RUN = 5
-"""Outliers in a row that are a new level."""
+"""Outliers in a row that are a new level, and missing samples in a row after which the gate is open as well: what then comes is
+not known well enough."""
 OPEN = 20
 """Samples that pass then, while the deviation is doubled."""
 EARLY = 1.0
@@ -95,6 +96,7 @@ class OutlierGate:
         self._weights = np.zeros((n, ORDER))  # of the oldest sample first
         self._weights[:, -1] = 1.0  # until there is a fit the last one is held
         self._deviation, self._out_count, self._open = np.full(n, np.inf), np.zeros(n), np.zeros(n, dtype=int)
+        self._gap, self._settling = np.zeros(n, dtype=int), np.zeros(n, dtype=int)  # samples missing in a row; left after a gap
         self._errors, self._is_usual = np.zeros((n, BLOCK)), np.zeros((n, BLOCK), dtype=bool)
 
     def check(self, z: Array) -> Array:
@@ -103,11 +105,15 @@ class OutlierGate:
             self._offset = np.nan_to_num(z)
         k, limit = self.count % BLOCK, self._limit()
         expected = self._offset + np.einsum("mi,mi->m", self._weights, self._past[:, k : k + ORDER])
-        error = z - expected
+        error, is_there = z - expected, ~np.isnan(z)
+        is_after_gap = is_there & (self._gap >= RUN)
+        self._open = np.where(is_after_gap, OPEN, self._open)
+        self._settling = np.where(is_after_gap, OPEN, np.maximum(self._settling - 1, 0))
+        self._gap = np.where(is_there, 0, self._gap + 1)
         is_outlier = (np.abs(error) > limit) & (self._open == 0)
         is_clipped = self.settings.action == "clip"
         kept = np.where(is_outlier, np.clip(error, -limit, limit) if is_clipped else np.nan, error)
-        self._errors[:, k], self._is_usual[:, k] = error, ~np.isnan(error) & ~is_outlier
+        self._errors[:, k], self._is_usual[:, k] = error, is_there & ~is_outlier & (self._settling == 0)
         self._past[:, ORDER + k] = expected - self._offset + np.nan_to_num(kept)
         self._count(is_outlier)
         return np.where(is_outlier, expected + kept, z)
@@ -116,7 +122,11 @@ class OutlierGate:
         """Return samples z (n, n_modes) [um] as `check` does one by one; all that pass between two outliers at once."""
         out, k = z.copy(), 0
         while k < len(z):
-            n = 0 if self.count == 0 or self._open.any() else self._pass(z[k : k + BLOCK - self.count % BLOCK])
+            n = (
+                0
+                if self.count == 0 or self._open.any() or (self._gap >= RUN).any()
+                else self._pass(z[k : k + BLOCK - self.count % BLOCK])
+            )
             if n == 0:
                 out[k] = self.check(z[k])
             k += max(n, 1)
@@ -166,6 +176,7 @@ class OutlierGate:
         self._errors[:, k : k + n], self._is_usual[:, k : k + n] = error[:, :n], True
         self._past[:, ORDER + k : ORDER + k + n] = x[:, :n]
         self._out_count = self._out_count * (1.0 - FORGET) ** n
+        self._gap = np.where(n > 0, 0, self._gap)
         self.count += n
         if n and k + n == BLOCK:
             self._fit()
@@ -174,9 +185,10 @@ class OutlierGate:
     def _fit(self) -> None:
         """Fit the deviation to the errors of this block, and the autoregression to what has passed."""
         seen = self._is_usual.sum(axis=1) > BLOCK // 4
-        median = np.nanmedian(np.where(self._is_usual | ~seen[:, None], np.abs(self._errors), np.nan), axis=1) / MEDIAN
+        magnitudes = np.where(self._is_usual | ~seen[:, None], np.nan_to_num(np.abs(self._errors)), np.nan)
+        median = np.nanmedian(magnitudes, axis=1) / MEDIAN
         is_first = np.isinf(self._deviation) & seen
-        old = np.where(is_first, median, self._deviation)
+        old = np.where(np.isinf(self._deviation), median, self._deviation)
         self._deviation = np.where(seen, old ** (1.0 - PACE) * median**PACE, self._deviation)
         for mode in np.flatnonzero(is_first).tolist():
             self._clean(mode)
@@ -207,6 +219,8 @@ STATE = (
     "_deviation",
     "_out_count",
     "_open",
+    "_gap",
+    "_settling",
     "_errors",
     "_is_usual",
 )

@@ -122,10 +122,13 @@ void wfsobs_gate_check(wfsobs_gate *g, wfsobs_real *z)
             expected = m->past[k + ORDER - 1];
         limit = WFSOBS_LEVEL * (1 + early / (blocks ? (double)blocks : 1)) * m->deviation;
         error = is_there ? (double)z[i] - m->offset - expected : 0;
+        if (m->settling > 0) m->settling--;
+        if (is_there && m->gap >= RUN) m->open = m->settling = OPEN; /* after a gap the prediction is worth little */
+        m->gap = is_there ? 0 : m->gap + 1;
         is_outlier = is_there && m->is_known && !m->open && size_of(error) > limit;
         m->errors[k] = error;
-        m->usual[k] = is_there && !is_outlier;
-        m->past[ORDER + k] = expected + (m->usual[k] ? error : 0);
+        m->usual[k] = is_there && !is_outlier && !m->settling;
+        m->past[ORDER + k] = expected + (is_outlier ? 0 : error);
         if (is_outlier) {
             volatile wfsobs_real none = 0;
             z[i] = none / none;

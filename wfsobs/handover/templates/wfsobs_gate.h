@@ -15,7 +15,7 @@
 /* The state of one mode, and of a gate; all zero is before the first call. */
 struct wfsobs_gate_mode {
     unsigned long outliers; /* so far */
-    int is_known, is_fitted, open, usual[WFSOBS_BLOCK];
+    int is_known, is_fitted, open, gap, settling, usual[WFSOBS_BLOCK];
     double offset, deviation, lasting, weights[WFSOBS_ORDER], errors[WFSOBS_BLOCK];
     double past[WFSOBS_ORDER + WFSOBS_BLOCK], normal[(WFSOBS_ORDER + 1) * (WFSOBS_ORDER + 1)];
 };
