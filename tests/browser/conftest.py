@@ -116,7 +116,8 @@ class Server:
 @pytest.fixture(scope="session")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     log = tmp_path_factory.mktemp("server") / "log"
-    server = Server(["-m", "panel", "serve", "app", "--port", "{port}", "--liveness"], log, "/app")
+    command = "-m panel serve app --port {port} --liveness --session-token-expiration 86400".split()
+    server = Server(command, log, "/app")
     yield server
     server.close()
 
