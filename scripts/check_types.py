@@ -14,7 +14,13 @@ from pathlib import Path
 LEAST = 0.98
 
 command = [sys.executable, "-m", "pyright", "--verifytypes", "wfsobs", "--ignoreexternal", "--outputjson"]
-place = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}  # an editable installation is not found by pyright
+place = {
+    **os.environ,
+    "PYTHONPATH": str(Path(__file__).parents[1]),  # an editable installation is not found by pyright
+    "PATH": os.pathsep.join(
+        [str(Path(sys.executable).parent), os.environ.get("PATH", "")]
+    ),  # nor are packages but of its first python
+}
 run = subprocess.run(command, capture_output=True, text=True, check=False, env=place)
 names = [s for s in json.loads(run.stdout)["typeCompleteness"]["symbols"] if s["isExported"]]
 library = [s for s in names if not s["name"].startswith("wfsobs.app.")]
