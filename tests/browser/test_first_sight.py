@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from tests.browser.conftest import QUICK
+from tests.browser.conftest import PATIENCE, QUICK
 from wfsobs.observers import OBSERVERS
 
 
@@ -120,6 +120,7 @@ def test_the_tour_is_offered_once_and_observers_are_described(browser: Browser, 
     """To a browser that was not here before; pointing at a card and its focus say what the observer is."""
     context = browser.new_context(viewport={"width": 1280, "height": 720})
     page = context.new_page()
+    page.set_default_timeout(PATIENCE)
     page.goto(server.url + QUICK)
     offer = page.get_by_role("dialog", name="Tour offer")
     offer.get_by_role("button", name="Take the tour").click()
