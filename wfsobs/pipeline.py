@@ -105,7 +105,7 @@ def observe(
     memo : RecordMemo, optional
         Estimates of this record that are known by what they depend on; they do not run, the others are noted there.
     gate : bool
-        Whether outliers are kept from the observers as `scenario.sensors.gate` says; a simulated record has none.
+        Whether outliers are kept from the observers as `scenario.sensors.gate` says; `run` does not test its own simulation.
 
     Returns
     -------

@@ -249,6 +249,8 @@ class StreamFrames:
         """Write what is held back: the counter of the stream is another one from now on."""
         for row in () if self._pairs is None else self._pairs.restart():
             self._write(*row)
+        for gate in self._gates or ():
+            gate.reset()
 
     def _follow_commands(self) -> None:
         while self._desk.inbox.poll():
