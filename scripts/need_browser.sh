@@ -1,6 +1,7 @@
 #!/bin/sh
-# need_browser.sh VENV: the browser of the tests ($CHROMIUM, else chromium) and what playwright's driver in VENV needs
-# of Debian; installed where they are missing and that is allowed, else one line says what to do.
+# need_browser.sh VENV: the browser of the tests ($CHROMIUM, else chromium-headless-shell, which needs a quarter less of the
+# processor, else chromium) and what playwright's driver in VENV needs of Debian; installed where they are missing and that is
+# allowed, else one line says what to do.
 set -eu
 venv=$1
 
@@ -13,7 +14,7 @@ missing() {
     if [ -n "${CHROMIUM:-}" ]; then
         command -v "$CHROMIUM" >/dev/null || fail "CHROMIUM=$CHROMIUM: no such program"
     else
-        command -v chromium >/dev/null || echo chromium
+        command -v chromium-headless-shell >/dev/null || command -v chromium >/dev/null || echo chromium-headless-shell
     fi
     "$venv"/lib/python3*/site-packages/playwright/driver/node --version >/dev/null 2>&1 || echo libatomic1
 }

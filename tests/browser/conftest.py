@@ -129,9 +129,9 @@ def make_server() -> type[Server]:
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
-    named = os.environ.get("CHROMIUM") or shutil.which("chromium")
+    named = os.environ.get("CHROMIUM") or shutil.which("chromium-headless-shell") or shutil.which("chromium")
     if named is None or shutil.which(named) is None:
-        pytest.fail("no browser: apt-get install chromium, or set CHROMIUM to one")
+        pytest.fail("no browser: apt-get install chromium-headless-shell, or set CHROMIUM to one")
     with sync_playwright() as p:
         browser = p.chromium.launch(executable_path=named, args=FLAGS)
         yield browser
