@@ -1,4 +1,4 @@
-"""`wfsobs check`, `wfsobs convert`, `wfsobs identify`, `wfsobs observe`, `wfsobs plant` and `wfsobs probe`: work on a record."""
+"""Commands that work on a record: check, convert, gain, identify, observe, plant; and `wfsobs probe`, which makes none."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ from wfsobs.cli.options import (
     training_options,
 )
 from wfsobs.cli.show import progress_bar, show, show_table, show_verdicts, warn
+from wfsobs.closed_loop.design import design
+from wfsobs.control.telemetry_gain import gain_from_telemetry
 from wfsobs.evaluation.rows import score_rows
 from wfsobs.files import check_writable, write_whole
 from wfsobs.identification import identify as identify_record
@@ -33,9 +35,11 @@ from wfsobs.identification.report import format_number, mode_rows
 from wfsobs.identification.result import Identification
 from wfsobs.pipeline import as_stated
 from wfsobs.pipeline import observe as observe_record
+from wfsobs.priors_from.controllers import plant_of
 from wfsobs.progress import Watch
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
+from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.spectral.search import LOWEST
 from wfsobs.telemetry.intake import DeclaredFormat, to_record
 from wfsobs.telemetry.preview import read_off
@@ -195,6 +199,40 @@ def plant(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha
     show_table(table)
     for line in plant_lines(groups):
         click.echo(line)
+
+
+@click.command()
+@click.argument("record_file", metavar="RECORD")
+@scenario_options
+@record_options
+@click.option("--prior", metavar="FOUND.toml", help="Also the gain by these spectra: the file of `wfsobs identify --out`.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+def gain(
+    record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None, prior: str | None, as_json: bool
+) -> None:
+    """Find the integrator's optimal gain from closed-loop telemetry (docs/closed_loop.md)."""
+    record = load_declared(record_file, scenario, declaration, sha256).without_outliers
+    delay = declaration.command_delay or scenario.control.delay
+    scenario = as_stated(record, told_scenario(prior, scenario)).replace({"control.delay": delay})
+    mirror, leak = plant_of(scenario).mirror, scenario.control.leak
+    laws = design(scenario, ["integrator"]).laws["integrator"] if prior else ()
+    rows = []
+    for mode, name in enumerate(m.name for m in modes_up_to(HIGHEST_ORDER)[: record.n_modes]):
+        found = gain_from_telemetry(record.z[record.delay :, mode], mirror, leak)
+        left = float(np.sqrt(np.nanmean(np.square(record.y_lgs[:, mode]))))
+        law = laws[mode].law if laws else None
+        rows.append({"mode": name, **asdict(found), "recorded_rms": left, "from_spectra": law.gain if law else None})
+    if as_json:
+        click.echo(json.dumps(rows, allow_nan=False))
+        return
+    table = Table(title=f"Gain of the integrator, delay {delay:g} frames", caption="rms: of the measurement, noise and all")
+    for column in ("Mode", "gain", "stable below", "rms, nm", "in the record, nm", *(["by the spectra"] if laws else [])):
+        table.add_column(column, no_wrap=True)
+    for row in rows:
+        best = format_number(Number(row["gain"], row["deviation"]))
+        numbers = [best, f"{row['limit']:.3g}", *(f"{1e3 * row[name]:.3g}" for name in ("measured_rms", "recorded_rms"))]
+        table.add_row(row["mode"], *numbers, *([f"{row['from_spectra']:.3g}"] if row["from_spectra"] else []))
+    show_table(table)
 
 
 @click.command()
