@@ -52,7 +52,7 @@ def compute(of: RunResults, watch: Watch, tell: Tell, memo: Memo | None = None) 
     record, shown = of.result.record, None
     plan = design(of.scenario, [name for name in CONTROLLERS if seconds(name, of.scenario) <= PATIENCE])
     linear = {
-        name: tuple(curves(d.law, plan.mirror, record.dt) for d in laws if d.law)
+        name: tuple(curves(plan.loop(name, mode), d.law.poles, record.dt) for mode, d in enumerate(laws) if d.law)
         for name, laws in plan.laws.items()
         if all(d.margins for d in laws)
     }

@@ -224,7 +224,7 @@ def loop(
         for i in range(seeds):
             one = scenario.replace({"run.seed": scenario.run.seed + i})
             given = simulate(one) if record is None else record
-            result = closed_loop(given, plan, Watch(progress=lambda f, i=i: update((i + f) / seeds)))
+            result = closed_loop(given, replace(plan, scenario=one), Watch(progress=lambda f, i=i: update((i + f) / seeds)))
             all_rows += loop_rows(result, one.run.seed) if record is None else loop_rows(result, None, source=GIVEN)
     if as_json:
         click.echo(json.dumps(all_rows, allow_nan=False))

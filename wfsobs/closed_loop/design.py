@@ -10,17 +10,19 @@ import numpy as np
 from wfsobs.control.base import Controller, Settings
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.law import Law
-from wfsobs.control.margins import Margins, frequencies, margins
+from wfsobs.control.margins import Margins, Response, frequencies, margins
 from wfsobs.control.mirror import Mirror, Plant
+from wfsobs.control.mismatch import SensorSpectra, loops, margins_of, one_loop, pairs, radius, weigh
 from wfsobs.control.residual import residual_variance
+from wfsobs.control.true_plant import TruePlant
 from wfsobs.evaluation.bound import INFORMATION, least_residual
 from wfsobs.observers.kalman.multirate import UnstableCycle
 from wfsobs.prior import Prior, Spectra
-from wfsobs.priors_from.controllers import own_settings, plant_of, prior_for
+from wfsobs.priors_from.controllers import own_settings, plant_of, prior_for, true_plant_of
 from wfsobs.priors_from.scenario import told_spectra
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
-from wfsobs.simulation.true_spectra import has_known_spectra, true_spectra
+from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, true_spectra
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,8 @@ class LawDesign:
     """A law in one mode and what theory says of it.
 
     law           : None for control by nothing, and where there is none
-    stable        : None where there is no law
+    stable        : None where there is no law; that of the law with the plant that it is designed for where the plant as it is
+        is not linear, or with a prediction beside the law
     predicted_rms : rms [um] of the residual by the true spectra; None where the law has no frequency response or is not stable
     margins       : the same
     note          : why there is no law
@@ -50,6 +53,7 @@ class Design:
         the NGS, too; none where the spectrum of the turbulence is not known
     priors : controller -> what it is told, spectra aside, of which only laws are made
     start  : from which the residuals count [s]: after the warm-up, and after what is trained on
+    true   : the plant as it is; None where it is the one that the controllers are designed for
     """
 
     scenario: Scenario
@@ -58,11 +62,30 @@ class Design:
     bounds: dict[str, tuple[float, ...]]
     priors: dict[str, Prior] = field(default_factory=dict, repr=False)
     start: float = 0.0
+    true: TruePlant | None = None
 
     @property
     def mirror(self) -> Mirror:
         """The mirror of the plant."""
         return self.plant.mirror
+
+    def loop(self, controller: str, mode: int) -> Response:
+        """Return T = L / (1 + L) of a time-invariant law with the plant as it is, loops of other modes closed."""
+        if self.true is None:
+            return nominal_loop(_law(self.laws[controller][mode]), self.mirror)
+        columns = next(of for of in pairs(self.true.matrix) if mode in of)
+        laws = [_law(self.laws[controller][column]) for column in columns]
+        return one_loop(laws, self.mirror, self.true, columns, columns.index(mode))
+
+
+def nominal_loop(law: Law, mirror: Mirror) -> Response:
+    """Return T = L / (1 + L) of a time-invariant law with the mirror that it is designed for."""
+    return lambda omega: mirror.response(omega) * law.response(omega)
+
+
+def _law(of: LawDesign) -> Law:
+    assert of.law is not None
+    return of.law
 
 
 def design(scenario: Scenario, controllers: Sequence[str] | None = None, start: float = 0.0) -> Design:
@@ -77,12 +100,16 @@ def design(scenario: Scenario, controllers: Sequence[str] | None = None, start: 
     spectra = [told_spectra(one) for one in true]
     made = {c.id: _design_one(c, before, plant, spectra) for c in select_controllers(controllers)}
     laws, priors = {name: laws for name, (laws, _) in made.items()}, {name: prior for name, (_, prior) in made.items()}
+    delay, actual = plant.mirror.delay, true_plant_of(scenario)
+    if actual is not None:
+        laws = {name: _with_plant(name, of, plant, actual, true) for name, of in laws.items()}
+        delay = actual.delay
     if scenario.events:
         laws = {name: tuple(replace(one, predicted_rms=None) for one in designed) for name, designed in laws.items()}
-        return Design(scenario, plant, laws, {}, priors, max(scenario.run.warm_up, start))
+        return Design(scenario, plant, laws, {}, priors, max(scenario.run.warm_up, start), actual)
     given = ("lgs", "both") if true else ()
-    bounds = {INFORMATION[of]: tuple(least_residual(one, plant.mirror.delay, of) for one in true) for of in given}
-    return Design(scenario, plant, laws, bounds, priors, max(scenario.run.warm_up, start))
+    bounds = {INFORMATION[of]: tuple(least_residual(one, delay, of) for one in true) for of in given}
+    return Design(scenario, plant, laws, bounds, priors, max(scenario.run.warm_up, start), actual)
 
 
 def design_mode(controller: str, scenario: Scenario, mode: int, spectra: Spectra | None) -> LawDesign:
@@ -127,5 +154,38 @@ def _of_mode(
     if not stable or controller.predict is not None or not law.time_invariant:
         return LawDesign(law, stable)
     predicted = None if spectra is None else float(np.sqrt(residual_variance(law, spectra, mirror)))
-    known = margins(lambda omega: mirror.response(omega) * law.response(omega), frequencies(law.poles), plant.dt)
+    known = margins(nominal_loop(law, mirror), frequencies(law.poles), plant.dt)
     return LawDesign(law, stable, predicted, known)
+
+
+def loop_spectra(spectra: TrueSpectra) -> SensorSpectra:
+    """Return true spectra as the theory of loops takes them."""
+    disturbance, cross = spectra.total
+    ngs = spectra.ngs
+    shared = ngs.measurement_cross, sum(ngs.cross.values(), np.zeros(1))
+    return SensorSpectra(disturbance, spectra.measurement, cross, (ngs.signal, *shared), ngs.noise)
+
+
+def _with_plant(
+    controller: str, designs: Sequence[LawDesign], plant: Plant, true: TruePlant, spectra: Sequence[TrueSpectra]
+) -> tuple[LawDesign, ...]:
+    """Return the designs of all modes with stability, residual and margins of the plant as it is; where that is linear."""
+    out = [replace(one, predicted_rms=None, margins=None) for one in designs]
+    if not true.is_linear or CONTROLLERS[controller].predict is not None or not all(one.law and one.stable for one in designs):
+        return tuple(out)
+    for columns in pairs(true.matrix):
+        laws, part = [_law(designs[column]) for column in columns], np.ix_(columns, columns)
+        matrix = true.matrix[part]
+        stable = radius(laws, plant.mirror, replace(true, matrix=matrix)) < 1.0
+        variance: Sequence[float] | None = None
+        if stable and spectra and true.time_invariant:
+            of = loops(laws, plant.mirror)
+            response = true.response(of.images)
+            _, Q = of.solve(response, matrix)
+            variance = of.residual(Q, response, matrix, [weigh(loop_spectra(spectra[column]), of) for column in columns]).tolist()
+        has_margins = stable and true.time_invariant and all(law.time_invariant for law in laws)
+        for i, column in enumerate(columns):
+            known = margins_of(one_loop(laws, plant.mirror, true, columns, i), laws, plant.dt) if has_margins else None
+            rms = None if variance is None else float(np.sqrt(variance[i]))
+            out[column] = replace(out[column], stable=stable, predicted_rms=rms, margins=known)
+    return tuple(out)

@@ -37,11 +37,14 @@ def exact_residuals(controller: str, scenario: Scenario) -> list[PeriodicError]:
     Raises
     ------
     ValueError
-        The spectra are not known, or a law of the controller is none, not stable, or has a prediction beside it.
+        The spectra are not known, the plant has errors, or a law of the controller is none, not stable, or has a prediction
+        beside it.
     """
     if not has_known_spectra(scenario):
         raise ValueError("the spectra of this scenario are not known for the whole record")
     plan = design(scenario, [controller])
+    if plan.true is not None:
+        raise ValueError("the exact residual is that of a plant without errors")
     out = []
     for mode, found in enumerate(plan.laws[controller]):
         if found.law is None or not found.stable or controller.startswith("integrator+"):

@@ -81,6 +81,7 @@ def rows(result: ClosedLoop, seed: int | None, *, source: PriorSource = TRUE) ->
         not run (`note` says why); strehl is that of all modes together
     residual_rms_mas : of tip and tilt alone;  predicted_rms_nm : by theory;  gain : of an integrator, optimised or set
     gain_margin_db, phase_margin_deg, delay_margin_ms : null where a loop has no frequency response or no such limit
+    disk_margin : `control.margins.disk_margin`
     limited : share of the steps in which a limit of the mirror changed the command. Where it is above 0 the loop is not the
         linear one that theory and margins are of: these are null, and `note` says why
     source : where the prior of the controllers comes from
@@ -93,7 +94,15 @@ def rows(result: ClosedLoop, seed: int | None, *, source: PriorSource = TRUE) ->
     def row(controller: str, needs: str, mode: int, stable: bool | None, left: Sequence[float] | None, **more: Any) -> Row:
         known = {
             name: more.get(name)
-            for name in ("predicted_rms_nm", "gain", "gain_margin_db", "phase_margin_deg", "delay_margin_ms", "limited")
+            for name in (
+                "predicted_rms_nm",
+                "gain",
+                "gain_margin_db",
+                "phase_margin_deg",
+                "delay_margin_ms",
+                "disk_margin",
+                "limited",
+            )
         }
         return {
             "controller": controller,
@@ -128,6 +137,7 @@ def rows(result: ClosedLoop, seed: int | None, *, source: PriorSource = TRUE) ->
                     gain_margin_db=20 * log10(m.gain) if m and m.gain else None,
                     phase_margin_deg=degrees(m.phase) if m and m.phase is not None else None,
                     delay_margin_ms=m.delay * 1e3 if m and m.delay is not None else None,
+                    disk_margin=m.disk if m else None,
                     limited=limited,
                     note=outcome.note or (LIMITED if limited else ""),
                 )

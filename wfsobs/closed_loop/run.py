@@ -2,7 +2,8 @@
 
     phi_res[k] = phi_dist[k] + phi_corr[k]
 
-A controller sees z and knows what it commanded; what the mirror does of it is `wfsobs.control.mirror`.
+A controller sees z and knows what it commanded; what the mirror does of it is `wfsobs.control.mirror`, or where the scenario has
+errors of the plant, which no controller knows, `wfsobs.control.true_plant`.
 """
 
 from __future__ import annotations
@@ -10,10 +11,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from functools import partial
 
+import numpy as np
+
 from wfsobs.closed_loop.design import Design, LawDesign, design
 from wfsobs.closed_loop.rows import ClosedLoop, Outcome
 from wfsobs.control.base import Controller
 from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.control.true_plant import TruePlant, drive
 from wfsobs.dependence import Memo, digest, record_digest
 from wfsobs.pipeline import as_stated
 from wfsobs.priors_from.controllers import controller_arguments, own_settings
@@ -106,9 +110,14 @@ def _name(controller: Controller, designs: Sequence[LawDesign], record: Record, 
     laws = [(d.law, d.stable, d.note) for d in designs]
     try:
         _, prior = controller_arguments(controller, record, settings, plan.priors[controller.id])
-        return digest("outcome", controller.id, laws, own, record_digest(record), prior, plan.plant, plan.start)
+        return digest("outcome", controller.id, laws, own, record_digest(record), prior, plan.plant, plan.start, *_plant_of(plan))
     except (TypeError, ValueError):
         return ""
+
+
+def _plant_of(plan: Design) -> tuple[TruePlant, int] | tuple[()]:
+    """Return the plant as it is and the seed of its random numbers; nothing where it is the one of the controllers."""
+    return () if plan.true is None else (plan.true, plan.scenario.run.seed)
 
 
 def _outcome(
@@ -123,9 +132,24 @@ def _outcome(
     try:
         measured, prior = controller_arguments(controller, record, settings, plan.priors[controller.id])
         with detach_watch(watch) as alone:
-            u, limited = controller.commands(laws, measured, prior, plan.plant, settings, alone)
+            if plan.true is None:
+                u, limited = controller.commands(laws, measured, prior, plan.plant, settings, alone)
+                correction = plan.mirror.correction(u)
+            else:
+                stepper = controller.assemble(laws, prior, plan.plant, settings, measured.sampling)
+                u, correction = drive(stepper, measured, plan.true, _plant_generator(plan.scenario), alone)
+                limited = None
     except ValueError as error:
         return Outcome(controller.id, tuple(None for _ in stable), note=str(error))
+    if not np.isfinite(correction).all():
+        frame = int(np.argmin(np.isfinite(correction).all(axis=1)))
+        return Outcome(controller.id, tuple(False for _ in stable), note=f"the loop diverges: frame {frame}")
     start = round(plan.start / record.dt)
-    residual = disturbance + plan.mirror.correction(u)
+    limited = plan.mirror.at_limit(u) if limited is None else limited
+    residual = disturbance + correction
     return Outcome(controller.id, stable, residual, u, tuple(limited[start:].mean(axis=0).tolist()))
+
+
+def _plant_generator(scenario: Scenario) -> np.random.Generator:
+    """Return the generator of the plant's random numbers: the same for every controller, none of those of the record."""
+    return np.random.default_rng(scenario.run.seed).spawn(3)[2]

@@ -150,20 +150,31 @@ class Controller:
         ValueError
             There is none; one line with the reason.
         """
+        return self.assemble(self.laws(prior, plant, settings, sampling.n_modes), prior, plant, settings, sampling, gate)
+
+    def assemble(
+        self,
+        laws: Sequence[Law],
+        prior: Prior,
+        plant: Plant,
+        settings: Settings,
+        sampling: Sampling,
+        gate: GateSettings | None = None,
+    ) -> StepController:
+        """Return `design` with laws that are already made from the same. Raises StepError."""
         if self.predict is not None and self.step_predict is None:
             raise StepError(f"{self.id}: has no step interface")
         if self.ngs and sampling.ratio is None:
             raise StepError(f"{self.id}: needs NGS frames: a sampling with their ratio")
-        found = self.laws(prior, plant, settings, sampling.n_modes)
-        if not all(law.stable for law in found):
+        if not all(law.stable for law in laws):
             raise StepError(f"{self.id}: a pole of the closed loop is not within the unit circle")
         ahead, beside = None, None
         if self.step_predict is not None:
             assert prior.bands is not None
             ahead = VibrationAhead(self.step_predict(prior, plant, settings, sampling), prior.bands, sampling)
-        if not self._takes_missing(found):
+        if not self._takes_missing(laws):
             beside = bridges(prior, sampling.n_modes, sampling.dt, sampling.ratio, _line_width(settings))
-        return StepController(self.id, plant, sampling, step_law(found, plant.mirror), ahead, self.ngs, beside, gate)
+        return StepController(self.id, plant, sampling, step_law(laws, plant.mirror), ahead, self.ngs, beside, gate)
 
     def commands(
         self,

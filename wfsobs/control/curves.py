@@ -11,9 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wfsobs.control.law import Law
-from wfsobs.control.margins import frequencies
-from wfsobs.control.mirror import Mirror
+from wfsobs.control.margins import Response, frequencies
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
 
@@ -37,7 +35,7 @@ class Curves:
             return self.noise / self.rejection
 
 
-def curves(law: Law, mirror: Mirror, dt: float) -> Curves:
-    """Of a time-invariant law and a step `dt` [s]."""
-    omega = frequencies(law.poles)[1:]
-    return Curves(omega / (2.0 * np.pi * dt), mirror.response(omega) * law.response(omega))
+def curves(T: Response, poles: Complex, dt: float) -> Curves:
+    """Of a time-invariant loop of T = L / (1 + L) whose law has these poles, with a step `dt` [s]."""
+    omega = frequencies(poles)[1:]
+    return Curves(omega / (2.0 * np.pi * dt), T(omega))

@@ -1,4 +1,4 @@
-"""How far a linear loop is from instability: gain, phase and delay margin.
+"""How far a linear loop is from instability: gain, phase, delay and disk margin.
 
 With T = P F = L / (1 + L) (`law`), nothing needs to be divided by what may vanish:
 
@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
@@ -32,12 +33,15 @@ class Margins:
         Phase by which the loop gain may be turned, either way [rad].
     delay : float or None
         Additional delay [s].
+    disk : float
+        `disk_margin`.
     """
 
     gain: float | None
     least_gain: float | None
     phase: float | None
     delay: float | None
+    disk: float
 
 
 def margins(T: Response, omega: Array, dt: float) -> Margins:
@@ -54,7 +58,21 @@ def margins(T: Response, omega: Array, dt: float) -> Margins:
         max(factors[(factors >= 0.0) & (factors < 1.0)].tolist(), default=None),
         _least(np.minimum(lag, 2.0 * np.pi - lag)),
         _least(lag / unit * dt),
+        disk_margin(T, omega),
     )
+
+
+def disk_margin(T: Response, omega: Array) -> float:
+    """Disk margin of a stable loop: 1 / max |S - 1/2|, S = 1 - T (P. Seiler et al., IEEE Control Systems 40, 2020).
+
+    The loop bears every complex factor (1 + x/2) / (1 - x/2), |x| below it: gain and phase at once, at any frequency.
+    omega : points from 0 to pi that are close where T changes
+    """
+    size = np.abs(T(omega) - 0.5)
+    i = int(np.argmax(size))
+    ends = omega[max(i - 1, 0)], omega[min(i + 1, omega.size - 1)]
+    found = minimize_scalar(lambda w: -abs(T(np.array([w]))[0] - 0.5), bounds=ends, method="bounded", options={"xatol": 1e-12})
+    return 1.0 / max(float(size[i]), -float(found.fun))
 
 
 def _least(x: Array) -> float | None:

@@ -65,6 +65,11 @@ class Mirror:
         """Whether commands u (n_steps,) [um], from rest, keep the limits."""
         return bool(np.abs(u).max() <= self.stroke and np.abs(np.diff(u, prepend=0.0)).max() <= self.slew)
 
+    def at_limit(self, u: Array) -> Array:
+        """Whether taken commands u (n_steps, ...) [um], from rest, are at a limit; same shape."""
+        near = 1.0 - 1e-12
+        return (np.abs(u) >= near * self.stroke) | (np.abs(np.diff(u, axis=0, prepend=0.0)) >= near * self.slew)
+
     def follow(self, u: Array) -> Array:
         """Return the commands (n_steps,) [um] that the mirror takes for the wanted ones, from rest."""
         if self.within(u):

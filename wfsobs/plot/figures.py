@@ -327,7 +327,8 @@ class LoopPlots:
     def _curves(self, controllers: Sequence[str] | None, mode: str | None) -> dict[str, Curves]:
         column, plan = self.names.index(_one_of(self.names, mode, "mode")), self.loop.design
         laws = {key: of[column] for key, of in plan.laws.items() if controllers is None or key in controllers}
-        return {key: curves(it.law, plan.mirror, self.loop.record.dt) for key, it in laws.items() if it.law and it.margins}
+        known = {key: it.law.poles for key, it in laws.items() if it.law and it.margins}
+        return {key: curves(plan.loop(key, column), poles, self.loop.record.dt) for key, poles in known.items()}
 
 
 @singledispatch

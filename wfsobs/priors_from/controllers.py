@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import inf
+from math import inf, pi
+
+import numpy as np
 
 from wfsobs.control.base import Controller, Settings
 from wfsobs.control.mirror import Mirror, Plant
+from wfsobs.control.true_plant import TruePlant, true_matrix
 from wfsobs.prior import Prior, Spectra, Training
 from wfsobs.priors_from.scenario import prior_of
 from wfsobs.record import Measurements, Record
 from wfsobs.scenario import Scenario
+from wfsobs.sensors.zernike import noll
 
 
 def plant_of(scenario: Scenario) -> Plant:
@@ -19,6 +23,28 @@ def plant_of(scenario: Scenario) -> Plant:
     c = scenario.control
     mirror = Mirror(c.delay, c.stroke or inf, c.rate * scenario.dt * 1e3 or inf)
     return Plant(mirror, scenario.dt, scenario.sensors.exposure_ratio)
+
+
+def true_plant_of(scenario: Scenario) -> TruePlant | None:
+    """Return the plant of a scenario's closed loop as it is; None where it is the one that the controllers are designed for."""
+    p, dt = scenario.plant, scenario.dt
+    matrix = true_matrix([noll(mode.noll) for mode in scenario.modes], p.gain_error, p.rotation, p.coupling)
+    out = TruePlant(
+        matrix,
+        scenario.control.delay + p.delay_error,
+        p.delay_jitter,
+        2.0 * pi * p.resonance * dt,
+        p.damping,
+        p.lost_commands,
+        p.quantum,
+        p.hysteresis,
+        p.hysteresis_range,
+        p.optical_gain_drift * dt,
+        p.optical_gain_rms,
+        p.optical_gain_time / dt,
+    )
+    is_perfect = out.time_invariant and not (p.delay_error or p.resonance) and np.array_equal(matrix, np.eye(len(matrix)))
+    return None if is_perfect else out
 
 
 def own_settings(controller: Controller, scenario: Scenario) -> Settings:

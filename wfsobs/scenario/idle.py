@@ -106,6 +106,12 @@ def _across(scenario: Scenario) -> Iterator[tuple[str, str]]:
             yield "sensors.lgs_angle", "Used only where LGS asterism, radius is above 0"
     if scenario.turbulence.source == "none":
         yield "sensors.tip_tilt_indetermination", "Used only where there is turbulence"
+    if not scenario.plant.resonance:
+        yield "plant.damping", "Used only where Resonance is above 0"
+    if not scenario.plant.hysteresis:
+        yield "plant.hysteresis_range", "Used only where Hysteresis is above 0"
+    if not scenario.plant.optical_gain_rms:
+        yield "plant.optical_gain_time", "Used only where Optical gain, rms is above 0"
     if s.noise_from == "nm" and not (flow and s.kind == "shack-hartmann"):
         yield "sensors.lenslets", "Used only by Shack-Hartmann sensors in frozen flow, and for noise from photons"
     if scenario.kalman.peak == "matched" and _every_mode_has_a_line(scenario):

@@ -18,6 +18,7 @@ import param
 from wfsobs import registry
 from wfsobs.scenario.groups.atmosphere import PsdTable, Telescope, Turbulence
 from wfsobs.scenario.groups.events import FRAMES, LASER, PEAK, WIND, Event, shift, turbulence_time
+from wfsobs.scenario.groups.plant import PlantErrors
 from wfsobs.scenario.groups.run import Control, Loop, Run
 from wfsobs.scenario.groups.sensors import Sensors
 from wfsobs.scenario.groups.vibration import Vibration
@@ -77,6 +78,7 @@ class Scenario(Group):
     kalman: Kalman = section(Kalman, "Kalman filters")
     butterworth: Butterworth = section(Butterworth, "Butterworth reference")
     control: Control = section(Control, "Controllers")
+    plant: PlantErrors = section(PlantErrors, "Plant errors")
     run: Run = section(Run, "Run")
     events: param.List[list[Event]] = param.List(
         [], item_type=Event, bounds=(0, 20), label="Events", doc="What changes during the record."
@@ -169,6 +171,12 @@ class Scenario(Group):
             for kind in ("lgs", "ngs"):
                 fit_lenslets(self.sensors.lenslets, kind, self.telescope.diameter, self.telescope.radial_order)
         self._validate_events()
+        least = self.control.delay + self.plant.delay_error - self.plant.delay_jitter
+        if least < 1.0:
+            raise SettingError(
+                f"plant.delay_error = {self.plant.delay_error:g}: with control.delay = {self.control.delay:g} and "
+                f"plant.delay_jitter = {self.plant.delay_jitter:g} a delay is {least:g} frames; it must be at least 1"
+            )
         widest = max(self.butterworth.bandwidth_offline, self.butterworth.bandwidth_online) / 2
         for i, f in enumerate(self.butterworth.frequencies):
             if not (f - widest > 0 and f + widest < nyquist):

@@ -75,7 +75,7 @@ class PeriodicFilter:
         padded[:n_steps] = v
         # (inputs of a block, all blocks and columns)
         inputs = padded.reshape(blocks, length * m, columns).transpose(1, 0, 2).reshape(length * m, -1)
-        F, G, H, J = self._lift(length)
+        F, G, H, J = self.lift(length)
         n = F.shape[0]
         start = np.zeros((n, columns)) if x0 is None else x0
         states = _block_states(F, (G @ inputs).reshape(n, blocks, columns), start)
@@ -84,7 +84,7 @@ class PeriodicFilter:
         steps = out.reshape(length, p, blocks - left, columns).transpose(2, 0, 1, 3).reshape(-1, p, columns)
         return steps[since - left * length : n_steps - left * length]
 
-    def _lift(self, length: int) -> tuple[Array, Array, Array, Array]:
+    def lift(self, length: int) -> tuple[Array, Array, Array, Array]:
         """Return the map of one block: (F, G, H, J) with all the inputs and outputs of the block stacked."""
         F0, G0, H0, _ = self.steps[0]
         n, m, p = F0.shape[0], G0.shape[1], H0.shape[0]

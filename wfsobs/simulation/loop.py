@@ -19,8 +19,8 @@ from wfsobs.simulation.disturbance import make_disturbance
 from wfsobs.simulation.sensing import OpenLoop, measure_noise, measure_open_loop
 from wfsobs.typing import Array
 
-TOLD = ("kalman", "butterworth", "control")
-"""Groups of what observers and controllers are told, which no simulation reads; nor does it read their own."""
+TOLD = ("kalman", "butterworth", "control", "plant")
+"""Groups of what observers and controllers are told, and of their plant, which no simulation of a record reads; nor their own."""
 
 TRAINING_MARGIN = 0.5
 """Time after the last window of a training record [s]; it keeps the end of the zero-phase filter out of the targets."""

@@ -19,7 +19,7 @@ from wfsobs.app.store import Store
 from wfsobs.app.style import look
 from wfsobs.app.views.plots import ExtraLines
 from wfsobs.app.views.spectrum_editor import Frames, HandleLayer, positive
-from wfsobs.closed_loop.design import LawDesign, design_mode
+from wfsobs.closed_loop.design import LawDesign, design_mode, nominal_loop
 from wfsobs.control.curves import Curves, curves
 from wfsobs.control.integrator import highest_stable_gain
 from wfsobs.evaluation.error_spectra import Theory
@@ -221,7 +221,7 @@ class GainEditor:
         found = design_mode(INTEGRATOR, trial, mode, spectra)
         if found.law is None or not found.stable:
             raise ValueError(f"the loop is not stable with a gain of {trial.control.gain:.3g}")
-        return trial.control.gain, found, curves(found.law, plant_of(trial).mirror, trial.dt)
+        return trial.control.gain, found, curves(nominal_loop(found.law, plant_of(trial).mirror), found.law.poles, trial.dt)
 
     def _land(self, replies: Sequence[int], answer: Answer | None, why: str) -> None:
         if not self.display.editing:
