@@ -178,6 +178,11 @@ def test_every_number_states_its_unit_or_has_none(subtests: pytest.Subtests) -> 
         "share",
         "third_corner",
         "gate_level",
+        "gain_error",
+        "coupling",
+        "lost_commands",
+        "hysteresis",
+        "optical_gain_rms",
     }
     for path, p in ALL.items():
         with subtests.test(path):

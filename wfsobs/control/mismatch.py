@@ -173,7 +173,8 @@ def _images_of(law: Law, omega: Array) -> tuple[Complex, Complex]:
         inside = np.exp(1j * c * omega[part])[:, None, None] * np.eye(len(F)) - F
         out[part] = H @ np.linalg.solve(inside, np.broadcast_to(G.astype(complex), (len(inside), *G.shape))) + J
     out = -np.conj(turn).swapaxes(1, 2) @ out / c
-    return out[:, :, ::inputs] @ turn, out[:, :, 1] if inputs > 1 else np.zeros((omega.size, c), dtype=complex)
+    ngs: Complex = out[:, :, 1] if inputs > 1 else np.zeros((omega.size, c), dtype=complex)
+    return np.matmul(out[:, :, ::inputs], turn, dtype=complex), ngs
 
 
 def _steps(law: Law) -> Sequence[FilterStep]:
