@@ -13,11 +13,11 @@ from math import pi
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
-from wfsobs.identification.check import known_numbers, sign_of
 from wfsobs.identification.plant import _Data, _Fit, _rotation, identify_plant
 from wfsobs.record import Record
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.spectral.model import Spectrum
+from wfsobs.telemetry.check import known_numbers, sign_of
 from wfsobs.typing import Array
 
 DT, N = 1e-3, 20_000

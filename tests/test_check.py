@@ -16,9 +16,9 @@ from scipy.stats import binom
 from tests.test_plant import closed_loop, rotation
 from wfsobs import PRESETS, simulate
 from wfsobs.cli import main
-from wfsobs.identification.check import LEVEL, find_changes
 from wfsobs.record import Record
 from wfsobs.signal.ar2 import Ar2
+from wfsobs.telemetry.check import LEVEL, find_changes
 from wfsobs.telemetry.records import save_record
 from wfsobs.typing import Array
 

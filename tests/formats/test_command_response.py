@@ -10,8 +10,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from tests.test_plant import closed_loop as loop_of_plant
+from tests.test_plant import rotation
 from wfsobs.cli import main
 from wfsobs.cli.options import load_declared
+from wfsobs.identification.plant import contradiction
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -19,7 +22,7 @@ from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.command_response import DECIDED, command_response, saturation_lines
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.preview import Preview, preview
-from wfsobs.telemetry.records import contradiction, load, save_record
+from wfsobs.telemetry.records import load, save_record
 from wfsobs.typing import Array
 
 GAIN, LEAK, NOISE = 0.4, 0.995, 0.05
@@ -152,22 +155,58 @@ def test_no_rail_is_seen_in_loops_without(disturbance: Array) -> None:
 @pytest.mark.parametrize("steps", [2000, 20_000])
 @pytest.mark.parametrize("delay", [1, 2, 3])
 def test_what_the_data_exclude(disturbance: Array, delay: int, steps: int) -> None:
-    """The wrong sign always, the right one never; nor the right delay, nor those beside it, which are nearly as likely."""
+    """The wrong sign always, the right one never; nor the right delay."""
     noise = NOISE * np.random.default_rng(3).standard_normal(disturbance.shape)
     record = closed_loop(disturbance, noise, 1, delay)
     record = replace(record, y_lgs=record.y_lgs[:steps], u=record.u[:steps] + 30.0, delay=delay)
     assert contradiction(record) == ""
     reverse = contradiction(replace(record, u=-record.u), -1)
-    assert reverse.startswith("command sign -1 is excluded by the data") and "and with +1 the spectrum" in reverse
+    assert reverse.startswith("command sign -1 is excluded by the data") and reverse.endswith(" with +1")
     if delay < 3:
-        assert contradiction(replace(record, delay=5)).startswith("command delay 5 is excluded by the data: with")
+        assert contradiction(replace(record, delay=5)).startswith("command delay 5 is excluded by the data, which")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("delay", "matrix", "line"),
+    [
+        (1.5, np.eye(2), r"command delay 2 is excluded by the data, .* with (1\.\d+) \+- .*"),
+        (2.0, 1.25 * np.eye(2), r"command gain 1 of (?:tip|tilt) is excluded by the data, .* with (1\.\d+) \+- .*"),
+        (2.0, rotation(np.radians(96.0)), r"command rotation 0 is excluded by the data, .* with \+(9\d\.\d) degrees, y = R u"),
+        (2.0, np.diag([1.0, -1.0]), r"command sign (\+1) of tilt is excluded by the data, .* with -1, .*"),
+        (2.0, np.diag([-1.0, 1.0]), r"command sign (\+1) of tip is excluded by the data, .* with -1, .*"),
+        (2.0, np.eye(2), ""),
+    ],
+)
+def test_what_else_the_data_exclude(delay: float, matrix: Array, line: str) -> None:
+    """Read as of two frames, gain 1, no rotation; numbers within five of the deviations that are usual in 20 s."""
+    found = re.fullmatch(line, contradiction(replace(loop_of_plant(20_000, delay, matrix, gain=0.4), delay=2)))
+    assert found, line
+    right = {1.5: 1.5}.get(delay, float(matrix[0, 0]) if line.startswith("command gain") else 96.0)
+    if "+-" in line or "degrees" in line:
+        assert float(found[1]) == pytest.approx(right, abs=5.0 * (0.3 if "degrees" in line else 0.03))
+
+
+def test_a_unit_that_is_none_is_not_taken_for_micrometres(tmp_path: Path) -> None:
+    """Nanometres without a unit; stated, or trusted, they are read."""
+    record = simulate(PRESETS["paper"]().replace({"run.duration": 2.0}))
+    np.savez(path := tmp_path / "r.npz", y_lgs=1e3 * record.y_lgs, u=1e3 * record.u, dt=record.dt)
+    with pytest.raises(RecordError, match=r"no unit is stated, .* plausible as nm.*; --trust goes on"):
+        load(path)
+    np.testing.assert_allclose(load(path, unit="nm").y_lgs, record.y_lgs)
+    np.testing.assert_allclose(load(path, trust=True).y_lgs, 1e3 * record.y_lgs)
+    shown = preview(path.read_bytes(), path.name)
+    assert isinstance(shown, Preview) and shown.reading.missing.startswith("Choose the unit first")
 
 
 def test_what_does_not_decide_is_not_excluded() -> None:
-    """Commands that follow nothing, too few steps, a mirror at rest, a loop so slow that its commands are lost in the noise."""
+    """Commands that follow nothing, or do nothing, too few steps, a mirror at rest, a loop so slow that its commands are lost in
+    the noise; numbers without noise."""
     rng = np.random.default_rng(5)
     noise, u = rng.standard_normal((5000, 2)), rng.standard_normal((5000, 2)).cumsum(axis=0)
-    for y, commands in ((noise, u), (noise[:300], u[:300]), (noise, 0.0 * u), (noise, -1e-3 * noise.cumsum(axis=0)), (u, u)):
+    slow, half, ramp = 1e-3 * noise.cumsum(axis=0), noise[:, :1].repeat(2, axis=1), np.arange(5000.0)[:, None] * [1.0, -1.0]
+    last = [(noise, half), (half, slow), (ramp, ramp), (noise, np.sign(ramp - 2500.5))]
+    for y, commands in ((noise, u), (noise[:300], u[:300]), (noise, 0.0 * u), (noise, -slow), (u, u), *last):
         for sign in (1, -1):
             assert contradiction(Record(y, sign * commands, 1e-3)) == ""
 
@@ -186,11 +225,11 @@ def test_every_way_in_refuses_a_wrong_sign_unless_it_is_trusted(tmp_path: Path) 
         words = [str(wrong) if word == "RECORD" else word for word in words]
         done = CliRunner().invoke(main, words)
         assert done.exit_code != 0 and done.stdout == ""
-        assert re.fullmatch(r"wfsobs: .*wrong.npz: command sign \+1 is excluded by the data: .*; --trust goes on\n", done.stderr)
+        assert re.fullmatch(r"wfsobs: .*wrong.npz: command sign \+1 is excluded by the data, .*; --trust goes on\n", done.stderr)
         done = CliRunner().invoke(main, [*words, "--trust"])
         assert done.exit_code == 0, done.output
     with pytest.raises(RecordError, match="command sign"):
         load(wrong)
     assert load(wrong, trust=True).n_steps == record.n_steps
     found = preview(wrong.read_bytes(), "wrong.npz")
-    assert isinstance(found, Preview) and "trust those stated: command sign +1 is excluded" in found.reading.missing
+    assert isinstance(found, Preview) and "trust what is stated: command sign +1 is excluded" in found.reading.missing

@@ -118,9 +118,7 @@ def record_options(command: Callable) -> Callable:
 
     return add_options(
         with_declaration,
-        click.option(
-            "--trust", is_flag=True, help="Take sign and delay of the commands as stated, whatever the file or the data say."
-        ),
+        click.option("--trust", is_flag=True, help="Take commands and unit as stated, whatever the file or the data say."),
         click.option("--sha256", metavar="HEX", help="Refuse the record unless its file has this SHA-256."),
         click.option(
             "--column",

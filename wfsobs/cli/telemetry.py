@@ -27,7 +27,6 @@ from wfsobs.evaluation.rows import score_rows
 from wfsobs.files import check_writable, write_whole
 from wfsobs.identification import identify as identify_record
 from wfsobs.identification import report as identified
-from wfsobs.identification.check import Check, check_record
 from wfsobs.identification.identification import LEVEL
 from wfsobs.identification.plant import design_probe, identify_plant, plant_dict, plant_lines
 from wfsobs.identification.process import Number
@@ -41,6 +40,7 @@ from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.spectral.search import LOWEST
+from wfsobs.telemetry.check import Check, check_record
 from wfsobs.telemetry.intake import DeclaredFormat, to_record
 from wfsobs.telemetry.preview import read_off
 from wfsobs.telemetry.records import load_record, name_differences, open_record, read_contents, save_arrays, save_record

@@ -20,9 +20,8 @@ from wfsobs.telemetry.command_response import CommandResponse, command_response,
 from wfsobs.telemetry.formats.contents import TIME, Contents
 from wfsobs.telemetry.formats.psd import NoSpectrumError, read_psd
 from wfsobs.telemetry.intake import DeclaredFormat, to_record
-from wfsobs.telemetry.records import contradiction_of, read_columns, read_contents, stated_delay, stated_sign
+from wfsobs.telemetry.records import contradiction_of, plausible_units, read_columns, read_contents, stated_delay, stated_sign
 from wfsobs.typing import Array
-from wfsobs.units import UNITS, micrometres_per
 
 MOST_FILE = 64_000_000
 """Maximum bytes of an uploaded file."""
@@ -33,9 +32,6 @@ MOST_NUMBERS = 256_000_000
 LONGEST_NAME = 80
 MOST_OFFERED = 100
 """Maximum columns that are offered to be said what they are."""
-
-PLAUSIBLE = (0.02, 5.0)
-"""Rms of tip or tilt of turbulence and vibration on telescopes of 1 to 40 m, with a margin [um]."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +49,7 @@ class Reading:
     limits : list of str
         What the data say of commands at the limit of the mirror, a line per mode.
     contradiction : str
-        Why the data exclude its sign or delay, unless that is trusted.
+        Why the data exclude its commands or its unit, unless that is trusted.
     delay : float
         Delay of the commands as the file or the user states it, with its fraction [steps].
     gain : tuple of float or None
@@ -80,8 +76,8 @@ class Reading:
     @property
     def missing(self) -> str:
         """What to say before the record can be used, in a line; empty where nothing is."""
-        if self.contradiction or set(self.units) <= {"um"}:
-            return self.contradiction and f"Take the proposed sign and delay, or trust those stated: {self.contradiction}."
+        if set(self.units) <= {"um"}:
+            return self.contradiction and f"State what the data say, or trust what is stated: {self.contradiction}."
         return f"Choose the unit first: the file does not say it, and the numbers are plausible as {' or '.join(self.units)}."
 
 
@@ -241,14 +237,11 @@ def preview(data: bytes, name: str, scenario: Scenario | None = None, declaratio
 
 def read_off(record: Record, contents: Contents, declaration: DeclaredFormat, scenario: Scenario) -> Reading:
     """Return what the data say of sign, delay and unit of a record and the contents of its file."""
-    z = record.z[record.delay :]
-    size = max(rms(column[~np.isnan(column)]) for column in z.T)
-    sign, known = stated_sign(contents, declaration), declaration.unit or contents.units or "unit" in contents.arrays
-    response, excluded = command_response(replace(record, u=sign * record.u)), contradiction_of(record, contents, declaration)
-    units = {} if known else {unit: size * micrometres_per(unit, scenario.telescope.diameter) for unit in UNITS}
-    plausible = {unit: x for unit, x in units.items() if PLAUSIBLE[0] <= x <= PLAUSIBLE[1]}
+    sign, units = stated_sign(contents, declaration), plausible_units(record, contents, declaration, scenario)
+    response = command_response(replace(record, u=sign * record.u))
+    excluded = contradiction_of(record, contents, declaration, scenario)
     stated = stated_delay(contents, declaration), declaration.command_gain
-    return Reading(sign, response, plausible, saturation_lines(record), excluded, *stated)
+    return Reading(sign, response, units, saturation_lines(record), excluded, *stated)
 
 
 def safe_name(name: str) -> str:

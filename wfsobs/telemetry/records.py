@@ -1,9 +1,4 @@
-"""Reading and writing of records: files of any format, checked, in one form. See docs/data.md.
-
-Whether the data exclude the sign or the delay of the commands of a closed loop.
-
-The spectrum of a disturbance in white noise falls, lines aside; that of z under a wrong sign or delay has the humps of the loop.
-"""
+"""Reading and writing of records: files of any format, checked, in one form. See docs/data.md."""
 
 from __future__ import annotations
 
@@ -18,19 +13,15 @@ from typing import IO
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.fft import rfft
-from scipy.ndimage import binary_dilation, median_filter
-from scipy.optimize import isotonic_regression
 
 from wfsobs.files import write_whole
+from wfsobs.identification.plant import contradiction
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import DELAY, Record, RecordError, hold_last
+from wfsobs.record import DELAY, Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
-from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.columns import join_clock, to_contents
-from wfsobs.telemetry.command_response import LONGEST, MOST_STEPS, command_response
 from wfsobs.telemetry.formats import format_of, writer_of
 from wfsobs.telemetry.formats.contents import Contents, FileColumns
 from wfsobs.telemetry.formats.csv import write
@@ -38,64 +29,7 @@ from wfsobs.telemetry.formats.npz import write as write_npz
 from wfsobs.telemetry.intake import DeclaredFormat, to_record
 from wfsobs.telemetry.modal import LoopMatrix, matrix_of, split_source
 from wfsobs.typing import Array
-
-REVERSED = 0.7
-"""Minimum correlation of what is new in a command and in the measurement of its row, of a sign that is reversed."""
-
-BANDS, LINE = 60, 10.0
-"""Bands of a spectrum that falls; how often the median about it a bin is that is left out, as one of a line."""
-
-CLEAR, CLEAR_DELAY, FALLS = 30.0, 0.01, 0.5
-"""Log-likelihood by which a sign is excluded; per sample, a delay (at least twice the first); that a falling band may lack."""
-
-
-def contradiction(record: Record, sign: int = 1) -> str:
-    """Return in a line why the data exclude that y = disturbance + u, `record.delay` steps later; empty where they do not.
-
-    sign : of the commands as it was stated, for the line alone; that of the record is +1
-    """
-    response = command_response(record)
-    if response is None:
-        return ""
-    y, u = (hold_last(x[LONGEST:MOST_STEPS, : len(TIP_TILT)]) for x in (record.y_lgs, record.u))
-    moving = np.ptp(u, axis=0) > 0
-    y, u = (x[:, moving] / max(np.abs(y).max(), np.abs(u).max()) for x in (y, u))
-    ways = [(0, 1), *((s, d) for s in (1, -1) for d in {*range(1, LONGEST + 1), record.delay})]
-    fits = sum(_falling(*mode, ways) for mode in zip(y.T, u.T, strict=True))
-    likelihood, lacks = (dict(zip(ways, x, strict=True)) for x in np.transpose(fits))
-    best, reverse = (max((w for w in ways if w[0] == s), key=lambda w: likelihood[w]) for s in (1, -1))
-    falls = "the spectrum of z falls as that of a disturbance does, lines aside"
-    if response.reply > REVERSED and likelihood[reverse] - max(likelihood[best], likelihood[0, 1]) > CLEAR:
-        row = f"commands move with the measurement of their row (correlation {response.reply:+.2f})"
-        return f"command sign {sign:+d} is excluded by the data: {row}, and with {-sign:+d} {falls}"
-    clear = max(2.0 * CLEAR, CLEAR_DELAY * len(y))
-    if likelihood[best] - max(likelihood[1, record.delay], likelihood[0, 1]) > clear and lacks[best] < FALLS * BANDS * y.shape[1]:
-        return f"command delay {record.delay} is excluded by the data: with {best[1]}, not with {record.delay}, {falls}"
-    return ""
-
-
-def _falling(y: Array, u: Array, ways: Sequence[tuple[int, int]]) -> Array:
-    """Return for every sign and delay the log-likelihood of the falling spectrum that is likeliest, and what it lacks, (ways, 2).
-
-    Lines are left out: bins far above those about them, of y or u, whatever the sign and the delay are.
-    """
-    n = len(y)
-    f = np.arange(2, n // 2) / n
-    Y, U = (rfft((x - x.mean()) * np.hanning(n + 2)[1:-1])[2 : n // 2] for x in (y, u))
-    keep = np.ones(len(f), dtype=bool)
-    for power in (np.abs(Y) ** 2, np.abs(U) ** 2):
-        keep &= ~binary_dilation(power > LINE * median_filter(power, min(201, len(f) // 20 | 1)), iterations=3)
-    edges = np.unique(np.concatenate([[0], np.geomspace(20, len(f), BANDS).astype(int)]))[:-1]
-    count = np.add.reduceat(keep.astype(float), edges)
-    out, known = [], count > 0
-    for sign, delay in ways:
-        power = keep * np.abs(Y - sign * np.exp(-2j * np.pi * f * delay) * U) ** 2
-        level = np.add.reduceat(power, edges)[known] / count[known]
-        level = np.maximum(level, max(1e-20 * level.max(), 1e-300))
-        S = isotonic_regression(level, weights=count[known], increasing=False).x
-        out.append([-0.5 * count[known] @ np.log(S), 0.5 * count[known] @ np.log(S / level)])  # half the bins: of a taper
-    return np.array(out)
-
+from wfsobs.units import UNITS, micrometres_per
 
 MOST_BYTES = 4_000_000_000
 """Maximum bytes of numbers in a file."""
@@ -298,8 +232,8 @@ def read_record(
     try:
         stated = declaration or DeclaredFormat()
         contents = read_contents(file, name, stated.columns, most)
-        record = to_record(contents, scenario or Scenario(), stated)
-        if why := contradiction_of(record, contents, stated):
+        record = to_record(contents, scenario := scenario or Scenario(), stated)
+        if why := contradiction_of(record, contents, stated, scenario):
             raise RecordError(f"{why}; --trust goes on")
         return record
     except RecordError as error:
@@ -318,9 +252,28 @@ def stated_delay(contents: Contents, declaration: DeclaredFormat) -> float:
     return stated if declaration.trust and declaration.command_delay else float(contents.arrays.get("delay", stated))
 
 
-def contradiction_of(record: Record, contents: Contents, declaration: DeclaredFormat) -> str:
-    """Return why the data exclude the sign or the delay with which a record was read; empty where they do not, or are not to."""
-    return "" if declaration.trust else contradiction(record, stated_sign(contents, declaration))
+def contradiction_of(record: Record, contents: Contents, declaration: DeclaredFormat, scenario: Scenario) -> str:
+    """Return why the data exclude the plant or the unit with which a record was read; empty where they do not, or are not to."""
+    if declaration.trust:
+        return ""
+    units = plausible_units(record, contents, declaration, scenario)
+    if units and "um" not in units:
+        return f"no unit is stated, and um is excluded by the size of z, plausible as {' or '.join(units)}: state the unit"
+    stated = stated_sign(contents, declaration), stated_delay(contents, declaration), declaration.command_gain or (1.0,)
+    return contradiction(record, *stated)
+
+
+PLAUSIBLE = (0.02, 5.0)
+"""Rms of tip or tilt of turbulence and vibration on telescopes of 1 to 40 m, with a margin [um]."""
+
+
+def plausible_units(record: Record, contents: Contents, declaration: DeclaredFormat, scenario: Scenario) -> dict[str, float]:
+    """Return the units under which the size of z is plausible, and its rms [um]; none where the unit is stated."""
+    if declaration.unit or contents.units or "unit" in contents.arrays:
+        return {}
+    size = float(np.sqrt(np.nanmean(record.z[record.delay :] ** 2, axis=0).max()))
+    units = {unit: size * micrometres_per(unit, scenario.telescope.diameter) for unit in UNITS}
+    return {unit: x for unit, x in units.items() if PLAUSIBLE[0] <= x <= PLAUSIBLE[1]}
 
 
 def read_contents(file: IO[bytes], name: str, roles: Mapping[str, str], most: int = MOST_BYTES) -> Contents:

@@ -21,7 +21,8 @@ from wfsobs.identification.result import Identification
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError, hold_last
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
-from wfsobs.telemetry.preview import PLAUSIBLE, Reading
+from wfsobs.telemetry.preview import Reading
+from wfsobs.telemetry.records import PLAUSIBLE
 from wfsobs.typing import Array
 
 SECTIONS = 8
