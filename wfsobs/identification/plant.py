@@ -278,7 +278,7 @@ OFF_DELAY, OFF_GAIN, TURNED = 0.2, 0.1, 10.0
 def _known_signals(record: Record, most: int) -> tuple[Array, Array]:
     """Return the first measurements of a record, NaN where a command that they may see is lost, and commands."""
     y, u = record.y_lgs[:most].copy(), hold_last(record.u[:most])
-    lost = np.isnan(record.u[:most]).any(axis=1)
+    lost = np.isnan(record.u[:most]).sum(axis=1) > 0
     for lag in range(1, LONGEST + 2):
         y[lag:][lost[:-lag]] = np.nan
     return y, u

@@ -22,7 +22,7 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError, hold_last
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.telemetry.preview import Reading
-from wfsobs.telemetry.records import PLAUSIBLE
+from wfsobs.telemetry.records import PLAUSIBLE, z_rms
 from wfsobs.typing import Array
 
 SECTIONS = 8
@@ -144,7 +144,7 @@ def _frames(record: Record) -> Iterator[Remark]:
 
 
 def _unit(record: Record, reading: Reading) -> Iterator[Remark]:
-    size, (least, most) = float(np.sqrt(np.nanmean(record.z[record.delay :] ** 2, axis=0).max())), PLAUSIBLE
+    size, (least, most) = z_rms(record), PLAUSIBLE
     if not least <= size <= most:
         usual = f"turbulence and vibration have {1e3 * least:g} to {1e3 * most:g} nm: check the unit"
         yield Remark("unit", "note", f"z has {1e3 * size:.3g} nm rms, where {usual}")

@@ -257,21 +257,27 @@ def contradiction_of(record: Record, contents: Contents, declaration: DeclaredFo
     if declaration.trust:
         return ""
     units = plausible_units(record, contents, declaration, scenario)
-    if units and "um" not in units:
+    if units and not PLAUSIBLE[0] / FAR < z_rms(record) < PLAUSIBLE[1] * FAR:
         return f"no unit is stated, and um is excluded by the size of z, plausible as {' or '.join(units)}: state the unit"
     stated = stated_sign(contents, declaration), stated_delay(contents, declaration), declaration.command_gain or (1.0,)
     return contradiction(record, *stated)
 
 
-PLAUSIBLE = (0.02, 5.0)
-"""Rms of tip or tilt of turbulence and vibration on telescopes of 1 to 40 m, with a margin [um]."""
+PLAUSIBLE, FAR = (0.02, 5.0), 10.0
+"""Rms of tip or tilt of turbulence and vibration on telescopes of 1 to 40 m, with a margin [um]; factor beyond which um, where no
+unit is stated, is refused."""
+
+
+def z_rms(record: Record) -> float:
+    """Return the largest rms of a mode of z [um]."""
+    return float(np.sqrt(np.nanmean(record.z[record.delay :] ** 2, axis=0).max()))
 
 
 def plausible_units(record: Record, contents: Contents, declaration: DeclaredFormat, scenario: Scenario) -> dict[str, float]:
     """Return the units under which the size of z is plausible, and its rms [um]; none where the unit is stated."""
     if declaration.unit or contents.units or "unit" in contents.arrays:
         return {}
-    size = float(np.sqrt(np.nanmean(record.z[record.delay :] ** 2, axis=0).max()))
+    size = z_rms(record)
     units = {unit: size * micrometres_per(unit, scenario.telescope.diameter) for unit in UNITS}
     return {unit: x for unit, x in units.items() if PLAUSIBLE[0] <= x <= PLAUSIBLE[1]}
 
