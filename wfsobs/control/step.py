@@ -6,46 +6,34 @@ prediction of the vibration beside it. Over a frame it does what `Controller.com
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from wfsobs.control.mirror import Plant
 from wfsobs.control.step_laws import StepLaw, VibrationAhead, push_row
 from wfsobs.observers.missing import Bridge
-from wfsobs.observers.step import StepError, check_frame, check_ngs, check_stars, check_state, make_gates, pass_gate
-from wfsobs.observers.stepping import Stateful, load_parts, save_parts
+from wfsobs.observers.step import StepBase, StepError
 from wfsobs.record import Sampling
 from wfsobs.signal.gate import GateSettings
 from wfsobs.typing import Array
 
 
-class StepController:
+class StepController(StepBase):
     """A controller of several modes, one frame at a time; made by `wfsobs.design`.
 
     Attributes
     ----------
-    id : str
-        Of the controller.
     plant : Plant
         Mirror, step and NGS ratio that it was designed for.
-    sampling : Sampling
-        Number of modes, step and NGS ratio.
-    bridges : tuple of Bridge or None
-        What completes LGS measurements and NGS frames; None where missing ones are none to its law.
-    frame : int
-        Frames that it has taken.
+    law : StepLaw or None
+        The laws of all modes; None for no command.
+    ahead : VibrationAhead or None
+        Prediction of the vibration beside them.
     """
 
-    id: str
     plant: Plant
-    sampling: Sampling
     law: StepLaw | None
     ahead: VibrationAhead | None
-    frame: int
-    uses_ngs: bool
-    bridges: tuple[Bridge, Bridge] | None
 
     def __init__(
         self,
@@ -58,22 +46,16 @@ class StepController:
         bridges: tuple[Bridge, Bridge] | None,
         gate: GateSettings | None = None,
     ):
-        self.id, self.plant, self.sampling, self.law, self.ahead = id, plant, sampling, law, ahead
-        self.frame = 0
+        super().__init__(id, sampling, uses_ngs, bridges, gate)
+        self.plant, self.law, self.ahead = plant, law, ahead
         n = sampling.n_modes
-        self.uses_ngs, self._ratio = uses_ngs, sampling.ratio or 0
-        self.bridges, (self._lgs, self._ngs) = bridges, bridges or (None, None)
-        if not uses_ngs:
-            self._ngs = None
         self._taps = plant.mirror.taps[1:]
         self._commands = np.zeros((len(self._taps), n))  # commands, newest first
         self._mirror = np.zeros((max(self._ratio, 1), n))  # the mirror in the last measurements, newest first
+        self._arrays = {"sent": self._commands, "mirror": self._mirror}
         self._none = np.zeros(n)
-        found = {"lgs": self._lgs, "law": law, "ngs": self._ngs}
-        self._parts: dict[str, Stateful] = {name: part for name, part in found.items() if part is not None}
+        self._parts |= {} if law is None else {"law": law}
         self._parts |= {} if ahead is None else ahead.parts
-        self._gates = make_gates(gate, sampling, uses_ngs)
-        self._parts |= self._gates
 
     def update(self, y: ArrayLike, ngs: ArrayLike | None = None, *, stars: int | None = None) -> Array:
         """Take the measurements of a frame and return its command.
@@ -126,23 +108,13 @@ class StepController:
         return self._taps @ self._commands
 
     def _take(self, x: ArrayLike, ngs: ArrayLike | None, stars: int | None, name: str, is_open: bool) -> Array:
-        x, is_whole = check_frame(self.id, x, name, self.sampling.n_modes, self.frame)
-        check_stars(self.id, stars)
-        due = self.uses_ngs and self.frame > 0 and self.frame % self._ratio == 0
-        slow = check_ngs(self.id, ngs, due, self.sampling.n_modes, self._ratio, self.frame) if self.uses_ngs else None
+        x, is_whole, slow = self._check(x, ngs, stars, name)
         seen = self.correction
-        z = x if is_open else x - seen
-        if self._gates:
-            z = pass_gate(self._gates, "gate_lgs", z, self.frame, self.sampling)
-            is_whole = is_whole and not np.isnan(z).any()
-        if self._lgs is not None:
-            z = self._lgs.complete(z, is_whole)
+        z = self._complete_lgs(x if is_open else x - seen, is_whole)
         if self.uses_ngs:
             push_row(self._mirror, seen)
         if slow is not None:
-            slow = slow if is_open else slow - self._mirror.mean(axis=0)
-            slow = pass_gate(self._gates, "gate_ngs", slow, self.frame, self.sampling)
-            slow = slow if self._ngs is None else self._ngs.complete(slow)
+            slow = self._complete_ngs(slow if is_open else slow - self._mirror.mean(axis=0))
         forward = self._none
         if self.ahead is not None:
             z, forward = self.ahead.split(z)
@@ -159,25 +131,6 @@ class StepController:
         """Do what does not need to be done before the command is out; the next `update` does it otherwise."""
         if self.ahead is not None:
             self.ahead.estimator.settle()
-
-    def reset(self) -> None:
-        """Go back to before the first frame, the mirror at rest."""
-        self.frame = 0
-        self._commands[...] = self._mirror[...] = 0.0
-        for part in self._parts.values():
-            part.reset()
-
-    def state_dict(self) -> dict[str, Array]:
-        """Return a copy of the state: name -> array, plain numbers that `numpy.savez` can keep."""
-        own = {"frame": np.array(self.frame), "sent": self._commands.copy(), "mirror": self._mirror.copy()}
-        return own | save_parts(self._parts)
-
-    def load_state_dict(self, state: Mapping[str, ArrayLike]) -> None:
-        """Go on from a state of `state_dict`. Raises StepError where it is that of another design."""
-        given = check_state(self.id, state, self.state_dict())
-        self.frame = int(given["frame"])
-        self._commands[...], self._mirror[...] = given["sent"], given["mirror"]
-        load_parts(self._parts, given)
 
     def take_over(self, old: StepController) -> None:
         """Go on where another design of the same controller is, without a bump.
@@ -200,12 +153,7 @@ class StepController:
             self.ahead.estimator.take_over(old.ahead.estimator)
             if self.ahead.bank.x.shape == old.ahead.bank.x.shape:
                 self.ahead.bank.load(old.ahead.bank.save())
-        for bridge, was in ((self._lgs, old._lgs), (self._ngs, old._ngs)):
-            if bridge is not None and was is not None:
-                bridge.take_over(was)
-        for name in self._gates.keys() & old._gates.keys():
-            self._gates[name].load(old._gates[name].save())
-        self._commands[...], self._mirror[...], self.frame = old._commands, old._mirror, old.frame
+        self._take_over(old)
 
     def _clip(self, command: Array) -> Array:
         """Return the commands nearest to these within the limits of the mirror."""

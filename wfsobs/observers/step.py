@@ -144,24 +144,114 @@ def run_frames(estimator: Any, targets: Sequence[str], measurements: Measurement
     return Estimates(found[0], {target: x for target, x in found[1].items() if not np.isnan(x).all()})
 
 
-class StepObserver:
-    """An observer of several modes, one frame at a time; made by `wfsobs.design`.
+class StepBase:
+    """What observers and controllers share, one frame at a time: checks, gates, the bridging of gaps, and the state.
 
     Attributes
     ----------
     id : str
-        Of the observer.
-    targets : tuple of str
-        What it estimates.
+        Of the observer or controller.
     sampling : Sampling
         Modes, step, NGS ratio and delay that it was designed for.
+    uses_ngs : bool
+        Whether it takes NGS frames.
+    bridges : tuple of Bridge or None
+        What completes LGS measurements and NGS frames; None where it takes missing ones as missing.
     frame : int
         Frames that it has taken.
     """
 
     id: str
-    targets: tuple[str, ...]
     sampling: Sampling
+    uses_ngs: bool
+    bridges: tuple[Bridge, Bridge] | None
+    frame: int
+
+    def __init__(
+        self,
+        id: str,
+        sampling: Sampling,
+        uses_ngs: bool,
+        bridges: tuple[Bridge, Bridge] | None,
+        gate: GateSettings | None,
+        each_shape: tuple[int, int] | None = None,
+    ):
+        self.id, self.sampling, self.uses_ngs, self.bridges, self.frame = id, sampling, uses_ngs, bridges, 0
+        self._ratio = sampling.ratio or 0
+        self._lgs, self._ngs = bridges or (None, None)
+        if not uses_ngs:
+            self._ngs = None
+        self._gates = make_gates(gate, sampling, uses_ngs, each_shape)
+        known = {"lgs": self._lgs, "ngs": self._ngs, **self._gates}
+        self._parts: dict[str, Stateful] = {name: part for name, part in known.items() if part is not None}
+        self._arrays: dict[str, Array] = {}
+
+    def reset(self) -> None:
+        """Go back to before the first frame, a mirror at rest."""
+        self.frame = 0
+        for x in self._arrays.values():
+            x[...] = 0.0
+        for part in self._parts.values():
+            part.reset()
+
+    def state_dict(self) -> dict[str, Array]:
+        """Return a copy of the state: name -> array, plain numbers that `numpy.savez` can keep."""
+        own = {name: x.copy() for name, x in self._arrays.items()}
+        return {"frame": np.array(self.frame), **own, **save_parts(self._parts)}
+
+    def load_state_dict(self, state: Mapping[str, ArrayLike]) -> None:
+        """Go on from a state of `state_dict`. Raises StepError where it is that of another design."""
+        given = check_state(self.id, state, self.state_dict())
+        self.frame = int(given["frame"])
+        for name, x in self._arrays.items():
+            x[...] = given[name]
+        load_parts(self._parts, given)
+
+    def _check(self, x: ArrayLike, ngs: ArrayLike | None, stars: int | None, name: str) -> tuple[Array, bool, Array | None]:
+        """Return an LGS measurement, whether it has no NaN, and an NGS frame that is due. Raises StepError."""
+        x, is_whole = check_frame(self.id, x, name, self.sampling.n_modes, self.frame)
+        check_stars(self.id, stars)
+        if not self.uses_ngs:
+            return x, is_whole, None
+        due = self.frame > 0 and self.frame % self._ratio == 0
+        return x, is_whole, check_ngs(self.id, ngs, due, self.sampling.n_modes, self._ratio, self.frame)
+
+    def _complete_lgs(self, z: Array, is_whole: bool) -> Array:
+        """Pass the gate and the bridge of LGS measurements."""
+        if self._gates:
+            z = pass_gate(self._gates, "gate_lgs", z, self.frame, self.sampling)
+            is_whole = is_whole and not np.isnan(z).any()
+        return z if self._lgs is None else self._lgs.complete(z, is_whole)
+
+    def _complete_ngs(self, z: Array) -> Array:
+        """Pass the gate and the bridge of NGS frames."""
+        z = pass_gate(self._gates, "gate_ngs", z, self.frame, self.sampling)
+        return z if self._ngs is None else self._ngs.complete(z)
+
+    def _take_over(self, old: StepBase) -> None:
+        """Go on with the bridges, gates and arrays of another design."""
+        for new, was in ((self._lgs, old._lgs), (self._ngs, old._ngs)):
+            if new is not None and was is not None:
+                new.take_over(was)
+        for name in self._gates.keys() & old._gates.keys():
+            self._gates[name].load(old._gates[name].save())
+        for name, x in self._arrays.items():
+            x[...] = old._arrays[name]
+        self.frame = old.frame
+
+
+class StepObserver(StepBase):
+    """An observer of several modes, one frame at a time; made by `wfsobs.design`.
+
+    Attributes
+    ----------
+    targets : tuple of str
+        What it estimates.
+    estimator : Estimator
+        What differs from observer to observer.
+    """
+
+    targets: tuple[str, ...]
     estimator: Estimator
 
     def __init__(
@@ -174,19 +264,14 @@ class StepObserver:
         bridges: tuple[Bridge, Bridge] | None,
         gate: GateSettings | None = None,
     ):
-        self.id, self.targets, self.sampling, self.estimator = id, targets, sampling, estimator
-        self.frame, self._ratio, self._needs_ngs = 0, sampling.ratio or 0, needs_ngs
-        self._lgs, self._ngs = bridges or (None, None)
-        if not needs_ngs:
-            self._ngs = None
-        found = {id: estimator, "lgs": self._lgs, "ngs": self._ngs}
-        self._parts: dict[str, Stateful] = {name: part for name, part in found.items() if part is not None}
+        self.targets, self.estimator = targets, estimator
         self._each_shape: tuple[int, int] | None = getattr(estimator, "each_shape", None)
-        self._gates = make_gates(gate, sampling, needs_ngs, self._each_shape)
-        self._parts |= self._gates
+        super().__init__(id, sampling, needs_ngs, bridges, gate, self._each_shape)
+        self._parts[id] = estimator
         self._allowed_requests: set[tuple[float, str]] = set()
         self._nothing = np.full(sampling.n_modes, np.nan)
         self._see_stars: Callable[[int | None], None] | None = getattr(estimator, "see_stars", None)
+        self._see_each: Callable[[Array], None] | None = getattr(estimator, "see_each", None)
 
     def update(
         self,
@@ -219,27 +304,18 @@ class StepObserver:
             A wrong shape, an infinite number, an NGS frame that is not due, no command, or no LGS apart, where that is needed.
             The frame is then not taken.
         """
-        z, is_whole = self._check(z, "z")
-        check_stars(self.id, stars)
-        due = self._needs_ngs and self.frame > 0 and self.frame % self._ratio == 0
-        slow = check_ngs(self.id, ngs, due, self.sampling.n_modes, self._ratio, self.frame) if self._needs_ngs else None
+        z, is_whole, slow = self._check(z, ngs, stars, "z")
         if self.estimator.needs_command:
             if u is None:
                 raise StepError(f"{self.id}: its windows hold commands: update(z, u=...) takes that of the frame, too")
-            u, _ = self._check(u, "u")
+            u, _ = check_frame(self.id, u, "u", self.sampling.n_modes, self.frame)
         else:
             u = None
-        if self._each_shape is not None:
+        if self._each_shape is not None and self._see_each is not None:
             stars_apart = check_each(self.id, each, self._each_shape, self.frame)
-            self.estimator.see_each(pass_gate(self._gates, "gate_each", stars_apart, self.frame, self.sampling))  # type: ignore[attr-defined]
-        if self._gates:
-            z = pass_gate(self._gates, "gate_lgs", z, self.frame, self.sampling)
-            is_whole = is_whole and not np.isnan(z).any()
-            slow = None if slow is None else pass_gate(self._gates, "gate_ngs", slow, self.frame, self.sampling)
-        if self._lgs is not None:
-            z = self._lgs.complete(z, is_whole)
-        if slow is not None and self._ngs is not None:
-            slow = self._ngs.complete(slow)
+            self._see_each(pass_gate(self._gates, "gate_each", stars_apart, self.frame, self.sampling))
+        z = self._complete_lgs(z, is_whole)
+        slow = None if slow is None else self._complete_ngs(slow)
         if self._see_stars is not None:
             self._see_stars(stars)
         self.estimator.advance(z, slow, u)
@@ -288,22 +364,6 @@ class StepObserver:
         """
         self.estimator.settle()
 
-    def reset(self) -> None:
-        """Go back to before the first frame."""
-        self.frame = 0
-        for part in self._parts.values():
-            part.reset()
-
-    def state_dict(self) -> dict[str, Array]:
-        """Return a copy of the state: name -> array, plain numbers that `numpy.savez` can keep."""
-        return {"frame": np.array(self.frame), **save_parts(self._parts)}
-
-    def load_state_dict(self, state: Mapping[str, ArrayLike]) -> None:
-        """Go on from a state of `state_dict`. Raises StepError where it is that of another design."""
-        given = check_state(self.id, state, self.state_dict())
-        self.frame = int(given["frame"])
-        load_parts(self._parts, given)
-
     def take_over(self, old: StepObserver) -> None:
         """Go on where another design of the same observer is: the estimates continue without a start of their own.
 
@@ -320,15 +380,7 @@ class StepObserver:
         if old.id != self.id or old.sampling != self.sampling:
             raise StepError(f"{self.id}: takes over from a design of the same observer and sampling, not from {old.id}")
         self.estimator.take_over(old.estimator)
-        for new, was in ((self._lgs, old._lgs), (self._ngs, old._ngs)):
-            if new is not None and was is not None:
-                new.take_over(was)
-        for name in self._gates.keys() & old._gates.keys():
-            self._gates[name].load(old._gates[name].save())
-        self.frame: int = old.frame
-
-    def _check(self, x: ArrayLike, name: str) -> tuple[Array, bool]:
-        return check_frame(self.id, x, name, self.sampling.n_modes, self.frame)
+        self._take_over(old)
 
 
 def make_gates(
