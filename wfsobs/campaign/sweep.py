@@ -331,7 +331,8 @@ class SweepResults:
         """
         if key[0] in BOUNDS:
             known = [s.rms for scores in self.scores.get(cell, ()) for s in scores if (s.observer, s.target, s.mode) == key]
-            return (float(np.mean(known)),) * 3 if known else None  # type: ignore[return-value]
+            mean = float(np.mean(known)) if known else None
+            return None if mean is None else (mean, mean, mean)
         evidence = self.evidence.get(cell)
         mean = evidence.mean(key) if evidence else None
         if evidence is None or mean is None:

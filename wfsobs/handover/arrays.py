@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.io import savemat
@@ -38,14 +39,14 @@ def arrays(design: LinearDesign) -> dict[str, Array]:
 
 def write_npz(path: str | Path, design: LinearDesign) -> None:
     """Write the arrays to an NPZ file. Raises OSError."""
-    write_whole(path, lambda file: np.savez_compressed(file, **arrays(design)))  # type: ignore[arg-type]
+    write_whole(path, lambda file: np.savez_compressed(file, allow_pickle=False, **arrays(design)))
 
 
 def write_mat(path: str | Path, design: LinearDesign) -> None:
     """Write the arrays to a MATLAB file. Raises OSError."""
     values = {name: str(x) if x.dtype.kind == "U" else x for name, x in arrays(design).items()}
-    buffer = BytesIO()
-    savemat(buffer, values)  # type: ignore[arg-type]
+    buffer: Any = BytesIO()
+    savemat(buffer, values)
     write_whole(path, lambda file: file.write(buffer.getvalue()))
 
 

@@ -99,4 +99,4 @@ def write_compass(path: str | Path, design: LinearDesign) -> None:
     text = np.array("\n".join(conventions(design, COMPASS)))
     values = {"A": A, "L": L, "K": K, "F": np.eye(len(K))}
     matrices = {name: np.asarray(x, np.float32) for name, x in values.items()}
-    write_whole(path, lambda file: np.savez_compressed(file, conventions=text, **matrices))  # type: ignore[arg-type]
+    write_whole(path, lambda file: np.savez_compressed(file, allow_pickle=False, conventions=text, **matrices))

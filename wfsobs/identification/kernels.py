@@ -161,7 +161,7 @@ def fit_kernels(
 
 def fitted_numbers(kernel: Kernel) -> list[str]:
     """Return the names of the numbers of a kernel that can be fitted; ValueError where there is none."""
-    found = [field.name for field in fields(kernel) if field.type == "Number"]  # type: ignore[arg-type]
+    found = [field.name for field in fields(kernel) if field.type == "Number"]
     if not found:
         raise ValueError(f"{type(kernel).__name__} cannot be fitted; a sum is given as a sequence of its parts")
     return found
@@ -178,7 +178,7 @@ def _fit_mode(name: str, parts: dict[str, tuple[Kernel, ...]], noise: float, dt:
     def at(x: Array) -> dict[str, tuple[Kernel, ...]]:
         values = dict(zip(places, np.exp(x[:-1]).tolist(), strict=True))
         return {
-            part: tuple(replace(k, **{f: values[part, i, f] for f in fitted_numbers(k)}) for i, k in enumerate(all_))  # type: ignore[type-var]
+            part: tuple(replace(k, **{f: values[part, i, f] for f in fitted_numbers(k)}) for i, k in enumerate(all_))
             for part, all_ in parts.items()
         }
 

@@ -630,7 +630,8 @@ class _Data:
         band = np.cumsum(cell.count / (NARROW + BAND * self.n * self.dt * cell.frequency)).astype(int)
         weight = np.bincount(band, cell.count)
         some = weight > 0
-        return tuple(np.bincount(band, cell.count * one)[some] / weight[some] for one in (cell.frequency, x))  # type: ignore[return-value]
+        frequency, mean = (np.bincount(band, cell.count * one)[some] / weight[some] for one in (cell.frequency, x))
+        return frequency, mean
 
     def uncertainty(self, fit: _Fit) -> float:
         """Return the 95 % limit of the rms of the error of z over the rms of z, in the worst octave."""

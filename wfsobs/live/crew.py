@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from multiprocessing.queues import Queue
@@ -62,7 +63,7 @@ def warm_up_of(site: Site) -> int:
     return round(site.settings["run"]["warm_up"] / site.sampling.dt)
 
 
-class Crew(Generic[D, M]):
+class Crew(ABC, Generic[D, M]):
     """What runs in one process: designs D, as the members M of the crew.
 
     Parameters
@@ -109,17 +110,17 @@ class Crew(Generic[D, M]):
                 self._say(LiveEvent(number, "{} on", name))
             self._waiting.clear()
 
+    @abstractmethod
     def start(self, name: str, design: D, number: int) -> None:
         """Let a design follow from a frame on."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _swap(self, name: str, member: M, design: D) -> None:
         """Have a design go on where a member is. Raises StepError."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _clear(self, name: str, member: M) -> None:
         """Clear what one had that is off."""
-        raise NotImplementedError
 
 
 class Follower:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 import numpy as np
 from scipy.linalg import cython_blas, cython_lapack
@@ -25,9 +26,9 @@ _name.restype, _name.argtypes = ctypes.c_char_p, [ctypes.py_object]
 _pointer.restype, _pointer.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
 
 
-def _routine(module: object, name: str, n_arguments: int):
+def _routine(module: Any, name: str, n_arguments: int):
     """Return a Fortran routine by name; every argument is an address."""
-    capsule = module.__pyx_capi__[name]  # type: ignore[attr-defined]
+    capsule = module.__pyx_capi__[name]
     return ctypes.CFUNCTYPE(None, *([ctypes.c_void_p] * n_arguments))(_pointer(capsule, _name(capsule)))
 
 

@@ -376,10 +376,10 @@ def _stamped_frames(signals: dict[str, Array], arrays: Mapping[str, Array], star
 
 
 def _training(signals: Mapping[str, Array]) -> Training | None:
-    found = [name for name in TRAINING[:2] if name in signals]
-    if len(found) == 1:
+    y, u, open_loop_y = map(signals.get, TRAINING)
+    if (y is None) != (u is None):
         raise RecordError("training_y and training_u must come together")
-    return Training(*(signals.get(name) for name in TRAINING)) if found else None  # type: ignore[arg-type]
+    return None if y is None or u is None else Training(y, u, open_loop_y)
 
 
 def _clock(name: str, raw: Array, n: int) -> Array:
@@ -399,9 +399,10 @@ def _number_of(
 ) -> float:
     """Return a number of the file, else the declared one, which comes first where it is trusted, else the default."""
     if name not in arrays or (trust and declaration is not None):
-        if declaration is None and default is None:
+        found = default if declaration is None else declaration
+        if found is None:
             raise RecordError("y_ngs needs ratio, the number of fast steps per NGS frame")
-        return declaration if declaration is not None else default  # type: ignore[return-value]
+        return found
     value = float(raw) if (raw := arrays[name]).ndim == 0 and raw.dtype.kind in "fiu" else np.nan
     if not np.isfinite(value):
         raise RecordError(f"{name} takes a number, not {np.array2string(raw, threshold=4)[:40]}")

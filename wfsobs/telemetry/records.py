@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -67,9 +67,9 @@ def save(path: str | Path, record: Record) -> None:
 def name_differences(record: Record, other: Record) -> list[str]:
     """Return the parts of a record that another does not have, or has otherwise."""
 
-    def differs(one: object, two: object) -> bool:
+    def differs(one: Any, two: Any) -> bool:
         if one is None or two is None or not hasattr(one, "__dict__"):
-            return one is not two if one is None or two is None else not np.array_equal(one, two, equal_nan=True)  # type: ignore[arg-type]
+            return one is not two if one is None or two is None else not np.array_equal(one, two, equal_nan=True)
         return any(differs(part, vars(two)[name]) for name, part in vars(one).items())
 
     names = [one.name for one in fields(record) if one.name not in ("origin", "gate")]

@@ -132,8 +132,8 @@ def _value(group: Any, path: str) -> Any:
     return reduce(lambda node, key: node[int(key)] if isinstance(node, list) else getattr(node, key), path.split("."), group)
 
 
-def _parameter(scenario: Scenario, path: str) -> param.Number:
-    return next(p for known, _, p in scenario.walk() if known == path)  # type: ignore[return-value]
+def _parameter(scenario: Scenario, path: str) -> Any:
+    return next(p for known, _, p in scenario.walk() if known == path)
 
 
 def _limits(bounds: tuple[Any, Any] | None) -> tuple[float, float]:

@@ -14,10 +14,10 @@ Every number may be complex with a tiny imaginary part: its effect on a result i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import Field, dataclass
 from functools import cache
 from math import factorial, pi
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from scipy.linalg import block_diag, expm
@@ -61,7 +61,9 @@ class StateSpace(NamedTuple):
 
 
 class Kernel(Protocol):
-    """A kernel of time, and the state space that it is."""
+    """A kernel of time, a dataclass of its numbers, and the state space that it is."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
     def state_space(self) -> StateSpace:
         """Return its stochastic equation."""
