@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.special import jv
 
+from tests.noll import noll_covariance
 from wfsobs.atmosphere.von_karman import von_karman_density
 from wfsobs.priors_from.scenario import modelled_processes
 from wfsobs.scenario import Scenario
-from wfsobs.sensors.zernike import noll_covariance
 from wfsobs.simulation import layers as atmosphere
 from wfsobs.simulation.disturbance import make_disturbance
 from wfsobs.simulation.guide_stars import lgs_error_process, lgs_error_variance, low_frequency_process

@@ -9,10 +9,11 @@ import pytest
 from scipy.signal import welch
 from scipy.special import j0, jv
 
+from tests.noll import noll_covariance
 from wfsobs.atmosphere.frozen_flow import FrequencyGrid, View, fft_length, frozen_flow, waves
 from wfsobs.atmosphere.plane_waves import Footprint
 from wfsobs.atmosphere.von_karman import TurbulenceLayer, von_karman_density
-from wfsobs.sensors.zernike import ZernikeProjection, bessel_ratio, noll, noll_covariance
+from wfsobs.sensors.zernike import ZernikeProjection, bessel_ratio, noll
 
 D, R0, L0 = 8.0, 0.157, 25.0
 STRENGTH = R0 ** (-5 / 3)

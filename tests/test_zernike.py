@@ -8,12 +8,12 @@ from math import factorial
 import numpy as np
 import pytest
 
+from tests.noll import noll_covariance
 from wfsobs.atmosphere.plane_waves import Footprint, Wave
 from wfsobs.sensors.zernike import (
     ZernikeProjection,
     bessel_ratio,
     noll,
-    noll_covariance,
     tabulated_bessel_ratio,
     transform,
     up_to_order,

@@ -23,7 +23,7 @@ from wfsobs.priors_from.controllers import controller_arguments, own_settings
 from wfsobs.priors_from.scenario import bands_of, kalman_model, modelled_processes, spectra_of
 from wfsobs.priors_from.turbulence import measurement_noise
 from wfsobs.progress import QUIET
-from wfsobs.record import Record, RecordError, Training
+from wfsobs.record import Record, RecordError, Training, delay_signal
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.errors import SettingError
@@ -181,7 +181,7 @@ def test_a_vibration_that_is_predicted_is_not_corrected_twice(changes: dict[str,
     known = ~np.isnan(ahead)
     ahead = np.where(known, ahead, 0.0)
     f = np.where(known, online_reference(bands_of(scenario), record.z, record.dt)[:, 0], 0.0)
-    commanded = plan.mirror.in_measurement(ahead)  # vib_hat[k-1] with two frames of delay
+    commanded = delay_signal(plan.mirror.correction(ahead), 1)  # vib_hat[k-1] with two frames of delay
     law = plan.laws["integrator+gpr-offline"][0].law
     assert law is not None and law.gain is not None
     own = np.zeros(record.n_steps)

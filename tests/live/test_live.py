@@ -15,6 +15,7 @@ from wfsobs.latencies import EDGES, Latencies
 from wfsobs.live.ring import CAPACITY, Ring
 from wfsobs.live.simulated import Integrator, endless_blocks
 from wfsobs.observers import OBSERVERS
+from wfsobs.prior import Training
 from wfsobs.scenario.presets import paper
 from wfsobs.telemetry.records import save_record
 
@@ -133,7 +134,7 @@ def test_live_numbers_are_those_of_the_recording(session):
     result, path = session
     record = wfsobs.load(path)
     scenario = paper().replace({"run.warm_up": 0.2})
-    names = [n for n in result["observers"] if record.training is not None or "training data" not in OBSERVERS[n].needed_parts]
+    names = [n for n in result["observers"] if record.training is not None or Training not in OBSERVERS[n].prior]
     assert {"kf-lgs", "multirate-optimal", "gpr-online"} <= set(names)
     for name in names:
         for s in wfsobs.observe(record, scenario, observers=[name]).scores:

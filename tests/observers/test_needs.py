@@ -12,6 +12,7 @@ from tests.records import ON_PAPER
 from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import BANDS, LINES, MODEL, TRAINING, Observer
+from wfsobs.prior import Training, words_for
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -69,9 +70,9 @@ def test_an_observer_depends_on_what_it_is_said_to_need(name: str, record: Recor
     learnt = replace(record, training=replace(record.training, y_lgs=record.training.y_lgs[::-1].copy()))
     if not np.array_equal(estimates(observer, learnt, scenario()), base, equal_nan=True):
         depends.add(TRAINING)
-    assert depends == set(observer.needed_parts)
+    assert depends == set(words_for(observer.prior))
 
 
 def test_what_learns_from_a_record_needs_it_in_the_record() -> None:
     for observer in OBSERVERS.values():
-        assert (TRAINING in observer.needed_parts) == ("training" in observer.needs)
+        assert (Training in observer.prior) == ("training" in observer.needs)

@@ -48,10 +48,6 @@ class Mirror:
         """phi_corr (n_steps, ...) [um] of commands u of that shape."""
         return lfilter(self.taps[1:], [1.0], u, axis=0)
 
-    def in_measurement(self, u: Array) -> Array:
-        """Return the commands as the measurements see them, one step later; same shape."""
-        return lfilter(self.taps, [1.0], u, axis=0)
-
     def response(self, omega: Array) -> Complex:
         """P, from a command to the measurement, at omega [rad per step]; same shape."""
         return np.exp(-1j * np.multiply.outer(omega, np.arange(self.taps.size))) @ self.taps

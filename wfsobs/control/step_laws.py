@@ -43,7 +43,17 @@ class StepLaw(Stateful, Protocol):
         ...
 
 
-class LinearLaws(StateArrays):
+class _Laws(StateArrays):
+    """Laws of one gain, for which the commands sent do not matter."""
+
+    def see_stars(self, count: int | None) -> None:
+        """Ignored: constant gain."""
+
+    def tell(self, command: Array, forward: Array) -> None:
+        """Ignored: z holds none of the commands."""
+
+
+class LinearLaws(_Laws):
     """Laws as filters of z."""
 
     state_names: tuple[str, ...] = ("bank",)
@@ -54,9 +64,6 @@ class LinearLaws(StateArrays):
         self._v = np.zeros((len(laws), laws[0].cycle.steps[0][1].shape[1]))
         self.mark_start()
 
-    def see_stars(self, count: int | None) -> None:
-        """Take no notice: there is one gain."""
-
     def command(self, z: Array, ngs: Array | None, forward: Array) -> Array:
         """Return what the filters give."""
         v = self._v
@@ -64,9 +71,6 @@ class LinearLaws(StateArrays):
         if v.shape[1] > 1:
             v[:, 1] = 0.0 if ngs is None else ngs
         return self.bank.step(v)[:, 0] + forward
-
-    def tell(self, command: Array, forward: Array) -> None:
-        """Take no notice: z holds none of the commands."""
 
     def take_over(self, old: Any) -> None:
         """Go on from a state of the same size."""
@@ -77,7 +81,7 @@ class LinearLaws(StateArrays):
         self.bank.load(old.bank.save())
 
 
-class KalmanLaws(StateArrays):
+class KalmanLaws(_Laws):
     """Laws as rows of what Kalman filters estimate; a measurement that is missing, NaN, is none to them."""
 
     laws: tuple[Law, ...]
@@ -107,9 +111,6 @@ class KalmanLaws(StateArrays):
         none = np.zeros(len(self.laws))
         return np.array([self.command(z, ngs, none) for z, ngs, _ in each_frame(self.filters, measurements, watch)])
 
-    def tell(self, command: Array, forward: Array) -> None:
-        """Take no notice: z holds none of the commands."""
-
     def take_over(self, old: Any) -> None:
         """Go on where the disturbance is in the old filters' states."""
         if not isinstance(old, KalmanLaws) or len(old.filters.bank.maps) != len(self.filters.bank.maps):
@@ -117,7 +118,7 @@ class KalmanLaws(StateArrays):
         self.filters.take_over(old.filters)
 
 
-class Integrators(StateArrays):
+class Integrators(_Laws):
     """Integrators whose state are their own commands, so that a limit of the mirror stops them (anti-windup)."""
 
     state_names: tuple[str, ...] = ("_own",)
@@ -129,9 +130,6 @@ class Integrators(StateArrays):
         self._taps = mirror.taps[1:]
         self._own = np.zeros((len(self._taps), len(laws)))  # newest first
         self.mark_start()
-
-    def see_stars(self, count: int | None) -> None:
-        """Take no notice: there is one gain."""
 
     def command(self, z: Array, ngs: Array | None, forward: Array) -> Array:
         """Return leak u - g y, y the measurement with the integrator's own commands alone."""

@@ -244,11 +244,6 @@ class Observer:
         """Whether it takes so long that no other waits for it."""
         return self.weight >= SLOW
 
-    @property
-    def needed_parts(self) -> tuple[str, ...]:
-        """What it has to be told of a simulation beside measurements, of the words above."""
-        return words_for(self.prior)
-
     def needs_text(self, *, source: PriorSource = TRUE) -> str:
         """Return what it has to be told beside measurements, for people; source : where its prior comes from."""
         return ", ".join(words_for(self.prior, source=source)) or NOTHING

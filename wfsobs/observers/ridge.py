@@ -134,11 +134,16 @@ class LinearPredictor(HeldEstimate):
         self._estimate()
 
 
-def fit_ridge(prior: Prior, g: OfflineGpr, mode: int, dt: float, delay: int, horizon: int = 0) -> tuple[Array, float]:
-    """Fit the linear limit of the offline GPR of one mode to the vibration `horizon` frames ahead, as `fit`."""
+def _targets(prior: Prior, mode: int, dt: float, delay: int, horizon: int) -> tuple[Training, Array]:
+    """Return the training data, and the vibration of one mode `horizon` frames ahead."""
     training, bands = prior.training, prior.bands
     assert training is not None and bands is not None
-    targets = training_targets(training, bands, dt, delay, horizon)[:, mode]
+    return training, training_targets(training, bands, dt, delay, horizon)[:, mode]
+
+
+def fit_ridge(prior: Prior, g: OfflineGpr, mode: int, dt: float, delay: int, horizon: int = 0) -> tuple[Array, float]:
+    """Fit the linear limit of the offline GPR of one mode to the vibration `horizon` frames ahead, as `fit`."""
+    training, targets = _targets(prior, mode, dt, delay, horizon)
     signals = training_signals(g, training, mode, dt, delay)
     return fit(signals, targets, g.depth, g.training_size, (g.noise_std * g.length_scale / g.signal_std) ** 2)
 
@@ -152,9 +157,7 @@ def ridge(prior: Prior, settings: OfflineGpr, sampling: Sampling, horizon: float
 
 def fit_30(prior: Prior, mode: int, dt: float, delay: int, horizon: int = 0) -> tuple[Array, float]:
     """Fit the last 30 measurements z of one mode to the vibration `horizon` frames ahead, as `fit`."""
-    training, bands = prior.training, prior.bands
-    assert training is not None and bands is not None
-    targets = training_targets(training, bands, dt, delay, horizon)[:, mode]
+    training, targets = _targets(prior, mode, dt, delay, horizon)
     z = pseudo_open_loop(training.y_lgs, training.u, delay)[:, [mode]]
     m = len(z) - TAPS - horizon  # the last targets have no reference
     return fit(z, targets, TAPS, m, PLAIN * m * float(np.mean(z**2)))

@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from math import gamma
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,30 +101,6 @@ def azimuthal(j: int, direction: NDArray[np.complex128]) -> Array:
     _, signed = noll(j)
     turn = direction ** abs(signed)
     return turn.real if signed >= 0 else turn.imag
-
-
-def noll_covariance(j: int, i: int) -> float:
-    """Return the covariance of the coefficients of two modes in Kolmogorov turbulence [(D / r0)^(5/3) rad^2] (Noll, eq. 25).
-
-    With the constant of the spectrum, 0.0229; the 2.2698 that is often printed here is 1 % larger.
-
-    >>> round(noll_covariance(2, 2), 3), round(noll_covariance(4, 4), 4), round(noll_covariance(2, 8), 4)
-    (0.449, 0.0232, -0.0142)
-    """
-    (n, m), (p, q) = noll(j), noll(i)
-    if j == 1 or i == 1:
-        raise ValueError("the variance of piston is infinite")
-    if m != q:
-        return 0.0
-    numeric = gamma(14 / 3) * (4.8 * gamma(6 / 5)) ** (5 / 6) * gamma(11 / 6) ** 2 / (2.0 ** (8 / 3) * math.pi)
-    sign = (-1) ** ((n + p - 2 * abs(m)) // 2)
-    return (
-        numeric
-        * sign
-        * math.sqrt((n + 1.0) * (p + 1.0))
-        * gamma((n + p - 5 / 3) / 2)
-        / (gamma((n - p + 17 / 3) / 2) * gamma((p - n + 17 / 3) / 2) * gamma((n + p + 23 / 3) / 2))
-    )
 
 
 TABLE_STEP, TABLE_END = 0.005, 1024.0

@@ -28,9 +28,10 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, VIBRATION
 from wfsobs.observers.estimates import Estimate
 from wfsobs.observers.gpr.inputs import scale_of, window_signals
-from wfsobs.observers.gpr.kernels import SquaredExponential, band, check_condition, square_from_band
+from wfsobs.observers.gpr.kernels import SquaredExponential
 from wfsobs.observers.gpr.offline import training_targets
 from wfsobs.observers.gpr.online import kernel_of, online_targets
+from wfsobs.observers.gpr.trained import eliminated_covariance
 from wfsobs.observers.missing import fill_missing
 from wfsobs.prior import Bands
 from wfsobs.priors_from.scenario import bands_of, prior_of
@@ -38,7 +39,6 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError, pseudo_open_loop
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
-from wfsobs.signal.linalg import eliminate
 from wfsobs.tuning.records import Records
 from wfsobs.tuning.space import Space
 from wfsobs.typing import Array
@@ -155,12 +155,7 @@ def log_marginal_likelihood(
 
     Raises ConditionError where the precision is not enough, Cancelled.
     """
-    V, points = band(signals, depth, kernel, first, m, m - 1)
-    S = np.zeros((m + 2, m + 2), order="F")  # the covariance with the targets and delta as two more rows
-    S[:m, :m] = square_from_band(V, 0, m)
-    S[m:, :m] = targets[first : first + m], points.delta
-    check_condition(S[:m, :m], kernel)
-    eliminate(S, m, watch.check)
+    S, _ = eliminated_covariance(signals, targets, depth, first, m, kernel, watch)
     a, b, c = -S[m, m], -S[m + 1, m], -S[m + 1, m + 1]
     quadratic = a - b**2 / (1.0 / kernel.variance + c)
     log_determinant = 2.0 * np.log(np.diagonal(S)[:m]).sum() + np.log1p(kernel.variance * c)

@@ -101,6 +101,24 @@ class TrainedGpr:
         return float(known[0] + here.delta[0] * self.constant)
 
 
+def eliminated_covariance(
+    signals: Array, targets: Array, depth: int, first: int, m: int, kernel: SquaredExponential, watch: Watch = QUIET
+) -> tuple[Array, Points]:
+    """Return the covariance of the m windows that end at first ... first + m - 1, and the windows as points.
+
+    The targets and delta are two more rows; the first m columns are eliminated. Raises ConditionError where the precision is not
+    enough, Cancelled.
+    """
+    V, points = band(signals, depth, kernel, first, m, m - 1)
+    watch.check()
+    S = np.zeros((m + 2, m + 2), order="F")
+    S[:m, :m] = square_from_band(V, 0, m)
+    S[m:, :m] = targets[first : first + m], points.delta
+    check_condition(S[:m, :m], kernel)
+    eliminate(S, m, watch.check)
+    return S, points
+
+
 def train(signals: Array, targets: Array, depth: int, m: int, kernel: SquaredExponential, watch: Watch = QUIET) -> TrainedGpr:
     """Fit the first m windows of signals (n, channels) to targets (n,), one per step.
 
@@ -109,13 +127,7 @@ def train(signals: Array, targets: Array, depth: int, m: int, kernel: SquaredExp
     if signals.shape[0] < depth + m:
         raise RecordError(f"the training data has {signals.shape[0]} steps, depth + training size need {depth + m}")
     first = depth - 1
-    V, points = band(signals, depth, kernel, first, m, m - 1)
-    watch.check()
-    S = np.empty((m + 2, m + 2), order="F")  # the covariance with the targets and delta as two more rows
-    S[:m, :m] = square_from_band(V, 0, m)
-    S[m:, :m] = targets[first : first + m], points.delta
-    check_condition(S[:m, :m], kernel)
-    eliminate(S, m, watch.check)
+    S, points = eliminated_covariance(signals, targets, depth, first, m, kernel, watch)
     a, b = solve_rows(S, m)
     pivot = float(1.0 / kernel.variance + points.delta @ b)
     constant = float(points.delta @ a) / pivot
