@@ -43,6 +43,7 @@ DOUBLES = {
     "design": "of one observer or controller for a user's loop, and of all controllers for a comparison",
     "compute": "what a kind of job of the dashboard does: the module says which kind",
     "main": "the usual name of an entry point",
+    "envelope": "the command, and the extremes of a signal that figures draw",
     "export": "the command, and the function that it calls",
     "identify": "the command, and the function that it calls",
     "observe": "the command, and the function that it calls",

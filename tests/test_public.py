@@ -34,6 +34,7 @@ FUNCTIONS = (
     "identify",
     "load",
     "observe",
+    "plant_envelope",
     "psd",
     "run",
     "save",

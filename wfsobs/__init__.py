@@ -18,6 +18,7 @@ from wfsobs.version import __version__ as __version__
 if TYPE_CHECKING:
     from wfsobs.app.report.export import export
     from wfsobs.app.serve import explore
+    from wfsobs.closed_loop.envelope import plant_envelope
     from wfsobs.closed_loop.run import close_loop
     from wfsobs.evaluation.bound import bound
     from wfsobs.evaluation.budget import error_budget
@@ -43,6 +44,7 @@ _HOMES = {
     "explore": "app.serve",
     "export": "app.report.export",
     "close_loop": "closed_loop.run",
+    "plant_envelope": "closed_loop.envelope",
     "design": "stepping",
     "error_budget": "evaluation.budget",
     "score": "evaluation.scores",
@@ -82,6 +84,7 @@ __all__ = [
     "identify",
     "load",
     "observe",
+    "plant_envelope",
     "psd",
     "register",
     "run",

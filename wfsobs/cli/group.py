@@ -26,6 +26,7 @@ COMMANDS = {
     "check": Place("telemetry", "Check a record: what was read, and what of it can be relied on."),
     "convert": Place("telemetry", "Write a record in another format: .npz, .aot.fits, .fits, .h5, .mat, .csv or .parquet."),
     "design": Place("design", "Write a controller for a program elsewhere: C99 with a test, arrays, python-control."),
+    "envelope": Place("simulate", "Compute what every linear controller leaves of the disturbance over an uncertain plant."),
     "export": Place("export", "Write a report: one HTML file with figures and numbers that opens without a network."),
     "figure": Place("figure", "Draw a figure of the paper as a file."),
     "gain": Place("telemetry", "Find the integrator's optimal gain from closed-loop telemetry."),

@@ -33,6 +33,7 @@ from wfsobs.cli.show import (
     warn,
 )
 from wfsobs.closed_loop.design import design
+from wfsobs.closed_loop.envelope import POINTS, PlantEnvelope, Uncertainty, plant_envelope
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label, linear
 from wfsobs.closed_loop.rows import rows as loop_rows
 from wfsobs.closed_loop.run import closed_loop
@@ -230,3 +231,60 @@ def loop(
         click.echo(json.dumps(all_rows, allow_nan=False))
     else:
         show_table(loop_table(all_rows))
+
+
+def envelope_table(result: PlantEnvelope) -> Table:
+    """Return the table of an envelope, least nominal residual first in each mode."""
+    of = result.uncertainty
+    names = {"delay": f"delay +-{of.delay:g} frames", "gain": f"gain +-{100.0 * of.gain:g} %"}
+    names |= {"rotation": f"rotation +-{of.rotation:g} deg", "resonance": f"resonance +-{100.0 * of.resonance:g} %"}
+    size = len(result.errors["delay"])
+    out = Table(title=f"Residual over {size} plants: {', '.join(names[name] for name in result.errors)}")
+    for name in ("Mode", "Controller"):
+        out.add_column(name, no_wrap=True)
+    for name in ("nominal, nm", "mean", "95 %", "worst", "unstable, %", "corners"):
+        out.add_column(name, justify="right", no_wrap=True)
+    rows = result.rows()
+    for mode in dict.fromkeys(r["mode"] for r in rows):
+        out.add_section()
+        for r in sorted((r for r in rows if r["mode"] == mode), key=lambda r: r["nominal_rms_nm"] or float("inf")):
+            left = [r[f"{name}_rms_nm"] for name in ("nominal", "mean", "p95", "worst")]
+            share = "{:.1f} ({:.1f} to {:.1f})".format(*(100.0 * r[f"unstable_{k}"] for k in ("share", "low", "high")))
+            shown = ["unstable" if x is None else f"{x:.2f}" for x in left]
+            out.add_row(mode, label(r["controller"]), *shown, share, f"{r['unstable_corners']} of {r['corners']}")
+    out.caption = "mean and 95 % of the stable plants; worst of all and of the corners; share with its 95 % interval"
+    return out
+
+
+@click.command()
+@scenario_options
+@click.option("--controller", "controllers", multiple=True, metavar="NAME", help="Of this controller alone; can be repeated.")
+@click.option("--points", type=click.IntRange(1, 100_000), default=POINTS, show_default=True, metavar="N", help="Plants.")
+@click.option("--delay", type=click.FloatRange(0), default=0.5, show_default=True, help="Largest error of the delay [frames].")
+@click.option("--gain", type=click.FloatRange(0, 1, max_open=True), default=0.2, show_default=True, help="Of the gain.")
+@click.option("--rotation", type=click.FloatRange(0, 180), default=10.0, show_default=True, help="Of the rotation [deg].")
+@click.option(
+    "--resonance", type=click.FloatRange(0, 1, max_open=True), default=0.1, show_default=True, help="Of `plant.resonance`."
+)
+@click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
+def envelope(
+    scenario: Scenario,
+    controllers: tuple[str, ...],
+    points: int,
+    delay: float,
+    gain: float,
+    rotation: float,
+    resonance: float,
+    as_json: bool,
+) -> None:
+    """Compute what every linear controller leaves of the disturbance over an uncertain plant (docs/trust.md)."""
+    of = Uncertainty(delay, gain, rotation, resonance)
+    with progress_bar("controllers") as update:
+        result = plant_envelope(scenario, controllers or None, uncertainty=of, points=points, watch=Watch(progress=update))
+    if as_json:
+        click.echo(json.dumps(result.rows(), allow_nan=False))
+        return
+    show_table(envelope_table(result))
+    for name, reason in result.notes.items():
+        click.echo(f"{label(name)}: {reason}")
+    click.echo(result.verdict())

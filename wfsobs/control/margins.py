@@ -93,12 +93,12 @@ def crossings(f: Callable[[Array], Array], x: Array, values: Array) -> Array:
     return 0.5 * (low + high)
 
 
-def frequencies(poles: Complex, n: int = 400) -> Array:
+def frequencies(poles: Complex, n: int = 400, near_pole: int = 24) -> Array:
     """Return points from 0 to pi [rad per step] for a filter with these poles.
 
-    Even, on a logarithmic scale, and close together near its poles.
+    n are even, n on a logarithmic scale, and so many on either side of each pole are close to it.
     """
-    spread = np.concatenate([[0.0], np.geomspace(0.05, 40.0, 24)])
+    spread = np.concatenate([[0.0], np.geomspace(0.05, 40.0, near_pole)])
     angle, width = np.abs(np.angle(poles)), np.maximum(-np.log(np.maximum(np.abs(poles), 1e-3)), 1e-9)
     near = (angle[:, None] + width[:, None] * np.concatenate([-spread, spread])).ravel()
     points = np.concatenate([np.geomspace(1e-5 * np.pi, np.pi, n), np.linspace(0.0, np.pi, n), near])

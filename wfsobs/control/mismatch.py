@@ -28,7 +28,10 @@ from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
 
 DENSE = 1600
-"""Even and logarithmic points of a frequency grid, each; those of an envelope are fewer."""
+"""Even and logarithmic points of a frequency grid, each."""
+
+COARSE = 120, 9
+"""The same for many plants, and points on either side of each pole; residuals differ by 0.3 % at most on `ut4`."""
 
 TURN = 2.0
 """Change of the phase of the determinant from point to point beyond which eigenvalues decide on stability [rad]."""
@@ -147,10 +150,10 @@ class Weights:
     ngs_noise: Array
 
 
-def loops(laws: Sequence[Law], nominal: Mirror, dense: int = DENSE) -> Loops:
+def loops(laws: Sequence[Law], nominal: Mirror, is_coarse: bool = False) -> Loops:
     """Return the loops of the laws of modes that one plant couples, on frequencies that are close where they change."""
-    c = len(laws[0].cycle.steps)
-    grid = np.unique(np.concatenate([frequencies(law.poles, dense) for law in laws])) / c
+    c, density = len(laws[0].cycle.steps), COARSE if is_coarse else (DENSE, 24)
+    grid = np.unique(np.concatenate([frequencies(law.poles, *density) for law in laws])) / c
     return loops_at(laws, nominal, grid)
 
 
@@ -173,8 +176,8 @@ def _images_of(law: Law, omega: Array) -> tuple[Complex, Complex]:
         inside = np.exp(1j * c * omega[part])[:, None, None] * np.eye(len(F)) - F
         out[part] = H @ np.linalg.solve(inside, np.broadcast_to(G.astype(complex), (len(inside), *G.shape))) + J
     out = -np.conj(turn).swapaxes(1, 2) @ out / c
-    ngs: Complex = out[:, :, 1] if inputs > 1 else np.zeros((omega.size, c), dtype=complex)
-    return np.matmul(out[:, :, ::inputs], turn, dtype=complex), ngs
+    ngs = out[:, :, 1] if inputs > 1 else np.zeros((omega.size, c))
+    return np.asarray(out[:, :, ::inputs] @ turn, dtype=complex), np.asarray(ngs, dtype=complex)
 
 
 def _steps(law: Law) -> Sequence[FilterStep]:

@@ -14,6 +14,7 @@ import holoviews as hv
 import numpy as np
 
 from wfsobs.campaign.sweep import SweepResults
+from wfsobs.closed_loop.envelope import PlantEnvelope
 from wfsobs.closed_loop.rows import ClosedLoop, residual_rms
 from wfsobs.control.curves import Curves, curves
 from wfsobs.evaluation.budget import TERMS, error_budget
@@ -331,6 +332,36 @@ class LoopPlots:
         return {key: curves(plan.loop(key, column), poles, self.loop.record.dt) for key, poles in known.items()}
 
 
+class EnvelopePlots:
+    """Figures of controllers over an uncertain plant: `envelope.plot`."""
+
+    def __init__(self, envelope: PlantEnvelope):
+        self.envelope = envelope
+        self.names: list[str] = [m.name for m in envelope.scenario.modes]
+
+    def residuals(self, *, over: str = "delay", controllers: Sequence[str] | None = None, mode: str | None = None) -> hv.Overlay:
+        """Draw the rms of the residual against one error of the plant: the mean and the largest of the stable plants of a bin.
+
+        over : "delay", "gain", "rotation" or "resonance"
+        """
+        of, column = self.envelope, self.names.index(_one_of(self.names, mode, "mode"))
+        errors, unit = of.errors[_one_of(list(of.errors), over, "error")], {"delay": "frames", "rotation": "deg"}.get(over, "")
+        x, y = quantity(f"error of {over}", unit), quantity(f"rms {self.names[column]}", "nm", f"residual, {self.names[column]}")
+        edges = np.linspace(errors.min(), errors.max(), 17)
+        bins = np.clip(np.digitize(errors, edges) - 1, 0, 15)
+        lines: list[Any] = []
+        for spread in of.spreads:
+            if controllers is not None and spread.controller not in controllers:
+                continue
+            left = np.where(np.isfinite(spread.points[:, column]), NM * spread.points[:, column], np.nan)
+            kept = [i for i in range(16) if np.isfinite(left[bins == i]).any()]
+            at, it = 0.5 * (edges[:-1] + edges[1:])[kept], look(spread.controller)
+            lines.append(draw_line(at, np.array([np.nanmean(left[bins == i]) for i in kept]), (x, y), it))
+            most = Look(f"{it.label}, worst", it.light, it.dark, (2, 2))
+            lines.append(draw_line(at, np.array([np.nanmax(left[bins == i]) for i in kept]), (x, y), most))
+        return overlay(_some(lines, "a stable plant"), log="y")
+
+
 @singledispatch
 def plots_of(source: object) -> Any:
     """Return the figures of an object."""
@@ -343,6 +374,7 @@ for _kind, _plots in {
     Identification: IdentificationPlots,
     SweepResults: SweepPlots,
     ClosedLoop: LoopPlots,
+    PlantEnvelope: EnvelopePlots,
 }.items():
     plots_of.register(_kind, _plots)
 

@@ -25,11 +25,11 @@ def plant_of(scenario: Scenario) -> Plant:
     return Plant(mirror, scenario.dt, scenario.sensors.exposure_ratio)
 
 
-def true_plant_of(scenario: Scenario) -> TruePlant | None:
-    """Return the plant of a scenario's closed loop as it is; None where it is the one that the controllers are designed for."""
+def full_plant_of(scenario: Scenario, rotation: float = 0.0) -> TruePlant:
+    """Return the plant of a scenario's closed loop as it is, and turned by a further angle [deg]."""
     p, dt = scenario.plant, scenario.dt
-    matrix = true_matrix([noll(mode.noll) for mode in scenario.modes], p.gain_error, p.rotation, p.coupling)
-    out = TruePlant(
+    matrix = true_matrix([noll(mode.noll) for mode in scenario.modes], p.gain_error, p.rotation + rotation, p.coupling)
+    return TruePlant(
         matrix,
         scenario.control.delay + p.delay_error,
         p.delay_jitter,
@@ -43,7 +43,12 @@ def true_plant_of(scenario: Scenario) -> TruePlant | None:
         p.optical_gain_rms,
         p.optical_gain_time / dt,
     )
-    is_perfect = out.time_invariant and not (p.delay_error or p.resonance) and np.array_equal(matrix, np.eye(len(matrix)))
+
+
+def true_plant_of(scenario: Scenario) -> TruePlant | None:
+    """Return the plant as it is; None where it is the one that the controllers are designed for."""
+    out, is_moved = full_plant_of(scenario), scenario.plant.delay_error or scenario.plant.resonance
+    is_perfect = out.time_invariant and not is_moved and np.array_equal(out.matrix, np.eye(len(out.matrix)))
     return None if is_perfect else out
 
 

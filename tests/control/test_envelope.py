@@ -1,0 +1,102 @@
+"""Controllers over an uncertain plant: each point is the loop of that plant, and the shares are counted as stated."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from tests.records import MATCHED
+from wfsobs.cli.group import main
+from wfsobs.closed_loop.design import design
+from wfsobs.closed_loop.envelope import PlantEnvelope, Spread, Uncertainty, plant_envelope
+from wfsobs.settings.errors import SettingError
+
+NAMES = ["integrator", "lqg-kf-lgs", "lqg-multirate-multi"]
+RESONANT = MATCHED.replace({"plant.resonance": 100.0, "plant.damping": 0.6, "plant.gain_error": [-0.5, -0.5]})
+
+
+@pytest.fixture(scope="module")
+def result() -> PlantEnvelope:
+    return plant_envelope(RESONANT, [*NAMES, "integrator+gpr-online"], points=40)
+
+
+def test_every_point_is_the_loop_of_its_plant(result: PlantEnvelope) -> None:
+    """On fewer frequencies: to 1 % where the loop is stable, and stable where eigenvalues have it."""
+    assert set(result.errors) == {"delay", "gain", "rotation", "resonance"}
+    seen = set()
+    for i in (3, 7, 12, 30):
+        changes = {name: float(x[i]) for name, x in result.errors.items()}
+        gain = 0.5 * (1.0 + changes["gain"]) - 1.0
+        s = RESONANT.replace(
+            {
+                "plant.delay_error": changes["delay"],
+                "plant.gain_error": [gain, gain],
+                "plant.rotation": changes["rotation"],
+                "plant.resonance": 100.0 * (1.0 + changes["resonance"]),
+            }
+        )
+        plan = design(s, NAMES)
+        for spread in result.spreads:
+            of = plan.laws[spread.controller]
+            stable = all(one.stable for one in of)
+            seen.add(stable)
+            assert np.isfinite(spread.points[i]).all() == stable
+            if stable:
+                assert spread.points[i] == pytest.approx([one.predicted_rms for one in of], rel=0.01)
+    assert seen == {True, False}, "both kinds are among them"
+
+
+def test_points_fill_the_box_and_corners_are_its_corners(result: PlantEnvelope) -> None:
+    most = {"delay": 0.5, "gain": 0.2, "rotation": 10.0, "resonance": 0.1}
+    for name, x in result.errors.items():
+        assert np.abs(x).max() < most[name] and abs(x.mean()) < 0.1 * most[name]
+        assert x.std() == pytest.approx(most[name] / np.sqrt(3.0), rel=0.05), "uniform; Sobol's points are even"
+    corners = np.column_stack([x / most[name] for name, x in result.corner_errors.items()])
+    assert len(np.unique(corners, axis=0)) == 16 and (np.abs(corners) == 1.0).all()
+
+
+def test_what_is_not_linear_is_left_out_and_says_so(result: PlantEnvelope) -> None:
+    assert [spread.controller for spread in result.spreads] == NAMES
+    assert list(result.notes) == ["integrator+gpr-online"]
+    with pytest.raises(SettingError, match="an envelope is by theory, for a plant that is linear"):
+        plant_envelope(MATCHED.replace({"plant.hysteresis": 0.1}), NAMES)
+    with pytest.raises(SettingError, match=r"delay: 1.2 - 0.5 frames are below 1"):
+        plant_envelope(MATCHED.replace({"control.delay": 1.2}), NAMES)
+
+
+def spread(name: str, nominal: float, points: list[float]) -> Spread:
+    return Spread(name, np.array([nominal]), np.array(points)[:, None], np.array([[max(points)]]))
+
+
+def test_shares_and_ranks_are_counted() -> None:
+    inf = float("inf")
+    bold, safe = spread("lqg-kf-lgs", 1.0, [1.0, 2.0, inf, 3.0]), spread("integrator", 2.0, [2.0] * 4)
+    both = PlantEnvelope(MATCHED, Uncertainty(), {"delay": np.zeros(4)}, {}, (bold, safe))
+    assert bold.unstable == 1 and bold.summary(0)[0] == 2.0 and np.isinf(bold.worst).all()
+    assert safe.unstable_interval == pytest.approx((0.0, 1.0 - 0.025**0.25)), "none of four"
+    assert both.ranking() == ["lqg-kf-lgs", "integrator"] and both.ranking(by_worst=True) == ["integrator", "lqg-kf-lgs"]
+    assert "Best at the worst plant: Integrator. LQG, LGS KF is unstable at 25 %." in both.verdict()
+    alone = PlantEnvelope(MATCHED, Uncertainty(), {"delay": np.zeros(4)}, {}, (bold,))
+    assert "None is stable over the whole envelope" in alone.verdict()
+
+
+def test_the_command_prints_table_and_rows(tmp_path) -> None:
+    file = tmp_path / "s.toml"
+    file.write_text("[sensors]\nlgs_rate = 500.0\n")
+    arguments = ["envelope", "--config", str(file), "--controller", "integrator", "--controller", "lqg-kf-lgs", "--points", "16"]
+    shown = CliRunner().invoke(main, arguments)
+    assert shown.exit_code == 0, shown.output
+    assert "Best at the nominal plant:" in shown.output and "rotation +-10 deg" in shown.output
+    rows = json.loads(CliRunner().invoke(main, [*arguments, "--json"]).output)
+    assert [(r["controller"], r["mode"]) for r in rows] == [(n, m) for n in ("integrator", "lqg-kf-lgs") for m in ("tip", "tilt")]
+    assert all(r["corners"] == 8 and r["nominal_rms_nm"] <= r["worst_rms_nm"] for r in rows)
+
+
+def test_it_draws_residuals_against_the_delay(result: PlantEnvelope) -> None:
+    drawn = result.plot.residuals(over="delay", controllers=["integrator", "lqg-multirate-multi"], mode="tilt")
+    assert len(drawn) == 4, "mean and worst of each"
+    with pytest.raises(ValueError, match="error 'wind'"):
+        result.plot.residuals(over="wind")

@@ -1,0 +1,309 @@
+"""Every linear controller over an uncertain plant: what it leaves at the plant that it is designed for, on average and at worst.
+
+The errors of the plant are independent and uniform around those of the scenario. They are taken at the points of Sobol's sequence
+and at all corners; stability and residual are by theory (`control.mismatch`), on fewer frequencies than for a single loop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from itertools import product
+from math import ceil, inf, log2
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from scipy.stats import binomtest
+from scipy.stats.qmc import Sobol
+
+from wfsobs.closed_loop.design import Design, design, loop_spectra
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.control.law import Law
+from wfsobs.control.mirror import Mirror
+from wfsobs.control.mismatch import loops, pairs, radius, weigh
+from wfsobs.control.true_plant import TruePlant
+from wfsobs.evaluation.rows import Row
+from wfsobs.notebook import PlotAccessor, import_extra
+from wfsobs.priors_from.controllers import full_plant_of
+from wfsobs.progress import QUIET, Watch
+from wfsobs.scenario import Scenario
+from wfsobs.settings.errors import SettingError
+from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, true_spectra
+from wfsobs.typing import Array
+
+if TYPE_CHECKING:
+    import pandas
+
+POINTS = 1000
+
+AT_ONCE = 2**21
+"""Numbers in the largest array of a block of plants."""
+
+BOTH = 2
+"""Blocks at work at the same time; numpy lets go of the interpreter's lock in them."""
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Largest errors either way: delay [frames], gain and resonance of the mirror over themselves, rotation [deg]."""
+
+    delay: float = 0.5
+    gain: float = 0.2
+    rotation: float = 10.0
+    resonance: float = 0.1
+
+
+@dataclass(frozen=True)
+class Spread:
+    """What one controller leaves over the envelope.
+
+    Attributes
+    ----------
+    nominal : Array
+        rms of the residual at the plant of the scenario, per mode [um]; infinite where it is not stable.
+    points, corners : Array
+        The same at the points and corners, (n, n_modes).
+    """
+
+    controller: str
+    nominal: Array
+    points: Array
+    corners: Array
+
+    @property
+    def unstable(self) -> int:
+        """Points that are not stable."""
+        return int(np.isinf(self.points).any(axis=1).sum())
+
+    @property
+    def unstable_interval(self) -> tuple[float, float]:
+        """95 % interval of their share, of as many independent points (Clopper and Pearson), whose scatter Sobol's is below."""
+        found = binomtest(self.unstable, len(self.points)).proportion_ci(0.95, "exact")
+        return float(found.low), float(found.high)
+
+    @property
+    def worst(self) -> Array:
+        """Largest rms of points and corners, per mode [um]; infinite where one is not stable."""
+        return np.maximum(self.points.max(axis=0), self.corners.max(axis=0))
+
+    def summary(self, mode: int) -> tuple[float | None, float | None]:
+        """(mean, 95 % quantile) of the rms at the stable points [um]."""
+        stable = self.points[np.isfinite(self.points).all(axis=1), mode]
+        return (float(stable.mean()), float(np.quantile(stable, 0.95))) if stable.size else (None, None)
+
+
+@dataclass(frozen=True)
+class PlantEnvelope:
+    """Controllers over an uncertain plant.
+
+    Attributes
+    ----------
+    errors : dict of str to Array
+        delay [frames], gain, rotation [deg] and resonance -> the errors at the points, (n,).
+    corner_errors : dict of str to Array
+        The same at the corners.
+    spreads : tuple of Spread
+        One per controller.
+    notes : dict of str to str
+        Controllers that are not there, and why.
+    """
+
+    scenario: Scenario
+    uncertainty: Uncertainty
+    errors: dict[str, Array]
+    corner_errors: dict[str, Array]
+    spreads: tuple[Spread, ...]
+    notes: dict[str, str] = field(default_factory=dict)
+    plot: ClassVar[PlotAccessor] = PlotAccessor()
+
+    def __repr__(self) -> str:
+        return f"PlantEnvelope({len(self.spreads)} controllers, {len(next(iter(self.errors.values())))} points)"
+
+    def rows(self) -> list[Row]:
+        """Return one plain dictionary per controller and mode: the keys of `wfsobs envelope --json`.
+
+        nominal_rms_nm, mean_rms_nm, p95_rms_nm, worst_rms_nm : null where not stable; mean and 95 % of the stable points
+        unstable_share, unstable_low, unstable_high : of the points, and its 95 % interval
+        unstable_corners : how many of `corners`
+        """
+        out = []
+        for spread in self.spreads:
+            low, high = spread.unstable_interval
+            for i, mode in enumerate(self.scenario.modes):
+                mean, most = spread.summary(i)
+                numbers = {"nominal": spread.nominal[i], "mean": mean, "p95": most, "worst": spread.worst[i]}
+                out.append(
+                    {
+                        "controller": spread.controller,
+                        "mode": mode.name,
+                        **{f"{k}_rms_nm": None if x is None or np.isinf(x) else float(x) * 1e3 for k, x in numbers.items()},
+                        "unstable_share": spread.unstable / len(spread.points),
+                        "unstable_low": low,
+                        "unstable_high": high,
+                        "unstable_corners": int(np.isinf(spread.corners).any(axis=1).sum()),
+                        "corners": len(spread.corners),
+                    }
+                )
+        return out
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Return `rows` as a pandas table. Raises ImportError without pandas."""
+        return import_extra("pandas", "arrays").DataFrame(self.rows())
+
+    def ranking(self, *, by_worst: bool = False) -> list[str]:
+        """Return controllers by the rms of all modes together at the nominal or the worst plant; unstable ones by their share."""
+
+        def key(spread: Spread) -> tuple[float, float]:
+            left = float(np.sqrt(np.sum((spread.worst if by_worst else spread.nominal) ** 2)))
+            return left, spread.unstable if left == inf else 0
+
+        return [spread.controller for spread in sorted(self.spreads, key=key)]
+
+    def verdict(self) -> str:
+        """Return which controller is best at the nominal plant, and which at worst."""
+        by = {spread.controller: spread for spread in self.spreads}
+        first, safest = self.ranking()[0], self.ranking(by_worst=True)[0]
+        bears = [name for name in self.ranking() if np.isfinite(by[name].worst).all()]
+        label = {name: CONTROLLERS[name].label for name in by}
+        nominal = ", then ".join(label[name] for name in self.ranking()[:3])
+        if not bears:
+            return f"Best at the nominal plant: {nominal}. None is stable over the whole envelope; {label[safest]} at most of it."
+        worst = ", then ".join(label[name] for name in self.ranking(by_worst=True)[:3] if name in bears)
+        fails = (
+            ""
+            if first in bears
+            else f" {label[first]} is unstable at {100.0 * by[first].unstable / len(by[first].points):.2g} %."
+        )
+        return f"Best at the nominal plant: {nominal}. Best at the worst plant: {worst}.{fails}"
+
+
+def plant_envelope(
+    scenario: Scenario,
+    controllers: Sequence[str] | None = None,
+    *,
+    uncertainty: Uncertainty | None = None,
+    points: int = POINTS,
+    watch: Watch = QUIET,
+) -> PlantEnvelope:
+    """Compute what every linear controller leaves over an uncertain plant.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings; the plant that the errors are around is that of `plant`, which must be linear and time-invariant.
+    controllers : sequence of str, optional
+        Ids of the controllers; by default all.
+    uncertainty : Uncertainty, optional
+        Largest errors.
+    points : int
+        Points of Sobol's sequence; corners come on top.
+    watch : Watch, optional
+        Receives the progress, and is asked whether to stop.
+
+    Returns
+    -------
+    PlantEnvelope
+        Residuals at all points.
+
+    Raises
+    ------
+    SettingError
+        The spectra are not known, the plant is not linear, a delay would be below one frame, or a controller is unknown.
+    Cancelled
+        `watch` asks to stop.
+
+    See Also
+    --------
+    wfsobs.close_loop : Simulate the loop with one plant.
+    """
+    base = full_plant_of(scenario)
+    if not base.time_invariant:
+        raise SettingError("plant: an envelope is by theory, for a plant that is linear and the same at every step")
+    if not has_known_spectra(scenario):
+        raise SettingError("the spectra of this scenario are not known for the whole record, and so is no residual by theory")
+    of = uncertainty or Uncertainty()
+    if base.delay - of.delay < 1.0:
+        raise SettingError(f"delay: {base.delay:g} - {of.delay:g} frames are below 1")
+    plan = design(scenario, controllers)
+    spectra = [true_spectra(scenario, mode) for mode in range(len(scenario.modes))]
+    errors, corners = error_samples(of, base, points)
+    nominal = {name: np.zeros(1) for name in errors}
+    names = list(errors)
+    every = {name: np.concatenate([nominal[name], errors[name], corners[name]]) for name in names}
+    plants = [plant_at(scenario, base, {name: float(every[name][i]) for name in names}) for i in range(len(every[names[0]]))]
+    spreads, notes = [], {}
+    linear = [name for name in plan.laws if CONTROLLERS[name].law is not None]
+    for i, name in enumerate(linear):
+        watch.check()
+        reason = _why_not(plan, name)
+        if reason:
+            notes[name] = reason
+            continue
+        laws = [one.law for one in plan.laws[name] if one.law is not None]
+        left = residuals(laws, plan.mirror, plants, spectra, watch)
+        spreads.append(Spread(name, left[0], left[1 : 1 + points], left[1 + points :]))
+        watch.step((i + 1) / len(linear))
+    return PlantEnvelope(scenario, of, errors, corners, tuple(spreads), notes)
+
+
+def _why_not(plan: Design, name: str) -> str:
+    if CONTROLLERS[name].predict is not None:
+        return "its prediction is not linear: an envelope by simulation is not there"
+    return next((one.note or "not stable" for one in plan.laws[name] if one.law is None), "")
+
+
+def error_samples(uncertainty: Uncertainty, base: TruePlant, points: int) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Return the errors by name at the points, (points,), and at all corners; of a resonance where the mirror has one."""
+    most = {"delay": uncertainty.delay, "gain": uncertainty.gain, "rotation": uncertainty.rotation}
+    if len(base.matrix) == 1:
+        del most["rotation"]
+    if base.resonance:
+        most["resonance"] = uncertainty.resonance
+    power = ceil(log2(max(points, 1)))
+    cube = Sobol(len(most), scramble=False).random_base2(power)[:points] + 0.5 ** (power + 1)  # in the middle of the cells
+    corners = np.array(list(product((-1.0, 1.0), repeat=len(most))))
+    by = list(enumerate(most.items()))
+    return {k: x * (2.0 * cube[:, i] - 1.0) for i, (k, x) in by}, {k: x * corners[:, i] for i, (k, x) in by}
+
+
+def plant_at(scenario: Scenario, base: TruePlant, errors: dict[str, float]) -> TruePlant:
+    """Return the plant of a scenario with further errors, on gain and resonance as factors 1 + error."""
+    turned = full_plant_of(scenario, errors.get("rotation", 0.0)).matrix
+    return replace(
+        base,
+        matrix=(1.0 + errors["gain"]) * turned,
+        delay=base.delay + errors["delay"],
+        resonance=base.resonance * (1.0 + errors.get("resonance", 0.0)),
+    )
+
+
+def residuals(
+    laws: Sequence[Law], nominal: Mirror, plants: Sequence[TruePlant], spectra: Sequence[TrueSpectra], watch: Watch = QUIET
+) -> Array:
+    """Rms of the residual [um] of every plant and mode, (plants, modes), infinite where a loop is not stable."""
+    matrices = np.array([plant.matrix for plant in plants])
+    out = np.empty(matrices.shape[:2])
+    for columns in pairs(np.abs(matrices).max(axis=0)):
+        mine = [laws[column] for column in columns]
+        of = loops(mine, nominal, is_coarse=True)
+        weights = [weigh(loop_spectra(spectra[column]), of) for column in columns]
+        images, size = of.images, len(columns) * of.K.shape[-1]
+        block = max(1, AT_ONCE // (of.omega.size * size * size))
+        parts = [slice(i, i + block) for i in range(0, len(plants), block)]
+
+        def one(part: slice, of=of, weights=weights, images=images, columns=columns, mine=mine) -> Array:
+            watch.check()
+            chosen = plants[part]
+            response = np.array([plant.response(images) for plant in chosen])
+            matrix = matrices[part][:, columns][:, :, columns]
+            determinant, Q = of.solve(response, matrix)
+            stable, is_sure = of.stable(determinant)
+            for i in np.flatnonzero(~is_sure).tolist():
+                stable[i] = radius(mine, nominal, replace(chosen[i], matrix=matrix[i])) < 1.0
+            left = of.residual(Q, response, matrix, weights)
+            return np.where(stable[:, None], np.sqrt(np.maximum(left, 0.0)), inf)
+
+        with ThreadPoolExecutor(BOTH) as pool:
+            out[:, columns] = np.concatenate(list(pool.map(one, parts)))
+    return out
