@@ -214,10 +214,10 @@ def contradiction(record: Record, sign: int = 1, delay: float | None = None, gai
     return ""
 
 
-def _contradiction_of(data: _Data, read: int, said: tuple[int, float, Sequence[float]], moving: Array) -> str:
+def _contradiction_of(data: _Data, delay: int, statement: tuple[int, float, Sequence[float]], moving: Array) -> str:
     k, (guess, excited) = moving.size, _first_guess(data)
-    names, ways = [TIP_TILT[i].name for i in moving], (*said[:2], np.resize(said[2], k))
-    stated = np.concatenate([np.full(k, float(read)), np.ones(k), np.zeros(k - 1)])
+    names, ways = [TIP_TILT[i].name for i in moving], (*statement[:2], np.resize(statement[2], k))
+    stated = np.concatenate([np.full(k, float(delay)), np.ones(k), np.zeros(k - 1)])
     is_turned = excited < REVERSED and bool((guess[k : 2 * k] < 0).any() or (k == 2 and abs(guess[-1]) > np.pi / 4))
     start = np.concatenate([stated[:k], guess[k:]]) if is_turned else stated
     ties = np.eye(3 * k - 1)[:, k - 1 :]
@@ -237,13 +237,13 @@ def _contradiction_of(data: _Data, read: int, said: tuple[int, float, Sequence[f
     return f"command {better[0]} is excluded by the data, which are likelier by {worth:.0f} (log-likelihood) with {better[1]}"
 
 
-def _what_is_off(fit: _Fit, stated: Array, names: Sequence[str], ways: tuple[int, float, Array]) -> tuple[str, str] | None:
+def _what_is_off(fit: _Fit, theta: Array, names: Sequence[str], ways: tuple[int, float, Array]) -> tuple[str, str] | None:
     """Return what of a stated plant is off the fitted one, and what it is there; None where nothing is.
 
     ways : sign, delay and gains as they were stated
     """
     k, (sign, delay, gains) = len(names), ways
-    sd, off = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0)), fit.theta - stated
+    sd, off = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0)), fit.theta - theta
     least = np.array([OFF_DELAY] * k + [OFF_GAIN] * k + [np.radians(TURNED)] * (k - 1))
     is_off: Array = np.abs(off) > np.maximum(SURE * sd, np.where(sd > 0.0, least, np.inf))
     turn, is_flipped = float(np.degrees(off[-1])) if k == 2 else 0.0, fit.theta[k : 2 * k] < 0
