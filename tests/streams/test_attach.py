@@ -20,11 +20,12 @@ import wfsobs
 from tests.streams.conftest import ENOUGH, started, wait_until
 from wfsobs.cli import main
 from wfsobs.observers.step import StepObserver
+from wfsobs.signal.gate import RUN, GateSettings
 from wfsobs.stepping import design
 from wfsobs.streams.attach import Attachment
 from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.shared_image import SharedImage
-from wfsobs.streams.watchdog import BEYOND, Fallback, Safety
+from wfsobs.streams.watchdog import Fallback, Safety
 from wfsobs.streams.wiring import NgsWiring, Wiring
 
 pytestmark = pytest.mark.slow
@@ -178,7 +179,7 @@ class Streams:
             SharedImage(folder / "in.im.shm"),
             SharedImage(folder / "out.im.shm"),
             design(name, wfsobs.PRESETS["paper"]()),
-            Wiring((0, 1), 1.0, 1.0, np.full(2, 0.03), np.full(2, 0.5), **settings),
+            Wiring((0, 1), 1.0, 1.0, np.full(2, 0.5), **settings),
             said.append,
         )
 
@@ -257,14 +258,14 @@ def test_garbage_gives_no_stale_and_no_wild_output(tmp_path: Path) -> None:
     with streams.running():
         for row in z[:50]:
             streams.answer(row)
-        wild = [streams.answer(np.array([1e12, -1e12])) for _ in range(BEYOND)]
+        wild = [streams.answer(np.array([1e12, -1e12])) for _ in range(RUN)]
         assert np.abs(wild).max() < 2.0 * np.abs(z).max() and not np.any(wild[-1])
         torn = streams.sink.count
         streams.source._writing[0] = 1
         streams.source._count[0] += np.uint64(1)
         assert not streams.next(torn).any()
         streams.source._writing[0] = 0
-    assert said[0].startswith("the estimate left its band") and streams.attachment.tally.torn == 1
+    assert said[0].startswith("5 measurements in a row are outliers") and streams.attachment.tally.torn == 1
 
 
 class Frames:
@@ -294,7 +295,7 @@ class Way:
         observer.reset()
         self.said: list[str] = []
         self.source, self.sink, self.ngs = Frames(2), Frames(2, dtype), Frames(2)
-        wiring = Wiring((0, 1), 1.0, 1.0, np.full(2, 0.02), np.full(2, 0.5), safety, 0, ENOUGH)
+        wiring = Wiring((0, 1), 1.0, 1.0, np.full(2, 0.5), safety, 0, ENOUGH, gate=GateSettings())
         second = NgsStream(self.ngs, NgsWiring((0, 1), 1.0, 5, 0, ENOUGH), self.said.append) if ngs else None  # pyright: ignore[reportArgumentType]
         self.attachment = Attachment(self.source, self.sink, observer, wiring, self.said.append, second)  # pyright: ignore[reportArgumentType]
 
@@ -321,7 +322,7 @@ def test_one_frame_that_cannot_be_changes_nothing_that_goes_out(fallback: Fallba
     z[1000] = np.nan
     np.testing.assert_array_equal(got, stepped(z, "kf-lgs", 1))
     summary = way.attachment.summary()
-    assert summary["out_of_band"] == 1 and summary["fallbacks"] == 0 and not way.said
+    assert summary["out_of_band"] == 1 and summary["outliers"] == [1, 1] and summary["fallbacks"] == 0 and not way.said
 
 
 @pytest.mark.parametrize("fallback", ["zero", "hold"])
@@ -333,7 +334,7 @@ def test_a_level_that_moves_for_good_is_followed(fallback: Fallback) -> None:
     got = np.array([way.send(row) for row in z])
     before = got[999] if fallback == "hold" else np.zeros(2)
     np.testing.assert_array_equal(got[1004:1304], np.tile(before, (300, 1)))
-    assert BEYOND - 1 <= way.attachment.summary()["out_of_band"] < 3 * BEYOND  # it swings in
+    assert RUN <= way.attachment.summary()["out_of_band"] < 3 * RUN
     assert way.said[1:] == ["output on again after 300 good frames"]
     assert np.abs(got[-500:] - z[-500:]).max() < 0.3  # the vibration and the noise of a frame
 

@@ -131,7 +131,7 @@ def test_a_publisher_that_dies_and_comes_back(tmp_path: Path) -> None:
     sink = SharedImage.create(tmp_path / "out.im.shm", (2,), dtype="float64")
     loop = Loop()
     with subscribed(loop, said.append) as source:
-        wiring = Wiring((0, 1), 1.0, 1.0, np.full(2, 0.03), np.full(2, 0.5), Safety(calm=20), stuck=0.3)
+        wiring = Wiring((0, 1), 1.0, 1.0, np.full(2, 0.5), Safety(calm=20), stuck=0.3)
         one = Attachment(source, sink, design("kf-lgs", wfsobs.PRESETS["paper"]()), wiring, said.append)
         ends: list[bool] = []
         thread = Thread(target=one.run, args=(ENOUGH,), kwargs={"stop": lambda: bool(ends)})

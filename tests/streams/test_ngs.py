@@ -53,7 +53,7 @@ class Loop:
         self.ngs = SharedImage.create(folder / "ngs.im.shm", (3,), dtype="float64")
         self.sink = SharedImage.create(folder / "out.im.shm", (2,), dtype="float64")
         self.said: list[str] = []
-        wiring = Wiring((0, 1), 1.0, 1.0, np.full(2, 0.03), np.full(2, 0.5), Safety(calm=1), 0, ENOUGH)
+        wiring = Wiring((0, 1), 1.0, 1.0, np.full(2, 0.5), Safety(calm=1), 0, ENOUGH)
         ngs_wiring = NgsWiring((2, 0), 1.0, RATIO, lag, stuck)
         ngs = NgsStream(
             SharedImage(self.ngs.path), ngs_wiring, lambda line: self.said.append(line.removeprefix(self.ngs.path + ": "))

@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
-from wfsobs.streams.watchdog import BEYOND, LEAST, PACE, SIGMAS, Gate, Safety, Watchdog
+from wfsobs.signal.gate import RUN, GateSettings
+from wfsobs.streams.attach import SafeGate
+from wfsobs.streams.watchdog import Safety, Watchdog
+from wfsobs.streams.wiring import Wiring
 
 NONE = np.full(2, np.nan)
 ESTIMATE, Z = np.array([0.3, -0.2]), np.zeros(2)
@@ -53,78 +56,39 @@ def test_as_much_as_is_allowed_is_no_fault() -> None:
 def test_an_estimate_out_of_its_band_falls_back_and_single_errors_do_not() -> None:
     said: list[str] = []
     dog = watchdog(said)
-    for beyond in range(BEYOND):
+    for beyond in range(RUN):
         np.testing.assert_array_equal(dog.output(ESTIMATE, Z, beyond, 0), ESTIMATE)
-    assert not said and not dog.output(ESTIMATE, Z, BEYOND, 0).any()
-    assert said[0].startswith("the estimate left its band")
+    assert not said and not dog.output(ESTIMATE, Z, RUN, 0).any()
+    assert said[0].startswith("5 measurements in a row are outliers")
 
 
 def test_what_is_held_is_of_a_frame_in_its_band() -> None:
     dog = watchdog([], fallback="hold")
     good(dog)
-    for beyond in range(1, BEYOND):
+    for beyond in range(1, RUN):
         np.testing.assert_array_equal(dog.output(2.0 * ESTIMATE, Z, beyond, 0), 2.0 * ESTIMATE)
-    np.testing.assert_array_equal(dog.output(2.0 * ESTIMATE, Z, BEYOND, 0), ESTIMATE)
+    np.testing.assert_array_equal(dog.output(2.0 * ESTIMATE, Z, RUN, 0), ESTIMATE)
 
 
-BAND = np.array([0.1, 0.2])
-"""Deviations that a filter states of a prediction of 0.3 in both modes."""
-
-
-def accept(gate: Gate, z: np.ndarray, mean: np.ndarray, sd: np.ndarray) -> np.ndarray:
-    gate.mean, gate.sd = mean, sd
-    return gate.accept(z)
-
-
-def gate() -> Gate:
-    """A gate that has followed good errors until the deviations that they show are below those that are stated."""
-    made = Gate(np.ones(2), np.full(2, 10.0))
-    for _ in range(round(np.log(1.0 / 0.05) / PACE)):
-        accept(made, np.full(2, 0.3), np.full(2, 0.3), BAND)
-    return made
-
-
-@pytest.mark.parametrize("factor", [0.99, 1.01])
-def test_six_deviations_are_a_measurement_and_more_is_none(factor: float) -> None:
-    """Each mode by itself."""
-    z = 0.3 + np.array([factor, 0.0]) * SIGMAS * BAND
-    made = gate()
-    got = accept(made, z, np.full(2, 0.3), BAND)
-    np.testing.assert_array_equal(got, z if factor < 1 else [np.nan, 0.3])
-    assert made.beyond.tolist() == [factor > 1, 0]
-
-
-def test_a_level_that_has_moved_is_taken_after_five_and_numbers_that_no_estimate_may_have_never_are() -> None:
-    for level, is_taken in ((8.0, True), (-15.9, True), (16.1, False), (1e300, False), (-np.inf, False)):
-        made, mean = gate(), np.full(2, 0.3)
-        got = [accept(made, np.full(2, level), mean, BAND) for _ in range(2 * BEYOND)]
-        assert np.isnan(got[: BEYOND - 1]).all() and (np.array(got[BEYOND - 1 :]) == level).all() == is_taken
-        assert made.beyond.tolist() == [2 * BEYOND] * 2
-        np.testing.assert_array_equal(accept(made, mean, mean, BAND), mean)
-        assert not made.beyond.any()
-
-
-def test_what_is_missing_says_nothing() -> None:
-    made = gate()
-    for z in (np.full(2, 5.0), NONE, NONE, np.full(2, 5.0)):
-        assert np.isnan(accept(made, z, np.full(2, 0.3), BAND)).all()
-    assert made.beyond.tolist() == [2, 2]
-
-
-def test_without_a_stated_deviation_that_of_the_errors_stands() -> None:
-    """Gaussian errors of 0.07: the running median is that of them to 11 % (its variance is PACE / 1.7 of its square)."""
-    errors = 3000
-    made, rng = Gate(np.ones(2), np.full(2, 10.0)), np.random.default_rng(1)
-    z = rng.normal(0.0, 0.07, (errors, 2))
-    taken = np.array([accept(made, row, np.zeros(2), NONE) for row in z])
-    np.testing.assert_array_equal(taken, z)
-    np.testing.assert_allclose(made._deviation, 0.07, rtol=0.4)  # four of its standard deviations
-    assert np.isnan(accept(made, np.full(2, 0.07 * 9), np.zeros(2), NONE)).all()
-    for _ in range(errors):
-        accept(made, np.zeros(2), np.zeros(2), NONE)
-    np.testing.assert_allclose(made._deviation, LEAST)
-    made.restart()
-    np.testing.assert_array_equal(made._deviation, 1.0)
+def test_numbers_that_no_estimate_may_have_are_never_taken() -> None:
+    """Largest estimate 10, rms 1: beyond 16, with a gate of outliers or without, also when it is open."""
+    rng = np.random.default_rng(1)
+    for settings in (None, GateSettings(), GateSettings(action="clip")):
+        gate = SafeGate(Wiring((0, 1), 1.0, 1.0, np.ones(2), Safety(), gate=settings))
+        for z in rng.standard_normal((300, 2)):
+            gate.accept(z)
+            gate.settle()
+        for level, is_possible in ((15.9, True), (16.1, False), (1e300, False), (-np.inf, False)):
+            before = gate.outliers.copy()
+            taken = []
+            for _ in range(2 * RUN):
+                taken.append(gate.accept(np.full(2, level)))
+                gate.settle()
+            assert (np.array(taken[RUN:]) == level).all() == is_possible
+            assert np.isnan(taken).all() != is_possible
+            assert (gate.outliers - before >= (0 if is_possible else 2 * RUN)).all()
+            gate.accept(np.full(2, np.nan))
+            assert (gate.beyond == 0) == is_possible, "what is missing says nothing"
 
 
 def test_nothing_is_sent_before_the_observer_has_seen_enough() -> None:

@@ -109,10 +109,10 @@ def attach(
     try:
         given = _open_source(source)
         taken = None if sink is None else _open_sink(sink, given, ngs)
-        observer, noise, spread = _design(name, scenario, len(elements), delay - 1, ngs is not None)
+        observer, spread = _design(name, scenario, len(elements), delay - 1, ngs is not None)
         warm_up = max(round(scenario.run.warm_up / scenario.dt), 1)
         limits = Safety(fallback, None if limit is None else limit * per_unit, calm=warm_up)
-        wiring = Wiring(elements, per_unit, delay, noise, spread, limits, warm_up, stuck, semaphore)
+        wiring = Wiring(elements, per_unit, delay, spread, limits, warm_up, stuck, semaphore, scenario.gate)
         second = None
         if ngs is not None:
             ngs_is = ngs_wiring(scenario, len(elements), ngs_modes, unit, ngs_lag, stuck)
@@ -153,10 +153,8 @@ def _open_sink(name: str, source: SharedImage | Subscription, ngs: str | None) -
     return SharedImage.create(path, source.header.shape, dtype=dtype, layout=source.header.layout)
 
 
-def _design(
-    name: str, scenario: Scenario, n_modes: int, horizon: float, has_ngs: bool
-) -> tuple[StepObserver, np.ndarray, np.ndarray]:
-    """Return the observer, and by its prior the rms of the noise of a measurement and of all of it, (n_modes,) [um]."""
+def _design(name: str, scenario: Scenario, n_modes: int, horizon: float, has_ngs: bool) -> tuple[StepObserver, np.ndarray]:
+    """Return the observer, and by its prior the rms of a measurement, (n_modes,) [um]."""
     if name not in OBSERVERS:
         raise SettingError(f"observer {name!r}: no such observer; there are {', '.join(OBSERVERS)}")
     declared = OBSERVERS[name]
@@ -176,7 +174,7 @@ def _design(
     noise = np.array([mode.lgs_noise for mode in known.model])
     disturbance = [(*lines.turbulence, *lines.lines, *lines.continuum) for lines in known.lines]
     parts = [[one.rms for one in (*of_mode, error.process)] for of_mode, error in zip(disturbance, known.lgs_error, strict=True)]
-    return observer, noise, np.array([np.linalg.norm([sd, *rms]) for sd, rms in zip(noise, parts, strict=True)])
+    return observer, np.array([np.linalg.norm([sd, *rms]) for sd, rms in zip(noise, parts, strict=True)])
 
 
 @contextmanager

@@ -241,8 +241,12 @@ class StreamFrames:
         ratio = self._source.sampling.ratio
         is_due = ratio is not None and self._ring.count > 0 and self._ring.count % ratio == 0
         tested = self._gates[0].check(z), self._gates[1].check(ngs) if is_due else ngs
-        if any(np.isnan(new).sum() > np.isnan(old).sum() for new, old in zip(tested, (z, ngs), strict=True)):
-            self._say_once("an outlying measurement is taken for missing")
+        if any(not np.array_equal(new, old, equal_nan=True) for new, old in zip(tested, (z, ngs), strict=True)):
+            counts = [", ".join(map(str, gate.outliers)) for gate in self._gates]
+            done = "clipped" if self._gates[0].settings.action == "clip" else "taken for missing"
+            self._say_once(
+                f"outliers are {done}", f": {counts[0]} so far, mode by mode" + f"; NGS {counts[1]}" * (ratio is not None)
+            )
         return tested
 
     def _begin_at(self) -> None:
@@ -304,11 +308,11 @@ class StreamFrames:
         if not self._stream.is_current:
             self._stream = None
 
-    def _say_once(self, line: str) -> None:
-        """Say what may be so at every other frame: the first time, and again after SPELL without it."""
+    def _say_once(self, line: str, more: str = "") -> None:
+        """Say what may be so at every other frame, and more of it: the first time, and again after SPELL without it."""
         now = monotonic()
         if now - self._spells.get(line, -inf) > SPELL:
-            self._say(line)
+            self._say(line + more)
         self._spells[line] = now
 
     def _say(self, line: str) -> None:

@@ -99,8 +99,8 @@ class OutlierGate:
         self._gap, self._settling = np.zeros(n, dtype=int), np.zeros(n, dtype=int)  # samples missing in a row; left after a gap
         self._errors, self._is_usual = np.zeros((n, BLOCK)), np.zeros((n, BLOCK), dtype=bool)
 
-    def check(self, z: Array) -> Array:
-        """Return z (n_modes,) [um] with outliers NaN, or clipped; NaN is missing."""
+    def check(self, z: Array, *, settles: bool = True) -> Array:
+        """Return z (n_modes,) [um] with outliers NaN, or clipped; NaN is missing. settles : or else `settle` has to follow."""
         if self.count == 0:
             self._offset = np.nan_to_num(z)
         k, limit = self.count % BLOCK, self._limit()
@@ -116,7 +116,14 @@ class OutlierGate:
         self._errors[:, k], self._is_usual[:, k] = error, is_there & ~is_outlier & (self._settling == 0)
         self._past[:, ORDER + k] = expected - self._offset + np.nan_to_num(kept)
         self._count(is_outlier)
+        if settles:
+            self.settle()
         return np.where(is_outlier, expected + kept, z)
+
+    def settle(self) -> None:
+        """Fit after the last sample of a block: the part of the work that can wait."""
+        if self.count % BLOCK == 0:
+            self._fit()
 
     def check_all(self, z: Array) -> Array:
         """Return samples z (n, n_modes) [um] as `check` does one by one; all that pass between two outliers at once."""
@@ -146,7 +153,7 @@ class OutlierGate:
         return self.settings.level * (1.0 + EARLY / max(self.count // BLOCK, 1)) * self._deviation
 
     def _count(self, is_outlier: Array) -> None:
-        """Count a sample, open the gate where outliers last, and fit at the end of a block.
+        """Count a sample, and open the gate where outliers last.
 
         Errors that last with one sign are a jump of the level, which the past has had from then on.
         """
@@ -162,8 +169,6 @@ class OutlierGate:
         self._open = np.where(lasting, OPEN, np.maximum(self._open - 1, 0))
         self._out_count = np.where(lasting, 0.0, self._out_count)
         self._deviation = np.where(lasting, 2.0, 1.0) * self._deviation
-        if self.count % BLOCK == 0:
-            self._fit()
 
     def _pass(self, z: Array) -> int:
         """Take samples (n, n_modes) of one block up to the first that is an outlier or missing; return how many."""
@@ -178,8 +183,8 @@ class OutlierGate:
         self._out_count = self._out_count * (1.0 - FORGET) ** n
         self._gap = np.where(n > 0, 0, self._gap)
         self.count += n
-        if n and k + n == BLOCK:
-            self._fit()
+        if n:
+            self.settle()
         return n
 
     def _fit(self) -> None:

@@ -13,10 +13,11 @@ from wfsobs.latencies import Latencies
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.step import StepObserver
 from wfsobs.record import Sampling
+from wfsobs.signal.gate import OutlierGate
 from wfsobs.streams.layout import Semaphore, StreamError
 from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.stream import SinkStream, SourceStream
-from wfsobs.streams.watchdog import Gate, Watchdog
+from wfsobs.streams.watchdog import Watchdog
 from wfsobs.streams.wiring import Wiring, check_elements
 from wfsobs.typing import Array
 
@@ -117,6 +118,57 @@ NANOMETRE = 1e-6
 """What stands for it in a histogram, which then goes from 0.1 nm to 1 cm."""
 
 
+FAR = 6.0
+"""Rms of a measurement by the prior beyond the largest estimate that may be sent: what is farther is never taken."""
+
+
+class SafeGate:
+    """Keeps outliers, and numbers far beyond any estimate that may be sent, from an observer.
+
+    Parameters
+    ----------
+    wiring : Wiring
+        Gate, rms of a measurement, largest estimate.
+
+    Attributes
+    ----------
+    outliers : Array of int
+        How many there were, (n_modes,).
+    beyond : int
+        How many there were in a row in a mode, the last one among them.
+    """
+
+    beyond: int
+
+    def __init__(self, wiring: Wiring):
+        n = wiring.spread.size
+        self._gate = None if wiring.gate is None else OutlierGate(n, wiring.gate)
+        self._possible, self.outliers = wiring.largest + FAR * wiring.spread, np.zeros(n, dtype=int)
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew with an observer that does."""
+        self._row, self.beyond = np.zeros(self._possible.size, dtype=int), 0
+        if self._gate is not None:
+            self._gate.reset()
+
+    def accept(self, z: Array) -> Array:
+        """Return a measurement, any numbers (n_modes,) [um], with outliers NaN, or clipped; `settle` has to follow."""
+        taken = np.where(np.abs(z) <= self._possible, z, np.nan)
+        if self._gate is not None:
+            taken = self._gate.check(taken, settles=False)
+        is_out = ~np.isnan(z) & (taken != z)
+        self.outliers += is_out
+        self._row = np.where(is_out, self._row + 1, np.where(np.isnan(z), self._row, 0))
+        self.beyond = int(self._row.max())
+        return taken
+
+    def settle(self) -> None:
+        """Do what can wait until an estimate is out."""
+        if self._gate is not None:
+            self._gate.settle()
+
+
 class _Span:
     """What is counted over a stretch of time."""
 
@@ -205,7 +257,7 @@ class Tally:
         error, size = span.medians()
         scores = "" if error is None else f"; next measurement: {error:.1f} of {size:.1f} nm (medians)"
         return (
-            f"{span.frames} frames, {span.missing} missing, {span.out_of_band} out of band, {span.late} late; "
+            f"{span.frames} frames, {span.missing} missing, {span.out_of_band} with outliers, {span.late} late; "
             f"{span.quantile(0.5):.0f}, {span.quantile(0.999):.0f} us (p50, p99.9){scores}; output: {reason or 'on'}"
         )
 
@@ -273,10 +325,10 @@ class Attachment:
         self._source, self._sink, self._observer, self._wiring, self._say = source, sink, observer, wiring, say
         self._elements = np.array(wiring.elements)
         self._watchdog = Watchdog(wiring.largest, wiring.safety, say, wiring.warm_up)
-        self._gate, self._ngs_gate = Gate(wiring.spread, wiring.largest), Gate(wiring.spread, wiring.largest)
+        self._gate, self._ngs_gate = SafeGate(wiring), SafeGate(wiring)
         self._semaphore: Semaphore | None = None
         self._semaphore_number: int | None = None
-        self._missing = np.full(len(wiring.elements), np.nan)
+        self._missing = self._forecast = np.full(len(wiring.elements), np.nan)
         self._count, self._alive = source.first, 0.0
         self._is_stuck = self._is_overtaken = False
         self._ngs, self._frames = ngs, GoingBack(observer)
@@ -350,20 +402,22 @@ class Attachment:
             lost = 0
         self._count = count
         for _ in range(lost):
-            self._frames.update(self._missing)
+            self._frames.update(self._gate.accept(self._missing))
+            self._gate.settle()
         if lost:
             self._expect()
         with np.errstate(over="ignore", invalid="ignore"):
             measured = values[self._elements] * self._wiring.unit
         found_ngs = self._look_for_ngs()
-        z, error = self._gate.accept(measured), measured - self._gate.mean
-        beyond = max(self._gate.beyond.max(), self._ngs_gate.beyond.max())
+        z, error = self._gate.accept(measured), measured - self._forecast
+        beyond = max(self._gate.beyond, self._ngs_gate.beyond)
         output = self._watchdog.output(self._step(z, *found_ngs), z, beyond, lost)
         self._is_overtaken = self._source.count != count and not self._is_overtaken
         if not self._is_overtaken:  # else the next answer follows at once, and who waits for it must not get this one
             self._send(output)
         self.tally.add(arrival, monotonic(), lost, measured, error, not np.array_equal(z, measured, equal_nan=True))
         self._observer.settle()
+        self._gate.settle()
         self._frames.keep()
         self._expect()
 
@@ -382,7 +436,11 @@ class Attachment:
         if phase is not None and self._frames.align((self._count - phase) % self._ngs.ratio):
             self._restart_gates()
             self._watchdog.fall_back("the NGS frames have found their place")
-        return (None, 0) if found is None else (self._ngs_gate.accept(found[1]), found[0])
+        if found is None:
+            return None, 0
+        ngs = self._ngs_gate.accept(found[1])
+        self._ngs_gate.settle()
+        return ngs, found[0]
 
     def _step(self, z: Array, ngs: Array | None, late: int) -> Array:
         self._frames.update(z, ngs, late)
@@ -391,19 +449,13 @@ class Attachment:
         )
 
     def _expect(self) -> None:
-        """Keep what the next measurement should be, and how sure that is: the deviations of the parts added up.
-
-        Observers of both sensors predict no errors of the LGS, so that they state no deviation of its measurement.
-        """
+        """Keep what the next measurement should be, for the statistics."""
         observer = self._observer
-        if observer.estimator.horizon or len(observer.targets) < len(TARGETS):
-            return
-        parts = [observer.predict(0, target) for target in observer.targets]
-        self._gate.mean = self._ngs_gate.mean = sum((mean for mean, _ in parts), np.zeros_like(self._missing))
-        if self._ngs is None:
-            self._gate.sd = sum((sd for _, sd in parts), self._wiring.noise)
+        if not observer.estimator.horizon and len(observer.targets) == len(TARGETS):
+            self._forecast = sum((observer.predict(0, target)[0] for target in observer.targets), np.zeros_like(self._missing))
 
     def _restart_gates(self) -> None:
+        self._forecast = self._missing
         self._gate.restart()
         self._ngs_gate.restart()
 
@@ -451,5 +503,6 @@ class Attachment:
 
     def summary(self) -> dict[str, Any]:
         """Return counts, latencies [us] and errors [nm] so far, as JSON takes them."""
-        ngs = {} if self._ngs is None else self._ngs.summary()
-        return {**self.tally.summary(), **ngs, "fallbacks": self._watchdog.trips, "output": self._watchdog.reason or "on"}
+        ngs = {} if self._ngs is None else {**self._ngs.summary(), "ngs_outliers": self._ngs_gate.outliers.tolist()}
+        counts = {"outliers": self._gate.outliers.tolist(), **ngs}
+        return {**self.tally.summary(), **counts, "fallbacks": self._watchdog.trips, "output": self._watchdog.reason or "on"}

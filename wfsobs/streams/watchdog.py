@@ -1,4 +1,4 @@
-"""What a loop may rely on: measurements that cannot be are missing, and estimates go out while all is well."""
+"""What a loop may rely on: estimates go out while all is well."""
 
 from __future__ import annotations
 
@@ -8,22 +8,13 @@ from typing import Literal
 
 import numpy as np
 
+from wfsobs.signal.gate import RUN
 from wfsobs.typing import Array
 
 Fallback = Literal["zero", "hold"]
 
-SIGMAS = 6.0
-"""A measurement is out of its band beyond so many standard deviations of its prediction."""
-BEYOND = 5
-"""Measurements in a row that are out of their band before they are believed rather than the estimate."""
 LIMIT = 10.0
 """Magnitude that no estimate may have unless told, over the rms of a measurement by the prior."""
-PACE = 0.02
-"""By how much of itself a deviation that follows the errors changes with each of them: it forgets in 1 / PACE of them."""
-LEAST = 1e-3
-"""The least that it falls to, over the rms of a measurement by the prior."""
-MEDIAN = 0.6745
-"""Median of the magnitude of a Gaussian variable, over its standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -40,57 +31,6 @@ class Safety:
     largest: float | None = None
     missing: int = 10
     calm: int = 1000
-
-
-class Gate:
-    """Replaces measurements that cannot be by missing ones.
-
-    A measurement beyond `SIGMAS` deviations of its prediction is missing; after `BEYOND` in a row they are taken, as then the
-    disturbance has moved. One far beyond any estimate that may be sent is always missing, so that none stays in a filter.
-
-    The deviation is the one that the filter states, or where that is larger the one that its errors show: the running median of
-    their magnitude, which starts at the rms of a measurement by the prior. Where the filter states none the latter stands alone.
-
-    Parameters
-    ----------
-    spread : Array
-        Rms of a measurement by the prior, (n_modes,) [um].
-    largest : Array
-        Magnitude that no estimate may have, (n_modes,) [um].
-
-    Attributes
-    ----------
-    mean, sd : Array
-        Prediction of the next measurement, and the standard deviation that the filter states for it, (n_modes,) [um]; NaN where
-        there is none.
-    beyond : Array of int
-        Measurements out of their band in a row, (n_modes,).
-    """
-
-    mean: Array
-    sd: Array
-    beyond: Array
-
-    def __init__(self, spread: Array, largest: Array):
-        self._spread, self._possible = spread, largest + SIGMAS * spread
-        self.restart()
-
-    def restart(self) -> None:
-        """Begin anew with a filter that does."""
-        self.mean = self.sd = np.full(self._spread.size, np.nan)
-        self.beyond = np.zeros(self._spread.size, dtype=int)
-        self._deviation = self._spread
-
-    def accept(self, z: Array) -> Array:
-        """Return a measurement, any numbers (n_modes,) [um], with NaN where it cannot be."""
-        is_possible, followed = np.abs(z) <= self._possible, self._deviation
-        error = np.abs(np.where(is_possible, z, np.nan) - np.where(np.isnan(self.mean), 0.0, self.mean))
-        is_in = error <= SIGMAS * np.where(np.isnan(self.sd), followed, self.sd)
-        self.beyond = np.where(is_in, 0, self.beyond + ~np.isnan(z))
-        is_taken = (error <= SIGMAS * np.fmax(followed, self.sd)) | is_possible & (self.beyond >= BEYOND)
-        pace = PACE * np.sign(np.nan_to_num(error - MEDIAN * followed))
-        self._deviation = np.maximum(followed * np.exp(pace), LEAST * self._spread)
-        return np.where(is_taken, z, np.nan)
 
 
 class Watchdog:
@@ -132,7 +72,7 @@ class Watchdog:
         z : Array
             The measurement that it has taken, (n_modes,) [um].
         beyond : int
-            Measurements out of their band in a row, this one among them (`Gate`).
+            Outliers in a row, this one among them.
         missing : int
             Frames missing in a row before this one.
         """
@@ -176,6 +116,6 @@ class Watchdog:
             return f"the estimate exceeds {self._largest[too_large][0]:.4g} um"
         if missing > self._safety.missing:
             return f"{missing} frames in a row are missing"
-        if beyond >= BEYOND:
-            return f"the estimate left its band: {BEYOND} measurements in a row {SIGMAS:g} standard deviations off"
+        if beyond >= RUN:
+            return f"{RUN} measurements in a row are outliers"
         return ""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from wfsobs.signal.gate import GateSettings
 from wfsobs.streams.layout import StreamError
 from wfsobs.streams.stream import AnyStream
 from wfsobs.streams.watchdog import LIMIT, Safety
@@ -23,21 +24,21 @@ class Wiring:
     elements : number in a frame of the stream of each mode of the observer
     unit     : micrometres per unit of the streams
     ahead    : frames from the newest measurement to the one that is to be met
-    noise    : rms of the noise of a measurement, (n_modes,) [um]
     spread   : rms of a measurement by the prior, (n_modes,) [um]
     stuck    : time without a frame after which the stream is stuck [s]
     semaphore : number of the semaphore that is waited for, where no other process does; None looks at the counter
+    gate     : how outliers are kept from the observer; by default not at all
     """
 
     elements: tuple[int, ...]
     unit: float
     ahead: float
-    noise: Array
     spread: Array
     safety: Safety = field(default_factory=Safety)
     warm_up: int = 0
     stuck: float = STUCK
     semaphore: int | None = None
+    gate: GateSettings | None = None
 
     @property
     def largest(self) -> Array:
