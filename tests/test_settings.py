@@ -183,6 +183,7 @@ def test_every_number_states_its_unit_or_has_none(subtests: pytest.Subtests) -> 
         "lost_commands",
         "hysteresis",
         "optical_gain_rms",
+        "caution",
     }
     for path, p in ALL.items():
         with subtests.test(path):

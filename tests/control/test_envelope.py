@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from tests.records import MATCHED
 from wfsobs.cli.group import main
 from wfsobs.closed_loop.design import design
-from wfsobs.closed_loop.envelope import PlantEnvelope, Spread, Uncertainty, plant_envelope
+from wfsobs.closed_loop.envelope import LOSS, PlantEnvelope, Spread, Uncertainty, plant_envelope
 from wfsobs.settings.errors import SettingError
 
 NAMES = ["integrator", "lqg-kf-lgs", "lqg-multirate-multi"]
@@ -56,6 +56,24 @@ def test_points_fill_the_box_and_corners_are_its_corners(result: PlantEnvelope) 
         assert x.std() == pytest.approx(most[name] / np.sqrt(3.0), rel=0.05), "uniform; Sobol's points are even"
     corners = np.column_stack([x / most[name] for name, x in result.corner_errors.items()])
     assert len(np.unique(corners, axis=0)) == 16 and (np.abs(corners) == 1.0).all()
+
+
+def test_caution_is_found_that_leaves_less_at_worst() -> None:
+    """Of a model that is the truth, none leaves less at the nominal plant: what is won at the worst is paid for there."""
+    s = MATCHED.replace({"sensors.lgs_rate": 500.0})
+    bold, tuned = (plant_envelope(s, ["lqg-kf-lgs"], points=20, tune=x) for x in (False, True))
+    (before,), (after,) = bold.spreads, tuned.spreads
+    together = [float(np.sqrt((x**2).sum())) for x in (before.worst, after.worst, before.nominal, after.nominal)]
+    assert after.caution > 1.0 and together[1] < together[0]
+    assert together[2] < together[3] <= (1.0 + LOSS) * together[2] * 1.001
+    again = plant_envelope(s.replace({"control.caution": after.caution}), ["lqg-kf-lgs"], points=20)
+    assert again.spreads[0].worst == pytest.approx(after.worst, rel=1e-9), "the setting is that of the search"
+
+
+def test_caution_divides_an_optimised_gain() -> None:
+    one, two = (design(MATCHED.replace({"control.caution": c}), ["integrator"]).laws["integrator"][0].law for c in (1.0, 2.0))
+    assert one is not None and two is not None and one.gain is not None
+    assert two.gain == pytest.approx(0.5 * one.gain, rel=1e-12)
 
 
 def test_what_is_not_linear_is_left_out_and_says_so(result: PlantEnvelope) -> None:

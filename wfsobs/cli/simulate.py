@@ -242,7 +242,7 @@ def envelope_table(result: PlantEnvelope) -> Table:
     out = Table(title=f"Residual over {size} plants: {', '.join(names[name] for name in result.errors)}")
     for name in ("Mode", "Controller"):
         out.add_column(name, no_wrap=True)
-    for name in ("nominal, nm", "mean", "95 %", "worst", "unstable, %", "corners"):
+    for name in ("caution", "nominal, nm", "mean", "95 %", "worst", "unstable, %", "corners"):
         out.add_column(name, justify="right", no_wrap=True)
     rows = result.rows()
     for mode in dict.fromkeys(r["mode"] for r in rows):
@@ -251,7 +251,9 @@ def envelope_table(result: PlantEnvelope) -> Table:
             left = [r[f"{name}_rms_nm"] for name in ("nominal", "mean", "p95", "worst")]
             share = "{:.1f} ({:.1f} to {:.1f})".format(*(100.0 * r[f"unstable_{k}"] for k in ("share", "low", "high")))
             shown = ["unstable" if x is None else f"{x:.2f}" for x in left]
-            out.add_row(mode, label(r["controller"]), *shown, share, f"{r['unstable_corners']} of {r['corners']}")
+            out.add_row(
+                mode, label(r["controller"]), f"{r['caution']:.3g}", *shown, share, f"{r['unstable_corners']} of {r['corners']}"
+            )
     out.caption = "mean and 95 % of the stable plants; worst of all and of the corners; share with its 95 % interval"
     return out
 
@@ -266,6 +268,7 @@ def envelope_table(result: PlantEnvelope) -> Table:
 @click.option(
     "--resonance", type=click.FloatRange(0, 1, max_open=True), default=0.1, show_default=True, help="Of `plant.resonance`."
 )
+@click.option("--tune", "is_tuned", is_flag=True, help="Search for the `control.caution` of least residual at the worst plant.")
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
 def envelope(
     scenario: Scenario,
@@ -275,12 +278,15 @@ def envelope(
     gain: float,
     rotation: float,
     resonance: float,
+    is_tuned: bool,
     as_json: bool,
 ) -> None:
     """Compute what every linear controller leaves of the disturbance over an uncertain plant (docs/trust.md)."""
     of = Uncertainty(delay, gain, rotation, resonance)
     with progress_bar("controllers") as update:
-        result = plant_envelope(scenario, controllers or None, uncertainty=of, points=points, watch=Watch(progress=update))
+        result = plant_envelope(
+            scenario, controllers or None, uncertainty=of, points=points, tune=is_tuned, watch=Watch(progress=update)
+        )
     if as_json:
         click.echo(json.dumps(result.rows(), allow_nan=False))
         return

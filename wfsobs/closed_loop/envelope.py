@@ -25,7 +25,8 @@ from wfsobs.control.mismatch import loops, pairs, radius, weigh
 from wfsobs.control.true_plant import TruePlant
 from wfsobs.evaluation.rows import Row
 from wfsobs.notebook import PlotAccessor, import_extra
-from wfsobs.priors_from.controllers import full_plant_of
+from wfsobs.priors_from.controllers import full_plant_of, own_settings
+from wfsobs.priors_from.scenario import told_spectra
 from wfsobs.progress import QUIET, Watch
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
@@ -36,6 +37,15 @@ if TYPE_CHECKING:
     import pandas
 
 POINTS = 1000
+
+CAUTIONS = tuple(2.0 ** (0.25 * i) for i in range(-3, 13))
+"""Cautions that a search tries, 0.6 to 8."""
+
+FEW = 32
+"""Points that it looks at, beside all corners."""
+
+LOSS = 0.1
+"""How much more a controller may leave at the nominal plant for less at the worst."""
 
 AT_ONCE = 2**21
 """Numbers in the largest array of a block of plants."""
@@ -64,12 +74,18 @@ class Spread:
         rms of the residual at the plant of the scenario, per mode [um]; infinite where it is not stable.
     points, corners : Array
         The same at the points and corners, (n, n_modes).
+    caution : float
+        `control.caution` that it was designed with.
+    trade : tuple of tuple
+        (caution, rms at the nominal plant, rms at the worst) of all that a search tried, modes together [um].
     """
 
     controller: str
     nominal: Array
     points: Array
     corners: Array
+    caution: float = 1.0
+    trade: tuple[tuple[float, float, float], ...] = ()
 
     @property
     def unstable(self) -> int:
@@ -137,6 +153,7 @@ class PlantEnvelope:
                     {
                         "controller": spread.controller,
                         "mode": mode.name,
+                        "caution": spread.caution,
                         **{f"{k}_rms_nm": None if x is None or np.isinf(x) else float(x) * 1e3 for k, x in numbers.items()},
                         "unstable_share": spread.unstable / len(spread.points),
                         "unstable_low": low,
@@ -184,6 +201,7 @@ def plant_envelope(
     *,
     uncertainty: Uncertainty | None = None,
     points: int = POINTS,
+    tune: bool = False,
     watch: Watch = QUIET,
 ) -> PlantEnvelope:
     """Compute what every linear controller leaves over an uncertain plant.
@@ -198,6 +216,9 @@ def plant_envelope(
         Largest errors.
     points : int
         Points of Sobol's sequence; corners come on top.
+    tune : bool
+        Whether to search for the caution of every controller (`control.caution`) that leaves least at the worst plant, at most
+        LOSS more than the least at the nominal one.
     watch : Watch, optional
         Receives the progress, and is asked whether to stop.
 
@@ -241,10 +262,35 @@ def plant_envelope(
             notes[name] = reason
             continue
         laws = [one.law for one in plan.laws[name] if one.law is not None]
+        caution, trade = scenario.control.caution, ()
+        if tune:
+            few = [*plants[: 1 + FEW], *plants[1 + points :]]  # the nominal plant, the first points, the corners
+            laws, caution, trade = _tune(plan, name, few, spectra, watch)
         left = residuals(laws, plan.mirror, plants, spectra, watch)
-        spreads.append(Spread(name, left[0], left[1 : 1 + points], left[1 + points :]))
+        spreads.append(Spread(name, left[0], left[1 : 1 + points], left[1 + points :], caution, trade))
         watch.step((i + 1) / len(linear))
     return PlantEnvelope(scenario, of, errors, corners, tuple(spreads), notes)
+
+
+def _tune(
+    plan: Design, name: str, plants: Sequence[TruePlant], spectra: Sequence[TrueSpectra], watch: Watch
+) -> tuple[list[Law], float, tuple[tuple[float, float, float], ...]]:
+    """Return the laws of the least residual at the worst of some plants, their caution, and what was tried."""
+    controller, prior = CONTROLLERS[name], replace(plan.priors[name], spectra=tuple(told_spectra(one) for one in spectra))
+    found: list[tuple[float, float, float, list[Law]]] = []
+    for caution in CAUTIONS:
+        settings = own_settings(controller, plan.scenario)
+        settings.control.caution = caution
+        try:
+            laws = list(controller.laws(prior, plan.plant, settings, len(spectra)))
+        except ValueError:
+            continue
+        if all(law.stable for law in laws):
+            left = np.sqrt((residuals(laws, plan.mirror, plants, spectra, watch) ** 2).sum(axis=1))
+            found.append((caution, float(left[0]), float(left.max()), laws))
+    most = (1.0 + LOSS) * min(nominal for _, nominal, _, _ in found)
+    caution, _, _, laws = min((one for one in found if one[1] <= most), key=lambda one: (one[2], one[1]))
+    return laws, caution, tuple((caution, nominal, worst) for caution, nominal, worst, _ in found)
 
 
 def _why_not(plan: Design, name: str) -> str:

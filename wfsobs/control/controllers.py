@@ -34,7 +34,7 @@ from wfsobs.settings.tree import Plain
 def integrator(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """Return the integrator with the gain of the settings, or with the optimal gain for the given spectra."""
     c = settings.control
-    gain = c.gain if c.integrator == "manual" else best_gain(prior.spectra[mode], plant.mirror, c.leak)
+    gain = c.gain if c.integrator == "manual" else best_gain(prior.spectra[mode], plant.mirror, c.leak) / c.caution
     return integrator_law(plant.mirror, gain, c.leak)
 
 
@@ -94,6 +94,8 @@ CONTROLLERS = Registry(
             lqg_kf_lgs,
             help="minus what the LGS Kalman filter predicts",
             prior=(LgsModel, LgsStars),
+            settings=("control",),
+            counts=_nothing_more,
             look=Look("LQG LGS KF", "#FF6600", "#FF8533"),
         ),
         Controller(
@@ -102,7 +104,7 @@ CONTROLLERS = Registry(
             lqg_kf_multi,
             help="minus what the Kalman filter of every peak predicts",
             prior=(Lines, LgsStars),
-            settings=("multipeak",),
+            settings=("control", "multipeak"),
             counts=_nothing_more,
             look=Look("LQG multi-peak", "#AE7D40", "#BA6A26", (14, 3)),
         ),
@@ -113,7 +115,7 @@ CONTROLLERS = Registry(
             help="minus what the paper's multi-rate filter predicts",
             prior=(NoiselessModel, LgsStars),
             asks=_matched_noise,
-            settings=("multirate",),
+            settings=("control", "multirate"),
             ngs=True,
             counts=_nothing_more,
             look=Look("LQG multi-rate", "#E31FFF", "#7E75C8", (10, 2, 2, 2)),
@@ -125,7 +127,7 @@ CONTROLLERS = Registry(
             help="minus what the optimal multi-rate filter predicts",
             prior=(NoiselessModel, LgsError, LgsStars),
             asks=_matched_noise,
-            settings=("multirate",),
+            settings=("control", "multirate"),
             ngs=True,
             counts=_nothing_more,
             look=Look("LQG opt. multi-rate", "#5718C1", "#B848F9", (3, 2)),
@@ -137,7 +139,7 @@ CONTROLLERS = Registry(
             help="minus what the optimal multi-rate filter of every peak predicts",
             prior=(LgsStars, Lines, Beams),
             asks=_matched_noise,
-            settings=("multirate", "multipeak"),
+            settings=("control", "multirate", "multipeak"),
             ngs=True,
             counts=_nothing_more,
             look=Look("LQG multi-rate multi-peak", "#AB64CF", "#F26FF3", (8, 3)),

@@ -28,7 +28,7 @@ from wfsobs.observers.kalman.multirate import (
     optimal_model,
 )
 from wfsobs.observers.kalman.single import steady_mode
-from wfsobs.prior import Prior
+from wfsobs.prior import Noise, Prior
 from wfsobs.signal.gap_gains import ONE, SensorMean
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
@@ -57,20 +57,36 @@ def lqg_of(model: DisturbanceModel, noise: float, mirror: Mirror, mean: SensorMe
     return replace(steady_law(found.gains.filter(row)), gains=found.gains, row=row[0], filter=found)
 
 
-def lqg_kf_lgs(prior: Prior, mode: int, plant: Plant, _settings: Any) -> Law:
+def _with_caution(prior: Prior, settings: Any) -> Prior:
+    """Return a prior with the noise that the settings have a filter take measurements to have."""
+    factor = settings.control.caution
+    if factor == 1.0:
+        return prior
+    return replace(
+        prior,
+        model=tuple(replace(m, lgs_noise=factor * m.lgs_noise, ngs_noise=factor * m.ngs_noise) for m in prior.model),
+        lines=tuple(replace(lines, noise=factor * lines.noise) for lines in prior.lines),
+        noise=tuple(Noise(factor * lgs, factor * ngs) for lgs, ngs in prior.noise),
+    )
+
+
+def lqg_kf_lgs(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With the model of the LGS Kalman filter: turbulence and one vibration peak."""
+    prior = _with_caution(prior, settings)
     model = prior.model[mode]
     return lqg_of(model.disturbance(), model.lgs_noise, plant.mirror, lgs_mean(prior, mode))
 
 
 def lqg_kf_multi(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With every peak of the vibration in the model."""
+    prior = _with_caution(prior, settings)
     lines = prior.lines[mode]
     return lqg_of(lines.disturbance(settings.multipeak.line_width), lines.noise, plant.mirror, lgs_mean(prior, mode))
 
 
 def lqg_multirate(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With the paper's multi-rate filter. Raises UnstableCycle."""
+    prior = _with_caution(prior, settings)
     known = prior.model[mode]
     model, noise = known.disturbance(), multirate_noise(settings.multirate, prior.noise_of(mode))
     found = multirate_mode(model, plant.ratio, *noise)._replace(mean=lgs_mean(prior, mode))
@@ -79,11 +95,13 @@ def lqg_multirate(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
 
 def lqg_multirate_optimal(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With the optimal multi-rate filter."""
+    prior = _with_caution(prior, settings)
     return _optimal(optimal_model(settings.multirate, prior, mode, plant.ratio), prior, mode, plant.mirror)
 
 
 def lqg_multirate_multi(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With the optimal multi-rate filter and every peak of the vibration in its model."""
+    prior = _with_caution(prior, settings)
     cycle = every_peak_model(settings.multirate, settings.multipeak, prior, mode, plant.ratio)
     return _optimal(cycle, prior, mode, plant.mirror)
 

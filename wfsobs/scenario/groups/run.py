@@ -84,6 +84,15 @@ class Control(Group):
         doc="g of u[k] = leak u[k-1] - g y[k], for integrator manual. With a delay of two frames stable below 1.",
     )
     leak: Real = Real(1.0, bounds=(0.0, 1.0), step=0.001, label="Integrator leak", doc="1 is a pure integrator.")
+    caution: Real = Real(
+        1.0,
+        bounds=(0.1, 1000.0),
+        softbounds=(0.5, 10.0),
+        step=0.1,
+        label="Caution",
+        doc="Factor on the noise that LQG takes measurements to have, where that is not set by hand, and divisor of an "
+        "integrator's optimised gain; above 1 a loop bears more errors of the plant.",
+    )
     wavelength: Real = Real(
         2.2, bounds=(0.1, 30.0), step=0.05, label="Science wavelength", doc="Wavelength of the Strehl ratio [um]."
     )
