@@ -16,6 +16,7 @@ from wfsobs.control.integrator import best_gain, highest_stable_gain
 from wfsobs.control.mirror import Mirror
 from wfsobs.control.telemetry_gain import gain_from_telemetry
 from wfsobs.prior import Spectra
+from wfsobs.record import delay_signal
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.typing import Array
 
@@ -44,7 +45,7 @@ def test_it_is_the_gain_whose_loop_leaves_least(delay: float, leak: float) -> No
     rng, mirror, n = np.random.default_rng(3), Mirror(delay), 6_000
     phi, noise = disturbance(rng, n), NOISE * rng.standard_normal(n)
     y, u = close(phi, noise, 0.2, mirror, leak)
-    z = y - mirror.in_measurement(u)
+    z = y - delay_signal(mirror.correction(u), 1)
     found = gain_from_telemetry(z, mirror, leak)
     assert found.limit == highest_stable_gain(mirror, leak)
     tried = found.gain * np.array([0.9, 1.0, 1.1])
