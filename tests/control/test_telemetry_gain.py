@@ -61,7 +61,7 @@ def test_it_is_that_of_the_true_spectra_within_its_deviation() -> None:
     """Over 60 records: no bias beyond three standard errors, and deviations of the right size."""
     mirror, n, grid = Mirror(2.0), 10_000, 2**16 + 1
     f = np.linspace(0.0, 0.5 / DT, grid)
-    own = sum(p.psd(f) for p in (SLOW, LINE)) / (2.0 * DT)
+    own = (SLOW.psd(f) + LINE.psd(f)) / (2.0 * DT)
     omega = 2.0 * np.pi * f * DT
     best = best_gain(Spectra(own, own + NOISE**2, own + 0.0 * omega), mirror, 1.0)
     found = []
