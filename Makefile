@@ -21,6 +21,8 @@ TEST := $(VENV)/.test-$(PINS)
 BENCH := $(VENV)/.bench-$(PINS)
 DOCS := $(VENV)-docs/.docs-$(PINS)
 PEERS := pyrtc hcipy
+# A browser waits as often as it computes.
+BROWSERS := $(shell echo $$(($$(nproc) * 3 / 2)))
 
 # $(call install,requirements[,packages]): these pins and the project itself with its packages, editable; stamps of other pins go.
 define install
@@ -44,7 +46,7 @@ run: $(RUN)  ## serve the dashboard on localhost:5006 (another port: make run PO
 test: setup  ## run all tests, then those in a browser
 	@status=0; \
 	$(BIN)/python -m pytest -n auto --dist worksteal || status=1; \
-	$(BIN)/python -m pytest -n auto --dist loadfile tests/browser || status=1; \
+	$(BIN)/python -m pytest -n $(BROWSERS) --dist loadfile tests/browser || status=1; \
 	exit $$status
 
 test-fast: $(TEST)  ## the quick tests alone: no dashboard, no report, none marked as slow
