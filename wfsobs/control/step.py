@@ -102,6 +102,12 @@ class StepController(StepBase):
         """
         return self._take(z, ngs, stars, "z", is_open=True)
 
+    def amend(self, sent: Array) -> None:
+        """Take what the mirror was sent, (n_modes,) [um], where that is another command than the one of the last frame."""
+        if self.law is not None:
+            self.law.amend(sent - self._commands[0])
+        self._commands[0] = sent
+
     @property
     def correction(self) -> Array:
         """What the mirror does in the last frame, phi_corr, (n_modes,) [um]: the residual is the disturbance and this."""
