@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import io
+import re
 import sys
 from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,12 +16,14 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+import wfsobs
 from wfsobs.record import Record, RecordError, Training
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.formats import FORMATS, format_of
 from wfsobs.telemetry.records import load_record, read_record, record_arrays, save_record
+from wfsobs.units import micrometres_per
 
 AOT = ".aot.fits"
 ENDINGS = [fmt.endings[0] for fmt in FORMATS if fmt.write]
@@ -216,6 +221,83 @@ def test_aot_from_slopes_and_commands() -> None:
     u = np.full((21, 2), np.nan)
     u[there] = commands.astype(float) @ to_tilt.T
     np.testing.assert_allclose(record.u[1:], 0.7 * u[1:] + 0.3 * u[:-1], rtol=1e-12)  # of 1.3 steps
+
+
+def slopes_of_a_loop(rng: np.random.Generator, unit: str, to_modes: np.ndarray | None, control: np.ndarray | None) -> Any:
+    """A system whose slopes, of five subapertures, no matrix of its file makes modes of unasked."""
+    import aotpy
+
+    telescope, star = aotpy.MainTelescope(uid="T"), aotpy.NaturalGuideStar(uid="S")
+    grid = np.array([[0, 1, -1], [2, 3, 4]])
+    sensor = aotpy.ShackHartmann(
+        uid="W",
+        source=star,
+        n_valid_subapertures=5,
+        measurements=aotpy.Image("slopes", rng.standard_normal((20, 2, 5)), unit=unit),
+        subaperture_mask=aotpy.Image("grid", grid),
+        subaperture_intensities=aotpy.Image("flux", rng.random((20, 5))),
+    )
+    n = 2 if to_modes is None else to_modes.shape[1]
+    matrices: dict[str, Any] = {} if control is None else {"control_matrix": aotpy.Image("cm", control)}
+    matrices |= {} if to_modes is None else {"commands_to_modes": aotpy.Image("c2m", to_modes)}
+    loop = aotpy.ControlLoop(
+        uid="L",
+        commanded_corrector=(mirror := aotpy.DeformableMirror(uid="M", telescope=telescope, n_valid_actuators=n)),
+        input_sensor=sensor,
+        commands=aotpy.Image("cmd", rng.standard_normal((20, n)), unit="um"),
+        framerate=1000.0,
+        **matrices,
+    )
+    parts: dict[str, Any] = {"wavefront_sensors": [sensor], "wavefront_correctors": [mirror], "loops": [loop]}
+    return aotpy.AOSystem(ao_mode="SCAO", main_telescope=telescope, sources=[star], **parts)
+
+
+def test_matrices_of_an_aot_file_as_reconstructors(tmp_path: Path) -> None:
+    """Its control matrix, through its commands where these have modes, and the mean slopes of its subapertures."""
+    import aotpy
+
+    rng, path = np.random.default_rng(0), tmp_path / "night.fits"
+    for to_modes in (None, rng.standard_normal((2, 4))):
+        control = rng.standard_normal((2 if to_modes is None else 4, 2, 5))
+        system = slopes_of_a_loop(rng, "pix", to_modes, control)
+        aotpy.AOTFITSWriter(system).get_hdulist().writeto(path, overwrite=True)
+        slopes = system.loops[0].input_sensor.measurements.data
+        record = wfsobs.load(path, reconstructor=str(path), trust=True)
+        rows = control if to_modes is None else np.tensordot(to_modes, control, 1)
+        np.testing.assert_allclose(record.y_lgs, np.einsum("tds,mds->tm", slopes, rows), rtol=1e-12)
+        assert re.search(r"2 modes of 10 slopes by .*night.fits:control_matrix, condition [\d.]+", record.origin)
+        with pytest.raises(RecordError, match="has no matrix 'other'; it has control_matrix, mean_slopes"):
+            wfsobs.load(path, reconstructor=f"{path}:other")
+    aotpy.AOTFITSWriter(system := slopes_of_a_loop(rng, "rad", None, None)).get_hdulist().writeto(path, overwrite=True)
+    mean = system.loops[0].input_sensor.measurements.data.mean(axis=2)
+    with open(geometry := tmp_path / "xy.csv", "w") as file:
+        file.write("x_m,y_m\n" + "".join(f"{x},{y}\n" for x, y in rng.random((5, 2))))
+    for source in (str(path), str(geometry)):
+        record = wfsobs.load(path, reconstructor=source, trust=True)
+        np.testing.assert_allclose(record.y_lgs, mean * micrometres_per("rad", 8.0), rtol=1e-12)
+        assert "the mean of each axis, condition 1" in record.origin
+
+
+def test_a_dump_of_an_observatory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What aotpy's translator makes of it is read as an AOT file; one that it does not accept is one line."""
+    from aotpy import translators
+
+    rng, given = np.random.default_rng(0), []
+    system = slopes_of_a_loop(rng, "pix", None, control := rng.standard_normal((2, 2, 5)))
+
+    class Translator:
+        @classmethod
+        def translate(cls, *arguments: Any) -> Any:
+            given.append(arguments)
+            return system
+
+    with pytest.raises(RecordError, match=r"no NAOMI dump that aotpy translates: .*NAOMI_LOOP_0001.fits"):
+        wfsobs.load(f"naomi:{tmp_path},1")
+    monkeypatch.setattr(translators, "NAOMITranslator", Translator)
+    slopes = system.loops[0].input_sensor.measurements.data
+    record = wfsobs.load(f"naomi:{tmp_path},1", reconstructor=f"naomi:{tmp_path},1", trust=True)
+    assert given == [(str(tmp_path), 1)] * 2
+    np.testing.assert_allclose(record.y_lgs, np.einsum("tds,mds->tm", slopes, control), rtol=1e-12)
 
 
 @pytest.mark.parametrize(("module", "ending", "extra"), [("astropy.io", ".fits", "fits"), ("aotpy", AOT, "aot")])

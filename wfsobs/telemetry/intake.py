@@ -212,6 +212,8 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
     swapped = [name for name, values in signals.items() if values.shape[0] < values.shape[1] > most]
     signals |= {name: np.ascontiguousarray(signals[name].T) for name in swapped}
     modes = apply_matrices(signals, declaration.reconstructor, declaration.command_modes)
+    if declaration.reconstructor and not declaration.reconstructor.keeps_unit:
+        contents.units.pop("y_lgs", None)
     if declaration.open_loop:
         signals["u"] = np.zeros_like(signals["y_lgs"])
     n, n_modes = signals["y_lgs"].shape

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from wfsobs.record import RecordError
-from wfsobs.telemetry.formats.contents import FileColumns
+from wfsobs.telemetry.formats.aot import TRANSLATED
+from wfsobs.telemetry.formats.contents import MEAN_SLOPES, FileColumns, mean_slopes
 from wfsobs.typing import Array
+from wfsobs.units import split_unit
 
 WORST = 1e4
 """Condition beyond which modes are not told from each other."""
@@ -25,10 +28,13 @@ class LoopMatrix:
         Where it comes from, FILE or FILE:NAME.
     values : tuple of tuple of float
         Its rows.
+    keeps_unit : bool
+        Whether modes have the unit of slopes, as their means have.
     """
 
     source: str
     values: tuple[tuple[float, ...], ...]
+    keeps_unit: bool = False
 
     def with_columns(self, n: int, what: str) -> Array:
         """Return it with n columns, transposed where that fits. Raises RecordError."""
@@ -48,14 +54,25 @@ def split_source(text: str) -> tuple[str, str]:
     (('night.fits', 'RECON'), ('matrix.npy', ''))
     """
     path, colon, name = text.rpartition(":")
-    return (path, name) if colon and not Path(text).is_file() else (text, "")
+    is_whole = Path(text).is_file() or path.lower() in TRANSLATED
+    return (path, name) if colon and not is_whole else (text, "")
 
 
 def matrix_of(file: FileColumns, source: str, name: str = "") -> LoopMatrix:
     """Return a matrix of a file. Raises RecordError where there is none of that name, or several without one.
 
-    file : with an array of two dimensions as columns name[0], name[1], ...
+    file : with the matrices of a loop; or an array of two dimensions as columns name[0], name[1], ...; or the positions x and y
+        of subapertures: tip and tilt are then the mean slopes of the axes, their least-squares fit whatever the positions are
     """
+    if file.matrices:
+        name = name or next(iter(file.matrices))
+        if name not in file.matrices:
+            raise RecordError(f"{source}: has no matrix {name!r}; it has {', '.join(file.matrices)}")
+        of = f"{source.removesuffix(f':{name}')}:{name}"
+        return LoopMatrix(of, tuple(map(tuple, file.matrices[name].tolist())), name == MEAN_SLOPES)
+    axes = {re.split("[^a-z]", split_unit(key)[0].lower())[-1]: values.size for key, values in file.columns.items()}
+    if axes.keys() == {"x", "y"} and len(file.columns) == 2:
+        return LoopMatrix(source, tuple(map(tuple, mean_slopes(axes["x"]).tolist())), keeps_unit=True)
     found: dict[str, list[Array]] = {}
     for key, values in file.columns.items():
         found.setdefault(key.partition("[")[0], []).append(values)
@@ -82,7 +99,10 @@ def apply_matrices(signals: dict[str, Array], reconstructor: LoopMatrix | None, 
             rows = matrix.with_columns(n, what)
             if name == "u":
                 rows = np.linalg.pinv(rows.T)
-            said.append(f"{len(rows)} modes of {n} {what} by {matrix.source}, condition {_condition(rows, matrix.source):.3g}")
+            mean = ", the mean of each axis" * matrix.keeps_unit
+            said.append(
+                f"{len(rows)} modes of {n} {what} by {matrix.source}{mean}, condition {_condition(rows, matrix.source):.3g}"
+            )
             signals[name] = signals[name] @ rows.T
     return said
 

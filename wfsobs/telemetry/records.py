@@ -23,6 +23,7 @@ from wfsobs.scenario.presets import paper
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.columns import join_clock, to_contents
 from wfsobs.telemetry.formats import format_of, writer_of
+from wfsobs.telemetry.formats.aot import TRANSLATED, translate
 from wfsobs.telemetry.formats.contents import Contents, FileColumns
 from wfsobs.telemetry.formats.csv import write
 from wfsobs.telemetry.formats.npz import write as write_npz
@@ -113,9 +114,14 @@ def load_record(
 def open_record(path: str | Path, sha256: str | None = None) -> Iterator[tuple[IO[bytes], str]]:
     """Open a file, or a folder of arrays, whose SHA-256 is this one; yield it and the name whose ending gives the format.
 
-    Raises RecordError, also where it cannot be read later.
+    An observatory's dump is NAME:FOLDER,..., such as naomi:night,1 (docs/data.md). Raises RecordError, also where it cannot be
+    read later.
     """
+    dump, colon, rest = str(path).partition(":")
     try:
+        if colon and dump.lower() in TRANSLATED and not Path(path).exists():
+            yield translate(dump.lower(), rest.split(",")), f"{path}.aot.fits"
+            return
         folder = Path(path).is_dir()
         with _open_folder(Path(path)) if folder else open(path, "rb") as file:
             if sha256 is not None:

@@ -10,15 +10,25 @@ training record.
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from typing import IO, Any
 
 import numpy as np
 
 from wfsobs.record import DELAY, RecordError
-from wfsobs.telemetry.formats.contents import NUMBERS, Contents, FileColumns, TooLargeError, numbers_and_texts
+from wfsobs.telemetry.formats.contents import (
+    MEAN_SLOPES,
+    NUMBERS,
+    Contents,
+    FileColumns,
+    TooLargeError,
+    mean_slopes,
+    numbers_and_texts,
+)
 from wfsobs.telemetry.formats.fits import open_fits, read_whole, tables_and_images
 from wfsobs.typing import Array
+from wfsobs.units import parse_unit
 
 PREFIX = "WFSOBS-"
 """Prefix of the names of images and metadata written here."""
@@ -50,11 +60,37 @@ def read(file: IO[bytes], most: int) -> FileColumns:
         reader = aotpy.AOTFITSReader(
             io.BytesIO(read_whole(file)), externals="disallow", exception_level=critical, log_level=critical
         )
-        return FileColumns(contents=_contents(reader.get_system(), aotpy))
+        loop = _first_loop(system := reader.get_system(), aotpy)
+        return FileColumns(contents=_contents(system, loop, aotpy), matrices=_matrices(loop))
     except RecordError:
         raise
     except Exception as error:  # of many kinds, by what a file lacks
         raise RecordError(f"not an AOT file that aotpy can read: {' '.join(str(error).split())[:200]}") from None
+
+
+TRANSLATED = ("ciao", "eris", "galacsi", "gpao", "naomi", "papyrus")
+"""Observatories' dumps that aotpy translates."""
+
+
+def translate(name: str, arguments: Sequence[str]) -> IO[bytes]:
+    """Return the dump of one of TRANSLATED as an AOT file, without pixels; its translator opens the files. Raises RecordError.
+
+    arguments : those of aotpy's translator: folders or a file, and the number of a telescope
+    """
+    aotpy = _aotpy()
+    from aotpy import translators
+
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            translator = getattr(translators, f"{name.upper()}Translator")
+            system = translator.translate(*(int(text) if text.isdecimal() else text for text in arguments))
+            for sensor in system.wavefront_sensors:
+                sensor.detector = sensor.subaperture_intensities = None
+            aotpy.AOTFITSWriter(system).get_hdulist().writeto(file := io.BytesIO())
+    except Exception as error:  # of many kinds, by what a folder lacks
+        raise RecordError(f"no {name.upper()} dump that aotpy translates: {' '.join(str(error).split())[:200]}") from None
+    file.seek(0)
+    return file
 
 
 def read_fits(file: IO[bytes], most: int) -> FileColumns:
@@ -76,22 +112,40 @@ def _check_lists(hdu: Any, most: int) -> None:
                 raise TooLargeError(most)
 
 
-def _contents(system: Any, aotpy: Any) -> Contents:
-    loops = [
-        loop
-        for loop in system.loops
-        if isinstance(loop, aotpy.ControlLoop) and loop.input_sensor is not None and loop.input_sensor.measurements is not None
-    ]
-    if not loops:
-        raise RecordError("has no control loop with measurements")
-    loop = loops[0]
+def _first_loop(system: Any, aotpy: Any) -> Any:
+    for loop in system.loops:
+        if isinstance(loop, aotpy.ControlLoop) and loop.input_sensor is not None and loop.input_sensor.measurements is not None:
+            return loop
+    raise RecordError("has no control loop with measurements")
+
+
+def _rows(image: Any) -> Array | None:
+    """Return an image (m, ...) as a matrix, (m, n)."""
+    return None if image is None else np.asarray(image.data, dtype=np.float64).reshape(len(image.data), -1)
+
+
+def _matrices(loop: Any) -> dict[str, Array]:
+    """Return the matrices of a loop by AOT's names: from slopes to modes, through commands where these are modes or have some."""
+    control, modes = _rows(loop.control_matrix), _rows(loop.commands_to_modes)
+    found = {
+        "measurements_to_modes": _rows(loop.measurements_to_modes),
+        "control_matrix": control if modes is None or control is None else modes @ control,
+        "modes_to_commands": _rows(loop.modes_to_commands),
+    }
+    shape = np.shape(loop.input_sensor.measurements.data)
+    if getattr(loop.input_sensor, "subaperture_mask", None) is not None and len(shape) == 3 and shape[1] == 2:
+        found[MEAN_SLOPES] = mean_slopes(shape[2])
+    return {name: matrix for name, matrix in found.items() if matrix is not None}
+
+
+def _contents(system: Any, loop: Any, aotpy: Any) -> Contents:
     sensor, contents = loop.input_sensor, Contents()
-    measured, to_modes = sensor.measurements, loop.measurements_to_modes
-    _take(contents, "y_lgs", measured, None if to_modes is None else to_modes.data)
+    measured = sensor.measurements
+    _take(contents, "y_lgs", measured, _rows(loop.measurements_to_modes))
     if loop.modal_coefficients is not None:
         _take(contents, "u", loop.modal_coefficients, None)
     elif loop.commands is not None:
-        _take(contents, "u", loop.commands, None if loop.commands_to_modes is None else loop.commands_to_modes.data)
+        _take(contents, "u", loop.commands, _rows(loop.commands_to_modes))
     other = next(
         (
             s
@@ -122,9 +176,10 @@ def _take(contents: Contents, name: str, image: Any, matrix: Array | None) -> No
     data = np.asarray(image.data, dtype=np.float64)
     rows = data.reshape(data.shape[0], -1)
     if matrix is not None:
-        rows = rows @ np.asarray(matrix, dtype=np.float64).reshape(len(matrix), -1).T
+        rows = rows @ matrix.T
     contents.arrays[name] = rows
-    if image.unit and matrix is None:
+    are_modes = name != "y_lgs" or rows.shape[1] <= 2 or parse_unit(image.unit or "")  # slopes may be in pixels
+    if image.unit and matrix is None and are_modes:
         contents.state_unit(name, image.unit)
 
 

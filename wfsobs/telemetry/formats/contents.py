@@ -97,6 +97,8 @@ class FileColumns:
         Name in the file -> number that stands alone.
     contents : Contents
         Whole arrays, numbers and texts of the names of a record (NAMES).
+    matrices : dict of str to Array
+        Matrices of a loop from slopes to modes, the first choice first, and from modes to commands.
     """
 
     columns: dict[str, Array] = field(default_factory=dict)
@@ -104,6 +106,7 @@ class FileColumns:
     texts: dict[str, str] = field(default_factory=dict)
     numbers: dict[str, float] = field(default_factory=dict)
     contents: Contents = field(default_factory=Contents)
+    matrices: dict[str, Array] = field(default_factory=dict)
 
     def add(self, name: str, data: object, unit: str = "") -> None:
         """Add what a file holds under a name: as part of a record where it has the name of one, and numbers as columns.
@@ -294,3 +297,12 @@ class TooLargeError(RecordError):
 
     def __init__(self, most: int):
         super().__init__(f"holds more than {most / 1e6:.4g} MB of numbers, which is the most that is read here")
+
+
+MEAN_SLOPES = "mean_slopes"
+"""Name of that matrix where a sensor has a grid of subapertures."""
+
+
+def mean_slopes(n: int) -> Array:
+    """Return the matrix (2, 2 n) from the slopes of n subapertures, x before y, to their means."""
+    return np.kron(np.eye(2), np.full((1, n), 1.0 / n))
