@@ -50,9 +50,9 @@ TABLE = """() => Object.fromEntries([...document.querySelectorAll("#table tbody:
     [...body.querySelectorAll("tr[data-observer]")].map(tr =>
         [`${body.dataset.target}/${tr.dataset.observer}`, [...tr.cells].map(c => c.textContent.trim())])))"""
 
-CARDS = """() => Object.fromEntries(["turbulence", "vibration"].flatMap(target =>
-    [...document.querySelectorAll(`#cards-${target} .card`)].map(c =>
-        [`${target}/${c.dataset.name}`, c.querySelector(".value").textContent])))"""
+LINES = """() => Object.fromEntries([...document.querySelectorAll(".lines input")].map(it =>
+    [`${it.closest("[data-target]").dataset.target}/${it.name}`, it.parentElement.querySelector("output").textContent]))"""
+"""Target/name -> the error beside the line."""
 
 LINE = """([figure, name]) => {
   const it = Bokeh.documents[0].get_model_by_name(figure)
@@ -150,6 +150,11 @@ def line(page: Page, figure: str, name: str) -> dict[str, Any]:
     return page.evaluate(LINE, [figure, name])
 
 
+def box_of(page: Page, name: str) -> Locator:
+    """The box that shows or hides the line of an observer of the vibration."""
+    return page.locator(f'.lines[data-target=vibration] input[name="{name}"]')
+
+
 def slide(page: Page, *places: int) -> None:
     for i, place in enumerate(places):
         page.locator(f"#vary-{i}").fill(str(place))
@@ -182,7 +187,7 @@ def test_every_state_shows_the_numbers_of_its_run(page: Page) -> None:
             choose(page, title)
             choose(page, written)
             scale = per_micrometre(unit, diameter)
-            table, cards = page.evaluate(TABLE), page.evaluate(CARDS)
+            table, lines = page.evaluate(TABLE), page.evaluate(LINES)
             of_mode = [row for row in rows if row["mode"] == mode]
             assert len(of_mode) == len(table) > 10
             for row in of_mode:
@@ -194,8 +199,8 @@ def test_every_state_shows_the_numbers_of_its_run(page: Page) -> None:
                 spread = f"{ends} " if row["observer"] == "bound" else ""
                 assert cells[1:3] == [spread + error, hundredths(row["normalised_rms"])]
                 assert cells[3] == ("–" if row["lag_s"] is None else hundredths(1e3 * row["lag_s"]))
-                assert cards.get(key, f"{error} {written}") == f"{error} {written}"
-            assert set(cards) - {f"{target}/{TRUTH}" for target in TARGETS} <= set(table)
+                assert lines.get(key, f"{error} {written}") == f"{error} {written}"
+            assert set(lines) - {f"{target}/{TRUTH}" for target in TARGETS} <= set(table)
             assert page.locator("#table .unit").first.text_content() == written
 
 
@@ -252,22 +257,21 @@ def test_errors_over_a_setting(page: Page) -> None:
     drawn = line(page, "sweep-vibration", "kf-lgs")
     assert drawn["x"] == list(GAINS) and drawn["y"] == pytest.approx([error(0, "tilt"), error(1, "tilt")])
     assert drawn["label"] == "rms error, tilt [nm]"
-    card = page.locator('#cards-vibration [data-name="kf-lgs"]')
-    card.click()
+    box = box_of(page, "kf-lgs")
+    box.uncheck()
     assert not line(page, "sweep-vibration", "kf-lgs")["visible"]
-    card.click()
+    box.check()
 
 
-def test_a_card_hides_its_line(page: Page) -> None:
-    card = page.locator('#cards-vibration [data-name="kf-lgs"]')
+def test_a_box_hides_its_line(page: Page) -> None:
+    box = box_of(page, "kf-lgs")
     canvas = page.locator("#trace-vibration")
     page.mouse.move(0, 0)
     page.wait_for_function(
         "() => [...Bokeh.index.query((it) => it.model.name === 'trace-vibration')].some((it) => it.has_finished())"
     )
     before = canvas.screenshot()
-    card.click()
-    expect(card).to_have_attribute("aria-pressed", "false")
+    box.uncheck()
     page.mouse.move(0, 0)
     assert not line(page, "trace-vibration", "kf-lgs")["visible"]
     assert not line(page, "spectrum-vibration", "kf-lgs")["visible"]
@@ -275,9 +279,9 @@ def test_a_card_hides_its_line(page: Page) -> None:
     changes(canvas, before)
     slide(page, 0, 0)
     assert not line(page, "trace-vibration", "kf-lgs")["visible"], "it stays hidden"
-    card.press("Enter")
+    box.press(" ")
     assert line(page, "trace-vibration", "kf-lgs")["visible"]
-    expect(card).to_be_focused()
+    expect(box).to_be_focused()
 
 
 def test_time_windows(page: Page) -> None:
@@ -328,7 +332,7 @@ def test_without_javascript_the_numbers_are_there(open_report: Any) -> None:
     expect(page.get_by_role("heading", name="Scenario")).to_be_visible()
     expect(page.get_by_text("The figures need JavaScript")).to_be_visible()
     expect(page.locator(".controls")).to_be_hidden()
-    expect(page.locator("#cards-vibration")).to_be_hidden()
+    expect(box_of(page, "kf-lgs")).to_be_hidden()
     shown = page.locator('details[open] table.rms:not(.budget):has(tr[data-observer="kf-ngs"])')
     expect(shown).to_have_count(1)
     result = wfsobs.run(scenario(SPEEDS[START[0]], GAINS[START[1]]), observers=["kf-ngs"])
@@ -369,15 +373,11 @@ def test_opens_with_the_verdict_and_the_errors_of_the_main_lines(page: Page) -> 
     expect(best).to_have_text([re.compile(r"^Turbulence, tilt\. "), re.compile(r"^Vibration, tilt\. ")])
     first = line(page, "trace-vibration", "kf-lgs")
     assert first["label"].startswith("error of tilt") and first["visible"]
-    shown = page.locator("#cards-vibration .card[aria-pressed=true]")
-    few = shown.count()
-    assert few < page.locator("#cards-vibration .card").count()
     assert not line(page, "trace-vibration", "butterworth-cl")["visible"]
-    page.locator("#cards-vibration").get_by_role("button", name=re.compile("^All ")).click()
-    page.locator("#cards-vibration").get_by_role("button", name="Show all lines").click()
+    expect(box_of(page, "butterworth-cl")).to_be_hidden()
+    page.locator("[data-target=vibration] summary").click()
+    box_of(page, "butterworth-cl").check()
     assert line(page, "trace-vibration", "butterworth-cl")["visible"]
-    page.locator("#cards-vibration").get_by_role("button", name="Main observers").click()
-    expect(shown).to_have_count(few)
 
 
 def test_on_paper_bars_have_their_colours_and_nothing_is_cut(open_report: Any) -> None:

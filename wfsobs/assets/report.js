@@ -1,12 +1,14 @@
-// The script of a report: reads the data embedded in the page and keeps figures, cards and table in step with the controls.
-// What draws the cards, `render`, stands above it in the same script, and what that needs.
+// The script of a report: reads the data embedded in the page and keeps figures, their lines and the table in step with the controls.
 
 const read = (id) => JSON.parse(document.getElementById(id).textContent)
 const data = read("data")
 const states = read("rows")
 const shown = {state: data.start, mode: data.modes[0], over: Object.keys(data.sweeps)[0]}
 for (const it of document.querySelectorAll(".switches input:checked")) shown[it.name] = it.value
-const hidden = {...data.hidden}
+const boxes = [...document.querySelectorAll("[data-target] input")]  // a line each, those of both figures of the target
+const boxesOf = (target) => boxes.filter((it) => it.closest("[data-target]").dataset.target === target)
+const linesOf = (target) => boxesOf(target).map((it) => it.name)
+const isShown = (target, name) => boxesOf(target).some((it) => it.name === name && it.checked)
 const night = matchMedia("screen and (prefers-color-scheme: dark)")
 let dark = night.matches
 
@@ -16,7 +18,7 @@ const NONE = 65535
 // ------------------------------------------------------------------ numbers and lines
 
 // Three significant digits and no exponent where it is of common size, as in the tables.
-export function number(value, digits = 3) {
+function number(value, digits = 3) {
   if (value === null || value === undefined) return "–"
   if (value === 0) return "0"
   const size = Math.abs(value)
@@ -77,7 +79,7 @@ function lines(figure) {
 }
 
 function fill(figure, x, columns) {
-  lines(figure)[0].data_source.data = {x, ...columns}
+  for (const it of lines(figure).slice(0, 1)) it.data_source.data = {x, ...columns}  // they share it
 }
 
 function drawTrace(figure, target, state) {
@@ -85,10 +87,10 @@ function drawTrace(figure, target, state) {
   const x = axis(state, "time")
   const columns = {}
   const seen = []
-  for (const name of data.names[target]) {
+  for (const name of linesOf(target)) {
     const y = points(state, shown.show, target, name)
     columns[name] = y ? y.map((v) => v * scale) : new Float64Array(x.length).fill(NaN)
-    if (!hidden[target].includes(name)) seen.push(columns[name])
+    if (isShown(target, name)) seen.push(columns[name])
   }
   fill(figure, x, columns)
   fitTrace(figure, x, seen, state.warm_up)
@@ -120,11 +122,11 @@ function drawSpectrum(figure, target, state) {
   const x = axis(state, cumulative ? "frequency-cumulative" : "frequency")
   const columns = {}
   const seen = []
-  for (const name of data.names[target]) {
+  for (const name of linesOf(target)) {
     const error = shown.show === "error" && name !== "truth"
     const y = points(state, shown.spectrum + (error ? "-error" : ""), target, name)
     columns[name] = y ? y.map((v) => v * scale) : new Float64Array(x.length).fill(NaN)
-    if (!hidden[target].includes(name)) seen.push(columns[name].filter((v) => v > 0).sort())
+    if (isShown(target, name)) seen.push(columns[name].filter((v) => v > 0).sort())
   }
   fill(figure, x, columns)
   const full = seen.filter((y) => y.length > 0)
@@ -161,22 +163,9 @@ function drawSweep(figure, target) {
   const now = places(shown.state)
   const order = values.map((_, i) => i).sort((a, b) => values[a] - values[b])
   const runs = order.map((place) => stateAt(now.with(Number(shown.over), place)))
-  const error = (index, name) => {
-    const row = rowOf(index, target, name)
-    return row ? (name === "truth" ? row.truth_rms_um : row.rms_um) * data.states[index].scale[shown.unit] : NaN
-  }
-  const columns = Object.fromEntries(data.names[target].map((name) => [name, runs.map((index) => error(index, name))]))
-  const x = order.map((place) => values[place])
-  fill(figure, x, columns)
-  const top = (names) => Math.max(...names.filter((name) => !hidden[target].includes(name))
-    .flatMap((name) => columns[name]).filter(Number.isFinite), 0)
-  const errors = top(data.names[target].slice(1))
-  const truth = top(["truth"])
-  const high = errors > 0 && truth > 3 * errors ? errors : Math.max(errors, truth)  // the truth where it leaves room
-  if (high > 0) figure.y_range.setv({start: 0, end: 1.05 * high, reset_start: 0, reset_end: 1.05 * high})
-  const room = 0.03 * (x[x.length - 1] - x[0])
-  const ends = {start: x[0] - room, end: x[x.length - 1] + room}
-  figure.x_range.setv({...ends, reset_start: ends.start, reset_end: ends.end})
+  const error = (index, name) => (rowOf(index, target, name)?.rms_um ?? NaN) * data.states[index].scale[shown.unit]
+  fill(figure, order.map((place) => values[place]),
+       Object.fromEntries(linesOf(target).map((name) => [name, runs.map((index) => error(index, name))])))
   figure.renderers.find((it) => it.name === "now").data_source.data = {x: [values[now[shown.over]]]}
   figure.below[0].axis_label = label
   figure.left[0].axis_label = `rms error, ${shown.mode} [${data.units[shown.unit]}]`
@@ -203,10 +192,6 @@ function paint(figure) {
   }
 }
 
-function hide(figure, target) {
-  for (const it of lines(figure)) it.visible = !hidden[target].includes(it.name)
-}
-
 // Figures are as wide as the window: on paper stands a picture of each, as wide as the page has room.
 function toPaper() {
   for (const it of document.querySelectorAll("canvas.paper")) it.remove()
@@ -227,56 +212,15 @@ function zoom(figure, state) {
   figure.x_range.setv({start, end: start + width, reset_start: 0, reset_end: state.length})
 }
 
-// ------------------------------------------------------------------ cards and table
+// ------------------------------------------------------------------ numbers of lines, and table
 
-function cards(target) {
-  const watchers = {items: [], heads: [], legend: [], hidden_lines: [], last_arrival: []}
-  const model = {
-    items: [], terms: {}, heads: {}, legend: [], kind: "observers",  // the report has a section of terms
-    hidden_lines: hidden[target], last_arrival: 0,
-    send_msg({all, main, hidden: names = data.hidden[target], number: asked = model.last_arrival}) {
-      if (all) return
-      hidden[target] = names
-      Object.assign(model, {hidden_lines: names, last_arrival: asked})
-      if (main) watchers.hidden_lines.forEach((f) => f())
-      toggled(target)
-    },
-    on(name, f) { watchers[name].push(f) },
+function drawNumbers(target) {
+  for (const it of boxesOf(target)) {
+    const row = rowOf(shown.state, target, it.name) ?? rowOf(shown.state, "next z", it.name)
+    const value = it.name === "truth" ? row?.truth_rms_um : row?.rms_um
+    const text = row ? `${number(value * data.states[shown.state].scale[shown.unit])} ${data.units[shown.unit]}` : "–"
+    it.parentElement.querySelector("output").textContent = text
   }
-  render({model, el: document.getElementById(`cards-${target}`)})
-  return () => {
-    model.items = data.names[target].filter((name) => name === "truth" || ran(target, name)).map((name) => card(target, name))
-    watchers.items.forEach((f) => f())
-  }
-}
-
-// Whether an observer has run in any state.
-const ran = (target, name) => data.states.some((state) => data.modes.some((mode) => `signal/${target}/${name}/${mode}` in state.lines))
-
-function card(target, name) {
-  const look = data.looks[name]
-  const known = rowOf(shown.state, target, name)
-  const drawn = `signal/${target}/${name}/${shown.mode}` in data.states[shown.state].lines
-  const loop = name === "truth" && !known && rowOf(shown.state, "residual y", "loop")  // where there is no truth
-  const row = known || loop || (drawn && rowOf(shown.state, "next z", name))
-  const value = row && (name === "truth" && !loop ? row.truth_rms_um : row.rms_um)
-  const base = loop ? " × z, residual" : known ? "" : " × z, next z"
-  const relative = row && row.normalised_rms !== null ? `${base ? "" : "relative error "}${row.normalised_rms.toFixed(2)}${base}` : ""
-  const interval = data.states[shown.state].intervals[`${name}/${target}/${shown.mode}`]
-  const half = interval && (interval[1] - interval[0]) / 2 * data.states[shown.state].scale[shown.unit]
-  const missing = name === "truth" ? "" : drawn ? "no truth" : "no result"
-  return {
-    name, label: loop ? "Recorded loop" : look.label, colour: loop ? "transparent" : look[dark ? "dark" : "light"], dash: look.dash, about: loop ? "" : look.about,
-    value: row ? number(value * data.states[shown.state].scale[shown.unit]) : "–",
-    unit: row ? data.units[shown.unit] : "", note: row ? (known && name === "truth" ? "rms" : own(row) || relative) : missing,
-    half: half && number(half, 2), meaning: "where the mean error over seeds lies, at 95 % confidence",
-    main: !data.hidden[target].includes(name),
-  }
-}
-
-// What is said of an observer that was scored on samples of its own.
-function own(row) {
-  return row.apart ? `${row.start_s.toFixed(2)} to ${row.stop_s.toFixed(2)} s only` : ""
 }
 
 function drawTable() {
@@ -296,12 +240,10 @@ function inUnit(table, scale) {
 // ------------------------------------------------------------------ all together
 
 let figures = {}
-const strips = {}
-
 function toggled(target) {
-  hide(figures[`trace-${target}`], target)
-  hide(figures[`spectrum-${target}`], target)
-  if (shown.over) hide(figures[`sweep-${target}`], target)
+  for (const kind of ["trace", "spectrum", ...shown.over ? ["sweep"] : []]) {
+    for (const it of lines(figures[`${kind}-${target}`])) it.visible = isShown(target, it.name)
+  }
   drawFigures(target)
 }
 
@@ -313,9 +255,9 @@ function drawFigures(target) {
 }
 
 function draw() {
-  for (const target of Object.keys(data.names)) {
+  for (const target of data.targets) {
     drawFigures(target)
-    strips[target]()
+    drawNumbers(target)
   }
   for (const it of document.querySelectorAll("[data-verdict]")) {
     it.hidden = it.dataset.verdict !== `${shown.state}` || it.dataset.mode !== shown.mode
@@ -324,7 +266,7 @@ function draw() {
 }
 
 function drawAxes() {
-  const [target] = Object.keys(data.names)
+  const [target] = data.targets
   const state = data.states[shown.state]
   zoom(figures[`trace-${target}`], state)
   const f = axis(state, "frequency")
@@ -332,11 +274,6 @@ function drawAxes() {
     const limits = {start: f[0], end: f[f.length - 1]}
     figures[`spectrum-${target}`].x_range.setv({...limits, reset_start: limits.start, reset_end: limits.end})
   }
-}
-
-function repaint() {
-  Object.values(figures).forEach(paint)
-  Object.values(strips).forEach((f) => f())
 }
 
 function sliders() {
@@ -386,14 +323,14 @@ function withoutAngle() {
 try {
   for (const it of document.querySelectorAll("[data-state]")) it.parentElement.open = false  // the one shown stands above
   figures = await embed()
-  for (const target of Object.keys(data.names)) strips[target] = cards(target)
+  for (const it of boxes) it.onchange = () => toggled(it.closest("[data-target]").dataset.target)
   sliders()
   switches()
   Object.values(figures).forEach(paint)
   drawAxes()
   draw()
-  Object.keys(data.names).forEach(toggled)
-  const turn = (to) => { dark = to; repaint() }
+  data.targets.forEach(toggled)
+  const turn = (to) => { dark = to; Object.values(figures).forEach(paint) }
   night.onchange = () => turn(night.matches)
   window.addEventListener("beforeprint", () => { turn(false); toPaper() })
   window.addEventListener("afterprint", () => turn(night.matches))

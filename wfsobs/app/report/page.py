@@ -16,7 +16,17 @@ from typing import Any
 
 import numpy as np
 from bokeh.document import Document
-from bokeh.models import BoxAnnotation, ColumnDataSource, CrosshairTool, DataRenderer, HoverTool, Range1d, Span, VSpan
+from bokeh.models import (
+    BoxAnnotation,
+    ColumnDataSource,
+    CrosshairTool,
+    DataRange1d,
+    DataRenderer,
+    HoverTool,
+    Range1d,
+    Span,
+    VSpan,
+)
 from bokeh.plotting import figure
 from bokeh.util.paths import bokehjs_path
 from markupsafe import Markup
@@ -58,7 +68,7 @@ START = 'document.documentElement.classList.add("js")'
 def page(report: Report, date: datetime) -> str:
     """Write the whole file; date: now, in the zone to write it in."""
     bokeh = (bokehjs_path() / "js/bokeh.min.js").read_text(encoding="utf-8") + "\nBokeh.set_log_level('warn')"
-    scripts = {"start": START, "bokeh": bokeh, "page": f"{asset('patch.js')}\n{asset('strip.js')}\n{asset('report.js')}"}
+    scripts = {"start": START, "bokeh": bokeh, "page": asset("report.js")}
     names = [state_name(report, state, i) or "All modes" for i, state in enumerate(report.states)]
     states = list(zip(report.states, names, strict=True))
     return render(
@@ -68,9 +78,12 @@ def page(report: Report, date: datetime) -> str:
         summary=summary(report, date),
         policy=_policy(*scripts.values()),
         scripts={name: Markup(script) for name, script in scripts.items()},
-        sheets={"shared": Markup(asset("style.css") + asset("strip.css")), "own": Markup(asset("report.css"))},
+        sheets={"shared": Markup(asset("style.css")), "own": Markup(asset("report.css"))},
         primary=PRIMARY,
         looks={name: look(name) for name in _line_names()},
+        lines=_lines(report),
+        main=report.states[report.start].main,
+        about=sentence_on,
         marks=(PEAKS, MODEL),
         shades=SHADES,
         targets=TARGETS,
@@ -120,6 +133,12 @@ def _line_names() -> list[str]:
     return [TRUTH, *OBSERVERS, *BOUNDS]
 
 
+def _lines(report: Report) -> dict[str, list[str]]:
+    """Which observers have a line in some state, and the truth, by target."""
+    drawn = {tuple(name.split("/")[1:3]) for state in report.states for name in state.lines}
+    return {target: [name for name in (TRUTH, *observers_of(target)) if (target, name) in drawn] for target in TARGETS}
+
+
 # ---------------------------------------------------------------------- for the script
 
 
@@ -127,7 +146,7 @@ def _figures(report: Report) -> dict[str, Any]:
     """Collect the figures without data, and where each is drawn."""
     document = Document()
     parts = report.sweep["lines"] if report.sweep else ()
-    for fig in all_figures(bool(_sweeps(report)), parts).values():
+    for fig in all_figures(_lines(report), bool(_sweeps(report)), parts).values():
         document.add_root(fig)
     return {"document": document.to_json(deferred=False), "roots": {root.id: str(root.name) for root in document.roots}}
 
@@ -142,21 +161,8 @@ def _data(report: Report) -> dict[str, Any]:
     pool = Pool()
     states = [_state(state, pool) for state in report.states]
     return {
-        "looks": {
-            name: {
-                "label": look(name).label,
-                "light": look(name).light,
-                "dark": look(name).dark,
-                "dash": look(name).dash,
-                "about": sentence_on(name),
-            }
-            for name in _line_names()
-        },
-        "hidden": {
-            target: [name for name in observers_of(target) if name not in report.states[report.start].main[target]]
-            for target in TARGETS
-        },
-        "names": {target: [TRUTH, *observers_of(target)] for target in TARGETS},
+        "looks": {name: {"light": look(name).light, "dark": look(name).dark} for name in _line_names()},
+        "targets": TARGETS,
         "modes": _modes(report),
         "tilts": [m.name for m in TIP_TILT],
         "angles": NO_ANGLE,
@@ -204,25 +210,26 @@ SHADES = {WARM_UP: "#808080", WINDOW: "#2B8AB3"}
 """Stretches of a trace that are shaded."""
 
 
-def all_figures(sweeps: bool, parts: Sequence[Mapping[str, Any]] = ()) -> dict[str, figure]:
+def all_figures(lines: Mapping[str, Sequence[str]], sweeps: bool, parts: Sequence[Mapping[str, Any]] = ()) -> dict[str, figure]:
     """Make all figures by name, as in "trace-turbulence"; the traces share their time axis, the spectra their frequencies.
 
-    sweeps : with those of errors over a setting that varies; parts : errors of a sweep over one setting, which have their data
+    lines : names of the lines by target; sweeps : with those of errors over a setting that varies; parts : errors of a sweep over
+    one setting, which have their data
     """
     times, frequencies = Range1d(start=0.0, end=10.0), Range1d(start=0.5, end=500.0)
     crosshair = CrosshairTool(dimensions="height", overlay=Span(dimension="height", line_alpha=0.4, line_width=1))
-    made = {f"{TRACE}-{target}": _trace(target, times, crosshair) for target in TARGETS}
-    made |= {f"{SPECTRUM}-{target}": _spectrum(target, frequencies) for target in TARGETS}
+    made = {f"{TRACE}-{target}": _trace(names, times, crosshair) for target, names in lines.items()}
+    made |= {f"{SPECTRUM}-{target}": _spectrum(target, names, frequencies) for target, names in lines.items()}
     if sweeps:
-        values = Range1d(start=0.0, end=1.0)
-        made |= {f"{SWEEP}-{target}": _sweep(target, values) for target in TARGETS}
+        values = DataRange1d()
+        made |= {f"{SWEEP}-{target}": _sweep(names, values) for target, names in lines.items()}
     made |= {f"{PART}-{i}": _part(part) for i, part in enumerate(parts)}
     for name, fig in made.items():  # see-through from the start: a white ground leaves its edge behind in dark mode
         fig.update(name=name, background_fill_alpha=0.0, border_fill_alpha=0.0)
     return made
 
 
-def _trace(target: str, times: Range1d, crosshair: CrosshairTool) -> figure:
+def _trace(names: Sequence[str], times: Range1d, crosshair: CrosshairTool) -> figure:
     """Time traces of the truth and the estimates; warm-up and the stretch of every sample shaded."""
     fig = new_figure(x_range=times, y_range=Range1d(start=-1.0, end=1.0))
     fig.xaxis.axis_label = "time [s]"
@@ -231,13 +238,11 @@ def _trace(target: str, times: Range1d, crosshair: CrosshairTool) -> figure:
         fig.add_layout(
             BoxAnnotation(left=0, right=0, fill_color=colour, fill_alpha=0.10, line_width=0, level="underlay", name=name)
         )
-    source = ColumnDataSource({"x": [], **{name: [] for name in _names(target)}})
-    for name in _names(target):
-        add_line(fig, name, source, name)
+    _add_lines(fig, names)
     return fig
 
 
-def _spectrum(target: str, frequencies: Range1d) -> figure:
+def _spectrum(target: str, names: Sequence[str], frequencies: Range1d) -> figure:
     """Spectra, log-log, the peaks of the vibration and of the Kalman filters' model marked."""
     fig = new_figure(x_range=frequencies, y_range=Range1d(start=1e-6, end=1.0), x_axis_type="log", y_axis_type="log")
     fig.xaxis.axis_label = "frequency [Hz]"
@@ -250,19 +255,17 @@ def _spectrum(target: str, frequencies: Range1d) -> figure:
             )
         ]
         fig.add_tools(HoverTool(renderers=marks, tooltips="@text"))
-    source = ColumnDataSource({"x": [], **{name: [] for name in _names(target)}})
-    for name in _names(target):
-        add_line(fig, name, source, name)
+    _add_lines(fig, names)
     return fig
 
 
-def _sweep(target: str, values: Range1d) -> figure:
+def _sweep(names: Sequence[str], values: DataRange1d) -> figure:
     """RMS errors over the values of a setting, a dot for every run; the present one marked."""
-    fig = new_figure(x_range=values, y_range=Range1d(start=0.0, end=1.0))
+    fig = new_figure(x_range=values, y_range=DataRange1d(start=0.0, only_visible=True))
     fig.add_glyph(ColumnDataSource({"x": []}), VSpan(x="x", line_color=PEAKS, line_alpha=0.6, line_width=1.5), name=NOW)
-    source = ColumnDataSource({"x": [], **{name: [] for name in _names(target)}})
-    for name in _names(target):
-        add_line(fig, name, source, name)
+    errors = [name for name in names if name != TRUTH]
+    source = _add_lines(fig, errors)
+    for name in errors:
         fig.scatter("x", name, source=source, size=5, color=look(name).light, name=name)
     return fig
 
@@ -274,8 +277,11 @@ def _part(part: Mapping[str, Any]) -> figure:
     return lines.figure
 
 
-def _names(target: str) -> list[str]:
-    return [TRUTH, *observers_of(target)]
+def _add_lines(fig: figure, names: Sequence[str]) -> ColumnDataSource:
+    source = ColumnDataSource({"x": [], **{name: [] for name in names}})
+    for name in names:
+        add_line(fig, name, source, name)
+    return source
 
 
 # -------------------------------------------------------------------------------------------------------- arrays
