@@ -68,7 +68,7 @@ def test_a_bar_is_as_long_as_the_error_and_its_pieces_are_shares_of_its_square(p
         positive = sum(x for x in terms.values() if x > 0)
         assert [part[1] for part in row["parts"]] == pytest.approx([max(x, 0.0) / positive for x in terms.values()], abs=1e-12)
         assert row["parts"][2][2] == f"Unmodelled peaks {round(100 * terms['lines'] / of['kf-lgs'].rms ** 2)} %"
-    assert page.strip.cards.heads["bar"] == "Error budget" and ["currentColor", "limit"] in page.strip.cards.legend
+    assert page.strip.cards.heads["bar"] == "Error budget" and ("currentColor", "limit") in page.strip.cards.legend
     assert not page.row("butterworth-ol")["parts"], "it looks ahead"
 
 

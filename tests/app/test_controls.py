@@ -301,13 +301,13 @@ class TestPeaks:
 
     def test_remove(self, controls: Controls, loop: Any) -> None:
         second = controls.store.scenario.vibration.peaks[1]
-        controls.lists[PATH].table._handle_msg({"action": "remove", "row": 0})
+        controls.lists[PATH].table._handle_msg({"action": "remove", "key": "0"})
         assert controls.store.scenario.vibration.peaks[0] == second
         loop.finish(controls.store)
 
     def test_remove_all(self, controls: Controls, loop: Any) -> None:
         while controls.lists[PATH].table.rows:
-            controls.lists[PATH].table._handle_msg({"action": "remove", "row": 0})
+            controls.lists[PATH].table._handle_msg({"action": "remove", "key": "0"})
         loop.finish(controls.store)
         assert controls.store.run.state == "done"
 
@@ -322,7 +322,7 @@ class TestPeaks:
     )
     def test_edit_in_place(self, controls: Controls, loop: Any, key: str, text: str, expected: float) -> None:
         before = controls.store.run.result
-        controls.lists[PATH].table._handle_msg({"action": "edit", "row": 2, "key": key, "text": text})
+        controls.lists[PATH].table._handle_msg({"action": "edit", "key": f"2.{key}", "name": text})
         assert controls.store.value(f"{PATH}.2.{key}") == expected
         assert controls.lists[PATH].table.errors == {}
         loop.finish(controls.store)
@@ -347,17 +347,17 @@ class TestPeaks:
             ("rms.1", "0,5", "use a point: 0.5"),
         ]:
             with subtests.test(key, text=text):
-                table._handle_msg({"action": "edit", "row": 2, "key": key, "text": text})
+                table._handle_msg({"action": "edit", "key": f"2.{key}", "name": text})
                 error = table.errors[f"2.{key}"]
                 assert error["text"] == text and says in error["reason"]
                 assert controls.store.run.result is shown and table.rows == rows
                 good = {"frequency": rows[2][0], "damping": rows[2][1], "rms.1": rows[2][3]}[key]
-                table._handle_msg({"action": "edit", "row": 2, "key": key, "text": good})
+                table._handle_msg({"action": "edit", "key": f"2.{key}", "name": good})
                 assert table.errors == {} and controls.store.run.result is shown
 
     def test_removing_a_bad_row_removes_its_error(self, controls: Controls, loop: Any) -> None:
-        controls.lists[PATH].table._handle_msg({"action": "edit", "row": 0, "key": "damping", "text": "7"})
-        controls.lists[PATH].table._handle_msg({"action": "remove", "row": 0})
+        controls.lists[PATH].table._handle_msg({"action": "edit", "key": "0.damping", "name": "7"})
+        controls.lists[PATH].table._handle_msg({"action": "remove", "key": "0"})
         assert controls.lists[PATH].table.errors == {}
         loop.finish(controls.store)
 
@@ -373,14 +373,14 @@ def test_what_did_not_arrive_is_done_again(controls: Controls, loop: Any) -> Non
     controls.take({"setting": "turbulence.wind_speed", "value": "22"})
     controls.take({"setting": "turbulence.wind_speed", "value": 200.0})
     controls.take({"setting": "loop.gain", "value": 0.4})
-    controls.take({"setting": PATH, "message": {"action": "edit", "row": 0, "key": "frequency", "text": "6.5"}})
+    controls.take({"setting": PATH, "message": {"action": "edit", "key": "0.frequency", "name": "6.5"}})
     for nonsense in (
         {},
         {"setting": 3},
         {"setting": "run.x", "value": 1},
         {"setting": "preset", "value": "x"},
         {"setting": PATH, "message": 1},
-        {"setting": PATH, "message": {"action": "remove", "row": 99}},
+        {"setting": PATH, "message": {"action": "remove", "key": "99"}},
         {"setting": "run.duration", "value": None},
     ):
         controls.take(nonsense)

@@ -283,7 +283,7 @@ def saved(dashboard: Dashboard, loop: Any, sent: list[dict[str, str]]) -> dict[s
     del sent[:]
     names = dashboard.actions.toolbar.saves
     for name in names:
-        dashboard.actions.handle({"action": "page", "name": name})
+        dashboard.actions.handle({"action": "page", "key": name})
     loop.until(lambda: len(sent) == len(names))
     return {file["name"]: base64.b64decode(file["content"]) for file in sent}
 
@@ -291,7 +291,7 @@ def saved(dashboard: Dashboard, loop: Any, sent: list[dict[str, str]]) -> dict[s
 def test_what_pages_have_found_is_saved(dashboard: Dashboard, loop: Any, sent: list[dict[str, str]]) -> None:
     assert dashboard.actions.toolbar.saves == []
     dashboard.pages.current = "identify"
-    dashboard.actions.handle({"action": "page", "name": "Model as TOML"})
+    dashboard.actions.handle({"action": "page", "key": "Model as TOML"})
     assert dashboard.actions.toolbar.notes == ["Model as TOML: there is none yet."]
     page: Any = dashboard.pages.by_name["identify"]
     page.start()

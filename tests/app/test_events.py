@@ -98,9 +98,9 @@ def test_a_kind_that_needs_a_duration_waits_for_it(make_store: Callable[..., Sto
     controls = Controls(make_store())
     controls.open_topic("events")
     editor = controls.lists["events"]
-    editor.handle({"action": "edit", "row": 1, "key": "kind", "text": "laser"})
+    editor.handle({"action": "edit", "key": "1.kind", "name": "laser"})
     (reason,) = editor.table.errors.values()
     assert reason["reason"] == "Event 2: duration = 0: takes a number above 0 s, for kind laser" and reason["text"] == "laser"
-    editor.handle({"action": "edit", "row": 1, "key": "duration", "text": "0.2"})
+    editor.handle({"action": "edit", "key": "1.duration", "name": "0.2"})
     assert editor.table.errors == {} and controls.store.scenario.events[1].kind == "laser"
     assert json.dumps(editor.table.rows)  # as it goes to the browser

@@ -142,28 +142,6 @@ def test_the_tour_is_offered_once_and_observers_are_described(browser: Browser, 
     context.close()
 
 
-PAINTED = """async () => {
-  const view = Bokeh.index.query_one((it) => it.model.type === "Figure")
-  const {paint, _after_layout} = view, done = []
-  view.paint = function () { done.push("painted"); paint.call(this) }
-  view._after_layout = function () { done.push("laid out"); _after_layout.call(this) }
-  const wait = (ms) => new Promise((go) => setTimeout(go, ms))
-  for (let seen = -1; seen !== done.length; await wait(1000)) seen = done.length
-  done.length = 0
-  view.request_layout(true)
-  const is_painted = () => done.includes("laid out") && done.lastIndexOf("painted") > done.indexOf("laid out")
-  for (const end = performance.now() + 20000; performance.now() < end && !is_painted();) await wait(50)
-  Object.assign(view, {paint, _after_layout})
-  return is_painted() || done
-}"""
-"""Whether a figure that finds that its axes need more room is painted after they have got it."""
-
-
-def test_a_figure_is_painted_where_its_axes_are(wide: Page) -> None:
-    page = wide
-    assert page.evaluate(PAINTED) is True
-
-
 def test_run_and_status_stay_in_sight(wide: Page) -> None:
     page = wide
     page.set_viewport_size({"width": 1200, "height": 700})

@@ -134,7 +134,7 @@ def test_a_link_with_one_bad_field(open_short: Any, open_page: Any) -> None:
 
     other = open_page(url=link)
     expect(speed(other)).to_have_value("25")
-    expect(other.locator('[data-cell="1.frequency"]')).to_have_text("20")
+    expect(other.locator('[data-cell="1.frequency"]')).to_have_value("20")
     expect(other.get_by_text("Not used")).to_have_count(0)
     cell = 'tr[data-observer="kf-lgs"][data-target="turbulence"] td'
     expect(other.locator(cell).first).to_have_text(re.compile(r"\d\s*$"))
@@ -176,7 +176,7 @@ def test_a_scenario_out_and_in_again(short: Page, tmp_path: Path) -> None:
     assert tomllib.loads(path.read_text(encoding="utf-8"))["turbulence"]["wind_speed"] == 22.0
     page.get_by_role("button", name="Reset", exact=True).click()
     expect(speed(page)).to_have_value("15")
-    file = page.get_by_label("Scenario file")
+    file = page.get_by_label("Record file")
     bad = tmp_path / "bad.toml"
     bad.write_text("run.seed = -1", encoding="utf-8")
     file.set_input_files(bad)

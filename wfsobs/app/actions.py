@@ -14,13 +14,14 @@ from wfsobs.app.downloads import Save, TooLarge, data_csv, data_npz
 from wfsobs.app.jobs import DONE, FAILED, RUNNING, Job
 from wfsobs.app.pages.pages import Pages, ViewState
 from wfsobs.app.pages.parts import Page
+from wfsobs.app.render import render
 from wfsobs.app.report.export import LIMIT, ReportError, make
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.share import FILE, Link, from_file, from_query, name_record, to_file, to_query
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord
 from wfsobs.app.store import Store
-from wfsobs.app.style import asset, labels
+from wfsobs.app.style import labels, script, sheets
 from wfsobs.app.views.plots import AFTERWARDS_MS, once
 from wfsobs.app.work import RunResults
 from wfsobs.settings.errors import SettingError
@@ -47,8 +48,14 @@ class Toolbar(Component):
     labels = param.Dict({}, doc="Name of a line in the figures -> what it is called, for the legends of figures that are saved.")
     saves = param.List([], doc="What the page can save beside the data, as it is called in the menu.")
 
-    _esm = asset("figures.js") + asset("actions.js")
-    _stylesheets = [asset("actions.css")]
+    html = param.String("", doc="The menus.")
+
+    _esm = script("patch", "markup", "save", "figures", "actions")
+    _stylesheets = sheets("base", "actions")
+
+    @param.depends("ready", "reporting", "saves", watch=True, on_init=True)
+    def _draw(self) -> None:
+        self.html = render("toolbar.html", ready=self.ready, reporting=self.reporting, saves=self.saves)
 
 
 class Actions:
@@ -106,7 +113,7 @@ class Actions:
             "toml": self.save_scenario,
             "csv": lambda: self.save_data("wfsobs.csv", "text/csv", data_csv),
             "npz": lambda: self.save_data("wfsobs.npz", "application/octet-stream", data_npz),
-            "page": lambda: self.save_of_page(str(msg.get("name", ""))),
+            "page": lambda: self.save_of_page(str(msg.get("key", ""))),
         }
         if (action := str(msg.get("action"))) in does:
             does[action]()

@@ -27,7 +27,7 @@ from wfsobs.app.pages.parts import ON_ONE_LINE, WIDE
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import Post, Session
 from wfsobs.app.store import Store
-from wfsobs.app.style import asset, labels, theme
+from wfsobs.app.style import labels, script, sheets, theme
 from wfsobs.app.upload import Upload
 from wfsobs.app.views.main_lines import effect_line
 from wfsobs.app.views.switches import ModeSwitch, UnitSwitch
@@ -43,8 +43,8 @@ class Connection(Component):
     session = param.String("", doc="A name of the session, to tell it from one made anew.")
     last_arrival = param.Integer(0, doc="Number of the last question that has arrived, and all before it.")
 
-    _esm = asset("connection.js")
-    _stylesheets = [asset("connection.css")]
+    _esm = script("focus", "connection")
+    _stylesheets = sheets("base", "connection")
 
     def __init__(self, take: Callable[[dict[str, Any]], None], **params: Any):
         """Connect a page. take : makes a change again that did not arrive."""
@@ -65,8 +65,8 @@ class Readout(Component):
 
     labels = param.Dict({}, doc="Name of a line in the figures -> what it is called.")
 
-    _esm = asset("readout.js")
-    _stylesheets = [asset("readout.css")]
+    _esm = script("readout")
+    _stylesheets = sheets("base", "readout")
 
     def __init__(self, **params: Any):
         super().__init__(labels=labels(), width=0, height=0, margin=0, **params)
@@ -113,14 +113,16 @@ class Frame(Component):
         default="", objects=["", "dark", "light"], doc="The theme that was chosen, for the browser to keep."
     )
     stale = param.Boolean(False, doc="Whether to fade the results.")
+    dark = param.Boolean(False, doc="Whether the page is dark.")
 
-    _esm = asset("patch.js") + asset("frame.js")
+    _esm = script("patch", "frame")
 
 
 class Keyboard(Component):
     """What the keyboard needs, and a first stop that leads to what is after it."""
 
-    _esm = asset("keyboard.js")
+    _esm = script("focus", "keyboard")
+    _stylesheets = sheets("base", "readout")
 
 
 class Idle(param.Parameterized):
@@ -204,6 +206,7 @@ class Dashboard:
         with edit_readonly(page):
             # Tied to what all sessions do, each change walks all models of the page, and the page outlives its session.
             page.busy = Idle().param.busy
+        self.display.param.watch(lambda event: setattr(self.frame, "dark", event.new), "dark")
         self.display.dark = page.dark_theme  # Panel has it from the address
         page.param.watch(self._on_theme, "dark_theme")
         self.frame.param.watch(lambda event: self._post(partial(setattr, page, "dark_theme", event.new)), "wants_dark")

@@ -10,8 +10,8 @@ import param
 from markupsafe import Markup, escape
 
 from wfsobs.app.component import Component
-from wfsobs.app.render import macro
-from wfsobs.app.style import asset
+from wfsobs.app.render import macro, render
+from wfsobs.app.style import script, sheets
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import target_title
 from wfsobs.observers import OBSERVERS
@@ -117,11 +117,10 @@ SHORTCUTS: Mapping[str, str] = MappingProxyType(
 class Help(Component):
     """The button at the top, and what it opens."""
 
-    shortcuts = param.Dict(dict(SHORTCUTS), doc="Key -> what it does.")
-    terms = param.Dict(dict(TERMS), doc="Word -> what it means.")
+    html = param.String("", doc="All that it shows.")
 
-    _esm = asset("dark.js") + asset("help.js")
-    _stylesheets = [asset("help.css")]
+    _esm = script("help")
+    _stylesheets = sheets("base", "help")
 
     def __init__(self, **params: Any):
-        super().__init__(width=36, margin=0, **params)
+        super().__init__(html=render("help.html", shortcuts=SHORTCUTS, terms=TERMS), width=36, margin=0, **params)

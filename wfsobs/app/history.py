@@ -36,7 +36,7 @@ from wfsobs.app.session_file import (
 )
 from wfsobs.app.sources import Step
 from wfsobs.app.store import Store
-from wfsobs.app.style import asset, look
+from wfsobs.app.style import look, script, sheets
 from wfsobs.app.work import RunResults
 from wfsobs.evaluation.evidence import rank_observers
 from wfsobs.evaluation.rows import can_be_best
@@ -277,13 +277,12 @@ class Sheet(Component):
     """The sheet in the browser; it asks by messages {action, key, name, on}, and has contents only while it is open."""
 
     open = param.Boolean(False, doc="Whether it is seen.")
-    dark = param.Boolean(False, doc="Dark mode.")
     html = param.String("", doc="What is in it.")
     largest = param.Integer(LARGEST, doc="The largest file that is sent [bytes].")
     part = param.Integer(PART, doc="How much is sent at a time [bytes].")
 
-    _esm = asset("patch.js") + asset("markup.js") + asset("parts.js") + asset("history.js")
-    _stylesheets = [asset("history.css")]
+    _esm = script("patch", "markup", "focus", "save", "parts", "history")
+    _stylesheets = sheets("base", "history")
 
 
 class HistorySheet:
@@ -375,7 +374,7 @@ class HistorySheet:
             self.sheet = Sheet(self.handle, width=0, height=0, margin=0, styles={"position": "absolute"})
             self.history.param.watch(self._refresh, ["entries", "current", "can_undelete"])
             self.history.param.watch(lambda event: self._say(event.new), "note", onlychanged=False)
-            self.display.param.watch(self._refresh, ["mode", "unit", "dark", "compared_runs"])
+            self.display.param.watch(self._refresh, ["mode", "unit", "compared_runs"])
             self._show(self.sheet)
         return self.sheet
 
@@ -401,7 +400,7 @@ class HistorySheet:
                 message=self.message,
                 suffix=SUFFIX,
             )
-            sheet.param.update(html=html, dark=self.display.dark)
+            sheet.html = html
 
     def _row(self, entry: HistoryEntry, run: ComparedRun | None) -> dict[str, Any]:
         return {

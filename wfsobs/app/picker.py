@@ -9,7 +9,8 @@ from typing import Any
 import param
 
 from wfsobs.app.component import Component
-from wfsobs.app.style import asset
+from wfsobs.app.render import render
+from wfsobs.app.style import script, sheets
 from wfsobs.telemetry.preview import safe_name
 
 LARGEST = 20_000_000
@@ -25,11 +26,16 @@ class Picker(Component):
     message = param.String("", doc="What there is to say, in one line.")
     source_title = param.String("", doc="What takes the place of the simulation.")
     back = param.String("Back to the simulation", doc="What the button is called that ends it.")
+    html = param.String("", doc="All that it shows.")
     largest = param.Integer(LARGEST, doc="The largest file that is sent [bytes].")
     part = param.Integer(PART, doc="How much is sent at a time [bytes].")
 
-    _esm = asset("dark.js") + asset("parts.js") + asset("upload.js")
-    _stylesheets = [asset("upload.css")]
+    _esm = script("patch", "markup", "save", "parts", "upload")
+    _stylesheets = sheets("base", "upload")
+
+    @param.depends("message", "source_title", "back", watch=True, on_init=True)
+    def _draw(self) -> None:
+        self.html = render("upload.html", title=self.source_title, back=self.back, message=self.message)
 
 
 class PartialFile:

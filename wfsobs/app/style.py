@@ -8,6 +8,7 @@ from importlib.resources import files
 from types import MappingProxyType
 from typing import Any
 
+import panel as pn
 from markupsafe import Markup
 
 from wfsobs.app.render import macro
@@ -114,6 +115,24 @@ def observers_of(target: str, with_zero: bool = False) -> list[str]:
 def asset(name: str) -> str:
     """Text of a file of the package's assets."""
     return files("wfsobs.assets").joinpath(name).read_text(encoding="utf-8")
+
+
+def script(*names: str) -> str:
+    """Join scripts of the assets, by name."""
+    return "".join(asset(f"{name}.js") for name in names)
+
+
+def sheets(*names: str) -> list[str]:
+    """Read style sheets of the assets, by name."""
+    return [asset(f"{name}.css") for name in names]
+
+
+WIDE: Mapping[str, Any] = MappingProxyType({"sizing_mode": "stretch_width", "margin": 0})
+
+
+def html(content: str = "", **params: Any) -> pn.pane.HTML:
+    """HTML in the page's style."""
+    return pn.pane.HTML(content, **{**WIDE, "stylesheets": sheets("style"), **params})
 
 
 def run_swatch(letter: str, dark: bool) -> Markup:

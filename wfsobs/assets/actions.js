@@ -3,161 +3,119 @@
 
 const SAID_MS = 6_000 // for which something that was done is told
 
-function tag(name, parent, properties = {}, attributes = {}) {
-  const it = Object.assign(document.createElement(name), properties)
-  for (const [key, value] of Object.entries(attributes)) it.setAttribute(key, value)
-  parent.append(it)
-  return it
-}
+export function render({model, view, el}) {
+  el.innerHTML = `<div class="bar"></div><span class="said" role="status"></span>
+    <div class="text" hidden><label>Copy this by hand<textarea readonly></textarea></label><button type="button">Close</button></div>
+    <div class="notes" hidden><div role="alert"></div><button type="button">Dismiss</button></div>`
+  const [bar, said, text, notes] = el.children
 
-function save(name, blob) {
-  const url = URL.createObjectURL(blob)
-  const link = document.createElement("a")
-  Object.assign(link, {href: url, download: name})
-  link.click()
-  setTimeout(() => URL.revokeObjectURL(url), 10_000)
-}
-
-// ------------------------------------------------------------------ menus
-
-function menu(bar, label, items) {
-  const button = tag("button", bar, {type: "button", textContent: label},
-                     {"aria-haspopup": "menu", "aria-expanded": "false", "aria-label": label})
-  const list = tag("div", bar, {className: "menu", popover: "auto"}, {role: "menu", "aria-label": label})
-  button.popoverTargetElement = list
-  list.addEventListener("beforetoggle", (event) => {
-    button.setAttribute("aria-expanded", event.newState === "open")
-    if (event.newState === "open") {
-      list.replaceChildren()
-      for (const [text, act] of items()) {
-        const item = tag("button", list, {type: "button", textContent: text, tabIndex: -1}, {role: "menuitem"})
-        item.onclick = () => { list.hidePopover(); button.focus(); act() }
-      }
-    }
-  })
-  list.addEventListener("toggle", (event) => {
-    if (event.newState !== "open") return
-    const box = button.getBoundingClientRect()
-    list.style.top = `${Math.min(box.bottom + 4, Math.max(window.innerHeight - list.offsetHeight - 8, 8))}px`
-    list.style.left = `${Math.max(8, Math.min(box.left, window.innerWidth - list.offsetWidth - 8))}px`
-    list.firstElementChild?.focus()
-  })
-  list.addEventListener("keydown", (event) => {
-    if (event.key === "Escape") {
-      event.preventDefault()
-      list.hidePopover()
-      button.focus()
-    }
-    move(event, [...list.children], list.getRootNode().activeElement)
-  })
-}
-
-function move(event, items, focused) {
-  const at = items.indexOf(focused)
-  const to = {ArrowDown: at + 1, ArrowUp: at - 1 + items.length, Home: 0, End: items.length - 1}[event.key]
-  if (to === undefined) return
-  event.preventDefault()
-  items[to % items.length]?.focus()
-}
-
-// ------------------------------------------------------------------ figures
-
-async function saveFigure(name, view, kind, labels, say) {
-  const blob = await exported(view, kind, labels)
-  save(`${name.toLowerCase().replaceAll(/[^a-z0-9]+/g, "-")}.${kind}`, blob)
-  say(`Saved ${name} as ${kind.toUpperCase()}.`)
-}
-
-// ------------------------------------------------------------------ the row
-
-// What was done, in one line: in words of the browser, or of the server, which is told when they have been there for long enough.
-function speaker(line, model) {
+  // What was done, in one line: in words of the browser, or of the server, which is told when they have been there for long enough.
   let over
-  const say = (text) => {
-    line.textContent = text
+  const say = (words) => {
+    said.textContent = words
     clearTimeout(over)
-    if (text && !text.endsWith("…")) over = setTimeout(() => {
-      line.textContent = ""
-      if (text === model.message) model.send_msg({action: "read", text})
+    if (words && !words.endsWith("…")) over = setTimeout(() => {
+      said.textContent = ""
+      if (words === model.message) model.send_msg({action: "read", text: words})
     }, SAID_MS)
   }
   model.on("message", () => say(model.message))
   say(model.message)
-  return say
-}
+  takeFiles(model, (name) => say(`Saved ${name}.`))
 
-function isText(target) {
-  const kind = target?.type ?? ""
-  return target?.isContentEditable || target?.tagName === "TEXTAREA" ||
-    (target?.tagName === "INPUT" && !["range", "checkbox", "radio", "button", "file"].includes(kind))
-}
+  // What was refused.
+  const note = () => {
+    notes.hidden = model.notes.length === 0
+    notes.firstChild.replaceChildren(...model.notes.map((it) => Object.assign(document.createElement("p"), {textContent: it})))
+    if (!notes.hidden) say(model.message)
+  }
+  const dismiss = () => { notes.hidden = true; model.send_msg({action: "dismiss"}) }
+  notes.querySelector("button").onclick = dismiss
+  model.on("notes", note)
+  note()
 
-function keys(model) {
-  const pressed = (event) => {
-    const at = event.composedPath()[0]
-    if (event.altKey || isText(at)) return
-    if (!(event.ctrlKey || event.metaKey)) {
-      if (event.key.toLowerCase() === "h" && !at.matches?.("[role=option], [role=combobox], [role=menuitem]")) model.send_msg({action: "history"})
-      return
-    }
-    const key = event.key.toLowerCase()
-    const action = key === "z" ? (event.shiftKey ? "redo" : "undo") : key === "y" ? "redo" : ""
-    if (action) {
-      event.preventDefault()
-      model.send_msg({action})
+  const here = () => {
+    const query = [model.query, model.view].filter(Boolean).join("&")
+    return location.origin + location.pathname + (query ? `?${query}` : "")
+  }
+  const copy = async (what) => {
+    if (what === "link" && !model.has_link) return model.send_msg({action: "unlinked"})
+    const link = model.record ? `link, which is without ${model.record}` : "link"
+    const content = what === "link" ? here() : model[what]
+    try {
+      await navigator.clipboard.writeText(content)
+      text.hidden = true
+      say(`Copied the ${{link, command: "command line", python: "Python"}[what]}.`)
+    } catch {
+      text.hidden = false
+      Object.assign(text.querySelector("textarea"), {value: content}).select()
+      say("The browser does not let this page copy.")
     }
   }
+  text.querySelector("button").onclick = () => { text.hidden = true }
+
+  const saveFigure = async (name, view, kind) => {
+    save(`${name.toLowerCase().replaceAll(/[^a-z0-9]+/g, "-")}.${kind}`, await exported(view, kind, model.labels))
+    say(`Saved ${name} as ${kind.toUpperCase()}.`)
+  }
+  const itemOf = ([name, view], kind) => {
+    const it = Object.assign(document.createElement("button"), {type: "button", role: "menuitem", tabIndex: -1, className: "figure"})
+    return Object.assign(it, {textContent: `Save ${name} as ${kind.toUpperCase()}`, act: () => saveFigure(name, view, kind)})
+  }
+
+  const draw = () => setMarkup(bar, model.html)
+  model.on("html", draw)
+  draw()
+  tellActions(bar, model)
+  bar.addEventListener("beforetoggle", ({target, newState}) => {
+    target.previousElementSibling.setAttribute("aria-expanded", newState === "open")
+    for (const it of target.querySelectorAll(".figure")) it.remove()
+    if (newState === "open" && target.id === "File") target.append(...figures().flatMap((it) => KINDS.map((kind) => itemOf(it, kind))))
+  }, true)
+  bar.addEventListener("toggle", ({target, newState}) => { if (newState === "open") target.firstElementChild.focus() }, true)
+  const leave = (menu) => { menu.hidePopover(); menu.previousElementSibling.focus() }
+  bar.addEventListener("keydown", (event) => {
+    const items = [...event.target.closest(".menu")?.children ?? []], at = items.indexOf(event.target), n = items.length
+    const to = {ArrowDown: at + 1, ArrowUp: at - 1 + n, Home: 0, End: n - 1}[event.key]
+    if (!n || (to === undefined && event.key !== "Escape")) return
+    event.preventDefault()
+    if (event.key === "Escape") leave(event.target.parentElement)
+    else items[to % n].focus()
+  })
+  bar.addEventListener("click", ({target}) => {
+    if (!target.matches("[role=menuitem]")) return
+    leave(target.parentElement)
+    const {event, copy: what, do: does} = target.dataset
+    if (event) document.dispatchEvent(new Event(event))
+    if (what) copy(what)
+    if (does) { notes.hidden = true; say(does === "report" ? "Making the report …" : "Preparing the file …") }
+    target.act?.()
+  })
+
+  const doc = view.model.document
+  const address = () => history.replaceState(history.state, "", here() + location.hash)
+  model.on("query", address)
+  travel(model, doc, address, () => history.pushState(null, "", here()))
+  if (known.has(doc)) address()
+  known.add(doc)
+  const pressed = (event) => keyPressed(event, model)
   document.addEventListener("keydown", pressed)
   model.on("remove", () => document.removeEventListener("keydown", pressed))
 }
 
-function textBox(el, say) {
-  const box = tag("div", el, {className: "text", hidden: true})
-  const label = tag("label", box, {textContent: "Copy this by hand"})
-  const area = tag("textarea", label, {readOnly: true})
-  tag("button", box, {type: "button", textContent: "Close"}).onclick = () => { box.hidden = true }
-  return async (text, what) => {
-    try {
-      await navigator.clipboard.writeText(text)
-      box.hidden = true
-      say(`Copied the ${what}.`)
-    } catch {
-      area.value = text
-      box.hidden = false
-      area.select()
-      say("The browser does not let this page copy.")
-    }
-  }
-}
+const TEXT = "[contenteditable], textarea, input:not([type=range], [type=checkbox], [type=radio], [type=button], [type=file])"
 
-// Opens a file as if it had been dropped on the page.
-function opener(bar) {
-  const input = tag("input", bar, {type: "file", accept: ".toml,.wfsobs-session", hidden: true}, {"aria-label": "Scenario file"})
-  input.onchange = () => {
-    if (input.files[0]) document.dispatchEvent(new CustomEvent("wfsobs:file", {detail: input.files[0]}))
-    input.value = ""
+function keyPressed(event, model) {
+  const at = event.composedPath()[0], key = event.key.toLowerCase()
+  if (event.altKey || at.matches?.(TEXT)) return
+  if (!(event.ctrlKey || event.metaKey)) {
+    if (key === "h" && !at.matches?.("[role=option], [role=combobox], [role=menuitem]")) model.send_msg({action: "history"})
+    return
   }
-  return () => input.click()
-}
-
-// What was refused; the function that takes it away.
-function noteBox(el, model, say) {
-  const box = tag("div", el, {className: "notes", hidden: true})
-  const lines = tag("div", box, {}, {role: "alert"})
-  const dismiss = () => {
-    box.hidden = true
-    model.send_msg({action: "dismiss"})
-  }
-  tag("button", box, {type: "button", textContent: "Dismiss"}).onclick = dismiss
-  const draw = () => {
-    lines.replaceChildren()
-    model.notes.forEach((note) => tag("p", lines, {textContent: note}))
-    box.hidden = model.notes.length === 0
-    if (!box.hidden) say(model.message)
-  }
-  model.on("notes", draw)
-  draw()
-  return dismiss
+  const action = key === "z" ? (event.shiftKey ? "redo" : "undo") : key === "y" ? "redo" : ""
+  if (!action) return
+  event.preventDefault()
+  model.send_msg({action})
 }
 
 // Parts of a view that are one of their own, to which the browser's Back returns; the others belong to the one they are changed in.
@@ -183,51 +141,3 @@ function travel(model, document, replace, push) {
 }
 
 const known = new WeakSet() // documents; one may be drawn anew after a connection was lost
-
-export function render({model, view, el}) {
-  const bar = tag("div", el, {className: "bar"})
-  const here = () => {
-    const query = [model.query, model.view].filter(Boolean).join("&")
-    return location.origin + location.pathname + (query ? `?${query}` : "")
-  }
-  const copyLink = () => model.has_link ? copy(here(), model.record ? `link, which is without ${model.record}` : "link") : model.send_msg({action: "unlinked"})
-  const ask = (message, what = "Preparing the file …") => () => {
-    dismiss()
-    say(what)
-    model.send_msg(message)
-  }
-  const open = opener(bar)
-  menu(bar, "File", () => [
-    ["Load data …", () => document.dispatchEvent(new Event("wfsobs:load"))],
-    ["Open scenario or session …", open],
-    ["Save scenario as TOML", ask({action: "toml"})],
-    ["Save session", ask({action: "session"})],
-    ...model.saves.map((name) => [`Save ${name}`, ask({action: "page", name})]),
-    ...(model.ready ? [["Save data as CSV", ask({action: "csv"})], ["Save data as NPZ", ask({action: "npz"})]] : []),
-    ...(model.ready && !model.reporting ? [["Save report", ask({action: "report"}, "Making the report …")]] : []),
-    ...figures().flatMap(([name, view]) =>
-      KINDS.map((kind) => [`Save ${name} as ${kind.toUpperCase()}`, () => saveFigure(name, view, kind, model.labels, say)])),
-  ])
-  menu(bar, "Share", () => [
-    ["Copy link", copyLink],
-    ["Copy as command line", () => copy(model.command, "command line")],
-    ["Copy as Python", () => copy(model.python, "Python")],
-  ])
-  tag("button", bar, {type: "button", textContent: "History", title: "Every result of this session, to compare, restore and save (H)"},
-      {"aria-haspopup": "dialog"}).onclick = () => model.send_msg({action: "history"})
-  const say = speaker(tag("span", bar, {className: "said"}, {role: "status"}), model)
-  const copy = textBox(el, say)
-  const dismiss = noteBox(el, model, say)
-  keys(model)
-
-  const address = () => history.replaceState(history.state, "", here() + location.hash)
-  model.on("query", address)
-  travel(model, view.model.document, address, () => history.pushState(null, "", here()))
-  if (known.has(view.model.document)) address()
-  known.add(view.model.document)
-  model.on("msg:custom", (event) => {
-    const {name, kind, content} = event.data ?? event
-    save(name, new Blob([Uint8Array.from(atob(content), (c) => c.charCodeAt(0))], {type: kind}))
-    say(`Saved ${name}.`)
-  })
-}

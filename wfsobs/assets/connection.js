@@ -45,13 +45,6 @@ function socketOf(act) {
   return socket
 }
 
-// What is being typed counts as typed: the box that it stands in is about to be drawn anew.
-function finishTyping() {
-  let box = document.activeElement
-  while (box?.shadowRoot?.activeElement) box = box.shadowRoot.activeElement
-  box?.blur()
-}
-
 // The path of the setting that a component, or what holds its data, stands for; or nothing.
 function settingOf(model) {
   const of = model?.data ? model : [...model?.document?.all_models ?? []].find((it) => it.data === model)
@@ -164,7 +157,7 @@ class Link {
       throw new Error("another session")  // so that Bokeh does not take it for connected
     }
     const {doc} = this
-    finishTyping()
+    focused()?.blur()  // what is being typed counts as typed: its box is about to be drawn anew
     doc.constructor.from_json(json, [], this.buffers).destructively_move(doc)
     doc.create_json_patch([]) // no model is new to the server
     this.away = false
@@ -259,14 +252,9 @@ class Link {
 
 export function render({model, view, el}) {
   const doc = view.model.document
-  const box = document.createElement("div")
-  Object.assign(box, {className: "banner", popover: "manual"})
-  box.setAttribute("role", "alert")
-  const text = document.createElement("span")
-  const button = Object.assign(document.createElement("button"), {type: "button", textContent: "Start again with these settings"})
+  el.innerHTML = `<div class="banner" popover="manual" role="alert"><span></span><button type="button">Start again with these settings</button></div>`
+  const box = el.firstChild, [text, button] = box.children
   button.onclick = () => doc.wfsobs.again()
-  box.append(text, button)
-  el.append(box)
   let hiding
   const draw = (said, state) => {
     clearTimeout(hiding)

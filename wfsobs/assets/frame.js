@@ -43,43 +43,6 @@ function patchTexts() {
   }
 }
 
-// Each part that is put into the page or changes its size has all of it laid out anew, some thirty times until the first picture
-// stands. Once a frame is enough. A figure that has asked for it paints when it has been done: it would paint where things were.
-function layOutOnceAFrame() {
-  const kind = Bokeh.Models.get("panel.models.esm.ReactiveESM").prototype.default_view.prototype
-  const figure = Bokeh.Models.get("Figure").prototype.default_view.prototype
-  if (kind.laidOutOnceAFrame) return
-  const {compute_layout} = kind, {compute_layout: ask, paint} = figure
-  const due = new Set()
-  kind.laidOutOnceAFrame = true
-  kind.compute_layout = function () {
-    if (this.is_managed) compute_layout.call(this)
-    else if (!due.has(this)) {
-      due.add(this)
-      requestAnimationFrame(() => {
-        due.delete(this)
-        if (!this.is_destroyed) compute_layout.call(this)
-        if (due.size === 0) paintAll()
-      })
-    }
-  }
-  figure.compute_layout = function () {
-    ask.call(this)
-    this.paintIsDue = due.size > 0
-  }
-  figure.paint = function () {
-    if (!this.paintIsDue) paint.call(this)
-  }
-  function paintAll() {
-    for (const view of Bokeh.index.query((it) => it.paintIsDue)) {
-      view.paintIsDue = false
-      view.invalidate_painters()
-      view.paint()
-    }
-  }
-}
-layOutOnceAFrame()
-
 // Each part of a figure has an element of its own, and writes the style sheet of its place with every picture: the browser finds its
 // styles anew before the next part asks for some, a hundred times a second on a page that is live. What is the same is not written
 // again; lines are on the canvas, and their elements, which nothing is in, need no place.
@@ -172,4 +135,7 @@ export function render({model, view, el}) {
     }
   }
   model.on("stale", fade)
+  const shade = () => { document.documentElement.style.colorScheme = model.dark ? "dark" : "light" }
+  model.on("dark", shade)
+  shade()
 }

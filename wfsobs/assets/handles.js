@@ -9,17 +9,9 @@ const NUDGE = 1.005, LEAP = 1.05, STRONGER = 1.06, BROADER = 1.12
 const DEAD = 3  // px that a pointer may tremble
 
 export function render({model, el}) {
-  const make = (tag, className, parent, text = "") => {
-    const it = Object.assign(document.createElement(tag), {className, textContent: text})
-    parent.append(it)
-    return it
-  }
-  const root = make("div", "root", el), marks = make("div", "marks", root), bar = make("div", "bar", root)
-  const add = make("button", "add", bar, "Add a peak")
-  add.type = "button"
-  const numbers = make("div", "numbers", bar), note = make("span", "note", bar)
-  note.setAttribute("role", "status")
-  const hint = make("span", "hint", bar), away = make("span", "away", bar)
+  el.innerHTML = `<div class="root"><div class="marks"><div class="room"></div></div><div class="bar"></div><span class="away"></span></div>`
+  const root = el.firstChild, [marks, bar, away] = root.children, room = marks.firstChild
+  const addButton = () => bar.querySelector(".add")
 
   let view = null, elements = new Map(), number = 0, waiting = 0, newest = null, late = 0, lost = 0, settle = 0
   let move = null  // {id, frequency, strength, damping, byKey, x, y}
@@ -116,10 +108,9 @@ export function render({model, el}) {
   const within = (x, handle) => Math.min(Math.max(x, limits()[0]), limits()[1], handle.highest ?? Infinity)
 
   const handleOf = (id) => {
-    const it = make("div", "handle", marks)
-    it.tabIndex = 0
+    const it = Object.assign(document.createElement("div"), {className: "handle", tabIndex: 0, role: "slider"})
     it.dataset.id = id
-    it.setAttribute("role", "slider")
+    marks.append(it)
     let start = null
     it.onpointerdown = (event) => {
       if (event.button || !view) return
@@ -161,7 +152,7 @@ export function render({model, el}) {
       if (event.key === "Enter") return release()
       if (event.key === "Delete" && handle.kind === "peak") {
         event.preventDefault()
-        add.focus()  // a place to go on from
+        addButton().focus()  // a place to go on from
         return send({action: "remove", last: true, id})
       }
       const [what, sign] = {
@@ -193,12 +184,9 @@ export function render({model, el}) {
       const it = elements.get(handle.id) ?? handleOf(handle.id)
       kept.set(handle.id, it)
       it.classList.add(handle.kind)
-      it.title = `${handle.label}: ${handle.text}`
-      it.setAttribute("aria-label", handle.label)
-      it.setAttribute("aria-valuetext", handle.text)
-      it.setAttribute("aria-valuenow", handle.frequency)
-      it.setAttribute("aria-valuemin", frame.limits[0])
-      it.setAttribute("aria-valuemax", handle.highest ?? frame.limits[1])
+      Object.assign(it, {
+        title: `${handle.label}: ${handle.text}`, ariaLabel: handle.label, ariaValueText: handle.text, ariaValueNow: handle.frequency,
+        ariaValueMin: frame.limits[0], ariaValueMax: handle.highest ?? frame.limits[1]})
     }
     const focused = root.getRootNode().activeElement
     for (const [id, it] of elements) {
@@ -216,32 +204,17 @@ export function render({model, el}) {
       wantsLast = false
       elements.get(frame.added)?.focus()
     }
-    add.hidden = frame.add === undefined
-    add.disabled = Boolean(frame.add)
-    add.title = frame.add || "then click on the spectrum; with the keyboard: a peak in the middle, to be moved from there"
-    hint.textContent = "Drag a handle, or use the arrow keys" +
-      (frame.add === undefined ? "." : `; wheel or Page up and down: damping${frame.add ? `. ${frame.add}` : "; Delete: remove a peak"}.`) +
-      (frame.hint ? ` ${frame.hint}` : "")
-    note.textContent = frame.note ?? ""
-    numbers.replaceChildren(...(frame.numbers ?? []).map(entry))
     place()
   }
-  const entry = (it) => {
-    const span = document.createElement("span")
-    span.dataset.name = it.name
-    span.classList.toggle("waits", it.waits)  // of an earlier frame: it comes with the next one
-    const swatch = document.createElement("i")
-    swatch.style.background = it.colour
-    const value = Object.assign(document.createElement("b"), {textContent: it.value})
-    span.append(swatch, `${it.label} `, value, ` ${it.unit}`)
-    if (it.was) span.append(Object.assign(document.createElement("small"), {textContent: ` was ${it.was}`}))
-    return span
+  const write = () => {
+    patchHtml(bar, model.html)
+    addButton().ariaPressed = marks.classList.contains("armed")
   }
 
   // ------------------------------------------------------------------ one more peak
 
   const arm = (on) => {
-    add.setAttribute("aria-pressed", on)
+    addButton().ariaPressed = on
     marks.classList.toggle("armed", on)
     if (!on) return
     const here = root.getBoundingClientRect(), there = view.el.getBoundingClientRect(), box = view.frame.bbox
@@ -250,16 +223,14 @@ export function render({model, el}) {
     marks.style.setProperty("--width", `${box.width}px`)
     marks.style.setProperty("--height", `${box.height}px`)
   }
-  const room = make("div", "room", marks)
-  arm(false)
-  add.onclick = (event) => {
-    if (!view) return
+  bar.onclick = (event) => {
+    if (!view || event.target !== addButton()) return
     if (event.detail === 0) {  // by keyboard
       wantsLast = true
       const [low, high] = limits()
       return send({action: "add", last: true, frequency: Math.sqrt(low * high)})
     }
-    arm(add.getAttribute("aria-pressed") !== "true")
+    arm(!marks.classList.contains("armed"))
   }
   room.onclick = (event) => {
     const there = view.el.getBoundingClientRect(), {x_scale, y_scale} = view.frame
@@ -270,6 +241,8 @@ export function render({model, el}) {
   root.onkeydown = (event) => { if (event.key === "Escape") arm(false) }
 
   model.on("frame", draw)
+  model.on("html", write)
+  write()
   draw()
   find()
 }

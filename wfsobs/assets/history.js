@@ -1,19 +1,10 @@
 // The history: a sheet at the right edge with every result of the session.
 
 export function render({model, el}) {
-  const sheet = document.createElement("div")
-  Object.assign(sheet, {className: "sheet", popover: "manual"})
-  sheet.setAttribute("role", "dialog")
-  sheet.setAttribute("aria-label", "History")
-  el.append(sheet)
-  const file = () => sheet.querySelector("[type=file]")
+  el.innerHTML = `<div class="sheet" popover="manual" role="dialog" aria-label="History"></div>`
+  const sheet = el.firstElementChild
   tellActions(sheet, model)
-  sheet.addEventListener("click", (event) => { if (event.target.matches(".pick")) file().click() })
-  sheet.addEventListener("change", ({target}) => {
-    if (target !== file() || !target.files[0]) return
-    send(model, target.files[0])
-    target.value = ""
-  })
+  handleFiles(sheet, model)
   sheet.addEventListener("keydown", ({key, target}) => {
     const isName = target.matches(".name")
     if (key === "Enter" && isName) target.blur()
@@ -24,7 +15,6 @@ export function render({model, el}) {
   let before = null // what had the focus
   const follow = () => {
     setMarkup(sheet, model.html)
-    sheet.classList.toggle("dark", model.dark)
     const close = sheet.querySelector("button") // of a sheet that is opened again it may come after the word to open
     const isOpen = model.open && close !== null
     if (isOpen === sheet.matches(":popover-open")) return
@@ -37,16 +27,6 @@ export function render({model, el}) {
       before?.focus()
     }
   }
-  for (const name of ["open", "html", "dark"]) model.on(name, follow)
-  model.on("msg:custom", (event) => {
-    const {name, kind, content} = event.data ?? event
-    save(name, kind, content)
-  })
+  for (const name of ["open", "html"]) model.on(name, follow)
   requestAnimationFrame(() => { if (sheet.isConnected) follow() })
-}
-
-function focused() {
-  let it = document.activeElement
-  while (it?.shadowRoot?.activeElement) it = it.shadowRoot.activeElement
-  return it
 }

@@ -2,11 +2,12 @@
 // them is chosen, tips where the focus is.
 
 export function render({model, el}) {
+  el.innerHTML = `<div class="tip" role="tooltip" popover="manual"></div>`
   const stop = new AbortController()
   const on = (type, heard) => document.addEventListener(type, heard, {signal: stop.signal, capture: true})
   const skip = skipLink(() => el.getRootNode().host.nextElementSibling)
   model.on("remove", () => { stop.abort(); skip.remove() })
-  const tips = tipsAt(el)
+  const tips = tipsAt(el.firstElementChild)
   for (const type of ["keydown", "keyup"]) on(type, openList)
   on("click", (event) => markItems(event.composedPath()[0]))
   // What moves the focus within one shadow root is not heard of out here: so every key is followed.
@@ -32,22 +33,13 @@ function name(at) {
   at.setAttribute("aria-label", at.getRootNode().host.getRootNode().host.getAttribute("aria-label"))
 }
 
-function focused() {
-  let it = document.activeElement
-  while (it.shadowRoot?.activeElement) it = it.shadowRoot.activeElement
-  return it
-}
-
 // The first stop of the page, seen while it has the focus.
 function skipLink(results) {
-  const room = document.createElement("nav")
-  room.setAttribute("aria-label", "Skip")
-  const link = document.createElement("button")
-  link.type = "button"
-  link.textContent = "Skip to figures"
-  const put = (top) => Object.assign(link.style, {
-    position: "fixed", left: "8px", top, zIndex: 10000, padding: "10px 14px", border: "0", borderRadius: "4px",
-    background: "#fff", color: "#0b4f6c", font: "14px sans-serif", outline: "3px solid #0b4f6c"})
+  const room = Object.assign(document.createElement("nav"), {ariaLabel: "Skip", innerHTML: `<button type="button">Skip to figures</button>`})
+  const link = room.firstElementChild
+  link.style = "position: fixed; left: 8px; z-index: 10000; padding: 10px 14px; border: 0; border-radius: 4px; background: #fff; " +
+    "color: #0b4f6c; font: 14px sans-serif; outline: 3px solid #0b4f6c"
+  const put = (top) => { link.style.top = top }
   put("-60px")
   link.onfocus = () => put("8px")
   link.onblur = () => put("-60px")
@@ -58,7 +50,6 @@ function skipLink(results) {
     to.focus()
     to.scrollIntoView()
   }
-  room.append(link)
   document.body.prepend(room)
   return room
 }
@@ -82,41 +73,34 @@ function markItems(at, tries = 600) {
   const isOpen = box.getAttribute("aria-expanded") === "true"  // else the list may be one that is fading
   const items = isOpen ? [...box.getRootNode().querySelectorAll("ul[role=listbox] > li")] : []
   for (const item of items) {
-    const chosen = item.textContent === box.textContent
-    item.setAttribute("role", "option")
-    item.setAttribute("aria-selected", chosen)
-    if (chosen) item.focus()
+    const isChosen = item.textContent === box.textContent
+    Object.assign(item, {role: "option", ariaSelected: isChosen})
+    if (isChosen) item.focus()
   }
-  const there = items.includes(box.getRootNode().activeElement)
-  if (!there) requestAnimationFrame(() => markItems(box, tries - 1))  // the list is on its way
+  const isThere = items.includes(box.getRootNode().activeElement)
+  if (!isThere) requestAnimationFrame(() => markItems(box, tries - 1))  // the list is on its way
 }
 
 const MARK = "label > svg.MuiSvgIcon-root, .MuiFormControlLabel-label > svg.MuiSvgIcon-root"
 
 // The tip of whatever has the focus: that of the mark beside a field's name, or its title.
-function tipsAt(el) {
-  const own = document.createElement("div")
-  own.setAttribute("role", "tooltip")
-  own.popover = "manual"
-  Object.assign(own.style, {
-    position: "fixed", margin: "0", padding: "4px 8px", border: "0", borderRadius: "4px", maxWidth: "300px",
-    background: "#616161", color: "#fff", font: "11px/1.4 sans-serif"})
-  el.append(own)
+function tipsAt(own) {
   let mark = null
+  const point = (type) => mark?.dispatchEvent(new MouseEvent(type, {bubbles: true}))
   const hide = () => {
-    mark?.dispatchEvent(new MouseEvent("mouseout", {bubbles: true}))
+    point("mouseout")
     mark = null
-    if (own.matches(":popover-open")) own.hidePopover()
+    own.hidePopover()
   }
   const show = (at) => {
     mark = at.getRootNode().querySelector?.(MARK) ?? null
-    mark?.dispatchEvent(new MouseEvent("mouseover", {bubbles: true}))
+    point("mouseover")
     if (mark || !at.title) return
     own.textContent = at.title
     own.showPopover()
     const box = at.getBoundingClientRect()
-    own.style.top = `${Math.min(box.bottom + 4, window.innerHeight - own.offsetHeight - 4)}px`
-    own.style.left = `${Math.min(box.left, window.innerWidth - own.offsetWidth - 8)}px`
+    own.style.top = `${Math.min(box.bottom + 4, innerHeight - own.offsetHeight - 4)}px`
+    own.style.left = `${Math.min(box.left, innerWidth - own.offsetWidth - 8)}px`
   }
   return {hide, show}
 }

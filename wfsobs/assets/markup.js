@@ -1,14 +1,13 @@
 // HTML of the server, brought up to date in place; what is pressed or changed in it is told by its name: data-do, and of which row.
 
 function setMarkup(root, html) {
-  const wanted = document.createElement("div")
-  wanted.innerHTML = html
-  for (const it of wanted.querySelectorAll("time")) it.textContent = when(it.dataset.seconds)
-  patch(root, [...wanted.childNodes])
-  for (const it of root.querySelectorAll("input[data-do]")) {  // what was typed or ticked is no attribute
+  patchHtml(root, html)
+  for (const it of root.querySelectorAll("time")) it.textContent = when(it.dataset.seconds)
+  for (const it of root.querySelectorAll(":is(input, select)[data-do]")) {  // what was typed, ticked or chosen is no attribute
     const key = keyOf(it)
-    if (it.type === "text" && (it !== root.getRootNode().activeElement || it.key !== key)) it.value = it.getAttribute("value")
-    it.checked = it.hasAttribute("checked")
+    const isBeingTyped = it === root.getRootNode().activeElement && it.key === key && it.value !== it.known
+    if (it.type === "checkbox") it.checked = it.hasAttribute("checked")
+    else if (!isBeingTyped) it.known = it.value = it.getAttribute("value") ?? it.querySelector("[selected]").value
     it.key = key
   }
 }
@@ -22,8 +21,10 @@ function when(seconds) {
 
 function tellActions(root, model) {
   const tell = (event) => {
-    const it = event.target.closest("[data-do]"), isInput = it?.matches("input")
-    if (it && isInput === (event.type === "change")) model.send_msg({action: it.dataset.do, key: keyOf(it), name: it.value, on: it.checked ?? false})
+    const it = event.target.closest("[data-do]"), isField = it?.matches("input, select")
+    if (!it || isField !== (event.type === "change")) return
+    it.known = it.value
+    model.send_msg({action: it.dataset.do, key: keyOf(it), name: it.value, on: it.checked ?? false})
   }
   root.addEventListener("click", tell)
   root.addEventListener("change", tell)

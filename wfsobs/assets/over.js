@@ -16,10 +16,9 @@ function settingAt(event) {
 }
 
 function offerSweep(model, el) {
-  const button = document.createElement("button")
-  Object.assign(button, {type: "button", className: "over", textContent: "Sweep this setting", popover: "manual"})
-  button.title = "Run the scenario over values of this setting (Alt+O)"
-  button.setAttribute("aria-keyshortcuts", "Alt+O")
+  const button = Object.assign(document.createElement("button"), {
+    type: "button", className: "over", textContent: "Sweep this setting", popover: "manual",
+    title: "Run the scenario over values of this setting (Alt+O)", ariaKeyShortcuts: "Alt+O"})
   el.append(button)
   let found = null, at = null
 
@@ -54,7 +53,9 @@ function offerSweep(model, el) {
   }
   button.onclick = ask
   // Not pointerover and focusin: between two parts of the page they do not leave its shadow tree.
-  const events = [["pointermove", offer], ["keyup", offer], ["keydown", press], ["scroll", place]]
-  for (const [name, act] of events) document.addEventListener(name, act, true)
-  model.on("remove", () => { for (const [name, act] of events) document.removeEventListener(name, act, true) })
+  const stop = new AbortController()
+  for (const [name, act] of Object.entries({pointermove: offer, keyup: offer, keydown: press, scroll: place})) {
+    document.addEventListener(name, act, {capture: true, signal: stop.signal})
+  }
+  model.on("remove", () => stop.abort())
 }

@@ -16,8 +16,13 @@ async function send(model, file) {
   }
 }
 
-function save(name, kind, content) {
-  const url = URL.createObjectURL(new Blob([Uint8Array.from(atob(content), (c) => c.charCodeAt(0))], {type: kind}))
-  Object.assign(document.createElement("a"), {href: url, download: name}).click()
-  setTimeout(() => URL.revokeObjectURL(url), 60_000)
+// The button that chooses a file, and files that the server sends.
+function handleFiles(root, model, take = (file) => send(model, file)) {
+  root.addEventListener("click", (event) => { if (event.target.matches(".pick")) root.querySelector("[type=file]").click() })
+  root.addEventListener("change", ({target}) => {
+    if (target.type !== "file" || !target.files[0]) return
+    take(target.files[0])
+    target.value = ""
+  })
+  takeFiles(model)
 }

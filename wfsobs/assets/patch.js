@@ -14,3 +14,9 @@ function patch(element, wanted) {
   })
   while (element.childNodes.length > wanted.length) element.lastChild.remove()
 }
+
+function patchHtml(element, html) {
+  const wanted = document.createElement("div")
+  wanted.innerHTML = html
+  patch(element, [...wanted.childNodes])
+}

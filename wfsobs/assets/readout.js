@@ -3,11 +3,8 @@
 const STEP = 0.01, LEAP = 0.1 // of the width, for an arrow key alone and with Shift
 
 export function render({model, el}) {
-  const box = document.createElement("div")
-  Object.assign(box, {className: "values", popover: "manual"})
-  const mark = document.createElement("div")
-  Object.assign(mark, {className: "mark", popover: "manual"})
-  el.append(mark, box)
+  el.innerHTML = `<div class="mark" popover="manual"></div><div class="values" popover="manual"></div>`
+  const [mark, box] = el.children
   const views = new WeakMap()
   let at = null // {view, share of the width} by keyboard
 
@@ -20,8 +17,9 @@ export function render({model, el}) {
   }
 
   const hide = () => {
-    for (const it of [box, mark]) if (it.matches(":popover-open")) it.hidePopover()
-    box.removeAttribute("role")
+    box.hidePopover()
+    mark.hidePopover()
+    box.role = null
   }
 
   const show = (view, sx, byKey) => {
@@ -31,17 +29,14 @@ export function render({model, el}) {
     const rows = lines.map((line) => ({...line, value: valueAt(line, x)})).filter((line) => Number.isFinite(line.value))
     if (!rows.length) return hide()
     const [across, unitX] = named(view.model.below[0]), [, unitY] = named(view.model.left[0])
-    if (byKey) box.setAttribute("role", "status")
-    else box.removeAttribute("role")
+    box.role = byKey ? "status" : null
     box.replaceChildren(...[{label: across, value: x, unit: unitX}, ...rows.map((row) => ({...row, unit: unitY}))].map(rowOf))
-    if (!box.matches(":popover-open")) box.showPopover()
+    box.showPopover()
     const room = window.innerWidth - box.offsetWidth - 4, right = rect.left + sx + 14
     box.style.left = `${right <= room ? right : Math.max(4, rect.left + sx - box.offsetWidth - 14)}px`
     box.style.top = `${Math.max(4, Math.min(rect.top + frame.top + 6, window.innerHeight - box.offsetHeight - 4))}px`
-    if (byKey) {
-      if (!mark.matches(":popover-open")) mark.showPopover()
-      Object.assign(mark.style, {left: `${rect.left + sx}px`, top: `${rect.top + frame.top}px`, height: `${frame.height}px`})
-    } else if (mark.matches(":popover-open")) mark.hidePopover()
+    mark.togglePopover(byKey)
+    Object.assign(mark.style, {left: `${rect.left + sx}px`, top: `${rect.top + frame.top}px`, height: `${frame.height}px`})
   }
 
   // A line that recedes has its own colour while its card is pointed at or has the focus.
@@ -123,14 +118,10 @@ function named(axis) {
 }
 
 function rowOf({label, colour, value, unit}) {
-  const row = document.createElement("div")
-  const swatch = document.createElement("i")
+  const row = Object.assign(document.createElement("div"), {innerHTML: "<i></i><span></span><b></b>"}), [swatch, name, number] = row.children
   swatch.style.background = colour ?? "transparent"
-  const name = document.createElement("span")
   name.textContent = label
-  const number = document.createElement("b")
   number.textContent = `${written(value)} ${unit}`
-  row.append(swatch, name, number)
   return row
 }
 

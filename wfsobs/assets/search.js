@@ -4,18 +4,10 @@ const MOST = 8 // of what is found
 const SETTLED = 20 // frames in which a topic opens and moves what is in it
 
 export function render({model, el}) {
-  const box = document.createElement("input")
-  Object.assign(box, {type: "search", placeholder: "Find a setting", autocomplete: "off", spellcheck: false})
-  for (const [name, value] of Object.entries({role: "combobox", "aria-label": "Find a setting", "aria-expanded": "false",
-    "aria-controls": "found", "aria-autocomplete": "list"})) box.setAttribute(name, value)
-  const list = document.createElement("div")
-  Object.assign(list, {id: "found", hidden: true})
-  list.setAttribute("role", "listbox")
-  list.setAttribute("aria-label", "Settings found")
-  const said = document.createElement("div")
-  said.className = "said"
-  said.setAttribute("role", "status")
-  el.append(box, list, said)
+  el.innerHTML = `<input type="search" placeholder="Find a setting" autocomplete="off" spellcheck="false" role="combobox"
+    aria-label="Find a setting" aria-expanded="false" aria-controls="found" aria-autocomplete="list">
+    <div id="found" role="listbox" aria-label="Settings found" hidden></div><div class="said" role="status"></div>`
+  const [box, list, said] = el.children
   let at = 0, found = []
 
   const mark = () => {
@@ -29,13 +21,9 @@ export function render({model, el}) {
     found = words.length ? ranked(model.items, words).slice(0, MOST) : []
     at = 0
     list.replaceChildren(...found.map((item, i) => {
-      const row = document.createElement("div")
-      row.id = `found-${i}`
-      row.setAttribute("role", "option")
-      row.textContent = item.label
-      const topic = document.createElement("small")
-      topic.textContent = item.topic + (item.unused ? `: ${item.unused}` : "")
-      row.append(topic)
+      const row = Object.assign(document.createElement("div"), {id: `found-${i}`, role: "option", textContent: item.label})
+      const topic = item.topic + (item.unused ? `: ${item.unused}` : "")
+      row.append(Object.assign(document.createElement("small"), {textContent: topic}))
       row.onpointerdown = (event) => { event.preventDefault(); choose(item) }
       return row
     }))

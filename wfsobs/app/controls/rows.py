@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from html import escape
 from typing import Any
 
@@ -12,23 +13,34 @@ from wfsobs.app.component import Component
 from wfsobs.app.controls.fields import TAG, idle_html, parse_number, short_number
 from wfsobs.app.controls.names import column_of, name_settings
 from wfsobs.app.display import unit_text
+from wfsobs.app.render import render
 from wfsobs.app.store import Store
-from wfsobs.app.style import asset
+from wfsobs.app.style import script, sheets
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.settings.group import Group
 from wfsobs.settings.parameters import Reals, unit_of
 
 
 class RowTable(Component):
-    """The table in the browser: texts down, messages {action, row, key, text} up."""
+    """The table in the browser; messages {action, key, name} up, where the key is a row, or a row and a column."""
 
-    rows = param.List([], doc="One list of texts per item, None for what means nothing in it.")
-    columns = param.List([], doc="{key, name, doc, choices} of every column.")
-    errors = param.Dict({}, doc="'row.key' -> {text, reason} of refused cells.")
-    noun = param.String("item", doc="What an item is called.")
+    html = param.String("", doc="The table, as `rows.html` has it.")
 
-    _esm = asset("rows.js")
-    _stylesheets = [asset("rows.css")]
+    _esm = script("patch", "markup", "rows")
+    _stylesheets = sheets("base", "rows")
+
+    def __init__(self, on_message: Callable[[dict[str, Any]], object], noun: str, columns: list[dict[str, Any]], **params: Any):
+        """Make a table without rows.
+
+        noun : what an item is called; columns : {key, name, doc, choices} of every one
+        """
+        self.noun, self.columns = noun, columns
+        super().__init__(on_message, **params)
+
+    def show(self, rows: list[list[str | None]], errors: dict[str, dict[str, str]]) -> None:
+        """Show rows: a text per column, None for what means nothing in an item. errors : "row.key" -> {text, reason}."""
+        self.rows, self.errors = rows, errors
+        self.html = render("rows.html", rows=rows, errors=errors, columns=self.columns, noun=self.noun)
 
 
 class RowEditor:
@@ -40,8 +52,8 @@ class RowEditor:
         self._texts: dict[str, str] = {}
         self.table = RowTable(
             self.handle,
-            columns=_columns(self._kind),
-            noun=self._kind.__name__.lower(),
+            self._kind.__name__.lower(),
+            _columns(self._kind),
             tags=[TAG + path],
             sizing_mode="stretch_width",
             margin=(0, 0, 8, 0),
@@ -60,13 +72,13 @@ class RowEditor:
 
     def handle(self, msg: dict[str, Any]) -> None:
         """Do what a message of the table says."""
-        action, row = msg.get("action"), int(msg.get("row", -1))
+        action, (row, _, key) = msg.get("action"), str(msg.get("key", "")).partition(".")
         if action == "add":
             self.add()
         elif action == "remove":
-            self.remove(row)
+            self.remove(int(row))
         elif action == "edit":
-            self.edit(row, str(msg["key"]), str(msg["text"]))
+            self.edit(int(row), key, str(msg["name"]))
 
     def add(self) -> None:
         """One more item, with the defaults."""
@@ -92,7 +104,7 @@ class RowEditor:
         for path, reason in self.store.errors.items():
             if f"{path}.".startswith(f"{self.path}."):
                 errors[path.removeprefix(f"{self.path}.")] = {"text": self._texts.get(path, ""), "reason": name_settings(reason)}
-        self.table.param.update(rows=rows, errors=errors)
+        self.table.show(rows, errors)
 
     def _plain(self) -> list[dict[str, Any]]:
         return [item.to_dict() for item in self.store.value(self.path)]

@@ -9,7 +9,7 @@ import param
 
 from wfsobs.app.component import Component
 from wfsobs.app.display import label_of, unit_text
-from wfsobs.app.style import asset
+from wfsobs.app.style import script, sheets
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.idle import why_idle_at
 
@@ -19,8 +19,8 @@ class Search(Component):
 
     items = param.List([], doc="{path, label, topic, doc, unused} of every setting.")
 
-    _esm = asset("over.js") + asset("search.js")
-    _stylesheets = [asset("search.css")]
+    _esm = script("over", "search")
+    _stylesheets = sheets("base", "search")
 
     def __init__(self, reveal: Callable[[str], None], idle: Callable[[], Mapping[str, str]], **params: Any):
         """Make the box.

@@ -8,7 +8,7 @@ from wfsobs.app.component import Component
 from wfsobs.app.controls.names import setting_name
 from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.store import Store
-from wfsobs.app.style import asset
+from wfsobs.app.style import script, sheets
 from wfsobs.app.work import RunResults
 
 ON_BAR = {
@@ -45,8 +45,8 @@ class Status(Component):
     note = param.String("", doc="What was refused.")
     label = param.String("Progress of the run", doc="What the bar is the progress of.")
 
-    _esm = asset("status.js")
-    _stylesheets = [asset("status.css")]
+    _esm = script("status")
+    _stylesheets = sheets("base", "status")
 
 
 def status_of(store: Store) -> tuple[float, str, str]:

@@ -17,7 +17,7 @@ from markupsafe import Markup
 from wfsobs.app.copies import LOOP, CopiedTask
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.downloads import residuals_csv, residuals_npz, table_csv
-from wfsobs.app.glossary import NEEDS, STREHL, TERMS, sentence_on
+from wfsobs.app.glossary import NEEDS, STREHL, TERMS
 from wfsobs.app.jobs import CANCELLED, FAILED, RUNNING, Job
 from wfsobs.app.loop_work import LoopResults, compute, cost, seconds
 from wfsobs.app.pages.parts import (
@@ -41,7 +41,7 @@ from wfsobs.app.store import Store
 from wfsobs.app.style import look, swatch
 from wfsobs.app.views.gain_editor import GainEditor, plane
 from wfsobs.app.views.plots import add_line, envelope, envelope_times, new_figure, on_settle, restyle
-from wfsobs.app.views.strip import Cards
+from wfsobs.app.views.strip import Cards, card_of
 from wfsobs.app.views.table import SMALLEST
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label, loop_verdict
 from wfsobs.control.controllers import CONTROLLERS
@@ -366,7 +366,7 @@ class ClosedLoopPage(Page):
         self._of = object()
         self._rooms = list[pn.viewable.Viewable]()
         self.note, self.verdict, self.table, self.margins = html(), html(), html(), html()
-        self.cards = Cards(kind="controllers", terms={STREHL: TERMS[STREHL]})
+        self.cards = Cards("controllers")
         self.cards.on_main, self._main, self._is_chosen = self._show_main, list[str](), False
         self.link = LinkedLines(
             "hide",
@@ -486,7 +486,7 @@ class ClosedLoopPage(Page):
                 self.verdict.object = loop_verdict_html(self.results, self.display)
                 self.table.object = loop_html(self.results, self.display)
                 self.margins.object = margins_html(self.results, self.display)
-                self.cards.items = self._items(self.results)
+                self.cards.show(self._items(self.results))
 
     def _choose(self, *_: object) -> None:
         """Keep to the lines that a visitor has chosen."""
@@ -516,7 +516,7 @@ class ClosedLoopPage(Page):
         left = {r["controller"]: r for r in results.rows if r["mode"] == self.display.mode}
         out = []
         for name in CONTROLLERS:
-            it, row = look(name), left.get(name)
+            row = left.get(name)
             value, unit = NOTHING, ""
             if row is None:
                 note = f"left out, {seconds(name, results.result.scenario):.0f} s" if results.complete else "computing …"
@@ -525,17 +525,5 @@ class ClosedLoopPage(Page):
             else:
                 value, unit = number(row["residual_rms_nm"] * scale), self.display.unit_label
                 note = f"Strehl {row['strehl']:.3f}"
-            out.append(
-                {
-                    "name": name,
-                    "label": it.label,
-                    "colour": it.colour(self.display.dark),
-                    "dash": list(it.dash),
-                    "about": sentence_on(name),
-                    "note": note,
-                    "value": value,
-                    "unit": unit,
-                    "main": name not in self._main,
-                }
-            )
+            out.append(card_of(name, self.display.dark, note, value, unit=unit, main=name not in self._main))
         return out

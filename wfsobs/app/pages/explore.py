@@ -27,7 +27,7 @@ from wfsobs.app.pages.parts import (
 )
 from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
-from wfsobs.app.style import asset
+from wfsobs.app.style import html, sheets
 from wfsobs.app.views.main_lines import MainLines
 from wfsobs.app.views.plots import call
 from wfsobs.app.views.spectra import MODEL, PEAKS, SpectraFigures
@@ -144,7 +144,7 @@ class Explore(Page):
         below = pn.Row(self.stretches[target].pane, *window, **WIDE, stylesheets=[WRAPPED])
         self.stretches[target].pane.styles = {"flex": "1 1 240px"}
         head = pn.Column(self.verdicts[target].pane, cards, **WIDE, stylesheets=[HEAD, BELOW_FIGURES])
-        return pn.Column(head, figures, below, **WIDE, stylesheets=[asset("box.css")])
+        return pn.Column(head, figures, below, **WIDE, stylesheets=sheets("box"))
 
     def _room(self, target: str, caption: pn.pane.HTML, pane: pn.pane.Bokeh) -> pn.Column:
         """Lay out a figure; those of the first target stand there at once, the others have their room."""
@@ -181,9 +181,4 @@ class Explore(Page):
 
 
 def _caption(text: str, marks: str = "") -> pn.pane.HTML:
-    return pn.pane.HTML(
-        f'<div class="caption">{escape(text)}{marks}</div>',
-        sizing_mode="stretch_width",
-        margin=(8, 0, 0, 0),
-        stylesheets=[asset("style.css")],
-    )
+    return html(f'<div class="caption">{escape(text)}{marks}</div>', margin=(8, 0, 0, 0))

@@ -13,7 +13,7 @@ from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.pages.parts import WIDE, Page, boxes, html
 from wfsobs.app.render import number
 from wfsobs.app.store import Store
-from wfsobs.app.style import asset, look, swatch
+from wfsobs.app.style import look, sheets, swatch
 from wfsobs.app.views.plots import call, new_figure
 from wfsobs.app.views.table import find
 from wfsobs.app.work import TRUTH, RunResults
@@ -64,7 +64,7 @@ class _Sheet:
     def view(self) -> pn.Column:
         """Return the contents of the page."""
         panes = [pn.pane.Bokeh(drawn.figure, **WIDE) for drawn in self.plots]
-        return pn.Column(self.head, *panes, self.caption, **WIDE, stylesheets=[asset("box.css")])
+        return pn.Column(self.head, *panes, self.caption, **WIDE, stylesheets=sheets("box"))
 
     def draw(self, results: RunResults, display: Display) -> None:
         """Every plot and the texts."""

@@ -20,7 +20,7 @@ from bokeh.plotting import figure
 from wfsobs.app.component import Component
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.pages.parts import WIDE, grid_style
-from wfsobs.app.style import asset, look
+from wfsobs.app.style import html, look, script, sheets
 from wfsobs.app.views.plots import FigureLines, call, envelope, envelope_times, new_figure
 from wfsobs.app.views.traces import WINDOW_S
 from wfsobs.app.work import TRUTH
@@ -47,7 +47,7 @@ class Pulse(Component):
 
     picture = param.Integer(0, doc="Number of the last one.")
     changes = param.List([], doc="What a Painter changes with it.")
-    _esm = asset("pulse.js")
+    _esm = script("pulse")
 
     def __init__(self, **params: Any):
         self.answer, self._time = -1, 0.0
@@ -481,7 +481,7 @@ class Detector:
         self._line = self.figure.line("x", "y", source=self._trail, line_alpha=0.5).glyph
         self._core = self.figure.circle("x", "y", radius=1.0, source=self._spot, fill_alpha=0.6).glyph
         self._style: tuple[float, float, str] | None = None
-        caption = pn.pane.HTML(f'<div class="caption">{self.label}</div>', margin=0, stylesheets=[asset("style.css")])
+        caption = html(f'<div class="caption">{self.label}</div>', sizing_mode=None)
         self.view = pn.Column(caption, pn.pane.Bokeh(self.figure, sizing_mode=self.figure.sizing_mode, margin=0), **WIDE)
 
     def draw(self, points: Array, reach: float, radius: float, dark: bool) -> None:
@@ -537,4 +537,4 @@ class LiveText(pn.pane.HTML):
 
 def live_text() -> LiveText:
     """Make one in the page's style."""
-    return LiveText("", **WIDE, stylesheets=[asset("style.css")])
+    return LiveText("", **WIDE, stylesheets=sheets("style"))

@@ -8,7 +8,7 @@ from wfsobs.app.display import Display
 from wfsobs.app.pages.parts import WIDE, Page
 from wfsobs.app.render import render, short
 from wfsobs.app.store import Store
-from wfsobs.app.style import asset, swatch
+from wfsobs.app.style import sheets, swatch
 from wfsobs.evaluation.description import Description, describe
 from wfsobs.observers import OBSERVERS
 from wfsobs.typing import Array
@@ -19,7 +19,7 @@ class ModelPage(Page):
 
     def __init__(self, store: Store, display: Display):
         super().__init__(store, display, "mode", "dark")
-        self.pane = pn.pane.HTML("", **WIDE, stylesheets=[asset("style.css"), asset("model.css")])
+        self.pane = pn.pane.HTML("", **WIDE, stylesheets=sheets("style", "model"))
         store.param.watch(self.redraw, "scenario")
 
     def view(self) -> pn.pane.HTML:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from html import escape
-from math import sin
 from types import MappingProxyType
 from typing import Any, Protocol
 
@@ -20,9 +19,10 @@ from wfsobs.app.copies import EXPLORED, CopiedTask
 from wfsobs.app.display import Display
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs import CANCELLED, DONE, RUNNING
+from wfsobs.app.render import render
 from wfsobs.app.service import IDLE, BackgroundTask
 from wfsobs.app.store import Store
-from wfsobs.app.style import HEARD, asset, swatch
+from wfsobs.app.style import HEARD, WIDE, html, sheets, swatch
 from wfsobs.app.views.plots import call
 from wfsobs.settings.errors import SettingError
 from wfsobs.settings.parameters import hint
@@ -269,9 +269,6 @@ KINDS = {"csv": "text/csv", "toml": "application/toml"}
 """Ending of a file -> its type, if it is not BYTES."""
 
 
-WIDE: Mapping[str, Any] = MappingProxyType({"sizing_mode": "stretch_width", "margin": 0})
-
-
 ON_ONE_LINE = """
 @media (max-height: 560px), (max-width: 600px) {
   [id^="flexbox"] { flex-wrap: nowrap !important; overflow: auto hidden; }
@@ -287,12 +284,7 @@ BELOW_FIGURES = "@media (max-height: 560px) { :host { order: 1; } }"
 def heading(title: str, about: str = "") -> pn.pane.HTML:
     """Make the title of a box; about : beside it, what is in the box."""
     words = f'<span class="about">{escape(about)}</span>' if about else ""
-    return pn.pane.HTML(f'<h2 class="title">{escape(title)}</h2>{words}', margin=0, stylesheets=[asset("style.css")])
-
-
-def html(content: str = "") -> pn.pane.HTML:
-    """HTML in the page's style."""
-    return pn.pane.HTML(content, **WIDE, stylesheets=[asset("style.css")])
+    return html(f'<h2 class="title">{escape(title)}</h2>{words}', sizing_mode=None)
 
 
 def text(content: str) -> pn.pane.HTML:
@@ -300,46 +292,9 @@ def text(content: str) -> pn.pane.HTML:
     return html(f'<p class="text">{escape(content)}</p>')
 
 
-STEPS = ((30, 14), (70, 40), (100, 62), (160, 76), (210, 96), (390, 104), (570, 104))
-
-
-def _wave(k: int) -> str:
-    points = ((30 + 6 * i, (22 - 7 * k) * (sin(0.31 * i + k) + sin((0.83 + 0.1 * k) * i))) for i in range(91))
-    return " ".join(f"{x},{60 + y:.0f}" for x, y in points)
-
-
-EXAMPLES: Mapping[str, tuple[str, str]] = MappingProxyType(
-    {
-        "tune": (
-            "Example: the smallest error found so far, over the evaluations",
-            f'<path d="M30 14{"".join(f"H{x}V{y}" for x, y in STEPS)}"/>'
-            + "".join(f'<circle cx="{x}" cy="{y}" r="3"/>' for x, y in STEPS[:-1]),
-        ),
-        "sweep": (
-            "Example: the best observer of every combination of two settings",
-            "".join(
-                f'<rect x="{40 + 108 * i}" y="{8 + 28 * j}" width="102" height="23" class="{"abc"[(2 * i + 3 * j) // 7]}"/>'
-                for i in range(5)
-                for j in range(4)
-            ),
-        ),
-        "live": (
-            "Example: the errors of the last seconds",
-            "".join(f'<polyline class="{name}" points="{_wave(k)}"/>' for k, name in enumerate("abc")),
-        ),
-    }
-)
-"""What a page shows before it has results: caption and drawing."""
-
-
 def example(name: str, results: Any) -> pn.pane.HTML:
     """Draw an example of the results of a page, until they are visible themselves."""
-    caption, drawing = EXAMPLES[name]
-    frame = '<path class="frame" d="M30 4v116h550"/>'
-    pane = html(
-        f'<figure class="example"><svg viewBox="0 0 600 124" role="img" aria-label="{caption}">{frame}{drawing}</svg>'
-        f"<figcaption>{caption}</figcaption></figure>"
-    )
+    pane = html(render("example.html", name=name))
     pane.visible = not results.visible
     results.param.watch(lambda event: setattr(pane, "visible", not event.new), "visible")
     return pane
@@ -357,7 +312,7 @@ def zoom_buttons(zoom: Callable[[float | None], None], stretches: Mapping[str, f
 
 def box(title: str, *content: Any, about: str = "") -> pn.Column:
     """Lay out a part of a page under its title; about : what is in it, in a few words."""
-    return pn.Column(heading(title, about), *content, **WIDE, stylesheets=[asset("box.css")])
+    return pn.Column(heading(title, about), *content, **WIDE, stylesheets=sheets("box"))
 
 
 def boxes(*parts: Any) -> pn.Column:
@@ -412,7 +367,7 @@ def figure_with_caption(title: str, fig: figure, *, tall: bool = False) -> pn.Co
     call(fig, title)
     if tall:
         fig.sizing_mode = "stretch_both"
-    caption = pn.pane.HTML(f'<div class="caption">{escape(title)}</div>', margin=(8, 0, 0, 0), stylesheets=[asset("style.css")])
+    caption = html(f'<div class="caption">{escape(title)}</div>', sizing_mode=None, margin=(8, 0, 0, 0))
     return pn.Column(caption, pn.pane.Bokeh(fig, sizing_mode=fig.sizing_mode, margin=0), **(TALL if tall else WIDE))
 
 

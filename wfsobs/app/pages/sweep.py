@@ -51,7 +51,7 @@ from wfsobs.app.render import render
 from wfsobs.app.seeds import SeedScores
 from wfsobs.app.service import BackgroundTask, Session
 from wfsobs.app.store import Store
-from wfsobs.app.style import asset, look
+from wfsobs.app.style import look, script, sheets
 from wfsobs.campaign.sweep import MOST_SEEDS, SEED, Sweep, SweepResults, parse_axis, plan_sweep, run_cell
 from wfsobs.evaluation.rows import target_title
 from wfsobs.evaluation.scores import SCORED
@@ -284,8 +284,8 @@ class SweepMap(Component):
 
     html = param.String("", doc="What is in it.")
 
-    _esm = asset("patch.js") + asset("markup.js") + asset("sweep.js")
-    _stylesheets = [asset("sweep.css")]
+    _esm = script("patch", "markup", "sweep")
+    _stylesheets = sheets("base", "sweep")
 
     def __init__(self, load: Callable[[int], None], **params: Any):
         """Make the map. load : takes the number of a cell."""

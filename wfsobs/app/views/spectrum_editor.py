@@ -17,10 +17,10 @@ from bokeh.plotting import figure
 from wfsobs.app.component import Component
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs import CANCELLED, CLICK, DONE, FAILED, Job
-from wfsobs.app.render import number
+from wfsobs.app.render import number, render
 from wfsobs.app.service import Session
 from wfsobs.app.store import Store
-from wfsobs.app.style import asset, look, observers_of
+from wfsobs.app.style import look, observers_of, script, sheets
 from wfsobs.app.views.plots import AFTERWARDS_MS, ExtraLines, once
 from wfsobs.evaluation.error_spectra import TRUTH, Prediction, Theory, cumulative_rms, is_predicted
 from wfsobs.evaluation.exact_errors import SETTLED
@@ -242,8 +242,14 @@ class HandleLayer(Component):
     figure = param.String("", doc="Name of the figure that the handles lie over.")
     frame = param.Dict({}, doc="What is shown: handles, numbers, a note, and the number of the message that is answered.")
 
-    _esm = asset("handles.js")
-    _stylesheets = [asset("handles.css")]
+    html = param.String("", doc="What stands below the figure.")
+
+    _esm = script("patch", "handles")
+    _stylesheets = sheets("base", "handles")
+
+    @param.depends("frame", watch=True, on_init=True)
+    def _draw(self) -> None:
+        self.html = render("handles.html", frame={"note": "", "hint": "", "numbers": [], "add": None, **self.frame})
 
 
 class SpectrumEditor:

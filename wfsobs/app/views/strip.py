@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import sqrt
 from typing import Any
@@ -14,10 +14,10 @@ from wfsobs.app.component import Component
 from wfsobs.app.display import OVER_SEEDS, Display, per_micrometre
 from wfsobs.app.glossary import RELATIVE, TERMS, sentence_on
 from wfsobs.app.jobs import DONE, RUNNING
-from wfsobs.app.render import NOTHING, change, number, with_decimals_of
+from wfsobs.app.render import NOTHING, change, number, render, with_decimals_of
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import BackgroundTask
-from wfsobs.app.style import TERM_COLOURS, asset, look, observers_of
+from wfsobs.app.style import TERM_COLOURS, look, observers_of, script, sheets
 from wfsobs.app.views.main_lines import REFERENCES, MainLines
 from wfsobs.app.views.table import find
 from wfsobs.app.work import TRUTH, RunResults
@@ -47,21 +47,31 @@ class RunErrors:
 class Cards(Component):
     """A row per line in the browser; a click on one hides or shows its line, a double click shows it alone."""
 
-    items = param.List([], doc="{name, label, colour, dash, value, unit, half, note, ...} of every row, as `Strip` makes them.")
-    heads = param.Dict({}, doc="Headings of the columns value, note, change and bar; a row of them if there are any.")
-    legend = param.List([], doc="(colour, label) of the pieces of bars.")
+    html = param.String("", doc="The rows, as `strip.html` has them.")
     hidden_lines = param.List([], doc="Names of the rows whose lines are hidden.")
     last_arrival = param.Integer(0, doc="Number of the last click that has arrived, and all before it.")
-    terms = param.Dict({}, doc="Heading -> what it means.")
-    kind = param.String("observers", doc="What the rows are of.")
 
-    _esm = asset("patch.js") + asset("strip.js")
-    _stylesheets = [asset("style.css"), asset("strip.css")]
+    _esm = script("patch", "strip")
+    _stylesheets = sheets("style", "strip")
 
-    def __init__(self, **params: Any):
+    def __init__(self, kind: str = "observers"):
+        """Make the table. kind : what the rows are of."""
+        self.kind = kind
         self.on_main: Callable[[], None] = lambda: None
         self.on_all: Callable[[], None] = lambda: None
-        super().__init__(self._take, sizing_mode="stretch_width", margin=0, **params)
+        super().__init__(self._take, sizing_mode="stretch_width", margin=0)
+        self.show([])
+
+    def show(
+        self, items: list[dict[str, Any]], heads: Mapping[str, str] | None = None, legend: Sequence[tuple[str, str]] = ()
+    ) -> None:
+        """Show rows, as `Strip` makes them.
+
+        heads : headings of the columns value, note, change and bar; legend : (colour, label) of the pieces of bars
+        """
+        self.items, self.heads, self.legend = items, heads or {}, legend
+        values = {"kind": self.kind, "terms": TERMS, "truth": TRUTH, "nothing": NOTHING}
+        self.html = render("strip.html", items=items, heads=self.heads, legend=legend, **values)
 
     def _take(self, data: dict[str, Any]) -> None:
         """Take a click: the names to hide, or the wish for the main rows or all."""
@@ -75,6 +85,14 @@ class Cards(Component):
                 hidden_lines=[name for name in names if isinstance(name, str)],
                 last_arrival=number if isinstance(number, int) else self.last_arrival,
             )
+
+
+def card_of(name: str, dark: bool, note: str, value: str = NOTHING, **fields: Any) -> dict[str, Any]:
+    """Describe the row of an observer or a controller that has no bar, nor anything it is compared with, but for other fields."""
+    it = look(name)
+    known = {"name": name, "label": it.label, "colour": it.colour(dark), "dash": it.dash, "about": sentence_on(name)}
+    empty = {"unit": "", "half": "", "change": "", "parts": (), "size": 0.0, "limit": 0.0, "compared": ()}
+    return {**known, "note": note, "value": value, **empty, **fields}
 
 
 class Strip:
@@ -96,7 +114,7 @@ class Strip:
         self.target, self.run, self.display, self.seeds, self.budgets = target, run, display, seeds, budgets
         self.lines = lines or MainLines(run, display, seeds)
         self._now = self._before = RunErrors()
-        self.cards = Cards(items=self.items(), terms={HEADS["note"]: TERMS[RELATIVE]})
+        self.cards = Cards()
         self._refresh()
         run.param.watch(self._follow, ["result", "state"])
         if seeds is not None:
@@ -125,12 +143,9 @@ class Strip:
         heads = HEADS | {"value": f"{error} [{unit}]"}
         heads["change"] *= any(item["change"] for item in items)
         heads["bar"] *= bool(terms)
-        limit = [["currentColor", LIMIT]] * any(item["limit"] for item in items)
-        self.cards.param.update(
-            items=items,
-            heads=heads,
-            legend=[[TERM_COLOURS[name], label] for name, label in BUDGET_TERMS.items() if name in terms] + limit,
-        )
+        limit = [("currentColor", LIMIT)] * any(item["limit"] for item in items)
+        legend = [(TERM_COLOURS[name], label) for name, label in BUDGET_TERMS.items() if name in terms]
+        self.cards.show(items, heads, legend + limit)
 
     def _hide(self, *_: object) -> None:
         self.cards.hidden_lines = self.display.hidden_lines.get(self.target, [])
@@ -243,19 +258,4 @@ class Strip:
         return value * per_micrometre(self.display.unit, results.scenario.telescope.diameter)
 
     def _card(self, name: str, value: float | None, note: str) -> dict[str, Any]:
-        it = look(name)
-        return {
-            "name": name,
-            "label": it.label,
-            "colour": it.colour(self.display.dark),
-            "dash": list(it.dash),
-            "about": sentence_on(name),
-            "note": note,
-            "value": NOTHING if value is None else number(value),
-            "unit": "",
-            "half": "",
-            "change": "",
-            "parts": [],
-            "size": 0.0,
-            "limit": 0.0,
-        }
+        return card_of(name, self.display.dark, note, NOTHING if value is None else number(value))

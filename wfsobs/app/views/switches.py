@@ -16,7 +16,7 @@ from wfsobs.app.jobs import FAILED
 from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import BackgroundTask
-from wfsobs.app.style import HEARD, asset, run_swatch
+from wfsobs.app.style import HEARD, html, run_swatch
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import TIP_TILT, Mode
 
@@ -134,7 +134,7 @@ class SeedSwitch:
         self.field = pmui.IntInput.from_param(
             seeds.param.count, size="small", width=90, margin=(0, 0, 4, 0), stylesheets=[NO_STEPPERS]
         )
-        self.line = pn.pane.HTML(self.text(), margin=0, stylesheets=[asset("style.css")])
+        self.line = html(self.text(), sizing_mode=None)
         seeds.param.watch(self._refresh, ["evidence", "count"])
         seeds.run.param.watch(self._refresh, ["state", "result"])
         seeds.task.param.watch(self._refresh, ["state", "message"])
@@ -175,7 +175,7 @@ class Pinning:
         self.button = pmui.Button(
             label="Pin", icon="push_pin", size="small", variant="outlined", margin=0, disabled=True, description=PIN
         )
-        self.note = pn.pane.HTML("", margin=0, visible=False, stylesheets=[asset("style.css")])
+        self.note = html(sizing_mode=None, visible=False)
         self.button.on_click(self._on_press)
         run.param.watch(self._refresh, "result")
         history.param.watch(self._refresh, "current")

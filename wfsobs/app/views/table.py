@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 
-import panel as pn
 from markupsafe import Markup
 
 from wfsobs.app.compared import ComparedRun
@@ -16,7 +15,7 @@ from wfsobs.app.jobs import DONE
 from wfsobs.app.render import Row, change, hundredths, macro, missing, number, table
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import BackgroundTask
-from wfsobs.app.style import asset, observers_of, swatch
+from wfsobs.app.style import html, observers_of, swatch
 from wfsobs.app.work import RunResults
 from wfsobs.evaluation.evidence import rank_observers
 from wfsobs.evaluation.known_lines import group_by_knowledge
@@ -60,7 +59,7 @@ class Table:
 
     def __init__(self, run: BackgroundTask, display: Display, seeds: SeedRuns | None = None):
         self.run, self.display, self.seeds = run, display, seeds
-        self.pane = pn.pane.HTML(self.html(), sizing_mode="stretch_width", margin=0, stylesheets=[asset("style.css")])
+        self.pane = html(self.html())
         run.param.watch(self._refresh, ["result", "state"])
         if seeds is not None:
             seeds.param.watch(self._refresh, "evidence")

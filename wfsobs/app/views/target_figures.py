@@ -14,7 +14,7 @@ from bokeh.plotting import figure
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.render import number
 from wfsobs.app.service import BackgroundTask
-from wfsobs.app.style import asset, look, observers_of, swatch
+from wfsobs.app.style import html, look, observers_of, swatch
 from wfsobs.app.views.plots import FigureLines, on_settle, zoom_of
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.error_spectra import band_rms
@@ -34,7 +34,7 @@ class Stretch:
     ):
         self.target, self.run, self.display = target, run, display
         self.times, self.frequencies, self.chosen_window = times, frequencies, chosen_window
-        self.pane = pn.pane.HTML("", sizing_mode="stretch_width", margin=0, stylesheets=[asset("style.css")])
+        self.pane = html()
         run.param.watch(self._refresh, "result")
         display.param.watch(self._refresh, ["mode", "unit", "hidden_lines", "dark"])
         on_settle([times, frequencies], self._refresh)

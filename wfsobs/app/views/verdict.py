@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from html import escape
 
-import panel as pn
 from markupsafe import Markup
 
 from wfsobs.app.budgets import Budgets
@@ -14,7 +13,7 @@ from wfsobs.app.jobs import DONE, RUNNING
 from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import IDLE, BackgroundTask
-from wfsobs.app.style import asset
+from wfsobs.app.style import html
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.rows import target_title
 from wfsobs.evaluation.scores import PREDICTION
@@ -37,7 +36,7 @@ class VerdictLine:
     ):
         self.target, self.run, self.display, self.seeds, self.budgets = target, run, display, seeds, budgets
         self._text: tuple[tuple[str, str], tuple[str, str]] = ("", ""), ("", "")
-        self.pane = pn.pane.HTML(self.html(), sizing_mode="stretch_width", margin=0, stylesheets=[asset("style.css")])
+        self.pane = html(self.html())
         run.param.watch(self._refresh, ["result", "state"])
         if seeds is not None:
             seeds.param.watch(self._refresh, "evidence")
