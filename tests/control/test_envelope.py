@@ -110,6 +110,8 @@ def test_the_command_prints_table_and_rows(tmp_path) -> None:
     assert "Best at the nominal plant:" in shown.output and "rotation +-10 deg" in shown.output
     rows = json.loads(CliRunner().invoke(main, [*arguments, "--json"]).output)
     assert [(r["controller"], r["mode"]) for r in rows] == [(n, m) for n in ("integrator", "lqg-kf-lgs") for m in ("tip", "tilt")]
+    refused = CliRunner().invoke(main, ["loop", "--envelope", "--json"])
+    assert refused.exit_code == 2 and "`wfsobs envelope --json` has the rows" in refused.output
     assert all(r["corners"] == 8 and r["nominal_rms_nm"] <= r["worst_rms_nm"] for r in rows)
 
 

@@ -42,7 +42,7 @@ EACH_RUN, EACH_FLOW, EACH_STEP = 0.4, 2.2, 1e-5
 """Time of a run beside `run_seconds` [s]: whatever its length (designs of the observers, scores, bounds); for frozen flow beside;
 for every step and mode (all quick observers). Measured as processor time: `paper` of 2, 10 and 60 s, `ut4` of 2 and 10 s."""
 
-SEED, CONTROL = "run.seed", "control"
+SEED, LOOP_ONLY = "run.seed", ("control.", "plant.")
 RANGE = re.compile(r"([^:,]+):([^:,]+):([^:,]+?)(:log)?")
 
 
@@ -213,8 +213,8 @@ def _check_effect(axes: Sequence[Variation], scenarios: Sequence[Scenario]) -> N
     """Raise SettingError for a setting that changes no error in any of the scenarios."""
     idle = [idle_settings(scenario) for scenario in scenarios]
     for axis in axes:
-        if axis.path.startswith(f"{CONTROL}."):
-            raise SettingError(f"--over {axis.path}: changes no error of an observer; only the controllers use it")
+        if axis.path.startswith(LOOP_ONLY):
+            raise SettingError(f"--over {axis.path}: changes no error of an observer; only the closed loop uses it")
         reasons = [why_idle_at(axis.path, known) for known in idle]
         if all(reasons):
             raise SettingError(f"--over {axis.path}: changes no error here; {reasons[0][0].lower()}{reasons[0][1:]}")

@@ -196,6 +196,7 @@ def run(
 @click.option("--record", "record_file", metavar="RECORD", help="Use the disturbance and noise of a record with truth.")
 @record_options
 @training_options
+@click.option("--envelope", "with_envelope", is_flag=True, help="Also print what an uncertain plant does (`wfsobs envelope`).")
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
 def loop(
     scenario: Scenario,
@@ -206,10 +207,13 @@ def loop(
     sha256: str | None,
     train: str | None,
     train_until: float | None,
+    with_envelope: bool,
     as_json: bool,
 ) -> None:
     """Close the loop with every controller on the same disturbance and print what is left of it (docs/closed_loop.md)."""
     record, start = None, 0.0
+    if with_envelope and (as_json or record_file is not None):
+        raise SettingError("--envelope: not with --json or --record; `wfsobs envelope --json` has the rows, of a scenario")
     if record_file is None and (train is not None or train_until is not None):
         raise SettingError("--train, --train-until: only with --record; a simulated record has its own training data")
     if record_file is not None:
@@ -231,6 +235,9 @@ def loop(
         click.echo(json.dumps(all_rows, allow_nan=False))
     else:
         show_table(loop_table(all_rows))
+    if with_envelope:
+        with progress_bar("envelope") as update:
+            _show_envelope(plant_envelope(scenario, controllers or None, watch=Watch(progress=update)))
 
 
 def envelope_table(result: PlantEnvelope) -> Table:
@@ -290,6 +297,10 @@ def envelope(
     if as_json:
         click.echo(json.dumps(result.rows(), allow_nan=False))
         return
+    _show_envelope(result)
+
+
+def _show_envelope(result: PlantEnvelope) -> None:
     show_table(envelope_table(result))
     for name, reason in result.notes.items():
         click.echo(f"{label(name)}: {reason}")
