@@ -314,6 +314,15 @@ def test_a_legend_of_all_observers_has_room(width: float, result: wfsobs.Result)
     assert paper.axes[0].get_position().height * own.height / paper.dpi > 0.8  # inches: the plot keeps its height
 
 
+def test_legends_of_all_observers_do_not_cover_each_other_in_a_notebook(result: wfsobs.Result) -> None:
+    truths = {"turbulence": result.record.turbulence, "vibration": result.record.vibration}
+    estimates = tuple(Estimate(o.id, of, x, 0.0) for o in OBSERVERS.values() for of, x in truths.items() if x is not None)
+    page = hv.renderer("matplotlib").get_plot(replace(result, estimates=estimates).plot.traces()).state
+    page.savefig(BytesIO())
+    above, below = (axes.get_legend().get_window_extent() for axes in page.axes)
+    assert above.y0 > below.y1
+
+
 def test_what_cannot_be_drawn_is_one_line(result: wfsobs.Result, loop: ClosedLoop) -> None:
     for draw, why in (
         (lambda: result.plot.traces(mode="focus"), "mode 'focus': there are tip, tilt"),

@@ -122,10 +122,11 @@ def _axis_label(of: hv.Dimension) -> str:
     return f"{of.label} [{of.unit}]" if of.unit else str(of.label)
 
 
-def stack(figures: Sequence[hv.Overlay], columns: int = 1) -> hv.Layout:
-    """Place figures below each other."""
-    looks = {"sublabel_format": "", "fig_size": NOTEBOOK, "vspace": 0.5}
-    return style(hv.Layout(list(figures)).cols(columns), bokeh={}, matplotlib=looks)
+def stack(figures: Sequence[hv.Overlay]) -> hv.Layout:
+    """Place figures below each other, as far apart as legends need."""
+    apart = max(0.5, 0.075 * max(map(len, figures)) - 0.8)
+    looks = {"sublabel_format": "", "fig_size": NOTEBOOK, "vspace": apart}
+    return style(hv.Layout(list(figures)).cols(1), bokeh={}, matplotlib=looks)
 
 
 Bar = tuple[str, Sequence[float], Sequence[str]]
