@@ -98,6 +98,7 @@ def test_delay_and_gain_are_put_right_by_the_next_command(tmp_path: Path) -> Non
     assert float(words[words.index("--command-delay") + 1]) == pytest.approx(1.5, abs=0.1)
     if seen["command gain"] == "note":
         assert float(words[words.index("--command-gain") + 1]) == pytest.approx(1.2, abs=0.1)
+    assert "--trust" in words, "the file states another delay"
     stated = ["check", str(file), "--json", "--command-delay", "1.5", "--command-gain", "1.2", "--trust"]
     again = verdicts(json.loads(CliRunner().invoke(main, stated).stdout))
     assert again["command delay"] == "ok" and again["command gain"] in ("ok", "undecided")

@@ -205,3 +205,11 @@ def test_the_state_of_a_gate_goes_on(ut4: Record) -> None:
     np.testing.assert_array_equal(one.predict(0, "vibration")[0], new.predict(0, "vibration")[0])
     one.reset()
     assert not one.state_dict()["gate_lgs.outliers"].any()
+
+
+def test_a_measurement_whose_command_is_lost_is_no_outlier() -> None:
+    rng = np.random.default_rng(1)
+    y, u = rng.standard_normal((2, 1000, 2))
+    u[300:320] = np.nan
+    record = Record(y, u, 1e-3, gate=GateSettings(level=8.0))
+    assert record.outliers == 0 and np.isnan(record.without_outliers.y_lgs).any(axis=1).sum() == 20

@@ -260,8 +260,8 @@ class Record(Signals):
 
     @property
     def outliers(self) -> int:
-        """Number of steps with an LGS measurement that the gate does not let through as it is."""
-        return int(((self.without_outliers.y_lgs != self.y_lgs) & ~np.isnan(self.y_lgs)).any(axis=1).sum()) if self.gate else 0
+        """Number of steps whose LGS measurement the gate does not let through as it is, but for those whose command is lost."""
+        return int(((self.without_outliers.y_lgs != self.y_lgs) & ~np.isnan(self.z)).any(axis=1).sum()) if self.gate else 0
 
     def truth(self, target: str) -> Array | None:
         """Return the true signal of `target` ("turbulence", "vibration", or "total", their sum), or None."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import click
 import numpy as np
@@ -283,7 +283,10 @@ def check(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha
     reading = read_off(record, contents, declaration, scenario)
     with progress_bar("sweeps") as update:
         result = check_record(record, reading, raw, Watch(progress=update))
-    command = shlex.join(["wfsobs", "identify", record_file, *declaration.options(result.corrections)])
+    own = {"command-delay": "delay", "command-sign": "command_sign"}  # which the file states otherwise
+    trust = declaration.trust or any(own.get(name) in contents.arrays for name in result.corrections)
+    words = replace(declaration, trust=trust).options(result.corrections)
+    command = shlex.join(["wfsobs", "identify", record_file, *words])
     if as_json:
         found = {
             "steps": record.n_steps,

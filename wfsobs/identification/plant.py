@@ -222,7 +222,10 @@ def _contradiction_of(data: _Data, delay: int, statement: tuple[int, float, Sequ
     start = np.concatenate([stated[:k], guess[k:]]) if is_turned else stated
     ties = np.eye(3 * k - 1)[:, k - 1 :]
     ties[:k, 0] = 1.0
-    new = data.fit(data.with_spectra(start), ties, STEPS)
+    begin = data.with_spectra(start)
+    if any(missing.any for missing in data.missing):  # no longer filled by straight lines
+        begin = data.with_spectra(start, begin.spectra)
+    new = data.fit(begin, ties, STEPS)
     is_far = not is_turned and (new.theta[k : 2 * k] < NEAR).any()  # commands that follow nothing, or of another unit
     if is_far or not _what_is_off(new, stated, names, ways):
         return ""
@@ -230,7 +233,9 @@ def _contradiction_of(data: _Data, delay: int, statement: tuple[int, float, Sequ
     if any(s.background for s in new.spectra) and excited < EXCITED and not is_turned:
         return ""  # as good as the form of the background
     none = np.concatenate([stated[:k], np.full(k, 1e-9), stated[2 * k :]])
-    old, idle = (data.fit(data.with_spectra(x, (), MOST_PEAKS, plain=False), ties[:, :0], STEPS) for x in (stated, none))
+    first = {i: data.with_spectra(x).spectra for i, x in enumerate((stated, none))}
+    again = (data.with_spectra(x, first[i], MOST_PEAKS, plain=False) for i, x in enumerate((stated, none)))
+    old, idle = (data.fit(one, ties[:, :0], STEPS) for one in again)
     worth, better = min(old.criterion, idle.criterion) - new.criterion, _what_is_off(new, stated, names, ways)
     if not worth > CLEAR or not better:
         return ""
