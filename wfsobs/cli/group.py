@@ -37,6 +37,7 @@ COMMANDS = {
     "plant": Place("telemetry", "Identify what the commands of a closed loop do: delay, gain and rotation."),
     "presets": Place("presets", "List the presets, or print one as TOML."),
     "probe": Place("telemetry", "Design a probe: commands by which delay, gain and rotation of a loop are known better."),
+    "promise": Place("telemetry", "State what controllers will leave of a loop, before one of them is switched on."),
     "rt-check": Place(
         "realtime", "Tell what this machine can hold: how late a loop at the LGS rate wakes, and what a step takes in it."
     ),

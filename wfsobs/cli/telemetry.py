@@ -22,6 +22,8 @@ from wfsobs.cli.options import (
 )
 from wfsobs.cli.show import progress_bar, show, show_table, show_verdicts, warn
 from wfsobs.closed_loop.design import design
+from wfsobs.closed_loop.promise import promise as make_promise
+from wfsobs.closed_loop.rows import label
 from wfsobs.control.telemetry_gain import gain_from_telemetry
 from wfsobs.evaluation.rows import score_rows
 from wfsobs.files import check_writable, write_whole
@@ -233,6 +235,55 @@ def gain(
         numbers = [best, f"{row['limit']:.3g}", *(f"{1e3 * row[name]:.3g}" for name in ("measured_rms", "recorded_rms"))]
         table.add_row(row["mode"], *numbers, *([f"{row['from_spectra']:.3g}"] if row["from_spectra"] else []))
     show_table(table)
+
+
+@click.command()
+@click.argument("record_file", metavar="RECORD")
+@scenario_options
+@record_options
+@click.option("--controller", "controllers", multiple=True, metavar="NAME", help="Of this controller alone; can be repeated.")
+@click.option("--after", metavar="NEXT", help="Compare with the record of the loop after one controller was switched on.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+def promise(
+    record_file: str,
+    scenario: Scenario,
+    declaration: DeclaredFormat,
+    sha256: str | None,
+    controllers: tuple[str, ...],
+    after: str | None,
+    as_json: bool,
+) -> None:
+    """State what controllers will leave of a loop, before one of them is switched on (docs/trust.md)."""
+    record, later = (
+        None if name is None else load_declared(name, scenario, declaration.as_commanded, sha)
+        for name, sha in ((record_file, sha256), (after, None))
+    )
+    assert record is not None
+    with progress_bar("controllers") as update:
+        result = make_promise(record, scenario, controllers or None, watch=Watch(progress=update))
+    found = None if later is None else result.left_in(later)
+    if as_json:
+        click.echo(json.dumps(result.to_dict() | {"after": found}, allow_nan=False))
+        return
+    table = Table(title="Residual promised, with 95 % intervals", caption="better: than the integrator with its optimal gain")
+    for column in ("Controller", "mode", "rms, nm", "stable, %", "better, %", "Switch on?"):
+        table.add_column(column, no_wrap=True)
+    for one in result.promised:
+        table.add_section()
+        shares = (f"{100.0 * share:.0f}" for share in (one.stable_share, one.better_share))
+        ends = [*shares, "yes" if one.switch_on else f"no{one.note and ': '}{one.note}"]
+        for mode, name in enumerate(m.name for m in result.scenario.modes):
+            text = (
+                ""
+                if one.rms is None or one.low is None or one.high is None
+                else (f"{1e3 * one.rms[mode]:.2f} ({1e3 * one.low[mode]:.2f} to {1e3 * one.high[mode]:.2f})")
+            )
+            table.add_row(*((label(one.controller), name, text, *ends) if not mode else ("", name, text)))
+    show_table(table)
+    if found is not None:
+        click.echo(
+            f"{after}: " + ", ".join(f"{m.name} {1e3 * x:.2f} nm" for m, x in zip(result.scenario.modes, found, strict=True))
+        )
 
 
 @click.command()

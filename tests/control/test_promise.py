@@ -1,0 +1,130 @@
+"""Promises: plants drawn from their uncertainty, the record as such a plant makes it, and what a next record has."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import wfsobs
+from wfsobs.cli.group import main
+from wfsobs.closed_loop.promise import DRAWS, _promised, as_seen, draw_plants, promise
+from wfsobs.control.true_plant import ActingPlant
+from wfsobs.identification.plant import GroupPlant, PlantNumber
+from wfsobs.priors_from.controllers import full_plant_of
+from wfsobs.record import Record, RecordError
+from wfsobs.typing import Array
+
+SCENARIO = wfsobs.PRESETS["paper"]().replace(
+    {
+        "run.duration": 10.0,
+        "run.seed": 4,
+        "sensors.lgs_low_frequency_rms": 0.0,
+        "control.integrator": "manual",
+        "control.gain": 0.4,
+        "plant.delay_error": 0.3,
+        "plant.gain_error": [0.1],
+        "plant.rotation": 6.0,
+    }
+)
+TOLD = SCENARIO.replace(
+    {"plant.delay_error": 0.0, "plant.gain_error": [0.0], "plant.rotation": 0.0, "control.integrator": "optimised"}
+)
+
+
+def noise_of(record: Record) -> tuple[Array, Array]:
+    """Return disturbance and noise of the measurements of a simulated record, both (n_steps, n_modes)."""
+    assert record.turbulence is not None and record.vibration is not None
+    disturbance = record.turbulence + record.vibration
+    return disturbance, record.z - np.vstack([np.zeros(2), disturbance[:-1]])
+
+
+@pytest.fixture(scope="module")
+def telemetry() -> Record:
+    """The loop of the integrator on the plant that nobody is told."""
+    made = wfsobs.close_loop(SCENARIO, controllers=["integrator"])
+    (outcome,) = made.outcomes
+    assert outcome.residual is not None and outcome.u is not None
+    y = noise_of(made.record)[1] + np.vstack([np.zeros(2), outcome.residual[:-1]])
+    return Record(y, outcome.u, SCENARIO.dt)
+
+
+def group(**numbers: PlantNumber) -> GroupPlant:
+    one = PlantNumber(1.0, 0.02)
+    given = {"delay": (one, one), "gain": (one, one), "common_delay": PlantNumber(2.3, 0.05), **numbers}
+    return GroupPlant(
+        ("tip", "tilt"), rotation=PlantNumber(0.1, 0.01), common_gain=one, uncertainty=0.0, peaks=(1, 1), has_background=False,
+        own_share=0.0, **given,  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+def test_plants_are_drawn_from_their_deviations() -> None:
+    delays, matrices = draw_plants([group()], 2, np.random.default_rng(1))
+    assert delays[0] == 2.3 and np.allclose(matrices[0], [[np.cos(0.1), -np.sin(0.1)], [np.sin(0.1), np.cos(0.1)]])
+    # 256 draws tell a deviation to 4.4 %
+    assert delays[1:].std() == pytest.approx(0.05, rel=0.18) and abs(delays[1:].mean() - 2.3) < 4 * 0.05 / np.sqrt(DRAWS)
+    angles = np.arctan2(matrices[1:, 1, 0], matrices[1:, 0, 0])
+    assert angles.std() == pytest.approx(0.01, rel=0.18)
+    for name in ("common_delay", "gain"):
+        unknown = PlantNumber() if name == "common_delay" else (PlantNumber(), PlantNumber(1.0, 0.1))
+        unsure = group(**{name: unknown, "delay": (PlantNumber(), PlantNumber())})  # type: ignore[arg-type]
+        with pytest.raises(RecordError, match="do not switch on"):
+            draw_plants([unsure], 2, np.random.default_rng(1))
+
+
+def test_the_record_as_its_plant_makes_it_has_the_disturbance(telemetry: Record) -> None:
+    true = full_plant_of(SCENARIO)
+    seen = as_seen(telemetry, true.delay, true.matrix)
+    disturbance, noise = noise_of(wfsobs.simulate(SCENARIO))
+    expected = noise + np.vstack([np.zeros(2), disturbance[:-1]])
+    np.testing.assert_allclose(seen.z[10:], expected[10:], rtol=0, atol=1e-12)
+
+
+def test_a_worse_and_an_unsteady_one_are_not_to_be_switched_on() -> None:
+    rng = np.random.default_rng(2)
+    integrator = 1.0 + 0.05 * rng.random((DRAWS, 2))
+    assert _promised("lqg-kf-lgs", 0.5 * integrator, integrator).switch_on
+    assert not _promised("lqg-kf-lgs", 1.5 * integrator, integrator).switch_on
+    shaky = 0.5 * integrator
+    shaky[: DRAWS // 10] = np.inf
+    assert not _promised("lqg-kf-lgs", shaky, integrator).switch_on
+    shaky[: DRAWS * 3 // 4] = np.inf
+    found = _promised("lqg-kf-lgs", shaky, integrator)
+    assert found.rms is None and "not stable" in found.note and found.stable_share == 0.25
+
+
+@pytest.mark.slow
+def test_the_next_record_keeps_the_promise(telemetry: Record, tmp_path: Path) -> None:
+    names = ["integrator", "lqg-kf-lgs", "lqg-kf-multi", "lqg-multirate"]
+    found = promise(telemetry, TOLD, names)
+    true, inverse = full_plant_of(SCENARIO), np.linalg.inv(found.matrix)
+    disturbance, noise = noise_of(wfsobs.simulate(SCENARIO.replace({"run.seed": 40})))
+    for one in found.promised:
+        if one.controller == "lqg-multirate":
+            assert one.note == "the record has no NGS" and not one.switch_on
+            continue
+        assert one.rms is not None and one.low is not None and one.high is not None and one.switch_on
+        controller, plant = wfsobs.design(one.controller, found.scenario), ActingPlant(true)
+        residual, last = np.zeros_like(disturbance), np.zeros(2)
+        for k in range(len(disturbance)):
+            last = disturbance[k] + plant.take(inverse @ controller.update(last + noise[k]))
+            residual[k] = last
+        left = np.sqrt(np.square(residual[1000:]).mean(axis=0))
+        middle, low, high = np.array(one.rms), np.array(one.low), np.array(one.high)
+        # a 95 % interval for two modes of three controllers: three of its halves hold in more than 0.999 of all cases
+        assert (np.abs(left - middle) < 1.5 * (high - low)).all(), one
+        assert (high - low < 0.5 * middle).all(), "it says something"
+        measured = np.vstack([np.zeros(2), residual[:-1]]) + noise
+        after = found.left_in(replace(telemetry, y_lgs=measured[1000:], u=telemetry.u[1000:]))
+        assert after == pytest.approx(left, rel=0.05)
+    wfsobs.save(tmp_path / "loop.npz", telemetry)
+    options = ["--preset", "paper", "--controller", "lqg-kf-lgs", "--after", str(tmp_path / "loop.npz")]
+    ran = CliRunner().invoke(main, ["promise", str(tmp_path / "loop.npz"), *options, "--json"])
+    rows = json.loads(ran.stdout)
+    assert [row["controller"] for row in rows["controllers"]] == ["integrator", "lqg-kf-lgs"]
+    assert rows["after"] == pytest.approx(found.left_in(telemetry), rel=1e-6)
+    assert "LQG" in CliRunner().invoke(main, ["promise", str(tmp_path / "loop.npz"), *options]).stdout

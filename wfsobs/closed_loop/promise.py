@@ -1,0 +1,230 @@
+"""What a controller will leave of a loop that another one closes now, with an interval, from a record of that loop alone.
+
+Plant and disturbance are identified (`wfsobs.identification`), the controllers are designed from what was found, and theory tells
+what each leaves on the identified spectra with plants that are drawn from their uncertainty. The next record is another one than
+that which was identified: both means of the square differ from that of the process by what a record of this length tells of it,
+which the scatter of its sections shows under the controller itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from math import sqrt
+from typing import Any
+
+import numpy as np
+
+from wfsobs.closed_loop.design import Design, design
+from wfsobs.closed_loop.envelope import residuals
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.control.law import Law
+from wfsobs.control.true_plant import TruePlant
+from wfsobs.identification.identification import identify
+from wfsobs.identification.plant import GroupPlant, identify_plant
+from wfsobs.pipeline import as_stated
+from wfsobs.progress import QUIET, Watch
+from wfsobs.record import Record, RecordError
+from wfsobs.scenario import Scenario
+from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
+from wfsobs.simulation.true_spectra import true_spectra
+from wfsobs.typing import Array
+
+DRAWS = 256
+"""Plants that are drawn."""
+
+SECTIONS = 16
+"""Of the record, whose scatter tells how well it knows a mean square."""
+
+SURE = 0.95
+"""Share of the draws in which a controller must be stable and better than the integrator."""
+
+INTEGRATOR = "integrator"
+
+
+@dataclass(frozen=True)
+class Promised:
+    """What one controller will leave.
+
+    Attributes
+    ----------
+    controller : str
+        Id.
+    rms, low, high : tuple of float or None
+        Residual of every mode and its 95 % interval [um]; None where not even half of the draws are stable.
+    stable_share, better_share : float
+        Of the draws, in which the loop is stable, and leaves less than the integrator, modes together.
+    note : str
+        Why there is none.
+    """
+
+    controller: str
+    rms: tuple[float, ...] | None = None
+    low: tuple[float, ...] | None = None
+    high: tuple[float, ...] | None = None
+    stable_share: float = 0.0
+    better_share: float = 0.0
+    note: str = ""
+
+    @property
+    def switch_on(self) -> bool:
+        """Whether it may take the place of the integrator."""
+        return min(self.stable_share, self.better_share) >= SURE
+
+
+@dataclass(frozen=True)
+class Promise:
+    """Promises of some controllers.
+
+    Attributes
+    ----------
+    scenario : Scenario
+        What was identified; the controllers are designed from it.
+    plant : tuple of GroupPlant
+        What the commands do.
+    matrix : Array
+        The likeliest correction of each mode by the command of each, (n_modes, n_modes).
+    noise : tuple of float
+        Of the measurements [um].
+    promised : tuple of Promised
+        One per controller.
+    """
+
+    scenario: Scenario
+    plant: tuple[GroupPlant, ...]
+    matrix: Array
+    noise: tuple[float, ...]
+    promised: tuple[Promised, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, the keys of `wfsobs promise --json`: numbers in um, `switch_on` last of each controller."""
+        controllers = [asdict(one) | {"switch_on": one.switch_on} for one in self.promised]
+        return {"matrix": self.matrix.tolist(), "noise": list(self.noise), "controllers": controllers}
+
+    def left_in(self, record: Record) -> tuple[float, ...]:
+        """Rms of the residual of every mode [um] in the record of another controller: of its measurements, less the noise."""
+        squares = np.nanmean(np.square(record.y_lgs), axis=0) - np.square(self.noise)
+        return tuple(np.sqrt(np.maximum(squares, 0.0)).tolist())
+
+
+def promise(
+    record: Record, scenario: Scenario, controllers: Sequence[str] | None = None, *, seed: int = 0, watch: Watch = QUIET
+) -> Promise:
+    """State what controllers will leave of the loop of a record, before one of them is switched on.
+
+    Parameters
+    ----------
+    record : Record
+        Measurements, and commands as they were given.
+    scenario : Scenario
+        All settings that are not identified; those of the integrator among them.
+    controllers : sequence of str, optional
+        Ids; by default all that are linear. The integrator with its optimal gain is always there.
+    seed : int
+        Of the draws.
+    watch : Watch, optional
+        Receives the progress, and is asked whether to stop.
+
+    Returns
+    -------
+    Promise
+        One per controller. Commands of the controllers, which are designed for a plant without gain and rotation, go through
+        the inverse of `matrix`.
+
+    Raises
+    ------
+    RecordError
+        The data do not decide delay, gain and rotation: a probe is needed (`wfsobs probe`).
+    SettingError
+        A controller is unknown.
+    """
+    groups = identify_plant(record, Watch(is_cancelled=watch.is_cancelled))
+    delays, matrices = draw_plants(groups, record.n_modes, np.random.default_rng(seed))
+    delay, matrix = delays[0], matrices[0]
+    seen = as_seen(record, delay, matrix)
+    found = identify(seen, watch=Watch(is_cancelled=watch.is_cancelled))
+    told = found.scenario(as_stated(seen, scenario)).replace({"control.delay": float(delay)})
+    names = None if controllers is None else [INTEGRATOR, *(name for name in controllers if name != INTEGRATOR)]
+    plan = design(told, names)
+    inverse = np.linalg.inv(matrix)
+    plants = [TruePlant(one @ inverse, float(late)) for one, late in zip(matrices, delays, strict=True)]
+    spectra = [true_spectra(told, mode) for mode in range(record.n_modes)]
+    noises = [mode.noise.value for mode in found.modes]
+    rng, left, out = np.random.default_rng(seed), dict[str, Array](), list[Promised]()
+    common = rng.standard_normal(len(plants) - 1)
+    for i, name in enumerate(plan.laws):
+        watch.check()
+        laws = [one.law for one in plan.laws[name] if one.law is not None]
+        if CONTROLLERS[name].predict is not None or CONTROLLERS[name].law is None:
+            continue  # not linear, or no control
+        lacks_ngs = CONTROLLERS[name].ngs and record.y_ngs is None
+        if lacks_ngs or len(laws) < record.n_modes or not all(law.stable for law in laws):
+            notes = ["the record has no NGS"] if lacks_ngs else [one.note for one in plan.laws[name] if one.note]
+            out.append(Promised(name, note=next(iter(notes), "not stable")))
+            continue
+        squares = residuals(laws, plan.mirror, plants, spectra, watch)[1:] ** 2
+        left[name] = squares * np.maximum(1.0 + sqrt(2.0) * _scatter(laws, plan, seen, noises) * common[:, None], 0.0)
+        out.append(_promised(name, left[name], left[INTEGRATOR]))
+        watch.step((i + 1) / len(plan.laws))
+    return Promise(told, groups, matrix, tuple(noises), tuple(out))
+
+
+def _promised(name: str, squares: Array, integrator: Array) -> Promised:
+    stable, total = np.isfinite(squares).all(axis=1), squares.sum(axis=1)
+    if stable.mean() < 0.5:
+        return Promised(name, stable_share=float(stable.mean()), note="not stable with plants that the data allow")
+    low, middle, high = np.sqrt(np.quantile(squares[stable], [0.025, 0.5, 0.975], axis=0))
+    better = float((total < integrator.sum(axis=1)).mean()) if name != INTEGRATOR else 1.0
+    return Promised(name, tuple(middle.tolist()), tuple(low.tolist()), tuple(high.tolist()), float(stable.mean()), better)
+
+
+def draw_plants(groups: Sequence[GroupPlant], n_modes: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return delays (1 + DRAWS,) and matrices (1 + DRAWS, n_modes, n_modes), the likeliest first. Raises RecordError.
+
+    Where modes have delays of their own, each draw has the mean of theirs.
+    """
+    delays, matrices = np.zeros(1 + DRAWS), np.zeros((1 + DRAWS, n_modes, n_modes))
+    order = [mode.name for mode in modes_up_to(HIGHEST_ORDER)]
+
+    def drawn(value: float | None, sd: float | None, what: str) -> Array:
+        if value is None or sd is None:
+            raise RecordError(f"the data do not decide the {what}: do not switch on; wfsobs probe designs a probe")
+        return value + sd * np.append(0.0, rng.standard_normal(DRAWS))
+
+    for group in groups:
+        names, n = " and ".join(group.modes), len(group.modes)
+        common = group.common_delay
+        each = [common] if common.value is not None else group.delay
+        delays += n / n_modes * np.mean([drawn(d.value, d.sd, f"delay ({names})") for d in each], axis=0)
+        block = np.zeros((1 + DRAWS, n, n))
+        for i, number in enumerate(group.gain):
+            block[:, i, i] = drawn(number.value, number.sd, f"gain ({names})")
+        if group.rotation is not None:
+            angle = drawn(group.rotation.value, group.rotation.sd, f"rotation ({names})")
+            turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            block = np.moveaxis(turn, 2, 0) @ block
+        columns = [order.index(name) for name in group.modes]
+        matrices[np.ix_(range(1 + DRAWS), columns, columns)] = block
+    return np.maximum(delays, 1.0), matrices
+
+
+def as_seen(record: Record, delay: float, matrix: Array) -> Record:
+    """Return a record whose commands are what the measurements see of them, by an identified plant."""
+    whole, part = int(delay), delay % 1.0
+    before = np.vstack([np.zeros((1, record.n_modes)), record.u[:-1]])
+    return replace(record, u=((1.0 - part) * record.u + part * before) @ matrix.T, delay=whole)
+
+
+def _scatter(laws: Sequence[Law], plan: Design, seen: Record, noises: Sequence[float]) -> Array:
+    """Return the relative standard deviation of the mean square of a residual over the record, per mode, from its sections."""
+    z, n = np.nan_to_num(seen.z), seen.n_steps
+    both = plan.plant.ratio is not None and laws[0].cycle.steps[0][1].shape[1] > 1
+    inputs = np.stack([z, np.nan_to_num(seen.z_ngs)], axis=1) if both else z[:, None]
+    out = []
+    for mode, law in enumerate(laws):
+        u = law.run(inputs[:, :, mode])
+        y = z[1:, mode] + plan.mirror.correction(u)[:-1]
+        squares = np.square(y[(n - 1) % SECTIONS :]).reshape(SECTIONS, -1).mean(axis=1)
+        mean = squares.mean()
+        out.append(squares.std(ddof=1) / sqrt(SECTIONS) / max(mean - noises[mode] ** 2, 0.1 * mean))
+    return np.array(out)
