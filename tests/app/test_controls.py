@@ -350,6 +350,7 @@ class TestPeaks:
                 table._handle_msg({"action": "edit", "key": f"2.{key}", "name": text})
                 error = table.errors[f"2.{key}"]
                 assert error["text"] == text and says in error["reason"]
+                assert f'value="{text}"' in table.html and table.html.count('aria-invalid="true"') == 1
                 assert controls.store.run.result is shown and table.rows == rows
                 good = {"frequency": rows[2][0], "damping": rows[2][1], "rms.1": rows[2][3]}[key]
                 table._handle_msg({"action": "edit", "key": f"2.{key}", "name": good})
