@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from math import pi
 from pathlib import Path
@@ -110,6 +111,19 @@ def test_a_rotation_and_a_flipped_axis_are_excluded(tmp_path: Path) -> None:
     assert (seen["command sign"], seen["command rotation"]) == ("ok", "excluded")
     seen = verdicts(checked(tmp_path, closed_loop(10_000, 2.0, np.diag([1.0, -1.0]))))
     assert (seen["command sign"], seen["command rotation"]) == ("excluded", "ok")
+
+
+@pytest.mark.slow
+def test_a_delay_in_which_the_halves_differ_is_not_decided(tmp_path: Path) -> None:
+    """No one plant made both; the whole record has one number for it, with a small deviation."""
+    one, two = closed_loop(10_000, 1.4, np.eye(2), gain=0.4), closed_loop(10_000, 2.5, np.eye(2), seed=2, gain=0.4)
+    parts = (np.concatenate([getattr(one, name), getattr(two, name)]) for name in ("y_lgs", "u"))
+    found = checked(tmp_path, Record(*parts, 1e-3, delay=3), "--trust")
+    (text,) = (f["text"] for f in found["findings"] if f["subject"] == "command delay")
+    assert verdicts(found)["command delay"] == "undecided"
+    first, second = (float(n) for n in re.findall(r"(\d\.\d+) \+-", text))
+    assert (first, second) == (pytest.approx(1.4, abs=0.1), pytest.approx(2.5, abs=0.1)), "five deviations of 10 s"
+    assert "--command-delay" not in found["next"]
 
 
 def test_faults_are_named(tmp_path: Path, record: Record) -> None:

@@ -6,8 +6,9 @@ Nothing is concluded that the data do not decide: a finding is `ok`, `note` (loo
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from math import hypot
 from typing import Literal
 
 import numpy as np
@@ -166,7 +167,38 @@ def _plant(record: Record, reading: Reading) -> tuple[tuple[GroupPlant, ...], li
         plant = identify_plant(record)
     except RecordError as error:
         return (), [*found, Remark(PLANT, "undecided", f"not identifiable: {error}")]
-    return plant, [*(remark for group in plant for remark in _commands(group, reading, len(plant) > 1)), *found]
+    remarks = [remark for group in plant for remark in _commands(group, reading, len(plant) > 1)]
+    if any(remark.verdict == "note" for remark in remarks):  # before the user is sent after another plant
+        plant, differences = _in_halves(plant, record)
+        known = {remark.subject for remark in differences}
+        again = [remark for group in plant for remark in _commands(group, reading, len(plant) > 1)]
+        remarks = [*(remark for remark in again if remark.subject not in known), *differences]
+    return plant, [*remarks, *found]
+
+
+def _in_halves(plant: tuple[GroupPlant, ...], record: Record) -> tuple[tuple[GroupPlant, ...], list[Remark]]:
+    """Return a plant without the delays and gains in which the halves of a record differ, and what they are there.
+
+    One plant made both; a disturbance of another form than that which is fitted does not.
+    """
+    middle, out, remarks = record.n_steps // 2, [], []
+    parts = (slice(0, middle), slice(middle, None))
+    try:
+        halves = [identify_plant(Record(y, u, record.dt)) for y, u in ((record.y_lgs[part], record.u[part]) for part in parts)]
+    except RecordError:
+        return plant, []
+    for group, *found in zip(plant, *halves, strict=True):
+        of = f" of {' and '.join(group.modes)}" * (len(plant) > 1)
+        for name, common in (("delay", "common_delay"), ("gain", "common_gain")):
+            pairs = list(zip(*(getattr(one, name) for one in found), strict=True))
+            if any(n.sd and m.sd and abs(abs(n.value) - abs(m.value)) > SURE * hypot(n.sd, m.sd) for n, m in pairs):
+                blank = {name: (PlantNumber(),) * len(group.modes), common: PlantNumber()}
+                group = replace(group, **blank)
+                each = " and ".join(n.text() for n in pairs[0])
+                text = f"{each} in the halves of the record: the disturbance has not the form that is fitted"
+                remarks.append(Remark(f"command {name}{of}", "undecided", text))
+        out.append(group)
+    return tuple(out), remarks
 
 
 PLANT = "command sign, delay, gain, rotation"
@@ -195,7 +227,7 @@ def _commands(group: GroupPlant, reading: Reading, several: bool) -> Iterator[Re
         ("gain", group.common_gain, group.gain, reading.gain or (1.0,), OFF_GAIN),
     ):
         numbers = known_numbers(group, subject)
-        text = " and ".join(n.text() for n in ((one,) if one.value is not None else each))
+        text = " and ".join(dict.fromkeys(n.text() for n in ((one,) if one.value is not None else each)))
         if numbers is None:
             yield Remark(f"command {subject}{of}", "undecided", f"{text}: not decided by the data")
             continue
