@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 import wfsobs
 from wfsobs.cli.group import main
-from wfsobs.closed_loop.promise import DRAWS, _promised, as_seen, draw_plants, promise
+from wfsobs.closed_loop.promise import DRAWS, _interval_of, as_seen, draw_plants, make_promise
 from wfsobs.control.true_plant import ActingPlant
 from wfsobs.identification.plant import GroupPlant, PlantNumber
 from wfsobs.priors_from.controllers import full_plant_of
@@ -87,23 +87,23 @@ def test_the_record_as_its_plant_makes_it_has_the_disturbance(telemetry: Record)
 def test_a_worse_and_an_unsteady_one_are_not_to_be_switched_on() -> None:
     rng = np.random.default_rng(2)
     integrator = 1.0 + 0.05 * rng.random((DRAWS, 2))
-    assert _promised("lqg-kf-lgs", 0.5 * integrator, integrator).switch_on
-    assert not _promised("lqg-kf-lgs", 1.5 * integrator, integrator).switch_on
+    assert _interval_of("lqg-kf-lgs", 0.5 * integrator, integrator).switch_on
+    assert not _interval_of("lqg-kf-lgs", 1.5 * integrator, integrator).switch_on
     shaky = 0.5 * integrator
     shaky[: DRAWS // 10] = np.inf
-    assert not _promised("lqg-kf-lgs", shaky, integrator).switch_on
+    assert not _interval_of("lqg-kf-lgs", shaky, integrator).switch_on
     shaky[: DRAWS * 3 // 4] = np.inf
-    found = _promised("lqg-kf-lgs", shaky, integrator)
+    found = _interval_of("lqg-kf-lgs", shaky, integrator)
     assert found.rms is None and "not stable" in found.note and found.stable_share == 0.25
 
 
 @pytest.mark.slow
 def test_the_next_record_keeps_the_promise(telemetry: Record, tmp_path: Path) -> None:
     names = ["integrator", "lqg-kf-lgs", "lqg-kf-multi", "lqg-multirate"]
-    found = promise(telemetry, TOLD, names)
+    found = make_promise(telemetry, TOLD, names)
     true, inverse = full_plant_of(SCENARIO), np.linalg.inv(found.matrix)
     disturbance, noise = noise_of(wfsobs.simulate(SCENARIO.replace({"run.seed": 40})))
-    for one in found.promised:
+    for one in found.residuals:
         if one.controller == "lqg-multirate":
             assert one.note == "the record has no NGS" and not one.switch_on
             continue

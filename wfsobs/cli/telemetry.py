@@ -22,7 +22,7 @@ from wfsobs.cli.options import (
 )
 from wfsobs.cli.show import progress_bar, show, show_table, show_verdicts, warn
 from wfsobs.closed_loop.design import design
-from wfsobs.closed_loop.promise import promise as make_promise
+from wfsobs.closed_loop.promise import make_promise
 from wfsobs.closed_loop.rows import label
 from wfsobs.control.telemetry_gain import gain_from_telemetry
 from wfsobs.evaluation.rows import score_rows
@@ -268,7 +268,7 @@ def promise(
     table = Table(title="Residual promised, with 95 % intervals", caption="better: than the integrator with its optimal gain")
     for column in ("Controller", "mode", "rms, nm", "stable, %", "better, %", "Switch on?"):
         table.add_column(column, no_wrap=True)
-    for one in result.promised:
+    for one in result.residuals:
         table.add_section()
         shares = (f"{100.0 * share:.0f}" for share in (one.stable_share, one.better_share))
         ends = [*shares, "yes" if one.switch_on else f"no{one.note and ': '}{one.note}"]

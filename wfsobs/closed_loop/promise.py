@@ -43,7 +43,7 @@ INTEGRATOR = "integrator"
 
 
 @dataclass(frozen=True)
-class Promised:
+class ResidualPromise:
     """What one controller will leave.
 
     Attributes
@@ -86,7 +86,7 @@ class Promise:
         The likeliest correction of each mode by the command of each, (n_modes, n_modes).
     noise : tuple of float
         Of the measurements [um].
-    promised : tuple of Promised
+    residuals : tuple of ResidualPromise
         One per controller.
     """
 
@@ -94,11 +94,11 @@ class Promise:
     plant: tuple[GroupPlant, ...]
     matrix: Array
     noise: tuple[float, ...]
-    promised: tuple[Promised, ...]
+    residuals: tuple[ResidualPromise, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, the keys of `wfsobs promise --json`: numbers in um, `switch_on` last of each controller."""
-        controllers = [asdict(one) | {"switch_on": one.switch_on} for one in self.promised]
+        controllers = [asdict(one) | {"switch_on": one.switch_on} for one in self.residuals]
         return {"matrix": self.matrix.tolist(), "noise": list(self.noise), "controllers": controllers}
 
     def left_in(self, record: Record) -> tuple[float, ...]:
@@ -107,7 +107,7 @@ class Promise:
         return tuple(np.sqrt(np.maximum(squares, 0.0)).tolist())
 
 
-def promise(
+def make_promise(
     record: Record, scenario: Scenario, controllers: Sequence[str] | None = None, *, seed: int = 0, watch: Watch = QUIET
 ) -> Promise:
     """State what controllers will leave of the loop of a record, before one of them is switched on.
@@ -141,16 +141,16 @@ def promise(
     groups = identify_plant(record, Watch(is_cancelled=watch.is_cancelled))
     delays, matrices = draw_plants(groups, record.n_modes, np.random.default_rng(seed))
     delay, matrix = delays[0], matrices[0]
-    seen = as_seen(record, delay, matrix)
-    found = identify(seen, watch=Watch(is_cancelled=watch.is_cancelled))
-    told = found.scenario(as_stated(seen, scenario)).replace({"control.delay": float(delay)})
+    corrected = as_seen(record, delay, matrix)
+    found = identify(corrected, watch=Watch(is_cancelled=watch.is_cancelled))
+    told = found.scenario(as_stated(corrected, scenario)).replace({"control.delay": float(delay)})
     names = None if controllers is None else [INTEGRATOR, *(name for name in controllers if name != INTEGRATOR)]
     plan = design(told, names)
     inverse = np.linalg.inv(matrix)
     plants = [TruePlant(one @ inverse, float(late)) for one, late in zip(matrices, delays, strict=True)]
     spectra = [true_spectra(told, mode) for mode in range(record.n_modes)]
     noises = [mode.noise.value for mode in found.modes]
-    rng, left, out = np.random.default_rng(seed), dict[str, Array](), list[Promised]()
+    rng, left, out = np.random.default_rng(seed), dict[str, Array](), list[ResidualPromise]()
     common = rng.standard_normal(len(plants) - 1)
     for i, name in enumerate(plan.laws):
         watch.check()
@@ -160,22 +160,22 @@ def promise(
         lacks_ngs = CONTROLLERS[name].ngs and record.y_ngs is None
         if lacks_ngs or len(laws) < record.n_modes or not all(law.stable for law in laws):
             notes = ["the record has no NGS"] if lacks_ngs else [one.note for one in plan.laws[name] if one.note]
-            out.append(Promised(name, note=next(iter(notes), "not stable")))
+            out.append(ResidualPromise(name, note=next(iter(notes), "not stable")))
             continue
         squares = residuals(laws, plan.mirror, plants, spectra, watch)[1:] ** 2
-        left[name] = squares * np.maximum(1.0 + sqrt(2.0) * _scatter(laws, plan, seen, noises) * common[:, None], 0.0)
-        out.append(_promised(name, left[name], left[INTEGRATOR]))
+        left[name] = squares * np.maximum(1.0 + sqrt(2.0) * _scatter(laws, plan, corrected, noises) * common[:, None], 0.0)
+        out.append(_interval_of(name, left[name], left[INTEGRATOR]))
         watch.step((i + 1) / len(plan.laws))
     return Promise(told, groups, matrix, tuple(noises), tuple(out))
 
 
-def _promised(name: str, squares: Array, integrator: Array) -> Promised:
+def _interval_of(name: str, squares: Array, integrator: Array) -> ResidualPromise:
     stable, total = np.isfinite(squares).all(axis=1), squares.sum(axis=1)
     if stable.mean() < 0.5:
-        return Promised(name, stable_share=float(stable.mean()), note="not stable with plants that the data allow")
+        return ResidualPromise(name, stable_share=float(stable.mean()), note="not stable with plants that the data allow")
     low, middle, high = np.sqrt(np.quantile(squares[stable], [0.025, 0.5, 0.975], axis=0))
     better = float((total < integrator.sum(axis=1)).mean()) if name != INTEGRATOR else 1.0
-    return Promised(name, tuple(middle.tolist()), tuple(low.tolist()), tuple(high.tolist()), float(stable.mean()), better)
+    return ResidualPromise(name, tuple(middle.tolist()), tuple(low.tolist()), tuple(high.tolist()), float(stable.mean()), better)
 
 
 def draw_plants(groups: Sequence[GroupPlant], n_modes: int, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -215,11 +215,11 @@ def as_seen(record: Record, delay: float, matrix: Array) -> Record:
     return replace(record, u=((1.0 - part) * record.u + part * before) @ matrix.T, delay=whole)
 
 
-def _scatter(laws: Sequence[Law], plan: Design, seen: Record, noises: Sequence[float]) -> Array:
+def _scatter(laws: Sequence[Law], plan: Design, corrected: Record, noises: Sequence[float]) -> Array:
     """Return the relative standard deviation of the mean square of a residual over the record, per mode, from its sections."""
-    z, n = np.nan_to_num(seen.z), seen.n_steps
+    z, n = np.nan_to_num(corrected.z), corrected.n_steps
     both = plan.plant.ratio is not None and laws[0].cycle.steps[0][1].shape[1] > 1
-    inputs = np.stack([z, np.nan_to_num(seen.z_ngs)], axis=1) if both else z[:, None]
+    inputs = np.stack([z, np.nan_to_num(corrected.z_ngs)], axis=1) if both else z[:, None]
     out = []
     for mode, law in enumerate(laws):
         u = law.run(inputs[:, :, mode])

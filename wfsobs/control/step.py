@@ -102,11 +102,11 @@ class StepController(StepBase):
         """
         return self._take(z, ngs, stars, "z", is_open=True)
 
-    def amend(self, sent: Array) -> None:
+    def amend(self, command: Array) -> None:
         """Take what the mirror was sent, (n_modes,) [um], where that is another command than the one of the last frame."""
         if self.law is not None:
-            self.law.amend(sent - self._commands[0])
-        self._commands[0] = sent
+            self.law.amend(command - self._commands[0])
+        self._commands[0] = command
 
     @property
     def correction(self) -> Array:

@@ -62,7 +62,7 @@ class Supervision:
     alarm : float
         Probability of an alarm in a frame without cause.
     worse : float
-        Rms of the measurement over that of the integrator beyond which the controller is taken for the worse one.
+        Rms of the measurement over that of the integrator beyond which the controller is held for the worse one.
     calm : int
         Frames of the integrator at the start and after an alarm; twice as many after each further one, up to 64 times.
     """
@@ -78,33 +78,33 @@ class _Level(StateArrays):
     """The distribution of the mean square of the measurement over `WINDOW` frames, and whether it has been left.
 
     slow         : running mean of the measurement, (n_modes,) [um]
-    squares      : of the last frames without it, (WINDOW, n_modes);  taken : frames
+    squares      : of the last frames without it, (WINDOW, n_modes);  frames : their number so far
     weight       : frames that the distribution counts for
     mean, spread : its mean and mean square, (n_modes,);  limit : threshold
     """
 
-    state_names: tuple[str, ...] = ("slow", "squares", "taken", "weight", "mean", "spread", "limit")
+    state_names: tuple[str, ...] = ("slow", "squares", "frames", "weight", "mean", "spread", "limit")
 
     def __init__(self, n_modes: int, alarm: float):
         self._alarm = alarm
         self.slow, self.squares = np.zeros(n_modes), np.zeros((WINDOW, n_modes))
-        self.taken = self.weight = 0
+        self.frames = self.weight = 0
         self.mean, self.spread, self.limit = np.zeros(n_modes), np.zeros(n_modes), np.full(n_modes, np.inf)
         self.mark_start()
 
     def exceeds(self, y: Array) -> bool:
-        """Take a measurement, zero where it is missing, and return whether the level is exceeded."""
+        """Take a measurement, zero where it is missing, and return whether the level is excess."""
         self.slow += (y - self.slow) / SLOW
-        self.squares[self.taken % WINDOW] = np.square(y - self.slow)
-        self.taken += 1
-        if self.taken < WINDOW:
+        self.squares[self.frames % WINDOW] = np.square(y - self.slow)
+        self.frames += 1
+        if self.frames < WINDOW:
             return False
         level = self.squares.mean(axis=0)
         usual = np.minimum(level, self.limit)  # an outburst does not make itself usual
         self.weight = min(self.weight + 1, MEMORY)
         self.mean += (usual - self.mean) / self.weight
         self.spread += (usual * usual - self.spread) / self.weight
-        if self.taken % REFRESH == 0 and self.weight > 3 * ANEW:
+        if self.frames % REFRESH == 0 and self.weight > 3 * ANEW:
             self.limit = self._limit()
         return bool((level > self.limit).any())
 
@@ -142,14 +142,14 @@ class SupervisedController(StateArrays):
 
     state_names: tuple[str, ...] = (
         "_level",
-        "_sent",
+        "_command",
         "_offset",
         "_usual",
         "_bound",
         "_why",
         "_left",
         "_calm",
-        "_clipped",
+        "_limit_share",
         "_since",
     )
 
@@ -158,12 +158,12 @@ class SupervisedController(StateArrays):
         self.controller, self.supervision, self.mirror = controller, supervision, mirror
         self.alarms = list[tuple[int, str]]()
         self._level = _Level(n, supervision.alarm)
-        self._sent, self._offset = np.zeros(n), np.zeros(n)
+        self._command, self._offset = np.zeros(n), np.zeros(n)
         self._usual = np.full(n, np.inf)  # mean square of the measurement under the integrator
         self._bound = np.full(n, np.inf)  # threshold of the controller over that mean square, when it last had the loop
         self._why = REASONS.index("start")
         self._left, self._calm = supervision.calm, supervision.calm  # frames of the integrator: still, and at the next alarm
-        self._clipped, self._since = 0.0, 0  # share of frames at a limit; frame of the last change of hands
+        self._limit_share, self._since = 0.0, 0  # share of frames at a limit; frame of the last change of hands
         self.mark_start()
 
     @property
@@ -178,7 +178,7 @@ class SupervisedController(StateArrays):
 
     @property
     def frame(self) -> int:
-        """Frames that it has taken."""
+        """Frames so far."""
         return self.controller.frame
 
     def update(self, y: ArrayLike, ngs: ArrayLike | None = None, *, stars: int | None = None) -> Array:
@@ -186,31 +186,31 @@ class SupervisedController(StateArrays):
         seen = np.asarray(y, dtype=float)
         seen = np.where(np.isfinite(seen), seen, np.nan)
         slow = None if ngs is None else np.where(np.isfinite(ngs), ngs, np.nan)
-        wanted = self.controller.update(seen, slow, stars=stars)
+        command = self.controller.update(seen, slow, stars=stars)
         error, plan = np.nan_to_num(seen), self.supervision
-        exceeded = self._level.exceeds(error)
-        safe = self._within(plan.leak * self._sent - plan.gain * error)
+        excess = self._level.exceeds(error)
+        safe = self._within(plan.leak * self._command - plan.gain * error)
         if self._why:
-            self._wait(wanted, safe, exceeded)
-        elif fault := self._fault(wanted, exceeded):
+            self._wait(command, safe, excess)
+        elif fault := self._fault(command, excess):
             self._fall_back(fault)
         u = safe
         if not self._why:
             self._offset *= BLEND
-            u = self._within(wanted + self._offset)
-            is_clipped = (np.abs(u) >= self.mirror.stroke) | (np.abs(u - self._sent) >= self.mirror.slew)
-            self._clipped += (bool(is_clipped.any()) - self._clipped) / 100.0
+            u = self._within(command + self._offset)
+            is_clipped = (np.abs(u) >= self.mirror.stroke) | (np.abs(u - self._command) >= self.mirror.slew)
+            self._limit_share += (bool(is_clipped.any()) - self._limit_share) / 100.0
         self.controller.amend(u)
-        self._sent = u
+        self._command = u
         return u
 
-    def _fault(self, wanted: Array, exceeded: bool) -> int:
+    def _fault(self, command: Array, excess: bool) -> int:
         """Return why the controller may not go on, an index of `REASONS`; 0 where it may."""
-        if not np.isfinite(wanted).all():
+        if not np.isfinite(command).all():
             return 2
-        if exceeded:
+        if excess:
             return 3
-        if self._clipped > CLIPPED:
+        if self._limit_share > CLIPPED:
             return 4
         # with an NGS the slow error of the LGS, which an integrator on y follows, rightly stays in y
         is_long = self.frame - self._since > 5 * ANEW and not self.controller.uses_ngs
@@ -220,21 +220,21 @@ class SupervisedController(StateArrays):
         self.alarms.append((self.frame - 1, REASONS[why]))
         most = 64 * self.supervision.calm
         self._left = self._calm = self.supervision.calm if self.frame - self._since > most else min(2 * self._calm, most)
-        self._why, self._clipped, self._since = why, 0.0, self.frame
+        self._why, self._limit_share, self._since = why, 0.0, self.frame
         self._bound = self._level.limit / self._usual
         self._level.begin(np.inf)
 
-    def _wait(self, wanted: Array, safe: Array, exceeded: bool) -> None:
+    def _wait(self, command: Array, safe: Array, excess: bool) -> None:
         """Let the integrator go on until all has been well for a while, then give the loop back."""
-        self._left = max(self._left - 1, WINDOW if exceeded else 0)
-        if not self._left and np.isfinite(wanted).all():
+        self._left = max(self._left - 1, WINDOW if excess else 0)
+        if not self._left and np.isfinite(command).all():
             self._usual, self._why, self._since = self._level.mean.copy(), 0, self.frame
-            self._offset = (safe - wanted) / BLEND
+            self._offset = (safe - command) / BLEND
             self._level.begin(np.minimum(self.supervision.worse**2 * self._level.limit, self._bound * self._usual))
 
     def _within(self, u: Array) -> Array:
         """Return the commands nearest to these within the limits of the mirror."""
-        near = np.clip(u, self._sent - self.mirror.slew, self._sent + self.mirror.slew)
+        near = np.clip(u, self._command - self.mirror.slew, self._command + self.mirror.slew)
         return np.clip(near, -self.mirror.stroke, self.mirror.stroke)
 
     def reset(self) -> None:
