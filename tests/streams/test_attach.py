@@ -22,7 +22,7 @@ from wfsobs.cli import main
 from wfsobs.observers.step import StepObserver
 from wfsobs.signal.gate import RUN, GateSettings
 from wfsobs.stepping import design
-from wfsobs.streams.attach import Attachment
+from wfsobs.streams.attach import Attachment, CommandStream
 from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.shared_image import SharedImage
 from wfsobs.streams.watchdog import Fallback, Safety
@@ -337,6 +337,34 @@ def test_a_level_that_moves_for_good_is_followed(fallback: Fallback) -> None:
     assert RUN <= way.attachment.summary()["out_of_band"] < 3 * RUN
     assert way.said[1:] == ["output on again after 300 good frames"]
     assert np.abs(got[-500:] - z[-500:]).max() < 0.3  # the vibration and the noise of a frame
+
+
+@pytest.mark.parametrize("delay", [2.0, 1.5])
+def test_commands_beside_residuals_give_the_pseudo_open_loop(delay: float) -> None:
+    """As z itself, once the place of the commands is known; other counters, a command that comes early, and one that is lost."""
+    rng = np.random.default_rng(1)
+    z, u = QUIET.z[:400], 0.2 * rng.standard_normal((400, 2)).cumsum(axis=0) / 10.0
+    whole, part = int(delay), delay % 1.0
+    m = np.zeros_like(u)
+    for k in range(3, len(u)):
+        m[k] = (1.0 - part) * u[k - whole] + part * u[k - whole - 1]
+    y, way, stream = z + m, Way(OBSERVED["kf-lgs"], Safety()), Frames(2)
+    stream.count = stream.first = 700
+    commands = CommandStream(stream, (0, 1), np.array(1.0), delay)  # pyright: ignore[reportArgumentType]
+    way.attachment._commands = commands
+    got, lost = [], 300
+    for k, row in enumerate(y):
+        if k == 100:  # before its measurement is taken
+            stream.write(u[k])
+        got.append(way.send(row))
+        for row in (u[lost], u[k]) if k == lost + 1 else () if k in (lost, 100) else (u[k],):
+            stream.write(row)
+    seen = z.copy()
+    seen[:9] = np.nan
+    hidden = [k for k in range(9, len(z)) if {k - whole, k - whole - 1 * (part > 0)} & {lost, 99}]
+    seen[hidden] = np.nan
+    np.testing.assert_allclose(got, stepped(seen, "kf-lgs", 1), rtol=0, atol=1e-9)
+    assert commands.missing == len(hidden) == way.attachment.summary()["commands_missing"]
 
 
 def test_measurements_that_are_never_there_are_frames_that_are_missing() -> None:

@@ -15,11 +15,11 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.step import StepError, StepObserver
 from wfsobs.prior import LgsError, Lines, Model, Training
 from wfsobs.priors_from.scenario import observer_settings
-from wfsobs.record import Sampling
+from wfsobs.record import DELAY, Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 from wfsobs.stepping import design, prior_in
-from wfsobs.streams.attach import Attachment
+from wfsobs.streams.attach import Attachment, CommandStream
 from wfsobs.streams.layout import StreamError
 from wfsobs.streams.network import Publication, Subscription, is_address
 from wfsobs.streams.ngs_frames import NgsStream
@@ -36,8 +36,22 @@ from wfsobs.units import UNITS, micrometres_per
     "source",
     required=True,
     metavar="STREAM",
-    help="Pseudo-open-loop modes: a name, the path of a file, or tcp://host:port.",
+    help="Pseudo-open-loop modes, or residuals beside --commands: a name, the path of a file, or tcp://host:port.",
 )
+@click.option(
+    "--commands",
+    metavar="STREAM",
+    help="Commands beside --in, which then holds residual measurements: their pseudo-open-loop is made here.",
+)
+@click.option(
+    "--command-delay",
+    type=click.FloatRange(1, 50),
+    default=DELAY,
+    show_default=True,
+    metavar="N",
+    help="Frames from a command to the first measurement that sees it, such as 1.5.",
+)
+@click.option("--command-gain", type=float, default=1.0, show_default=True, metavar="G", help="What the mirror does of them.")
 @click.option("--out", "sink", metavar="STREAM", help="Where the estimates go, made if there is none; or tcp://*:port.")
 @click.option("--shadow", is_flag=True, help="Write nothing.")
 @click.option("--prior", metavar="FOUND.toml", help="Prior of the observer: the file of `wfsobs identify --out`.")
@@ -81,6 +95,9 @@ from wfsobs.units import UNITS, micrometres_per
 def attach(
     scenario: Scenario,
     source: str,
+    commands: str | None,
+    command_delay: float,
+    command_gain: float,
     sink: str | None,
     shadow: bool,
     prior: str | None,
@@ -108,7 +125,7 @@ def attach(
     per_unit = micrometres_per(unit, scenario.telescope.diameter)
     try:
         given = _open_source(source)
-        taken = None if sink is None else _open_sink(sink, given, ngs)
+        taken = None if sink is None else _open_sink(sink, given, ngs, commands)
         observer, spread = _design(name, scenario, len(elements), delay - 1, ngs is not None)
         warm_up = max(round(scenario.run.warm_up / scenario.dt), 1)
         limits = Safety(fallback, None if limit is None else limit * per_unit, calm=warm_up)
@@ -117,7 +134,10 @@ def attach(
         if ngs is not None:
             ngs_is = ngs_wiring(scenario, len(elements), ngs_modes, unit, ngs_lag, stuck)
             second = NgsStream(_open_source(ngs), ngs_is, _say)
-        attachment = Attachment(given, taken, observer, wiring, _say, second)
+        third = None
+        if commands is not None:
+            third = CommandStream(_open_source(commands), elements, np.array(command_gain * per_unit), command_delay)
+        attachment = Attachment(given, taken, observer, wiring, _say, second, third)
         with _stop_signals() as stop:
             attachment.run(seconds or np.inf, report=_say, stop=stop)
     except (StreamError, StepError) as error:
@@ -137,14 +157,14 @@ def _open_source(name: str) -> SharedImage | Subscription:
     return click.get_current_context().with_resource(closing(Subscription(name, _say)))
 
 
-def _open_sink(name: str, source: SharedImage | Subscription, ngs: str | None) -> SharedImage | Publication:
+def _open_sink(name: str, source: SharedImage | Subscription, *others: str | None) -> SharedImage | Publication:
     dtype = source.header.dtype.name if isinstance(source, SharedImage) else source.dtype
     if is_address(name):
         made = click.get_current_context().with_resource(closing(Publication(name, source.n, dtype)))
         _say(f"{made.path}: estimates go out here")
         return made
     path = stream_path(name)
-    if path.resolve() in {stream_path(one).resolve() for one in (source.path, ngs) if one is not None}:
+    if path.resolve() in {stream_path(one).resolve() for one in (source.path, *others) if one is not None}:
         raise SettingError(f"--out {name}: is a stream that is read")
     if path.exists():
         return SharedImage(path)

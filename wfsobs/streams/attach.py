@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from time import monotonic
 from typing import Any, Protocol
 
@@ -16,7 +16,7 @@ from wfsobs.record import Sampling
 from wfsobs.signal.gate import OutlierGate
 from wfsobs.streams.layout import Semaphore, StreamError
 from wfsobs.streams.ngs_frames import NgsStream
-from wfsobs.streams.stream import SinkStream, SourceStream
+from wfsobs.streams.stream import FrameStream, SinkStream, SourceStream
 from wfsobs.streams.watchdog import Watchdog
 from wfsobs.streams.wiring import Wiring, check_elements
 from wfsobs.typing import Array
@@ -169,6 +169,67 @@ class SafeGate:
             self._gate.settle()
 
 
+class CommandStream:
+    """The commands beside a stream of residual measurements, for their pseudo-open-loop z = y - m.
+
+    One command follows from every measurement. The newest that is there when a measurement comes is that of the one before, in
+    most of the first `FIRST` frames; from then on the counters alone say to which a command belongs.
+
+    Parameters
+    ----------
+    stream : FrameStream
+        Commands, frames with the elements of the measurements.
+    elements : sequence of int
+        Number in a frame of each mode.
+    scale : Array
+        Micrometres that the mirror does per unit of a command, with its sign, (n_modes,) or ().
+    delay : float
+        Frames from a command to the first measurement that sees it, 1 or more: m[k] = (1 - p) u[k-d] + p u[k-d-1].
+
+    Attributes
+    ----------
+    missing : int
+        Measurements whose command was not there.
+    """
+
+    def __init__(self, stream: FrameStream, elements: Sequence[int], scale: Array, delay: float):
+        check_elements(stream, elements)
+        self._stream, self._elements, self._scale = stream, np.array(elements), scale
+        self._whole, self._part = int(delay), delay % 1.0
+        self._count, self.missing = stream.first, 0
+        self.restart()
+
+    def restart(self) -> None:
+        """Look anew for which command belongs to which measurement: a counter is another one."""
+        self._offset: int | None = None
+        self._offsets: list[int] = []
+        self._rows: dict[int, Array] = {}
+
+    def open_loop(self, count: int, y: Array) -> Array:
+        """Return z of a measurement (n_modes,) [um] with this counter; NaN where its command is not known."""
+        if self._stream.count != self._count and (frame := self._stream.read(0.0)) is not None:
+            if not 0 < frame[0] - self._count <= LONGEST_GAP:
+                self.restart()
+            self._count = frame[0]
+            self._rows[self._count] = frame[1][self._elements] * self._scale
+            self._offsets.append(count - 1 - self._count)
+            if self._offset is None and len(self._offsets) == FIRST:
+                self._offset = int(np.median(self._offsets))
+        if self._offset is None:
+            return np.full_like(y, np.nan)
+        at = count - self._offset
+        now, before = (self._rows.get(at - lag, np.full_like(y, np.nan)) for lag in (self._whole, self._whole + 1))
+        m = now if self._part == 0.0 else (1.0 - self._part) * now + self._part * before
+        for old in [row for row in self._rows if row < at - self._whole]:
+            del self._rows[old]
+        self.missing += bool(np.isnan(m).any())
+        return y - m
+
+
+FIRST = 9
+"""Commands from which their place is found: fewer than the measurements that may be missing."""
+
+
 class _Span:
     """What is counted over a stretch of time."""
 
@@ -303,6 +364,8 @@ class Attachment:
         Receives one line about whatever happens.
     ngs : NgsStream, optional
         The frames of an NGS, for an observer that takes them.
+    commands : CommandStream, optional
+        Commands, where the source has residual measurements.
 
     Raises
     ------
@@ -318,6 +381,7 @@ class Attachment:
         wiring: Wiring,
         say: Callable[[str], None],
         ngs: NgsStream | None = None,
+        commands: CommandStream | None = None,
     ):
         for stream in (source, sink):
             if stream is not None:
@@ -331,7 +395,7 @@ class Attachment:
         self._missing = self._forecast = np.full(len(wiring.elements), np.nan)
         self._count, self._alive = source.first, 0.0
         self._is_stuck = self._is_overtaken = False
-        self._ngs, self._frames = ngs, GoingBack(observer)
+        self._ngs, self._commands, self._frames = ngs, commands, GoingBack(observer)
         self.tally: Tally = Tally(observer.sampling.dt)
 
     def run(
@@ -408,6 +472,8 @@ class Attachment:
             self._expect()
         with np.errstate(over="ignore", invalid="ignore"):
             measured = values[self._elements] * self._wiring.unit
+            if self._commands is not None:
+                measured = self._commands.open_loop(count, measured)
         found_ngs = self._look_for_ngs()
         z, error = self._gate.accept(measured), measured - self._forecast
         beyond = max(self._gate.beyond, self._ngs_gate.beyond)
@@ -486,6 +552,8 @@ class Attachment:
         """Begin at a counter that has nothing to do with the one before."""
         if self._ngs is not None:
             self._ngs.restart()
+        if self._commands is not None:
+            self._commands.restart()
         self._observer.reset()
         self._frames.forget()
         self._restart_gates()
@@ -504,5 +572,6 @@ class Attachment:
     def summary(self) -> dict[str, Any]:
         """Return counts, latencies [us] and errors [nm] so far, as JSON takes them."""
         ngs = {} if self._ngs is None else {**self._ngs.summary(), "ngs_outliers": self._ngs_gate.outliers.tolist()}
+        ngs |= {} if self._commands is None else {"commands_missing": self._commands.missing}
         counts = {"outliers": self._gate.outliers.tolist(), **ngs}
         return {**self.tally.summary(), **counts, "fallbacks": self._watchdog.trips, "output": self._watchdog.reason or "on"}
