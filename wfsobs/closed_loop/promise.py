@@ -215,11 +215,11 @@ def as_seen(record: Record, delay: float, matrix: Array) -> Record:
     return replace(record, u=((1.0 - part) * record.u + part * before) @ matrix.T, delay=whole)
 
 
-def _scatter(laws: Sequence[Law], plan: Design, corrected: Record, noises: Sequence[float]) -> Array:
+def _scatter(laws: Sequence[Law], plan: Design, record: Record, noises: Sequence[float]) -> Array:
     """Return the relative standard deviation of the mean square of a residual over the record, per mode, from its sections."""
-    z, n = np.nan_to_num(corrected.z), corrected.n_steps
+    z, n = np.nan_to_num(record.z), record.n_steps
     both = plan.plant.ratio is not None and laws[0].cycle.steps[0][1].shape[1] > 1
-    inputs = np.stack([z, np.nan_to_num(corrected.z_ngs)], axis=1) if both else z[:, None]
+    inputs = np.stack([z, np.nan_to_num(record.z_ngs)], axis=1) if both else z[:, None]
     out = []
     for mode, law in enumerate(laws):
         u = law.run(inputs[:, :, mode])
