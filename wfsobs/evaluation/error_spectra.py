@@ -47,6 +47,9 @@ from wfsobs.typing import Array
 TRUTH = "truth"
 """Name of the prediction of the target itself: the error of an estimate of zero."""
 
+FEWEST = 16
+"""Samples of a spectrum, at least."""
+
 AIR = ("telescope", "turbulence", "sensors", "run")
 """Groups of settings that the turbulence and its sensors depend on."""
 
@@ -91,7 +94,7 @@ def spectra(
     chosen = range(record.n_modes) if modes is None else modes
     columns = [scored_samples(record, truth[:, mode], values[:, mode], warm_up) for mode in chosen]
     shortest = min(true.size for true, _ in columns)
-    if shortest < 16:
+    if shortest < FEWEST:
         return None
     true, value = (np.column_stack([x[-shortest:] for x in of]) for of in zip(*columns, strict=True))
     frequency, density = psd(np.hstack([value, value - true]), record.dt)

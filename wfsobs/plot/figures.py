@@ -18,7 +18,7 @@ from wfsobs.closed_loop.envelope import PlantEnvelope
 from wfsobs.closed_loop.rows import ClosedLoop, residual_rms
 from wfsobs.control.curves import Curves, curves
 from wfsobs.evaluation.budget import TERMS, error_budget
-from wfsobs.evaluation.error_spectra import TRUTH, cumulative_rms, spectra
+from wfsobs.evaluation.error_spectra import FEWEST, TRUTH, cumulative_rms
 from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.rows import NO_ESTIMATE, row_label
 from wfsobs.identification.result import Identification
@@ -204,15 +204,16 @@ class ResultPlots:
         mode: str | None,
         of_error: bool,
     ) -> hv.Layout:
-        name, record, figures = _one_of(self.names, mode, "mode"), self.result.record, []
-        for of in self._signals(observers, target, of_error):
+        name, dt, figures = _one_of(self.names, mode, "mode"), self.result.record.dt, []
+        for of, signals in self._signals(observers, target, of_error).items():
             y = quantity(f"{what} {of} {name}", unit, f"{what}{' of error' if of_error else ''}\n{of}, {name}")
             lines = []
-            for key, x in self._signals(observers, of, False)[of].items():
-                found = spectra(record, of, x, self.result.scenario.run.warm_up, [self.names.index(name)])
-                if found and not (of_error and key == TRUTH):
-                    frequency, density = found[0][1:], found[1 + of_error][1:, 0]
-                    lines.append(draw_line(frequency, curve(frequency, density), (FREQUENCY, y), key))
+            for key, x in signals.items():
+                known = x[round(self.result.scenario.run.warm_up / dt) :, self.names.index(name)]
+                known = known[~np.isnan(known)]
+                if known.size >= FEWEST:
+                    frequency, density = psd(known[:, None], dt)
+                    lines.append(draw_line(frequency[1:], curve(frequency[1:], density[1:, 0]), (FREQUENCY, y), key))
             figures.append(overlay(_some(lines, f"a spectrum of {of}"), log="xy"))
         return stack(figures)
 
