@@ -20,7 +20,7 @@ RESONANT = MATCHED.replace({"plant.resonance": 100.0, "plant.damping": 0.6, "pla
 
 @pytest.fixture(scope="module")
 def result() -> PlantEnvelope:
-    return plant_envelope(RESONANT, [*NAMES, "integrator+gpr-online"], points=40)
+    return plant_envelope(RESONANT, controllers=[*NAMES, "integrator+gpr-online"], points=40)
 
 
 def test_every_point_is_the_loop_of_its_plant(result: PlantEnvelope) -> None:
@@ -61,12 +61,12 @@ def test_points_fill_the_box_and_corners_are_its_corners(result: PlantEnvelope) 
 def test_caution_is_found_that_leaves_less_at_worst() -> None:
     """Of a model that is the truth, none leaves less at the nominal plant: what is won at the worst is paid for there."""
     s = MATCHED.replace({"sensors.lgs_rate": 500.0})
-    bold, tuned = (plant_envelope(s, ["lqg-kf-lgs"], points=20, tune=x) for x in (False, True))
+    bold, tuned = (plant_envelope(s, controllers=["lqg-kf-lgs"], points=20, tune=x) for x in (False, True))
     (before,), (after,) = bold.spreads, tuned.spreads
     together = [float(np.sqrt((x**2).sum())) for x in (before.worst, after.worst, before.nominal, after.nominal)]
     assert after.caution > 1.0 and together[1] < together[0]
     assert together[2] < together[3] <= (1.0 + LOSS) * together[2] * 1.001
-    again = plant_envelope(s.replace({"control.caution": after.caution}), ["lqg-kf-lgs"], points=20)
+    again = plant_envelope(s.replace({"control.caution": after.caution}), controllers=["lqg-kf-lgs"], points=20)
     assert again.spreads[0].worst == pytest.approx(after.worst, rel=1e-9), "the setting is that of the search"
 
 
@@ -80,9 +80,9 @@ def test_what_is_not_linear_is_left_out_and_says_so(result: PlantEnvelope) -> No
     assert [spread.controller for spread in result.spreads] == NAMES
     assert list(result.notes) == ["integrator+gpr-online"]
     with pytest.raises(SettingError, match="an envelope is by theory, for a plant that is linear"):
-        plant_envelope(MATCHED.replace({"plant.hysteresis": 0.1}), NAMES)
+        plant_envelope(MATCHED.replace({"plant.hysteresis": 0.1}), controllers=NAMES)
     with pytest.raises(SettingError, match=r"delay: 1.2 - 0.5 frames are below 1"):
-        plant_envelope(MATCHED.replace({"control.delay": 1.2}), NAMES)
+        plant_envelope(MATCHED.replace({"control.delay": 1.2}), controllers=NAMES)
 
 
 def spread(name: str, nominal: float, points: list[float]) -> Spread:

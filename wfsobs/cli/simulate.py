@@ -237,7 +237,7 @@ def loop(
         show_table(loop_table(all_rows))
     if with_envelope:
         with progress_bar("envelope") as update:
-            _show_envelope(plant_envelope(scenario, controllers or None, watch=Watch(progress=update)))
+            _show_envelope(plant_envelope(scenario, controllers=controllers or None, watch=Watch(progress=update)))
 
 
 def envelope_table(result: PlantEnvelope) -> Table:
@@ -292,7 +292,7 @@ def envelope(
     of = Uncertainty(delay, gain, rotation, resonance)
     with progress_bar("controllers") as update:
         result = plant_envelope(
-            scenario, controllers or None, uncertainty=of, points=points, tune=is_tuned, watch=Watch(progress=update)
+            scenario, controllers=controllers or None, uncertainty=of, points=points, tune=is_tuned, watch=Watch(progress=update)
         )
     if as_json:
         click.echo(json.dumps(result.rows(), allow_nan=False))

@@ -197,8 +197,8 @@ class PlantEnvelope:
 
 def plant_envelope(
     scenario: Scenario,
-    controllers: Sequence[str] | None = None,
     *,
+    controllers: Sequence[str] | None = None,
     uncertainty: Uncertainty | None = None,
     points: int = POINTS,
     tune: bool = False,
