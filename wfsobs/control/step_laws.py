@@ -38,10 +38,6 @@ class StepLaw(Stateful, Protocol):
         """Tell what the mirror took of them."""
         ...
 
-    def amend(self, difference: Array) -> None:
-        """Tell by how much another command was sent than what was told last."""
-        ...
-
     def take_over(self, old: Any) -> None:
         """Go on from the state of other laws. Raises StepError."""
         ...
@@ -55,9 +51,6 @@ class _Laws(StateArrays):
 
     def tell(self, command: Array, forward: Array) -> None:
         """Ignored: z holds none of the commands."""
-
-    def amend(self, difference: Array) -> None:
-        """Ignored for the same reason."""
 
 
 class LinearLaws(_Laws):
@@ -147,7 +140,7 @@ class Integrators(_Laws):
         push_row(self._own, command - forward)
 
     def amend(self, difference: Array) -> None:
-        """Go on from what was sent."""
+        """Go on from a command that differs by this from the one told last."""
         self._own[0] += difference
 
     def take_over(self, old: Any) -> None:
