@@ -32,6 +32,7 @@ class StepController(StepBase):
     """
 
     plant: Plant
+    frame: int
     law: StepLaw | None
     ahead: VibrationAhead | None
 

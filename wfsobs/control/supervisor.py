@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import gammainccinv
 
+from wfsobs.control.mirror import Mirror
 from wfsobs.control.step import StepController
 from wfsobs.observers.step import check_state
 from wfsobs.observers.stepping import StateArrays, load_parts, save_parts
@@ -155,8 +156,10 @@ class SupervisedController(StateArrays):
 
     def __init__(self, controller: StepController, supervision: Supervision = Supervision()):
         n, mirror = controller.sampling.n_modes, controller.plant.mirror
-        self.controller, self.supervision, self.mirror = controller, supervision, mirror
-        self.alarms = list[tuple[int, str]]()
+        self.controller: StepController = controller
+        self.supervision: Supervision = supervision
+        self.mirror: Mirror = mirror
+        self.alarms: list[tuple[int, str]] = []
         self._level = _Level(n, supervision.alarm)
         self._command, self._offset = np.zeros(n), np.zeros(n)
         self._usual = np.full(n, np.inf)  # mean square of the measurement under the integrator

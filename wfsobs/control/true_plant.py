@@ -126,8 +126,9 @@ class ActingPlant:
     def __init__(self, plant: TruePlant, *columns: int):
         self.plant = plant
         shape = (len(plant.matrix), *columns)
-        self.position, self.swing = np.zeros(shape), np.zeros(shape, dtype=complex)  # of the mirror, once all has arrived
-        self.ahead = np.zeros((plant.size, *shape))  # phi_corr of the frames to come, by the commands so far
+        self.position: Array = np.zeros(shape)  # of the mirror, once all has arrived, as its swing
+        self.swing: Complex = np.zeros(shape, dtype=complex)
+        self.ahead: Array = np.zeros((plant.size, *shape))  # phi_corr of the frames to come, by the commands so far
         self._plays = np.zeros((len(PLAYS), *shape))
         self._turn = np.exp(plant.pole) if plant.resonance else 0j
         self._mean = (self._turn - 1.0) / plant.pole if plant.resonance else 0j

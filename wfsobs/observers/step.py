@@ -253,6 +253,7 @@ class StepObserver(StepBase):
 
     targets: tuple[str, ...]
     estimator: Estimator
+    frame: int
 
     def __init__(
         self,

@@ -105,8 +105,10 @@ class GapGains:
     def __init__(self, cycle: Sequence[Step], posteriors: Sequence[Array], rows: Array, scale: float, mean: SensorMean = ONE):
         e = len(mean.A)
         beside = lyapunov(mean.A, mean.Q) if e else mean.A
-        self.cycle = tuple((block_diag(A, mean.A), np.pad(C, ((0, 0), (0, e))), block_diag(Q, mean.Q), R) for A, C, Q, R in cycle)
-        self.posteriors = tuple(block_diag(P, beside) for P in posteriors)
+        self.cycle: tuple[Step, ...] = tuple(
+            (block_diag(A, mean.A), np.pad(C, ((0, 0), (0, e))), block_diag(Q, mean.Q), R) for A, C, Q, R in cycle
+        )
+        self.posteriors: tuple[Array, ...] = tuple(block_diag(P, beside) for P in posteriors)
         rows = np.pad(rows, ((0, 0), (0, e)))
         self.weights, self.most, self._mean = rows.T @ rows, STEADY * scale, mean
         self._first: dict[tuple[int, Pattern], GapStep] = {}

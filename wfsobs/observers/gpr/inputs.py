@@ -186,7 +186,7 @@ class Windows(StateArrays):
 
     def __init__(self, settings: Gpr | None, sampling: Sampling, depth: int, scales: Sequence[Scale] = ()):
         self._of_record = settings, sampling.dt, tuple(scales)
-        self.needs_command = settings is not None and settings.inputs == "u-y"
+        self.needs_command: bool = settings is not None and settings.inputs == "u-y"
         self.depth, self.count = depth, 0
         n = sampling.n_modes * (2 if self.needs_command else 1)
         self._inputs = None
