@@ -226,8 +226,8 @@ def _contradiction_of(data: _Data, delay: int, statement: tuple[int, float, Sequ
     if any(missing.any for missing in data.missing):  # no longer filled by straight lines
         begin = data.with_spectra(start, begin.spectra)
     new = data.fit(begin, ties, STEPS)
-    is_far = not is_turned and (new.theta[k : 2 * k] < NEAR).any()  # commands that follow nothing, or of another unit
-    if is_far or not _what_is_off(new, stated, names, ways):
+    is_far = np.any((new.theta[k : 2 * k] < NEAR[0]) | (new.theta[k : 2 * k] > NEAR[1]))  # following nothing, or of another unit
+    if (is_far and not is_turned) or not _what_is_off(new, stated, names, ways):
         return ""
     new = data.fit(data.with_spectra(new.theta, new.spectra, MOST_PEAKS, plain=False), ties, STEPS)
     if any(s.background for s in new.spectra) and excited < EXCITED and not is_turned:
@@ -273,8 +273,8 @@ standard deviations by which it is off."""
 REVERSED = 0.5
 """Share of what is new in the commands that the measurements do not explain, beyond which their signs say nothing."""
 
-NEAR = 0.3
-"""Gain below which a plant is not near a stated one."""
+NEAR = (0.3, 1.7)
+"""Gains between which a plant is near a stated one."""
 
 OFF_DELAY, OFF_GAIN, TURNED = 0.2, 0.1, 10.0
 """Distance of a delay [frames], a gain and an angle [degrees] from what is stated below which a record is not refused."""
