@@ -264,7 +264,7 @@ def _sweep(names: Sequence[str], values: DataRange1d) -> figure:
     fig = new_figure(x_range=values, y_range=DataRange1d(start=0.0, only_visible=True))
     fig.add_glyph(ColumnDataSource({"x": []}), VSpan(x="x", line_color=PEAKS, line_alpha=0.6, line_width=1.5), name=NOW)
     errors = [name for name in names if name != TRUTH]
-    source = _add_lines(fig, errors)
+    source = _add_lines(fig, errors, (0.0, 1.0))
     for name in errors:
         fig.scatter("x", name, source=source, size=5, color=look(name).light, name=name)
     return fig
@@ -277,8 +277,9 @@ def _part(part: Mapping[str, Any]) -> figure:
     return lines.figure
 
 
-def _add_lines(fig: figure, names: Sequence[str]) -> ColumnDataSource:
-    source = ColumnDataSource({"x": [], **{name: [] for name in names}})
+def _add_lines(fig: figure, names: Sequence[str], start: Sequence[float] = ()) -> ColumnDataSource:
+    """Add lines that the page fills in. start : their points until then, of which axes that fit themselves need some."""
+    source = ColumnDataSource({name: [*start] for name in ("x", *names)})
     for name in names:
         add_line(fig, name, source, name)
     return source
