@@ -7,6 +7,7 @@ const GIVEN_UP = 40 // after which another way to the server is tried [ticks]
 const PERIOD = 12 // between questions where nothing is changed [ticks]
 const TIMEOUT = 3_000 // of a question beside the connection [ms]
 const LONGEST = 3_000 // between two attempts to connect [ms]
+const REFUSALS = 5 // of a server that answers, after which it has no such session: a busy one may greet a page with a change first
 const UNSENT = "wfsobs-unsent"
 const TAG = "setting:"
 const TYPED = ["value", "value_input", "value_throttled"]
@@ -173,7 +174,7 @@ class Link {
     } catch {
       if (this.state === "gone") return
       this.refused = await reachable() ? this.refused + 1 : 0
-      if (this.refused > 2) return this.end()
+      if (this.refused > REFUSALS) return this.end()
       this.turn(navigator.onLine ? "lost" : "offline")
       this.wait = Math.min(2 * this.wait + 500, LONGEST)
       this.retrying = setTimeout(() => this.retry(), this.wait)
