@@ -181,6 +181,8 @@ def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
             words[words.index("--seeds") + 1] = "2"
         short = SHORT if words[1] in ("run", "observe", "tune", "loop", "export", "sweep") else ()
         short = ("--seconds", "0.1") if words[1] == "attach" else short
+        if words[1] == "envelope":
+            short = ("--points", "8", *(() if "--controller" in words else ("--controller", "lqg-kf-lgs")))
         if words[1] in ("run", "observe", "export", "sweep", "live") and "--observer" not in words:
             short = (*short, *FEW)
         result = CliRunner().invoke(main, [*words[1:], *short])

@@ -127,7 +127,7 @@ assert before.own.speed == 1.0 and before == wfsobs.Scenario()
 assert before.replace({"own.speed": 2}).difference(before) == {"own": {"speed": 2.0}}
 before.own.speed = 0.5
 assert wfsobs.Scenario().own.speed == 1.0 and before.copy().own.speed == 0.5
-print(list(before.to_dict())[-4:])
+print(list(before.to_dict())[-5:])
 print({s.observer for s in wfsobs.run(wfsobs.PRESETS["paper"]().replace({"run.duration": 1.5}), observers=["mine"]).scores})
 """
 
@@ -136,7 +136,7 @@ print({s.observer for s in wfsobs.run(wfsobs.PRESETS["paper"]().replace({"run.du
 def test_a_scenario_made_before_has_the_settings_too() -> None:
     done = subprocess.run([sys.executable, "-c", LATE], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[0] == "['own', 'control', 'run', 'events']"
+    assert done.stdout.splitlines()[0] == "['own', 'control', 'plant', 'run', 'events']"
     assert "'mine'" in done.stdout.splitlines()[1]
 
 

@@ -3,7 +3,7 @@
 Plant and disturbance are identified (`wfsobs.identification`), the controllers are designed from what was found, and theory tells
 what each leaves on the identified spectra with plants that are drawn from their uncertainty. The next record is another one than
 that which was identified: both means of the square differ from that of the process by what a record of this length tells of it,
-which the scatter of its sections shows under the controller itself.
+which the scatter of sections shows in a simulation of what was identified.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from wfsobs.closed_loop.design import Design, design
+from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.envelope import residuals
+from wfsobs.closed_loop.run import each_outcome
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.control.law import Law
 from wfsobs.control.true_plant import TruePlant
 from wfsobs.identification.identification import identify
 from wfsobs.identification.plant import GroupPlant, identify_plant
@@ -27,6 +27,7 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
+from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import true_spectra
 from wfsobs.typing import Array
 
@@ -34,7 +35,13 @@ DRAWS = 256
 """Plants that are drawn."""
 
 SECTIONS = 16
-"""Of the record, whose scatter tells how well it knows a mean square."""
+"""Of a residual, whose scatter tells how well a record knows its mean square."""
+
+LONGEST = 60_000
+"""Steps of the simulation that tells this."""
+
+START = 500
+"""Steps that a filter takes to start."""
 
 SURE = 0.95
 """Share of the draws in which a controller must be stable and better than the integrator."""
@@ -146,12 +153,13 @@ def make_promise(
     told = found.scenario(as_stated(corrected, scenario)).replace({"control.delay": float(delay)})
     names = None if controllers is None else [INTEGRATOR, *(name for name in controllers if name != INTEGRATOR)]
     plan = design(told, names)
+    length = min(record.n_steps, LONGEST)
+    model = simulate(told.replace({"run.duration": (length + START) * record.dt, "run.seed": seed}))
     inverse = np.linalg.inv(matrix)
     plants = [TruePlant(one @ inverse, float(late)) for one, late in zip(matrices, delays, strict=True)]
     spectra = [true_spectra(told, mode) for mode in range(record.n_modes)]
-    noises = [mode.noise.value for mode in found.modes]
-    rng, left, out = np.random.default_rng(seed), dict[str, Array](), list[ResidualPromise]()
-    common = rng.standard_normal(len(plants) - 1)
+    left, out = dict[str, Array](), list[ResidualPromise]()
+    common = np.random.default_rng(seed).standard_normal(len(plants) - 1)
     for i, name in enumerate(plan.laws):
         watch.check()
         laws = [one.law for one in plan.laws[name] if one.law is not None]
@@ -163,10 +171,13 @@ def make_promise(
             out.append(ResidualPromise(name, note=next(iter(notes), "not stable")))
             continue
         squares = residuals(laws, plan.mirror, plants, spectra, watch)[1:] ** 2
-        left[name] = squares * np.maximum(1.0 + sqrt(2.0) * _scatter(laws, plan, corrected, noises) * common[:, None], 0.0)
+        (outcome,) = each_outcome(model, plan, watch, [name])
+        assert outcome.residual is not None
+        spread = sqrt(2.0 * length / record.n_steps) * _scatter(outcome.residual[START:])
+        left[name] = squares * np.maximum(1.0 + spread * common[:, None], 0.0)
         out.append(_interval_of(name, left[name], left[INTEGRATOR]))
         watch.step((i + 1) / len(plan.laws))
-    return Promise(told, groups, matrix, tuple(noises), tuple(out))
+    return Promise(told, groups, matrix, tuple(mode.noise.value for mode in found.modes), tuple(out))
 
 
 def _interval_of(name: str, squares: Array, integrator: Array) -> ResidualPromise:
@@ -215,16 +226,7 @@ def as_seen(record: Record, delay: float, matrix: Array) -> Record:
     return replace(record, u=((1.0 - part) * record.u + part * before) @ matrix.T, delay=whole)
 
 
-def _scatter(laws: Sequence[Law], plan: Design, record: Record, noises: Sequence[float]) -> Array:
-    """Return the relative standard deviation of the mean square of a residual over the record, per mode, from its sections."""
-    z, n = np.nan_to_num(record.z), record.n_steps
-    both = plan.plant.ratio is not None and laws[0].cycle.steps[0][1].shape[1] > 1
-    inputs = np.stack([z, np.nan_to_num(record.z_ngs)], axis=1) if both else z[:, None]
-    out = []
-    for mode, law in enumerate(laws):
-        u = law.run(inputs[:, :, mode])
-        y = z[1:, mode] + plan.mirror.correction(u)[:-1]
-        squares = np.square(y[(n - 1) % SECTIONS :]).reshape(SECTIONS, -1).mean(axis=1)
-        mean = squares.mean()
-        out.append(squares.std(ddof=1) / sqrt(SECTIONS) / max(mean - noises[mode] ** 2, 0.1 * mean))
-    return np.array(out)
+def _scatter(residual: Array) -> Array:
+    """Return the relative standard deviation of the mean square of a residual, per mode, from its sections."""
+    squares = np.square(residual[len(residual) % SECTIONS :]).reshape(SECTIONS, -1, residual.shape[1]).mean(axis=1)
+    return np.asarray(squares.std(axis=0, ddof=1) / squares.mean(axis=0) / sqrt(SECTIONS))
