@@ -83,7 +83,7 @@ def test_a_report_has_its_line_and_its_setting(python: Run, tmp_path: Path) -> N
     said(python("-m", "wfsobs", "export", str(made), *SHORT, *chosen, "--set", "low_pass.corner=80"))
     page = made.read_text(encoding="utf-8")
     assert "--line-low-pass:#8A4B00" in page and "--line-low-pass:#E0A050" in page
-    assert '"label":"Low-pass"' in page and "low_pass.corner" in page
+    assert '"#line-low-pass"/></svg>Low-pass <output>' in page and "low_pass.corner" in page
 
 
 def test_its_controller_closes_the_loop(python: Run) -> None:
@@ -135,7 +135,7 @@ scenario = configfile.scenario_from("paper", None, ASSIGNMENTS)
 shown = compute(scenario, QUIET, lambda **_: None)
 assert shown.result.estimate("low-pass", "turbulence") is not None
 page = make(shown, "paper", QUIET).decode()  # in a process of its own
-assert "--line-low-pass:#8A4B00" in page and '"label":"Low-pass"' in page
+assert "--line-low-pass:#8A4B00" in page and '"#line-low-pass"/></svg>Low-pass <output>' in page
 
 script = to_python(scenario.replace({"low_pass.corner": 1.0}), "paper")
 assert '"low_pass.corner": 1.0' in script
