@@ -83,7 +83,7 @@ def test_visitors_wait_in_line_with_every_kind_of_work_and_a_click_goes_first(vi
     status(second, "Waiting: position 1")
     (tmp_path / "log.csv").write_text("seeing,airmass\n1,2\n", encoding="utf-8")
     second.get_by_label("Record file").set_input_files(tmp_path / "log.csv")
-    expect(second.locator(".said", has_text="Waiting: position 1")).to_be_visible()  # the reading of the file
+    expect(second.locator(".bar > [role=status]", has_text="Waiting: position 1")).to_be_visible()  # the reading of the file
     status(second, "Waiting: position 2")
     first.get_by_role("button", name="Cancel", exact=True).click()
     status(first, "Cancelled")
