@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import gamma
@@ -90,6 +92,18 @@ def test_numbers_that_are_none_are_missing(record: wfsobs.Record) -> None:
         a = one.update(np.array([np.inf, -np.inf]) if gone else record.z[k])
         b = other.update(np.full(2, np.nan) if gone else record.z[k])
         np.testing.assert_array_equal(a, b)
+
+
+def test_a_dropout_does_not_make_the_usual_residual_small(record: wfsobs.Record) -> None:
+    """A third of the frames without measurements: the level stays that of the others, and nothing alarms afterwards."""
+    supervised = SupervisedController(wfsobs.design("lqg-kf-lgs", SCENARIO), PLAN)
+    lost = replace(record, y_lgs=np.where((np.arange(record.n_steps) // 500 == 3)[:, None], np.nan, record.y_lgs))
+    close(supervised, lost)
+    whole = SupervisedController(wfsobs.design("lqg-kf-lgs", SCENARIO), PLAN)
+    close(whole, record)
+    assert supervised.alarms == []
+    # one half of a second in three: as many samples less
+    assert supervised._level.mean == pytest.approx(whole._level.mean, rel=0.25)
 
 
 @pytest.mark.parametrize("frames", [100, 700])

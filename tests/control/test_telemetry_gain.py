@@ -98,3 +98,12 @@ def test_the_command(tmp_path: Path) -> None:
         assert row["gain"] == pytest.approx(theory.gain, rel=0.1)
     shown = CliRunner().invoke(main, ["gain", str(tmp_path / "record.npz")]).stdout
     assert "Gain of the integrator, delay 2 frames" in shown and "tilt" in shown
+
+
+def test_a_fraction_of_the_delay_in_the_file_counts(tmp_path: Path) -> None:
+    rng, mirror, n = np.random.default_rng(8), Mirror(2.5), 6_000
+    y, u = (np.column_stack(x) for x in zip(*(close(disturbance(rng, n), NOISE * rng.standard_normal(n), 0.2, mirror, 1.0)
+                                              for _ in range(2)), strict=True))  # fmt: skip
+    np.savez(tmp_path / "r.npz", y_lgs=y, u=u, dt=DT, delay=2.5)
+    rows = json.loads(CliRunner().invoke(main, ["gain", str(tmp_path / "r.npz"), "--unit", "um", "--json"]).stdout)
+    assert [row["limit"] for row in rows] == pytest.approx([highest_stable_gain(mirror, 1.0)] * 2, rel=1e-9)

@@ -18,7 +18,7 @@ from wfsobs.settings.errors import SettingError
 from wfsobs.streams.wiring import STUCK, NgsWiring
 from wfsobs.telemetry.command_response import saturation_lines
 from wfsobs.telemetry.intake import LONGEST_DELAY, DeclaredFormat
-from wfsobs.telemetry.records import load_record, read_loop_matrix
+from wfsobs.telemetry.records import open_record, read_loop_matrix, read_with_delay
 from wfsobs.units import UNITS, micrometres_per
 
 
@@ -196,7 +196,15 @@ def training(
 
 def load_declared(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None = None) -> Record:
     """Read the record of a file; print its interpretation on standard error."""
-    record = load_record(record_file, scenario, declaration, sha256)
+    return load_with_delay(record_file, scenario, declaration, sha256)[0]
+
+
+def load_with_delay(
+    record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None = None
+) -> tuple[Record, float]:
+    """As `load_declared`, and the delay of the commands with its fraction [steps]."""
+    with open_record(record_file, sha256) as (file, name):
+        record, delay = read_with_delay(file, name, scenario, declaration)
     if record.origin:
         click.echo(f"wfsobs: {record_file}: read as {record.origin}", err=True)
     if record.missing:
@@ -215,7 +223,7 @@ def load_declared(record_file: str, scenario: Scenario, declaration: DeclaredFor
         )
     for line in saturation_lines(record):
         click.echo(f"wfsobs: {record_file}: {line}", err=True)
-    return record
+    return record, delay
 
 
 def stream_elements(text: str | None, n_modes: int, option: str = "--modes") -> tuple[int, ...]:

@@ -13,6 +13,7 @@ from rich.text import Text
 
 from wfsobs.cli.options import (
     load_declared,
+    load_with_delay,
     observer_option,
     record_options,
     scenario_options,
@@ -213,8 +214,8 @@ def gain(
     record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None, prior: str | None, as_json: bool
 ) -> None:
     """Find the integrator's optimal gain from closed-loop telemetry (docs/closed_loop.md)."""
-    record = load_declared(record_file, scenario, declaration, sha256).without_outliers
-    delay = declaration.command_delay or scenario.control.delay
+    whole, delay = load_with_delay(record_file, scenario, declaration, sha256)
+    record = whole.without_outliers
     scenario = as_stated(record, told_scenario(prior, scenario)).replace({"control.delay": delay})
     mirror, leak = plant_of(scenario).mirror, scenario.control.leak
     laws = design(scenario, ["integrator"]).laws["integrator"] if prior else ()
@@ -260,7 +261,7 @@ def promise(
     )
     assert record is not None
     with progress_bar("controllers") as update:
-        result = make_promise(record, scenario, controllers or None, watch=Watch(progress=update))
+        result = make_promise(record, scenario, controllers=controllers or None, watch=Watch(progress=update))
     found = None if later is None else result.left_in(later)
     if as_json:
         click.echo(json.dumps(result.to_dict() | {"after": found}, allow_nan=False))

@@ -110,12 +110,12 @@ class Promise:
 
     def left_in(self, record: Record) -> tuple[float, ...]:
         """Rms of the residual of every mode [um] in the record of another controller: of its measurements, less the noise."""
-        squares = np.nanmean(np.square(record.y_lgs), axis=0) - np.square(self.noise)
+        squares = np.nanmean(np.square(record.without_outliers.y_lgs), axis=0) - np.square(self.noise)
         return tuple(np.sqrt(np.maximum(squares, 0.0)).tolist())
 
 
 def make_promise(
-    record: Record, scenario: Scenario, controllers: Sequence[str] | None = None, *, seed: int = 0, watch: Watch = QUIET
+    record: Record, scenario: Scenario, *, controllers: Sequence[str] | None = None, seed: int = 0, watch: Watch = QUIET
 ) -> Promise:
     """State what controllers will leave of the loop of a record, before one of them is switched on.
 
@@ -124,7 +124,7 @@ def make_promise(
     record : Record
         Measurements, and commands as they were given.
     scenario : Scenario
-        All settings that are not identified; those of the integrator among them.
+        All settings that are not identified; those of the integrator among them. Its `plant` is not used: that is identified.
     controllers : sequence of str, optional
         Ids; by default all that are linear. The integrator with its optimal gain is always there.
     seed : int
@@ -150,7 +150,8 @@ def make_promise(
     delay, matrix = delays[0], matrices[0]
     corrected = as_seen(record, delay, matrix)
     found = identify(corrected, watch=Watch(is_cancelled=watch.is_cancelled))
-    told = found.scenario(as_stated(corrected, scenario)).replace({"control.delay": float(delay)})
+    known = {"control.delay": float(delay), **{f"plant.{name}": value for name, value in Scenario().plant.to_dict().items()}}
+    told = found.scenario(as_stated(corrected, scenario)).replace(known)
     names = None if controllers is None else [INTEGRATOR, *(name for name in controllers if name != INTEGRATOR)]
     plan = design(told, names)
     length = min(record.n_steps, LONGEST)

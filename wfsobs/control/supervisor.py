@@ -191,7 +191,7 @@ class SupervisedController(StateArrays):
         slow = None if ngs is None else np.where(np.isfinite(ngs), ngs, np.nan)
         command = self.controller.update(seen, slow, stars=stars)
         error, plan = np.nan_to_num(seen), self.supervision
-        excess = self._level.exceeds(error)
+        excess = not np.isnan(seen).any() and self._level.exceeds(error)  # a dropout is no small residual
         safe = self._within(plan.leak * self._command - plan.gain * error)
         if self._why:
             self._wait(command, safe, excess)

@@ -235,13 +235,24 @@ def read_record(
     most: int = MOST_BYTES,
 ) -> Record:
     """Read the record of an open file; its name gives the format and is never opened. most : maximum bytes of numbers."""
+    return read_with_delay(file, name, scenario, declaration, most)[0]
+
+
+def read_with_delay(
+    file: IO[bytes],
+    name: str,
+    scenario: Scenario | None = None,
+    declaration: DeclaredFormat | None = None,
+    most: int = MOST_BYTES,
+) -> tuple[Record, float]:
+    """As `read_record`, and the delay of its commands with its fraction [steps], which those of the record have in them."""
     try:
         stated = declaration or DeclaredFormat()
         contents = read_contents(file, name, stated.columns, most)
         record = to_record(contents, scenario := scenario or Scenario(), stated)
         if why := contradiction_of(record, contents, stated, scenario):
             raise RecordError(f"{why}; --trust goes on")
-        return record
+        return record, stated_delay(contents, stated)
     except RecordError as error:
         raise RecordError(f"{name}: {error}") from None
 
