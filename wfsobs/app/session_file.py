@@ -73,7 +73,7 @@ def read_score(values: Any) -> Score:
     if not isinstance(values, dict):
         raise SessionError(DAMAGED)
     text, one, some = partial(get_text, values), partial(get_number, values), partial(_get_numbers, values)
-    calibration = some("calibration", 4)
+    calibration, interval = some("calibration", 4), some("interval", 2)
     return Score(
         text("observer"),
         text("target"),
@@ -86,7 +86,7 @@ def read_score(values: Any) -> Score:
         _get_optional(values, "start"),
         _get_optional(values, "stop"),
         get_value(values, "apart", bool),
-        some("interval", 2),  # type: ignore[arg-type]
+        (interval[0], interval[1]) if interval else None,
         some("phases", None),
         Calibration(*calibration) if calibration else None,
     )

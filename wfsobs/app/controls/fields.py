@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+from abc import ABC, abstractmethod
 from html import escape
 from typing import Any
 
@@ -30,7 +31,7 @@ TAG = "setting:"
 """Stands before the path of its setting in the tag of a widget: the browser knows by it what was changed."""
 
 
-class Field:
+class Field(ABC):
     """The widgets of one setting; `view` is what the page shows."""
 
     has_help = False
@@ -72,16 +73,16 @@ class Field:
             self._note_html = html
             self.view[1:] = [pn.pane.HTML(html, margin=(0, 0, 6, 0))] if html else []
 
+    @abstractmethod
     def show(self, value: Any) -> None:
         """Put a value into the widgets."""
-        raise NotImplementedError
 
     def enter(self, value: Any) -> None:
         """Do as if a value had been typed or chosen. Raises ValueError where that cannot be."""
         self.widgets[-1].value = value
 
-    def _widgets(self) -> list[Any]:
-        raise NotImplementedError
+    @abstractmethod
+    def _widgets(self) -> list[Any]: ...
 
     def _row(self) -> Any:
         return self.widgets[0]

@@ -76,9 +76,10 @@ def setting_name(path: str) -> str:
 def _item(p: param.List, number: str, *keys: str) -> str:
     """Name an item of a list, or a setting of it."""
     kind = p.item_type
-    if not number.isdecimal() or (keys and keys[0] not in kind.settings()):  # type: ignore[union-attr]
+    assert isinstance(kind, type) and issubclass(kind, Group)
+    if not number.isdecimal() or (keys and keys[0] not in kind.settings()):
         return ""
-    item = f"{kind.__name__} {int(number) + 1}"  # type: ignore[union-attr]
+    item = f"{kind.__name__} {int(number) + 1}"
     return f"{item}: {column_of('.'.join(keys))}" if keys else item
 
 

@@ -48,7 +48,8 @@ class RowEditor:
 
     def __init__(self, store: Store, path: str, p: param.List):
         self.store, self.path = store, path
-        self._kind: type[Group] = p.item_type  # type: ignore[assignment]
+        assert isinstance(p.item_type, type) and issubclass(p.item_type, Group)
+        self._kind: type[Group] = p.item_type
         self._texts: dict[str, str] = {}
         self.table = RowTable(
             self.handle,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from html import escape
@@ -197,7 +198,7 @@ def _text(value: Any) -> str:
     return ",".join(value) if isinstance(value, list) else f"{value:g}" if isinstance(value, (int, float)) else value
 
 
-class Page:
+class Page(ABC):
     """A page of the main area: what it does with the record, what of it an address has, and what it has found.
 
     Attributes
@@ -219,9 +220,9 @@ class Page:
         self.store, self.run, self.display = store, store.run, display
         display.param.watch(self.redraw, [*switches] or ["mode", "unit", "dark"])
 
+    @abstractmethod
     def view(self) -> Any:
         """Return the contents of the page."""
-        raise NotImplementedError
 
     def show(self, visible: bool) -> None:
         """Bring it up to date, and keep it so while it is visible."""
@@ -230,7 +231,8 @@ class Page:
         self.redraw()  # what is shown, and how, may have changed
 
     def follow(self, *_: object) -> None:
-        """Begin what is to be computed of what is shown now."""
+        """Begin what is to be computed of what is shown now; most pages compute nothing."""
+        return
 
     def redraw(self, *_: object) -> None:
         """Draw what has come, as one message, where it is seen."""
@@ -239,7 +241,8 @@ class Page:
                 self.draw()
 
     def draw(self) -> object:
-        """Draw what has come."""
+        """Draw what has come; a page without figures draws nothing."""
+        return None
 
     def open_link(self, texts: Mapping[str, str]) -> list[str]:
         """Take what an address has of the page; return a line for each text refused."""

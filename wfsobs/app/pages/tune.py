@@ -211,8 +211,7 @@ def tuning_html(result: TuningResult, display: Display, diameter: float) -> str:
 def _row(section: str, name: str, before: float | str | None, after: float | str | None, scale: float) -> Row:
     error, name = section in (VALIDATION, TEST, OTHER), setting_name(name) if section == SETTING else name
     cells = [_cell(x, scale if error else 1.0) for x in (before, after)]
-    known = error and isinstance(before, float) and isinstance(after, float)
-    cells.append(change(before, after) if known else "")  # type: ignore[arg-type]
+    cells.append(change(before, after) if error and isinstance(before, float) and isinstance(after, float) else "")
     return Row(Markup("<b>{}</b>").format(name) if name == TOGETHER else name, cells, {"section": section})
 
 
