@@ -1,6 +1,6 @@
 """The tables of docs/trust.md: controllers over an uncertain plant.
 
-`trust.py [PRESET ...]`: `paper` and `ut4` unless told; by theory, but for the sequence of the plants no random numbers.
+`trust.py [PRESET ...]`: `paper` and `ut4` by default; by theory, without random numbers.
 """
 
 from __future__ import annotations
