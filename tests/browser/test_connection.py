@@ -23,6 +23,10 @@ def hang_up(end: socket.socket) -> None:
     end.close()
 
 
+HEAD = b'{"msgid"'
+"""Begins the first part of a message."""
+
+
 class Cable:
     """What lies between browser and server, and can be cut."""
 
@@ -32,6 +36,7 @@ class Cable:
         self.to, self.whole, self.lock = 0, True, threading.Lock()
         self.quick = threading.Event()
         self.quick.set()
+        self.within = threading.Event()
         self.ends: list[socket.socket] = []
         threading.Thread(target=self._accept, daemon=True).start()
 
@@ -58,6 +63,10 @@ class Cable:
             while part := one.recv(65536):
                 if back:
                     self.quick.wait()
+                if back and self.within.is_set() and HEAD in part:
+                    other.sendall(part[: part.index(b"}", part.index(HEAD)) + 1])
+                    self.within.clear()
+                    break
                 other.sendall(part)
         except OSError:
             pass
@@ -70,6 +79,10 @@ class Cable:
             for end in self.ends:
                 hang_up(end)
             self.ends = []
+
+    def cut_within(self) -> None:
+        """Cut the connection by which the server's next message comes, after the first of its parts."""
+        self.within.set()
 
     def mend(self, quick: bool = True) -> None:
         """Make it whole again; what the server says arrives later unless it is quick."""
@@ -203,6 +216,15 @@ def test_a_cut_line_comes_back_to_the_same_session(page: Page, cable: Cable) -> 
     expect(page.get_by_role("status").filter(has_text="Compared with")).to_contain_text(
         "Wind speed V₀ 22 → 24 m/s"
     )  # the same session: its pinned run is there
+    done(page)
+
+
+def test_a_line_cut_in_the_middle_of_a_message(page: Page, cable: Cable) -> None:
+    cable.cut_within()
+    speed(page, "25")
+    connected_again(page)
+    page.wait_for_function("() => location.search.includes('turbulence.wind_speed=25')")
+    assert not cable.within.is_set()
     done(page)
 
 

@@ -7,7 +7,7 @@ const GIVEN_UP = 40 // after which another way to the server is tried [ticks]
 const PERIOD = 12 // between questions where nothing is changed [ticks]
 const TIMEOUT = 3_000 // of a question beside the connection [ms]
 const LONGEST = 3_000 // between two attempts to connect [ms]
-const REFUSALS = 5 // of a server that answers, after which it has no such session, or Bokeh waits for the rest of a message that was cut off
+const REFUSALS = 5 // of a server that answers, after which it has no such session
 const UNSENT = "wfsobs-unsent"
 const TAG = "setting:"
 const TYPED = ["value", "value_input", "value_throttled"]
@@ -46,6 +46,38 @@ function socketOf(act) {
   return socket
 }
 
+// What is missing of the message that comes by a socket. Bokeh has one reader for all sockets, one after the other: it would take
+// what comes by the next for the rest of a message that was cut off.
+class Reading {
+  constructor(socket, heard) {
+    this.socket = socket
+    this.missing = []
+    socket.addEventListener("message", ({data}) => {
+      heard()
+      if (typeof data === "string" && data.startsWith('{"msgid"')) {
+        const {num_buffers = 0} = JSON.parse(data)
+        this.missing = ["{}", '{"events": []}', ...Array(num_buffers).fill(["{}", new ArrayBuffer(0)]).flat()]
+      } else {
+        this.missing.shift()
+      }
+    })
+  }
+
+  // Give the reader the rest: the document is asked for anew, so that it does not matter what is made of it.
+  finish() {
+    for (const data of this.missing.splice(0)) {
+      try {
+        this.socket.onmessage(new MessageEvent("message", {data}))
+      } catch { /* half a message */ }
+    }
+  }
+}
+
+// A server may send a change before its greeting; Bokeh then refuses the socket with a code that browsers do not take.
+function refuse(event) {
+  if (!event.data.includes('"ACK"')) event.target.close()
+}
+
 // The path of the setting that a component, or what holds its data, stands for; or nothing.
 function settingOf(model) {
   const of = model?.data ? model : [...model?.document?.all_models ?? []].find((it) => it.data === model)
@@ -60,7 +92,7 @@ function areSettingsDrawn() {
 
 class Link {
   constructor(doc) {
-    Object.assign(this, {doc, state: "connected", asked: 0, unsent: [], kept: new Set(), away: false, socket: null, connection: null, refused: 0, wait: 0, ticks: 0})
+    Object.assign(this, {doc, state: "connected", asked: 0, unsent: [], kept: new Set(), away: false, reading: null, connection: null, refused: 0, wait: 0, ticks: 0})
     doc.replace_with_json = (json) => this.replace(json)
     doc.on_change((event) => this.changed(event))
     doc.on_event("connection_lost", (_, event) => this.lost(event.connection.deref()))
@@ -98,10 +130,11 @@ class Link {
     if (this.connection || !this.ready) return
     if (this.asked === this.model.last_arrival) this.ticks = 0
     this.asked += 1
-    const socket = socketOf(() => this.model.send_msg({ask: this.asked}))
-    // Whatever comes is a sign of life: a socket closed in the middle of a message leaves Bokeh waiting for the rest of it.
-    if (socket !== this.socket) socket?.addEventListener("message", () => { this.ticks = 0 })
-    this.socket = socket
+    this.watch(socketOf(() => this.model.send_msg({ask: this.asked})))
+  }
+
+  watch(socket) {
+    if (socket && socket !== this.reading?.socket) this.reading = new Reading(socket, () => { this.ticks = 0 }) // whatever comes is a sign of life
   }
 
   // The connection stands, as far as one knows.
@@ -124,8 +157,8 @@ class Link {
 
   // Where the server is there but this way to it is not.
   async another() {
-    const {asked, socket} = this
-    if (await reachable() && this.model.last_arrival < asked && socket === this.socket) socket?.close()
+    const {asked, reading} = this
+    if (await reachable() && this.model.last_arrival < asked && reading === this.reading) reading?.socket.close()
   }
 
   // ---------------------------------------------------------------- lost, and found again
@@ -169,8 +202,12 @@ class Link {
     clearTimeout(this.retrying)
     if (this.trying) return
     this.trying = true
+    this.reading?.finish()
     try {
-      await this.connection.connect()
+      const connected = this.connection.connect(), {socket} = this.connection
+      socket?.addEventListener("message", refuse, {once: true})
+      this.watch(socket)
+      await connected
     } catch {
       if (this.state === "gone") return
       this.refused = await reachable() ? this.refused + 1 : 0
