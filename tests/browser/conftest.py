@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, JSHandle, Page, expect, sync_playwright
 
 from wfsobs.app.style import observers_of
 from wfsobs.priors_from.selection import usual_observers
@@ -267,9 +267,14 @@ CHANGED = f"""() => [...new URLSearchParams(location.search).keys()]
 """Whether the link has settings beside those of `QUICK`."""
 
 
+def until(page: Page, holds: str, arg: object = None) -> JSHandle:
+    """Wait until a function holds on the page: asked with every picture, as is usual, it takes time from what it waits for."""
+    return page.wait_for_function(holds, arg=arg, polling=50)
+
+
 def answered(page: Page) -> None:
     """Wait until the server has done what the page has told it so far."""
-    page.wait_for_function(ANSWERED, polling=50)
+    until(page, ANSWERED)
 
 
 def eventually(page: Page, holds: Callable[[], object], seconds: float = PATIENCE / 1000) -> None:
@@ -282,6 +287,6 @@ def eventually(page: Page, holds: Callable[[], object], seconds: float = PATIENC
 
 def finished(page: Page) -> None:
     """Wait until the settings are there, the run is over and its results are drawn."""
-    page.wait_for_function(SETTINGS, polling=100)
-    page.wait_for_function(DONE, polling=100)
-    page.wait_for_function(DRAWN, polling=100)
+    until(page, SETTINGS)
+    until(page, DONE)
+    until(page, DRAWN)

@@ -7,6 +7,8 @@ from typing import Any
 
 from playwright.sync_api import expect
 
+from tests.browser.conftest import until
+
 QUICK = "?run.duration=2&gpr_online.training_size=40&gpr_online.depth=20"
 
 
@@ -25,4 +27,4 @@ def test_controllers_side_by_side(open_page: Any, server: Any) -> None:
     card.click()
     expect(card).to_have_attribute("aria-pressed", "false")
     page.set_viewport_size({"width": 390, "height": 844})
-    page.wait_for_function("() => document.documentElement.scrollWidth <= 390")
+    until(page, "() => document.documentElement.scrollWidth <= 390")

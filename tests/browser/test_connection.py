@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.browser.conftest import PATIENCE, QUICK, answered, finished, leave, with_seeds
+from tests.browser.conftest import PATIENCE, QUICK, answered, finished, leave, until, with_seeds
 
 
 def hang_up(end: socket.socket) -> None:
@@ -184,7 +184,7 @@ def banner(page: Page, text: str) -> Any:
 
 def connected_again(page: Page) -> None:
     """Wait until the page has said so."""
-    page.wait_for_function("() => window.alerts.some((it) => it.includes('Connected again'))")
+    until(page, "() => window.alerts.some((it) => it.includes('Connected again'))")
 
 
 def test_offline_for_a_while(page: Page) -> None:
@@ -193,7 +193,7 @@ def test_offline_for_a_while(page: Page) -> None:
     speed(page, "22")
     page.context.set_offline(False)
     connected_again(page)
-    page.wait_for_function("() => location.search.includes('turbulence.wind_speed=22')")
+    until(page, "() => location.search.includes('turbulence.wind_speed=22')")
     expect(page.get_by_role("alert").filter(has_text="Connected again")).to_be_hidden()
     done(page)
 
@@ -210,8 +210,8 @@ def test_a_cut_line_comes_back_to_the_same_session(page: Page, cable: Cable) -> 
     peaks = page.locator('[data-cell$=".frequency"]').count()
     cable.mend()
     connected_again(page)
-    page.wait_for_function("() => location.search.includes('turbulence.wind_speed=24')")
-    page.wait_for_function("() => location.search.includes('vibration.peaks=6.5,')")
+    until(page, "() => location.search.includes('turbulence.wind_speed=24')")
+    until(page, "() => location.search.includes('vibration.peaks=6.5,')")
     expect(page.locator('[data-cell$=".frequency"]')).to_have_count(peaks + 1)
     expect(page.get_by_role("status").filter(has_text="Compared with")).to_contain_text(
         "Wind speed V₀ 22 → 24 m/s"
@@ -223,7 +223,7 @@ def test_a_line_cut_in_the_middle_of_a_message(page: Page, cable: Cable) -> None
     cable.cut_within()
     speed(page, "25")
     connected_again(page)
-    page.wait_for_function("() => location.search.includes('turbulence.wind_speed=25')")
+    until(page, "() => location.search.includes('turbulence.wind_speed=25')")
     assert not cable.within.is_set()
     done(page)
 
@@ -233,7 +233,7 @@ def test_what_is_changed_while_the_line_comes_back_counts_once(page: Page, cable
     cable.cut()
     expect(banner(page, "connection to the server is lost")).to_be_visible()
     cable.mend(quick=False)
-    page.wait_for_function(CONNECTING)
+    until(page, CONNECTING)
     peak(page).fill("7")
     peak(page).press("Enter")
     page.get_by_role("button", name="+ Add peak").click()
@@ -241,7 +241,7 @@ def test_what_is_changed_while_the_line_comes_back_counts_once(page: Page, cable
     damping.fill("0.02")  # and on with the typing
     cable.quick.set()
     connected_again(page)
-    page.wait_for_function("() => location.search.includes('vibration.peaks=7,0.02,')")
+    until(page, "() => location.search.includes('vibration.peaks=7,0.02,')")
     expect(page.locator('[data-cell$=".frequency"]')).to_have_count(peaks + 1)
     expect(damping).to_have_value("0.02")
     done(page)
@@ -249,7 +249,7 @@ def test_what_is_changed_while_the_line_comes_back_counts_once(page: Page, cable
 
 def test_a_server_that_was_started_again(page: Page, host: Host) -> None:
     speed(page, "26")
-    page.wait_for_function("() => location.search.includes('turbulence.wind_speed=26')")
+    until(page, "() => location.search.includes('turbulence.wind_speed=26')")
     host.kill()
     expect(banner(page, "connection to the server is lost")).to_be_visible()
     speed(page, "200")
@@ -262,6 +262,6 @@ def test_a_server_that_was_started_again(page: Page, host: Host) -> None:
     expect(peak(page)).to_have_value("7.5")
     expect(banner(page, "Wind speed V₀ = 200: takes a number from 0.1 to 100 m/s").first).to_be_visible()
     expect(page.get_by_role("textbox", name="m/s")).to_have_value("200")
-    page.wait_for_function("() => location.search.includes('turbulence.wind_speed=26')")
-    page.wait_for_function("() => location.search.includes('vibration.peaks=7.5,')")
+    until(page, "() => location.search.includes('turbulence.wind_speed=26')")
+    until(page, "() => location.search.includes('vibration.peaks=7.5,')")
     done(page)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.browser.conftest import answered, carded, eventually
+from tests.browser.conftest import answered, carded, eventually, until
 from wfsobs.app.style import look
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario.presets import PRESETS
@@ -37,7 +37,7 @@ def rms(page: Page, observer: str = "kf-lgs", target: str = "turbulence") -> str
 
 def still(page: Page) -> None:
     """Wait until nothing moves or changes its colour any more."""
-    page.wait_for_function("() => document.getAnimations().every(a => a.playState !== 'running')")
+    until(page, "() => document.getAnimations().every(a => a.playState !== 'running')")
 
 
 def wind(page: Page) -> Any:
@@ -84,7 +84,7 @@ def phone(open_shared: Any) -> Page:
 def test_the_drawer_of_a_phone_is_closed_from_the_first_frame_on(request: pytest.FixtureRequest, name: str, seen: bool) -> None:
     page = request.getfixturevalue(name)
     if seen:
-        page.wait_for_function("() => window.drawerSeen > 0")
+        until(page, "() => window.drawerSeen > 0")
     assert bool(page.evaluate("() => { window.drawerTold = true; return window.drawerSeen }")) == seen
 
 
@@ -105,7 +105,7 @@ def test_phone(phone: Page, tmp_path: Path) -> None:
     page = phone
     expect(page.get_by_role("button", name="Open drawer")).to_be_visible()
     still(page)
-    page.wait_for_function("() => document.documentElement.scrollWidth <= 390")
+    until(page, "() => document.documentElement.scrollWidth <= 390")
     shot(page, tmp_path, "phone")
     page.get_by_role("button", name="Open drawer").click()
     expect(wind(page)).to_be_visible()
@@ -130,7 +130,7 @@ def test_first_paint(wide: Page, tmp_path: Path) -> None:
     lines = page.locator(".card[aria-pressed=true]").count()
     assert 2 * len(TARGETS) < lines < 20, "the truth and the few observers that matter"
     drawn = f"n => {{ const all = ({POINTS})(); return all.length === n && Math.min(...all) > 300 }}"
-    page.wait_for_function(drawn, arg=2 * lines)  # every line that the cards show has points, in both figures
+    until(page, drawn, arg=2 * lines)  # every line that the cards show has points, in both figures
     shot(page, tmp_path, "light")
 
 
@@ -155,15 +155,15 @@ def test_a_double_click_shows_a_line_alone(wide: Page) -> None:
     )
     assert "gpr-online" in pressed and not {"multirate", "butterworth-ol"} & set(pressed), "the few that matter at first"
     few = [name for name in pressed if name != "truth"]  # which has no error
-    page.wait_for_function(f"few => few.every((name) => ({VISIBLE})().includes(name))", arg=few)
+    until(page, f"few => few.every((name) => ({VISIBLE})().includes(name))", arg=few)
     few = page.evaluate(VISIBLE)
     assert set(few) <= set(pressed) and "gpr-offline" not in few
     for card in page.locator(".card[data-name=kf-lgs]").all():
         card.dblclick()
-    page.wait_for_function(f"() => ({VISIBLE})().join() === 'kf-lgs'")
+    until(page, f"() => ({VISIBLE})().join() === 'kf-lgs'")
     expect(vibration_card(page, "Online GPR")).to_have_attribute("aria-pressed", "false")
     page.keyboard.press("s")  # the card has the focus
-    page.wait_for_function(f"() => ({VISIBLE})().includes('gpr-online')")
+    until(page, f"() => ({VISIBLE})().includes('gpr-online')")
     assert "gpr-offline" not in page.evaluate(VISIBLE)  # those before, not all
     card = vibration_card(page, "LGS KF")
     for pressed in ("false", "true"):  # alone, and those before again
@@ -172,7 +172,7 @@ def test_a_double_click_shows_a_line_alone(wide: Page) -> None:
     for i in range(2):
         page.get_by_role("button", name=re.compile("^All .* observers$")).nth(i).click()
         page.get_by_role("button", name="Main observers").click()
-    page.wait_for_function(f"few => ({VISIBLE})().join() === few.join()", arg=few)
+    until(page, f"few => ({VISIBLE})().join() === few.join()", arg=few)
 
 
 def test_a_bad_value_shows_inline_and_leaves_the_result(wide: Page) -> None:
@@ -206,14 +206,14 @@ def test_signal_and_error(wide: Page) -> None:
     page = wide
     label = """() => [...Bokeh.index.roots[0].model.document.all_models]
         .filter(m => m.type === "LinearAxis").map(m => m.axis_label).join()"""
-    page.wait_for_function(f"({label})().includes('error of tip [nm]')")
+    until(page, f"({label})().includes('error of tip [nm]')")
     page.get_by_role("button", name="Signal", exact=True).click()
-    page.wait_for_function(f"!({label})().includes('error')")
+    until(page, f"!({label})().includes('error')")
     page.get_by_role("button", name="Error", exact=True).click()
-    page.wait_for_function(f"({label})().includes('error of tip [nm]')")
+    until(page, f"({label})().includes('error of tip [nm]')")
     page.get_by_role("button", name="mas", exact=True).click()
     page.get_by_role("button", name="Tilt", exact=True).click()
-    page.wait_for_function(f"({label})().includes('error of tilt [mas]')")
+    until(page, f"({label})().includes('error of tilt [mas]')")
     expect(page.get_by_role("columnheader", name="RMS error [mas]")).to_be_visible()
 
 
@@ -222,9 +222,9 @@ def test_a_zoom_fetches_more_samples(wide: Page) -> None:
     step = """() => [...Bokeh.index.roots[0].model.document.all_models]
         .filter(m => m.type === "ColumnDataSource" && m.data["kf-ngs"]).map(m => m.data.x[1] - m.data.x[0])[0]"""
     page.get_by_role("button", name="Time window: all").click()
-    page.wait_for_function(f"({step})() > 5e-3")
+    until(page, f"({step})() > 5e-3")
     page.get_by_role("button", name="Time window: 0.2 s").click()
-    page.wait_for_function(f"Math.abs(({step})() - 1e-3) < 1e-9")
+    until(page, f"Math.abs(({step})() - 1e-3) < 1e-9")
 
 
 def test_cards_hide_lines(wide: Page) -> None:
@@ -235,7 +235,7 @@ def test_cards_hide_lines(wide: Page) -> None:
     expect(card).to_have_attribute("aria-pressed", "false")
     visible = """() => [...Bokeh.index.roots[0].model.document.all_models]
         .filter(m => m.type === "GlyphRenderer" && m.name === "gpr-online").map(m => m.visible)"""
-    page.wait_for_function(f"({visible})().every(v => !v)")
+    until(page, f"({visible})().every(v => !v)")
     card.click()
     expect(card).to_have_attribute("aria-pressed", "true")
 
@@ -245,9 +245,9 @@ def test_figures_take_the_height_of_the_window(wide: Page) -> None:
     figure = page.get_by_role("figure", name="Turbulence time trace")
     height = "box => box.getBoundingClientRect().height"
     # What is left of the window below what stands above it, of which a line of text is the caption's.
-    page.wait_for_function(f"([it]) => Math.abs(({height})(it) - 620) < 30", arg=[figure.element_handle()])
+    until(page, f"([it]) => Math.abs(({height})(it) - 620) < 30", arg=[figure.element_handle()])
     page.set_viewport_size({"width": 1400, "height": 700})
-    page.wait_for_function(f"([it]) => Math.abs(({height})(it) - 350) < 30", arg=[figure.element_handle()])
+    until(page, f"([it]) => Math.abs(({height})(it) - 350) < 30", arg=[figure.element_handle()])
     page.set_viewport_size({"width": 1400, "height": 1000})
 
 
@@ -258,12 +258,12 @@ def test_dark(wide: Page, tmp_path: Path) -> None:
     button.click()
     colour = """() => [...Bokeh.index.roots[0].model.document.all_models]
         .filter(m => m.type === "GlyphRenderer" && m.name === "gpr-online").map(m => m.glyph.line_color.value)"""
-    page.wait_for_function(f"({colour})().every(c => c === '{look('gpr-online').colour(True)}')")
-    page.wait_for_function("before => getComputedStyle(document.body).backgroundColor !== before", arg=ground)
+    until(page, f"({colour})().every(c => c === '{look('gpr-online').colour(True)}')")
+    until(page, "before => getComputedStyle(document.body).backgroundColor !== before", arg=ground)
     still(page)
     shot(page, tmp_path, "dark")
     button.click()  # the browser keeps what is chosen, and other pages are light
-    page.wait_for_function("before => getComputedStyle(document.body).backgroundColor === before", arg=ground)
+    until(page, "before => getComputedStyle(document.body).backgroundColor === before", arg=ground)
 
 
 def test_the_wind_speed_slider_runs_again(wide: Page) -> None:
@@ -337,13 +337,13 @@ def test_a_long_run_grows_and_stops_at_once(wide: Page) -> None:
     page.get_by_role("button", name="Time window: all").click()
     page.get_by_role("button", name="Run", exact=True).last.click()  # the topic
     duration = page.get_by_role("textbox", name="Duration [s]", exact=True)
-    duration.fill("60")
+    duration.fill("30")
     duration.press("Enter")
     expect(page.get_by_text(re.compile("changed: .*Duration"))).to_be_visible()
     page.get_by_role("button", name="Run", exact=True).first.click()
-    page.wait_for_function(f"() => {{ const part = ({ONLINE})(); return part > 0.02 && part < 0.9 }}")
+    until(page, f"() => {{ const part = ({ONLINE})(); return part > 0.02 && part < 0.9 }}")
     part = page.evaluate(ONLINE)
-    page.wait_for_function(f"part => ({ONLINE})() > part", arg=part)
+    until(page, f"part => ({ONLINE})() > part", arg=part)
     page.get_by_role("button", name="Cancel", exact=True).click()
     page.locator("[role=status]", has_text="Cancelled").first.wait_for(state="attached")
     assert page.evaluate(ONLINE) < 0.95, "what had come stays, the rest does not come"

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from tests.browser.conftest import PATIENCE, QUICK
+from tests.browser.conftest import PATIENCE, QUICK, until
 from wfsobs.observers import OBSERVERS
 
 
@@ -67,9 +67,10 @@ def test_a_setting_is_found_and_gets_the_focus(wide: Page) -> None:
     box.focus()
     page.keyboard.type("outer scale")
     page.keyboard.press("Enter")
-    page.wait_for_function(
+    until(
+        page,
         "() => [...Bokeh.index.query((it) => it.model.tags?.some((tag) => tag.includes('outer_scale')))]"
-        ".some((it) => it.el.matches(':focus'))"
+        ".some((it) => it.el.matches(':focus'))",
     )
     box.focus()
     page.keyboard.type("no such thing")
@@ -152,7 +153,7 @@ def test_run_and_status_stay_in_sight(wide: Page) -> None:
 
 
 def no_wider_than(page: Page, width: int) -> None:
-    page.wait_for_function("width => document.documentElement.scrollWidth <= width", arg=width)
+    until(page, "width => document.documentElement.scrollWidth <= width", arg=width)
 
 
 def test_other_pages_by_keyboard_on_a_phone(phone: Page) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Locator, Page, expect
 
-from tests.browser.conftest import CHANGED, answered, finished
+from tests.browser.conftest import CHANGED, answered, finished, until
 from wfsobs.app.style import asset
 
 STANDS = "47.44 Hz, 7.90 nm rms, damping 0.004"
@@ -77,7 +77,7 @@ def test_by_mouse(page: Page) -> None:
     curve = """() => [...Bokeh.index.roots[0].model.document.all_models]
         .filter(m => m.type === "GlyphRenderer" && m.name === "predicted" && m.data_source.data.ys?.length > 3)
         .map(m => m.data_source.data.ys.map(y => y[60]).join()).join()"""
-    page.wait_for_function(curve)
+    until(page, curve)
     before = page.evaluate(curve)
     value = page.locator(".card[data-name=kf-multi] .value").last
     run = value.inner_text()
@@ -87,7 +87,7 @@ def test_by_mouse(page: Page) -> None:
     page.mouse.move(x + 40, y - 30, steps=6)
     expect(predicted(page, "kf-multi")).not_to_have_text("10.9")
     expect(peak).not_to_have_attribute("aria-valuetext", STANDS)
-    page.wait_for_function(f"before => ({curve})() !== before", arg=before)
+    until(page, f"before => ({curve})() !== before", arg=before)
     expect(page.get_by_role("button", name="Undo")).to_be_disabled()  # nothing has been set yet
     page.mouse.up()
     expect(page.get_by_role("button", name="Undo")).to_be_enabled()
@@ -182,7 +182,7 @@ def test_the_keyboard_stays_on_a_handle_when_results_come(page: Page, name: str)
         page.keyboard.press("Shift+ArrowLeft")
         expect(it).not_to_have_attribute("aria-valuenow", before)
         page.keyboard.press("Enter")
-        page.wait_for_function("address => location.search !== address", arg=address)
+        until(page, "address => location.search !== address", arg=address)
         finished(page)
         answered(page)  # and all that it has sent meanwhile is there
         expect(it).to_be_focused()

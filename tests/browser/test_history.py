@@ -8,7 +8,7 @@ from typing import Any
 
 from playwright.sync_api import Locator, Page, expect
 
-from tests.browser.conftest import QUICK, eventually
+from tests.browser.conftest import QUICK, eventually, until
 from tests.browser.test_pages import PINNED
 
 OWN = QUICK + "&run.seed=7"
@@ -92,7 +92,7 @@ def test_a_session_from_runs_to_a_file_and_back(open_page: Any, server: Any, tmp
     expect(of_a).to_have_text(re.compile(r"[+−][\d.]+ % \d"))
     legend = page.get_by_role("status").filter(has_text="Compared with")
     expect(legend).to_contain_text("windy since then: Wind speed V₀ 22 → 30 m/s")
-    page.wait_for_function(f"({PINNED})().every(n => n > 0)")
+    until(page, f"({PINNED})().every(n => n > 0)")
 
     row(page, first).get_by_role("button", name="Restore").click()
     current(page, first)

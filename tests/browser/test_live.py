@@ -9,14 +9,14 @@ from typing import Any
 import pytest
 from playwright.sync_api import Locator, Page, expect
 
-from tests.browser.conftest import DONE, QUICK, SETTINGS, eventually, finished
+from tests.browser.conftest import DONE, QUICK, SETTINGS, eventually, finished, until
 
 LIVE = QUICK + "&view.page=live&view.live.observers=kf-multi,multirate-multi,gpr-online&view.live.controllers=integrator"
 """Few beside the page: those whose lines are shown first."""
 
 
 def begin(page: Page) -> None:
-    page.wait_for_function(SETTINGS, polling=100)
+    until(page, SETTINGS)
     page.get_by_role("button", name="Start", exact=True).click()
     expect(page.get_by_role("figure", name="Waterfall")).to_be_visible()
 
@@ -80,9 +80,9 @@ def test_a_page_that_sleeps_and_wakes_shows_now(running: Page) -> None:
     """What came while it slept is not made up for, picture by picture: one may have been on its way, the next is of now."""
     page = running
     page.evaluate(WATCH)
-    page.wait_for_function("window.shown.length > 2")
+    until(page, "window.shown.length > 2")
     asleep = page.evaluate(SLEEP)
-    page.wait_for_function(f"window.read() > {asleep} + 5")
+    until(page, f"window.read() > {asleep} + 5")
     page.evaluate("() => clearInterval(window.watch)")
     late = [t for t in page.evaluate("window.shown") if asleep + 0.5 < t < asleep + 4.5]
     # On a busy machine the observers may be behind, too. There were some 25 pictures of these four seconds.
@@ -118,10 +118,10 @@ def test_a_figure_out_of_sight_is_changed_once_a_second_and_scrolled_to_with_eve
     top, star = page.get_by_role("button", name="Start", exact=True), page.get_by_role("figure", name="Star: Integrator")
     expect(star).to_be_attached()
     top.scroll_into_view_if_needed()
-    page.wait_for_function(NOTE, arg="Star: Integrator")
-    page.wait_for_function(SELDOM)
+    until(page, NOTE, arg="Star: Integrator")
+    until(page, SELDOM)
     star.scroll_into_view_if_needed()
-    page.wait_for_function(OFTEN)
+    until(page, OFTEN)
     top.scroll_into_view_if_needed()
 
 
@@ -143,7 +143,7 @@ def test_traces_of_all_observers_follow_the_loop(running: Page) -> None:
     for _ in range(4):
         all_there = "it.lines.length === 3 && it.lines.every((line) => line.first < line.last)"
         moved = f"end => {{ const it = ({TRACE})(); return it?.end > end && {all_there} && it }}"
-        seen = page.wait_for_function(moved, arg=end).json_value()
+        seen = until(page, moved, arg=end).json_value()
         end = seen["end"]
         assert all(line["same"] for line in seen["lines"])
         for line in seen["lines"]:
@@ -157,7 +157,7 @@ def test_errors_of_both_targets_together(running: Page) -> None:
     page = running
     page.get_by_role("combobox", name="Errors of").click()
     page.get_by_role("option", name="Turbulence and vibration together", exact=True).click()
-    page.wait_for_function("location.search.includes('view.live.errors=total')")
+    until(page, "location.search.includes('view.live.errors=total')")
     table = page.get_by_role("region", name="Live")
 
     def of(name: str) -> Locator:
@@ -179,7 +179,7 @@ def test_errors_of_both_targets_together(running: Page) -> None:
     expect(of("Online GPR")).to_have_text("–")
     page.get_by_role("combobox", name="Errors of").click()
     page.get_by_role("option", name="Turbulence", exact=True).click()
-    page.wait_for_function("!location.search.includes('view.live.errors')")
+    until(page, "!location.search.includes('view.live.errors')")
 
 
 def test_a_peak_that_is_moved_in_the_live_spectrum(running: Page) -> None:
@@ -219,7 +219,7 @@ def test_one_observer_is_identified_anew_while_the_loop_runs(running: Page) -> N
     expect(events).to_contain_text("Multi-rate multi-peak has a new design")
     told = re.search(r"([0-9.]+) s: Multi-rate multi-peak has a new design", events.inner_text())  # to 0.01 s
     assert told is not None
-    page.wait_for_function(f"({MARKS})().some((x) => Math.abs(x - {told[1]}) < 0.006)")
+    until(page, f"({MARKS})().some((x) => Math.abs(x - {told[1]}) < 0.006)")
     assert re.findall(r"s: (.+) has a new design", events.inner_text()) == ["Multi-rate multi-peak"]
     page.get_by_role("button", name="Redesign now", exact=True).click()
     expect(events).to_have_text(re.compile("(Multi-rate multi-peak has a new design.*){2}", re.S))

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Locator, Page, expect
 
-from tests.browser.conftest import QUICK
+from tests.browser.conftest import QUICK, until
 
 
 def place(it: Locator) -> tuple[float, float]:
@@ -20,15 +20,16 @@ def place(it: Locator) -> tuple[float, float]:
 def becomes(page: Page, expected: bool) -> None:
     """Wait for the theme."""
     sign = "<" if expected else ">="
-    page.wait_for_function(
-        f"() => getComputedStyle(document.body).backgroundColor.match(/\\d+/g).slice(0, 3).reduce((a, b) => +a + +b) {sign} 300"
+    until(
+        page,
+        f"() => getComputedStyle(document.body).backgroundColor.match(/\\d+/g).slice(0, 3).reduce((a, b) => +a + +b) {sign} 300",
     )
 
 
 def remembered(page: Page, theme: str) -> None:
     """Wait until the theme that was chosen is in the address and in what the browser keeps."""
-    page.wait_for_function("theme => location.search.includes(`theme=${theme}`)", arg=theme)
-    page.wait_for_function("theme => localStorage.getItem('wfsobs-theme') === theme", arg=theme)
+    until(page, "theme => location.search.includes(`theme=${theme}`)", arg=theme)
+    until(page, "theme => localStorage.getItem('wfsobs-theme') === theme", arg=theme)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +75,7 @@ def test_nothing_moves_under_the_pointer(wide: Page) -> None:
     page = wide
     load, source = page.get_by_role("button", name="File", exact=True), page.get_by_role("combobox", name="Find a setting")
     run, box = page.get_by_role("button", name="Run", exact=True).first, page.get_by_role("textbox", name="m/s")
-    page.wait_for_function("() => document.fonts.status === 'loaded'")
+    until(page, "() => document.fonts.status === 'loaded'")
     before = [place(it) for it in (load, run, box, source)]
     page.evaluate("() => { navigator.clipboard.writeText = () => Promise.resolve() }")
     page.get_by_role("button", name="Share", exact=True).click()

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Locator, Page, expect
 
-from tests.browser.conftest import carded
+from tests.browser.conftest import carded, until
 from wfsobs.app.display import AT_LIMIT
 from wfsobs.observers.base import TARGETS
 
@@ -52,7 +52,7 @@ def test_the_table_is_grouped_by_prior_knowledge(wide: Page) -> None:
     table = page.get_by_role("region", name="RMS errors")
     assert table.evaluate("it => it.scrollWidth <= it.clientWidth"), "all columns at 1400 pixels, the drawer open"
     expect(table.get_by_role("rowheader", name="Prior knowledge: none")).to_have_count(3)
-    page.wait_for_function(f"() => ({ERRORS})().every((errors) => errors.every((error, i) => i === 0 || errors[i - 1] <= error))")
+    until(page, f"() => ({ERRORS})().every((errors) => errors.every((error, i) => i === 0 || errors[i - 1] <= error))")
 
 
 def sentences(page: Page, target: str) -> Locator:
@@ -104,7 +104,7 @@ def test_the_figures_of_the_paper(wide: Page, tmp_path: Path) -> None:
         const made = ({LINES})().filter(([name, length]) => !before.includes(name))
         return made.length === n && made.every(([name, length]) => length > 100)
     }}"""
-    page.wait_for_function(drawn, arg=[before, LINES_OF_FIGURES])
+    until(page, drawn, arg=[before, LINES_OF_FIGURES])
     expect(page.get_by_role("heading", name="RMS errors")).to_be_hidden()
     page.screenshot(path=tmp_path / "figures.png")
     turn(page, "Explore")
@@ -121,7 +121,7 @@ def test_values_at_the_pointer_and_by_the_arrow_keys(wide: Page) -> None:
     page = wide
     box = page.locator(".values")
     figure = page.get_by_role("figure", name="Turbulence time trace")
-    page.wait_for_function(PAINTED, arg="Turbulence time trace")
+    until(page, PAINTED, arg="Turbulence time trace")
     at = figure.bounding_box()
     page.mouse.move(at["x"] + at["width"] / 2, at["y"] + at["height"] / 2)
     expect(box).to_have_text(re.compile(r"time\s*[\d.]+ s.*LGS KF\s*[−\d.]+ nm", re.S))
@@ -149,7 +149,7 @@ def test_a_brush_over_time_and_over_a_band(wide: Page) -> None:
     line = page.locator("p.stretch").filter(has_text="Online GPR")
     figure = page.get_by_role("figure", name="Vibration spectrum")
     figure.scroll_into_view_if_needed()
-    page.wait_for_function(PAINTED, arg="Vibration spectrum")
+    until(page, PAINTED, arg="Vibration spectrum")
     at = figure.bounding_box()
     y = at["y"] + at["height"] / 2
     page.mouse.move(at["x"] + 0.5 * at["width"], y)
@@ -163,7 +163,7 @@ def test_a_brush_over_time_and_over_a_band(wide: Page) -> None:
         .filter(m => m.type === "GlyphRenderer" && m.name === "gpr-online" && m.data_source.data.y)[0].data_source.data.y[0]"""
     before = page.evaluate(points)
     page.get_by_role("checkbox", name="Spectra of the window").check()
-    page.wait_for_function(f"before => ({points})() !== before", arg=before)
+    until(page, f"before => ({points})() !== before", arg=before)
     figure.scroll_into_view_if_needed()
     at = figure.bounding_box()
     page.mouse.dblclick(at["x"] + 0.6 * at["width"], at["y"] + at["height"] / 2)
@@ -175,12 +175,12 @@ def test_cumulative_rms(wide: Page) -> None:
     page = wide
     assert "cumulative" not in page.evaluate(LABELS)
     turn(page, "Cumulative rms")
-    page.wait_for_function(f"({LABELS})().includes('cumulative rms of error, tip [nm]')")
+    until(page, f"({LABELS})().includes('cumulative rms of error, tip [nm]')")
     turn(page, "Signal")
-    page.wait_for_function(f"({LABELS})().includes('cumulative rms, tip [nm]')")
+    until(page, f"({LABELS})().includes('cumulative rms, tip [nm]')")
     turn(page, "PSD")
     turn(page, "Error")
-    page.wait_for_function(f"({LABELS})().includes('PSD of error, tip')")
+    until(page, f"({LABELS})().includes('PSD of error, tip')")
 
 
 def test_pin_and_compare(wide: Page) -> None:
@@ -194,7 +194,7 @@ def test_pin_and_compare(wide: Page) -> None:
         page.get_by_role("button", name="Show all lines").nth(i).click()
     # a trace of errors has no line of the truth, their spectra have
     expected = ",".join(map(str, sorted([*IN_EACH, *(n - 1 for n in IN_EACH)])))
-    page.wait_for_function(f"({PINNED})().sort((a, b) => a - b).join() === '{expected}'")
+    until(page, f"({PINNED})().sort((a, b) => a - b).join() === '{expected}'")
     box = page.get_by_role("textbox", name="m/s")
     box.fill("30")
     box.press("Enter")
@@ -210,7 +210,7 @@ def test_pin_and_compare(wide: Page) -> None:
     expect(card).to_have_text(f"{before} {change} %")
     page.get_by_role("button", name="Unpin: compare with no other run").click()
     expect(page.get_by_role("columnheader", name="A [nm]", exact=True)).to_have_count(0)
-    page.wait_for_function(f"({PINNED})().every(n => n === 0)")
+    until(page, f"({PINNED})().every(n => n === 0)")
     page.get_by_role("button", name="Undo", exact=True).click()
     expect(box).to_have_value("15")
 

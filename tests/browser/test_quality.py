@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.browser.conftest import CHANGED, QUICK, answered, carded
+from tests.browser.conftest import CHANGED, QUICK, answered, carded, until
 
 ALLOWED: Mapping[str, tuple[str, int, str]] = MappingProxyType(
     {
@@ -77,8 +77,8 @@ def theme(page: Page) -> None:
     """Switch the theme and wait for the new colours."""
     before = page.evaluate("() => getComputedStyle(document.body).backgroundColor")
     page.get_by_role("button", name=re.compile("theme", re.I)).click()
-    page.wait_for_function("before => getComputedStyle(document.body).backgroundColor !== before", arg=before)
-    page.wait_for_function("() => document.getAnimations().every(a => a.playState !== 'running')")
+    until(page, "before => getComputedStyle(document.body).backgroundColor !== before", arg=before)
+    until(page, "() => document.getAnimations().every(a => a.playState !== 'running')")
 
 
 def violations(page: Page) -> tuple[list[str], Counter[str]]:
@@ -95,7 +95,7 @@ def violations(page: Page) -> tuple[list[str], Counter[str]]:
 
 def fits(page: Page, width: int) -> None:
     """Wait until nothing is wider than the window."""
-    page.wait_for_function(FITS, arg=width)
+    until(page, FITS, arg=width)
 
 
 def focused(page: Page, key: str = "Tab") -> dict[str, Any]:
@@ -108,7 +108,7 @@ def history_is_accessible(page: Page, width: int) -> None:
     sheet, before = page.get_by_role("dialog", name="History"), page.evaluate(f"() => {MODELS}.length")
     expect(sheet).to_have_count(0)
     page.get_by_role("button", name="History").click()
-    page.wait_for_function(f"before => {MODELS}.length > before", arg=before)  # the sheet is made when it is opened
+    until(page, f"before => {MODELS}.length > before", arg=before)  # the sheet is made when it is opened
     sheet.get_by_role("listitem").get_by_role("checkbox").check()
     expect(page.get_by_text("Compared as A")).to_be_visible()
     accessible(page)
@@ -148,10 +148,10 @@ def test_accessibility_and_no_box_over_another(open_page: Any, server: Any, widt
     page.set_viewport_size({"width": width, "height": 600})  # boxes that are higher than the window
     page.get_by_role("button", name="Closed loop", exact=True).click()
     for upper, lower in (("Residual, zoomed", "Controllers"), ("Rejection and noise transfer", "Controllers")):
-        page.wait_for_function(BELOW, arg=[upper, lower])
+        until(page, BELOW, arg=[upper, lower])
     page.get_by_role("button", name="Explore", exact=True).click()
     for upper, lower in (("Turbulence spectrum", "Vibration, tip"), ("Vibration spectrum", "RMS errors")):
-        page.wait_for_function(BELOW, arg=[upper, lower])
+        until(page, BELOW, arg=[upper, lower])
 
 
 def accessible(page: Page) -> None:
@@ -236,7 +236,7 @@ def press(page: Page, key: str) -> dict[str, Any]:
     return page.evaluate(ACTIVE)
 
 
-def until(page: Page, name: str, key: str = "Tab", most: int = 60) -> int:
+def step_to(page: Page, name: str, key: str = "Tab", most: int = 60) -> int:
     """Go on with a key until the focus is on something of that name; how many stops that took."""
     for count in range(1, most + 1):
         if name in press(page, key)["name"]:
@@ -247,19 +247,19 @@ def until(page: Page, name: str, key: str = "Tab", most: int = 60) -> int:
 def chosen(page: Page) -> Any:
     """The item that has the focus, once the list is open."""
     found = f"() => {{ const it = ({ACTIVE})(); return it.selected === 'true' && it }}"
-    return page.wait_for_function(found).json_value()
+    return until(page, found).json_value()
 
 
 def goes_to(page: Page, key: str, name: str) -> None:
     """Press a key, and wait until the focus is on what is called so."""
     page.keyboard.press(key)
-    page.wait_for_function(f"name => ({ACTIVE})().name === name", arg=name)
+    until(page, f"name => ({ACTIVE})().name === name", arg=name)
 
 
 def test_a_list_opens_and_chooses_by_keyboard(page: Page) -> None:
     preset = page.get_by_role("combobox", name="Preset")
     expect(preset).to_have_text("Paper")
-    until(page, "Paper")
+    step_to(page, "Paper")
     for key in ("ArrowUp", "ArrowDown", "Space", "Enter"):
         press(page, key)
         assert chosen(page) == {"name": "Paper", "role": "option", "selected": "true"}
@@ -277,13 +277,13 @@ def test_a_list_opens_and_chooses_by_keyboard(page: Page) -> None:
 
 
 def test_the_lists_of_other_pages_open_by_keyboard(page: Page) -> None:
-    until(page, "Explore")
-    until(page, "Tune", "ArrowRight", 3)
+    step_to(page, "Explore")
+    step_to(page, "Tune", "ArrowRight", 3)
     press(page, "Enter")
     observer = page.get_by_role("combobox", name="Observer")
     expect(observer).to_be_visible()
-    until(page, "File")
-    until(page, "Vibration", most=30)
+    step_to(page, "File")
+    step_to(page, "Vibration", most=30)
     press(page, "Enter")
     source = page.get_by_role("combobox", name="Source").first  # where the vibration comes from
     source.focus()
@@ -305,9 +305,9 @@ def test_the_figures_are_not_far(page: Page) -> None:
     goes_to(page, "Tab", "Skip to figures")
     expect(page.get_by_role("button", name="Skip to figures")).to_be_in_viewport()
     press(page, "Enter")
-    assert until(page, "Truth", most=10), "a card of the first strip"
+    assert step_to(page, "Truth", most=10), "a card of the first strip"
     stops = len(carded("turbulence")) + 4  # a card each, three buttons below them, and the figure
-    assert until(page, "Turbulence time trace", most=stops), "a figure has a name"
+    assert step_to(page, "Turbulence time trace", most=stops), "a figure has a name"
     for name in ("Page", "Mode", "Unit", "Show", "Spectrum"):
         expect(page.get_by_role("group", name=name, exact=True)).to_be_visible()
     for name in ("Turbulence time trace", "Turbulence spectrum", "Vibration time trace", "Vibration spectrum"):
@@ -315,20 +315,20 @@ def test_the_figures_are_not_far(page: Page) -> None:
 
 
 def test_a_table_is_one_stop_and_keeps_the_focus(page: Page) -> None:
-    until(page, "Peak 1: f")
+    step_to(page, "Peak 1: f")
     goes_to(page, "ArrowDown", "Peak 2: f [Hz]")
-    assert until(page, "Remove peak 2", most=5)
+    assert step_to(page, "Remove peak 2", most=5)
     value = page.locator('[data-cell="2.frequency"]').input_value()
     press(page, "Enter")
     expect(page.locator('input[data-cell="1.frequency"]')).to_have_value(value)
-    page.wait_for_function(f"() => ({ACTIVE})().name === 'Remove peak 2'")  # the next one
-    assert until(page, "Add peak", most=1)
+    until(page, f"() => ({ACTIVE})().name === 'Remove peak 2'")  # the next one
+    assert step_to(page, "Add peak", most=1)
     press(page, "Enter")
-    page.wait_for_function(f"() => ({ACTIVE})().name === 'Peak 15: f [Hz]'")
+    until(page, f"() => ({ACTIVE})().name === 'Peak 15: f [Hz]'")
 
 
 def test_a_tip_comes_with_the_focus(page: Page) -> None:
-    until(page, "Wind speed")
+    step_to(page, "Wind speed")
     tip = page.get_by_role("tooltip").filter(has_text=re.compile("wind", re.I))
     expect(tip.first).to_be_visible()
     press(page, "Tab")

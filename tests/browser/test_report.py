@@ -21,7 +21,7 @@ from click.testing import CliRunner
 from playwright.sync_api import Browser, Locator, Page, expect
 
 import wfsobs
-from tests.browser.conftest import PATIENCE
+from tests.browser.conftest import PATIENCE, until
 from wfsobs.app.display import UNITS, per_micrometre
 from wfsobs.app.render import hundredths, number
 from wfsobs.app.report.page import STEP
@@ -101,7 +101,7 @@ def opening(browser: Browser, report: Path) -> Iterator[Callable[..., Page]]:
         page.goto(report.as_uri())
         if options.get("java_script_enabled", True):
             page.locator("#table tbody").first.wait_for()
-            page.wait_for_function("() => window.Bokeh?.documents?.[0]?.get_model_by_name('spectrum-vibration')")
+            until(page, "() => window.Bokeh?.documents?.[0]?.get_model_by_name('spectrum-vibration')")
         return page
 
     open_it.allowed = allowed  # type: ignore[attr-defined]
@@ -267,9 +267,7 @@ def test_a_box_hides_its_line(page: Page) -> None:
     box = box_of(page, "kf-lgs")
     canvas = page.locator("#trace-vibration")
     page.mouse.move(0, 0)
-    page.wait_for_function(
-        "() => [...Bokeh.index.query((it) => it.model.name === 'trace-vibration')].some((it) => it.has_finished())"
-    )
+    until(page, "() => [...Bokeh.index.query((it) => it.model.name === 'trace-vibration')].some((it) => it.has_finished())")
     before = canvas.screenshot()
     box.uncheck()
     page.mouse.move(0, 0)
@@ -300,7 +298,7 @@ def test_time_windows(page: Page) -> None:
     zoomed = (
         f"() => {{ const [a, b] = ({LINE})(['trace-turbulence', 'truth']).range; return 0.4 < a && a < 1 && 1 < b && b < 1.5 }}"
     )
-    page.wait_for_function(zoomed)  # a drag zooms both
+    until(page, zoomed)  # a drag zooms both
     choose(page, "0.5 s")
     choose(page, "Whole record")
     assert line(page, "trace-turbulence", "truth")["range"] == [0, 2]
@@ -351,14 +349,14 @@ def test_accessible_and_no_wider_than_the_window(open_report: Any) -> None:
     page.evaluate(OPEN)
     page.evaluate(files("axe_playwright_python").joinpath("axe.min.js").read_text(encoding="utf-8"))
     assert page.evaluate(VIOLATIONS) == []
-    page.wait_for_function(FITS, arg=1300)
+    until(page, FITS, arg=1300)
     drawn = f"colour => ({LINE})(['trace-vibration', 'kf-lgs']).colour === colour"
     for scheme, colour in (("light", "#FF6600"), ("dark", "#FF8533")):
         page.emulate_media(color_scheme=scheme)
-        page.wait_for_function(drawn, arg=colour)
+        until(page, drawn, arg=colour)
     assert page.evaluate(VIOLATIONS) == [], "dark"
     page.set_viewport_size({"width": 390, "height": 844})
-    page.wait_for_function(FITS, arg=390)
+    until(page, FITS, arg=390)
     assert page.evaluate(VIOLATIONS) == [], "on a phone"
 
 
@@ -395,7 +393,7 @@ def test_on_paper_bars_have_their_colours_and_nothing_is_cut(open_report: Any) -
     width = round((210 - 2 * 10) / 25.4 * 96)  # A4 within its margins [px]
     page.set_viewport_size({"width": width, "height": 1000})
     wide = "() => [...document.querySelectorAll('.scroll')].filter(it => it.scrollWidth > it.clientWidth).length"
-    page.wait_for_function(f"width => document.documentElement.scrollWidth <= width && ({wide})() === 0", arg=width)
+    until(page, f"width => document.documentElement.scrollWidth <= width && ({wide})() === 0", arg=width)
 
 
 def test_the_policy_holds(open_report: Any) -> None:

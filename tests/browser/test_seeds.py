@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.browser.conftest import QUICK
+from tests.browser.conftest import QUICK, until
 
 
 def set_seeds(page: Page, count: int) -> None:
@@ -84,7 +84,7 @@ def test_what_is_being_typed_stays_when_what_was_typed_before_is_taken(page: Pag
     expect(second).to_have_value("0.0123")
     expect(second).to_be_focused()
     page.keyboard.press("Enter")
-    page.wait_for_function("() => location.search.includes('vibration.peaks=6.5,0.0123,')")
+    until(page, "() => location.search.includes('vibration.peaks=6.5,0.0123,')")
 
 
 def test_a_change_shows_its_effect_beside_the_errors(page: Page) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Download, Locator, Page, expect
 
-from tests.browser.conftest import QUICK
+from tests.browser.conftest import QUICK, until
 from wfsobs.app.style import look
 
 
@@ -72,19 +72,19 @@ def test_back_and_reload_return_to_the_view(short: Page) -> None:
     page = short
     start = page.evaluate("location.search")
     page.get_by_role("button", name="Tilt", exact=True).click()
-    page.wait_for_function("location.search.includes('view.mode=tilt')")
+    until(page, "location.search.includes('view.mode=tilt')")
     tilt = page.evaluate("location.search")
     page.get_by_role("button", name="Model", exact=True).click()
-    page.wait_for_function("location.search.includes('view.page=model')")
+    until(page, "location.search.includes('view.page=model')")
     expect(page.get_by_role("heading", name=re.compile("State space"))).to_be_visible()
     page.go_back()
     expect(page.get_by_role("heading", name="RMS errors")).to_be_visible()
-    page.wait_for_function("address => location.search === address", arg=tilt)
+    until(page, "address => location.search === address", arg=tilt)
     page.get_by_role("button", name="Time window: 0.2 s").click()
-    page.wait_for_function("location.search.includes('view.window=')")
+    until(page, "location.search.includes('view.window=')")
     page.locator(".card[data-name=kf-lgs]").first.dblclick()
     # Not that of the first click of the two, which hides the line.
-    page.wait_for_function("/view.hide.turbulence=/.test(location.search) && !/kf-lgs/.test(location.search)")
+    until(page, "/view.hide.turbulence=/.test(location.search) && !/kf-lgs/.test(location.search)")
     address, stretch = page.evaluate("location.search"), page.locator("p.stretch").first
     expect(stretch).to_contain_text(WINDOW)
     window = WINDOW.search(stretch.inner_text())
@@ -92,20 +92,20 @@ def test_back_and_reload_return_to_the_view(short: Page) -> None:
     expect(page.get_by_role("button", name="Tilt", exact=True)).to_have_attribute("aria-pressed", "true")
     expect(page.locator(".card[data-name=kf-multi]").first).to_have_attribute("aria-pressed", "false")
     expect(stretch).to_contain_text(window[0])
-    page.wait_for_function("address => location.search === address", arg=address)
+    until(page, "address => location.search === address", arg=address)
     page.go_back()
-    page.wait_for_function("address => location.search === address", arg=start)
+    until(page, "address => location.search === address", arg=start)
     expect(page.get_by_role("button", name="Tip", exact=True)).to_have_attribute("aria-pressed", "true")
 
 
 def test_undo_by_key_and_by_button(short: Page) -> None:
     page = short
     set_speed(page, "20")
-    page.wait_for_function("location.search.includes('turbulence.wind_speed=20')")
+    until(page, "location.search.includes('turbulence.wind_speed=20')")
     page.locator("h2", has_text="Turbulence").click()
     page.keyboard.press("Control+z")
     expect(speed(page)).to_have_value("15")
-    page.wait_for_function("!location.search.includes('turbulence.wind_speed')")
+    until(page, "!location.search.includes('turbulence.wind_speed')")
     page.keyboard.press("Control+Shift+z")
     expect(speed(page)).to_have_value("20")
     page.get_by_role("button", name="Undo", exact=True).click()
@@ -115,7 +115,7 @@ def test_undo_by_key_and_by_button(short: Page) -> None:
     expect(page.get_by_role("button", name="Redo", exact=True)).to_be_disabled()
     speed(page).press("Control+z")
     page.get_by_role("button", name="Tilt", exact=True).click()
-    page.wait_for_function("location.search.includes('view.mode=tilt')")  # the answer to what came after the keys
+    until(page, "location.search.includes('view.mode=tilt')")  # the answer to what came after the keys
     assert "turbulence.wind_speed=20" in page.url, "in a text the keys belong to the text"
 
 
@@ -126,7 +126,7 @@ def test_a_link_with_one_bad_field(open_short: Any, open_page: Any) -> None:
     expect(speed(page)).to_have_value("15")
     set_speed(page, "25")
     page.get_by_role("button", name="Dismiss").click()
-    page.wait_for_function("location.search.includes('turbulence.wind_speed=25')")
+    until(page, "location.search.includes('turbulence.wind_speed=25')")
     box = copied(page, "Copy link")
     expect(box).to_have_value(re.compile("turbulence.wind_speed=25"))
     link = box.input_value()
@@ -171,7 +171,7 @@ def test_data_and_figures(short: Page, tmp_path: Path) -> None:
 def test_a_scenario_out_and_in_again(short: Page, tmp_path: Path) -> None:
     page = short
     set_speed(page, "22")
-    page.wait_for_function("location.search.includes('turbulence.wind_speed=22')")
+    until(page, "location.search.includes('turbulence.wind_speed=22')")
     path = saved(page, "scenario as TOML", tmp_path)
     assert tomllib.loads(path.read_text(encoding="utf-8"))["turbulence"]["wind_speed"] == 22.0
     page.get_by_role("button", name="Reset", exact=True).click()

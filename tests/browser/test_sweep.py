@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Locator, Page, expect
 
+from tests.browser.conftest import until
 from tests.browser.test_quality import accessible, fits, focused, theme
 
 QUICK = "?run.duration=1&run.warm_up=0.2&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.3"
@@ -87,9 +88,9 @@ def test_a_sweep_over_one_setting_runs_after_back(page: Page) -> None:
     enter(page, "Values", "5,20")
     enter(page, "Seeds of each", "1")
     page.get_by_role("button", name="Explore", exact=True).click()
-    page.wait_for_function("() => !location.search.includes('view.page')")
+    until(page, "() => !location.search.includes('view.page')")
     page.go_back()
-    page.wait_for_function("() => location.search.includes('view.page=sweep')")
+    until(page, "() => location.search.includes('view.page=sweep')")
     expect(page.get_by_text("2 scenarios × 1 seed = 2 runs")).to_be_visible()
     page.get_by_role("button", name="Run the sweep").click()
     expect(page.get_by_text("Finished · 2 of 2 runs")).to_be_visible()

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 
+from tests.browser.conftest import until
 from wfsobs.app.pages.pages import TITLES
 from wfsobs.app.style import labels, look
 from wfsobs.campaign.plan import parse_plan
@@ -92,8 +93,8 @@ def all_in(page: Page, dark: bool, titles: list[str]) -> None:
         button, before = page.get_by_role("button", name=title, exact=True), page.evaluate(FIGURES)
         if button.get_attribute("aria-pressed") != "true":
             button.click()
-            page.wait_for_function(TURNED, arg=[before, title in WITHOUT])
-        page.wait_for_function(f"(it) => ({WRONG})(it).length === 0", arg=[LOOKS, dark])
+            until(page, TURNED, arg=[before, title in WITHOUT])
+        until(page, f"(it) => ({WRONG})(it).length === 0", arg=[LOOKS, dark])
 
 
 @pytest.mark.parametrize(
@@ -111,7 +112,7 @@ def test_every_page_has_the_theme(open_page: Any, server: Any, system: str, aske
     query = "&".join(f"{path}={value}" for path, value in SHORT.items())
     link = f"{server.url}?{query}" + f"&theme={asked}" * bool(asked) + f"&view.page={TITLES[first]}" * (first != "Explore")
     page = open_page(url=link, color_scheme=system)
-    page.wait_for_function(TURNED, arg=[[], False])
+    until(page, TURNED, arg=[[], False])
     all_in(page, dark, [first, *(it for it in titles if it != first)])
     page.get_by_role("button", name=re.compile("theme", re.I)).click()
     all_in(page, not dark, titles[::-1])
