@@ -126,13 +126,21 @@ def test_a_delay_in_which_the_halves_differ_is_not_decided(tmp_path: Path) -> No
     assert "--command-delay" not in found["next"]
 
 
+def test_an_offset_and_a_few_outliers_are_no_fault(tmp_path: Path, record: Record) -> None:
+    """One frame in 200 off by 40 times the noise in one part of the record, and commands about another place than zero."""
+    y, rng = record.y_lgs.copy(), np.random.default_rng(3)
+    y[300 + rng.choice(2000, 10, replace=False)] += 40.0 * PRESETS["paper"]().sensors.lgs_noise
+    found = checked(tmp_path, Record(y, record.u + 200.0, record.dt, delay=record.delay))
+    assert found["reliable"] and verdicts(found)["stationarity"] == "ok"
+
+
 def test_faults_are_named(tmp_path: Path, record: Record) -> None:
-    """Lost frames, a level of outliers and a change of the disturbance."""
+    """Lost frames, a level of outliers and noise that grows."""
     rng = np.random.default_rng(3)
     y = record.y_lgs.copy()
     y[rng.choice(len(y), 200, replace=False)] = np.nan
     late = slice(len(y) // 2, None)
-    y[late] += 0.05 * np.sin(2.0 * pi * 200.0 * record.dt * np.arange(len(y)))[late, None]
+    y[late] += 0.02 * rng.standard_normal(y[late].shape)
     y[rng.choice(len(y), 120, replace=False), 0] += 1.5
     found = checked(tmp_path, Record(y, record.u, record.dt, delay=record.delay))
     assert not found["reliable"]

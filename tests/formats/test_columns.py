@@ -266,6 +266,13 @@ def test_names_that_suggest_nothing() -> None:
     assert suggest_roles(["a", "b", "column 1", "", "x"]) == {}
 
 
+def test_slopes_and_commands_of_actuators_are_suggested_whole() -> None:
+    file = io.BytesIO()
+    np.savez(file, slopes=np.ones((N, 9)), dm_cmd=np.ones((N, 5)), recon=np.ones((2, 9)))
+    with pytest.raises(RecordError, match=r"has no y_lgs.*: --column 'y_lgs=slopes' --column 'u=dm_cmd'$"):
+        read_record(file, "a.npz", declaration=DeclaredFormat(rate=500.0))
+
+
 def test_on_the_command_line(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     rng = np.random.default_rng(1)

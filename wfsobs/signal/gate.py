@@ -190,8 +190,10 @@ class OutlierGate:
     def _fit(self) -> None:
         """Fit the deviation to the errors of this block, and the autoregression to what has passed."""
         seen = self._is_usual.sum(axis=1) > BLOCK // 4
-        magnitudes = np.where(self._is_usual | ~seen[:, None], np.nan_to_num(np.abs(self._errors)), np.nan)
-        median = np.nanmedian(magnitudes, axis=1) / MEDIAN
+        counted = self._is_usual | ~seen[:, None]
+        magnitudes = np.sort(np.where(counted, np.nan_to_num(np.abs(self._errors)), np.inf), axis=1)
+        middle = (counted.sum(axis=1)[:, None] + [-1, 0]) // 2
+        median = np.take_along_axis(magnitudes, middle, axis=1).mean(axis=1) / MEDIAN
         is_first = np.isinf(self._deviation) & seen
         old = np.where(np.isinf(self._deviation), median, self._deviation)
         self._deviation = np.where(seen, old ** (1.0 - PACE) * median**PACE, self._deviation)

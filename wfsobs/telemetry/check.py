@@ -219,7 +219,8 @@ def _commands(group: GroupPlant, reading: Reading, several: bool) -> Iterator[Re
     if degrees.value is not None and degrees.sd is not None:
         off = abs(degrees.value) if sign != -1 else 180.0 - abs(degrees.value)
         verdict = "ok" if off < max(SURE * degrees.sd, TURNED) else "excluded" if off > 45.0 else "note"
-        yield Remark(f"command rotation{of}", verdict, f"{degrees.text(' degrees')}, y = R u")
+        turn = "; a matrix of --command-modes, R^-1, turns them" * (verdict == "excluded")
+        yield Remark(f"command rotation{of}", verdict, f"{degrees.text(' degrees')}, y = R u{turn}")
     elif group.rotation is not None:
         yield Remark(f"command rotation{of}", "undecided", "not identifiable")
     for subject, one, each, stated, least in (
@@ -269,7 +270,7 @@ def _is_off(n: PlantNumber, right: float, least: float) -> bool:
 
 def _stationarity(record: Record) -> Iterator[Remark]:
     names = [mode.name for mode in modes_up_to(HIGHEST_ORDER)]
-    z = hold_last(record.z[record.delay :])
+    z = hold_last(record.without_outliers.z[record.delay :])
     length = len(z) // SECTIONS
     if length < 8 * FEWEST_BINS:
         yield Remark("stationarity", "undecided", f"{record.n_steps} frames are too few to compare {SECTIONS} sections")

@@ -123,7 +123,7 @@ def to_contents(file: FileColumns, roles: Mapping[str, str]) -> Contents:
         contents.arrays["dt"] = np.array(1.0 / rate)
         contents.guesses.append(f"{rate:g} Hz by {name}")
     contents.leftovers = [*unused, *(f"{name} (text)" if why.endswith("number") else name for name, why in file.texts.items())]
-    suggested = {role: name for role, name in suggest_roles(unused).items() if role not in roles}
+    suggested = {role: name for role, name in (suggest_roles(unused) | _many_in_one(unused)).items() if role not in roles}
     if suggested:
         contents.hint = "; as its names suggest: " + " ".join(f"--column '{role}={name}'" for role, name in _by_array(suggested))
     elif unused:
@@ -152,6 +152,13 @@ def _by_array(roles: Mapping[str, str]) -> list[tuple[str, str]]:
     whole = {role.partition("/")[0]: name.removesuffix("[0]") for role, name in roles.items() if name.endswith("[0]")}
     whole = {signal: name for signal, name in whole.items() if roles.get(f"{signal}/tilt") == f"{name}[1]"}
     return [*whole.items(), *((role, name) for role, name in roles.items() if role.partition("/")[0] not in whole)]
+
+
+def _many_in_one(names: Iterable[str]) -> dict[str, str]:
+    """Return the arrays of many columns, as of slopes and actuators, that their names suggest, {signal: name}."""
+    many = [name.removesuffix("[2]") for name in names if name.endswith("[2]")]
+    roles = {_role_of(f"{name}[0]"): name for name in reversed(many)}
+    return {signal: roles[role] for signal in ("y_lgs", "u") if (role := f"{signal}/tip") in roles}
 
 
 PART = re.compile(r"(?P<stem>.*?)(?P<unit>u|micro|n|nano|milli)(?P<word>_?sec(?:ond)?s?)", re.I)

@@ -163,7 +163,7 @@ def saturation_lines(record: Record) -> list[str]:
         if beyond := np.count_nonzero((commands < low) | (commands > high)):
             levels = " and ".join(f"{1e3 * level:+.3g} nm" for level in (low, high) if np.isfinite(level))
             known = f"commands beyond about {levels}, {100.0 * beyond / len(y):.2g} % of all, do nothing"
-            lines.append(f"{mode.name}: {known}: the mirror is at its limit there, and z, which has the whole of them, is wrong")
+            lines.append(f"{mode.name}: {known}: the mirror is at its limit there, and z is wrong without --rail")
         elif count := max(_count_at_end(commands), _count_at_end(-commands)):
             lines.append(f"{mode.name}: commands stay at their largest value in {count} frames, as at the limit of a mirror")
     return lines

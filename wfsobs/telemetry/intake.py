@@ -96,22 +96,26 @@ def find_bridged(y: Array, z: Array, dt: float) -> Array:
 
 def _lacking(again: Array, left_over: Array, rounding: Array, longest: float) -> Array:
     """Return which frames repeat, or lack the noise that those before them have, (n,); none before there is some noise."""
-    usual, seen, lasting, apart = np.zeros(left_over.shape[1]), 0, 0, 0
+    rows, every = np.arange(len(again)), USUAL // 10
+    apart = rows - np.maximum.accumulate(np.where(again, rows, -1))  # a window with frames that repeat says nothing of the others
+    usual, seen, lasting, k = np.zeros(left_over.shape[1]), 0, 0, WINDOW
     last = np.zeros((USUAL, left_over.shape[1]))  # of those that are measured, in any order
     out = np.zeros(len(left_over), dtype=bool)
-    for k, squares in enumerate(left_over):
-        apart = 0 if again[k] else apart + 1  # a window that has frames that repeat says nothing of the others
-        has_noise = seen >= USUAL // 10 and bool((np.isfinite(usual) & (usual > rounding[k] ** 2)).all())
-        lacks = has_noise and bool(again[k] or (apart >= WINDOW and (squares <= SHARE * usual).all()))
-        lasting = lasting + 1 if lacks else 0
-        out[k] = 0 < lasting <= longest
-        if lasting > longest:
-            seen = 0
-        if not out[k] and k >= WINDOW:
-            last[seen % USUAL] = squares
-            seen += 1
-            if seen % (USUAL // 10) == 0:
-                usual = np.median(last[:seen], axis=0)
+    while k < len(out):  # up to where the usual square is taken anew, or a gap is too long for one
+        part = slice(k, k + every - seen % every)
+        squares, count = left_over[part], np.arange(1, len(out[part]) + 1)
+        has_noise = (seen >= every) & (np.isfinite(usual) & (usual > rounding[part] ** 2)).all(axis=1)
+        lacks = has_noise & (again[part] | (apart[part] >= WINDOW) & (squares <= SHARE * usual).all(axis=1))
+        run = count - np.maximum.accumulate(np.where(lacks, -lasting, count))
+        is_over = bool((run > longest).any())
+        n = int(np.argmax(run > longest)) + 1 if is_over else len(count)
+        lasting, seen = int(run[n - 1]), 0 if is_over else seen
+        out[k : k + n] = lacks[:n] & (run[:n] <= longest)
+        measured = squares[n - 1 : n] if is_over else squares[~lacks]
+        last[(seen + np.arange(len(measured))) % USUAL] = measured
+        seen, k = seen + len(measured), k + n
+        if seen % every == 0:
+            usual = np.median(last[:seen], axis=0)
     return out
 
 
@@ -207,7 +211,8 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
     arrays, most = contents.arrays, len(scenario.modes)
     for name in ("y_lgs", "u")[: 1 if declaration.open_loop else 2]:
         if name not in arrays:
-            raise RecordError(f"has no {name}; a record needs y_lgs, u and dt{contents.hint}")
+            at_rest = ", or --open-loop" * (name == "u")
+            raise RecordError(f"has no {name}; a record needs y_lgs, u and dt{at_rest}{contents.hint}")
     signals = {name: _signal(name, arrays[name]) for name in SIGNALS if name in arrays}
     swapped = [name for name, values in signals.items() if values.shape[0] < values.shape[1] > most]
     signals |= {name: np.ascontiguousarray(signals[name].T) for name in swapped}

@@ -286,8 +286,8 @@ unit is stated, is refused."""
 
 
 def z_rms(record: Record) -> float:
-    """Return the largest rms of a mode of z [um]."""
-    return float(np.sqrt(np.nanmean(record.z[record.delay :] ** 2, axis=0).max()))
+    """Return the largest rms of a mode of z about its mean, which an offset of the commands is part of [um]."""
+    return float(np.nanstd(record.z[record.delay :], axis=0).max())
 
 
 def plausible_units(record: Record, contents: Contents, declaration: DeclaredFormat, scenario: Scenario) -> dict[str, float]:
