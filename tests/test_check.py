@@ -90,7 +90,7 @@ def test_a_wrong_sign_is_excluded_and_put_right_by_the_next_command(tmp_path: Pa
 @pytest.mark.slow
 def test_delay_and_gain_are_put_right_by_the_next_command(tmp_path: Path) -> None:
     """Half a frame and a mirror that does 1.2 times what it is told; a rotation has no option."""
-    file, done = tmp_path / "r.npz", closed_loop(20_000, 1.5, 1.2 * np.eye(2), gain=0.4)
+    file, done = tmp_path / "r.npz", closed_loop(10_000, 1.5, 1.2 * np.eye(2), gain=0.4)
     save_record(file, replace(done, delay=2))
     found = json.loads(CliRunner().invoke(main, ["check", str(file), "--json"]).stdout)
     seen = verdicts(found)
@@ -107,9 +107,9 @@ def test_delay_and_gain_are_put_right_by_the_next_command(tmp_path: Path) -> Non
 
 @pytest.mark.slow
 def test_a_rotation_and_a_flipped_axis_are_excluded(tmp_path: Path) -> None:
-    seen = verdicts(checked(tmp_path, closed_loop(10_000, 2.0, rotation(np.radians(96.0)))))
+    seen = verdicts(checked(tmp_path, closed_loop(5000, 2.0, rotation(np.radians(96.0)))))
     assert (seen["command sign"], seen["command rotation"]) == ("ok", "excluded")
-    seen = verdicts(checked(tmp_path, closed_loop(10_000, 2.0, np.diag([1.0, -1.0]))))
+    seen = verdicts(checked(tmp_path, closed_loop(5000, 2.0, np.diag([1.0, -1.0]))))
     assert (seen["command sign"], seen["command rotation"]) == ("excluded", "ok")
 
 

@@ -196,7 +196,7 @@ def made(rate: float, modes: Modes, scale: float, turbulent: bool, seed: int) ->
     return recorded(*columns, dt=dt)
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(
     rate=RATES,
     modes=st.lists(PEAKS, min_size=1, max_size=2),
