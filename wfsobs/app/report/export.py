@@ -88,8 +88,8 @@ def export(
 
 log = logging.getLogger(__name__)
 
-LIMIT = 60.0
-"""The most that waiting for others, and then the making, may take [s]."""
+LIMIT = 240.0
+"""The most that waiting for others, and then the making, may take [s]: ten seconds on a quiet machine, a minute on a busy one."""
 
 POLL = 0.1
 """How often it is looked whether anybody still wants it [s]."""
