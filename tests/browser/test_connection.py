@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import threading
 from collections.abc import Iterator
@@ -23,8 +24,8 @@ def hang_up(end: socket.socket) -> None:
     end.close()
 
 
-HEAD = b'{"msgid"'
-"""Begins the first part of a message."""
+HEAD = re.compile(rb'\{"msgid"[^}]*\}')
+"""The first part of a message."""
 
 
 class Cable:
@@ -63,8 +64,8 @@ class Cable:
             while part := one.recv(65536):
                 if back:
                     self.quick.wait()
-                if back and self.within.is_set() and HEAD in part:
-                    other.sendall(part[: part.index(b"}", part.index(HEAD)) + 1])
+                if back and self.within.is_set() and (head := HEAD.search(part)):
+                    other.sendall(part[: head.end()])
                     self.within.clear()
                     break
                 other.sendall(part)

@@ -39,6 +39,7 @@ PICTURES = """() => new Promise((done) => {
   const next = (left) => left ? requestAnimationFrame(() => next(left - 1)) : done()
   next(20)
 })"""
+"""Waits for twenty pictures: a change of colour takes a quarter of a second."""
 
 FOCUSED = """() => {
   let e = document.activeElement

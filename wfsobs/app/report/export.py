@@ -89,7 +89,7 @@ def export(
 log = logging.getLogger(__name__)
 
 LIMIT = 240.0
-"""The most that waiting for others, and then the making, may take [s]: ten seconds on a quiet machine, a minute on a busy one."""
+"""The most that waiting for others, and then the making, may take [s]; long enough for a machine that is busy otherwise."""
 
 POLL = 0.1
 """How often it is looked whether anybody still wants it [s]."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from math import degrees
@@ -35,7 +36,7 @@ MOST = 0.98
 """The highest gain that a handle gives, over that at which the loop becomes unstable."""
 
 
-class GainHandle:
+class GainHandle(ABC):
     """The handle in one figure, and the line of the gain that it would set."""
 
     title = ""
@@ -45,21 +46,21 @@ class GainHandle:
         self.lines = ExtraLines(fig, "predicted", line_alpha=1.0, line_width=2.2, line_dash=[2, 2], level="glyph")
         self.number = 0
 
+    @abstractmethod
     def gain_at(self, scenario: Scenario, position: object) -> float:
         """Return the gain for a place of the handle, or the highest. Raises ValueError for no such place."""
-        raise NotImplementedError
 
+    @abstractmethod
     def line(self, at: Curves) -> tuple[Array, Array]:
         """Return what is drawn of the loop's curves."""
-        raise NotImplementedError
 
+    @abstractmethod
     def place(self, at: Curves, design: LawDesign) -> tuple[float, str]:
         """Return where the handle stands on the horizontal axis, in the height of 0, and what it says of that."""
-        raise NotImplementedError
 
+    @abstractmethod
     def limits(self, scenario: Scenario) -> list[float]:
         """Return the first and the last place."""
-        raise NotImplementedError
 
     def entry(self, gain: float, at: Curves, design: LawDesign) -> dict[str, Any]:
         """Describe the handle."""
