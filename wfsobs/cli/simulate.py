@@ -34,7 +34,7 @@ from wfsobs.cli.show import (
 )
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.envelope import POINTS, PlantEnvelope, Uncertainty, plant_envelope
-from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label, linear
+from wfsobs.closed_loop.rows import label, linear, no_theory
 from wfsobs.closed_loop.rows import rows as loop_rows
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.evaluation.evidence import FEWEST, gather_evidence, seeds_interval
@@ -90,8 +90,7 @@ def loop_table(rows: Sequence[Row]) -> Table:
             linear(same, median_text(same, "delay_margin_ms", 2)),
             _share(same),
         )
-    if any(r["limited"] for r in rows):
-        out.caption = f"{NOT_APPLICABLE}: {LIMITED}"
+    out.caption = no_theory(rows) or None
     return out
 
 
@@ -235,6 +234,8 @@ def loop(
         click.echo(json.dumps(all_rows, allow_nan=False))
     else:
         show_table(loop_table(all_rows))
+        for line in dict.fromkeys(f"{label(r['controller'])}: {r['note']}" for r in all_rows if r["alarms"]):
+            click.echo(line)
     if with_envelope:
         with progress_bar("envelope") as update:
             _show_envelope(plant_envelope(scenario, controllers=controllers or None, watch=Watch(progress=update)))
