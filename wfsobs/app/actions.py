@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 import param
 
-from wfsobs.app.component import Component
+from wfsobs.app.component import HtmlComponent
 from wfsobs.app.copies import EXPLORED, to_command, to_python
 from wfsobs.app.downloads import Save, TooLarge, data_csv, data_npz
 from wfsobs.app.jobs import DONE, FAILED, RUNNING, Job
@@ -32,7 +32,7 @@ LARGEST = 2_000_000
 REPORT = "wfsobs-report.html"
 
 
-class Toolbar(Component):
+class Toolbar(HtmlComponent):
     """The menus in the browser: texts down, messages {action, ...} up, files down as messages."""
 
     query = param.String("", doc="What a link to the settings has after its ?.")
@@ -48,8 +48,6 @@ class Toolbar(Component):
     labels = param.Dict({}, doc="Name of a line in the figures -> what it is called, for the legends of figures that are saved.")
     saves = param.List([], doc="What the page can save beside the data, as it is called in the menu.")
 
-    html = param.String("", doc="The menus.")
-
     _esm = script("patch", "markup", "save", "figures", "actions")
     _stylesheets = sheets("base", "actions")
 
@@ -63,7 +61,7 @@ class Actions:
 
     def __init__(self, store: Store):
         self.store = store
-        self.toolbar = Toolbar(self.handle, labels=labels(), margin=0)
+        self.toolbar: Final = Toolbar(self.handle, labels=labels(), margin=0)
         self._tasks: dict[str, BackgroundTask] = {}
         self._under_way: dict[str, tuple[str, Callable[[Any], None]]] = {}
         self._pages: Pages | None = None

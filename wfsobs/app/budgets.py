@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from typing import Final
 
 import param
 
@@ -37,13 +38,20 @@ class Budgets(param.Parameterized):
     seeds : which change the main ones; where one record is enough, nothing else runs in idle time
     """
 
-    by_observer = param.Dict({}, doc="Observer -> its budgets (a sequence of Budget), as far as they are known.")
-    every = param.Boolean(False, doc="Whether observers that are not linear have theirs too, though they are not main ones.")
+    by_observer: param.Parameter[ByObserver] = param.Parameter(
+        {}, doc="Observer -> its budgets (a sequence of Budget), as far as they are known."
+    )
+    every: param.Boolean[bool] = param.Boolean(
+        False, doc="Whether observers that are not linear have theirs too, though they are not main ones."
+    )
 
     def __init__(self, store: Store, main: Callable[[str], Collection[str]], seeds: SeedRuns | None = None):
         super().__init__()
-        self.store, self.run, self.main, self.seeds = store, store.run, main, seeds
-        self.task = BackgroundTask(store.session)
+        self.store = store
+        self.run: Final = store.run
+        self.main = main
+        self.seeds = seeds
+        self.task: Final = BackgroundTask(store.session)
         self._of: RunResults | None = None
         self._budgets: ByObserver = {}
         self._names: list[str] = []

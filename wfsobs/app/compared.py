@@ -115,7 +115,7 @@ def _flat(item: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _change(p: param.Parameter, old: Any, new: Any) -> str:
+def _change(p: param.Parameter[Any], old: Any, new: Any) -> str:
     """Two values of a setting; of lists only that they differ."""
     if isinstance(new, list):
         return "changed"

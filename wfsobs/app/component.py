@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 import panel as pn
+import param
 from panel.custom import JSComponent
 
 
@@ -37,6 +38,14 @@ class Component(JSComponent):
     def save(self, name: str, kind: str, content: bytes) -> None:
         """Have the browser save a file, where the component's script takes such messages."""
         self._send_msg(file_message(name, kind, content))
+
+
+class HtmlComponent(Component):
+    """A component whose contents are HTML that is made here."""
+
+    __abstract = True
+
+    html: param.String[str] = param.String("", doc="What is in it.")
 
 
 def file_message(name: str, kind: str, content: bytes) -> dict[str, str]:

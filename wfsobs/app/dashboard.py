@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, Final
 from uuid import uuid4
 
 import panel as pn
@@ -136,28 +136,29 @@ class Dashboard:
 
     def __init__(self, post: Post, session: Session, scenario: Scenario | None = None):
         self._post = post
-        self.store = Store(post, session, scenario)
-        self.upload = Upload(self.store)
-        self.display = Display()
+        self.store: Final = Store(post, session, scenario)
+        self.upload: Final = Upload(self.store)
+        self.display: Final = Display()
         self._theme_chosen = False
-        self.controls = Controls(self.store)
+        self.controls: Final = Controls(self.store)
         self.controls.effect_of = partial(effect_line, self.display)
-        self.actions = Actions(self.store)
+        self.actions: Final = Actions(self.store)
         self.upload.open_scenario = self.actions.open_file
-        self.history = History(self.store, self.display)
-        self.history_sheet = HistorySheet(self.history, lambda sheet: self.body.append(sheet))
+        self.history: Final = History(self.store, self.display)
+        self.history_sheet: Final = HistorySheet(self.history, lambda sheet: self.body.append(sheet))
         self.actions.open_history = self.history_sheet.toggle
         self.actions.session = lambda: session_save(self.history)
         self.upload.open_session = self.history_sheet.open_file
-        self.modes, self.units = ModeSwitch(self.store.run, self.display), UnitSwitch(self.display)
-        self.seeds = SeedRuns(self.store)
-        self.explore = Explore(self.history, self.seeds)
-        self.connection = Connection(self.controls.take, width=0, height=0, margin=0)
-        self.drawer = pn.Column(sizing_mode="stretch_width", margin=0)
-        self.frame = Frame(width=0, height=0, margin=0)
-        self.keyboard = Keyboard(width=0, height=0, margin=0, styles={"position": "absolute"})
-        self.alert = pmui.Alert(object="", severity="error", visible=False, **WIDE)
-        self.stale = pmui.Alert(object=STALE, severity="warning", visible=False, **WIDE)
+        self.modes: Final = ModeSwitch(self.store.run, self.display)
+        self.units: Final = UnitSwitch(self.display)
+        self.seeds: Final = SeedRuns(self.store)
+        self.explore: Final = Explore(self.history, self.seeds)
+        self.connection: Final = Connection(self.controls.take, width=0, height=0, margin=0)
+        self.drawer: Final = pn.Column(sizing_mode="stretch_width", margin=0)
+        self.frame: Final = Frame(width=0, height=0, margin=0)
+        self.keyboard: Final = Keyboard(width=0, height=0, margin=0, styles={"position": "absolute"})
+        self.alert: Final = pmui.Alert(object="", severity="error", visible=False, **WIDE)
+        self.stale: Final = pmui.Alert(object=STALE, severity="warning", visible=False, **WIDE)
         self.store.run.param.watch(self._refresh, ["state", "message"])
         self.store.param.watch(self._refresh, ["stale", "waiting"])
 

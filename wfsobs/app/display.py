@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Any
 
 import param
 
@@ -54,7 +55,7 @@ def unit_text(unit: str) -> str:
     return re.sub(r"\bum\b", "µm", unit).replace("^2", "²")
 
 
-def label_of(p: param.Parameter) -> str:
+def label_of(p: param.Parameter[Any]) -> str:
     """Write a setting's label with its unit in [brackets]."""
     unit = unit_text(unit_of(p))
     return f"{p.label} [{unit}]" if unit else str(p.label)
@@ -91,16 +92,24 @@ def short_name(mode: Mode) -> str:
 class Display(param.Parameterized):
     """The switches above the figures."""
 
-    mode = param.Selector(default=MODES[0], objects=MODES, label="Mode")
-    show = param.Selector(default=ERROR, objects=[SIGNAL, ERROR, RUNNING_RMS], label="Show")
-    unit = param.Selector(default="nm", objects=list(UNITS), label="Unit")
-    hidden_lines = param.Dict({}, doc="Target -> names of its hidden lines.")
-    named_lines = param.Dict({}, doc="Target -> names of the lines that matter: those that the verdict names.")
-    dark = param.Boolean(False, doc="Dark mode.")
-    spectrum = param.Selector(default=PSD, objects=[PSD, CUMULATIVE], label="Spectrum")
-    window_spectra = param.Boolean(False, label="Spectra of the window", doc="Spectra of the stretch of time in view alone.")
-    editing = param.Boolean(False, label="Edit figure", doc="Handles on the spectra, and what theory predicts.")
-    compared_runs = param.List([], item_type=ComparedRun, doc="The runs to compare with, by their letters.")
+    mode: param.Selector[str] = param.Selector(default=MODES[0], objects=MODES, label="Mode")
+    show: param.Selector[str] = param.Selector(default=ERROR, objects=[SIGNAL, ERROR, RUNNING_RMS], label="Show")
+    unit: param.Selector[str] = param.Selector(default="nm", objects=list(UNITS), label="Unit")
+    hidden_lines: param.Parameter[dict[str, list[str]]] = param.Parameter({}, doc="Target -> names of its hidden lines.")
+    named_lines: param.Parameter[dict[str, list[str]]] = param.Parameter(
+        {}, doc="Target -> names of the lines that matter: those that the verdict names."
+    )
+    dark: param.Boolean[bool] = param.Boolean(False, doc="Dark mode.")
+    spectrum: param.Selector[str] = param.Selector(default=PSD, objects=[PSD, CUMULATIVE], label="Spectrum")
+    window_spectra: param.Boolean[bool] = param.Boolean(
+        False, label="Spectra of the window", doc="Spectra of the stretch of time in view alone."
+    )
+    editing: param.Boolean[bool] = param.Boolean(
+        False, label="Edit figure", doc="Handles on the spectra, and what theory predicts."
+    )
+    compared_runs: param.List[list[ComparedRun]] = param.List(
+        [], item_type=ComparedRun, doc="The runs to compare with, by their letters."
+    )
 
     @property
     def column(self) -> int:

@@ -6,10 +6,9 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-import param
 from markupsafe import Markup, escape
 
-from wfsobs.app.component import Component
+from wfsobs.app.component import HtmlComponent
 from wfsobs.app.render import macro, render
 from wfsobs.app.style import script, sheets
 from wfsobs.control.controllers import CONTROLLERS
@@ -114,10 +113,8 @@ SHORTCUTS: Mapping[str, str] = MappingProxyType(
 """Key -> what it does."""
 
 
-class Help(Component):
+class Help(HtmlComponent):
     """The button at the top, and what it opens."""
-
-    html = param.String("", doc="All that it shows.")
 
     _esm = script("help")
     _stylesheets = sheets("base", "help")

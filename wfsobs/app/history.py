@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, Final
 
 import param
 
 from wfsobs.app.compared import LETTERS, ComparedRun, name_of_change, thin_lines
-from wfsobs.app.component import Component
+from wfsobs.app.component import HtmlComponent
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.downloads import Save, TooLarge
@@ -52,22 +52,24 @@ AFTER_DRAWING = 1
 class History(param.Parameterized):
     """The entries, newest first, in step with the store; and the runs of the display that are compared."""
 
-    entries = param.List([], item_type=HistoryEntry, doc="Every result, newest first.")
-    current = param.String("", doc="Key of the entry shown.")
-    note = param.String("", doc="What was done or refused, in one line.")
-    can_undelete = param.Boolean(False, doc="Whether an entry was deleted that can come back.")
+    entries: param.List[list[HistoryEntry]] = param.List([], item_type=HistoryEntry, doc="Every result, newest first.")
+    current: param.String[str] = param.String("", doc="Key of the entry shown.")
+    note: param.String[str] = param.String("", doc="What was done or refused, in one line.")
+    can_undelete: param.Boolean[bool] = param.Boolean(False, doc="Whether an entry was deleted that can come back.")
 
     def __init__(self, store: Store, display: Display):
         super().__init__()
-        self.store, self.display = store, display
+        self.store = store
+        self.display = display
         service = store.session.service
-        self.most_bytes, self.most_record_bytes = map(service.session_share, (service.cache.most_bytes, RECORD_BYTES))
+        self.most_bytes: int = service.session_share(service.cache.most_bytes)
+        self.most_record_bytes: int = service.session_share(RECORD_BYTES)
         self.open_view: Callable[[str], Any] = lambda _query: None
         self._query = ""
         self._view_to_open = "", ""  # key of the results to wait for, and the view
         self._shown_step: Step | None = None
         self._deletions: list[HistoryEntry] = []
-        self.task = BackgroundTask(store.session)
+        self.task: Final = BackgroundTask(store.session)
         # After the store, which says what is stale, and the figures; before "Done" is said.
         store.run.param.watch(self._on_run, ["state", "result"], precedence=AFTER_DRAWING)
         self.task.param.watch(self._on_lines, "state")
@@ -273,13 +275,12 @@ class History(param.Parameterized):
 FILE = f"session{SUFFIX}"
 
 
-class Sheet(Component):
+class Sheet(HtmlComponent):
     """The sheet in the browser; it asks by messages {action, key, name, on}, and has contents only while it is open."""
 
-    open = param.Boolean(False, doc="Whether it is seen.")
-    html = param.String("", doc="What is in it.")
-    largest = param.Integer(LARGEST, doc="The largest file that is sent [bytes].")
-    part = param.Integer(PART, doc="How much is sent at a time [bytes].")
+    open: param.Boolean[bool] = param.Boolean(False, doc="Whether it is seen.")
+    largest: param.Integer[int] = param.Integer(LARGEST, doc="The largest file that is sent [bytes].")
+    part: param.Integer[int] = param.Integer(PART, doc="How much is sent at a time [bytes].")
 
     _esm = script("patch", "markup", "focus", "save", "parts", "history")
     _stylesheets = sheets("base", "history")
@@ -290,12 +291,15 @@ class HistorySheet:
 
     def __init__(self, history: History, show: Callable[[Sheet], None]):
         """Make nothing yet. show : puts the sheet on the page, once."""
-        self.history, self.display, self._show = history, history.display, show
+        self.history = history
+        self.display: Final = history.display
+        self._show = show
         self.sheet: Sheet | None = None
         self._parcel = PartialFile()
         self._name = self.message = ""
         self.rows, self._stars_alone = list[dict[str, Any]](), False
-        self.saving, self.reading = BackgroundTask(history.store.session), BackgroundTask(history.store.session)
+        self.saving: Final = BackgroundTask(history.store.session)
+        self.reading: Final = BackgroundTask(history.store.session)
         self.saving.param.watch(self._save, ["state", "place"])
         self.reading.param.watch(self._open, ["state", "place"])
 

@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Hashable, Mapping
 from functools import partial
 from time import monotonic
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from wfsobs.app.cache import Cache
 from wfsobs.app.logs import event
@@ -61,7 +61,7 @@ class Job:
     quiet      : one of many in a second, of which the log says nothing unless it is asked for everything
     """
 
-    numbers = itertools.count(1)
+    _numbers = itertools.count(1)
 
     def __init__(
         self,
@@ -77,10 +77,16 @@ class Job:
         endless: bool = False,
         quiet: bool = False,
     ):
-        self.kind, self.key, self.cost = kind, key, cost
-        self.priority = (CLICK if cost <= LONG else BATCH) if priority is None else priority
-        self.time_limit, self.wait_limit, self.endless = time_limit, wait_limit, endless
-        self.number, self.since, self.turn = next(Job.numbers), monotonic(), 0
+        self.kind = kind
+        self.key = key
+        self.cost = cost
+        self.priority: Final = (CLICK if cost <= LONG else BATCH) if priority is None else priority
+        self.time_limit = time_limit
+        self.wait_limit = wait_limit
+        self.endless = endless
+        self.number: Final = next(Job._numbers)
+        self.since: Final = monotonic()
+        self.turn = 0
         self._work, self._refusal = work, refusal
         self._level = logging.DEBUG if quiet else logging.INFO
         self._lock = threading.RLock()  # where a session has no thread of its own, a listener may leave
@@ -199,8 +205,9 @@ class JobQueue:
     """
 
     def __init__(self, workers: int, cache: Cache[Any], rest: float = REST):
-        self.cache, self.rest = cache, rest
-        self.closing = False
+        self.cache = cache
+        self.rest = rest
+        self.closing: bool = False
         self._waiting: list[Job] = []
         self._running: list[Job] = []
         self._shared_jobs: dict[str, Job] = {}

@@ -8,7 +8,7 @@ from typing import Any
 
 import param
 
-from wfsobs.app.component import Component
+from wfsobs.app.component import HtmlComponent
 from wfsobs.app.render import render
 from wfsobs.app.style import script, sheets
 from wfsobs.telemetry.preview import safe_name
@@ -20,13 +20,12 @@ PART = 1_000_000
 """Of what the browser sends at a time [bytes]."""
 
 
-class Picker(Component):
+class Picker(HtmlComponent):
     """The button and what is said beside it; files up in parts."""
 
     message = param.String("", doc="What there is to say, in one line.")
     source_title = param.String("", doc="What takes the place of the simulation.")
     back = param.String("Back to the simulation", doc="What the button is called that ends it.")
-    html = param.String("", doc="All that it shows.")
     largest = param.Integer(LARGEST, doc="The largest file that is sent [bytes].")
     part = param.Integer(PART, doc="How much is sent at a time [bytes].")
 

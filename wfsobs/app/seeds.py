@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import param
@@ -64,12 +65,16 @@ def run_seed(
 class SeedRuns(param.Parameterized):
     """One seed after the other, once a run is done; what has been found of a scenario goes with it."""
 
-    count = param.Integer(SEEDS, bounds=(1, MOST), label="Seeds", doc="Seeds whose records are compared; 1 is the one shown.")
-    evidence: Evidence | None = param.Parameter(None, doc="What the seeds done so far say; None for too few.")  # type: ignore
+    count: param.Integer[int] = param.Integer(
+        SEEDS, bounds=(1, MOST), label="Seeds", doc="Seeds whose records are compared; 1 is the one shown."
+    )
+    evidence: param.Parameter[Evidence | None] = param.Parameter(None, doc="What the seeds done so far say; None for too few.")
 
     def __init__(self, store: Store):
         super().__init__()
-        self.store, self.run, self.task = store, store.run, BackgroundTask(store.session)
+        self.store = store
+        self.run: Final = store.run
+        self.task: Final = BackgroundTask(store.session)
         self._of: RunResults | None = None
         self._scores: list[Sequence[Score]] = []
         self.run.param.watch(self._follow, ["state", "result"])

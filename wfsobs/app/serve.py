@@ -191,7 +191,8 @@ class NextPage(Handler):
     def __init__(self, service: Service, prefix: str, secret: bytes | None, token_lifetime: int, lifetime: float):
         """Make none yet. prefix, secret, token_lifetime : as the server has them; lifetime : of an unconnected page [s]."""
         super().__init__()
-        self.service, self.lifetime = service, lifetime
+        self.service = service
+        self.lifetime = lifetime
         self._prefix, self._secret, self._token_lifetime = f"/{prefix.strip('/')}".rstrip("/"), secret, token_lifetime
         self.context: ApplicationContext | None = None
         self._page: tuple[Session, ServerSession, float] | None = None

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from math import isfinite
 from time import monotonic
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import param
 
@@ -51,10 +51,11 @@ class Service:
     """
 
     def __init__(self, limits: Limits, workers: int, most_bytes: int, work: Compute | None = None):
-        self.limits, self.memo = limits, Memo()
+        self.limits = limits
+        self.memo: Final = Memo()
         self.cache: Cache[Any] = Cache(most_bytes)
-        self.queue = JobQueue(workers, self.cache)
-        self.sessions = 0
+        self.queue: Final = JobQueue(workers, self.cache)
+        self.sessions: int = 0
         self._last_wish = monotonic()
         self.live: LiveOrder | None = None  # the loop that all sessions watch
         self.live_loop: LiveLoop | None = None
@@ -155,14 +156,17 @@ class Session(param.Parameterized):
     Before the visitor has come, what is not known already waits for them.
     """
 
-    doing = param.Dict({}, doc="What is at work beside the run: its name -> fraction done, and how it is going in a line.")
+    doing: param.Parameter[dict[str, tuple[float, str]]] = param.Parameter(
+        {}, doc="What is at work beside the run: its name -> fraction done, and how it is going in a line."
+    )
 
     def __init__(self, service: Service):
         super().__init__()
-        self.service, self.number = service, 0
+        self.service = service
+        self.number: int = 0
         self.post: Post = lambda function: function()
         self.tasks: list[BackgroundTask] = []
-        self.is_closed = False
+        self.is_closed: bool = False
         self._jobs: list[tuple[Job, Listener]] | None = []
         self._leave: dict[Listener, Callable[[], None]] = {}
         self._since = monotonic()
@@ -222,16 +226,18 @@ class BackgroundTask(param.Parameterized):
     it goes on.
     """
 
-    state = param.Selector(default=IDLE, objects=[IDLE, RUNNING, DONE, CANCELLED, FAILED])
-    progress = param.Number(0.0, bounds=(0.0, 1.0), doc="Fraction done.")
-    place = param.Integer(0, doc="Place in the line of jobs, from 1; 0 when it is being done.")
-    message = param.String("", doc="Why it failed, in one line.")
-    latest = param.Parameter(None, doc="What the work has told of itself so far.")
-    result = param.Parameter(None, doc="The latest result, in parts where it comes in parts.")
+    state: param.Selector[str] = param.Selector(default=IDLE, objects=[IDLE, RUNNING, DONE, CANCELLED, FAILED])
+    progress: param.Number[float] = param.Number(0.0, bounds=(0.0, 1.0), doc="Fraction done.")
+    place: param.Integer[int] = param.Integer(0, doc="Place in the line of jobs, from 1; 0 when it is being done.")
+    message: param.String[str] = param.String("", doc="Why it failed, in one line.")
+    latest: param.Parameter[Any] = param.Parameter(None, doc="What the work has told of itself so far.")
+    result: param.Parameter[Any] = param.Parameter(None, doc="The latest result, in parts where it comes in parts.")
 
     def __init__(self, session: Session, drawn_first: bool = False, title: str = ""):
         super().__init__()
-        self.session, self._drawn_first, self._title = session, drawn_first, title
+        self.session = session
+        self._drawn_first = drawn_first
+        self._title = title
         if title:
             self.param.watch(self._announce, ["state", "progress", "place"])
         session.tasks.append(self)

@@ -216,7 +216,7 @@ def value_text(path: str, value: Any) -> str:
     return _word(value)
 
 
-def read_value(path: str, text: str, settings: Mapping[str, param.Parameter]) -> Any:
+def read_value(path: str, text: str, settings: Mapping[str, param.Parameter[Any]]) -> Any:
     """Read a value of a link; what makes no sense stays text, for the setting itself to refuse."""
     p = settings.get(path)
     if isinstance(p, param.List) and holds_groups(p):
@@ -228,7 +228,7 @@ def read_value(path: str, text: str, settings: Mapping[str, param.Parameter]) ->
     return parse_number(text) if isinstance(p, param.Number) else text
 
 
-def _item(text: str, settings: Mapping[str, param.Parameter]) -> Any:
+def _item(text: str, settings: Mapping[str, param.Parameter[Any]]) -> Any:
     """One group of a list: its numbers in the order of its settings, a list of numbers at the end."""
     numbers = [parse_number(part) for part in text.split(",")]
     *names, last = settings

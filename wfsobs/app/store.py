@@ -6,7 +6,7 @@ A `Scenario` in the store is replaced, never changed in place, so whoever holds 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import panel as pn
 import param
@@ -70,17 +70,23 @@ STEPS_BACK = 100
 class Store(param.Parameterized):
     """The settings of a session, what was refused of them, and their run."""
 
-    scenario: Scenario = param.ClassSelector(class_=Scenario, doc="The settings as accepted.")  # type: ignore
-    errors = param.Dict({}, doc="Dotted path of a refused setting -> why, in one line.")
-    preset = param.Selector(default=next(iter(PRESETS)), objects=list(PRESETS), doc="Where the settings started.")
-    source: Source | None = param.Parameter(None, doc="What the observers run on; None for the simulation of the settings.")  # type: ignore
-    wanted_record: NamedRecord | None = param.Parameter(
+    scenario: param.Parameter[Scenario] = param.Parameter(doc="The settings as accepted.")
+    errors: param.Parameter[dict[str, str]] = param.Parameter({}, doc="Dotted path of a refused setting -> why, in one line.")
+    preset: param.Selector[str] = param.Selector(
+        default=next(iter(PRESETS)), objects=list(PRESETS), doc="Where the settings started."
+    )
+    source: param.Parameter[Source | None] = param.Parameter(
+        None, doc="What the observers run on; None for the simulation of the settings."
+    )
+    wanted_record: param.Parameter[NamedRecord | None] = param.Parameter(
         None, doc="The record of the link that was opened, until its file is given."
-    )  # type: ignore
-    stale = param.Boolean(False, doc="Whether the results shown are not those of the settings.")
-    waiting = param.Number(0.0, doc="How long the run would take that waits to be asked for [s]; 0 where none does.")
-    can_undo = param.Boolean(False, doc="Whether there is a change to undo.")
-    can_redo = param.Boolean(False, doc="Whether there is an undone change to make again.")
+    )
+    stale: param.Boolean[bool] = param.Boolean(False, doc="Whether the results shown are not those of the settings.")
+    waiting: param.Number[float] = param.Number(
+        0.0, doc="How long the run would take that waits to be asked for [s]; 0 where none does."
+    )
+    can_undo: param.Boolean[bool] = param.Boolean(False, doc="Whether there is a change to undo.")
+    can_redo: param.Boolean[bool] = param.Boolean(False, doc="Whether there is an undone change to make again.")
 
     def __init__(self, post: Post, session: Session, scenario: Scenario | None = None):
         live = session.service.live  # whoever changes a setting of the loop that all watch, changes that one alone
@@ -88,13 +94,14 @@ class Store(param.Parameterized):
             super().__init__(scenario=live.scenario, preset=live.preset or next(iter(PRESETS)))
         else:
             super().__init__(scenario=scenario or PRESETS[next(iter(PRESETS))]())
-        self.session, self.limits = session, session.service.limits
+        self.session = session
+        self.limits: Final = session.service.limits
         session.post = post
         self._refusals: dict[str, Any] = {}
         self._past: list[Step] = []
         self._future: list[Step] = []
-        self.run = BackgroundTask(session, drawn_first=True)
-        self.rests = False
+        self.run: Final = BackgroundTask(session, drawn_first=True)
+        self.rests: bool = False
         """Whether runs wait until a page needs one."""
         self.run.param.watch(self._compare, "result")
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import panel as pn
@@ -48,15 +48,17 @@ class UploadFields:
 
     def __init__(self, on_change: Callable[[], None]):
         """Make the fields. on_change : called after every change of one."""
-        self.unit = _select("Unit", [SILENT, *UNITS])
-        self.sign = _select("Commands", {SILENT: 0, "are added to the measurement (+1)": 1, "are subtracted (-1)": -1})
-        self.delay, self.rate = _text("Delay of commands [steps]", 240), _text("Rate [Hz]")
-        self.gain, self.rail = _text("Gain of commands"), _text("Rail: largest command")
+        self.unit: Final = _select("Unit", [SILENT, *UNITS])
+        self.sign: Final = _select("Commands", {SILENT: 0, "are added to the measurement (+1)": 1, "are subtracted (-1)": -1})
+        self.delay: Final = _text("Delay of commands [steps]", 240)
+        self.rate: Final = _text("Rate [Hz]")
+        self.gain: Final = _text("Gain of commands")
+        self.rail: Final = _text("Rail: largest command")
         self.trust, self.open_loop = (
             pmui.Checkbox(label=label, value=False, size="small", margin=(4, 0))
             for label in ("Trust sign and delay as stated", "Open loop: the mirror was at rest")
         )
-        self.widgets = (self.unit, self.sign, self.delay, self.rate, self.gain, self.rail, self.trust, self.open_loop)
+        self.widgets: Final = (self.unit, self.sign, self.delay, self.rate, self.gain, self.rail, self.trust, self.open_loop)
         for widget in self.widgets:
             widget.param.watch(lambda _event: on_change(), "value")
 
@@ -117,11 +119,11 @@ class PreviewView:
     """The text and the figure of a preview."""
 
     def __init__(self) -> None:
-        self.text = pn.pane.HTML("", sizing_mode="stretch_width", margin=(4, 0), styles=TEXT)
-        self.figure = new_figure(x_axis_type="log", y_axis_type="log")
+        self.text: Final = pn.pane.HTML("", sizing_mode="stretch_width", margin=(4, 0), styles=TEXT)
+        self.figure: Final = new_figure(x_axis_type="log", y_axis_type="log")
         self.figure.name = "Spectrum of the record"
         self.figure.xaxis.axis_label, self.figure.yaxis.axis_label = "frequency [Hz]", "PSD of z [µm²/Hz]"
-        self.sources = [ColumnDataSource({"x": [], "y": []}) for _ in TIP_TILT]
+        self.sources: Final = [ColumnDataSource({"x": [], "y": []}) for _ in TIP_TILT]
         for source, colour, mode in zip(self.sources, COLOURS, TIP_TILT, strict=True):
             self.figure.line("x", "y", source=source, color=colour, line_width=1.4, legend_label=mode.name)
 
@@ -166,10 +168,10 @@ class ColumnForm:
         """Make the lists. on_change : called after every choice."""
         self._on_change = on_change
         self._fills = False
-        self.choices = {role: _select(label[0].upper() + label[1:], {"–": ""}) for role, label in ROLES.items()}
+        self.choices: Final = {role: _select(label[0].upper() + label[1:], {"–": ""}) for role, label in ROLES.items()}
         for choice in self.choices.values():
             choice.param.watch(self._choose, "value")
-        self.view = pn.Column(
+        self.view: Final = pn.Column(
             pn.pane.HTML(f"<p>{HINT}</p>", margin=0, styles=TEXT),
             pn.FlexBox(*self.choices.values(), gap="8px", margin=0),
             sizing_mode="stretch_width",
@@ -206,31 +208,31 @@ class Upload:
 
     def __init__(self, store: Store) -> None:
         self.store = store
-        self.picker = Picker(sizing_mode="stretch_width", margin=0)
+        self.picker: Final = Picker(sizing_mode="stretch_width", margin=0)
         self.picker.on_message = self.handle
-        self.use = pmui.Button(label="Use this record", color="primary", size="small", margin=4)
-        self.drop = pmui.Button(label="Discard", variant="outlined", size="small", margin=4)
-        self.missing = pn.pane.HTML("", margin=(8, 4))
-        self.content = PreviewView()
+        self.use: Final = pmui.Button(label="Use this record", color="primary", size="small", margin=4)
+        self.drop: Final = pmui.Button(label="Discard", variant="outlined", size="small", margin=4)
+        self.missing: Final = pn.pane.HTML("", margin=(8, 4))
+        self.content: Final = PreviewView()
         self.form: ColumnForm | None = None
-        self.take = pmui.Button(
+        self.take: Final = pmui.Button(
             label="Take the proposed sign and delay", variant="outlined", size="small", margin=4, visible=False
         )
         self.take.on_click(lambda _event: self.take_proposals())
-        self.place = RecordPlace(store)
+        self.place: Final = RecordPlace(store)
         self._simulating = BackgroundTask(store.session)
         self._simulating.param.watch(self._save_sample, ["state", "place"])
         self.open_scenario: Callable[[str, object], None] = lambda _name, _text: None
         self.open_session: Callable[[str, bytes], None] = lambda _name, _content: None
-        self.room = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
+        self.room: Final = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
         self._parcel = PartialFile()
         self._name, self._content, self._digest = "", b"", ""
         self._preview: AnyPreview | None = None
-        self.reading = BackgroundTask(store.session)
+        self.reading: Final = BackgroundTask(store.session)
         self.reading.param.watch(self._read, ["state", "place", "message"])
         self.use.on_click(lambda _event: self.confirm())
         self.drop.on_click(lambda _event: self.discard())
-        self.fields = UploadFields(self.look)
+        self.fields: Final = UploadFields(self.look)
         self._diameter = store.scenario.telescope.diameter
         store.param.watch(self._follow, "scenario")
         store.param.watch(self._entitle, ["source", "wanted_record"])

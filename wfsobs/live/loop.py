@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from math import isnan
 from threading import Event, Lock, Thread
-from typing import Any
+from typing import Any, Final
 from weakref import ReferenceType, finalize, ref
 
 import numpy as np
@@ -218,14 +218,18 @@ class LiveLoop:
     ):
         for name in observers:
             check_slot(name)
-        self.source, self.sampling, told = source, source.sampling, scenario_on(source, scenario)
+        self.source = source
+        self.sampling: Final = source.sampling
+        told = scenario_on(source, scenario)
         self._speed, self._is_wanted, self._has_begun = check_speed(speed), False, False
         self.events: deque[LiveEvent] = deque(maxlen=MOST_EVENTS)
         self.controllers: set[str] = set()
         self._shadow: Shadow | None = None
         self._log_file, self.readings, self._tending = "", SharedView(), Lock()
         self._processes = LiveProcesses(source, told.before_events, tuple(dict.fromkeys(observers)), self._speed, n_frames)
-        self.feed, self.board, self.delivery = self._processes.feed, self._processes.board, self._processes.delivery
+        self.feed: Final = self._processes.feed
+        self.board: Final = self._processes.board
+        self.delivery: Final = self._processes.delivery
         self.programme: Programme = Programme(told, self.feed.tell)
         self.recorder: Recorder = Recorder(self.feed.ring, self.sampling, self.say, source.name == SIMULATION)
         self.workshop: Workshop = Workshop(self._processes, self.sampling, self.say)

@@ -12,7 +12,7 @@ from multiprocessing.process import BaseProcess
 from signal import Signals
 from threading import Event, Lock, RLock
 from time import monotonic, sleep
-from typing import Any
+from typing import Any, Final
 
 from wfsobs.live.board import CREWS, Board, crew_of
 from wfsobs.live.control_crew import ControlView, control_frames, row_width
@@ -153,7 +153,7 @@ class CrewProcess:
     def __init__(self, context: SpawnContext, name: str, width: int, work: Callable[..., None], site: Site, *more: object):
         self.rows: Rows = Rows(width, ROOM)
         inbox, self._outbox = context.Pipe(duplex=False)
-        self.process = context.Process(target=work, args=(site, self.rows.name, inbox, *more), name=name, daemon=True)
+        self.process: Final = context.Process(target=work, args=(site, self.rows.name, inbox, *more), name=name, daemon=True)
         self.process.start()
 
     def tell(self, command: Command) -> None:

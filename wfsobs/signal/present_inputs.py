@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag, helmert
@@ -51,7 +51,7 @@ class PresentInputs:
 
     def __init__(self, covariances: Sequence[Array], basis: Array, n_fast: int):
         self._covariances, self._to_each, self._n_fast = covariances, np.linalg.inv(basis), n_fast
-        self.selection = lru_cache(SETS)(self._select)
+        self.selection: Final = lru_cache(SETS)(self._select)
 
     def estimate(self, targets: Sequence[tuple[Array, Array]], present: Present) -> tuple[Array, Array]:
         """Return weights of all states and standard deviations, (n_phases, n_targets, n_states) and (n_phases, n_targets).

@@ -138,6 +138,7 @@ class SafeGate:
         How many there were in a row in a mode, the last one among them.
     """
 
+    outliers: Array
     beyond: int
 
     def __init__(self, wiring: Wiring):
@@ -196,7 +197,8 @@ class CommandStream:
         check_elements(stream, elements)
         self._stream, self._elements, self._scale = stream, np.array(elements), scale
         self._whole, self._part = int(delay), delay % 1.0
-        self._count, self.missing = stream.first, 0
+        self._count = stream.first
+        self.missing: int = 0
         self.restart()
 
     def restart(self) -> None:

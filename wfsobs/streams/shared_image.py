@@ -8,6 +8,7 @@ import struct
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -81,7 +82,7 @@ class SharedImage:
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or "the file is empty"
             raise StreamError(f"{path}: no stream: {reason}") from None
-        self.header = read_header(self.path, memoryview(self._map))
+        self.header: Final = read_header(self.path, memoryview(self._map))
         layout, n = self.header.layout, int(np.prod(self.header.shape))
         self._values = np.ndarray(n, self.header.dtype, self._map, layout.header)
         self._count = np.ndarray(1, np.uint64, self._map, layout.count)

@@ -10,7 +10,7 @@ import math
 import re
 from abc import ABC, abstractmethod
 from html import escape
-from typing import Any
+from typing import Any, Final
 
 import panel as pn
 import panel_material_ui as pmui
@@ -37,13 +37,16 @@ class Field(ABC):
     has_help = False
     """Whether its box has a line of help, which says why it has no effect; else a line below does."""
 
-    def __init__(self, store: Store, path: str, p: param.Parameter):
-        self.store, self.path, self.parameter = store, path, p
-        self.idle = self._note_html = ""
-        self.widgets = self._widgets()
+    def __init__(self, store: Store, path: str, p: param.Parameter[Any]):
+        self.store = store
+        self.path = path
+        self.parameter = p
+        self.idle: str = ""
+        self._note_html = ""
+        self.widgets: Final = self._widgets()
         for widget in self.widgets:
             widget._debounce = SOON
-        self.view = pn.Column(self._row(), sizing_mode="stretch_width", margin=0)
+        self.view: Final = pn.Column(self._row(), sizing_mode="stretch_width", margin=0)
         self.refresh()
         store.param.watch(self.refresh, ["scenario", "errors"])
 
@@ -299,7 +302,7 @@ class SliderField(TextField):
             slider.param.update(start=min(low, place), end=max(high, place), value=place, value_throttled=place)
 
 
-def make_field(store: Store, path: str, p: param.Parameter) -> Field:
+def make_field(store: Store, path: str, p: param.Parameter[Any]) -> Field:
     """Make the field that fits a setting."""
     if isinstance(p, param.Boolean):
         return SwitchField(store, path, p)

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Final
 
 import panel as pn
 import panel_material_ui as pmui
@@ -76,7 +76,7 @@ class Controls:
         self.lists: dict[str, RowEditor] = {}
         self.parts: list[tuple[str, Any]] = []
         self.headings: dict[str, tuple[str, pn.pane.HTML]] = {}
-        self.preset = pmui.Select(
+        self.preset: Final = pmui.Select(
             label="Preset",
             tags=[TAG + PRESET],
             value=store.preset,
@@ -86,24 +86,26 @@ class Controls:
             stylesheets=[TWO_LINES],
             **ROOM,
         )
-        self.reset = pmui.Button(label="Reset", variant="text", size="small", margin=(4, 0))
+        self.reset: Final = pmui.Button(label="Reset", variant="text", size="small", margin=(4, 0))
         self.undo, self.redo = (
             pmui.Button(label=name, variant="text", size="small", margin=(4, 4, 4, 0), disabled=True) for name in ("Undo", "Redo")
         )
-        self.run = pmui.Button(
+        self.run: Final = pmui.Button(
             label="Run", icon="play_arrow", size="small", margin=0, sx=ON_BAR | {"backgroundColor": "#fff", "color": PRIMARY}
         )
-        self.cancel = pmui.Button(label="Cancel", icon="stop", variant="outlined", size="small", margin=(0, 10, 0, 6), sx=ON_BAR)
-        self.status = Status(sizing_mode="stretch_width", max_width=200, margin=0, stylesheets=[STATUS_ON_BAR])
-        self.search = Search(self.open_setting, self._idle, sizing_mode="stretch_width", margin=(8, 0, 4, 0))
+        self.cancel: Final = pmui.Button(
+            label="Cancel", icon="stop", variant="outlined", size="small", margin=(0, 10, 0, 6), sx=ON_BAR
+        )
+        self.status: Final = Status(sizing_mode="stretch_width", max_width=200, margin=0, stylesheets=[STATUS_ON_BAR])
+        self.search: Final = Search(self.open_setting, self._idle, sizing_mode="stretch_width", margin=(8, 0, 4, 0))
         self.effect_of: Callable[[RunResults, RunResults], str] = lambda _before, _now: ""
         self._effect = pn.pane.HTML("", margin=0, styles=EFFECT)
         self._before: RunResults | None = None
         self._changed_part: Field | RowEditor | None = None
-        self.topics = _names()
-        self.rooms = {name: pn.Column(sizing_mode="stretch_width", margin=0) for name in self.topics}
+        self.topics: Final = _names()
+        self.rooms: Final = {name: pn.Column(sizing_mode="stretch_width", margin=0) for name in self.topics}
         self.titles = dict(self.topics)
-        self.accordion = pmui.Accordion(
+        self.accordion: Final = pmui.Accordion(
             *((title, self.rooms[name]) for name, title in self.topics.items()),
             title_variant="body2",
             variant="outlined",

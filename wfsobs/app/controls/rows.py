@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from html import escape
-from typing import Any
+from typing import Any, Final
 
 import panel as pn
 import param
 
-from wfsobs.app.component import Component
+from wfsobs.app.component import HtmlComponent
 from wfsobs.app.controls.fields import TAG, idle_html, parse_number, short_number
 from wfsobs.app.controls.names import column_of, name_settings
 from wfsobs.app.display import unit_text
@@ -21,10 +21,8 @@ from wfsobs.settings.group import Group
 from wfsobs.settings.parameters import Reals, unit_of
 
 
-class RowTable(Component):
+class RowTable(HtmlComponent):
     """The table in the browser; messages {action, key, name} up, where the key is a row, or a row and a column."""
-
-    html = param.String("", doc="The table, as `rows.html` has it.")
 
     _esm = script("patch", "markup", "rows")
     _stylesheets = sheets("base", "rows")
@@ -34,7 +32,8 @@ class RowTable(Component):
 
         noun : what an item is called; columns : {key, name, doc, choices} of every one
         """
-        self.noun, self.columns = noun, columns
+        self.noun = noun
+        self.columns = columns
         super().__init__(on_message, **params)
 
     def show(self, rows: list[list[str | None]], errors: dict[str, dict[str, str]]) -> None:
@@ -47,11 +46,12 @@ class RowEditor:
     """The table of one list of groups, kept in step with the store."""
 
     def __init__(self, store: Store, path: str, p: param.List):
-        self.store, self.path = store, path
+        self.store = store
+        self.path = path
         assert isinstance(p.item_type, type) and issubclass(p.item_type, Group)
         self._kind: type[Group] = p.item_type
         self._texts: dict[str, str] = {}
-        self.table = RowTable(
+        self.table: Final = RowTable(
             self.handle,
             self._kind.__name__.lower(),
             _columns(self._kind),
@@ -59,8 +59,9 @@ class RowEditor:
             sizing_mode="stretch_width",
             margin=(0, 0, 8, 0),
         )
-        self.label, self.idle = str(p.label), ""
-        self.view = pn.Column(self.table, sizing_mode="stretch_width", margin=0)
+        self.label: Final = str(p.label)
+        self.idle: str = ""
+        self.view: Final = pn.Column(self.table, sizing_mode="stretch_width", margin=0)
         self.refresh()
         store.param.watch(self.refresh, ["scenario", "errors"])
 

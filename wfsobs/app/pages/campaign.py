@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import panel as pn
@@ -242,13 +242,14 @@ class CampaignPage(Page):
         """Make the page. explore : turns to the page that shows a scenario."""
         super().__init__(store, display)
         self._explore = explore
-        self.work = CampaignTask(store.session)
-        self.status = Status(label="Progress of the campaign", sizing_mode="stretch_width", margin=(4, 0))
-        self.failure = html()
-        self.room = boxes()
-        self.table, self.legend = html(), html()
-        self.map = SweepMap(self.load, **WIDE)
-        self.pane = pn.Column(**WIDE)
+        self.work: Final = CampaignTask(store.session)
+        self.status: Final = Status(label="Progress of the campaign", sizing_mode="stretch_width", margin=(4, 0))
+        self.failure: Final = html()
+        self.room: Final = boxes()
+        self.table: Final = html()
+        self.legend: Final = html()
+        self.map: Final = SweepMap(self.load, **WIDE)
+        self.pane: Final = pn.Column(**WIDE)
         self.slice: SweepLines | None = None
         self._slice_of: tuple[str, ...] = ()
         self.axes: dict[str, PlanAxis] = {}

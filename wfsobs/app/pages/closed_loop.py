@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from html import escape
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import panel as pn
@@ -43,7 +43,7 @@ from wfsobs.app.views.gain_editor import GainEditor, plane
 from wfsobs.app.views.plots import add_line, envelope, envelope_times, new_figure, on_settle, restyle
 from wfsobs.app.views.strip import Cards, card_of
 from wfsobs.app.views.table import SMALLEST
-from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label, loop_verdict, no_theory
+from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label, loop_verdict
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import Row as Score
 from wfsobs.evaluation.scores import BOUNDS
@@ -67,8 +67,8 @@ class LoopLines:
 
     def __init__(self, fig: figure, names: tuple[str, ...]):
         self.figure = fig
-        self.sources = {name: ColumnDataSource({"x": [], "y": []}) for name in names}
-        self.lines = {name: add_line(fig, name, source) for name, source in self.sources.items()}
+        self.sources: Final = {name: ColumnDataSource({"x": [], "y": []}) for name in names}
+        self.lines: Final = {name: add_line(fig, name, source) for name, source in self.sources.items()}
 
     def restyle(self, dark: bool, hidden_names: list[str]) -> None:
         """Set the colours of light or dark mode, and hide lines."""
@@ -79,7 +79,7 @@ class Trace(LoopLines):
     """The residual of every controller over time; that of none would dwarf the rest. seconds : shown of a record at first."""
 
     def __init__(self, seconds: float):
-        self.x_range = Range1d(start=0.0, end=1.0)
+        self.x_range: Final = Range1d(start=0.0, end=1.0)
         super().__init__(
             new_figure(x_range=self.x_range, y_range=Range1d(start=-1.0, end=1.0)),
             tuple(name for name in CONTROLLERS if name != NONE),
@@ -171,8 +171,8 @@ class Response(LoopLines):
     def __init__(self) -> None:
         fig = new_figure(x_range=Range1d(start=0.5, end=500.0), y_range=Range1d(start=-50.0, end=15.0), x_axis_type="log")
         super().__init__(fig, CURVES)
-        self.noise = {name: ColumnDataSource({"x": [], "y": []}) for name in CURVES}
-        self.faint = {name: add_line(fig, name, source) for name, source in self.noise.items()}
+        self.noise: Final = {name: ColumnDataSource({"x": [], "y": []}) for name in CURVES}
+        self.faint: Final = {name: add_line(fig, name, source) for name, source in self.noise.items()}
         for line in self.lines.values():
             line.glyph.line_width = 2.2
         for line in self.faint.values():
@@ -210,7 +210,7 @@ class Nyquist(LoopLines):
         fig.line(np.cos(turn), np.sin(turn), line_color="#888888", line_dash=[4, 3])
         fig.scatter([-1.0], [0.0], marker="x", size=11, line_color="#888888", line_width=2)
         super().__init__(fig, CURVES)
-        self.marks = ColumnDataSource({"x": [], "y": [], "colour": [], "marker": []})
+        self.marks: Final = ColumnDataSource({"x": [], "y": [], "colour": [], "marker": []})
         fig.scatter("x", "y", source=self.marks, marker="marker", line_color="colour", fill_alpha=0.0, size=9, line_width=2)
         fig.xaxis.axis_label, fig.yaxis.axis_label = "real part", "imaginary part"
         self._at: dict[str, list[tuple[complex, str]]] = {}
@@ -273,7 +273,7 @@ def loop_html(results: LoopResults, display: Display) -> str:
     smallest = next((r["controller"] for r in rows if r["controller"] not in BOUNDS and r["residual_rms_nm"] is not None), None)
     scale = 1e-3 * per_micrometre(display.unit, results.result.scenario.telescope.diameter)
     body = [_row(r, display, scale, r["controller"] == smallest) for r in rows]
-    notes = {r["note"]: label(r["controller"]) for r in reversed(rows) if r["note"] not in ("", LIMITED)}
+    notes = {r["note"]: label(r["controller"]) for r in reversed(rows) if r["note"] and not r["limited"]}
     failures = macro("texts", "failure", [f"{name}: {note}" for note, name in notes.items()])
     return f"{table('Controllers', columns, [('', body)])}{limits_note(rows)}{failures}"
 
@@ -287,9 +287,8 @@ def loop_verdict_html(results: LoopResults, display: Display) -> str:
 
 
 def limits_note(rows: Sequence[Score]) -> str:
-    """Why some of the rows have no theory and no margins; nothing where all have them."""
-    said = no_theory(rows)
-    return f"<p>{said}</p>" if said else ""
+    """Why some of the rows have no theory and no margins; nothing where no limit of the mirror acts."""
+    return f"<p>{NOT_APPLICABLE}: {LIMITED}</p>" if any(r["limited"] for r in rows) else ""
 
 
 def linear_text(row: Score, value: str) -> str:
@@ -363,11 +362,14 @@ class ClosedLoopPage(Page):
 
     def __init__(self, store: Store, display: Display):
         super().__init__(store, display, "mode", "unit")
-        self.work = BackgroundTask(store.session, title="Closed loop")
+        self.work: Final = BackgroundTask(store.session, title="Closed loop")
         self._of = object()
         self._rooms = list[pn.viewable.Viewable]()
-        self.note, self.verdict, self.table, self.margins = html(), html(), html(), html()
-        self.cards = Cards("controllers")
+        self.note: Final = html()
+        self.verdict: Final = html()
+        self.table: Final = html()
+        self.margins: Final = html()
+        self.cards: Final = Cards("controllers")
         self.cards.on_main, self._main, self._is_chosen = self._show_main, list[str](), False
         self.link = LinkedLines(
             "hide",
@@ -376,10 +378,13 @@ class ClosedLoopPage(Page):
             self._hide,
             lambda act: self.cards.param.watch(act, "hidden_lines"),
         )
-        self.trace, self.zoom = Trace(FIRST_S), Trace(ZOOM_S)
-        self.spectrum, self.response, self.nyquist = LoopSpectrum(), Response(), Nyquist()
-        self.room = figure_with_caption("Rejection and noise transfer", self.response.figure, tall=True)
-        self.stability = figure_with_caption("Loop gain L, unit circle", self.nyquist.figure)
+        self.trace: Final = Trace(FIRST_S)
+        self.zoom: Final = Trace(ZOOM_S)
+        self.spectrum: Final = LoopSpectrum()
+        self.response: Final = Response()
+        self.nyquist: Final = Nyquist()
+        self.room: Final = figure_with_caption("Rejection and noise transfer", self.response.figure, tall=True)
+        self.stability: Final = figure_with_caption("Loop gain L, unit circle", self.nyquist.figure)
         self.editor: GainEditor | None = None
         display.param.watch(self._edit, "editing")
         self._edit()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from html import escape
 from types import MappingProxyType
+from typing import Final
 
 import panel as pn
 import panel_material_ui as pmui
@@ -58,20 +59,22 @@ class Explore(Page):
 
     def __init__(self, history: History, seeds: SeedRuns | None = None):
         run, display = history.store.run, history.display
-        self.run, self.display, self.seeds = run, display, seeds
-        self.show_switch = group(display, "show", {"Signal": SIGNAL, "Error": ERROR, "Running rms": RUNNING_RMS})
+        self.run = run
+        self.display = display
+        self.seeds = seeds
+        self.show_switch: Final = group(display, "show", {"Signal": SIGNAL, "Error": ERROR, "Running rms": RUNNING_RMS})
         self._wanted_show = display.show
         run.param.watch(self._offer_errors, "result")  # before the figures, which then draw once
-        self.lines = MainLines(run, display, seeds)
-        self.traces = Traces(run, display)
-        self.spectra = SpectraFigures(run, display, self.traces.x_range)
-        self.budgets = Budgets(seeds.store, self.lines.names, seeds) if seeds else None
-        self.strips = {target: Strip(target, run, display, seeds, self.lines, self.budgets) for target in TARGETS}
-        self.verdicts = {target: VerdictLine(target, run, display, seeds, self.budgets) for target in TARGETS}
+        self.lines: Final = MainLines(run, display, seeds)
+        self.traces: Final = Traces(run, display)
+        self.spectra: Final = SpectraFigures(run, display, self.traces.x_range)
+        self.budgets: Final = Budgets(seeds.store, self.lines.names, seeds) if seeds else None
+        self.strips: Final = {target: Strip(target, run, display, seeds, self.lines, self.budgets) for target in TARGETS}
+        self.verdicts: Final = {target: VerdictLine(target, run, display, seeds, self.budgets) for target in TARGETS}
         axes = self.traces.x_range, self.spectra.x_range
-        self.stretches = {target: Stretch(target, run, display, *axes, self.traces.chosen_window) for target in TARGETS}
-        self.table = Table(run, display, seeds)
-        self.pinning = Pinning(run, display, history)
+        self.stretches: Final = {target: Stretch(target, run, display, *axes, self.traces.chosen_window) for target in TARGETS}
+        self.table: Final = Table(run, display, seeds)
+        self.pinning: Final = Pinning(run, display, history)
         self.rooms: dict[str, pn.Column] = {}
         self._later: list[tuple[pn.Column, pn.pane.Bokeh]] = []
         self.editors: dict[str, SpectrumEditor] = {}

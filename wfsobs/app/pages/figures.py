@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from html import escape
+from typing import Any, Final
 
 import numpy as np
 import panel as pn
@@ -38,7 +39,7 @@ class Figures(Page):
 
     def __init__(self, store: Store, display: Display):
         super().__init__(store, display, "unit", "dark")
-        self.sheets = [_Sheet(it) for it in FIGURES]
+        self.sheets: Final = [_Sheet(it) for it in FIGURES]
         self.run.param.watch(self.redraw, "result")
 
     def view(self) -> pn.Column:
@@ -109,7 +110,7 @@ class _PlotLines:
         self.figure.xaxis.axis_label = "frequency [Hz]" if plot.what == SPECTRUM else "time [s]"
         call(self.figure, f"{of.title}, {TIP_TILT[plot.column].name}, {plot.what}")
         self.sources = {name: ColumnDataSource({"x": [], "y": []}) for name in names}
-        self.lines: dict[str, GlyphRenderer] = {
+        self.lines: dict[str, GlyphRenderer[Any]] = {
             name: self.figure.line(
                 "x",
                 "y",

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from html import escape
+from typing import Final
 
 import numpy as np
 import panel as pn
@@ -160,17 +161,17 @@ class SpectrumFigure:
     """What was measured, mean and highest value of every bin; over it the model, its parts, and a mark on every peak."""
 
     def __init__(self) -> None:
-        self.figure = new_figure(
+        self.figure: Final = new_figure(
             x_range=Range1d(start=0.1, end=500.0), y_range=Range1d(start=1e-6, end=1.0), x_axis_type="log", y_axis_type="log"
         )
         self.figure.height = HEIGHT
         call(self.figure, "Spectrum of z and its model")
         self.figure.xaxis.axis_label = "frequency [Hz]"
-        self.measurement = ColumnDataSource({"x": [], "mean": [], "highest": []})
-        self.total = ColumnDataSource({"x": [], "y": []})
-        self.parts = ColumnDataSource({"xs": [], "ys": []})
-        self.spikes = ColumnDataSource({"x": [], "low": [], "high": []})
-        self.peaks = ColumnDataSource({"x": [], "y": [], "text": []})
+        self.measurement: Final = ColumnDataSource({"x": [], "mean": [], "highest": []})
+        self.total: Final = ColumnDataSource({"x": [], "y": []})
+        self.parts: Final = ColumnDataSource({"xs": [], "ys": []})
+        self.spikes: Final = ColumnDataSource({"x": [], "low": [], "high": []})
+        self.peaks: Final = ColumnDataSource({"x": [], "y": [], "text": []})
         fig = self.figure
         self._renderers = {
             "highest": [fig.line("x", "highest", source=self.measurement, line_alpha=0.45, line_width=1.0)],
@@ -299,17 +300,21 @@ class IdentifyPage(Page):
 
     def __init__(self, store: Store, display: Display):
         super().__init__(store, display)
-        self.work = BackgroundTask(store.session, title="Identification")
-        self.starter = Starter(
+        self.work: Final = BackgroundTask(store.session, title="Identification")
+        self.starter: Final = Starter(
             self.work, "Identify the record", "Progress of the identification", uses=("Filters only", "As a new simulation")
         )
-        self.level, self.lowest = number_field("Level", LEVEL, 120), number_field("Lowest peak [Hz]", LOWEST, 120)
+        self.level: Final = number_field("Level", LEVEL, 120)
+        self.lowest: Final = number_field("Lowest peak [Hz]", LOWEST, 120)
         self.link = LinkedFields({"level": self.level, "lowest": self.lowest})
-        self.figure = SpectrumFigure()
-        self.legend, self.table, self.verdict, self.note = html(), html(), html(), html()
-        self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
+        self.figure: Final = SpectrumFigure()
+        self.legend: Final = html()
+        self.table: Final = html()
+        self.verdict: Final = html()
+        self.note: Final = html()
+        self.stale: Final = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
         self.of: RecordSpectrum | None = None
-        self.measuring = BackgroundTask(store.session)
+        self.measuring: Final = BackgroundTask(store.session)
         self._scenario: Scenario | None = None
         self._spectrum = object()
         self.starter.start.on_click(lambda _event: self.start())
@@ -432,12 +437,13 @@ class Suggestion:
     """The line above the first results of a loaded record: its button identifies it and has the filters use the model."""
 
     def __init__(self, store: Store, make_page: Callable[[], IdentifyPage]):
-        self.store, self._make_page = store, make_page
+        self.store = store
+        self._make_page = make_page
         self.page: IdentifyPage | None = None
         self._waits = False  # for a model that is to be used once it is there
-        self.words = html()
-        self.button = pmui.Button(label="Identify", icon="troubleshoot", size="small", margin=0)
-        self.view = pn.FlexBox(self.words, self.button, gap="8px 12px", align_items="center", visible=False, **WIDE)
+        self.words: Final = html()
+        self.button: Final = pmui.Button(label="Identify", icon="troubleshoot", size="small", margin=0)
+        self.view: Final = pn.FlexBox(self.words, self.button, gap="8px 12px", align_items="center", visible=False, **WIDE)
         self.words.sizing_mode = None
         self.button.on_click(self._identify)
         store.param.watch(self._refresh, ["source", "scenario"])

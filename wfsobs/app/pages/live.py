@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from html import escape
 from time import monotonic
+from typing import Final
 
 import panel as pn
 import panel_material_ui as pmui
@@ -129,13 +130,18 @@ class LiveRoom:
     """The figures and tables of one page."""
 
     def __init__(self, store: Store, display: Display, controls: LiveControls, pulse: Pulse):
-        self.display, self.store, self.controls = display, store, controls
+        self.display = display
+        self.store = store
+        self.controls = controls
         self._painter = painter = Painter(pulse)
-        self.traces, self.spectra, self.waterfall = RollingTraces(painter), RollingSpectra(painter), Waterfall()
-        self.latencies, self.stars = LatencyHistogram(painter), Stars(painter)
+        self.traces: Final = RollingTraces(painter)
+        self.spectra: Final = RollingSpectra(painter)
+        self.waterfall: Final = Waterfall()
+        self.latencies: Final = LatencyHistogram(painter)
+        self.stars: Final = Stars(painter)
         self.table, self.control_table, self.news, self.peaks = (live_text() for _ in range(4))
         self.editor: SpectrumEditor | None = None
-        self.legend = live_text()
+        self.legend: Final = live_text()
         self._second = 0
         self._bounds: Bounds = {}
         self._spectra_room = figure_with_caption("Spectra", self.spectra.figure)
@@ -237,13 +243,15 @@ class LivePage(Page):
 
     def __init__(self, store: Store, display: Display):
         super().__init__(store, display, "mode", "unit", "dark", "show", "spectrum", "editing")
-        self.work = LiveTask(store.session)
+        self.work: Final = LiveTask(store.session)
         self.controls = c = LiveControls()
-        self.buttons, self.link = c.buttons, c.link
-        self.intro, self.status = text(INTRO), live_text()
-        self.room = boxes()
+        self.buttons: Final = c.buttons
+        self.link = c.link
+        self.intro: Final = text(INTRO)
+        self.status: Final = live_text()
+        self.room: Final = boxes()
         self.room.visible = False
-        self.pulse = Pulse(width=0, height=0, margin=0)
+        self.pulse: Final = Pulse(width=0, height=0, margin=0)
         self.picture: LiveRoom | None = None
         self._known_loop: LiveLoop | None = None
         self._beat = Beat(store.session.post, self.tick) if pn.state.curdoc else None

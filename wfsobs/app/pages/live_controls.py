@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from html import escape
 from math import inf, isnan
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import panel_material_ui as pmui
@@ -202,34 +202,34 @@ class LiveControls:
     """Buttons and fields."""
 
     def __init__(self) -> None:
-        self.buttons = {
+        self.buttons: Final = {
             name: pmui.Button(label=name, icon=icon, color="primary" if name == "Start" else "default", size="small", margin=0)
             for name, icon in BUTTONS.items()
         }
         select = {"size": "small", "margin": 0}
-        self.speed = pmui.Select(label="Speed", options=SPEEDS, value=1.0, width=100, **select)
-        self.window = pmui.Select(label="Window", options=WINDOWS, value=5.0, width=100, **select)
-        self.target = pmui.Select(label="Errors of", options=QUANTITIES, value=TARGETS[0], width=300, **select)
-        self.lasers = pmui.Checkbox(label="Lasers", value=True, **select)
-        self.ngs = pmui.Checkbox(label="NGS", value=True, **select)
-        self.losses = pmui.Select(label="Frame loss", options=LOSSES, value=0.0, width=160, **select)
-        self.running = pmui.MultiChoice(
+        self.speed: Final = pmui.Select(label="Speed", options=SPEEDS, value=1.0, width=100, **select)
+        self.window: Final = pmui.Select(label="Window", options=WINDOWS, value=5.0, width=100, **select)
+        self.target: Final = pmui.Select(label="Errors of", options=QUANTITIES, value=TARGETS[0], width=300, **select)
+        self.lasers: Final = pmui.Checkbox(label="Lasers", value=True, **select)
+        self.ngs: Final = pmui.Checkbox(label="NGS", value=True, **select)
+        self.losses: Final = pmui.Select(label="Frame loss", options=LOSSES, value=0.0, width=160, **select)
+        self.running: Final = pmui.MultiChoice(
             label="Observers", options={look(name).label: name for name in SLOTS}, value=list(FIRST), **APART
         )
-        self.controllers = pmui.MultiChoice(
+        self.controllers: Final = pmui.MultiChoice(
             label="Controllers", options={look(name).label: name for name in SEATS}, value=list(USUAL), **APART
         )
-        self.whose = pmui.Select(label="Redesign", options={"All that run": ALL}, value=ALL, width=230, **select)
+        self.whose: Final = pmui.Select(label="Redesign", options={"All that run": ALL}, value=ALL, width=230, **select)
         for field in (self.running, self.controllers):
             field.param.watch(self._offer, "value")
         self._offer()
         waterfall = {"the measurement": MEASUREMENT} | {f"error of {label}": name for label, name in self.running.options.items()}
-        self.waterfall = pmui.Select(label="Waterfall of", options=waterfall, value=MEASUREMENT, width=260, **select)
-        self.lines = pmui.MultiChoice(label="Lines", options=self.running.options, value=list(MAIN), **APART)
+        self.waterfall: Final = pmui.Select(label="Waterfall of", options=waterfall, value=MEASUREMENT, width=260, **select)
+        self.lines: Final = pmui.MultiChoice(label="Lines", options=self.running.options, value=list(MAIN), **APART)
 
         linked = {"errors": self.target, "window": self.window}
         linked |= {"observers": self.running, "controllers": self.controllers, "speed": self.speed}
-        self.link = LinkedFields(linked, {"speed": lambda text: self._offer_speed(speed_of(text))})
+        self.link: Final = LinkedFields(linked, {"speed": lambda text: self._offer_speed(speed_of(text))})
 
     def tell(self, loop: LiveLoop) -> None:
         """Show what runs."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from time import monotonic
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import panel as pn
@@ -45,12 +45,13 @@ PATIENCE = 10.0
 class Pulse(Component):
     """Tells when a picture has been painted."""
 
-    picture = param.Integer(0, doc="Number of the last one.")
-    changes = param.List([], doc="What a Painter changes with it.")
+    picture: param.Integer[int] = param.Integer(0, doc="Number of the last one.")
+    changes: param.List[list[Any]] = param.List([], doc="What a Painter changes with it.")
     _esm = script("pulse")
 
     def __init__(self, **params: Any):
-        self.answer, self._time = -1, 0.0
+        self.answer: int = -1
+        self._time = 0.0
         self._waiting: Callable[[], None] | None = None
         super().__init__(self._take, **params)
 
@@ -152,9 +153,10 @@ class LiveFigure:
     """A figure with a line per observer, each made when it is first shown."""
 
     def __init__(self, fig: figure, painter: Painter):
-        self.figure, self.painter = fig, painter
-        self.sources = {name: ColumnDataSource({"x": [], "y": []}) for name in NAMES}
-        self.lines = FigureLines(fig, {name: (source, "y") for name, source in self.sources.items()})
+        self.figure = fig
+        self.painter = painter
+        self.sources: Final = {name: ColumnDataSource({"x": [], "y": []}) for name in NAMES}
+        self.lines: Final = FigureLines(fig, {name: (source, "y") for name, source in self.sources.items()})
         self._style: tuple[bool, set[str]] = (False, set())
 
     def put(self, data: Mapping[str, tuple[Array, Array]], dark: bool) -> None:
@@ -365,7 +367,9 @@ class Waterfall:
     """
 
     def __init__(self) -> None:
-        self.figure = new_figure(x_range=Range1d(start=0.0, end=1.0), y_range=Range1d(start=LOWEST, end=500.0), y_axis_type="log")
+        self.figure: Final = new_figure(
+            x_range=Range1d(start=0.0, end=1.0), y_range=Range1d(start=LOWEST, end=500.0), y_axis_type="log"
+        )
         self.figure.xaxis.axis_label, self.figure.yaxis.axis_label = "time of the loop [s]", "frequency [Hz]"
         self.figure.grid.visible = False
         self._colours = LogColorMapper(palette=Viridis256, low=1e-6, high=1.0, nan_color="rgba(0, 0, 0, 0)")
@@ -374,7 +378,7 @@ class Waterfall:
         self.figure.add_glyph(self._source, glyph, level="image")
         self._bar = ColorBar(color_mapper=self._colours, width=8, padding=4, title_text_font_style="normal")
         self.figure.add_layout(self._bar, "right")
-        self.columns = np.full((ROWS, COLUMNS), np.nan)
+        self.columns: Final = np.full((ROWS, COLUMNS), np.nan)
         self._of: tuple[str, str, int] = ("", "", 0)
         self._number = 0
         self._sent_in = ("", False)
@@ -468,7 +472,8 @@ class Detector:
 
     def __init__(self, name: str, painter: Painter):
         self.painter = painter
-        self.name, self.label = name, look("none" if name == TRUTH else name).label
+        self.name = name
+        self.label: Final = look("none" if name == TRUTH else name).label
         ranges = {"x_range": Range1d(start=-1.0, end=1.0), "y_range": Range1d(start=-1.0, end=1.0)}
         self.figure: figure = new_figure(**ranges)
         self.figure.update(height=None, aspect_ratio=1.0, min_width=SIDE, min_border_left=36, toolbar_location=None)
@@ -482,7 +487,7 @@ class Detector:
         self._core = self.figure.circle("x", "y", radius=1.0, source=self._spot, fill_alpha=0.6).glyph
         self._style: tuple[float, float, str] | None = None
         caption = html(f'<div class="caption">{self.label}</div>', sizing_mode=None)
-        self.view = pn.Column(caption, pn.pane.Bokeh(self.figure, sizing_mode=self.figure.sizing_mode, margin=0), **WIDE)
+        self.view: Final = pn.Column(caption, pn.pane.Bokeh(self.figure, sizing_mode=self.figure.sizing_mode, margin=0), **WIDE)
 
     def draw(self, points: Array, reach: float, radius: float, dark: bool) -> None:
         """Send the last instants (n, 2), the newest last; reach : of the axes;  radius : of the core, all in mas."""
@@ -504,7 +509,7 @@ class Stars:
 
     def __init__(self, painter: Painter) -> None:
         self._painter = painter
-        self.row = pn.Column(**{**WIDE, "margin": (12, 0, 0, 0)}, stylesheets=[GRID])
+        self.row: Final = pn.Column(**{**WIDE, "margin": (12, 0, 0, 0)}, stylesheets=[GRID])
         self._detectors: dict[str, Detector] = {}
         self._reach = 1.0
 

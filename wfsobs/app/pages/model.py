@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import panel as pn
 
 from wfsobs.app.display import Display
@@ -19,7 +21,7 @@ class ModelPage(Page):
 
     def __init__(self, store: Store, display: Display):
         super().__init__(store, display, "mode", "dark")
-        self.pane = pn.pane.HTML("", **WIDE, stylesheets=sheets("style", "model"))
+        self.pane: Final = pn.pane.HTML("", **WIDE, stylesheets=sheets("style", "model"))
         store.param.watch(self.redraw, "scenario")
 
     def view(self) -> pn.pane.HTML:

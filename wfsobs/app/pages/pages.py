@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Final
 from urllib.parse import parse_qsl, quote
 
 import panel as pn
@@ -86,18 +86,18 @@ class Pages(param.Parameterized):
         }
         if store.session.service.campaign is not None:
             self._makers[CAMPAIGN] = lambda: CampaignPage(store, display, explored)
-        self.suggestion = Suggestion(store, self._identify_page)
+        self.suggestion: Final = Suggestion(store, self._identify_page)
         known = {title: name for title, name in TITLES.items() if name == EXPLORE or name in self._makers}
         self.param["current"].objects = [*known.values()]
         self.by_name: dict[str, Page] = {EXPLORE: explore}
-        self.rooms = {
+        self.rooms: Final = {
             EXPLORE: pn.Column(self.suggestion.view, explore.view(), **WIDE),
             **{name: pn.Column(visible=False, sizing_mode="stretch_width", margin=0) for name in self._makers},
         }
-        self.switch = pmui.RadioButtonGroup.from_param(
+        self.switch: Final = pmui.RadioButtonGroup.from_param(
             self.param.current, options=known, size="small", margin=0, css_classes=["tabs"], sx=TABS, stylesheets=[HEARD]
         )
-        self.view = pn.Column(*self.rooms.values(), sizing_mode="stretch_width", margin=0)
+        self.view: Final = pn.Column(*self.rooms.values(), sizing_mode="stretch_width", margin=0)
         self.param.watch(self._turn, "current")
 
     @property
@@ -158,7 +158,10 @@ class ViewState(param.Parameterized):
 
     def __init__(self, display: Display, pages: Pages, lines: MainLines, traces: Traces, seeds: SeedRuns):
         super().__init__()
-        self.display, self.pages, self.lines, self.traces = display, pages, lines, traces
+        self.display = display
+        self.pages = pages
+        self.lines = lines
+        self.traces = traces
         switches = LinkedFields({PAGE: (pages, "current")} | {name: (display, name) for name in SWITCHES})
         switches.fresh[PAGE] = EXPLORE
         self._parts: list[tuple[Collection[str], LinkPart]] = [

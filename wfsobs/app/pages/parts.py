@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from functools import partial
 from html import escape
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import panel as pn
 import panel_material_ui as pmui
@@ -60,7 +60,7 @@ class LinkedFields:
     def __init__(self, fields: Mapping[str, Any], offers: Mapping[str, Callable[[str], object]] = MappingProxyType({})):
         self._offers = offers
         self._fields = {name: field if isinstance(field, tuple) else (field, "value") for name, field in fields.items()}
-        self.fresh = {name: _text(getattr(*field)) for name, field in self._fields.items()}
+        self.fresh: Final = {name: _text(getattr(*field)) for name, field in self._fields.items()}
 
     def texts(self) -> dict[str, str]:
         """Return the texts that differ from those of a fresh page."""
@@ -172,7 +172,11 @@ class LinkedLines:
         hide: Callable[[list[str] | None], object],
         watch: Callable[[Callable[..., object]], object],
     ):
-        self.name, self._lines, self._choice, self._hide, self.watch = name, lines, choice, hide, watch
+        self.name = name
+        self._lines = lines
+        self._choice = choice
+        self._hide = hide
+        self.watch = watch
 
     def texts(self) -> dict[str, str]:
         """Return the lines that are hidden, where a visitor has chosen."""
@@ -213,11 +217,13 @@ class Page(ABC):
 
     link: LinkPart = LinkedFields({})
     files: Mapping[str, tuple[str, Callable[[Any], bytes]]] = MappingProxyType({})
-    visible = False
+    visible: bool = False
 
     def __init__(self, store: Store, display: Display, *switches: str):
         """Make it. switches : of the display, after whose changes it is drawn; by default mode, unit and theme."""
-        self.store, self.run, self.display = store, store.run, display
+        self.store = store
+        self.run: BackgroundTask = store.run
+        self.display = display
         display.param.watch(self.redraw, [*switches] or ["mode", "unit", "dark"])
 
     @abstractmethod
@@ -407,13 +413,14 @@ class Starter:
         self, work: BackgroundTask, start: str, label: str, detail: Callable[[], str] = str, uses: Sequence[str] = ("Use it",)
     ):
         """Make the buttons. detail : what to add to the line while the work goes on; uses : what can be done with the result."""
-        self.work, self._detail = work, detail
-        self.start = pmui.Button(label=start, icon="play_arrow", color="primary", size="small", margin=0)
-        self.cancel = pmui.Button(label="Stop", icon="stop", variant="outlined", size="small", margin=0, disabled=True)
-        self.uses = [
+        self.work = work
+        self._detail = detail
+        self.start: Final = pmui.Button(label=start, icon="play_arrow", color="primary", size="small", margin=0)
+        self.cancel: Final = pmui.Button(label="Stop", icon="stop", variant="outlined", size="small", margin=0, disabled=True)
+        self.uses: Final = [
             pmui.Button(label=use, icon="check", variant="outlined", size="small", margin=0, disabled=True) for use in uses
         ]
-        self.status = Status(label=label, sizing_mode="stretch_width", margin=(4, 0), visible=False)
+        self.status: Final = Status(label=label, sizing_mode="stretch_width", margin=(4, 0), visible=False)
         self.cancel.on_click(lambda _event: work.cancel())
         work.param.watch(self.refresh, ["state", "progress", "place", "message", "latest", "result"])
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from time import monotonic
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import panel as pn
@@ -14,7 +14,7 @@ import panel_material_ui as pmui
 import param
 
 from wfsobs.app.cache import key_of
-from wfsobs.app.component import Component
+from wfsobs.app.component import HtmlComponent
 from wfsobs.app.controls.fields import number_text
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.copies import SWEEP, CopiedTask
@@ -238,8 +238,8 @@ class AxisFields:
     def __init__(self, store: Store, labels: tuple[str, str], options: dict[str, str], path: str, values: str):
         """Make the fields. labels : of the setting and of its values; options : name -> path of those to choose from."""
         self.store = store
-        self.select = pmui.Select(label=labels[0], options=options, value=path, size="small", searchable=True, **LONG)
-        self.values = pmui.TextInput(label=labels[1], value=values, size="small", width=150, margin=0)
+        self.select: Final = pmui.Select(label=labels[0], options=options, value=path, size="small", searchable=True, **LONG)
+        self.values: Final = pmui.TextInput(label=labels[1], value=values, size="small", width=150, margin=0)
         self.select.param.watch(self._suggest, "value")
 
     @property
@@ -279,10 +279,8 @@ REDRAW = 0.3
 """Least time between two pictures while runs come in [s]."""
 
 
-class SweepMap(Component):
+class SweepMap(HtmlComponent):
     """The map in the browser; a click on a cell asks for its scenario."""
-
-    html = param.String("", doc="What is in it.")
 
     _esm = script("patch", "markup", "sweep")
     _stylesheets = sheets("base", "sweep")
@@ -313,17 +311,20 @@ class SweepPage(Page):
         """Make the page. explore : turns to the page that shows a scenario."""
         super().__init__(store, display)
         self._explore = explore
-        self.work = SweepTask(store.session)
-        self.starter = Starter(self.work, "Run the sweep", "Progress of the sweep", self._so_far, uses=())
+        self.work: Final = SweepTask(store.session)
+        self.starter: Final = Starter(self.work, "Run the sweep", "Progress of the sweep", self._so_far, uses=())
         names = sweep_settings(store.scenario)
         (first, values), (second, more) = FIRST
-        self.axes = (
+        self.axes: Final = (
             AxisFields(store, ("Error over", "Values"), names, first, values),
             AxisFields(store, ("and over", "Values of the second"), {"no second setting": NONE, **names}, second, more),
         )
-        self.settings, self.values = [axis.select for axis in self.axes], [axis.values for axis in self.axes]
-        self.seeds = number_field("Seeds of each", SEEDS, 120)
-        self.observers = pmui.Select(label="Observers", options=OBSERVERS_OF, value=QUICK, size="small", width=290, margin=0)
+        self.settings: Final = [axis.select for axis in self.axes]
+        self.values: Final = [axis.values for axis in self.axes]
+        self.seeds: Final = number_field("Seeds of each", SEEDS, 120)
+        self.observers: Final = pmui.Select(
+            label="Observers", options=OBSERVERS_OF, value=QUICK, size="small", width=290, margin=0
+        )
         first_axis, second_axis = self.axes
         linked = {
             "over": first_axis.select,
@@ -335,18 +336,18 @@ class SweepPage(Page):
         }
         # a setting of a list is not among the choices until it is asked for
         self.link = LinkedFields(linked, {"over": first_axis.offer, "second": second_axis.offer})
-        self.estimate = html()
-        self.maps = {target: SweepMap(self.load, **WIDE) for target in SCORED}
+        self.estimate: Final = html()
+        self.maps: Final = {target: SweepMap(self.load, **WIDE) for target in SCORED}
         self.lines: dict[str, SweepLines] = {}
-        self.panes = {target: pn.Column(**WIDE) for target in SCORED}
-        self.legends = {target: html() for target in SCORED}
-        self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
-        self.verdicts = {target: html() for target in SCORED}
-        self.boxes = [
+        self.panes: Final = {target: pn.Column(**WIDE) for target in SCORED}
+        self.legends: Final = {target: html() for target in SCORED}
+        self.stale: Final = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
+        self.verdicts: Final = {target: html() for target in SCORED}
+        self.boxes: Final = [
             box(target_title(target), self.verdicts[target], self.legends[target], self.panes[target], self.maps[target])
             for target in SCORED
         ]
-        self.shades = text(f"{legend_of_shades()} Click a cell to load its scenario in Explore.")
+        self.shades: Final = text(f"{legend_of_shades()} Click a cell to load its scenario in Explore.")
         self._draw_time = 0.0
         for part in (*self.boxes, self.shades):
             part.visible = False

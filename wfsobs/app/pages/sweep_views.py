@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import param
@@ -57,7 +57,8 @@ class SweepLines:
         if texts is not None:
             self.figure.xaxis.ticker = FixedTicker(ticks=x.tolist())
             self.figure.xaxis.major_label_overrides = dict(zip(x.tolist(), texts, strict=True))
-        self.sources, self.glyphs = {}, {}
+        self.sources: Final = {}
+        self.glyphs: Final = {}
         for name in part["errors"]:
             source = self.sources[name] = ColumnDataSource({column: [] for column in ("x", "at", "y", "low", "high")})
             bar = self.figure.segment("at", "low", "at", "high", source=source, line_width=2, line_alpha=0.35, level="underlay")
@@ -120,9 +121,9 @@ def axis_title(scenario: Scenario, path: str) -> str:
     return f"{setting_name(path)} [{unit}]" if unit else setting_name(path)
 
 
-def parameter_of(scenario: Scenario, path: str) -> param.Parameter | None:
+def parameter_of(scenario: Scenario, path: str) -> param.Parameter[Any] | None:
     """Return the parameter of a setting, that of the list for a number in it; None where there is no such setting."""
-    known: dict[str, param.Parameter] = {path: p for path, _, p in scenario.walk()}
+    known: dict[str, param.Parameter[Any]] = {path: p for path, _, p in scenario.walk()}
     above, _, number = path.rpartition(".")
     p = known.get(path) or known.get(above)
     return p if path in known or (isinstance(p, Reals) and number.isdecimal()) else None

@@ -7,7 +7,7 @@ from functools import partial
 from html import escape
 from itertools import groupby
 from time import monotonic
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import panel as pn
@@ -163,10 +163,10 @@ class HistoryFigure:
     """The error, or what takes its place, on the validation record of every evaluation, and the least so far."""
 
     def __init__(self) -> None:
-        self.figure = new_figure(x_range=DataRange1d(range_padding=0.02), y_range=DataRange1d())
+        self.figure: Final = new_figure(x_range=DataRange1d(range_padding=0.02), y_range=DataRange1d())
         call(self.figure, "History of the tuning")
         self.figure.xaxis.axis_label = "evaluation"
-        self.source = ColumnDataSource({"x": [], "tried": [], "best": []})
+        self.source: Final = ColumnDataSource({"x": [], "tried": [], "best": []})
         self._trials = self.figure.scatter("x", "tried", source=self.source, size=6, fill_alpha=0.7)
         self._best = self.figure.step("x", "best", source=self.source, mode="after", line_width=2.0)
 
@@ -249,18 +249,20 @@ class TunePage(Page):
 
     def __init__(self, store: Store, display: Display):
         super().__init__(store, display, "unit", "dark")
-        self.work = BackgroundTask(store.session, title="Tuning")
-        self.starter = Starter(self.work, "Start tuning", "Progress of the tuning", self._so_far)
-        self.observer = pmui.Select(label="Observer", options=choices(), value=START, size="small", width=250, margin=0)
-        self.target = pmui.Select(label="Error of", options=[], size="small", width=130, margin=0)
-        self.evaluations = number_field("Evaluations", EVALUATIONS, 110)
-        self.figure = HistoryFigure()
+        self.work: Final = BackgroundTask(store.session, title="Tuning")
+        self.starter: Final = Starter(self.work, "Start tuning", "Progress of the tuning", self._so_far)
+        self.observer: Final = pmui.Select(label="Observer", options=choices(), value=START, size="small", width=250, margin=0)
+        self.target: Final = pmui.Select(label="Error of", options=[], size="small", width=130, margin=0)
+        self.evaluations: Final = number_field("Evaluations", EVALUATIONS, 110)
+        self.figure: Final = HistoryFigure()
         self.measure = MEASURES[TRUTH]
-        self.search_space, self.legend, self.table = html(), html(), html()
-        self.history = box("History", self.legend, pn.pane.Bokeh(self.figure.figure, **WIDE))
-        self.outcome = box("Before and after", self.table)
+        self.search_space: Final = html()
+        self.legend: Final = html()
+        self.table: Final = html()
+        self.history: Final = box("History", self.legend, pn.pane.Bokeh(self.figure.figure, **WIDE))
+        self.outcome: Final = box("Before and after", self.table)
         self.history.visible = self.outcome.visible = False
-        self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
+        self.stale: Final = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
         self.starter.start.on_click(lambda _event: self.start())
         self.starter.uses[0].on_click(lambda _event: self.use())
         self.observer.param.watch(self._choose, "value")

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from math import degrees
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import panel as pn
@@ -42,8 +42,10 @@ class GainHandle(ABC):
     title = ""
 
     def __init__(self, fig: figure, hear: Callable[[GainHandle, Mapping[str, Any]], None]):
-        self.layer = HandleLayer(partial(hear, self), figure=str(fig.name), sizing_mode="stretch_width", margin=0, visible=False)
-        self.lines = ExtraLines(fig, "predicted", line_alpha=1.0, line_width=2.2, line_dash=[2, 2], level="glyph")
+        self.layer: Final = HandleLayer(
+            partial(hear, self), figure=str(fig.name), sizing_mode="stretch_width", margin=0, visible=False
+        )
+        self.lines: Final = ExtraLines(fig, "predicted", line_alpha=1.0, line_width=2.2, line_dash=[2, 2], level="glyph")
         self.number = 0
 
     @abstractmethod
@@ -154,9 +156,12 @@ class GainEditor:
     def __init__(
         self, rejection: figure, nyquist: figure, store: Store, display: Display, results: Callable[[], LoopResults | None]
     ):
-        self.store, self.display, self.results = store, display, results
-        self.frames, self.theory = Frames(store.session), Theory()
-        self.handles = RejectionHandle(rejection, self.hear), NyquistHandle(nyquist, self.hear)
+        self.store = store
+        self.display = display
+        self.results = results
+        self.frames: Final = Frames(store.session)
+        self.theory: Final = Theory()
+        self.handles: Final = RejectionHandle(rejection, self.hear), NyquistHandle(nyquist, self.hear)
         self._note, self._trial, self._known_gain = "", None, None
         store.param.watch(self._take_over, "scenario")
         display.param.watch(self.follow, ["editing", "mode", "unit", "dark"])

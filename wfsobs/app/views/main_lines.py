@@ -78,7 +78,9 @@ class MainLines:
     """
 
     def __init__(self, run: BackgroundTask, display: Display, seeds: SeedRuns | None = None):
-        self.run, self.display, self.seeds = run, display, seeds
+        self.run = run
+        self.display = display
+        self.seeds = seeds
         self._chosen_targets: set[str] = set()
         run.param.watch(self._on_results, ["result", "state"])  # the last result may come before the run is over
         display.param.watch(self._follow, "mode")

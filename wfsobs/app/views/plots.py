@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import panel as pn
@@ -123,14 +123,14 @@ def call(fig: figure, name: str) -> None:
     fig.update(name=name, html_attributes={"role": "figure", "aria-label": name})
 
 
-def make_line(name: str, source: ColumnDataSource, y: str = "y", **options: Any) -> GlyphRenderer:
+def make_line(name: str, source: ColumnDataSource, y: str = "y", **options: Any) -> GlyphRenderer[Any]:
     """Make a line in the look of an observer or of the truth, without the glyphs of what is selected or muted: nothing is."""
     it = look(name)
     glyph = Line(x="x", y=y, line_color=it.light, line_width=it.width, line_dash=list(it.dash))
     return GlyphRenderer(data_source=source, glyph=glyph, name=name, **options)
 
 
-def add_line(fig: figure, name: str, source: ColumnDataSource, y: str = "y") -> GlyphRenderer:
+def add_line(fig: figure, name: str, source: ColumnDataSource, y: str = "y") -> GlyphRenderer[Any]:
     """Draw a line in the look of an observer or of the truth."""
     renderer = make_line(name, source, y)
     fig.renderers.append(renderer)
@@ -164,7 +164,7 @@ def _same(a: Any, b: Any) -> bool:
     return np.array_equal(a, b, equal_nan=True) if isinstance(b, np.ndarray) else list(a) == list(b)
 
 
-def restyle(lines: dict[str, GlyphRenderer], dark: bool, hidden_names: list[str]) -> None:
+def restyle(lines: dict[str, GlyphRenderer[Any]], dark: bool, hidden_names: list[str]) -> None:
     """Give every line the colour of the mode, and hide those that are to be hidden."""
     for name, line in lines.items():
         line.glyph.line_color = look(name).colour(dark)
@@ -181,7 +181,9 @@ class ExtraLines:
     """Lines beside those of the results in a figure; nothing until there is one."""
 
     def __init__(self, fig: figure, name: str, **style: Any):
-        self.figure, self.name, self.style = fig, name, style
+        self.figure = fig
+        self.name = name
+        self.style = style
         self.source: ColumnDataSource | None = None
 
     def draw(self, lines: Mapping[str, tuple[ArrayLike, ArrayLike]], dark: bool) -> None:
@@ -222,11 +224,11 @@ class EndLabels:
 
     def __init__(self, fig: figure):
         self.figure = fig
-        self.source = ColumnDataSource({name: [] for name in ("x", "y", "text", "colour", "dash")})
+        self.source: Final = ColumnDataSource({name: [] for name in ("x", "y", "text", "colour", "dash")})
         box: dict[str, Any] = {"border_line_color": "colour", "border_line_dash": "dash", "text_baseline": "middle"}
         box |= {"text_font": "Roboto, Helvetica, Arial, sans-serif", "text_font_size": "12px"}
         # In the page and not on the canvas, where what is beside the frame would be cut off.
-        self.labels = HTMLLabelSet(x="x", y="y", text="text", x_offset=5, source=self.source, **box)
+        self.labels: Final = HTMLLabelSet(x="x", y="y", text="text", x_offset=5, source=self.source, **box)
         fig.add_layout(self.labels)
         fig.min_border_right = ROOM_FOR_NAMES
 
@@ -286,9 +288,9 @@ def spread(places: Sequence[float], least: float) -> list[float]:
 class LazyLine:
     """A line that is in its figure once it has been shown."""
 
-    def __init__(self, make: Callable[[], GlyphRenderer]):
+    def __init__(self, make: Callable[[], GlyphRenderer[Any]]):
         self._make = make
-        self.renderer: GlyphRenderer | None = None
+        self.renderer: GlyphRenderer[Any] | None = None
 
     @property
     def visible(self) -> bool:
@@ -338,8 +340,8 @@ class FigureLines(Mapping[str, LazyLine]):
             recedes = many and name != TRUTH and name not in main_names
             line.show(name not in hidden_names, GREY[dark] if recedes else own, own if recedes else "")
 
-    def _maker(self, name: str, source: ColumnDataSource, y: str) -> Callable[[], GlyphRenderer]:
-        def make() -> GlyphRenderer:
+    def _maker(self, name: str, source: ColumnDataSource, y: str) -> Callable[[], GlyphRenderer[Any]]:
+        def make() -> GlyphRenderer[Any]:
             renderer = make_line(name, source, y, view=CDSView(filter=self._all))
             names = list(self)
             above = [line.renderer for line in map(self.get, names[names.index(name) + 1 :]) if line and line.renderer]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Final
 
 import numpy as np
 from bokeh.models import ColumnDataSource, HoverTool, Range1d, UnionRenderers, VSpan
@@ -37,9 +38,9 @@ class SpectraFigures(TargetFigures):
 
     def __init__(self, run: BackgroundTask, display: Display, times: Range1d):
         """Watch the results, the switches, and the axis of time where only what it shows counts."""
-        self.x_range = Range1d(start=0.5, end=500.0, reset_start=0.5, reset_end=500.0)
+        self.x_range: Final = Range1d(start=0.5, end=500.0, reset_start=0.5, reset_end=500.0)
         self.times = times
-        self.spectra = {target: _Spectrum(target, self.x_range) for target in TARGETS}
+        self.spectra: Final = {target: _Spectrum(target, self.x_range) for target in TARGETS}
         super().__init__(run, display, self.spectra, ["mode", "show", "unit", "spectrum", "compared_runs", "window_spectra"])
         on_settle([times], lambda: self._redraw() if display.window_spectra else None)
 

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 from functools import partial
 from math import isfinite, pi
 from time import monotonic
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import panel as pn
 import param
 from bokeh.plotting import figure
 
-from wfsobs.app.component import Component
+from wfsobs.app.component import HtmlComponent
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs import CANCELLED, CLICK, DONE, FAILED, Job
 from wfsobs.app.render import number, render
@@ -236,13 +236,13 @@ FRAME = 0.05
 """Time after which a frame of a drag begins no more observers [s]: those that are left come first in the next one."""
 
 
-class HandleLayer(Component):
+class HandleLayer(HtmlComponent):
     """The handles in the browser, and the numbers below the figure. All that it shows is one frame, made here."""
 
-    figure = param.String("", doc="Name of the figure that the handles lie over.")
-    frame = param.Dict({}, doc="What is shown: handles, numbers, a note, and the number of the message that is answered.")
-
-    html = param.String("", doc="What stands below the figure.")
+    figure: param.String[str] = param.String("", doc="Name of the figure that the handles lie over.")
+    frame: param.Dict[dict[Any, Any]] = param.Dict(
+        {}, doc="What is shown: handles, numbers, a note, and the number of the message that is answered."
+    )
 
     _esm = script("patch", "handles")
     _stylesheets = sheets("base", "handles")
@@ -256,13 +256,18 @@ class SpectrumEditor:
     """One figure's."""
 
     def __init__(self, target: str, fig: figure, store: Store, display: Display, frames: Frames, theory: Theory):
-        self.target, self.store, self.display, self.frames, self.theory = target, store, display, frames, theory
+        self.target: str = target
+        self.store = store
+        self.display = display
+        self.frames = frames
+        self.theory = theory
         self.figure = fig
-        self.trial, self._last = store.scenario, list[Prediction]()
-        self.layer = HandleLayer(
+        self.trial: Scenario = store.scenario
+        self._last = list[Prediction]()
+        self.layer: Final = HandleLayer(
             self.hear, figure=str(fig.name), frame=self._frame(), sizing_mode="stretch_width", margin=0, visible=False
         )
-        self.lines = ExtraLines(fig, "predicted", line_alpha=1.0, line_width=1.6, line_dash=[2, 2], level="glyph")
+        self.lines: Final = ExtraLines(fig, "predicted", line_alpha=1.0, line_width=1.6, line_dash=[2, 2], level="glyph")
         self._number, self._moves, self._rests = 0, False, False
         self._left, self._shown_trial = list[str](), self.trial  # observers whose last numbers are of settings before these
         self._go_on = once(self._ask_for_those_left, AFTERWARDS_MS)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import sqrt
-from typing import Any
+from typing import Any, Final
 
 import param
 
 from wfsobs.app.budgets import Budgets
-from wfsobs.app.component import Component
+from wfsobs.app.component import HtmlComponent
 from wfsobs.app.display import OVER_SEEDS, Display, per_micrometre
 from wfsobs.app.glossary import RELATIVE, TERMS, sentence_on
 from wfsobs.app.jobs import DONE, RUNNING
@@ -44,10 +44,9 @@ class RunErrors:
     errors: Evidence = field(default_factory=lambda: gather_evidence([]))
 
 
-class Cards(Component):
+class Cards(HtmlComponent):
     """A row per line in the browser; a click on one hides or shows its line, a double click shows it alone."""
 
-    html = param.String("", doc="The rows, as `strip.html` has them.")
     hidden_lines = param.List([], doc="Names of the rows whose lines are hidden.")
     last_arrival = param.Integer(0, doc="Number of the last click that has arrived, and all before it.")
 
@@ -111,10 +110,14 @@ class Strip:
         lines: MainLines | None = None,
         budgets: Budgets | None = None,
     ):
-        self.target, self.run, self.display, self.seeds, self.budgets = target, run, display, seeds, budgets
-        self.lines = lines or MainLines(run, display, seeds)
+        self.target = target
+        self.run = run
+        self.display = display
+        self.seeds = seeds
+        self.budgets = budgets
+        self.lines: Final = lines or MainLines(run, display, seeds)
         self._now = self._before = RunErrors()
-        self.cards = Cards()
+        self.cards: Final = Cards()
         self._refresh()
         run.param.watch(self._follow, ["result", "state"])
         if seeds is not None:

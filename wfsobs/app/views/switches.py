@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 import panel as pn
 import panel_material_ui as pmui
@@ -28,12 +28,13 @@ class ModeSwitch:
     """
 
     def __init__(self, run: BackgroundTask, display: Display):
-        self.run, self.display = run, display
+        self.run = run
+        self.display = display
         options = {_title(mode): mode.name for mode in TIP_TILT}
-        self.buttons = pmui.RadioButtonGroup(
+        self.buttons: Final = pmui.RadioButtonGroup(
             label="Mode", options=options, value=display.mode, size="small", margin=0, variant="outlined", stylesheets=[HEARD]
         )
-        self.list = pmui.Select(
+        self.list: Final = pmui.Select(
             label="Mode", options=options, value=display.mode, size="small", margin=0, width=190, visible=False
         )
         for widget in (self.buttons, self.list):
@@ -81,7 +82,7 @@ class UnitSwitch:
 
     def __init__(self, display: Display):
         self.display = display
-        self.buttons = pmui.RadioButtonGroup(
+        self.buttons: Final = pmui.RadioButtonGroup(
             label="Unit",
             options=self._options(),
             value=display.unit,
@@ -90,7 +91,7 @@ class UnitSwitch:
             variant="outlined",
             stylesheets=[HEARD],
         )
-        self.note = pn.pane.HTML(NO_MAS, visible=False, margin=0)
+        self.note: Final = pn.pane.HTML(NO_MAS, visible=False, margin=0)
         self.buttons.param.watch(self._on_choice, "value")
         display.param.watch(self._follow, ["mode", "unit"])
 
@@ -131,10 +132,10 @@ class SeedSwitch:
 
     def __init__(self, seeds: SeedRuns):
         self.seeds = seeds
-        self.field = pmui.IntInput.from_param(
+        self.field: Final = pmui.IntInput.from_param(
             seeds.param.count, size="small", width=90, margin=(0, 0, 4, 0), stylesheets=[NO_STEPPERS]
         )
-        self.line = html(self.text(), sizing_mode=None)
+        self.line: Final = html(self.text(), sizing_mode=None)
         seeds.param.watch(self._refresh, ["evidence", "count"])
         seeds.run.param.watch(self._refresh, ["state", "result"])
         seeds.task.param.watch(self._refresh, ["state", "message"])
@@ -171,11 +172,13 @@ class Pinning:
     """Pin and unpin, one button: the result shown is the first one that is compared, or none is any more."""
 
     def __init__(self, run: BackgroundTask, display: Display, history: History):
-        self.run, self.display, self.history = run, display, history
-        self.button = pmui.Button(
+        self.run = run
+        self.display = display
+        self.history = history
+        self.button: Final = pmui.Button(
             label="Pin", icon="push_pin", size="small", variant="outlined", margin=0, disabled=True, description=PIN
         )
-        self.note = html(sizing_mode=None, visible=False)
+        self.note: Final = html(sizing_mode=None, visible=False)
         self.button.on_click(self._on_press)
         run.param.watch(self._refresh, "result")
         history.param.watch(self._refresh, "current")

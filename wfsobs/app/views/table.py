@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Final
 
 from markupsafe import Markup
 
@@ -58,8 +59,10 @@ class Table:
     """Every score of the mode shown, one row per observer and target."""
 
     def __init__(self, run: BackgroundTask, display: Display, seeds: SeedRuns | None = None):
-        self.run, self.display, self.seeds = run, display, seeds
-        self.pane = html(self.html())
+        self.run = run
+        self.display = display
+        self.seeds = seeds
+        self.pane: Final = html(self.html())
         run.param.watch(self._refresh, ["result", "state"])
         if seeds is not None:
             seeds.param.watch(self._refresh, "evidence")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 import panel as pn
@@ -32,9 +32,13 @@ class Stretch:
         frequencies: Range1d,
         chosen_window: Callable[[], tuple[float, float] | None],
     ):
-        self.target, self.run, self.display = target, run, display
-        self.times, self.frequencies, self.chosen_window = times, frequencies, chosen_window
-        self.pane = html()
+        self.target = target
+        self.run = run
+        self.display = display
+        self.times = times
+        self.frequencies = frequencies
+        self.chosen_window = chosen_window
+        self.pane: Final = html()
         run.param.watch(self._refresh, "result")
         display.param.watch(self._refresh, ["mode", "unit", "hidden_lines", "dark"])
         on_settle([times, frequencies], self._refresh)
@@ -96,8 +100,11 @@ class TargetFigures:
 
     def __init__(self, run: BackgroundTask, display: Display, drawings: Mapping[str, Drawing], switches: Sequence[str]):
         """Watch the results and the switches of the display; drawings : target -> its figure."""
-        self.run, self.display, self._drawings = run, display, drawings
-        self.visible, self._behind = True, False
+        self.run = run
+        self.display = display
+        self._drawings = drawings
+        self.visible: bool = True
+        self._behind = False
         run.param.watch(self._redraw, "result")
         display.param.watch(self._redraw, [*switches, "dark", "hidden_lines", "named_lines"])
 

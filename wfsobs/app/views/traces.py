@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from bokeh.models import BoxAnnotation, ColumnDataSource, CrosshairTool, GlyphRenderer, Label, Range1d, Span, Text, VSpan, VStrip
@@ -87,10 +87,11 @@ class EventMarks:
     """The marks in one figure, none until there is an event; words hang from the top of its axis."""
 
     def __init__(self, fig: figure):
-        self.figure, self._marks_exist = fig, False
-        self.jumps = ColumnDataSource({"x": []})
-        self.spans = ColumnDataSource({"start": [], "end": []})
-        self.words = ColumnDataSource({"x": [], "y": [], "text": [], "below": []})
+        self.figure = fig
+        self._marks_exist = False
+        self.jumps: Final = ColumnDataSource({"x": []})
+        self.spans: Final = ColumnDataSource({"start": [], "end": []})
+        self.words: Final = ColumnDataSource({"x": [], "y": [], "text": [], "below": []})
         self._line = VSpan(x="x", line_width=1.5, line_dash=[6, 3])
         self._strip = VStrip(x0="start", x1="end", fill_alpha=0.13, line_width=0)
         self._text = Text(x="x", y="y", text="text", x_offset=4, y_offset="below", text_baseline="top", text_font_size="11px")
@@ -147,11 +148,11 @@ class Traces(TargetFigures):
     """The figures, redrawn when the results, the switches or the window change."""
 
     def __init__(self, run: BackgroundTask, display: Display):
-        self.x_range = Range1d(start=0.0, end=10.0, reset_start=0.0, reset_end=10.0)
-        self.length = 0.0
+        self.x_range: Final = Range1d(start=0.0, end=10.0, reset_start=0.0, reset_end=10.0)
+        self.length: float = 0.0
         self._wanted_window: tuple[float, float] | None = None
         crosshair = CrosshairTool(dimensions="height", overlay=Span(dimension="height", line_alpha=0.4, line_width=1))
-        self.traces = {target: _Trace(target, self.x_range, crosshair) for target in TARGETS}
+        self.traces: Final = {target: _Trace(target, self.x_range, crosshair) for target in TARGETS}
         super().__init__(run, display, self.traces, ["mode", "show", "unit", "compared_runs"])
         on_settle([self.x_range], self._redraw)
 
@@ -204,7 +205,7 @@ class _Band:
 
     def __init__(self, fig: figure):
         self.figure, self.source = fig, ColumnDataSource({"x": [], "low": [], "high": []})
-        self.renderer: GlyphRenderer | None = None
+        self.renderer: GlyphRenderer[Any] | None = None
         place = {"x": 6, "y": 6, "x_units": "screen", "y_units": "screen", "text_font_size": "12px"}
         self.label = Label(text="95 % band predicted by the filter", visible=False, **place)
         fig.add_layout(self.label)  # from the start: the browser looks for it in vain if it comes later

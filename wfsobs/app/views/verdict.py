@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from html import escape
+from typing import Final
 
 from markupsafe import Markup
 
@@ -34,9 +35,13 @@ class VerdictLine:
         seeds: SeedRuns | None = None,
         budgets: Budgets | None = None,
     ):
-        self.target, self.run, self.display, self.seeds, self.budgets = target, run, display, seeds, budgets
+        self.target = target
+        self.run = run
+        self.display = display
+        self.seeds = seeds
+        self.budgets = budgets
         self._text: tuple[tuple[str, str], tuple[str, str]] = ("", ""), ("", "")
-        self.pane = html(self.html())
+        self.pane: Final = html(self.html())
         run.param.watch(self._refresh, ["result", "state"])
         if seeds is not None:
             seeds.param.watch(self._refresh, "evidence")

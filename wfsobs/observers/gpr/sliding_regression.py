@@ -78,11 +78,17 @@ class SlidingRegression:
         NaN until the training set is full. `update` must follow before the next sample.
         """
         self.step += 1
-        self._last_target = np.asarray(last_targets, dtype=float)
+        self._learn(np.asarray(last_targets, dtype=float))
         self._slide(samples)
         self._covariances()
-        if not self.ready:
-            return np.full(len(samples), np.nan)
+        return self._means() if self.ready else np.full(len(samples), np.nan)
+
+    def _learn(self, targets: Array) -> None:
+        """Bring in the targets that have come."""
+        self._last_target = targets
+
+    def _means(self) -> Array:
+        """Predictions for the newest windows."""
         over = self._weights @ np.stack((self._kappa, self._points.delta), axis=2)
         (a, b, h), last = over.transpose(1, 2, 0), self._last_target
         border = (self._newest.delta[:, 0] - b[0]) / (1.0 / self.kernel.variance + b[1])
@@ -237,7 +243,8 @@ class LateRegression(SlidingRegression):
 
     The target of the window that ends at step j, what will be `late` steps on, is known only at step j + 1 + late. Until then
     the window must not count; but leaving a point out of a Gaussian process is the same as giving it the target that makes its
-    own weight zero, so it can sit in its slot with that target, and the sliding goes on as it is.
+    own weight zero, so it can sit in its slot with that target, and the sliding goes on as it is. With the samples of step k
+    `predict` takes the targets of the windows k - 1 - late.
 
     Raises ValueError if no window would have one.
     """
@@ -248,26 +255,14 @@ class LateRegression(SlidingRegression):
         super().__init__(depth, m, channels, kernel, n_modes)
         self.late = late
 
-    def predict(self, samples: Array, last_targets: Array) -> Array:
-        """Take the samples (n_modes, channels) of this step k and the targets (n_modes,) of the windows k - 1 - late.
-
-        Returns the predictions, (n_modes,), NaN until there are m windows before this one. `update` must follow before the
-        next sample.
-        """
-        self.step += 1
-        self._last_target = np.zeros(len(samples))  # none for the newest window; `_learn` brings them in when they come
-        self._learn(last_targets)
-        self._slide(samples)
-        self._covariances()
-        if not self.ready:
-            return np.full(len(samples), np.nan)
+    def _means(self) -> Array:
         waiting = [(self.step - 1 - i) % self.m for i in range(self.late)]
         columns = (
             np.stack([self._column(slot) for slot in waiting[1:]], axis=1)
             if self.late > 1
-            else np.empty((len(samples), 0, self.m))
+            else np.empty((len(self._kappa), 0, self.m))
         )
-        return np.array([self._mean(mode, waiting, columns[mode]) for mode in range(len(samples))])
+        return np.array([self._mean(mode, waiting, columns[mode]) for mode in range(len(self._kappa))])
 
     def _mean(self, mode: int, waiting: list[int], columns: Array) -> float:
         """Prediction of a mode; columns : of N at the windows that wait but the newest, (late - 1, m)."""
@@ -283,6 +278,7 @@ class LateRegression(SlidingRegression):
 
     def _learn(self, targets: Array) -> None:
         """Bring in the targets of the newest windows that have them."""
+        self._last_target = np.zeros(len(targets))  # none for the newest window
         window = self.step - 1 - self.late
         if window >= self.depth - 1:
-            self._weights[:, 0] += np.asarray(targets)[:, None] * self._column(window % self.m)
+            self._weights[:, 0] += targets[:, None] * self._column(window % self.m)
