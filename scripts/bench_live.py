@@ -22,7 +22,6 @@ import argparse
 import asyncio
 import json
 import os
-import shutil
 import subprocess
 import sys
 import time
@@ -30,6 +29,7 @@ from multiprocessing import Manager, Process, Queue, Value
 from urllib.request import urlopen
 
 from live_pages import SHOWN, lags_of, watch_pages
+from measure_dashboard import BROWSER
 from playwright.sync_api import sync_playwright
 from usage import cpu_seconds, family, memory_mb
 
@@ -72,7 +72,7 @@ def visit(base: str, pages: int, pictures) -> None:
 def watch(url: str, opened, lags, end) -> None:
     """Keep one page in a browser: note how long it takes to show the present, and from then on how far it is behind."""
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox", "--disable-gpu"])
+        browser = playwright.chromium.launch(executable_path=BROWSER, args=["--no-sandbox", "--disable-gpu"])
         page, start = browser.new_page(viewport={"width": 1400, "height": 1000}), time.monotonic()
         page.goto(url)
         shown = page.get_by_text(SHOWN)

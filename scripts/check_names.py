@@ -29,6 +29,7 @@ IRREGULAR = frozenset(
 """Participles that do not end in -ed."""
 
 PARTICIPLES = {
+    "Control.supervised": "a setting, `control.supervised`, in the files of users",
     "Loop.closed": "a setting, `loop.closed`, in the files of users; closed loop is the term of the field",
     "Cancelled": "an exception; the word of concurrent code",
     "LoopPredictor.fitted": "read by the loop that calls the predictor: the interface of pyRTC",

@@ -2,7 +2,7 @@
 
     python scripts/first_look.py [--save FOLDER]
 
-Starts `wfsobs serve` and a headless Chromium ($CHROMIUM, else /usr/bin/chromium) and waits until the run is done. A control
+Starts `wfsobs serve` and a headless Chromium (as measure_dashboard.py) and waits until the run is done. A control
 takes the focus, by Tab or by the arrow keys of its group; a word is text between blanks, outside of a canvas; either counts where
 a part of it is visible in the window, not scrolled or clipped away. Figure: the distance of the first one from the window's top.
 """
@@ -10,10 +10,9 @@ a part of it is visible in the window, not scrolled or clipped away. Figure: the
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 
-from measure_dashboard import FLAGS, _server
+from measure_dashboard import BROWSER, FLAGS, _server
 from playwright.sync_api import sync_playwright
 
 SIZES = {"wide": (1440, 900), "laptop": (1280, 720), "phone": (390, 844)}
@@ -71,7 +70,7 @@ def main() -> None:
     parser.add_argument("--save", type=Path, help="folder for a picture and the list of each size")
     save = parser.parse_args().save
     with sync_playwright() as p, _server(["wfsobs", "serve", "--port", "{port}"]) as url:
-        browser = p.chromium.launch(executable_path=os.environ.get("CHROMIUM") or "/usr/bin/chromium", args=FLAGS)
+        browser = p.chromium.launch(executable_path=BROWSER, args=FLAGS)
         for name, (width, height) in SIZES.items():
             page = browser.new_page(viewport={"width": width, "height": height})
             page.goto(url)

@@ -3,7 +3,8 @@
     python scripts/measure_dashboard.py [-n 10]
 
 Starts `wfsobs serve`, a server of a page that has as little as it can (minimal_page.py), and a headless Chromium ($CHROMIUM, else
-chromium). Either server rests before each visitor; ours makes the page of the next one meanwhile. A picture is there when every
+its headless shell, else chromium).
+Either server rests before each visitor; ours makes the page of the next one meanwhile. A picture is there when every
 figure in the window has a line with points, at the second frame after that. A run's times end with the second frame after the
 last change: of the traces, spectra and rows of the quick observers, of all but those that learn during the run, of everything,
 and of the one filter that runs alone.
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import socket
 import statistics
 import subprocess
@@ -30,6 +32,7 @@ ROOT = Path(__file__).parents[1]
 REST = 6.0
 """Time without a visitor [s]."""
 
+BROWSER = os.environ.get("CHROMIUM") or shutil.which("chromium-headless-shell") or shutil.which("chromium")
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"]
 
 # When every figure in the window has been painted with its lines, and of how many models the page was then.
@@ -115,7 +118,7 @@ def main() -> None:
         _server(["wfsobs", "serve", "--port", "{port}"]) as own,
         _server(minimal) as other,
     ):
-        browser = p.chromium.launch(executable_path=os.environ.get("CHROMIUM") or "/usr/bin/chromium", args=FLAGS)
+        browser = p.chromium.launch(executable_path=BROWSER, args=FLAGS)
         urls = {"first page": f"{own}/", "minimal page": f"{other}/minimal_page"}
         cold = {name: _opened(browser, url) for name, url in urls.items()}
         pairs = [{name: _rested(browser, url) for name, url in urls.items()} for _ in range(n)]

@@ -184,6 +184,7 @@ def test_every_number_states_its_unit_or_has_none(subtests: pytest.Subtests) -> 
         "hysteresis",
         "optical_gain_rms",
         "caution",
+        "fallback_gain",
     }
     for path, p in ALL.items():
         with subtests.test(path):

@@ -12,6 +12,7 @@ import numpy as np
 from wfsobs import PRESETS, plant_envelope
 from wfsobs.closed_loop.envelope import POINTS, PlantEnvelope
 from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.tuning import tuned_envelope
 
 
 def table(result: PlantEnvelope) -> str:
@@ -33,4 +34,4 @@ if __name__ == "__main__":
     for preset in sys.argv[1:] or ["paper", "ut4"]:
         for tune in (False, True):
             print(f"\n{preset}, {'tuned' if tune else 'as designed'}\n")
-            print(table(plant_envelope(PRESETS[preset](), points=POINTS, tune=tune)))
+            print(table((tuned_envelope if tune else plant_envelope)(PRESETS[preset](), points=POINTS)))

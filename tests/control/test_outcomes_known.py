@@ -29,6 +29,7 @@ CASES: dict[str, tuple[dict[str, Any], set[str]]] = {
     "GPR": ({"gpr_online.length_scale": 20.0}, {"integrator+gpr-online"}),
     "delay": ({"control.delay": 3.0}, set(CONTROLLERS)),
     "stroke": ({"control.stroke": 0.3}, set(CONTROLLERS)),
+    "supervision": ({"control.supervised": True}, set(CONTROLLERS) - {"none", "integrator"}),
     "an observer's own": ({"adaptive.window": 3.0}, set()),
     "what only the Strehl ratio is of": ({"control.wavelength": 1.6}, set()),
     "windows, which are of z in the loop": ({"gpr_online.inputs": "z"}, set()),

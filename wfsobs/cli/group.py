@@ -44,7 +44,7 @@ COMMANDS = {
     "run": Place("simulate", "Simulate the loop, run every observer and print the RMS table."),
     "serve": Place("serve", "Serve the dashboard."),
     "sweep": Place("sweep", "Run a scenario over the values of one or two settings and print the best observer in each."),
-    "tune": Place("tuning", "Search for the settings of an observer that are best on a validation record."),
+    "tune": Place("tuning", "Search for the best settings of an observer on a record, or of a controller on uncertain plants."),
 }
 
 ENTRY_POINTS = "wfsobs.commands"

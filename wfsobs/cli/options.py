@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from wfsobs.closed_loop.envelope import Uncertainty
 from wfsobs.priors_from.identification import told_by
 from wfsobs.priors_from.training import training_part
 from wfsobs.record import DELAY, Record
@@ -47,6 +48,25 @@ def scenario_options(command: Callable) -> Callable:
         ),
         click.option("--config", metavar="F.toml", help="Settings from a TOML file, on top of the preset."),
         click.option("--preset", metavar="NAME", help=f"Start from {', '.join(PRESETS)}; by default paper."),
+    )
+
+
+def uncertainty_options(command: Callable) -> Callable:
+    """Add the largest errors of the plant; the command receives the `uncertainty`."""
+
+    @wraps(command)
+    def with_uncertainty(*, delay: float, gain: float, rotation: float, resonance: float, **values: Any) -> Any:
+        return command(uncertainty=Uncertainty(delay, gain, rotation, resonance), **values)
+
+    below_1 = click.FloatRange(0, 1, max_open=True)
+    return add_options(
+        with_uncertainty,
+        click.option("--resonance", type=below_1, default=0.1, show_default=True, help="Of `plant.resonance`."),
+        click.option("--rotation", type=click.FloatRange(0, 180), default=10.0, show_default=True, help="Of the rotation [deg]."),
+        click.option("--gain", type=below_1, default=0.2, show_default=True, help="Of the gain."),
+        click.option(
+            "--delay", type=click.FloatRange(0), default=0.5, show_default=True, help="Largest error of the delay [frames]."
+        ),
     )
 
 

@@ -18,6 +18,7 @@ from wfsobs.cli.options import (
     scenario_options,
     training,
     training_options,
+    uncertainty_options,
 )
 from wfsobs.cli.recovery_tables import OverTime
 from wfsobs.cli.show import (
@@ -34,7 +35,7 @@ from wfsobs.cli.show import (
 )
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.envelope import POINTS, PlantEnvelope, Uncertainty, plant_envelope
-from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label, linear
+from wfsobs.closed_loop.rows import label, linear, no_theory
 from wfsobs.closed_loop.rows import rows as loop_rows
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.evaluation.evidence import FEWEST, gather_evidence, seeds_interval
@@ -53,6 +54,7 @@ from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.formats.psd import load_psd
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.records import save_record
+from wfsobs.tuning import EnvelopeGoal, tuned_envelope
 from wfsobs.units import UNITS
 
 
@@ -90,8 +92,7 @@ def loop_table(rows: Sequence[Row]) -> Table:
             linear(same, median_text(same, "delay_margin_ms", 2)),
             _share(same),
         )
-    if any(r["limited"] for r in rows):
-        out.caption = f"{NOT_APPLICABLE}: {LIMITED}"
+    out.caption = no_theory(rows) or None
     return out
 
 
@@ -235,6 +236,8 @@ def loop(
         click.echo(json.dumps(all_rows, allow_nan=False))
     else:
         show_table(loop_table(all_rows))
+        for line in dict.fromkeys(f"{label(r['controller'])}: {r['note']}" for r in all_rows if r["alarms"]):
+            click.echo(line)
     if with_envelope:
         with progress_bar("envelope") as update:
             _show_envelope(plant_envelope(scenario, controllers=controllers or None, watch=Watch(progress=update)))
@@ -269,31 +272,25 @@ def envelope_table(result: PlantEnvelope) -> Table:
 @scenario_options
 @click.option("--controller", "controllers", multiple=True, metavar="NAME", help="Of this controller alone; can be repeated.")
 @click.option("--points", type=click.IntRange(1, 100_000), default=POINTS, show_default=True, metavar="N", help="Plants.")
-@click.option("--delay", type=click.FloatRange(0), default=0.5, show_default=True, help="Largest error of the delay [frames].")
-@click.option("--gain", type=click.FloatRange(0, 1, max_open=True), default=0.2, show_default=True, help="Of the gain.")
-@click.option("--rotation", type=click.FloatRange(0, 180), default=10.0, show_default=True, help="Of the rotation [deg].")
-@click.option(
-    "--resonance", type=click.FloatRange(0, 1, max_open=True), default=0.1, show_default=True, help="Of `plant.resonance`."
-)
-@click.option("--tune", "is_tuned", is_flag=True, help="Search for the `control.caution` of least residual at the worst plant.")
+@uncertainty_options
+@click.option("--tune", "is_tuned", is_flag=True, help="Of each controller after `wfsobs tune --envelope`.")
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
 def envelope(
     scenario: Scenario,
     controllers: tuple[str, ...],
     points: int,
-    delay: float,
-    gain: float,
-    rotation: float,
-    resonance: float,
+    uncertainty: Uncertainty,
     is_tuned: bool,
     as_json: bool,
 ) -> None:
     """Compute what every linear controller leaves of the disturbance over an uncertain plant (docs/trust.md)."""
-    of = Uncertainty(delay, gain, rotation, resonance)
+    names = controllers or None
     with progress_bar("controllers") as update:
-        result = plant_envelope(
-            scenario, controllers=controllers or None, uncertainty=of, points=points, tune=is_tuned, watch=Watch(progress=update)
-        )
+        watch = Watch(progress=update)
+        if is_tuned:
+            result = tuned_envelope(scenario, controllers=names, goal=EnvelopeGoal(uncertainty), points=points, watch=watch)
+        else:
+            result = plant_envelope(scenario, controllers=names, uncertainty=uncertainty, points=points, watch=watch)
     if as_json:
         click.echo(json.dumps(result.rows(), allow_nan=False))
         return

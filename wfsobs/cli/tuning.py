@@ -1,15 +1,18 @@
-"""`wfsobs tune`: search for the settings of an observer."""
+"""`wfsobs tune`: search for the settings of an observer or a controller."""
 
 from __future__ import annotations
 
 import json
+from typing import Literal
 
 import click
+import numpy as np
 from rich.table import Table
 
-from wfsobs.cli.options import load_declared, record_options, scenario_options
+from wfsobs.cli.options import load_declared, record_options, scenario_options, uncertainty_options
 from wfsobs.cli.show import progress_bar, show_table
-from wfsobs.evaluation.rows import row_label
+from wfsobs.closed_loop.envelope import Uncertainty
+from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.scores import PREDICTION
 from wfsobs.files import check_writable, write_whole
 from wfsobs.observers import OBSERVERS
@@ -18,7 +21,7 @@ from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 from wfsobs.telemetry.intake import DeclaredFormat
-from wfsobs.tuning import report
+from wfsobs.tuning import EnvelopeGoal, report
 from wfsobs.tuning import tune as search
 from wfsobs.tuning.report import nm, settings
 from wfsobs.tuning.tuning import EVALUATIONS, TuningResult
@@ -26,7 +29,7 @@ from wfsobs.tuning.tuning import EVALUATIONS, TuningResult
 
 def settings_table(result: TuningResult) -> Table:
     """Return the table of searched settings, and of those set by hand for the search, before and after."""
-    out = Table(title=f"{row_label(result.observer)}: settings after {len(result.history)} evaluations")
+    out = Table(title=f"{result.label}: settings after {len(result.history)} evaluations")
     out.add_column("Setting", no_wrap=True)
     for name in ("before", "after"):
         out.add_column(name, justify="right", no_wrap=True)
@@ -52,11 +55,44 @@ def errors_table(result: TuningResult) -> Table:
     return out
 
 
+def spreads_table(result: TuningResult) -> Table:
+    """Residual of a controller over the plants of the search and over others, modes together."""
+    out = Table(title="Residual, rms over modes, nm")
+    out.add_column("", no_wrap=True)
+    for name in ("search, before", "after", "other plants, before", "after"):
+        out.add_column(name, justify="right", no_wrap=True)
+    stages = [s.spreads for s in (result.before, result.after) if s.spreads]
+    spreads = [one for both in zip(*stages, strict=True) for one in both]
+    for name, key in (("nominal", "nominal"), ("95 %", "p95"), ("worst", "worst")):
+        left = [float(np.sqrt(np.mean(getattr(one, key) ** 2))) for one in spreads]
+        out.add_row(name, *("unstable" if np.isinf(x) else nm(x) for x in left))
+    out.add_row("unstable plants", *(f"{one.unstable} of {len(one.points)}" for one in spreads))
+    return out
+
+
 NAMES = [o.id for o in OBSERVERS.values() if o.tunable.usual]
+LINEAR = [c.id for c in CONTROLLERS.values() if c.tunable.usual]
 
 
 @click.command()
-@click.option("--observer", required=True, type=click.Choice(NAMES), help="Observer to tune.")
+@click.option("--observer", type=click.Choice(NAMES), help="Observer to tune.")
+@click.option("--controller", type=click.Choice(LINEAR), help="Controller to tune, with --envelope.")
+@click.option("--envelope", "on_envelope", is_flag=True, help="Tune a controller for an uncertain plant (docs/trust.md).")
+@uncertainty_options
+@click.option(
+    "--by",
+    type=click.Choice(["worst", "p95"]),
+    default="worst",
+    show_default=True,
+    help="Residual that --envelope minimises.",
+)
+@click.option(
+    "--loss",
+    type=click.FloatRange(0),
+    default=EnvelopeGoal.loss,
+    show_default=True,
+    help="How much more --envelope may leave at the nominal plant.",
+)
 @scenario_options
 @click.option(
     "--setting",
@@ -87,7 +123,12 @@ NAMES = [o.id for o in OBSERVERS.values() if o.tunable.usual]
 @click.option("--out", metavar="F.toml", help="Save all settings, the tuned ones with a comment.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
 def tune(
-    observer: str,
+    observer: str | None,
+    controller: str | None,
+    on_envelope: bool,
+    uncertainty: Uncertainty,
+    by: Literal["worst", "p95"],
+    loss: float,
     scenario: Scenario,
     settings: tuple[str, ...],
     target: str | None,
@@ -99,8 +140,13 @@ def tune(
     out: str | None,
     as_json: bool,
 ) -> None:
-    """Search for the settings of an observer that are best on a validation record (docs/tuning.md)."""
-    record = None
+    """Search for the best settings of an observer on a record, or of a controller on uncertain plants (docs/tuning.md)."""
+    goal, record = EnvelopeGoal(uncertainty, by, loss), None
+    name = controller if on_envelope else observer
+    if name is None or (controller if not on_envelope else observer) is not None:
+        raise SettingError("give --observer, or --envelope and --controller")
+    if not on_envelope and goal != EnvelopeGoal():
+        raise SettingError("--delay, --gain, --rotation, --resonance, --by, --loss: only with --envelope")
     if record_file is not None:
         if validation is not None:
             raise SettingError("--validation: only for simulated records, not with --record")
@@ -110,12 +156,13 @@ def tune(
     with progress_bar("evaluations") as update:
         tuned = search(
             scenario,
-            observer,
+            name,
             settings or None,
             evaluations=evaluations,
             record=record,
             target=target,
             validation=validation,
+            envelope=goal if on_envelope else None,
             watch=Watch(progress=update),
         )
     if out:
@@ -125,6 +172,6 @@ def tune(
         click.echo(json.dumps(report.tuning_dict(tuned), allow_nan=False))
         return
     show_table(settings_table(tuned))
-    show_table(errors_table(tuned))
+    show_table(errors_table(tuned) if tuned.after.spreads is None else spreads_table(tuned))
     for line in report.tuning_remarks(tuned):
         click.echo(line)

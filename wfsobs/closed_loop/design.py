@@ -18,7 +18,7 @@ from wfsobs.control.true_plant import TruePlant
 from wfsobs.evaluation.bound import INFORMATION, least_residual
 from wfsobs.observers.kalman.multirate import UnstableCycle
 from wfsobs.prior import Prior, Spectra
-from wfsobs.priors_from.controllers import own_settings, plant_of, prior_for, true_plant_of
+from wfsobs.priors_from.controllers import own_settings, plant_of, prior_for, supervision_of, true_plant_of
 from wfsobs.priors_from.scenario import told_spectra
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
@@ -31,8 +31,9 @@ class LawDesign:
 
     law           : None for control by nothing, and where there is none
     stable        : None where there is no law; that of the law with the plant that it is designed for where the plant as it is
-        is not linear, or with a prediction beside the law
-    predicted_rms : rms [um] of the residual by the true spectra; None where the law has no frequency response or is not stable
+        is not linear, with a prediction beside the law, or under supervision
+    predicted_rms : rms [um] of the residual by the true spectra; None where the law has no frequency response, is not stable or
+        is supervised
     margins       : the same
     note          : why there is no law
     """
@@ -104,6 +105,8 @@ def design(scenario: Scenario, controllers: Sequence[str] | None = None, start: 
     if actual is not None:
         laws = {name: _with_plant(name, of, plant, actual, true) for name, of in laws.items()}
         delay = actual.delay
+    for name in [name for name in laws if supervision_of(CONTROLLERS[name], scenario)]:
+        laws[name] = tuple(replace(one, predicted_rms=None, margins=None) for one in made[name][0])
     if scenario.events:
         laws = {name: tuple(replace(one, predicted_rms=None) for one in designed) for name, designed in laws.items()}
         return Design(scenario, plant, laws, {}, priors, max(scenario.run.warm_up, start), actual)

@@ -6,7 +6,7 @@ and at all corners; stability and residual are by theory (`control.mismatch`), o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -17,7 +17,7 @@ import numpy as np
 from scipy.stats import binomtest
 from scipy.stats.qmc import Sobol
 
-from wfsobs.closed_loop.design import Design, design, loop_spectra
+from wfsobs.closed_loop.design import loop_spectra, select_controllers
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.law import Law
 from wfsobs.control.mirror import Mirror
@@ -25,7 +25,7 @@ from wfsobs.control.mismatch import loops, pairs, radius, weigh
 from wfsobs.control.true_plant import TruePlant
 from wfsobs.evaluation.rows import Row
 from wfsobs.notebook import PlotAccessor, import_extra
-from wfsobs.priors_from.controllers import full_plant_of, own_settings
+from wfsobs.priors_from.controllers import full_plant_of, own_settings, plant_of, prior_for
 from wfsobs.priors_from.scenario import told_spectra
 from wfsobs.progress import QUIET, Watch
 from wfsobs.scenario import Scenario
@@ -37,15 +37,6 @@ if TYPE_CHECKING:
     import pandas
 
 POINTS = 1000
-
-CAUTIONS = tuple(2.0 ** (0.25 * i) for i in range(-3, 13))
-"""Cautions that a search tries, 0.6 to 8."""
-
-FEW = 32
-"""Points that it looks at, beside all corners."""
-
-LOSS = 0.1
-"""How much more a controller may leave at the nominal plant for less at the worst."""
 
 AT_ONCE = 2**21
 """Numbers in the largest array of a block of plants."""
@@ -76,8 +67,6 @@ class Spread:
         The same at the points and corners, (n, n_modes).
     caution : float
         `control.caution` that it was designed with.
-    trade : tuple of tuple
-        (caution, rms at the nominal plant, rms at the worst) of all that a search tried, modes together [um].
     """
 
     controller: str
@@ -85,7 +74,6 @@ class Spread:
     points: Array
     corners: Array
     caution: float = 1.0
-    trade: tuple[tuple[float, float, float], ...] = ()
 
     @property
     def unstable(self) -> int:
@@ -101,7 +89,12 @@ class Spread:
     @property
     def worst(self) -> Array:
         """Largest rms of points and corners, per mode [um]; infinite where one is not stable."""
-        return np.maximum(self.points.max(axis=0), self.corners.max(axis=0))
+        return np.concatenate([self.points, self.corners]).max(axis=0)
+
+    @property
+    def p95(self) -> Array:
+        """95 % quantile of the rms at the points, per mode [um]; infinite where more than 5 % are not stable."""
+        return np.quantile(self.points, 0.95, axis=0, method="higher")
 
     def summary(self, mode: int) -> tuple[float | None, float | None]:
         """(mean, 95 % quantile) of the rms at the stable points [um]."""
@@ -195,13 +188,22 @@ class PlantEnvelope:
         return f"Best at the nominal plant: {nominal}. Best at the worst plant: {worst}.{fails}"
 
 
+@dataclass(frozen=True)
+class Plants:
+    """Plants of an envelope: the nominal one, those at the points and those at the corners."""
+
+    nominal: TruePlant
+    points: Sequence[TruePlant]
+    corners: Sequence[TruePlant]
+
+
 def plant_envelope(
     scenario: Scenario,
     *,
     controllers: Sequence[str] | None = None,
     uncertainty: Uncertainty | None = None,
     points: int = POINTS,
-    tune: bool = False,
+    on_spread: Callable[[PlantEnvelope], None] | None = None,
     watch: Watch = QUIET,
 ) -> PlantEnvelope:
     """Compute what every linear controller leaves over an uncertain plant.
@@ -216,9 +218,8 @@ def plant_envelope(
         Largest errors.
     points : int
         Points of Sobol's sequence; corners come on top.
-    tune : bool
-        Whether to search for the caution of every controller (`control.caution`) that leaves least at the worst plant, at most
-        LOSS more than the least at the nominal one.
+    on_spread : callable, optional
+        Receives what there is after every controller.
     watch : Watch, optional
         Receives the progress, and is asked whether to stop.
 
@@ -237,66 +238,61 @@ def plant_envelope(
     See Also
     --------
     wfsobs.close_loop : Simulate the loop with one plant.
+    wfsobs.tune : Tune a controller on an uncertain plant.
     """
-    base = full_plant_of(scenario)
-    if not base.time_invariant:
-        raise SettingError("plant: an envelope is by theory, for a plant that is linear and the same at every step")
-    if not has_known_spectra(scenario):
-        raise SettingError("the spectra of this scenario are not known for the whole record, and so is no residual by theory")
     of = uncertainty or Uncertainty()
-    if base.delay - of.delay < 1.0:
-        raise SettingError(f"delay: {base.delay:g} - {of.delay:g} frames are below 1")
-    plan = design(scenario, controllers)
-    spectra = [true_spectra(scenario, mode) for mode in range(len(scenario.modes))]
-    errors, corners = error_samples(of, base, points)
-    nominal = {name: np.zeros(1) for name in errors}
-    names = list(errors)
-    every = {name: np.concatenate([nominal[name], errors[name], corners[name]]) for name in names}
-    plants = [plant_at(scenario, base, {name: float(every[name][i]) for name in names}) for i in range(len(every[names[0]]))]
-    spreads, notes = [], {}
-    linear = [name for name in plan.laws if CONTROLLERS[name].law is not None]
+    errors, corners, plants = uncertain_plants(scenario, of, points)
+    spectra = known_spectra(scenario)
+    linear = [c.id for c in select_controllers(controllers) if c.law is not None]
+    spreads, notes = list[Spread](), dict[str, str]()
     for i, name in enumerate(linear):
         watch.check()
-        reason = _why_not(plan, name)
-        if reason:
-            notes[name] = reason
-            continue
-        laws = [one.law for one in plan.laws[name] if one.law is not None]
-        caution, trade = scenario.control.caution, ()
-        if tune:
-            few = [*plants[: 1 + FEW], *plants[1 + points :]]  # the nominal plant, the first points, the corners
-            laws, caution, trade = _tune(plan, name, few, spectra, watch)
-        left = residuals(laws, plan.mirror, plants, spectra, watch)
-        spreads.append(Spread(name, left[0], left[1 : 1 + points], left[1 + points :], caution, trade))
+        try:
+            spreads.append(spread_of(name, scenario, plants, spectra, watch))
+        except ValueError as error:
+            notes[name] = str(error)
         watch.step((i + 1) / len(linear))
+        if on_spread:
+            on_spread(PlantEnvelope(scenario, of, errors, corners, tuple(spreads), dict(notes)))
     return PlantEnvelope(scenario, of, errors, corners, tuple(spreads), notes)
 
 
-def _tune(
-    plan: Design, name: str, plants: Sequence[TruePlant], spectra: Sequence[TrueSpectra], watch: Watch
-) -> tuple[list[Law], float, tuple[tuple[float, float, float], ...]]:
-    """Return the laws of the least residual at the worst of some plants, their caution, and what was tried."""
-    controller, prior = CONTROLLERS[name], replace(plan.priors[name], spectra=tuple(told_spectra(one) for one in spectra))
-    found: list[tuple[float, float, float, list[Law]]] = []
-    for caution in CAUTIONS:
-        settings = own_settings(controller, plan.scenario)
-        settings.control.caution = caution
-        try:
-            laws = list(controller.laws(prior, plan.plant, settings, len(spectra)))
-        except ValueError:
-            continue
-        if all(law.stable for law in laws):
-            left = np.sqrt((residuals(laws, plan.mirror, plants, spectra, watch) ** 2).sum(axis=1))
-            found.append((caution, float(left[0]), float(left.max()), laws))
-    most = (1.0 + LOSS) * min(nominal for _, nominal, _, _ in found)
-    caution, _, _, laws = min((one for one in found if one[1] <= most), key=lambda one: (one[2], one[1]))
-    return laws, caution, tuple((caution, nominal, worst) for caution, nominal, worst, _ in found)
+def known_spectra(scenario: Scenario) -> list[TrueSpectra]:
+    """Return the true spectra of all modes. Raises SettingError where they are not known."""
+    if not has_known_spectra(scenario):
+        raise SettingError("the spectra of this scenario are not known for the whole record, and so is no residual by theory")
+    return [true_spectra(scenario, mode) for mode in range(len(scenario.modes))]
 
 
-def _why_not(plan: Design, name: str) -> str:
-    if CONTROLLERS[name].predict is not None:
-        return "its prediction is not linear: an envelope by simulation is not there"
-    return next((one.note or "not stable" for one in plan.laws[name] if one.law is None), "")
+def uncertain_plants(
+    scenario: Scenario, uncertainty: Uncertainty, points: int
+) -> tuple[dict[str, Array], dict[str, Array], Plants]:
+    """Return errors at the points and at the corners, as `error_samples`, and the plants. Raises SettingError."""
+    base = full_plant_of(scenario)
+    if not base.time_invariant:
+        raise SettingError("plant: an envelope is by theory, for a plant that is linear and the same at every step")
+    if base.delay - uncertainty.delay < 1.0:
+        raise SettingError(f"delay: {base.delay:g} - {uncertainty.delay:g} frames are below 1")
+    errors, corners = error_samples(uncertainty, base, points)
+
+    def plants(of: dict[str, Array]) -> list[TruePlant]:
+        return [plant_at(scenario, base, {k: float(x[i]) for k, x in of.items()}) for i in range(len(of["delay"]))]
+
+    return errors, corners, Plants(base, plants(errors), plants(corners))
+
+
+def spread_of(name: str, scenario: Scenario, plants: Plants, spectra: Sequence[TrueSpectra], watch: Watch = QUIET) -> Spread:
+    """Return what a controller leaves of these plants. Raises ValueError saying why it cannot, Cancelled."""
+    controller, told = CONTROLLERS[name], [told_spectra(one) for one in spectra]
+    if controller.law is None or controller.predict is not None:
+        raise ValueError("its prediction is not linear: an envelope by simulation is not there")
+    prior, plant = prior_for(controller, scenario, told), plant_of(scenario)
+    laws = controller.laws(prior, plant, own_settings(controller, scenario), len(spectra))
+    if not all(law.stable for law in laws):
+        raise ValueError("not stable")
+    left = residuals(laws, plant.mirror, [plants.nominal, *plants.points, *plants.corners], spectra, watch)
+    end = 1 + len(plants.points)
+    return Spread(name, left[0], left[1:end], left[end:], scenario.control.caution)
 
 
 def error_samples(uncertainty: Uncertainty, base: TruePlant, points: int) -> tuple[dict[str, Array], dict[str, Array]]:

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 LIMITED = "theory and margins are not applicable: a limit of the mirror acts, and the loop is no longer linear"
 """Why a row has neither."""
 
+SUPERVISED = "no theory and no margins under supervision: an integrator may take over"
+"""Why the others have none."""
+
 NOT_APPLICABLE = "n/a"
 
 
@@ -42,6 +45,7 @@ class Outcome:
     u             : (n_steps, n_modes) commands that the mirror took [um], or None
     limited_share : share of the steps after the warm-up in which a limit changed a command, per mode
     note          : why there is no residual
+    alarms        : (time [s], reason) of every time that the integrator took over; None without supervision
     """
 
     controller: str
@@ -50,6 +54,7 @@ class Outcome:
     u: Array | None = None
     limited_share: tuple[float, ...] = ()
     note: str = ""
+    alarms: tuple[tuple[float, str], ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -84,6 +89,7 @@ def rows(result: ClosedLoop, seed: int | None, *, source: PriorSource = TRUE) ->
     disk_margin : `control.margins.disk_margin`
     limited : share of the steps in which a limit of the mirror changed the command. Where it is above 0 the loop is not the
         linear one that theory and margins are of: these are null, and `note` says why
+    alarms : time [s] and reason of every time that the integrator took over, null without supervision; `note` has the first
     source : where the prior of the controllers comes from
     """
     plan, warm_up = result.design, result.design.start
@@ -102,6 +108,7 @@ def rows(result: ClosedLoop, seed: int | None, *, source: PriorSource = TRUE) ->
                 "delay_margin_ms",
                 "disk_margin",
                 "limited",
+                "alarms",
             )
         }
         return {
@@ -139,7 +146,8 @@ def rows(result: ClosedLoop, seed: int | None, *, source: PriorSource = TRUE) ->
                     delay_margin_ms=m.delay * 1e3 if m and m.delay is not None else None,
                     disk_margin=m.disk if m else None,
                     limited=limited,
-                    note=outcome.note or (LIMITED if limited else ""),
+                    alarms=outcome.alarms,
+                    note=outcome.note or took_over(outcome.alarms or ()) or (LIMITED if limited else ""),
                 )
             )
     (spectra,) = words_for((Spectra,), source=source)
@@ -195,6 +203,23 @@ def label(controller: str) -> str:
 def linear(same: Sequence[Row], value: str) -> str:
     """Return the text of a number of the linear loop: not applicable where a limit of the mirror acts in any of the rows."""
     return NOT_APPLICABLE if any(r["limited"] for r in same) else value
+
+
+def took_over(alarms: Sequence[tuple[float, str]]) -> str:
+    """Say when the integrator took over, (time [s], reason) of each time; empty for none."""
+    if not alarms:
+        return ""
+    (time, reason), *more = alarms
+    return f"Integrator took over at {time:.2f} s: {reason}" + (f"; {len(more)} times more" if more else "")
+
+
+def no_theory(rows: Sequence[Row]) -> str:
+    """Say why some of the rows have no theory and no margins; empty where all have what their laws have."""
+    said = {
+        f"{NOT_APPLICABLE}: {LIMITED}": any(r["limited"] for r in rows),
+        SUPERVISED: any(r["alarms"] is not None for r in rows),
+    }
+    return "; ".join(text for text, applies in said.items() if applies)
 
 
 def residual_rms(outcome: Outcome, record: Record, warm_up: float) -> list[float] | None:

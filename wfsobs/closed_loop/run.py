@@ -17,10 +17,11 @@ from wfsobs.closed_loop.design import Design, LawDesign, design
 from wfsobs.closed_loop.rows import ClosedLoop, Outcome
 from wfsobs.control.base import Controller
 from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.control.supervisor import SupervisedController
 from wfsobs.control.true_plant import TruePlant, drive
 from wfsobs.dependence import Memo, digest, record_digest
 from wfsobs.pipeline import as_stated
-from wfsobs.priors_from.controllers import controller_arguments, own_settings
+from wfsobs.priors_from.controllers import controller_arguments, full_plant_of, own_settings, supervision_of
 from wfsobs.progress import QUIET, Watch, detach_watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
@@ -110,7 +111,8 @@ def _name(controller: Controller, designs: Sequence[LawDesign], record: Record, 
     laws = [(d.law, d.stable, d.note) for d in designs]
     try:
         _, prior = controller_arguments(controller, record, settings, plan.priors[controller.id])
-        return digest("outcome", controller.id, laws, own, record_digest(record), prior, plan.plant, plan.start, *_plant_of(plan))
+        which, acting = supervision_of(controller, plan.scenario), _plant_of(plan)
+        return digest("outcome", controller.id, laws, own, record_digest(record), prior, plan.plant, plan.start, which, *acting)
     except (TypeError, ValueError):
         return ""
 
@@ -132,13 +134,18 @@ def _outcome(
     try:
         measured, prior = controller_arguments(controller, record, settings, plan.priors[controller.id])
         with detach_watch(watch) as alone:
-            if plan.true is None:
+            supervision, alarms = supervision_of(controller, plan.scenario), None
+            if plan.true is None and supervision is None:
                 u, limited = controller.commands(laws, measured, prior, plan.plant, settings, alone)
                 correction = plan.mirror.correction(u)
             else:
                 stepper = controller.assemble(laws, prior, plan.plant, settings, measured.sampling)
-                u, correction = drive(stepper, measured, plan.true, _plant_generator(plan.scenario), alone)
+                acting = stepper if supervision is None else SupervisedController(stepper, supervision)
+                true = plan.true or full_plant_of(plan.scenario)
+                u, correction = drive(acting, measured, true, _plant_generator(plan.scenario), alone)
                 limited = None
+                if isinstance(acting, SupervisedController):
+                    alarms = tuple((frame * record.dt, reason) for frame, reason in acting.alarms)
     except ValueError as error:
         return Outcome(controller.id, tuple(None for _ in stable), note=str(error))
     if not np.isfinite(correction).all():
@@ -147,7 +154,7 @@ def _outcome(
     start = round(plan.start / record.dt)
     limited = plan.mirror.at_limit(u) if limited is None else limited
     residual = disturbance + correction
-    return Outcome(controller.id, stable, residual, u, tuple(limited[start:].mean(axis=0).tolist()))
+    return Outcome(controller.id, stable, residual, u, tuple(limited[start:].mean(axis=0).tolist()), alarms=alarms)
 
 
 def _plant_generator(scenario: Scenario) -> np.random.Generator:

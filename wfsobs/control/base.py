@@ -24,7 +24,7 @@ from wfsobs.control.law import Law
 from wfsobs.control.mirror import Plant
 from wfsobs.control.step import StepController
 from wfsobs.control.step_laws import KalmanLaws, StepPredict, VibrationAhead, step_law, take_missing
-from wfsobs.observers.base import NOTHING, PLAIN, Look
+from wfsobs.observers.base import NOT_TUNED, NOTHING, PLAIN, Look, Tunable
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
 from wfsobs.observers.step import StepError
@@ -78,6 +78,8 @@ class Controller:
         (prior, plant, settings, sampling) -> its prediction, one frame at a time; None without one.
     counts : callable or None
         Settings -> what of them its commands depend on beside its laws, as plain values; None for all that have an effect.
+    tunable : Tunable
+        Settings that its laws can be tuned by on an uncertain plant.
 
     Raises
     ------
@@ -100,6 +102,7 @@ class Controller:
     look: Look = PLAIN
     step_predict: StepPredict | None = None
     counts: Callable[[Any], Any] | None = None
+    tunable: Tunable = NOT_TUNED
 
     def __post_init__(self) -> None:
         if self.predict is not None and not asks_for(Bands, self.prior):

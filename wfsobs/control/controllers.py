@@ -11,8 +11,9 @@ from wfsobs.control.law import Law
 from wfsobs.control.lqg import lqg_kf_lgs, lqg_kf_multi, lqg_multirate, lqg_multirate_multi, lqg_multirate_optimal
 from wfsobs.control.mirror import Plant
 from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead, of_z, step_gpr_offline_ahead, step_gpr_online_ahead
-from wfsobs.observers.base import Look
-from wfsobs.observers.kalman.multirate import matched_noise
+from wfsobs.observers.base import Look, Tunable
+from wfsobs.observers.kalman.multirate import TUNABLE, matched_noise
+from wfsobs.observers.kalman.single import MODEL
 from wfsobs.prior import (
     Bands,
     Beams,
@@ -71,6 +72,9 @@ def _online_seconds(settings: Any, n_steps: int, n_modes: int) -> float:
     return n_steps * n_modes * (1e-4 + 0.7e-9 * settings.gpr_online.training_size**2)
 
 
+_CAUTION = ("control.caution",)
+_BOTH_SENSORS = Tunable(_CAUTION, (*TUNABLE.usual, *MODEL))
+
 CONTROLLERS = Registry(
     Controller,
     registry.CONTROLLERS,
@@ -85,6 +89,7 @@ CONTROLLERS = Registry(
             help="u[k] = leak u[k-1] - g y[k]",
             settings=("control",),
             asks=_gain,
+            tunable=Tunable(_CAUTION, ("control.gain", "control.leak")),
             counts=_nothing_more,
             look=Look("Integrator", "#003DE6", "#7AA2FF"),
         ),
@@ -95,6 +100,7 @@ CONTROLLERS = Registry(
             help="minus what the LGS Kalman filter predicts",
             prior=(LgsModel, LgsStars),
             settings=("control",),
+            tunable=Tunable(_CAUTION, (*MODEL, "kalman.lgs_noise")),
             counts=_nothing_more,
             look=Look("LQG LGS KF", "#FF6600", "#FF8533"),
         ),
@@ -105,6 +111,7 @@ CONTROLLERS = Registry(
             help="minus what the Kalman filter of every peak predicts",
             prior=(Lines, LgsStars),
             settings=("control", "multipeak"),
+            tunable=Tunable(_CAUTION, ("multipeak.line_width", "kalman.lgs_noise", "kalman.turbulence_rms")),
             counts=_nothing_more,
             look=Look("LQG multi-peak", "#AE7D40", "#BA6A26", (14, 3)),
         ),
@@ -117,6 +124,7 @@ CONTROLLERS = Registry(
             asks=_matched_noise,
             settings=("control", "multirate"),
             ngs=True,
+            tunable=_BOTH_SENSORS,
             counts=_nothing_more,
             look=Look("LQG multi-rate", "#E31FFF", "#7E75C8", (10, 2, 2, 2)),
         ),
@@ -129,6 +137,7 @@ CONTROLLERS = Registry(
             asks=_matched_noise,
             settings=("control", "multirate"),
             ngs=True,
+            tunable=_BOTH_SENSORS,
             counts=_nothing_more,
             look=Look("LQG opt. multi-rate", "#5718C1", "#B848F9", (3, 2)),
         ),
@@ -141,6 +150,7 @@ CONTROLLERS = Registry(
             asks=_matched_noise,
             settings=("control", "multirate", "multipeak"),
             ngs=True,
+            tunable=Tunable(_CAUTION, ("multipeak.line_width", *TUNABLE.usual, "kalman.turbulence_rms")),
             counts=_nothing_more,
             look=Look("LQG multi-rate multi-peak", "#AB64CF", "#F26FF3", (8, 3)),
         ),

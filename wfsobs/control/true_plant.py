@@ -20,6 +20,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from wfsobs.control.step import StepController
+from wfsobs.control.supervisor import SupervisedController
 from wfsobs.observers.step import EVERY
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, hold_last
@@ -158,7 +159,11 @@ class ActingPlant:
 
 
 def drive(
-    controller: StepController, measurements: Measurements, plant: TruePlant, rng: np.random.Generator, watch: Watch = QUIET
+    controller: StepController | SupervisedController,
+    measurements: Measurements,
+    plant: TruePlant,
+    rng: np.random.Generator,
+    watch: Watch = QUIET,
 ) -> tuple[Array, Array]:
     """(commands, what the mirror made of them), both (n_steps, n_modes) [um], of a loop on pseudo-open-loop measurements.
 

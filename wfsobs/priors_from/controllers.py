@@ -10,6 +10,7 @@ import numpy as np
 
 from wfsobs.control.base import Controller, Settings
 from wfsobs.control.mirror import Mirror, Plant
+from wfsobs.control.supervisor import Supervision
 from wfsobs.control.true_plant import TruePlant, true_matrix
 from wfsobs.prior import Prior, Spectra, Training
 from wfsobs.priors_from.scenario import prior_of
@@ -50,6 +51,13 @@ def true_plant_of(scenario: Scenario) -> TruePlant | None:
     out, is_moved = full_plant_of(scenario), scenario.plant.delay_error or scenario.plant.resonance
     is_perfect = out.time_invariant and not is_moved and np.array_equal(out.matrix, np.eye(len(out.matrix)))
     return None if is_perfect else out
+
+
+def supervision_of(controller: Controller, scenario: Scenario) -> Supervision | None:
+    """Return how a controller is supervised; None where it is not, as are an integrator and control by nothing."""
+    c = scenario.control
+    is_safe = controller.law is None or controller.id == "integrator"
+    return Supervision(c.fallback_gain, c.leak) if c.supervised and not is_safe else None
 
 
 def own_settings(controller: Controller, scenario: Scenario) -> Settings:

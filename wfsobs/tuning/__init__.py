@@ -1,6 +1,7 @@
-"""Settings of an observer from a search: `tune`."""
+"""Settings of an observer or a controller from a search: `tune`."""
 
+from wfsobs.tuning.envelope import EnvelopeGoal
 from wfsobs.tuning.trials import Evaluation, Stage
-from wfsobs.tuning.tuning import TuningResult, tune
+from wfsobs.tuning.tuning import TuningResult, tune, tuned_envelope
 
-__all__ = ["Evaluation", "Stage", "TuningResult", "tune"]
+__all__ = ["EnvelopeGoal", "Evaluation", "Stage", "TuningResult", "tune", "tuned_envelope"]

@@ -38,13 +38,17 @@ SHORTEST = 1.0
 
 TRUTH, NEXT, REFERENCE = "the truth", "the next measurement of the LGS", "the zero-phase Butterworth reference"
 """What an estimate is compared with."""
+WORST, P95 = "the worst plant", "95 % of the plants"
+"""Where a controller is scored."""
 
 MEASURES = {
     TRUTH: "RMS error",
     NEXT: "RMS one-step prediction error of z",
     REFERENCE: "RMS distance to the zero-phase Butterworth reference",
+    WORST: "Largest RMS of the plants",
+    P95: "RMS that 95 % of the plants do not exceed",
 }
-"""What the numbers of a tuning are, by what an estimate is compared with."""
+"""What the numbers of a tuning are, by what an estimate is compared with or where a controller is scored."""
 
 LENGTHS = ("gpr_offline.training_size", "gpr_offline.depth")
 """Settings of which a training record is longer."""

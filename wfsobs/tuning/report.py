@@ -5,18 +5,22 @@ from __future__ import annotations
 from functools import reduce
 from typing import Any
 
-from wfsobs.evaluation.rows import row_label
+import numpy as np
+
+from wfsobs.closed_loop.envelope import Spread
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import add_comments, changed_settings, to_toml
-from wfsobs.tuning.records import TRUTH
+from wfsobs.tuning.records import P95, TRUTH, WORST
 from wfsobs.tuning.trials import Errors, Stage
 from wfsobs.tuning.tuning import TuningResult
+from wfsobs.typing import Array
 
 
 def tuning_dict(result: TuningResult) -> dict[str, Any]:
     """Return the output of `wfsobs tune --json`.
 
-    Errors in um, null where the observer failed; likelihoods in nats, null where there is no GPR.
+    Errors in um, null where the observer failed; likelihoods in nats, null where there is no GPR. Of a controller, `envelope` has
+    what it leaves of the plants of the search and of others, null where it is not stable.
     """
 
     def stage(s: Stage) -> dict[str, Any]:
@@ -27,10 +31,11 @@ def tuning_dict(result: TuningResult) -> dict[str, Any]:
             "test_um": _modes(s.test),
             "other_target_test_um": _modes(s.other),
             "log_marginal_likelihood": list(s.likelihood) if s.likelihood else None,
+            "envelope": dict(zip(("searched", "others"), map(_spread, s.spreads), strict=True)) if s.spreads else None,
         }
 
     return {
-        "observer": result.observer,
+        "controller" if result.after.spreads else "observer": result.observer,
         "target": result.target,
         "against": result.against,
         "settings": changed_settings(result.scenario, result.before.scenario),
@@ -42,6 +47,15 @@ def tuning_dict(result: TuningResult) -> dict[str, Any]:
             for e in result.history
         ],
     }
+
+
+def _spread(of: Spread) -> dict[str, Any]:
+    left = {name: _finite(getattr(of, name)) for name in ("nominal", "p95", "worst")}
+    return {**{f"{name}_um": x for name, x in left.items()}, "unstable": of.unstable, "plants": len(of.points)}
+
+
+def _finite(rms: Array) -> list[float] | None:
+    return rms.tolist() if np.isfinite(rms).all() else None
 
 
 def _modes(errors: Errors | None) -> dict[str, float] | None:
@@ -76,7 +90,7 @@ def nm(rms: float) -> str:
 
 def tuning_remarks(result: TuningResult) -> list[str]:
     """Return one line on each fact that is not in the tables."""
-    out = [] if result.against == TRUTH else [f"compared with {result.against}, no truth being known"]
+    out = [] if result.against in (TRUTH, WORST, P95) else [f"compared with {result.against}, no truth being known"]
     known = [s.likelihood for s in (result.before, result.after)]
     if all(known):
         text = " -> ".join(", ".join(f"{x:.1f}" for x in values) for values in known if values)
@@ -96,9 +110,9 @@ def tuning_toml(result: TuningResult) -> str:
         path: f"{'tuned' if path in result.paths else 'with it'}, {_before(result, path)} before"
         for path in changed_settings(result.scenario, base)
     }
-    evaluations = len(result.history)
+    evaluations, where = len(result.history), "at" if result.after.spreads else "against"
     head = [
-        f"{row_label(result.observer)} tuned for {result.target}, against {result.against}, in {evaluations} evaluations.",
+        f"{result.label} tuned for {result.target}, {where} {result.against}, in {evaluations} evaluations.",
         *(
             f"{result.measure}, {name}: {_of(before)} before, {_of(after)} after"
             for name, before, after in (

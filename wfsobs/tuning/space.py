@@ -1,11 +1,11 @@
-"""The search space of each observer: its tuned settings, their ranges and scales.
+"""The search space of each observer and controller: its tuned settings, their ranges and scales.
 
 The world (turbulence, vibration, sensors, loop) is not tuned.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
@@ -13,12 +13,19 @@ from typing import Any
 import numpy as np
 import param
 
+from wfsobs.control.base import Controller
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.control.integrator import best_gain
 from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import Observer, Tunable
+from wfsobs.priors_from.controllers import plant_of
+from wfsobs.priors_from.scenario import told_spectra
 from wfsobs.priors_from.turbulence import measurement_noise
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.disturbance import vibration_lines, vibration_variance
 from wfsobs.simulation.layers import relative_rms
+from wfsobs.simulation.true_spectra import true_spectra
 from wfsobs.simulation.turbulence import turbulence_process
 from wfsobs.typing import Array
 
@@ -84,44 +91,50 @@ def numbers(scenario: Scenario) -> dict[str, float]:
     return {path: _value(scenario, path) for path, _, p in scenario.walk() if isinstance(p, param.Number)}
 
 
-def space(scenario: Scenario, observer: str, names: Sequence[str] | None = None) -> Space:
-    """Return the search space of an observer: its usual settings, or those named.
+def space(
+    scenario: Scenario, name: str, names: Sequence[str] | None = None, of: Mapping[str, Observer | Controller] = OBSERVERS
+) -> Space:
+    """Return the search space of an observer, or of a controller: its usual settings, or those named.
 
     A range is that of the sliders (soft bounds), wide enough for the scenario's own number.
     Raises SettingError for a name that is no setting, is not one number, or is not used by the observer.
     """
-    if observer not in OBSERVERS:
-        raise SettingError(f"observer {observer!r}: no such observer; there are {', '.join(OBSERVERS)}")
-    known = OBSERVERS[observer].tunable
+    kind = "controller" if of is CONTROLLERS else "observer"
+    if name not in of:
+        raise SettingError(f"{kind} {name!r}: no such {kind}; there are {', '.join(of)}")
+    known = of[name].tunable
     if not known.usual:
-        raise SettingError(f"observer {observer!r}: has no settings to tune")
+        raise SettingError(f"{kind} {name!r}: has no settings to tune")
     chosen = tuple(known.usual if names is None else names)
     if not chosen:
         raise SettingError("names: takes one setting or more")
     for i, path in enumerate(chosen):
-        _check(scenario, observer, path)
+        _check(scenario, name, known, path)
         if path in chosen[:i]:
             raise SettingError(f"{path}: is given twice")
     by_hand = {}
     for switch, (paths, matched) in BY_HAND.items():
-        if set(paths) & set(chosen) and _value(scenario, switch) == "matched":
+        if set(paths) & set(chosen) and _value(scenario, switch) != "manual":
             by_hand |= {
                 switch: "manual",
                 **{p: _clip_to_limits(scenario, p, v) for p, v in zip(paths, matched(scenario), strict=True)},
             }
+    gain_from = by_hand.get("control.integrator", scenario.control.integrator)
+    if name == "integrator" and "control.caution" in chosen and gain_from == "manual":
+        raise SettingError("control.caution: has no effect on an integrator while control.integrator = manual")
     values = {**numbers(scenario), **by_hand}
     return Space(tuple(_axis(scenario, path, values[path]) for path in chosen), by_hand)
 
 
-def _check(scenario: Scenario, observer: str, path: str) -> None:
-    usual, others = OBSERVERS[observer].tunable
-    settings = {known: p for known, _, p in scenario.walk()}
+def _check(scenario: Scenario, of: str, tunable: Tunable, path: str) -> None:
+    usual, others = tunable
+    settings = {name: p for name, _, p in scenario.walk()}
     if path not in settings:
         raise SettingError(f"{path}: no such setting")
     if not isinstance(settings[path], param.Number):
         raise SettingError(f"{path}: cannot be tuned, it is not a single number")
     if path not in (*usual, *others):
-        raise SettingError(f"{path}: not a setting of {observer} that can be tuned; there are {', '.join((*usual, *others))}")
+        raise SettingError(f"{path}: not a setting of {of} that can be tuned; there are {', '.join((*usual, *others))}")
     group, _, name = path.rpartition(".")
     if name == "highpass" and (way := _value(scenario, f"{group}.inputs_filter")) != "high-pass":
         raise SettingError(f"{path}: has no effect while {group}.inputs_filter = {way}")
@@ -177,10 +190,18 @@ def _noise(scenario: Scenario) -> tuple[float, float]:
     return lgs, ngs
 
 
-BY_HAND: dict[str, tuple[tuple[str, str], Callable[[Scenario], tuple[float, float]]]] = {
+def _gain(scenario: Scenario) -> tuple[float]:
+    """Optimal gain of the integrator, less its caution, mean over the modes: set by hand it is one for all of them."""
+    mirror, c = plant_of(scenario).mirror, scenario.control
+    spectra = (told_spectra(true_spectra(scenario, mode)) for mode in range(len(scenario.modes)))
+    return (float(np.mean([best_gain(one, mirror, c.leak) for one in spectra])) / c.caution,)
+
+
+BY_HAND: dict[str, tuple[tuple[str, ...], Callable[[Scenario], tuple[float, ...]]]] = {
+    "control.integrator": (("control.gain",), _gain),
     "kalman.peak": (("kalman.frequency", "kalman.damping"), _peak),
     "kalman.process_noise": (("kalman.turbulence_rms", "kalman.vibration_rms"), _process),
     "kalman.measurement_noise": (("kalman.lgs_noise", "kalman.ngs_noise"), _noise),
     "multirate.measurement_noise": (("multirate.lgs_noise", "multirate.ngs_noise"), _noise),
 }
-"""Settings that say "matched", the two numbers that count instead once they say "manual", and what those are until then."""
+"""Settings that say "matched" or "optimised", the numbers that count once they say "manual", and what those are until then."""

@@ -12,6 +12,7 @@ c = delta' N delta, N = (M + sigma_n^2 I)^-1,
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from math import inf, isfinite
@@ -21,6 +22,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import qmc
 
+from wfsobs.closed_loop.envelope import Spread
 from wfsobs.evaluation.result import Failure
 from wfsobs.evaluation.scores import PREDICTION, supervised_scores, unsupervised_scores
 from wfsobs.execution import each_estimate
@@ -223,33 +225,36 @@ class Stage:
     validation, test : its errors on either record, None where it fails
     other            : on the test record, its errors in the target that it was not tuned for, if it has another
     likelihood       : of a GPR, the log marginal likelihood of its training targets, a number per mode
+    spreads          : of a controller, what it leaves of the plants of the search and of others
     """
 
     scenario: Scenario
     validation: Errors | None
     test: Errors | None
-    other: Errors | None
-    likelihood: tuple[float, ...] | None
+    other: Errors | None = None
+    likelihood: tuple[float, ...] | None = None
+    spreads: tuple[Spread, Spread] | None = None
 
 
 @dataclass
-class Trials:
-    """Runs of the observer on the validation record, each once."""
+class Trials(ABC):
+    """Settings that are tried, each once."""
 
     scenario: Scenario
     space: Space
-    records: Records
-    judge: Judge
     most: int
     watch: Watch
     on_evaluation: Callable[[Evaluation], None] | None
-    history: list[Evaluation] = field(default_factory=list)
-    errors: dict[tuple[Any, ...], float] = field(default_factory=dict)
-    warm_up: float = field(init=False)
+    history: list[Evaluation] = field(default_factory=list, init=False)
+    errors: dict[tuple[Any, ...], float] = field(default_factory=dict, init=False)
 
-    def __post_init__(self) -> None:
-        record = self.records.validation
-        self.warm_up = max(self.scenario.run.warm_up, LEARNING * record.n_steps * record.dt)
+    @abstractmethod
+    def errors_of(self, scenario: Scenario) -> Errors:
+        """Return the errors with these settings. Raises ValueError in one line where there are none, Cancelled."""
+
+    @abstractmethod
+    def stage(self, evaluation: Evaluation) -> Stage:
+        """Score the scenario of an evaluation on what the search has not seen."""
 
     def at(self, point: Array) -> float:
         """Return the error at a point of the unit cube. Raises NoEvaluationLeft where evaluations are used up, Cancelled."""
@@ -264,10 +269,10 @@ class Trials:
         return self.errors[key]
 
     def run(self, changes: dict[str, Any]) -> Evaluation:
-        """One evaluation; scores begin where the first has its estimates, if that is later. Raises Cancelled."""
+        """One evaluation. Raises Cancelled."""
         errors, reason = None, ""
         try:
-            errors = self._errors(self.scenario.replace(changes))
+            errors = self.errors_of(self.scenario.replace(changes))
         except ValueError as error:
             reason = str(error)
         done = Evaluation(changes, errors, reason)
@@ -276,9 +281,28 @@ class Trials:
             self.on_evaluation(done)
         return done
 
-    def _errors(self, scenario: Scenario) -> Errors:
+    def inner(self) -> Watch:
+        """Return the watch of one evaluation, a part of the whole progress."""
+        done, all_of_it = len(self.history), self.most + 2
+        return Watch(lambda f: self.watch.progress((done + f) / all_of_it), self.watch.is_cancelled)
+
+
+@dataclass
+class RecordTrials(Trials):
+    """Runs of an observer on the validation record; scores begin where the first has its estimates, if that is later."""
+
+    records: Records
+    judge: Judge
+    warm_up: float = field(init=False)
+
+    def __post_init__(self) -> None:
         record = self.records.validation
-        estimates = self.judge.estimates(record, scenario, self._inner())
+        self.warm_up = max(self.scenario.run.warm_up, LEARNING * record.n_steps * record.dt)
+
+    def errors_of(self, scenario: Scenario) -> Errors:
+        """Return the errors on the validation record."""
+        record = self.records.validation
+        estimates = self.judge.estimates(record, scenario, self.inner())
         begins = self.judge.begins(estimates) * record.dt
         if not self.history and begins <= LATEST * record.n_steps * record.dt:
             self.warm_up = max(self.warm_up, begins)
@@ -294,15 +318,10 @@ class Trials:
         record, judge, errors, other = self.records.test(scenario), self.judge, None, None
         others = {*OBSERVERS[judge.observer].targets} - {judge.target} if judge.target != PREDICTION else set[str]()
         try:
-            estimates = judge.estimates(record, scenario, self._inner())
+            estimates = judge.estimates(record, scenario, self.inner())
             errors = judge.errors(record, scenario, estimates, scenario.run.warm_up)
             for target in others:
                 other = replace(judge, target=target).errors(record, scenario, estimates, scenario.run.warm_up)
         except ValueError:
             pass  # of the scenario as it was: the reason is in the history
         return Stage(scenario, evaluation.errors, errors, other, likelihood(judge.observer, record, scenario, self.watch))
-
-    def _inner(self) -> Watch:
-        """Return the watch of one run, a part of the whole progress."""
-        done, all_of_it = len(self.history), self.most + 2
-        return Watch(lambda f: self.watch.progress((done + f) / all_of_it), self.watch.is_cancelled)

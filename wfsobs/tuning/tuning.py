@@ -1,19 +1,26 @@
-"""Tuning: the settings of an observer that are best on a record which is neither the training nor the test record."""
+"""Tuning: the settings of an observer, or of a controller, that are best on what it is not scored on in the end."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from math import isfinite
 
+from wfsobs.closed_loop.design import select_controllers
+from wfsobs.closed_loop.envelope import POINTS, PlantEnvelope, plant_envelope
+from wfsobs.closed_loop.rows import label
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.evaluation.rows import row_label
 from wfsobs.pipeline import as_stated
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
-from wfsobs.tuning.records import DESIGN, MEASURES, cut_record, simulate_records, stream
+from wfsobs.tuning.envelope import EnvelopeGoal, EnvelopeTrials
+from wfsobs.tuning.records import DESIGN, MEASURES, P95, WORST, cut_record, simulate_records, stream
 from wfsobs.tuning.space import space
-from wfsobs.tuning.trials import Evaluation, Judge, Stage, Trials, minimise, target_of
+from wfsobs.tuning.trials import Evaluation, Judge, RecordTrials, Stage, Trials, minimise, target_of
 
 EVALUATIONS = 40
 
@@ -22,8 +29,9 @@ EVALUATIONS = 40
 class TuningResult:
     """What a tuning gives.
 
-    target  : what the errors are those of: "turbulence", "vibration", or "next z" where there is no truth
-    against : what stood for the truth, in words
+    observer : its id, or that of a controller
+    target  : what the errors are those of: "turbulence", "vibration", "next z" where there is no truth, or "residual"
+    against : what stood for the truth, in words; of a controller the plants
     paths   : the settings that were searched
     start   : dotted path -> number before, of these and of those set by hand with them; of matched ones what that stands for
     history : every evaluation in its order, the scenario as it was first
@@ -42,6 +50,11 @@ class TuningResult:
     def scenario(self) -> Scenario:
         """The scenario with the tuned settings: the one before where nothing was better."""
         return self.after.scenario
+
+    @property
+    def label(self) -> str:
+        """The label of the observer or controller."""
+        return (row_label if self.after.spreads is None else label)(self.observer)
 
     @property
     def measure(self) -> str:
@@ -63,29 +76,32 @@ def tune(
     record: Record | None = None,
     target: str | None = None,
     validation: float | None = None,
+    envelope: EnvelopeGoal | None = None,
     on_evaluation: Callable[[Evaluation], None] | None = None,
     watch: Watch = QUIET,
 ) -> TuningResult:
-    """Search for the settings of an observer with the minimum error on a validation record.
+    """Search for the settings of an observer with the minimum error on a validation record, or of a controller on an envelope.
 
-    The test record is scored after that.
+    The test record, or plants that the search has not seen, are scored after that.
 
     Parameters
     ----------
     scenario : Scenario
         Settings to start from.
     observer : str
-        Id of the observer.
+        Id of the observer; with `envelope`, of the controller.
     names : sequence of str, optional
         Dotted paths of the settings; by default the observer's usual ones.
     evaluations : int
-        Maximum runs of the observer on the validation record; repeated settings cost none.
+        Maximum runs of the observer on the validation record, or designs of the controller; repeated settings cost none.
     record : Record, optional
         Telemetry, cut into pieces; by default the records are simulated.
     target : {"turbulence", "vibration"}, optional
         Target of the errors; by default vibration where the observer estimates it.
     validation : float, optional
         Length of the simulated validation record [s]; by default that of the scenario.
+    envelope : EnvelopeGoal, optional
+        Tune a linear controller for an uncertain plant, by theory, without a record: what for.
     on_evaluation : callable, optional
         Receives every evaluation as it is done: what remains of a tuning that is cancelled.
     watch : Watch, optional
@@ -108,9 +124,17 @@ def tune(
     See Also
     --------
     wfsobs.run : Run observers with given settings.
+    wfsobs.plant_envelope : What controllers with given settings leave over an uncertain plant.
     """
     if evaluations < 1:
         raise SettingError(f"evaluations = {evaluations}: takes a whole number from 1")
+    if envelope is not None:
+        if not (record is None and target is None and validation is None):
+            raise SettingError("envelope: is by theory, and takes no record, target or validation")
+        scenario.validate()
+        of_plants = space(scenario, observer, names, CONTROLLERS)
+        trials = EnvelopeTrials(scenario, of_plants, evaluations, watch, on_evaluation, observer, envelope)
+        return _search(trials, observer, "residual", WORST if envelope.by == "worst" else P95)
     if record is not None:
         scenario = as_stated(record, scenario)
     scenario.validate()
@@ -119,22 +143,53 @@ def tune(
         records = simulate_records(scenario, searched, target, validation, watch)
     else:
         records = cut_record(record, scenario, observer, target)
-    trials = Trials(scenario, searched, records, Judge(observer, records.target), evaluations, watch, on_evaluation)
+    trials = RecordTrials(scenario, searched, evaluations, watch, on_evaluation, records, Judge(observer, records.target))
+    return _search(trials, observer, records.target, records.against)
+
+
+def _search(trials: Trials, observer: str, target: str, against: str) -> TuningResult:
+    scenario, searched = trials.scenario, trials.space
     trials.run({})
-    minimise(trials.at, searched.start(scenario), evaluations, stream(scenario, DESIGN))
+    minimise(trials.at, searched.start(scenario), trials.most, stream(scenario, DESIGN))
     first, best = trials.history[0], min(trials.history, key=lambda e: e.rms)
     if not isfinite(best.rms):
         raise RecordError(first.reason)
     before, after = (trials.stage(e) for e in (first, best))
-    watch.step(1.0)
+    trials.watch.step(1.0)
     start = {path: v for path, v in {**searched.by_hand, **searched.values(scenario)}.items() if not isinstance(v, str)}
     return TuningResult(
         observer,
-        records.target,
-        records.against,
+        target,
+        against,
         tuple(a.path for a in searched.axes),
         start,
         before,
         after,
         tuple(trials.history),
     )
+
+
+CAUTION_EVALUATIONS = 20
+"""Designs of each controller in `tuned_envelope`."""
+
+
+def tuned_envelope(
+    scenario: Scenario,
+    *,
+    controllers: Sequence[str] | None = None,
+    goal: EnvelopeGoal | None = None,
+    points: int = POINTS,
+    watch: Watch = QUIET,
+) -> PlantEnvelope:
+    """Return `plant_envelope` of controllers each tuned by `tune`, by its usual settings. Raises SettingError, Cancelled."""
+    goal = goal or EnvelopeGoal()
+    names, parts = [c.id for c in select_controllers(controllers) if c.law is not None], list[PlantEnvelope]()
+    for i, name in enumerate(names):
+        inner, tuned = Watch(is_cancelled=watch.is_cancelled), scenario
+        if CONTROLLERS[name].tunable.usual:
+            with suppress(RecordError):  # nothing that was tried is stable at every plant
+                tuned = tune(scenario, name, envelope=goal, evaluations=CAUTION_EVALUATIONS, watch=inner).scenario
+        parts.append(plant_envelope(tuned, controllers=[name], uncertainty=goal.uncertainty, points=points, watch=inner))
+        watch.step((i + 1) / len(names))
+    spreads, notes = sum((part.spreads for part in parts), ()), {k: x for part in parts for k, x in part.notes.items()}
+    return replace(parts[0], scenario=scenario, spreads=spreads, notes=notes)

@@ -43,7 +43,7 @@ from wfsobs.app.views.gain_editor import GainEditor, plane
 from wfsobs.app.views.plots import add_line, envelope, envelope_times, new_figure, on_settle, restyle
 from wfsobs.app.views.strip import Cards, card_of
 from wfsobs.app.views.table import SMALLEST
-from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label, loop_verdict
+from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label, loop_verdict, no_theory
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import Row as Score
 from wfsobs.evaluation.scores import BOUNDS
@@ -273,7 +273,7 @@ def loop_html(results: LoopResults, display: Display) -> str:
     smallest = next((r["controller"] for r in rows if r["controller"] not in BOUNDS and r["residual_rms_nm"] is not None), None)
     scale = 1e-3 * per_micrometre(display.unit, results.result.scenario.telescope.diameter)
     body = [_row(r, display, scale, r["controller"] == smallest) for r in rows]
-    notes = {r["note"]: label(r["controller"]) for r in reversed(rows) if r["note"] and not r["limited"]}
+    notes = {r["note"]: label(r["controller"]) for r in reversed(rows) if r["note"] not in ("", LIMITED)}
     failures = macro("texts", "failure", [f"{name}: {note}" for note, name in notes.items()])
     return f"{table('Controllers', columns, [('', body)])}{limits_note(rows)}{failures}"
 
@@ -287,8 +287,9 @@ def loop_verdict_html(results: LoopResults, display: Display) -> str:
 
 
 def limits_note(rows: Sequence[Score]) -> str:
-    """Why some of the rows have no theory and no margins; nothing where no limit of the mirror acts."""
-    return f"<p>{NOT_APPLICABLE}: {LIMITED}</p>" if any(r["limited"] for r in rows) else ""
+    """Why some of the rows have no theory and no margins; nothing where all have them."""
+    said = no_theory(rows)
+    return f"<p>{said}</p>" if said else ""
 
 
 def linear_text(row: Score, value: str) -> str:

@@ -43,7 +43,9 @@ class Run(Group):
 class Control(Group):
     """The mirror and the controllers of the closed-loop comparison; the loop's own integrator makes the record."""
 
-    used_when: ClassVar[UsedWhen] = MappingProxyType({"gain": ("integrator", ("manual",))})
+    used_when: ClassVar[UsedWhen] = MappingProxyType(
+        {"gain": ("integrator", ("manual",)), "fallback_gain": ("supervised", (True,))}
+    )
 
     delay: Real = Real(
         2.0,
@@ -92,6 +94,20 @@ class Control(Group):
         label="Caution",
         doc="Factor on the noise that LQG takes measurements to have, where that is not set by hand, and divisor of an "
         "integrator's optimised gain; above 1 a loop bears more errors of the plant.",
+    )
+    supervised: param.Boolean[bool] = param.Boolean(
+        False,
+        label="Supervised",
+        doc="An integrator closes the loop for 1000 frames, and takes over from every other controller where its loop is worse "
+        "than it should be.",
+    )
+    fallback_gain: Real = Real(
+        0.2,
+        bounds=(0.0, 5.0),
+        softbounds=(0.0, 1.0),
+        step=0.01,
+        label="Gain of the fallback",
+        doc="Gain of that integrator, of the leak above; stable for every plant that may come.",
     )
     wavelength: Real = Real(
         2.2, bounds=(0.1, 30.0), step=0.05, label="Science wavelength", doc="Wavelength of the Strehl ratio [um]."
