@@ -13,7 +13,8 @@ from math import pi
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
-from wfsobs.identification.plant import _Data, _Fit, _rotation, identify_plant
+from wfsobs.identification.plant import identify_plant
+from wfsobs.identification.plant_likelihood import PlantFit, PlantLikelihood, rotation_matrix
 from wfsobs.record import Record
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.spectral.model import Spectrum
@@ -46,7 +47,7 @@ def simulate(rng: np.random.Generator) -> tuple[Record, Array, list[Spectrum], s
         line = Ar2(2.0 * pi * rng.uniform(15.0, 80.0), rng.uniform(0.003, 0.02), rng.uniform(0.01, 0.08), DT)
         spectra.append(Spectrum(noise, DT, slow, (line,)))
     seen = np.column_stack([sum(p.sample(N, rng) for p in s.processes) + noise * rng.standard_normal(N) for s in spectra])
-    R, d, p = _rotation(angle), int(delay), delay % 1.0
+    R, d, p = rotation_matrix(angle), int(delay), delay % 1.0
     name, step = ("integrator", rng.uniform(0.15, 0.45)) if rng.random() < 0.5 else ("LQG", 0.0)
     nominal = int(np.ceil(delay))
     filters, states = [predictor(s, nominal + 1) for s in spectra], [np.zeros((4, 1)) for _ in spectra]
@@ -74,7 +75,7 @@ def main(loops: int) -> None:
         while not np.abs((made := simulate(rng))[0].y_lgs).max() < 10.0:
             pass  # not stable
         record, theta, spectra, name = made
-        bound = np.sqrt(np.diag(_Data(record.y_lgs, record.u, DT).fit(_Fit(theta, spectra), ties, 1).covariance))
+        bound = np.sqrt(np.diag(PlantLikelihood(record.y_lgs, record.u, DT).fit(PlantFit(theta, spectra), ties, 1).covariance))
         (found,) = identify_plant(record)
         delay, gain = (
             known_numbers(found, "delay"),

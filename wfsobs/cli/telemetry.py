@@ -31,7 +31,8 @@ from wfsobs.files import check_writable, write_whole
 from wfsobs.identification import identify as identify_record
 from wfsobs.identification import report as identified
 from wfsobs.identification.identification import LEVEL
-from wfsobs.identification.plant import design_probe, identify_plant, plant_dict, plant_lines
+from wfsobs.identification.plant import identify_plant, plant_dict, plant_lines
+from wfsobs.identification.probe import design_probe
 from wfsobs.identification.process import Number
 from wfsobs.identification.report import format_number, mode_rows
 from wfsobs.identification.result import Identification

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from wfsobs.files import write_whole
-from wfsobs.identification.plant import contradiction
+from wfsobs.identification.stated_plant import contradiction
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import DELAY, Record, RecordError
 from wfsobs.scenario import Scenario

@@ -1,0 +1,300 @@
+"""The likelihood of the plant of a closed loop, together with that of the spectra of its disturbance.
+
+The mirror holds a command for a frame and the sensor averages over one, so that with the delay d + p, 0 <= p < 1, in frames,
+
+    y[k] = disturbance[k] + R(angle) diag(gain) m[k] + noise[k],    m[k] = (1 - p) u[k-d] + p u[k-d-1].
+
+The disturbance and the noise of each mode have a spectrum S of a stated form: white noise, turbulence of second or third order, a
+coloured background where it is worth it, and resonances. Whittle's likelihood of z = y - R diag(gain) m,
+
+    - log L = sum log S + |Z|^2 / S    over modes and frequencies,
+
+has its maximum over plant and spectra together (the direct method: U. Forssell and L. Ljung, Automatica 35, 1999). The plant's
+covariance is its block of the inverse of the joint information: in a closed loop what a plant explains a spectrum may explain as
+well. A probe in the commands makes that small.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.fft import rfft
+from scipy.stats import chi2
+
+from wfsobs.record import Record, hold_last
+from wfsobs.spectral.missing import MissingSamples, find_outlying
+from wfsobs.spectral.model import Spectrum
+from wfsobs.spectral.periodogram import Cells, fast_length, inflation, periodogram_frequencies, taper
+from wfsobs.spectral.quick import quick_spectrum
+from wfsobs.spectral.whittle import spectrum_negative_log_likelihood
+from wfsobs.typing import Array
+
+LONGEST = 6
+"""Largest delay [frames]."""
+
+ORDER, SPAN, DEGREE = 16, 12, 4
+"""Of the first guess: frames of the past that predict a measurement, and frames after it over which the response of a disturbance
+is a polynomial of this degree."""
+
+PEAKS, MOST_PEAKS, LOWEST = 10, 40, 5.0
+"""Maximum number of resonances per mode, while a maximum is looked for and then; their minimum frequency [Hz]."""
+
+STEPS, REACH, ENOUGH = 25, 0.3, 0.02
+"""Newton steps; maximum change of a number of the plant in one; gain of log-likelihood below which they end."""
+
+NARROW, BAND, LOOSE = 10.0, 0.1, 0.1
+"""Bands over which the correlation of plant and spectra is smoothed: bins, and share of the frequency added to it; information on
+each number of a spectrum beside that of the data, which keeps those that the data say nothing of.
+"""
+
+FAR = 0.05
+"""Gain of the first guess below which, or over whose inverse, it is not taken for 1."""
+
+
+def known_signals(record: Record, most: int) -> tuple[Array, Array]:
+    """Return the first measurements of a record, NaN where a command that they may see is lost, and commands."""
+    y, u = record.y_lgs[:most].copy(), hold_last(record.u[:most])
+    lost = np.isnan(record.u[:most]).sum(axis=1) > 0
+    for lag in range(1, LONGEST + 2):
+        y[lag:][lost[:-lag]] = np.nan
+    return y, u
+
+
+@dataclass(frozen=True)
+class PlantFit:
+    """Plant: delays, gains and, of two modes, the angle; spectra; - log L; covariance of the plant; bins."""
+
+    theta: Array
+    spectra: Sequence[Spectrum]
+    value: float = np.inf
+    covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    bins: int = 0
+
+    @property
+    def criterion(self) -> float:
+        """That of Schwarz: a number of a spectrum has to be worth half of the log of the bins."""
+        return self.value + 0.5 * np.log(max(self.bins, 1)) * sum(s.starts[-1] for s in self.spectra)
+
+
+class PlantLikelihood:
+    """Measurements, and commands of up to LONGEST + 1 frames before, of the modes of a group, with their Fourier transforms."""
+
+    def __init__(self, y: Array, u: Array, dt: float):
+        skip = LONGEST + 1
+        self.n, self.dt, self.k = fast_length(len(y) - skip), dt, y.shape[1]
+        self.f = periodogram_frequencies(self.n, dt)
+        u = u - u.mean(axis=0)
+        self.u = np.array([u[skip - j : skip - j + self.n] for j in range(LONGEST + 2)])
+        self.y = (y - np.nanmean(y, axis=0))[skip : skip + self.n]
+        self.y = np.column_stack([np.where(np.isnan(x) | find_outlying(x), np.nan, x) for x in self.y.T])
+        self.missing = [MissingSamples(np.isnan(x), dt) for x in self.y.T]
+        self.U = np.array([self._transform(x) for x in self.u])
+        self.Y = self._transform(self.filled_y)
+
+    @property
+    def filled_y(self) -> Array:
+        """Measurements with straight lines through gaps."""
+        return np.column_stack([m.interpolate(x) for m, x in zip(self.missing, self.y.T, strict=True)])
+
+    def _transform(self, x: Array) -> Array:
+        """Return the Fourier transform of the columns (k, bins), such that its square is the periodogram."""
+        return np.sqrt(2.0 * self.dt / self.n) * rfft(taper(self.n)[:, None] * x, axis=0)[1 : (self.n + 1) // 2].T
+
+    def with_spectra(self, theta: Array, spectra: Sequence[Spectrum] = (), most: int = PEAKS, *, plain: bool = True) -> PlantFit:
+        """Return a plant with first guesses of the spectra; missing samples are filled by those before.
+
+        plain : without a background, which the commands of a wrong plant look like
+        """
+        seen = self._mirror_signal(theta)
+        z = self.y - seen
+        for i, missing in enumerate(self.missing):
+            z[:, i] = missing.interpolate(z[:, i]) if not spectra else missing.fill(z[:, i], spectra[i].psd(self.f))
+        if any(missing.any for missing in self.missing):
+            self.Y = self._transform(z + seen)
+        some = zip(z.T, spectra or [None] * self.k, strict=True)
+        found = [quick_spectrum(x, self.dt, most, LOWEST, s, complete=not plain) for x, s in some]
+        return PlantFit(theta, [replace(s, background=None) if plain else s for s in found])
+
+    def _mirror_signal(self, theta: Array) -> Array:
+        """Return the commands as the measurements see them, (n, k)."""
+        whole = np.minimum(theta[: self.k].astype(int), LONGEST)
+        part = theta[: self.k] - whole
+        m = [(1.0 - p) * self.u[d, :, j] + p * self.u[d + 1, :, j] for j, (d, p) in enumerate(zip(whole, part, strict=True))]
+        return np.array(m).T @ self._matrix(theta).T
+
+    def _matrix(self, theta: Array, turn: float = 0.0) -> Array:
+        return rotation_matrix((theta[-1] if self.k == 2 else 0.0) + turn)[: self.k, : self.k] * theta[self.k : 2 * self.k]
+
+    def z(self, theta: Array, lower: Array) -> tuple[Array, Array]:
+        """Return the transform of z (k, bins) and its derivatives by theta (p, k, bins); lower : whole part of the delays."""
+        before, change = (np.array([x[d, j] for j, d in enumerate(lower)]) for x in (self.U, self.U[1:] - self.U[:-1]))
+        m, matrix = before + (theta[: self.k] - lower)[:, None] * change, self._matrix(theta)
+        by_delay = [-matrix[:, j, None] * change[j] for j in range(self.k)]
+        by_gain = [-matrix[:, j, None] / theta[self.k + j] * m[j] for j in range(self.k)]
+        by_angle = [-self._matrix(theta, np.pi / 2.0) @ m] if self.k == 2 else []
+        return self.Y - matrix @ m, np.array(by_delay + by_gain + by_angle)
+
+    def fit(self, start: PlantFit, ties: Array, steps: int) -> PlantFit:
+        """Take damped Newton steps with the expected second derivatives; ties : theta by its free numbers (p, q)."""
+        theta, spectra = start.theta, list(start.spectra)
+        cells = [
+            Cells(self.f, np.zeros_like(self.f), np.ones_like(self.f), [p.omega / (2.0 * np.pi) for p in s.resonances])
+            for s in spectra
+        ]
+        lower, held = np.minimum(theta[: self.k].astype(int), LONGEST), 1e-3
+        best, F = np.inf, np.zeros((0, 0))
+        theta_there, spectra_there, lower_there = theta, spectra, lower
+        step = gradient = np.zeros(0)
+        for _ in range(steps):
+            Z, dZ = self.z(theta_there, lower_there)
+            for cell, z in zip(cells, Z, strict=True):
+                cell.mean = _means(np.abs(z) ** 2, cell)
+            there = sum(spectrum_negative_log_likelihood(s, cell) for s, cell in zip(spectra_there, cells, strict=True))
+            gain = best - there
+            crossed = (lower_there != lower).any()
+            if gain >= 0:
+                theta, spectra, lower, best, held = theta_there, spectra_there, lower_there, there, 0.2 * held
+                F, gradient = self._second_derivatives(dZ, Z, spectra, cells, ties)
+                if gain < ENOUGH and not crossed:
+                    break
+            else:
+                held = max(10.0 * held, 1e-3)
+                if held > 1e4:
+                    break
+            step = np.linalg.solve(F + np.diag(held * np.diag(F) + 1e-9), -gradient)
+            q = ties.shape[1]
+            theta_there = theta + np.clip(ties @ step[:q], -REACH, REACH)
+            theta_there, lower_there = self._within(theta_there, lower)
+            spectra_there, at = [], q
+            for s in spectra:
+                vector, free = s.vector.copy(), _free(s)
+                vector[free] += np.clip(step[at : at + len(free)], -1.0, 1.0)
+                at += len(free)
+                spectra_there.append(s.with_vector(vector))
+        covariance = np.linalg.inv(F)[: ties.shape[1], : ties.shape[1]] * inflation(self.n)
+        covariance /= 1.0 - max(missing.is_missing.mean() for missing in self.missing)  # filled ones tell nothing
+        return PlantFit(theta, spectra, float(best), ties @ covariance @ ties.T, self.f.size)
+
+    def _within(self, theta: Array, lower: Array) -> tuple[Array, Array]:
+        """Stop delays at the next whole number, where the derivative changes; they go on from there in the next step."""
+        theta, out = theta.copy(), lower.copy()
+        for j, d in enumerate(lower):
+            if theta[j] >= d + 1:
+                theta[j], out[j] = d + 1, min(d + 1, LONGEST)
+            elif theta[j] <= d:
+                theta[j], out[j] = d, max(d - 1, 1)
+        return theta, out
+
+    def _second_derivatives(
+        self, dZ: Array, Z: Array, spectra: Sequence[Spectrum], cells: Sequence[Cells], ties: Array
+    ) -> tuple[Array, Array]:
+        """Return the expected second derivatives and the gradient of - log L by the free numbers of plant and spectra."""
+        dZ = np.tensordot(ties.T, dZ, 1)
+        q = len(dZ)
+        size = q + sum(len(_free(s)) for s in spectra)
+        F, gradient, at = np.zeros((size, size)), np.zeros(size), q
+        for i, (s, cell) in enumerate(zip(spectra, cells, strict=True)):
+            S, free = s.psd(cell.frequency), _free(s)
+            slopes, own = s.slopes(cell.frequency, free) / S, slice(at, at + len(free))
+            weighted = dZ[:, i] / np.repeat(S, cell.count.astype(int))
+            by_cell = 2.0 * np.add.reduceat(np.real(np.conj(Z[i]) * weighted), _edges(cell), axis=1)
+            gradient[:q] += by_cell.sum(axis=1)
+            gradient[own] = slopes @ (cell.count * (1.0 - cell.mean / S))
+            F[:q, :q] += 2.0 * np.real(weighted @ dZ[:, i].conj().T)
+            smooth = np.array([np.interp(cell.frequency, *self._band_means(x / cell.count, cell)) for x in by_cell])
+            smooth = smooth.reshape(q, len(cell.count))
+            F[:q, own] = -(smooth * cell.count) @ slopes.T
+            F[own, own] = (slopes * cell.count) @ slopes.T + LOOSE * np.eye(len(free))
+            at += len(free)
+        F[q:, :q] = F[:q, q:].T
+        return F, gradient
+
+    def _band_means(self, x: Array, cell: Cells) -> tuple[Array, Array]:
+        """Return frequencies and means of x over bands: as Z times its derivatives over S, it is smooth but for its scatter."""
+        band = np.cumsum(cell.count / (NARROW + BAND * self.n * self.dt * cell.frequency)).astype(int)
+        weight = np.bincount(band, cell.count)
+        some = weight > 0
+        frequency, mean = (np.bincount(band, cell.count * one)[some] / weight[some] for one in (cell.frequency, x))
+        return frequency, mean
+
+    def uncertainty(self, fit: PlantFit) -> float:
+        """Return the 95 % limit of the rms of the error of z over the rms of z, in the worst octave."""
+        Z, dZ = self.z(fit.theta, np.minimum(fit.theta[: self.k].astype(int), LONGEST))
+        values, vectors = np.linalg.eigh(fit.covariance)
+        dZ = np.tensordot((vectors * np.sqrt(np.maximum(values, 0.0))).T, dZ, 1)
+        low, worst = 1.0, 0.0
+        while low < 0.25 / self.dt:
+            octave = (self.f >= low) & (self.f < min(2.0 * low, 0.25 / self.dt))
+            for i in range(self.k if octave.any() else 0):
+                part = dZ[:, i, octave]
+                sizes = np.maximum(np.linalg.eigvalsh(np.real(part @ part.conj().T)), 0.0)
+                freedom = sizes.sum() ** 2 / max((sizes**2).sum(), 1e-300)  # as of a multiple of chi squared
+                limit = sizes.sum() * chi2.ppf(0.95, freedom) / freedom if freedom > 0 else 0.0
+                worst = max(worst, limit / max(float(np.sum(np.abs(Z[i, octave]) ** 2)), 1e-300))
+            low *= 2.0
+        return float(np.sqrt(worst))
+
+
+def rotation_matrix(angle: float) -> Array:
+    """Return the matrix (2, 2) of a rotation by an angle [rad]."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s], [s, c]])
+
+
+def _angle(matrix: Array) -> float:
+    """Return the angle of the rotation that is nearest to a matrix (2, 2)."""
+    return float(np.arctan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1]))
+
+
+def _free(s: Spectrum) -> list[int]:
+    return [i for i in range(s.starts[-1]) if i not in s.fixed_parameters]
+
+
+def _edges(cells: Cells) -> Array:
+    return np.concatenate([[0], np.cumsum(cells.count)[:-1]]).astype(int)
+
+
+def _means(x: Array, cells: Cells) -> Array:
+    return np.add.reduceat(x, _edges(cells)) / cells.count
+
+
+def guess_plant(data: PlantLikelihood) -> tuple[Array, float]:
+    """Return a plant to start from, but for its delay, and the share of what is new in u that y does not explain.
+
+    Sign and angle are those under which the commands reduce what is new in the measurements, or, where most of the commands does
+    not follow from them, those of the strongest response to it; the gain is 1 or, where that is far
+    off, as of other units, the one that makes the response of the disturbance smoothest: with w[k] the error of the prediction of
+    y[k] from the past, h[i] = cov(y[k+i], w[k]) / var(w) and g[i] the same of u, that response is h[i] - gain R g[i - delay].
+    """
+    y, u, k = data.filled_y, data.u[0], data.k
+    n = data.n - ORDER
+    past = np.column_stack([x[ORDER - i : ORDER - i + n] for x in (y, u) for i in range(1, ORDER + 1)])
+    w, v = (x[ORDER:] - past @ np.linalg.lstsq(past, x[ORDER:], rcond=1e-10)[0] for x in (y, u))
+    turn = -np.linalg.lstsq(w, v, rcond=None)[0]
+    own = v + w @ turn
+    excited = float(np.sum(own**2) / max(np.sum(v**2), 1e-300))
+    source, basis = w if excited < 0.5 else own, np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, SPAN), DEGREE + 1))[0]
+    source = source[: n - SPAN]
+    inverse = np.linalg.inv(source.T @ source)
+    h, g = (np.array([x[ORDER + i : ORDER + i + len(source)].T @ source @ inverse for i in range(SPAN + 1)]) for x in (y, u))
+    if excited >= 0.5:  # commands of their own: what they do is seen directly
+        turn = max(h[1:], key=np.linalg.norm)
+    flip = np.diag([1.0, np.sign(np.linalg.det(turn))]) if k == 2 else np.sign(turn)
+    angle = _angle(turn @ flip) if k == 2 else 0.0
+    R = rotation_matrix(angle)[:k, :k] @ flip
+
+    def rough(x: Array) -> Array:
+        """Return what a polynomial leaves of responses (SPAN, k, k)."""
+        return x - np.tensordot(basis @ basis.T, x, 1)
+
+    best = (0.0, 1.0)
+    for delay in range(1, LONGEST + 1):
+        seen = R @ rough(np.concatenate([np.zeros((delay - 1, k, k)), g[: SPAN - delay + 1]]))
+        product, power = float(np.sum(rough(h[1:]) * seen)), float(np.sum(seen**2))
+        if product > 0:
+            best = max(best, (product**2 / power, product / power))
+    explained = best[0] > 0.5 * np.sum(rough(h[1:]) ** 2)
+    gain = best[1] if explained and not FAR < best[1] < 1.0 / FAR else 1.0
+    return np.concatenate([np.zeros(k), gain * np.diag(flip), [angle] * (k == 2)]), excited
