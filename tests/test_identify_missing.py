@@ -169,3 +169,15 @@ def test_outlying_samples_are_counted_told_and_missing() -> None:
     # a hundredth of the samples less: a tenth of a standard deviation, times 5
     assert abs(found.modes[0].noise.value - clean.modes[0].noise.value) < 0.5 * clean.modes[0].noise.std
     assert len(found.modes[0].peaks) == len(clean.modes[0].peaks) == 1
+
+
+def test_a_measurement_whose_command_is_lost_is_missing() -> None:
+    """What the mirror did at that time is not known: a command that is held instead would be noise of the measurement."""
+    rng = np.random.default_rng(5)
+    z = record(0.0, rng, 3000).y_lgs
+    u = rng.standard_normal((3000, 1)).cumsum(axis=0) * 0.01
+    lost = gaps(0.05, 3000)
+    y = np.concatenate([z[:2], z[2:] + u[:-2]])
+    gone = np.concatenate([np.zeros(2, bool), lost[:-2]])
+    found = identify(Record(y, np.where(lost[:, None], np.nan, u), DT))
+    assert found == identify(Record(np.where(gone[:, None], np.nan, y), u, DT))

@@ -14,7 +14,7 @@ from wfsobs.identification.one_mode import OneMode
 from wfsobs.identification.result import Identification, read_mode
 from wfsobs.identification.whiteness import Whiteness, autocorrelation_test, cumulated_test, innovations
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Record, RecordError, hold_last, pseudo_open_loop
+from wfsobs.record import Record, RecordError
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.filter_covariance import RiccatiError
@@ -131,7 +131,7 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
     """
     if np.isinf(record.y_lgs).any() or np.isinf(record.u).any():
         raise RecordError("the record has infinite samples; NaN stands for a missing one")
-    z = pseudo_open_loop(record.y_lgs, hold_last(record.u), record.delay)[record.delay :]
+    z = record.z[record.delay :]
     z = z[: fast_length(len(z))]
     if len(z) < SHORTEST:
         raise RecordError(f"the record has {record.n_steps} samples, identification needs {SHORTEST + record.delay} or more")

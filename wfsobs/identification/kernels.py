@@ -20,7 +20,7 @@ from wfsobs.observers.gp.kernels import Kernel, Matern, Sho, SquaredExponentialI
 from wfsobs.observers.gp.likelihood import log_likelihood
 from wfsobs.prior import Line, Lines
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Record, RecordError, hold_last, pseudo_open_loop
+from wfsobs.record import Record, RecordError
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.typing import Array
@@ -147,7 +147,7 @@ def fit_kernels(
     """
     if np.isinf(record.y_lgs).any() or np.isinf(record.u).any():
         raise RecordError("the record has infinite samples; NaN stands for a missing one")
-    z = pseudo_open_loop(record.y_lgs, hold_last(record.u), record.delay)[record.delay :]
+    z = record.z[record.delay :]
     if np.isfinite(z).sum(axis=0).min(initial=len(z)) < SHORTEST:
         raise RecordError(f"a mode has fewer than {SHORTEST} samples")
     names = [mode.name for mode in modes_up_to(HIGHEST_ORDER)[: z.shape[1]]]
