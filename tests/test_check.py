@@ -75,12 +75,24 @@ def test_a_right_record_can_be_relied_on(tmp_path: Path, record: Record) -> None
     assert found["next"] == f"wfsobs identify {tmp_path / 'r.npz'}"
 
 
+def test_a_rate_of_no_loop_and_a_mode_without_noise_are_excluded(tmp_path: Path, record: Record) -> None:
+    """The first file states 1000 Hz as if it were the time between two rows."""
+    slow = Record(record.y_lgs, record.u, 1000.0)
+    assert verdicts(checked(tmp_path, slow))["rate"] == "excluded"
+    still = Record(0.0 * record.y_lgs + [0.0, 0.25], 0.0 * record.u, 1e-3)
+    texts = [f["text"] for f in checked(tmp_path, still)["findings"] if f["verdict"] == "excluded"]
+    assert texts[:2] == [f"y_lgs/{what} all the time; a measurement has noise" for what in ("tip is 0", "tilt is 0.25")]
+    for none in (Record(record.y_lgs, np.nan * record.u, 1e-3), Record(record.y_lgs[:2], record.u[:2], 1e-3)):
+        assert verdicts(checked(tmp_path, none))["identification"] == "excluded"
+
+
 def test_a_wrong_sign_is_excluded_and_put_right_by_the_next_command(tmp_path: Path, record: Record) -> None:
     file, data = tmp_path / "r.npz", {"y_lgs": record.y_lgs, "u": -record.u, "dt": np.array(record.dt), "unit": np.array("um")}
     np.savez(file, allow_pickle=False, **data)
-    done = CliRunner().invoke(main, ["check", str(file), "--json"])
+    done = CliRunner().invoke(main, ["check", str(file), "--json", "--preset", "ut4", "--set", "telescope.diameter=10"])
     found = json.loads(done.stdout)
     assert not found["reliable"]
+    assert " --preset ut4 --set telescope.diameter=10 " in found["next"]
     assert verdicts(found)["commands"] == "excluded"
     assert found["next"].endswith("--command-sign -1")
     again = json.loads(CliRunner().invoke(main, ["check", *found["next"].split()[2:], "--json"]).stdout)

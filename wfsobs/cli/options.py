@@ -90,6 +90,13 @@ def preset_of_command() -> str:
     return configfile.preset_name(given["preset"], given["config"])
 
 
+def scenario_words() -> list[str]:
+    """Return the options of the command that its scenario is from."""
+    given = click.get_current_context().params
+    named = [(f"--{name}", given[name]) for name in ("preset", "config")]
+    return [word for pair in [*named, *(("--set", one) for one in given["assignments"])] for word in pair if pair[1]]
+
+
 def ngs_options(command: Callable) -> Callable:
     """Add --ngs, --ngs-modes and --ngs-lag, the stream of a second sensor."""
     return add_options(

@@ -17,6 +17,7 @@ from wfsobs.cli.options import (
     observer_option,
     record_options,
     scenario_options,
+    scenario_words,
     told_scenario,
     training,
     training_options,
@@ -339,7 +340,7 @@ def check(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha
     own = {"command-delay": "delay", "command-sign": "command_sign"}  # which the file states otherwise
     trust = declaration.trust or any(own.get(name) in contents.arrays for name in result.corrections)
     words = replace(declaration, trust=trust).options(result.corrections)
-    command = shlex.join(["wfsobs", "identify", record_file, *words])
+    command = shlex.join(["wfsobs", "identify", record_file, *scenario_words(), *words])
     if as_json:
         found = {
             "steps": record.n_steps,

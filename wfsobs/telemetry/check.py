@@ -21,6 +21,7 @@ from wfsobs.identification.plant import EXCITED, GroupPlant, PlantNumber, identi
 from wfsobs.identification.result import Identification
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError, hold_last
+from wfsobs.scenario.groups.sensors import Sensors
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.telemetry.preview import Reading
 from wfsobs.telemetry.records import PLAUSIBLE, z_rms
@@ -140,6 +141,14 @@ def _frames(record: Record) -> Iterator[Remark]:
     share = record.missing / n
     text = f"{n} at {1.0 / record.dt:.6g} Hz, {n * record.dt:.4g} s; {record.missing} missing ({100.0 * share:.2g} %)"
     yield Remark("frames", "note" if share > OUTLYING else "ok", text)
+    low, high = Sensors.settings()["lgs_rate"].bounds
+    if not low <= 1.0 / record.dt <= high:
+        yield Remark("rate", "excluded", f"that of a loop is {low:g} to {high:g} Hz: check dt, or the unit of the time")
+    for name, y in (("y_lgs", record.y_lgs), ("y_ngs", record.y_ngs)):
+        for mode, values in zip(modes_up_to(HIGHEST_ORDER), () if y is None else y.T, strict=False):
+            known = values[~np.isnan(values)]
+            if known.size and np.ptp(known) == 0.0:
+                yield Remark("frames", "excluded", f"{name}/{mode.name} is {known[0]:g} all the time; a measurement has noise")
     if record.origin:
         yield Remark("read as", "ok", record.origin)
 
@@ -275,7 +284,8 @@ def _stationarity(record: Record) -> Iterator[Remark]:
     if length < 8 * FEWEST_BINS:
         yield Remark("stationarity", "undecided", f"{record.n_steps} frames are too few to compare {SECTIONS} sections")
         return
-    changes = [(name, *change) for name, column in zip(names, z.T, strict=False) for change in find_changes(column, record.dt)]
+    columns = [(name, column) for name, column in zip(names, z.T, strict=False) if np.ptp(column) > 0.0]
+    changes = [(name, *change) for name, column in columns for change in find_changes(column, record.dt)]
     for name, low, high, section, ratio in changes:
         start, end = section * length * record.dt, (section + 1) * length * record.dt
         where = f"{name}, {low:.3g} to {high:.3g} Hz: from {start:.3g} to {end:.3g} s {ratio:.2g} times the power of the rest"

@@ -287,7 +287,8 @@ unit is stated, is refused."""
 
 def z_rms(record: Record) -> float:
     """Return the largest rms of a mode of z about its mean, which an offset of the commands is part of [um]."""
-    return float(np.nanstd(record.z[record.delay :], axis=0).max())
+    known = (z[~np.isnan(z)] for z in record.z[record.delay :].T)
+    return max(float(z.std()) if z.size else 0.0 for z in known)
 
 
 def plausible_units(record: Record, contents: Contents, declaration: DeclaredFormat, scenario: Scenario) -> dict[str, float]:
