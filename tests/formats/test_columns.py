@@ -173,6 +173,8 @@ def test_a_frame_counter_says_what_is_missing(name: str, bits: int, every: int, 
     file = io.BytesIO()
     np.savez(file, y_lgs=Y[there], u=U[there], unit="nm", **{name: count.astype(np.uint32)})
     is_as_clean(read_record(file, "a.npz", declaration=stated), said, len(lost))
+    signed = table((name, *OWN[1:]), count - 2 ** (bits - 1), *Y[there].T, *U[there].T)
+    is_as_clean(read_record(io.BytesIO(signed), "a.csv", declaration=stated), said, len(lost))
     rng = np.random.default_rng(1)
     stamps = TIME[there] + 1e-3 * rng.standard_normal(there.size) * (there % (N - 1) > 0)
     both = table((OWN[0], name, *OWN[1:]), stamps, count, *Y[there].T, *U[there].T)
@@ -192,6 +194,26 @@ def test_a_frame_counter_says_what_is_missing(name: str, bits: int, every: int, 
 def test_a_counter_that_does_not_count(count: np.ndarray, line: str) -> None:
     with pytest.raises(RecordError, match=line):
         read_record(io.BytesIO(table(("frame", *OWN[1:]), count, *Y.T, *U.T)), "a.csv", declaration=DeclaredFormat(rate=500.0))
+
+
+@pytest.mark.parametrize(("step", "unit"), [(2, "ms"), (2000, "us"), (2_000_000, "ns")])
+def test_stamps_that_are_seconds_apart_are_in_another_unit(step: int, unit: str) -> None:
+    """No loop is so slow; a unit that is stated holds."""
+    frames = np.arange(5, N, 5)
+    ngs = {"y_ngs": np.random.default_rng(2).standard_normal((frames.size, 2)), "time_ngs": step * frames}
+    file = io.BytesIO()
+    np.savez(file, y_lgs=Y, u=U, time=step * np.arange(N), unit="nm", **ngs)
+    record = read_record(file, "a.npz")
+    assert (record.dt, record.ratio, record.origin) == (0.002, 5, f"unit nm, time in {unit}, time_ngs in {unit}")
+    assert read_record(io.BytesIO(table(OWN, step * np.arange(N), *Y.T, *U.T)), "a.csv").dt == step
+
+
+def test_tables_as_a_spreadsheet_writes_them() -> None:
+    """A first line for itself, cells and headings that are empty at the end, and headings that come twice."""
+    rows = table([*OWN, "flux", "flux", "", ""], TIME, *Y.T, *U.T, TIME, TIME, *np.full((2, N), np.nan)).decode()
+    content = "sep=;\n" + rows.replace(",", ";").replace("nan", "")
+    read = read_record(io.BytesIO(content.encode()), "a.csv")
+    is_as_clean(read, "unit nm, cells separated by semicolons, columns flux, flux (7) not used")
 
 
 def test_what_is_not_used_is_named() -> None:

@@ -113,6 +113,12 @@ def test_jumps_of_the_clock_are_missing_frames(start: float, lost: list[int]) ->
     assert np.isnan(record.y_lgs[lost]).all() and np.isnan(record.u[lost]).all()
 
 
+def test_the_clock_of_a_day_goes_on_after_midnight() -> None:
+    time = (86399.99 + 0.001 * np.arange(N)) % 86400.0
+    record = taken(time=time, time_ngs=time[5::5], y_ngs=RNG.standard_normal((7, 2)), dt=NONE)
+    assert (record.n_steps, record.missing, record.ratio) == (N, 0, 5) and record.dt == pytest.approx(0.001, rel=1e-6)
+
+
 def test_a_stated_rate_counts_and_must_agree() -> None:
     assert taken(DeclaredFormat(rate=500.0), dt=NONE).dt == 0.002
     assert taken(DeclaredFormat(rate=1000.0), time=0.001 * np.arange(N), dt=NONE).dt == 0.001
@@ -256,7 +262,8 @@ CSV = [
     ("y_lgs/tip_um;u/tip_um\n1,5;2\n3,x;2\n", "line 3, y_lgs/tip_um: '3,x' is not a number"),
     ("y_lgs/tip_um;u/tip_um\n1;2\n1\n", "line 3 has 1 cells, the heading 2; cells are separated by semicolons"),
     ("frame,seeing\n1,2\n", "has no y_lgs; a record needs y_lgs, u and dt"),
-    ("y_lgs/tip_um,y_lgs/tip_um,u/tip_um\n1,2,3\n", "two columns have the same heading"),
+    ("y_lgs/tip_um,y_lgs/tip_um,u/tip_um\n1,2,3\n", "two columns have the same heading, y_lgs/tip_um"),
+    ("timestamp,y_lgs/tip_um,u/tip_um\n1,2,3\n2,3,3\n", "has no dt and no time; .*suggest: --column 'time=timestamp'"),
     ("y_lgs/tip_um,y_lgs/tip_nm,u/tip_um\n1,2,3\n", "two columns are named y_lgs/tip"),
     ("y_lgs/tip_um,y_lgs/tilt_nm,u/tip_um,u/tilt_um\n1,2,3,4\n", "y_lgs is in um and in nm"),
     ("y_lgs/tip_V,u/tip_um\n1,2\n", "y_lgs is in 'V', which is no unit"),

@@ -10,10 +10,10 @@ import numpy as np
 from wfsobs.record import RecordError
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.telemetry.formats.contents import (
+    CLOCKS,
     FRAME,
     NGS,
     TIME,
-    TIME_NGS,
     Contents,
     FileColumns,
     column_mode,
@@ -113,8 +113,10 @@ def to_contents(file: FileColumns, roles: Mapping[str, str]) -> Contents:
         unused.remove(counters[0])
         contents.arrays[FRAME] = file.columns[counters[0]]
         contents.guesses.append(f"frames counted by {counters[0]}")
-    for name in {TIME, TIME_NGS} & contents.arrays.keys():
-        if unit := _guess_unit(contents.arrays[name]):
+    stated = found.get(TIME, (None, ""))[1] or file.units.get(TIME, "")
+    by_step = "" if stated or TIME not in contents.arrays else _unit_of_steps(contents.arrays[TIME])
+    for name in [clock for clock in CLOCKS if clock in contents.arrays]:
+        if unit := _guess_unit(contents.arrays[name]) or by_step:
             contents.arrays[name] = contents.arrays[name] * SECONDS[unit]
             contents.guesses.append(f"{name} in {unit}")
     rates = {name: rate for name, rate in file.numbers.items() if is_rate(name) and rate > 0}
@@ -137,6 +139,12 @@ def _guess_unit(time: Array) -> str:
     if 4e4 < size < 9e4 and 0 < np.median(np.diff(time)) < 1e-6:
         return "d"
     return next((unit for unit in ("ms", "us", "ns") if 1e9 < size * SECONDS[unit] < 4.2e9), "")
+
+
+def _unit_of_steps(time: Array) -> str:
+    """Return the unit of stamps a second or more apart, as those of no loop are: that in which they are up to 0.1 s apart."""
+    step = float(np.median(np.diff(time))) if time.ndim == 1 and time.size > 1 and time.dtype.kind in "fiu" else 0.0
+    return next((unit for unit in ("ms", "us", "ns") if step >= 1.0 and step * SECONDS[unit] < 0.1), "")
 
 
 def _each_mode(file: FileColumns, role: str, name: str) -> list[tuple[str, str]]:

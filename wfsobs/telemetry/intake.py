@@ -34,7 +34,7 @@ from wfsobs.sensors.modes import order_of
 from wfsobs.telemetry.formats.contents import APART, FAST, FRAME, LARGEST, NGS, SIGNALS, STARS, TIME, TRAINING, Contents
 from wfsobs.telemetry.modal import LoopMatrix, apply_matrices
 from wfsobs.typing import Array
-from wfsobs.units import ANGLES, micrometres_per, parse_unit
+from wfsobs.units import ANGLES, SECONDS, micrometres_per, parse_unit
 
 WINDOW = 28
 """Frames that are fitted by a polynomial."""
@@ -343,7 +343,7 @@ def _apply_timestamps(
     start = 0.0
     steps = counted_steps(_clock(FRAME, arrays[FRAME], n)) if FRAME in arrays else None
     if TIME in arrays:
-        time = _clock(TIME, arrays[TIME], n)
+        time = _past_midnight(_clock(TIME, arrays[TIME], n))
         steps, dt, said = steps_of(time, dt, steps)
         start = float(time[0])
     if steps is not None:
@@ -352,6 +352,7 @@ def _apply_timestamps(
                 signals[name] = place_rows(values, steps)
     if dt is None:
         there = f": which column is the time? It has {', '.join(contents.leftovers[:20])}" if contents.leftovers else ""
+        there = contents.hint if "--column" in contents.hint else there
         raise RecordError(f"has no dt and no time; a record needs y_lgs, u and dt, or a stated rate{there}")
     if NGS not in signals:
         return dt, None, said
@@ -367,7 +368,7 @@ def _apply_timestamps(
 def _stamped_frames(signals: dict[str, Array], arrays: Mapping[str, Array], start: float, dt: float) -> int:
     """Place the frames by their stamps, start the record `ratio` steps before a frame, and return the ratio."""
     frames, n = signals[NGS], signals["y_lgs"].shape[0]
-    steps = frames_at(_clock("time_ngs", arrays["time_ngs"], frames.shape[0]), start, dt)
+    steps = frames_at(_past_midnight(_clock("time_ngs", arrays["time_ngs"], frames.shape[0])), start, dt)
     between = int(np.median(np.diff(steps))) if steps.size > 1 else None
     ratio = _ratio(arrays, between)
     late = np.flatnonzero((steps - steps[0]) % ratio)
@@ -393,6 +394,16 @@ def _clock(name: str, raw: Array, n: int) -> Array:
     if raw.dtype.kind not in "fiu" or raw.shape != (n,):
         raise RecordError(f"{name} takes {n} numbers, not {raw.dtype} of shape {raw.shape}")
     return raw.astype(np.float64)
+
+
+def _past_midnight(time: Array) -> Array:
+    """Return the times of a day [s] with those after midnight going on; others as they are."""
+    midnight = np.diff(time, prepend=time[:1]) < -0.5 * DAY
+    return time + DAY * np.cumsum(midnight) if midnight.any() and 0 <= time.min() and time.max() < DAY else time
+
+
+DAY = SECONDS["d"]
+"""Length of a day [s]."""
 
 
 def _number(name: str, raw: Array) -> float:
@@ -552,10 +563,10 @@ def counted_steps(frame: Array) -> Array:
     >>> counted_steps(np.array([65534.0, 65535.0, 0.0, 3.0]))
     array([0, 1, 2, 5])
     """
-    if not (np.isfinite(frame) & (frame >= 0) & (frame == np.round(frame))).all():
-        raise RecordError("frame takes whole numbers from 0")
+    if not (np.isfinite(frame) & (frame == np.round(frame))).all():
+        raise RecordError("frame takes whole numbers")
     difference = np.diff(frame)
-    turn = next(2.0**bits for bits in COUNTERS if frame.max() < 2.0**bits)
+    turn = next(2.0**bits for bits in COUNTERS if np.ptp(frame) < 2.0**bits)  # also of one with a sign
     around = difference + turn * (difference < 0)
     each = np.median(around)
     wrong = np.flatnonzero((around <= 0) | (around % max(each, 1) != 0) | ((difference < 0) & (around > frame.size * each)))

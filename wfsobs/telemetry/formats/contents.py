@@ -126,11 +126,13 @@ class FileColumns:
             self._add_texts(name, [x.decode("utf-8", "replace") if isinstance(x, bytes) else x for x in values.ravel().tolist()])
         elif values.dtype.kind not in "fiu":
             self.leave(name, f"{name} holds {KINDS.get(values.dtype.kind, values.dtype)}, not numbers")
+        elif not values.size:
+            self.leave(name, f"{name} is empty")
         elif values.size == 1 and known in (*NUMBERS, *TEXTS):
             self.contents.arrays[known] = values.reshape(())
         elif values.size == 1 and known not in NAMES and not parse_heading(name):
             self.numbers[name] = float(values.item())
-        elif values.size:
+        else:
             self._add_numbers(name, values, unit)
 
     def _add_numbers(self, name: str, values: Array, unit: str) -> None:

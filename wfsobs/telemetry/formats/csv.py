@@ -27,6 +27,7 @@ from wfsobs.telemetry.formats.contents import (
     TooLargeError,
     numbers_and_texts,
     parse_cell,
+    parse_heading,
     to_columns,
 )
 from wfsobs.typing import Array
@@ -57,8 +58,12 @@ def read(file: IO[bytes], most: int) -> FileColumns:
         file = io.BytesIO(file.read(most).decode("utf-16", "replace").encode())
     file.seek(0)
     heading, separator, rows, named = _head(file, out.contents)
-    if len(set(heading)) < len(heading):
-        raise RecordError("two columns have the same heading")
+    seen = set[str]()
+    for i, name in enumerate(heading):
+        if name in seen and parse_heading(name):
+            raise RecordError(f"two columns have the same heading, {name}")
+        heading[i] = f"{name} ({i + 1})" if name and name in seen else name
+        seen.add(name)
     width, commas = len(heading), False
     cells_of, ends = {i: array("d") for i in range(width)}, [0] * width
     first = next(rows, None)
@@ -120,6 +125,8 @@ def _head(file: IO[bytes], contents: Contents) -> tuple[list[str], str, Iterator
     """
     lines, comment = numbered_lines(file), ""
     for number, text in lines:
+        if text[:4].lower() == "sep=":  # as Excel writes it; what follows tells as well
+            continue
         if not text.startswith(COMMENTS):
             signs = [sign for sign in SEPARATORS if sign is None or sign in text]
             sign = next((sign for sign in signs if all(map(_is_number, _cells(text, sign)))), signs[0])
