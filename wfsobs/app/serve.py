@@ -257,8 +257,8 @@ class PageHandler(DocHandler):
         page = None if self.request.arguments else self.next_page.take()
         if page is not None:
             return page
-        made: ServerSession = await super().get_session()  # type: ignore[misc]
-        return made
+        made: Any = super().get_session()
+        return await made
 
     async def prepare(self) -> None:
         """Turn the visitor away if the server is full."""

@@ -293,7 +293,7 @@ def radius(laws: Sequence[Law], nominal: Mirror, plant: TruePlant) -> float:
             S = sum((w * (A[phase] @ S @ A[phase].T) for w, A in steps), np.zeros((n, n)))
         return S.ravel()
 
-    operator = LinearOperator((n * n, n * n), matvec=advance, dtype=float)  # type: ignore[call-arg]
+    operator = LinearOperator((n * n, n * n), matvec=advance, dtype=float)
     return float(np.abs(eigs(operator, 1, v0=np.eye(n).ravel(), return_eigenvectors=False)).max())
 
 

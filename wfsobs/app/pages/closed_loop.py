@@ -40,7 +40,7 @@ from wfsobs.app.service import BackgroundTask
 from wfsobs.app.store import Store
 from wfsobs.app.style import look, swatch
 from wfsobs.app.views.gain_editor import GainEditor, plane
-from wfsobs.app.views.plots import add_line, envelope, envelope_times, new_figure, on_settle, restyle
+from wfsobs.app.views.plots import add_line, envelope, envelope_times, in_view, new_figure, on_settle, restyle
 from wfsobs.app.views.strip import Cards, card_of
 from wfsobs.app.views.table import SMALLEST
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label, loop_verdict, no_theory
@@ -103,7 +103,8 @@ class Trace(LoopLines):
 
     def zoom(self, seconds: float | None) -> None:
         """Show the middle of the record, or all of it after the start."""
-        start, end = float(self.x_range.reset_start), float(self.x_range.reset_end)  # type: ignore[arg-type]
+        whole: Any = self.x_range
+        start, end = whole.reset_start, whole.reset_end
         half = 0.5 * min(seconds or end - start, end - start)
         self.x_range.update(start=0.5 * (start + end) - half, end=0.5 * (start + end) + half)
 
@@ -113,7 +114,7 @@ class Trace(LoopLines):
             return
         results, display = self._of
         record = results.result.record
-        start, end = sorted((float(self.x_range.start), float(self.x_range.end)))  # type: ignore[arg-type]
+        start, end = in_view(self.x_range)
         first = min(max(int(start / record.dt), 0), record.n_steps - 2)
         last = min(max(int(np.ceil(end / record.dt)) + 1, first + 2), record.n_steps)
         scale = per_micrometre(display.unit, results.result.scenario.telescope.diameter)

@@ -59,11 +59,15 @@ def once(function: Callable[[], None], milliseconds: int) -> Callable[..., None]
     return ask
 
 
-def zoom_of(axis: Range1d) -> tuple[float, float] | None:
+def in_view(axis: Any) -> tuple[float, float]:
+    """Return the ends of what is in view of an axis of numbers, the lower one first."""
+    return min(axis.start, axis.end), max(axis.start, axis.end)
+
+
+def zoom_of(axis: Any) -> tuple[float, float] | None:
     """Return what of an axis is in view; None where all of it is."""
-    start, end, first, last = (float(x) for x in (axis.start, axis.end, axis.reset_start, axis.reset_end) if x is not None)  # type: ignore[arg-type]
-    start, end = min(start, end), max(start, end)
-    return None if start <= first and end >= last else (start, end)
+    start, end = in_view(axis)
+    return None if start <= axis.reset_start and end >= axis.reset_end else (start, end)
 
 
 def later(function: Any, milliseconds: int) -> None:
@@ -200,7 +204,7 @@ class ExtraLines:
             self.figure.multi_line("xs", "ys", line_color="colour", source=self.source, name=self.name, **self.style)
         data: dict[str, Any] = {name: [line[i] for line in lines] for i, name in enumerate(names)}
         data.update(columns)
-        self.source.data = data  # type: ignore[assignment]
+        self.source.data = data
 
 
 class ComparedLines(ExtraLines):

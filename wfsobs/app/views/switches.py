@@ -46,8 +46,8 @@ class ModeSwitch:
         """Return the buttons and the list, one of them visible."""
         return [self.buttons, self.list]
 
-    def _on_choice(self, event: object) -> None:
-        value = event.new  # type: ignore[attr-defined]
+    def _on_choice(self, event: Any) -> None:
+        value = event.new
         if value is not None:
             self.display.mode = value
 
@@ -102,8 +102,8 @@ class UnitSwitch:
     def _options(self) -> dict[str, str]:
         return {UNITS[unit]: unit for unit in self.display.units}
 
-    def _on_choice(self, event: object) -> None:
-        value = event.new  # type: ignore[attr-defined]
+    def _on_choice(self, event: Any) -> None:
+        value = event.new
         if value in self.display.units:
             self.display.unit = value
 

@@ -21,6 +21,7 @@ from wfsobs.app.views.plots import (
     band_envelope,
     envelope,
     envelope_times,
+    in_view,
     new_figure,
     on_settle,
     send,
@@ -105,7 +106,7 @@ class EventMarks:
         lasting = [e for e in events if e.duration > 0]
         send(self.jumps, {"x": [e.start for e in events if not e.duration > 0]})
         send(self.spans, {"start": [e.start for e in lasting], "end": [e.start + e.duration for e in lasting]})
-        top = float(self.figure.y_range.end)  # type: ignore[attr-defined]
+        _, top = in_view(self.figure.y_range)
         send(
             self.words,
             {
@@ -171,7 +172,7 @@ class Traces(TargetFigures):
 
     def _window(self, n_steps: int, dt: float) -> tuple[int, int]:
         """Find the samples to send: those in view and a margin."""
-        start, end = sorted((float(self.x_range.start), float(self.x_range.end)))  # type: ignore[arg-type]
+        start, end = in_view(self.x_range)
         margin = 0.0 if end - start >= self.length else MARGIN * (end - start)
         first = max(int((start - margin) / dt), 0)
         return min(first, n_steps - 2), min(max(int((end + margin) / dt) + 2, 2), n_steps)
@@ -188,14 +189,14 @@ class Traces(TargetFigures):
         """Return the stretch in view [s]; None where it is that of a fresh page."""
         if self.run.result is None or not self.length:  # nothing has been drawn yet
             return self._wanted_window
-        start, end = float(self.x_range.start), float(self.x_range.end)  # type: ignore[arg-type]
+        start, end = in_view(self.x_range)
         first = first_window(self.run.result)
         return None if abs(start - first[0]) + abs(end - first[1]) < 1e-9 else (start, end)
 
     def zoom(self, seconds: float | None) -> None:
         """Show a stretch of the record around the middle of the one in view, or all of it."""
         length = min(seconds or self.length, self.length)
-        middle = 0.5 * (float(self.x_range.start) + float(self.x_range.end))  # type: ignore[arg-type]
+        middle = 0.5 * sum(in_view(self.x_range))
         start = min(max(middle - 0.5 * length, 0.0), self.length - length)
         self.x_range.update(start=start, end=start + length)
 
