@@ -143,12 +143,6 @@ def test_a_notebook_shows_tables(result: wfsobs.Result) -> None:
         assert html.startswith("<table>") and html.endswith("</table>") and f"<td>{cell}</td>" in html
 
 
-def test_a_data_frame_has_a_row_per_score(result: wfsobs.Result) -> None:
-    frame = result.to_dataframe()
-    assert list(frame["rms_um"]) == [s.rms for s in result.scores]
-    assert list(frame["observer"]) == [s.observer for s in result.scores]
-
-
 def test_scores_are_those_of_the_run(result: wfsobs.Result) -> None:
     again = wfsobs.score(result.record, result.estimates, warm_up=result.scenario.run.warm_up)
     assert set(again) == {s for s in result.scores if s.observer not in BOUNDS}

@@ -359,7 +359,7 @@ def test_arrays_are_those_of_the_result(result: wfsobs.Result) -> None:
     np.testing.assert_array_equal(record.to_xarray()["y_lgs"].sel(mode=3), record.y_lgs[:, 1])
 
 
-def test_arrays_and_table_of_a_sweep(field: SweepResults) -> None:
+def test_arrays_of_a_sweep(field: SweepResults) -> None:
     data = field.to_xarray()
     assert data["rms"].dims == ("turbulence.wind_speed", "sensors.lgs_noise", "observer", "target", "mode")
     for cell, changes in enumerate(field.sweep.cells):
@@ -367,7 +367,6 @@ def test_arrays_and_table_of_a_sweep(field: SweepResults) -> None:
             known = field.error(cell, key)
             here = data.sel({**changes, **dict(zip(("observer", "target", "mode"), key, strict=True))})
             assert known == tuple(float(here[name]) for name in ("rms", "low", "high"))
-    assert list(field.to_dataframe()["mean_rms_nm"]) == [row["mean_rms_nm"] for row in field.rows()]
 
 
 def test_an_identification_is_a_table(found: Identification) -> None:

@@ -16,6 +16,7 @@ from scipy.optimize import minimize
 
 from wfsobs.identification.process import Number
 from wfsobs.identification.settings import MATCHED, base_scenario, model_settings
+from wfsobs.notebook import import_extra
 from wfsobs.observers.gp.kernels import Kernel, Matern, Sho, SquaredExponentialInTime, Sum
 from wfsobs.observers.gp.likelihood import log_likelihood
 from wfsobs.prior import Line, Lines
@@ -26,6 +27,8 @@ from wfsobs.signal.ar2 import Ar2
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:
+    import pandas
+
     from wfsobs.scenario import Scenario
 
 SHORTEST = 100
@@ -72,6 +75,11 @@ class KernelFits:
 
     modes: tuple[KernelFit, ...]
     dt: float
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Return a pandas table: a row per mode and number that was fitted. Raises ImportError without pandas."""
+        rows = [(mode.name, name, *number) for mode in self.modes for name, number in mode.numbers.items()]
+        return import_extra("pandas", "arrays").DataFrame(rows, columns=["mode", "number", "value", "std"])
 
     def scenario(self, base: Scenario | None = None) -> Scenario:
         """Return a scenario that tells `gp-lgs` and `gp-both` of the kernels.

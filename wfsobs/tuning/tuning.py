@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from math import isfinite
+from math import isfinite, nan
+from typing import TYPE_CHECKING
 
 from wfsobs.closed_loop.design import select_controllers
 from wfsobs.closed_loop.envelope import POINTS, PlantEnvelope, plant_envelope
 from wfsobs.closed_loop.rows import label
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import row_label
+from wfsobs.notebook import import_extra
 from wfsobs.pipeline import as_stated
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
@@ -21,6 +23,9 @@ from wfsobs.tuning.envelope import EnvelopeGoal, EnvelopeTrials
 from wfsobs.tuning.records import DESIGN, MEASURES, P95, WORST, cut_record, simulate_records, stream
 from wfsobs.tuning.space import space
 from wfsobs.tuning.trials import Evaluation, Judge, RecordTrials, Stage, Trials, minimise, target_of
+
+if TYPE_CHECKING:
+    import pandas
 
 EVALUATIONS = 40
 
@@ -65,6 +70,14 @@ class TuningResult:
     def best(self) -> Evaluation:
         """The evaluation with the smallest error, the earliest of equals."""
         return min(self.history, key=lambda e: e.rms)
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Return `history` as a pandas table: a row per evaluation, NaN for what stayed as it was and for failures.
+
+        Raises ImportError without pandas.
+        """
+        rows = [{**e.changes, "rms_um": e.rms if e.errors else nan, "reason": e.reason} for e in self.history]
+        return import_extra("pandas", "arrays").DataFrame(rows)
 
 
 def tune(
