@@ -16,7 +16,7 @@ from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.typing import Array
 
-LQG = [name for name in CONTROLLERS if name.startswith("lqg-")]
+LQG = [name for name, c in CONTROLLERS.items() if name.startswith("lqg-") and c.is_quick]
 
 _dropout = cache(dropout)
 

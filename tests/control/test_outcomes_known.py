@@ -20,6 +20,7 @@ from wfsobs.testing.common import QUICK
 BASE = PRESETS["paper"]().replace(QUICK)
 GPR = {"integrator+gpr-offline", "integrator+gpr-online"}
 OF_LINES = {"lqg-kf-multi", "lqg-multirate-multi"}
+ADAPTIVE = {"lqg-kf-adaptive", "lqg-multirate-adaptive"}
 OF_ONE_LINE = {"lqg-kf-lgs", "lqg-multirate", "lqg-multirate-optimal"}
 
 CASES: dict[str, tuple[dict[str, Any], set[str]]] = {
@@ -30,7 +31,8 @@ CASES: dict[str, tuple[dict[str, Any], set[str]]] = {
     "delay": ({"control.delay": 3.0}, set(CONTROLLERS)),
     "stroke": ({"control.stroke": 0.3}, set(CONTROLLERS)),
     "supervision": ({"control.supervised": True}, set(CONTROLLERS) - {"none", "integrator"}),
-    "an observer's own": ({"adaptive.window": 3.0}, set()),
+    "windows of a filter": ({"adaptive.window": 0.3}, ADAPTIVE),
+    "an observer's own": ({"gp.background_rms": 0.1}, set()),
     "what only the Strehl ratio is of": ({"control.wavelength": 1.6}, set()),
     "windows, which are of z in the loop": ({"gpr_online.inputs": "z"}, set()),
     "a width below that of every line": ({"multipeak.line_width": 0.011}, set()),

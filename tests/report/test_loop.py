@@ -26,7 +26,7 @@ def report(result: Result, short: Scenario) -> Report:
 
 def test_rows_of_the_controllers_that_take_a_moment(report: Report) -> None:
     (state,) = report.states
-    quick = [name for name, controller in CONTROLLERS.items() if controller.predict is None]
+    quick = [name for name, controller in CONTROLLERS.items() if controller.is_quick]
     assert [(r["controller"], r["mode"]) for r in state.loop] == [
         (n, m) for n in (*quick, *COMMON_BOUNDS) for m in ("tip", "tilt")
     ]

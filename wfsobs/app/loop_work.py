@@ -60,7 +60,7 @@ def compute(of: RunResults, watch: Watch, tell: Tell, memo: Memo | None = None) 
     spectra: dict[str, tuple[Array, Array]] = {}
     start = round(of.scenario.run.warm_up / record.dt)
     names = list(plan.laws)
-    quick = [name for name in names if CONTROLLERS[name].predict is None]
+    quick = [name for name in names if CONTROLLERS[name].is_quick]
     for outcome in each_outcome(record, plan, watch, memo=memo):
         outcomes.append(outcome)
         if outcome.residual is not None:

@@ -54,7 +54,7 @@ def package_version(name: str) -> str:
     if name in NOT_OBSERVERS:
         return f"wfsobs {__version__}"
     entry = OBSERVERS.get(name)
-    function = entry.run if entry is not None else CONTROLLERS[name].law or CONTROLLERS[name].predict
+    function = entry.run if entry is not None else CONTROLLERS[name].law or CONTROLLERS[name].step_law
     home = getattr(function, "__module__", "wfsobs").partition(".")[0]
     package = sys.modules.get(home)
     return f"{home} {getattr(package, '__version__', None) or _distribution_version(home)}"

@@ -23,11 +23,11 @@ from wfsobs.control.integrator import limited_integrator
 from wfsobs.control.law import Law
 from wfsobs.control.mirror import Plant
 from wfsobs.control.step import StepController
-from wfsobs.control.step_laws import KalmanLaws, StepPredict, VibrationAhead, step_law, take_missing
+from wfsobs.control.step_laws import KalmanLaws, MakeStepLaw, StepPredict, VibrationAhead, step_law, take_missing
 from wfsobs.observers.base import NOT_TUNED, NOTHING, PLAIN, Look, Tunable
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
-from wfsobs.observers.step import StepError
+from wfsobs.observers.step import StepError, each_frame
 from wfsobs.prior import TRUE, Bands, Part, Prior, PriorSource, ask_nothing, asks_for, words_for
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, Sampling, hold_last
@@ -80,6 +80,8 @@ class Controller:
         Settings -> what of them its commands depend on beside its laws, as plain values; None for all that have an effect.
     tunable : Tunable
         Settings that its laws can be tuned by on an uncertain plant.
+    step_law : callable or None
+        In place of `law`: laws of all modes, frame by frame, that change as they run.
 
     Raises
     ------
@@ -103,10 +105,21 @@ class Controller:
     step_predict: StepPredict | None = None
     counts: Callable[[Any], Any] | None = None
     tunable: Tunable = NOT_TUNED
+    step_law: MakeStepLaw | None = None
 
     def __post_init__(self) -> None:
         if self.predict is not None and not asks_for(Bands, self.prior):
             raise ValueError(f"controller {self.id!r}: with a prediction it needs Bands in its prior")
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether it commands nothing."""
+        return self.law is None and self.step_law is None
+
+    @property
+    def is_quick(self) -> bool:
+        """Whether it is linear, or idle."""
+        return self.predict is None and self.step_law is None
 
     @property
     def groups(self) -> tuple[str, ...]:
@@ -177,7 +190,8 @@ class Controller:
             ahead = VibrationAhead(self.step_predict(prior, plant, settings, sampling), prior.bands, sampling)
         if not self._takes_missing(laws):
             beside = bridges(prior, sampling.n_modes, sampling.dt, sampling.ratio, _line_width(settings))
-        return StepController(self.id, plant, sampling, step_law(laws, plant.mirror), ahead, self.ngs, beside, gate)
+        own = self.step_law(prior, plant, settings, sampling) if self.step_law else step_law(laws, plant.mirror)
+        return StepController(self.id, plant, sampling, own, ahead, self.ngs, beside, gate)
 
     def commands(
         self,
@@ -195,6 +209,11 @@ class Controller:
         """
         if self.ngs and measurements.y_ngs is None:
             raise RecordError("the record has no NGS measurement")
+        if self.step_law is not None:
+            stepper = self.assemble(laws, prior, plant, settings, measurements.sampling)
+            frames = each_frame(stepper, replace(measurements, u=hold_last(measurements.u)), watch)
+            u = np.array([stepper.update_open_loop(z, ngs if self.ngs else None) for z, ngs, _ in frames])
+            return u, plant.mirror.at_limit(u)
         if self._takes_missing(laws):
             return self._without_missing(laws, replace(measurements, u=hold_last(measurements.u)), plant, watch)
         measurements = fill_missing(measurements, prior, _line_width(settings))
@@ -215,7 +234,7 @@ class Controller:
         return np.column_stack([u for u, _ in modes]), np.column_stack([u != wanted for u, wanted in modes])
 
     def _takes_missing(self, laws: Sequence[Law]) -> bool:
-        return self.predict is None and take_missing(laws)
+        return self.step_law is not None or (self.predict is None and take_missing(laws))
 
     def _inputs(self, measurements: Measurements, z: Array) -> Array:
         """Return the inputs of the laws, (n_steps, 1 or 2, n_modes) [um], zero where no NGS frame is due."""

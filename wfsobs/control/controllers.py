@@ -8,10 +8,19 @@ from wfsobs import registry
 from wfsobs.control.base import Controller
 from wfsobs.control.integrator import best_gain, integrator_law
 from wfsobs.control.law import Law
-from wfsobs.control.lqg import lqg_kf_lgs, lqg_kf_multi, lqg_multirate, lqg_multirate_multi, lqg_multirate_optimal
+from wfsobs.control.lqg import (
+    lqg_kf_adaptive,
+    lqg_kf_lgs,
+    lqg_kf_multi,
+    lqg_multirate,
+    lqg_multirate_adaptive,
+    lqg_multirate_multi,
+    lqg_multirate_optimal,
+)
 from wfsobs.control.mirror import Plant
 from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead, of_z, step_gpr_offline_ahead, step_gpr_online_ahead
 from wfsobs.observers.base import Look, Tunable
+from wfsobs.observers.kalman.adaptive import KF_ADAPTIVE, MULTIRATE_ADAPTIVE
 from wfsobs.observers.kalman.multirate import TUNABLE, matched_noise
 from wfsobs.observers.kalman.single import MODEL
 from wfsobs.prior import (
@@ -65,6 +74,17 @@ def _offline_used(settings: Any) -> Plain:
 
 def _online_used(settings: Any) -> Plain:
     return of_z(settings.gpr_online).effective_values()
+
+
+def _adaptive_used(settings: Any) -> Any:
+    assert MULTIRATE_ADAPTIVE.counts is not None
+    return *MULTIRATE_ADAPTIVE.counts(Prior(), settings.adaptive), settings.control.fallback_gain, settings.control.leak
+
+
+def _adaptive_seconds(settings: Any, n_steps: int, n_modes: int) -> float:
+    """Estimate the time of a step, and that of the identifications at 1 kHz."""
+    assert KF_ADAPTIVE.seconds is not None
+    return n_steps * n_modes * 5e-5 + KF_ADAPTIVE.seconds(settings.adaptive, n_steps, n_modes, 1e-3)
 
 
 def _online_seconds(settings: Any, n_steps: int, n_modes: int) -> float:
@@ -153,6 +173,29 @@ CONTROLLERS = Registry(
             tunable=Tunable(_CAUTION, ("multipeak.line_width", *TUNABLE.usual, "kalman.turbulence_rms")),
             counts=_nothing_more,
             look=Look("LQG multi-rate multi-peak", "#AB64CF", "#F26FF3", (8, 3)),
+        ),
+        Controller(
+            "lqg-kf-adaptive",
+            "LQG, adaptive KF",
+            step_law=lqg_kf_adaptive,
+            help="minus what a filter predicts whose model is identified anew as the loop runs; at first an integrator",
+            settings=("control", "adaptive"),
+            weight=20.0,
+            seconds=_adaptive_seconds,
+            counts=_adaptive_used,
+            look=Look("LQG adaptive", "#522C0A", "#F4C173", (20, 2)),
+        ),
+        Controller(
+            "lqg-multirate-adaptive",
+            "LQG, adaptive multi-rate KF",
+            step_law=lqg_multirate_adaptive,
+            help="the same with a filter of both sensors",
+            settings=("control", "adaptive"),
+            ngs=True,
+            weight=20.0,
+            seconds=_adaptive_seconds,
+            counts=_adaptive_used,
+            look=Look("LQG adaptive multi-rate", "#591677", "#F3C1F7", (20, 2, 3, 2)),
         ),
         Controller(
             "integrator+gpr-offline",

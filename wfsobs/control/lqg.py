@@ -5,6 +5,9 @@ will be while it acts (certainty equivalence): u[k] = -(turb_hat[k+1] + vib_hat[
 frames, and for n + f frames the mean over the time that the command is held,
 
     u[k] = -((1 - f) phi_hat[k+n-1] + f phi_hat[k+n]).
+
+The adaptive ones predict by a filter that is identified anew while the loop runs, from the pseudo-open-loop so far; until its
+first window is full an integrator closes the loop.
 """
 
 from __future__ import annotations
@@ -15,9 +18,12 @@ from typing import Any
 
 import numpy as np
 
+from wfsobs.control.integrator import integrator_law
 from wfsobs.control.law import Law, steady_law
 from wfsobs.control.mirror import Mirror, Plant
+from wfsobs.control.step_laws import Integrators, PredictionLaws
 from wfsobs.observers.base import TARGETS
+from wfsobs.observers.kalman.adaptive import AdaptiveEstimator, kf_adaptive, multirate_adaptive
 from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean
 from wfsobs.observers.kalman.multirate import (
     Cycle,
@@ -29,6 +35,7 @@ from wfsobs.observers.kalman.multirate import (
 )
 from wfsobs.observers.kalman.single import steady_mode
 from wfsobs.prior import Noise, Prior
+from wfsobs.record import Sampling
 from wfsobs.signal.gap_gains import ONE, SensorMean
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
@@ -119,3 +126,18 @@ def _two_sensors(mode_filter: ModeFilter, row: Array) -> Law:
 
 def _run_first(filter_: MultiRateFilter, z: Array) -> Array:
     return filter_.run(z)[:, 0]
+
+
+def lqg_kf_adaptive(prior: Prior, plant: Plant, settings: Any, sampling: Sampling) -> PredictionLaws:
+    """With the adaptive filter of the LGS. Raises RecordError for a window of too few samples."""
+    return _adaptive(kf_adaptive(prior, settings.adaptive, sampling, 0.0), plant, settings)
+
+
+def lqg_multirate_adaptive(prior: Prior, plant: Plant, settings: Any, sampling: Sampling) -> PredictionLaws:
+    """With the adaptive filter of both sensors. Raises RecordError for a window of too few samples."""
+    return _adaptive(multirate_adaptive(prior, settings.adaptive, sampling, 0.0), plant, settings)
+
+
+def _adaptive(estimator: AdaptiveEstimator, plant: Plant, settings: Any) -> PredictionLaws:
+    first = integrator_law(plant.mirror, settings.control.fallback_gain, settings.control.leak)
+    return PredictionLaws(estimator, Integrators([first] * estimator.sampling.n_modes, plant.mirror), plant.mirror)

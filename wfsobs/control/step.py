@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from wfsobs.control.mirror import Plant
-from wfsobs.control.step_laws import Integrators, StepLaw, VibrationAhead, push_row
+from wfsobs.control.step_laws import StepLaw, VibrationAhead, push_row
 from wfsobs.observers.missing import Bridge
 from wfsobs.observers.step import StepBase, StepError
 from wfsobs.record import Sampling
@@ -105,7 +105,7 @@ class StepController(StepBase):
 
     def amend(self, command: Array) -> None:
         """Take what the mirror was sent, (n_modes,) [um], where that is another command than the one of the last frame."""
-        if isinstance(self.law, Integrators):  # the state of no other law holds commands
+        if self.law is not None:
             self.law.amend(command - self._commands[0])
         self._commands[0] = command
 

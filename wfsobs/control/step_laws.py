@@ -9,6 +9,7 @@ import numpy as np
 
 from wfsobs.control.law import Law
 from wfsobs.control.mirror import Mirror, Plant
+from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.observers.step import Estimator, StepError, each_frame
 from wfsobs.observers.stepping import FilterBank, StateArrays, Stateful
@@ -21,6 +22,13 @@ from wfsobs.typing import Array
 
 StepPredict = Callable[[Prior, Plant, Any, Sampling], Estimator]
 """(prior, plant, settings, sampling) -> predictor of the vibration while the command of the frame acts."""
+
+MakeStepLaw = Callable[[Prior, Plant, Any, Sampling], "StepLaw"]
+"""(prior, plant, settings, sampling) -> laws of all modes. Raises ValueError saying why there are none."""
+
+
+DECIMALS = 9
+"""Of z [um] where a model is identified from it: it is then the same in whichever order commands were added."""
 
 
 class StepLaw(Stateful, Protocol):
@@ -38,6 +46,10 @@ class StepLaw(Stateful, Protocol):
         """Tell what the mirror took of them."""
         ...
 
+    def amend(self, difference: Array) -> None:
+        """Go on from a command that differs by this from the one told last."""
+        ...
+
     def take_over(self, old: Any) -> None:
         """Go on from the state of other laws. Raises StepError."""
         ...
@@ -51,6 +63,9 @@ class _Laws(StateArrays):
 
     def tell(self, command: Array, forward: Array) -> None:
         """Ignored: z holds none of the commands."""
+
+    def amend(self, difference: Array) -> None:
+        """Ignored, as what is told."""
 
 
 class LinearLaws(_Laws):
@@ -132,8 +147,8 @@ class Integrators(_Laws):
         self.mark_start()
 
     def command(self, z: Array, ngs: Array | None, forward: Array) -> Array:
-        """Return leak u - g y, y the measurement with the integrator's own commands alone."""
-        return self._leak * self._own[0] - self._gain * (z + self._taps @ self._own) + forward
+        """Return leak u - g y, y the measurement with the integrator's own commands alone; none where it is missing."""
+        return self._leak * self._own[0] - self._gain * np.nan_to_num(z + self._taps @ self._own) + forward
 
     def tell(self, command: Array, forward: Array) -> None:
         """Go on from what the mirror took."""
@@ -148,6 +163,38 @@ class Integrators(_Laws):
         if not isinstance(old, Integrators) or old._own.shape != self._own.shape:
             raise StepError("the laws are of another kind")
         self._own[...] = old._own
+
+
+class PredictionLaws(_Laws):
+    """Minus what an observer predicts that needs time until it does; until then integrators."""
+
+    state_names: tuple[str, ...] = ("estimator", "integrators")
+
+    def __init__(self, estimator: Estimator, integrators: Integrators, mirror: Mirror):
+        self.estimator, self.integrators = estimator, integrators
+        self._taps = [(steps, tap) for steps, tap in enumerate(mirror.taps[1:].tolist()) if tap]
+        self.mark_start()
+
+    def command(self, z: Array, ngs: Array | None, forward: Array) -> Array:
+        """Return minus the mean of the prediction while the command acts."""
+        self.estimator.advance(np.round(z, DECIMALS), None if ngs is None else np.round(ngs, DECIMALS), None)
+        ahead = sum((tap * self.estimator.predict(k, target)[0] for k, tap in self._taps for target in TARGETS), -forward)
+        return np.where(np.isnan(ahead), self.integrators.command(z, ngs, forward), -ahead)
+
+    def tell(self, command: Array, forward: Array) -> None:
+        """Have the integrators go on from what the mirror took."""
+        self.integrators.tell(command, forward)
+
+    def amend(self, difference: Array) -> None:
+        """Go on from a command that differs by this from the one told last."""
+        self.integrators.amend(difference)
+
+    def take_over(self, old: Any) -> None:
+        """Go on from what the old observer knows."""
+        if not isinstance(old, PredictionLaws):
+            raise StepError("the laws are of another kind")
+        self.estimator.take_over(old.estimator)
+        self.integrators.take_over(old.integrators)
 
 
 def take_missing(laws: Sequence[Law]) -> bool:

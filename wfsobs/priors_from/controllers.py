@@ -56,7 +56,7 @@ def true_plant_of(scenario: Scenario) -> TruePlant | None:
 def supervision_of(controller: Controller, scenario: Scenario) -> Supervision | None:
     """Return how a controller is supervised; None where it is not, as are an integrator and control by nothing."""
     c = scenario.control
-    is_safe = controller.law is None or controller.id == "integrator"
+    is_safe = controller.is_idle or controller.id == "integrator"
     return Supervision(c.fallback_gain, c.leak) if c.supervised and not is_safe else None
 
 

@@ -519,7 +519,7 @@ class Stars:
         come = view.truth("turbulence") + view.truth("vibration")
         signals = {TRUTH: view.frames.z if np.isnan(come).all() else come}
         if left is not None:
-            signals |= {name: left.residual(name) for name in names if CONTROLLERS[name].law is not None}
+            signals |= {name: left.residual(name) for name in names if not CONTROLLERS[name].is_idle}
         if list(signals) != list(self._detectors):
             self._detectors = {name: self._detectors.get(name) or Detector(name, self._painter) for name in signals}
             self.row[:] = [detector.view for detector in self._detectors.values()]

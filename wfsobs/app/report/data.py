@@ -245,7 +245,7 @@ def seeds_of(evidence: Evidence) -> dict[str, Any]:
 
 def loop_rows(result: Result) -> list[Row]:
     """Close the loop on the record of a run with the controllers that take a moment; nothing where the truth is not known."""
-    quick = [name for name, controller in CONTROLLERS.items() if controller.predict is None]
+    quick = [name for name, controller in CONTROLLERS.items() if controller.is_quick]
     try:
         closed = closed_loop(result.record, design(result.scenario, quick))
         return controller_rows(closed, result.scenario.run.seed, source=result.prior_source)

@@ -43,9 +43,7 @@ class Run(Group):
 class Control(Group):
     """The mirror and the controllers of the closed-loop comparison; the loop's own integrator makes the record."""
 
-    used_when: ClassVar[UsedWhen] = MappingProxyType(
-        {"gain": ("integrator", ("manual",)), "fallback_gain": ("supervised", (True,))}
-    )
+    used_when: ClassVar[UsedWhen] = MappingProxyType({"gain": ("integrator", ("manual",))})
 
     delay: Real = Real(
         2.0,
@@ -107,7 +105,8 @@ class Control(Group):
         softbounds=(0.0, 1.0),
         step=0.01,
         label="Gain of the fallback",
-        doc="Gain of that integrator, of the leak above; stable for every plant that may come.",
+        doc="Gain of that integrator, and of the one with which adaptive controllers begin, of the leak above; stable for every "
+        "plant that may come.",
     )
     wavelength: Real = Real(
         2.2, bounds=(0.1, 30.0), step=0.05, label="Science wavelength", doc="Wavelength of the Strehl ratio [um]."
