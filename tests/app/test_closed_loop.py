@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
+from threading import Event
+from time import sleep
 from typing import Any
 
 import numpy as np
@@ -10,12 +13,13 @@ import pytest
 from wfsobs.app import loop_work
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.display import per_micrometre
-from wfsobs.app.jobs import DONE
+from wfsobs.app.jobs import CANCELLED, DONE
 from wfsobs.app.pages.closed_loop import CURVES, ClosedLoopPage
 from wfsobs.app.pages.pages import EXPLORE, LOOP
 from wfsobs.app.style import look
 from wfsobs.app.views.plots import envelope
 from wfsobs.closed_loop.design import design
+from wfsobs.closed_loop.envelope import plant_envelope
 from wfsobs.closed_loop.rows import rows
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.control.controllers import CONTROLLERS
@@ -174,3 +178,44 @@ def test_what_would_take_minutes_is_left_out(dashboard: Dashboard, loop: Any, mo
     assert card["note"].startswith("left out") and "integrator+gpr-online" not in page.table.object
     dashboard.close()
     assert page.run.session.is_closed, "a session that ends takes its loop with it"
+
+
+def test_an_uncertain_plant_adds_columns_a_sentence_and_a_figure(page: ClosedLoopPage, dashboard: Dashboard, loop: Any) -> None:
+    few, box = 12, page.uncertain
+    assert "Worst [" not in page.table.object and not box.room.visible
+    with pytest.MonkeyPatch.context() as m:
+        m.setattr(loop_work, "plant_envelope", partial(plant_envelope, points=few))
+        box.starter.start.clicks += 1
+        loop.until(lambda: box.work.state == DONE)
+    assert page.results is not None
+    expected = plant_envelope(page.results.result.scenario, points=few)
+    assert box.finding is not None and box.finding.rows() == expected.rows()
+    assert "Worst [nm]" in page.table.object and box.room.visible
+    for line in expected.sentences(0, 1e3, "nm"):
+        assert line.replace("+-", "±").replace(" deg", "°") in page.verdict.object
+    x, _, most = expected.curves("delay", 1)["integrator"]
+    dashboard.display.param.update(mode="tilt", unit="mas")
+    drawn = box.figure.sources["integrator"].data
+    assert np.array_equal(drawn["x"], x)
+    assert np.allclose(drawn["y"], per_micrometre("mas", 8.0) * most, equal_nan=True)
+    dashboard.store.replace({"turbulence.wind_speed": 9.0})
+    loop.until(lambda: page.run.result is not None and page.run.result.scenario.turbulence.wind_speed == 9.0)
+    done(page, loop)
+    assert box.finding is None and not box.room.visible and "Worst [" not in page.table.object, "it was of other results"
+
+
+def test_an_uncertain_plant_stops_when_told(page: ClosedLoopPage) -> None:
+    begun, box = Event(), page.uncertain
+
+    def endless(_scenario: Any, *, watch: Any, **_: Any) -> Any:
+        begun.set()
+        while True:
+            watch.check()
+            sleep(0.01)
+
+    with pytest.MonkeyPatch.context() as m:
+        m.setattr(loop_work, "plant_envelope", endless)
+        box.starter.start.clicks += 1
+        assert begun.wait(60.0)
+        box.starter.cancel.clicks += 1
+    assert box.work.state == CANCELLED and box.finding is None

@@ -28,3 +28,16 @@ def test_controllers_side_by_side(open_page: Any, server: Any) -> None:
     expect(card).to_have_attribute("aria-pressed", "false")
     page.set_viewport_size({"width": 390, "height": 844})
     until(page, "() => document.documentElement.scrollWidth <= 390")
+
+
+def test_an_uncertain_plant_is_asked_for(open_page: Any, server: Any) -> None:
+    page = open_page(url=server.url + QUICK)
+    page.get_by_role("button", name="Closed loop", exact=True).click()
+    page.get_by_role("button", name="Compute", exact=True).click()
+    expect(page.get_by_role("button", name="Stop", exact=True)).to_be_enabled()
+    worst = page.locator('tr[data-controller="integrator"] td').nth(3)
+    expect(worst).to_have_text(re.compile(r"\d$"))  # the first controllers are there while the others are computed
+    expect(page.locator("p.verdict", has_text="Residual, tip")).to_contain_text("With the plant uncertain (delay ±0.5 frames")
+    expect(page.get_by_role("figure", name="Residual against delay error")).to_be_visible()
+    page.set_viewport_size({"width": 390, "height": 844})
+    until(page, "() => document.documentElement.scrollWidth <= 390")

@@ -86,8 +86,22 @@ def test_shares_and_ranks_are_counted() -> None:
     assert np.isinf(bold.p95) and safe.p95 == 2.0
     assert both.ranking() == ["lqg-kf-lgs", "integrator"] and both.ranking(by_worst=True) == ["integrator", "lqg-kf-lgs"]
     assert "Best at the worst plant: Integrator. LQG, LGS KF is unstable at 25 %." in both.verdict()
+    assert both.sentences(0, 1e3, "nm") == [
+        "With the plant uncertain (delay +-0.5 frames), Integrator is best at worst: 2e+03 nm, 2e+03 nm at the nominal plant.",
+        "LQG, LGS KF is best at the nominal plant: 1e+03 nm, at worst unstable.",
+        "LQG, LGS KF is unstable for 25 % of the plants.",
+    ]
     alone = PlantEnvelope(MATCHED, Uncertainty(), {"delay": np.zeros(4)}, {}, (bold,))
     assert "None is stable over the whole envelope" in alone.verdict()
+
+
+def test_curves_are_means_and_maxima_of_their_parts() -> None:
+    errors, rms = np.linspace(-0.5, 0.5, 160), np.abs(np.linspace(-1.0, 1.0, 160))
+    rms[:10], rms[10] = np.inf, np.inf
+    of = PlantEnvelope(MATCHED, Uncertainty(), {"delay": errors}, {}, (spread("integrator", 1.0, rms.tolist()),))
+    at, mean, most = of.curves("delay", 0)["integrator"]
+    assert np.diff(at) == pytest.approx(1.0 / 16.0) and np.isnan(mean[0]) and np.isnan(most[0])
+    assert mean[1] == pytest.approx(rms[11:20].mean()) and most[1] == rms[11] and most[-1] == 1.0
 
 
 def test_the_command_prints_table_and_rows(tmp_path) -> None:

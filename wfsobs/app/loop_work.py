@@ -9,6 +9,7 @@ from typing import Any
 from wfsobs.app.jobs import Tell
 from wfsobs.app.work import RunResults
 from wfsobs.closed_loop.design import design
+from wfsobs.closed_loop.envelope import PlantEnvelope, plant_envelope
 from wfsobs.closed_loop.rows import ClosedLoop, Row, rows
 from wfsobs.closed_loop.run import each_outcome
 from wfsobs.control.controllers import CONTROLLERS
@@ -72,6 +73,16 @@ def compute(of: RunResults, watch: Watch, tell: Tell, memo: Memo | None = None) 
             if not shown.complete:
                 tell(result=shown)
     return shown
+
+
+def uncertain(scenario: Scenario, watch: Watch, tell: Tell) -> PlantEnvelope:
+    """Compute what the linear controllers leave over an uncertain plant; tell what there is after each."""
+    return plant_envelope(scenario, on_spread=lambda found: tell(result=found), watch=watch)
+
+
+def uncertain_seconds(scenario: Scenario) -> float:
+    """Estimate how long that takes [s]: 24 to 37 of a processor for two modes, in two threads."""
+    return 15.0 * len(scenario.modes)
 
 
 def cost(scenario: Scenario) -> float:

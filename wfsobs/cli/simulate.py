@@ -245,11 +245,7 @@ def loop(
 
 def envelope_table(result: PlantEnvelope) -> Table:
     """Return the table of an envelope, least nominal residual first in each mode."""
-    of = result.uncertainty
-    names = {"delay": f"delay +-{of.delay:g} frames", "gain": f"gain +-{100.0 * of.gain:g} %"}
-    names |= {"rotation": f"rotation +-{of.rotation:g} deg", "resonance": f"resonance +-{100.0 * of.resonance:g} %"}
-    size = len(result.errors["delay"])
-    out = Table(title=f"Residual over {size} plants: {', '.join(names[name] for name in result.errors)}")
+    out = Table(title=f"Residual over {len(result.errors['delay'])} plants: {result.ranges}")
     for name in ("Mode", "Controller"):
         out.add_column(name, no_wrap=True)
     for name in ("caution", "nominal, nm", "mean", "95 %", "worst", "unstable, %", "corners"):

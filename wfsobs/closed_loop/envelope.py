@@ -38,6 +38,9 @@ if TYPE_CHECKING:
 
 POINTS = 1000
 
+BINS = 16
+"""Parts of the range of an error in `PlantEnvelope.curves`."""
+
 AT_ONCE = 2**21
 """Numbers in the largest array of a block of plants."""
 
@@ -169,6 +172,57 @@ class PlantEnvelope:
             return left, spread.unstable if left == inf else 0
 
         return [spread.controller for spread in sorted(self.spreads, key=key)]
+
+    @property
+    def ranges(self) -> str:
+        """The largest errors, in words."""
+        of = self.uncertainty
+        names = {"delay": f"delay +-{of.delay:g} frames", "gain": f"gain +-{100.0 * of.gain:g} %"}
+        names |= {"rotation": f"rotation +-{of.rotation:g} deg", "resonance": f"resonance +-{100.0 * of.resonance:g} %"}
+        return ", ".join(names[name] for name in self.errors)
+
+    def curves(self, over: str, mode: int) -> dict[str, tuple[Array, Array, Array]]:
+        """Return (error, mean rms, largest rms [um]), (BINS,) each, of the stable points in parts of the range of an error.
+
+        By controller; over : a key of `errors`; NaN where no point of a part is stable
+        """
+        errors = self.errors[over]
+        edges = np.linspace(errors.min(), errors.max(), BINS + 1)
+        inside = np.clip(np.digitize(errors, edges) - 1, 0, BINS - 1) == np.arange(BINS)[:, None]
+        out = {}
+        for spread in self.spreads:
+            rms = spread.points[:, mode]
+            counted = inside & np.isfinite(rms)
+            total, n = np.where(counted, rms, 0.0).sum(axis=1), counted.sum(axis=1)
+            mean = np.where(n > 0, total / np.maximum(n, 1), np.nan)
+            most = np.where(n > 0, np.where(counted, rms, 0.0).max(axis=1), np.nan)
+            out[spread.controller] = 0.5 * (edges[:-1] + edges[1:]), mean, most
+        return out
+
+    def sentences(self, mode: int, scale: float, unit: str) -> list[str]:
+        """Return which controller is best at worst in one mode, at what cost, and which are not stable; scale [unit per um]."""
+
+        def text(rms: float) -> str:
+            return "unstable" if np.isinf(rms) else f"{scale * rms:.3g} {unit}"
+
+        if not self.spreads:
+            return []
+        first, safest = (min(self.spreads, key=lambda one: getattr(one, key)[mode]) for key in ("nominal", "worst"))
+        if np.isinf(safest.worst[mode]):
+            out = [f"With the plant uncertain ({self.ranges}) no controller is stable everywhere."]
+        else:
+            name, worst, nominal = CONTROLLERS[safest.controller].label, text(safest.worst[mode]), text(safest.nominal[mode])
+            out = [f"With the plant uncertain ({self.ranges}), {name} is best at worst: {worst}, {nominal} at the nominal plant."]
+        if first.controller != safest.controller:
+            name = CONTROLLERS[first.controller].label
+            out.append(f"{name} is best at the nominal plant: {text(first.nominal[mode])}, at worst {text(first.worst[mode])}.")
+        for spread in self.spreads:
+            if np.isinf(spread.worst[mode]):
+                share = (
+                    f"for {100.0 * spread.unstable / len(spread.points):.2g} % of the plants" if spread.unstable else "at corners"
+                )
+                out.append(f"{CONTROLLERS[spread.controller].label} is unstable {share}.")
+        return out
 
     def verdict(self) -> str:
         """Return which controller is best at the nominal plant, and which at worst."""

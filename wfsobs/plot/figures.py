@@ -346,20 +346,15 @@ class EnvelopePlots:
         over : "delay", "gain", "rotation" or "resonance"
         """
         of, column = self.envelope, self.names.index(_one_of(self.names, mode, "mode"))
-        errors, unit = of.errors[_one_of(list(of.errors), over, "error")], {"delay": "frames", "rotation": "deg"}.get(over, "")
+        over, unit = _one_of(list(of.errors), over, "error"), {"delay": "frames", "rotation": "deg"}.get(over, "")
         x, y = quantity(f"error of {over}", unit), quantity(f"rms {self.names[column]}", "nm", f"residual, {self.names[column]}")
-        edges = np.linspace(errors.min(), errors.max(), 17)
-        bins = np.clip(np.digitize(errors, edges) - 1, 0, 15)
         lines: list[Any] = []
-        for spread in of.spreads:
-            if controllers is not None and spread.controller not in controllers:
-                continue
-            left = np.where(np.isfinite(spread.points[:, column]), NM * spread.points[:, column], np.nan)
-            kept = [i for i in range(16) if np.isfinite(left[bins == i]).any()]
-            at, it = 0.5 * (edges[:-1] + edges[1:])[kept], look(spread.controller)
-            lines.append(draw_line(at, np.array([np.nanmean(left[bins == i]) for i in kept]), (x, y), it))
-            most = Look(f"{it.label}, worst", it.light, it.dark, (2, 2))
-            lines.append(draw_line(at, np.array([np.nanmax(left[bins == i]) for i in kept]), (x, y), most))
+        for name, (at, mean, most) in of.curves(over, column).items():
+            if controllers is None or name in controllers:
+                it, known = look(name), np.isfinite(mean)
+                lines.append(draw_line(at[known], NM * mean[known], (x, y), it))
+                worst = Look(f"{it.label}, worst", it.light, it.dark, (2, 2))
+                lines.append(draw_line(at[known], NM * most[known], (x, y), worst))
         return overlay(_some(lines, "a stable plant"), log="y")
 
 

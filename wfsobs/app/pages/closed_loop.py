@@ -11,7 +11,6 @@ import numpy as np
 import panel as pn
 import panel_material_ui as pmui
 from bokeh.models import ColumnDataSource, Range1d
-from bokeh.plotting import figure
 from markupsafe import Markup
 
 from wfsobs.app.copies import LOOP, CopiedTask
@@ -35,14 +34,16 @@ from wfsobs.app.pages.parts import (
     text,
     zoom_buttons,
 )
+from wfsobs.app.pages.uncertain_plant import UncertainPlant, uncertain_cells, uncertain_columns
 from wfsobs.app.render import NOTHING, Row, macro, number, table
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.store import Store
 from wfsobs.app.style import look, swatch
 from wfsobs.app.views.gain_editor import GainEditor, plane
-from wfsobs.app.views.plots import add_line, envelope, envelope_times, in_view, new_figure, on_settle, restyle
+from wfsobs.app.views.plots import LoopLines, add_line, envelope, envelope_times, in_view, new_figure, on_settle, restyle
 from wfsobs.app.views.strip import Cards, card_of
 from wfsobs.app.views.table import SMALLEST
+from wfsobs.closed_loop.envelope import PlantEnvelope
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label, loop_verdict, no_theory
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import Row as Score
@@ -60,19 +61,6 @@ CURVES = tuple(c.id for c in CONTROLLERS.values() if c.law and not c.predict and
 """Controllers that may have a transfer function."""
 
 NOWHERE = (np.empty(0), np.empty(0, dtype=complex), np.empty(0, dtype=complex))
-
-
-class LoopLines:
-    """A figure with a line per controller."""
-
-    def __init__(self, fig: figure, names: tuple[str, ...]):
-        self.figure = fig
-        self.sources: Final = {name: ColumnDataSource({"x": [], "y": []}) for name in names}
-        self.lines: Final = {name: add_line(fig, name, source) for name, source in self.sources.items()}
-
-    def restyle(self, dark: bool, hidden_names: list[str]) -> None:
-        """Set the colours of light or dark mode, and hide lines."""
-        restyle(self.lines, dark, hidden_names)
 
 
 class Trace(LoopLines):
@@ -258,13 +246,15 @@ def of_mode(results: LoopResults, display: Display) -> list[Score]:
     return sorted(rows, key=lambda r: float("inf") if r["residual_rms_nm"] is None else r["residual_rms_nm"])
 
 
-def loop_html(results: LoopResults, display: Display) -> str:
-    """Residual and Strehl of every controller, and the bounds."""
+def loop_html(results: LoopResults, display: Display, envelope: PlantEnvelope | None = None) -> str:
+    """Residual and Strehl of every controller, and the bounds; with an envelope, what an uncertain plant does to them."""
     unit = display.unit_label
+    added = {} if envelope is None else uncertain_columns(unit)
     columns = {
         "Controller": "",
         f"Residual [{unit}]": "rms after the warm-up",
         f"Theory [{unit}]": "from the true spectra, for an endless record",
+        **added,
         f"Strehl at {results.result.scenario.control.wavelength:g} µm": TERMS[STREHL],
         "Gain": "of the integrator",
         "At a limit [%]": "steps in which a limit of the mirror changed the command",
@@ -273,18 +263,23 @@ def loop_html(results: LoopResults, display: Display) -> str:
     rows = of_mode(results, display)
     smallest = next((r["controller"] for r in rows if r["controller"] not in BOUNDS and r["residual_rms_nm"] is not None), None)
     scale = 1e-3 * per_micrometre(display.unit, results.result.scenario.telescope.diameter)
-    body = [_row(r, display, scale, r["controller"] == smallest) for r in rows]
+    more = uncertain_cells(envelope, display.column, 1e3 * scale) if envelope is not None else {}
+    empty = [NOTHING] * len(added)
+    body = [_row(r, display, scale, r["controller"] == smallest, more.get(r["controller"], empty)) for r in rows]
     notes = {r["note"]: label(r["controller"]) for r in reversed(rows) if r["note"] not in ("", LIMITED)}
     failures = macro("texts", "failure", [f"{name}: {note}" for note, name in notes.items()])
     return f"{table('Controllers', columns, [('', body)])}{limits_note(rows)}{failures}"
 
 
-def loop_verdict_html(results: LoopResults, display: Display) -> str:
-    """Write the controllers with the smallest residual by prior knowledge, and the limit."""
+def loop_verdict_html(results: LoopResults, display: Display, envelope: PlantEnvelope | None = None) -> str:
+    """Write the controllers with the smallest residual by prior knowledge, and the limit; and the best over an envelope."""
     found = loop_verdict(results.result, display.mode)
     scale = per_micrometre(display.unit, results.result.scenario.telescope.diameter)
-    said = " ".join(found.sentences(scale, display.unit_label)) if found else ""
-    return f'<p class="verdict">{escape(said)}</p>' if said else ""
+    said = [*found.sentences(scale, display.unit_label)] if found else []
+    if envelope is not None:
+        lines = envelope.sentences(display.column, scale, display.unit_label)
+        said += [line.replace("+-", "±").replace(" deg", "°") for line in lines]
+    return f'<p class="verdict">{escape(" ".join(said))}</p>' if said else ""
 
 
 def limits_note(rows: Sequence[Score]) -> str:
@@ -298,7 +293,7 @@ def linear_text(row: Score, value: str) -> str:
     return Markup('<span title="{}">{}</span>').format(LIMITED, NOT_APPLICABLE) if row["limited"] else value
 
 
-def _row(row: Score, display: Display, scale: float, smallest: bool) -> Row:
+def _row(row: Score, display: Display, scale: float, smallest: bool, more: Sequence[str]) -> Row:
     def scaled(key: str) -> str:
         return NOTHING if row[key] is None else number(row[key] * scale)
 
@@ -306,6 +301,7 @@ def _row(row: Score, display: Display, scale: float, smallest: bool) -> Row:
     cells = [
         (SMALLEST if smallest else "") + residual,
         linear_text(row, scaled("predicted_rms_nm")),
+        *more,
         NOTHING if row["strehl"] is None else f"{row['strehl']:.4f}",
         number(row["gain"]),
         NOTHING if row["limited"] is None else number(100.0 * row["limited"], 2),
@@ -390,6 +386,8 @@ class ClosedLoopPage(Page):
         self.editor: GainEditor | None = None
         display.param.watch(self._edit, "editing")
         self._edit()
+        self.uncertain = UncertainPlant(store, display)
+        self.uncertain.work.param.watch(self._restyle, ["state", "result"])
         self._figures = (self.trace, self.zoom, self.spectrum, self.response, self.nyquist)
         self.work.param.watch(self._say, ["state", "place", "message"])
         self.work.param.watch(self.redraw, "result")
@@ -418,7 +416,7 @@ class ClosedLoopPage(Page):
             **WIDE,
             stylesheets=[HALVES],
         )
-        parts = (self._switch(), figures, box("Controllers", self.table), box("Stability", stability))
+        parts = (self._switch(), figures, box("Controllers", self.table), self.uncertain.view(), box("Stability", stability))
         self._rooms = [pn.Column(part, **WIDE) for part in parts]  # a grid by its own style is shown even where it is not visible
         residual = box("Residual in closed loop", text(INTRO), self.note, self.verdict, self.cards, *self._rooms[:2])
         return boxes(residual, *self._rooms[2:])
@@ -451,6 +449,7 @@ class ClosedLoopPage(Page):
         if of is None or self.run.state == RUNNING or of is self._of:
             return
         self._of = of
+        self.uncertain.forget()
         self.work.start(Job("loop", partial(compute, of, memo=self.store.session.service.memo), cost=cost(of.scenario)))
 
     @property
@@ -491,8 +490,10 @@ class ClosedLoopPage(Page):
             for drawn in (self.trace, self.zoom, self.spectrum):
                 drawn.fit(self.cards.hidden_lines)
             if self.results is not None:
-                self.verdict.object = loop_verdict_html(self.results, self.display)
-                self.table.object = loop_html(self.results, self.display)
+                envelope = self.uncertain.finding
+                self.verdict.object = loop_verdict_html(self.results, self.display, envelope if self.uncertain.complete else None)
+                self.table.object = loop_html(self.results, self.display, envelope)
+                self.uncertain.draw(self.cards.hidden_lines)
                 self.margins.object = margins_html(self.results, self.display)
                 self.cards.show(self._items(self.results))
 

@@ -141,6 +141,19 @@ def add_line(fig: figure, name: str, source: ColumnDataSource, y: str = "y") -> 
     return renderer
 
 
+class LoopLines:
+    """A figure with a line per controller."""
+
+    def __init__(self, fig: figure, names: tuple[str, ...]):
+        self.figure = fig
+        self.sources: Final = {name: ColumnDataSource({"x": [], "y": []}) for name in names}
+        self.lines: Final = {name: add_line(fig, name, source) for name, source in self.sources.items()}
+
+    def restyle(self, dark: bool, hidden_names: list[str]) -> None:
+        """Set the colours of light or dark mode, and hide lines."""
+        restyle(self.lines, dark, hidden_names)
+
+
 def marked_peaks(scenario: Scenario) -> list[Peak]:
     """List the peaks in the scenario's vibration; of a measured spectrum, its stronger lines."""
     vibration = scenario.vibration
