@@ -367,6 +367,22 @@ def test_commands_beside_residuals_give_the_pseudo_open_loop(delay: float) -> No
     assert commands.missing == len(hidden) == way.attachment.summary()["commands_missing"]
 
 
+@pytest.mark.parametrize("left_out", [[50], [50, 51, 52]])
+@pytest.mark.parametrize("delay", [2.0, 1.5])
+def test_commands_that_a_loop_leaves_out_do_not_shift_those_after_them(delay: float, left_out: list[int]) -> None:
+    """Their counter says nothing of that; nine commands later, at most, each is that of its measurement again."""
+    u, y = np.random.default_rng(1).standard_normal((2, 100, 2)).cumsum(axis=1)
+    stream, whole, part = Frames(2), int(delay), delay % 1.0
+    commands, got = CommandStream(stream, (0, 1), np.array(1.0), delay), []  # pyright: ignore[reportArgumentType]
+    for k, row in enumerate(u):
+        got.append(commands.open_loop(k, y[k]))
+        if k not in left_out:
+            stream.write(row)
+    again = np.arange(left_out[-1] + 9 + whole + 1, 100)
+    for k in (np.arange(13, 50), again):
+        np.testing.assert_allclose(np.array(got)[k], y[k] - (1.0 - part) * u[k - whole] - part * u[k - whole - 1], atol=1e-12)
+
+
 def test_measurements_that_are_never_there_are_frames_that_are_missing() -> None:
     way = Way(OBSERVED["kf-lgs"], Safety("zero"))
     got = np.array([way.send(row) for row in [*QUIET.z[:500], *np.full((11, 2), np.nan)]])

@@ -174,7 +174,8 @@ class CommandStream:
     """The commands beside a stream of residual measurements, for their pseudo-open-loop z = y - m.
 
     One command follows from every measurement. The newest that is there when a measurement comes is that of the one before, in
-    most of the first `FIRST` frames; from then on the counters alone say to which a command belongs.
+    most of the first `FIRST` frames; from then on the counters alone say to which a command belongs. Where the newest is older
+    than that for `FIRST` frames, commands have been left out, and the counters go on from there.
 
     Parameters
     ----------
@@ -214,9 +215,10 @@ class CommandStream:
                 self.restart()
             self._count = frame[0]
             self._rows[self._count] = frame[1][self._elements] * self._scale
-            self._offsets.append(count - 1 - self._count)
-            if self._offset is None and len(self._offsets) == FIRST:
-                self._offset = int(np.median(self._offsets))
+            self._offsets = [*self._offsets, count - 1 - self._count][-FIRST:]
+            if len(self._offsets) == FIRST:
+                first = int(np.median(self._offsets)) if self._offset is None else self._offset
+                self._offset = max(first, min(self._offsets))
         if self._offset is None:
             return np.full_like(y, np.nan)
         at = count - self._offset
