@@ -11,6 +11,8 @@ import wfsobs
 from wfsobs.closed_loop.design import design as design_laws
 from wfsobs.closed_loop.rows import residual_rms
 from wfsobs.closed_loop.run import closed_loop
+from wfsobs.live.beside import Beside
+from wfsobs.live.checks import make_design
 from wfsobs.live.control_crew import SEATS, ControlCrew, ControlView, row_width
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.ring import LiveFrame
@@ -38,7 +40,7 @@ def crew_of(scenario, names, said=None):
     record = wfsobs.simulate(scenario)
     crew = ControlCrew(record.sampling, round(scenario.run.warm_up / record.dt), (said or queue.Queue()).put)
     for name in names:
-        crew.follow({"id": name, "design": wfsobs.design(name, scenario)}, 0)
+        crew.follow({"id": name, "design": Beside(wfsobs.design(name, scenario))}, 0)
     return crew, record
 
 
@@ -109,8 +111,8 @@ def test_controllers_come_and_go_and_take_over():
     crew, record = crew_of(scenario, ("lqg-kf-multi",), said)
     frames = list(frames_of(record))
     rows = [crew.take(frames[k], k).copy() for k in range(503)]
-    crew.follow({"id": "integrator", "design": wfsobs.design("integrator", scenario)}, 503)
-    crew.follow({"id": "lqg-kf-multi", "design": wfsobs.design("lqg-kf-multi", scenario)}, 503)
+    crew.follow({"id": "integrator", "design": Beside(wfsobs.design("integrator", scenario))}, 503)
+    crew.follow({"id": "lqg-kf-multi", "design": Beside(wfsobs.design("lqg-kf-multi", scenario))}, 503)
     rows += [crew.take(frames[k], k).copy() for k in range(503, 900)]
     crew.follow({"id": "lqg-kf-multi", "design": None}, 900)
     rows += [crew.take(frames[k], k).copy() for k in range(900, 1000)]
@@ -161,3 +163,51 @@ def wait(condition, seconds=60.0):
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.02)
+
+
+WRONG = {"plant.delay_error": 2.0, "plant.gain_error": [0.5, 0.5]}
+
+
+def test_supervised_and_on_a_wrong_plant_they_are_those_of_the_closed_loop():
+    """With the alarms as events; what would diverge is switched off."""
+    scenario = paper().replace({**SMALL, "run.duration": 3.0, "control.supervised": True, **WRONG})
+    record = wfsobs.simulate(scenario)
+    names = ["integrator", "lqg-kf-multi", "lqg-multirate-multi"]
+    said = queue.Queue()
+    crew = ControlCrew(record.sampling, 500, said.put)
+    for name in names:
+        crew.follow({"id": name, "design": make_design(name, scenario.to_dict(), record.sampling)}, 0)
+    view = ControlView(0, record.dt, rows_of(crew, record))
+    events = [said.get() for _ in range(said.qsize())]
+    for outcome in closed_loop(record, design_laws(scenario, names)).outcomes:
+        told = [event for event in events if event.about == outcome.controller]
+        taken = [(event.frame * record.dt, event.detail) for event in told if event.what.startswith("integrator")]
+        assert taken == [(pytest.approx(time), f": {reason}") for time, reason in outcome.alarms or ()]
+        if outcome.residual is not None:
+            np.testing.assert_allclose(view.residual(outcome.controller), outcome.residual, rtol=0, atol=1e-9)
+    assert {event.about for event in events if event.kind == "ALARM"} >= set(names[1:])
+
+
+def test_what_diverges_is_switched_off_and_a_supervised_one_is_not():
+    scenario = paper().replace({**SMALL, **WRONG})
+    record, said = wfsobs.simulate(scenario), queue.Queue()
+    crew = ControlCrew(record.sampling, 500, said.put)
+    crew.follow({"id": "lqg-kf-lgs", "design": make_design("lqg-kf-lgs", scenario.to_dict(), record.sampling)}, 0)
+    rows = rows_of(crew, record)
+    words = [event.line for event in (said.get() for _ in range(said.qsize()))]
+    assert words == ["lqg-kf-lgs on", "lqg-kf-lgs off", "ALARM lqg-kf-lgs diverges"] and crew.is_idle
+    assert np.isnan(ControlView(0, record.dt, rows[-1:]).residual("lqg-kf-lgs")).all()
+
+
+def test_a_new_design_goes_on_with_the_mirror_where_it_is():
+    scenario = paper().replace({**SMALL, "run.duration": 2.5, "control.supervised": True, "plant.resonance": 400.0})
+    record = wfsobs.simulate(scenario)
+    rows = []
+    for swaps in ((), (1200,)):
+        crew = ControlCrew(record.sampling, 500, queue.Queue().put)
+        for k, frame in enumerate(frames_of(record)):
+            if k in (0, *swaps):
+                crew.follow({"id": "lqg-kf-lgs", "design": make_design("lqg-kf-lgs", scenario.to_dict(), record.sampling)}, k)
+            rows.append(crew.take(frame, k).copy())
+    alone, swapped = (ControlView(0, record.dt, np.array(part)).residual("lqg-kf-lgs") for part in np.array_split(rows, 2))
+    np.testing.assert_allclose(swapped, alone, rtol=0, atol=1e-12)

@@ -240,6 +240,12 @@ class SupervisedController(StateArrays):
         near = np.clip(u, self._command - self.mirror.slew, self._command + self.mirror.slew)
         return np.clip(near, -self.mirror.stroke, self.mirror.stroke)
 
+    def take_over(self, old: SupervisedController) -> None:
+        """Go on where another design of the same controller is supervised. Raises StepError."""
+        self.controller.take_over(old.controller)
+        self.load(old.save())
+        self.alarms = old.alarms
+
     def reset(self) -> None:
         """Go back to before the first frame, the mirror at rest."""
         super().reset()

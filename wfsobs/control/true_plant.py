@@ -135,6 +135,13 @@ class ActingPlant:
         self._mean = (self._turn - 1.0) / plant.pole if plant.resonance else 0j
         self._on_time = plant.step_means()
 
+    def go_on(self, old: ActingPlant) -> None:
+        """Go on from where another mirror is; where its delay is another, from where that will come to rest."""
+        self.position = old.position
+        self.ahead[:] = old.position
+        if old.ahead.shape == self.ahead.shape:
+            self.ahead[:], self.swing = old.ahead, old.swing
+
     def take(self, v: Array, late: float = 0.0, is_lost: bool = False) -> Array:
         """Take a command (n_modes, ...) [um] and return phi_corr of its frame, the same shape."""
         p = self.plant

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
+
+import numpy as np
 
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.step import StepController
+from wfsobs.live.beside import Beside
 from wfsobs.live.board import ADAPTIVE, LONG_STEPS, SLOTS
 from wfsobs.live.control_crew import SEATS
 from wfsobs.live.source import STREAM, LiveSource
@@ -13,6 +17,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, Observer
 from wfsobs.observers.step import StepObserver
 from wfsobs.prior import Training
+from wfsobs.priors_from.controllers import full_plant_of, supervision_of, true_plant_of
 from wfsobs.priors_from.scenario import observer_settings
 from wfsobs.priors_from.selection import has_prior
 from wfsobs.record import Sampling
@@ -24,9 +29,16 @@ SLOWEST, FASTEST = 0.1, 20.0
 """Limits of the speed."""
 
 
-def make_design(name: str, settings: dict[str, Any], sampling: Sampling) -> StepObserver | StepController:
+def make_design(name: str, settings: dict[str, Any], sampling: Sampling) -> StepObserver | Beside:
     """Design an observer or a controller for a scenario; in another process. Raises ValueError."""
-    return design(name, Scenario.from_dict(settings), sampling=sampling)
+    scenario = Scenario.from_dict(settings)
+    made = design(name, scenario, sampling=sampling)
+    if not isinstance(made, StepController):
+        return made
+    supervision, n = supervision_of(CONTROLLERS[name], scenario), sampling.n_modes
+    plant = full_plant_of(scenario) if supervision else true_plant_of(scenario)
+    of_modes = None if plant is None else replace(plant, matrix=plant.matrix[:n, :n])
+    return Beside(made, of_modes, supervision, np.random.default_rng(scenario.run.seed))
 
 
 def check_slot(name: str) -> None:

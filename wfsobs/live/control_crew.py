@@ -11,9 +11,9 @@ from time import sleep
 import numpy as np
 
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.control.step import StepController
+from wfsobs.live.beside import Beside
 from wfsobs.live.crew import ROOM, Crew, Site, warm_up_of
-from wfsobs.live.paced import LiveEvent, enter_process
+from wfsobs.live.paced import ALARM, LiveEvent, enter_process
 from wfsobs.live.ring import CAPACITY, LiveFrame, Ring
 from wfsobs.live.rows import Rows
 from wfsobs.live.view import rms_of_known
@@ -44,7 +44,7 @@ def seat_width(n_modes: int) -> int:
     return 2 * n_modes + 1
 
 
-class ControlCrew(Crew[StepController, StepController]):
+class ControlCrew(Crew[Beside, Beside]):
     """The controllers of one process."""
 
     def __init__(self, sampling: Sampling, warm_up: int, say: Callable[[LiveEvent], None]):
@@ -53,6 +53,7 @@ class ControlCrew(Crew[StepController, StepController]):
         self._row = np.full(row_width(m), np.nan)
         seats = self._row[1:].reshape(len(SEATS), seat_width(m))
         self._left, self._squares, self._counts = seats[:, :m], seats[:, m:-1], seats[:, -1]  # views of the row
+        self._reasons: dict[str, str] = {}
 
     @property
     def is_idle(self) -> bool:
@@ -65,12 +66,16 @@ class ControlCrew(Crew[StepController, StepController]):
         ngs = None if np.isnan(frame.ngs[0]) else frame.ngs
         disturbance = frame.turbulence + frame.vibration
         self._row[0] = number
-        for name, controller in self._active.items():
-            seat = SEATS.index(name)
-            measured = frame.z + controller.correction
-            controller.update_open_loop(frame.z, ngs if controller.frame else None)
-            controller.settle()
-            left = disturbance + controller.correction
+        for name, member in list(self._active.items()):
+            seat, controller = SEATS.index(name), member.controller
+            measured = frame.z + member.correction
+            member.take(frame.z, ngs)
+            self._tell_reason(name, member, number)
+            if member.has_diverged:
+                self.follow({"id": name, "design": None}, number)
+                self._say(LiveEvent(number, "{} diverges", name, kind=ALARM))
+                continue
+            left = disturbance + member.correction
             # without truth, what its sensor would have seen
             self._left[seat] = left = np.where(np.isnan(left), measured, left)
             if controller.frame > self._warm_up and not np.isnan(left).any():
@@ -80,19 +85,29 @@ class ControlCrew(Crew[StepController, StepController]):
 
     def reset(self) -> None:
         """Start anew: frames were overwritten."""
-        for controller in self._active.values():
-            controller.reset()
+        for member in self._active.values():
+            member.reset()
 
-    def start(self, name: str, design: StepController, number: int) -> None:
+    def _tell_reason(self, name: str, member: Beside, number: int) -> None:
+        """Tell when an integrator takes over, and when the controller has its loop back."""
+        before, now = self._reasons.get(name, member.reason), member.reason
+        self._reasons[name] = now
+        if now not in ("", "start", before):
+            self._say(LiveEvent(number, "integrator in place of {}", name, f": {now}", kind=ALARM))
+        elif before and not now:
+            self._say(LiveEvent(number, "{} has its loop", name))
+
+    def start(self, name: str, design: Beside, number: int) -> None:
         """Let a controller run from a frame on."""
         self._fill(name, 0.0)
         self._active[name] = design
 
-    def _swap(self, name: str, member: StepController, design: StepController) -> None:
+    def _swap(self, name: str, member: Beside, design: Beside) -> None:
         design.take_over(member)
         self._active[name] = design
 
-    def _clear(self, name: str, member: StepController) -> None:
+    def _clear(self, name: str, member: Beside) -> None:
+        self._reasons.pop(name, None)
         self._fill(name, np.nan)
 
     def _fill(self, name: str, value: float) -> None:

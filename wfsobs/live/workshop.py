@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from wfsobs.control.step import StepController
+from wfsobs.live.beside import Beside
 from wfsobs.live.checks import check_slot, make_design
 from wfsobs.live.finding import Bounds, Finding, bounds_of, identify_frames
 from wfsobs.live.peaks import Change
@@ -101,8 +101,8 @@ class Workshop:
         self._findings = [*self._findings[-1:], finding]
         self.change = Change(self._findings)
 
-    def _deliver(self, design: StepObserver | StepController) -> None:
-        if isinstance(design, StepController):
+    def _deliver(self, design: StepObserver | Beside) -> None:
+        if isinstance(design, Beside):
             self._processes.tell_controllers({"id": design.id, "design": design})
         else:
             self._processes.tell_observers({"id": design.id, "design": design})
