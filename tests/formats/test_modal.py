@@ -100,6 +100,8 @@ def test_a_matrix_that_does_not_fit_is_one_line(file: Path, matrix: object, what
 
 
 def test_slopes_without_a_matrix_are_told_of_it(file: Path) -> None:
+    with pytest.raises(RecordError, match="commands of actuators need --command-modes"):
+        wfsobs.load(file, columns=COLUMNS, reconstructor=f"{file}:R")
     with pytest.raises(RecordError, match="slopes need a --reconstructor"):
         wfsobs.load(file, columns=COLUMNS)
 

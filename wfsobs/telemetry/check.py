@@ -23,6 +23,7 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError, hold_last
 from wfsobs.scenario.groups.sensors import Sensors
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
+from wfsobs.signal.gate import BLOCK
 from wfsobs.telemetry.preview import Reading
 from wfsobs.telemetry.records import PLAUSIBLE, z_rms
 from wfsobs.typing import Array
@@ -279,7 +280,8 @@ def _is_off(n: PlantNumber, right: float, least: float) -> bool:
 
 def _stationarity(record: Record) -> Iterator[Remark]:
     names = [mode.name for mode in modes_up_to(HIGHEST_ORDER)]
-    z = hold_last(record.without_outliers.z[record.delay :])
+    begin = record.delay + (BLOCK if record.gate else 0)  # the first ones all pass a gate
+    z = hold_last(record.without_outliers.z[begin:])
     length = len(z) // SECTIONS
     if length < 8 * FEWEST_BINS:
         yield Remark("stationarity", "undecided", f"{record.n_steps} frames are too few to compare {SECTIONS} sections")
@@ -287,7 +289,7 @@ def _stationarity(record: Record) -> Iterator[Remark]:
     columns = [(name, column) for name, column in zip(names, z.T, strict=False) if np.ptp(column) > 0.0]
     changes = [(name, *change) for name, column in columns for change in find_changes(column, record.dt)]
     for name, low, high, section, ratio in changes:
-        start, end = section * length * record.dt, (section + 1) * length * record.dt
+        start, end = ((begin + part * length) * record.dt for part in (section, section + 1))
         where = f"{name}, {low:.3g} to {high:.3g} Hz: from {start:.3g} to {end:.3g} s {ratio:.2g} times the power of the rest"
         yield Remark("stationarity", "note", where)
     if not changes:

@@ -231,7 +231,8 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
         rows = signals["training_y"].shape[0] if name in TRAINING and "training_y" in signals else n
         rows = signals[name].shape[0] if name == NGS else rows  # may have one row per frame
         if signals[name].shape != (rows, n_modes):
-            raise RecordError(f"{name} has shape {signals[name].shape}; expected ({rows}, {n_modes})")
+            actuators = "; commands of actuators need --command-modes" * (name == "u" and signals[name].shape[1] > n_modes)
+            raise RecordError(f"{name} has shape {signals[name].shape}; expected ({rows}, {n_modes}){actuators}")
     if APART in arrays:
         signals[APART] = _stars_apart(arrays[APART], n, n_modes)
     delay = _number_of("delay", arrays, declaration.command_delay, DELAY, declaration.trust)
