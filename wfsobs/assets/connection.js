@@ -46,33 +46,6 @@ function socketOf(act) {
   return socket
 }
 
-// What is missing of the message that comes by a socket. Bokeh has one reader for all sockets, one after the other: it would take
-// what comes by the next for the rest of a message that was cut off.
-class Reading {
-  constructor(socket, heard) {
-    this.socket = socket
-    this.missing = []
-    socket.addEventListener("message", ({data}) => {
-      heard()
-      if (typeof data === "string" && data.startsWith('{"msgid"')) {
-        const {num_buffers = 0} = JSON.parse(data)
-        this.missing = ["{}", '{"events": []}', ...Array(num_buffers).fill(["{}", new ArrayBuffer(0)]).flat()]
-      } else {
-        this.missing.shift()
-      }
-    })
-  }
-
-  // Give the reader the rest: the document is asked for anew, so that it does not matter what is made of it.
-  finish() {
-    for (const data of this.missing.splice(0)) {
-      try {
-        this.socket.onmessage(new MessageEvent("message", {data}))
-      } catch { /* half a message */ }
-    }
-  }
-}
-
 // A server may send a change before its greeting; Bokeh then refuses the socket with a code that browsers do not take.
 function refuse(event) {
   if (!event.data.includes('"ACK"')) event.target.close()
@@ -92,8 +65,7 @@ function areSettingsDrawn() {
 
 class Link {
   constructor(doc) {
-    Object.assign(this, {doc, state: "connected", asked: 0, unsent: [], kept: new Set(), away: false, reading: null, connection: null, refused: 0, wait: 0, ticks: 0})
-    doc.replace_with_json = (json) => this.replace(json)
+    Object.assign(this, {doc, state: "connected", asked: 0, unsent: [], kept: new Set(), socket: null, connection: null, refused: 0, wait: 0, ticks: 0})
     doc.on_change((event) => this.changed(event))
     doc.on_event("connection_lost", (_, event) => this.lost(event.connection.deref()))
     window.addEventListener("offline", () => {
@@ -111,8 +83,6 @@ class Link {
     Object.assign(this, {model, draw, session: model.session, arrived: model.last_arrival})
     model.on("last_arrival", () => this.answered(model.last_arrival))
     if (!again) this.restore()
-    this.connection = null
-    this.wait = this.refused = 0
     this.due = true
     this.deliver()
     this.turn("connected")
@@ -127,19 +97,21 @@ class Link {
   // ---------------------------------------------------------------- questions and answers
 
   ask() {
-    if (this.connection || !this.ready) return
+    if (!this.model || !this.ready) return
     if (this.asked === this.model.last_arrival) this.ticks = 0
     this.asked += 1
     this.watch(socketOf(() => this.model.send_msg({ask: this.asked})))
   }
 
   watch(socket) {
-    if (socket && socket !== this.reading?.socket) this.reading = new Reading(socket, () => { this.ticks = 0 }) // whatever comes is a sign of life
+    if (!socket || socket === this.socket) return
+    this.socket = socket
+    socket.addEventListener("message", () => { this.ticks = 0 }) // whatever comes is a sign of life
   }
 
   // The connection stands, as far as one knows.
   tick() {
-    if (this.connection || document.hidden) return
+    if (!this.model || document.hidden) return
     this.deliver()
     this.ticks += 1
     const waiting = this.asked > this.model.last_arrival
@@ -155,63 +127,39 @@ class Link {
     if (["offline", "silent"].includes(this.state)) this.turn("connected")
   }
 
-  // Where the server is there but this way to it is not.
+  // Where the server is there but this way to it is not. One that was busy answers both now: its answer by the socket comes first.
   async another() {
-    const {asked, reading} = this
-    if (await reachable() && this.model.last_arrival < asked && reading === this.reading) reading?.socket.close()
+    const {socket} = this
+    if (!await reachable()) return
+    const {ticks} = this
+    setTimeout(() => { if (this.ticks >= ticks && socket === this.socket) socket?.close() }, TIMEOUT)
   }
 
   // ---------------------------------------------------------------- lost, and found again
 
+  // A lost connection is not used again: its reader may be in the middle of a message.
   lost(connection) {
-    if (this.connection) return
     this.connection = connection
-    this.away = true
-    const link = this
-    // A socket that is not open yet throws, and nobody else hears of the change then; one that is open takes it before what was kept.
-    if (!Object.hasOwn(connection, "send")) {
-      const {send, send_with_reply: ask} = connection
-      connection.send_with_reply = async function (message) {
-        const reply = await ask.call(this, message)
-        link.buffers = reply.buffers
-        return reply
-      }
-      connection.send = function (message) {
-        if (!link.away || message.msgtype() !== "PATCH-DOC") send.call(this, message)
-      }
-    }
+    this.model = null
+    connection.close()
     this.turn(navigator.onLine ? "lost" : "offline")
     this.retry()
   }
 
-  // The document as the server has it: Bokeh 3.9 would leave out the buffers that came with it, which hold its arrays.
-  replace(json) {
-    if (!JSON.stringify(json).includes(this.session)) {
-      this.end()
-      throw new Error("another session")  // so that Bokeh does not take it for connected
-    }
-    const {doc} = this
-    focused()?.blur()  // what is being typed counts as typed: its box is about to be drawn anew
-    doc.constructor.from_json(json, [], this.buffers).destructively_move(doc)
-    doc.create_json_patch([]) // no model is new to the server
-    this.away = false
-    this.kept = new Set(this.unsent) // what comes now is sent as ever
-  }
-
   async retry() {
     clearTimeout(this.retrying)
-    if (this.trying) return
+    if (this.trying || this.state === "gone") return
     this.trying = true
-    this.reading?.finish()
+    const {constructor: Connection, url, token, args_string} = this.connection
+    this.connection = new Connection(url, token, args_string)
     try {
       const connected = this.connection.connect(), {socket} = this.connection
       socket?.addEventListener("message", refuse, {once: true})
       this.watch(socket)
-      await connected
+      this.take(await connected)
     } catch {
-      if (this.state === "gone") return
       this.refused = await reachable() ? this.refused + 1 : 0
-      if (this.refused > REFUSALS) return this.end()
+      if (this.refused > REFUSALS) return this.turn("gone")
       this.turn(navigator.onLine ? "lost" : "offline")
       this.wait = Math.min(2 * this.wait + 500, LONGEST)
       this.retrying = setTimeout(() => this.retry(), this.wait)
@@ -220,9 +168,20 @@ class Link {
     }
   }
 
-  end() {
-    this.turn("gone")
-    this.connection.close()
+  // The document as the server has it, in place of the one that is shown.
+  take(session) {
+    const {doc, connection} = this, {document: pulled} = session
+    if (![...pulled.all_models].some((it) => it.session === this.session)) {
+      session.close()
+      return this.turn("gone")
+    }
+    focused()?.blur()  // what is being typed counts as typed: its box is about to be drawn anew
+    pulled.destructively_move(doc)
+    doc.create_json_patch([]) // no model is new to the server
+    connection.session = new session.constructor(connection, doc)
+    this.kept = new Set(this.unsent) // what comes now is sent as ever
+    this.wait = this.refused = this.ticks = 0
+    this.connection = this.model = null // until it is drawn
   }
 
   async again() {
