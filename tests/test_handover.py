@@ -37,7 +37,8 @@ def make(path: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "controller", ["integrator", "lqg-kf-lgs", "lqg-kf-multi", "lqg-multirate", "lqg-multirate-optimal", "lqg-multirate-multi"]
+    "controller",
+    ["integrator", "lqg-kf-lgs", "lqg-kf-multi", "h2-fir", "lqg-multirate", "lqg-multirate-optimal", "lqg-multirate-multi"],
 )
 def test_c99_is_the_run_over_a_record_and_its_test_notices_one_wrong_number(tmp_path: Path, controller: str) -> None:
     path = write(tmp_path, controller, "c99")

@@ -37,7 +37,8 @@ def test_json_is_the_rows_of_every_controller_mode_and_seed() -> None:
     for row in rows:
         assert row["stable"] is True and 0 < row["strehl"] < 1
         assert row["residual_rms_mas"] == pytest.approx(row["residual_rms_nm"] * 0.103133, rel=1e-4)  # 10.3133 mas in 100 nm
-        assert (row["phase_margin_deg"] is not None) == (row["controller"] in ("integrator", "lqg-kf-lgs", "lqg-kf-multi"))
+        has_margins = row["controller"] in ("integrator", "lqg-kf-lgs", "lqg-kf-multi", "h2-fir")
+        assert (row["phase_margin_deg"] is not None) == has_margins
 
 
 def test_rows_are_those_of_the_library() -> None:

@@ -23,7 +23,7 @@ def test_the_verdict_is_the_least_residual_of_each_kind_of_prior_knowledge_and_t
         ]
         peaks = found.best_with("peaks")
         assert peaks is not None and peaks.observer == min(("lqg-kf-multi", "lqg-multirate-multi"), key=lambda name: ran[name])
-        assert found.best_with("spectra").observer == "integrator"  # type: ignore[union-attr]
+        assert found.best_with("spectra").observer == "h2-fir"  # type: ignore[union-attr]
         nothing = found.best_with("nothing")
         assert nothing is not None and nothing.observer == min(
             ("lqg-kf-adaptive", "lqg-multirate-adaptive"), key=lambda n: ran[n]

@@ -6,6 +6,7 @@ from typing import Any
 
 from wfsobs import registry
 from wfsobs.control.base import Controller
+from wfsobs.control.h2 import h2_fir
 from wfsobs.control.integrator import best_gain, integrator_law
 from wfsobs.control.law import Law
 from wfsobs.control.lqg import (
@@ -134,6 +135,17 @@ CONTROLLERS = Registry(
             tunable=Tunable(_CAUTION, ("multipeak.line_width", "kalman.lgs_noise", "kalman.turbulence_rms")),
             counts=_nothing_more,
             look=Look("LQG multi-peak", "#AE7D40", "#BA6A26", (14, 3)),
+        ),
+        Controller(
+            "h2-fir",
+            "H2, robust",
+            h2_fir,
+            help="64 taps of least residual that bear half a frame, 20 % and 10 degrees",
+            prior=(Spectra,),
+            settings=("control",),
+            counts=_nothing_more,
+            tunable=Tunable(_CAUTION),
+            look=Look("H2, robust", "#A3004F", "#FF7AB0", (5, 2, 1, 2)),
         ),
         Controller(
             "lqg-multirate",
