@@ -151,9 +151,10 @@ class Link {
     if (this.trying || this.state === "gone") return
     this.trying = true
     const {constructor: Connection, url, token, args_string} = this.connection
-    this.connection = new Connection(url, token, args_string)
+    const fresh = this.connection = new Connection(url, token, args_string), {send} = fresh
+    fresh.send = (message) => { if (message.msgtype() !== "PATCH-DOC") send.call(fresh, message) } // the server has all that it sends
     try {
-      const connected = this.connection.connect(), {socket} = this.connection
+      const connected = fresh.connect(), {socket} = fresh
       socket?.addEventListener("message", refuse, {once: true})
       this.watch(socket)
       this.take(await connected)
@@ -178,6 +179,7 @@ class Link {
     focused()?.blur()  // what is being typed counts as typed: its box is about to be drawn anew
     pulled.destructively_move(doc)
     doc.create_json_patch([]) // no model is new to the server
+    delete connection.send
     connection.session = new session.constructor(connection, doc)
     this.kept = new Set(this.unsent) // what comes now is sent as ever
     this.wait = this.refused = this.ticks = 0
