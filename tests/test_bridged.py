@@ -17,7 +17,7 @@ from wfsobs.observers.missing import fill_missing
 from wfsobs.priors_from.scenario import prior_and_settings
 from wfsobs.record import Record, delay_signal, hold_last
 from wfsobs.simulation.loop import simulate
-from wfsobs.telemetry.intake import LONGEST, WINDOW, find_bridged, without_bridged
+from wfsobs.telemetry.bridged import LONGEST, WINDOW, find_bridged, without_bridged
 from wfsobs.telemetry.records import load, save_record
 from wfsobs.typing import Array
 
