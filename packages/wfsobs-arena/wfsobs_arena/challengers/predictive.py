@@ -13,26 +13,21 @@ is told nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from wfsobs.control.base import Controller, Settings
-from wfsobs.control.law import Law
 from wfsobs.control.mirror import Mirror, Plant
-from wfsobs.control.step import StepController
 from wfsobs.control.step_laws import StepLaw, push_row
-from wfsobs.observers.missing import bridges, fill_missing
 from wfsobs.observers.step import StepError
 from wfsobs.observers.stepping import Saved
 from wfsobs.prior import Prior
-from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Measurements, Sampling
+from wfsobs.record import Sampling
 from wfsobs.typing import Array
 from wfsobs_arena.challengers.base import Challenger
-from wfsobs_arena.challengers.rls import BLOCK, MEMORY, ORDER, Rls
+from wfsobs_arena.challengers.rls import MEMORY, ORDER, Rls
 
 PENALTY = 1e-6
 """Of the squares of the weights at the start [um^2]."""
@@ -60,14 +55,17 @@ class PredictiveLaw:
         """Take no notice: it learns from the mean as it is."""
 
     def command(self, z: Array, ngs: Array | None, forward: Array) -> Array:
-        """Learn from the newest z (n_modes,), and return the command (n_modes,) [um]."""
+        """Learn from the newest z (n_modes,), the one before where it is missing, and return the command (n_modes,) [um]."""
         lag = len(self._taps)
-        push_row(self._recent, z)
+        push_row(self._recent, np.where(np.isnan(z), self._recent[0], z))
         self.fit.learn(self._recent[lag:].ravel(), self._taps[::-1] @ self._recent[:lag])
         return forward - self._recent[:ORDER].ravel() @ self.fit.W
 
     def tell(self, command: Array, forward: Array) -> None:
         """Take no notice: z holds none of the commands."""
+
+    def amend(self, difference: Array) -> None:
+        """Take no notice, as of what is told."""
 
     def take_over(self, old: Any) -> None:
         """Go on from what another law has learnt."""
@@ -88,52 +86,13 @@ class PredictiveLaw:
         self.fit.P[...], self.fit.W[...], self._recent[...] = state["P"], state["W"], state["recent"]
 
 
-MakeStepLaw = Callable[[Plant, int], StepLaw]
-"""(plant, number of modes) -> law of all modes, before its first frame."""
-
-
-def predictive_law(plant: Plant, n_modes: int) -> StepLaw:
+def predictive_law(_prior: Prior, plant: Plant, _settings: Settings, sampling: Sampling) -> StepLaw:
     """Return the law before its first frame."""
-    return PredictiveLaw(plant.mirror, plant.dt, n_modes)
-
-
-@dataclass(frozen=True, kw_only=True)
-class LearningController(Controller):
-    """A controller whose law is learnt while it runs, from the LGS alone.
-
-    Attributes
-    ----------
-    step_law : callable
-        Makes the law.
-    """
-
-    step_law: MakeStepLaw
-
-    def laws(self, prior: Prior, plant: Plant, settings: Settings, n_modes: int) -> tuple[Law, ...]:
-        """Return none: there is no linear law before there are measurements."""
-        return ()
-
-    def design(self, prior: Prior, plant: Plant, settings: Settings, sampling: Sampling) -> StepController:
-        """Return the controller one frame at a time, see `Controller.design`."""
-        beside = bridges(prior, sampling.n_modes, sampling.dt, sampling.ratio)
-        return StepController(self.id, plant, sampling, self.step_law(plant, sampling.n_modes), None, False, beside)
-
-    def commands(
-        self, laws: Any, measurements: Measurements, prior: Prior, plant: Plant, settings: Settings, watch: Watch = QUIET
-    ) -> tuple[Array, Array]:
-        """Return the commands and whether a limit changed them, see `Controller.commands`."""
-        z = fill_missing(measurements, prior).z
-        law, wanted, none = self.step_law(plant, z.shape[1]), np.empty_like(z), np.zeros(z.shape[1])
-        for k, now in enumerate(z):
-            if k % BLOCK == 0:
-                watch.step(k / len(z))
-            wanted[k] = law.command(now, None, none)
-        taken = np.column_stack([plant.mirror.follow(u) for u in wanted.T])
-        return taken, taken != wanted
+    return PredictiveLaw(plant.mirror, plant.dt, sampling.n_modes)
 
 
 PREDICTIVE_RLS = Challenger(
-    LearningController(
+    Controller(
         "predictive-rls",
         "Predictive control, least squares",
         help="minus what recursive least squares on 20 measurements of all modes predicts",
