@@ -11,7 +11,7 @@ from wfsobs.evaluation.scores import BOUND_BOTH
 
 @pytest.mark.slow
 def test_the_verdict_is_the_least_residual_of_each_kind_of_prior_knowledge_and_the_limit() -> None:
-    result = close_loop(PRESETS["paper"]().replace({"run.duration": 3.0}))
+    result = close_loop(PRESETS["paper"]().replace({"run.duration": 3.0, "adaptive.window": 0.8}))
     for mode in ("tip", "tilt"):
         table = {r["controller"]: r["residual_rms_nm"] for r in rows(result, 1) if r["mode"] == mode}
         found = loop_verdict(result, mode)
@@ -34,3 +34,16 @@ def test_the_verdict_is_the_least_residual_of_each_kind_of_prior_knowledge_and_t
         assert lead.startswith(f"Residual, {mode}. ") and "the theoretical limit using LGS and NGS" in lead
         for label in ("Integrator", "LQG, LGS KF"):
             assert label in " ".join([lead, *others])
+
+
+def test_a_controller_that_learns_is_ranked_where_its_own_laws_close_the_loop() -> None:
+    scenario = PRESETS["paper"]().replace({"run.duration": 2.0, "run.warm_up": 0.5, "adaptive.window": 1.0})
+    names = ["integrator", "lqg-kf-adaptive"]
+    for warm_up, ranked, said in ((0.5, {"integrator"}, "until its first window is full, at 1.00 s"), (1.2, set(names), "")):
+        result = close_loop(scenario.replace({"run.warm_up": warm_up}), controllers=names)
+        found = loop_verdict(result, "tip")
+        assert found is not None and {place.observer for place in found.places} == ranked
+        notes = {r["note"] for r in rows(result, 1) if r["controller"] == "lqg-kf-adaptive"}
+        assert len(notes) == 1 and said in notes.pop()
+    (outcome,) = close_loop(scenario.replace({"run.duration": 0.9}), controllers=names[1:]).outcomes
+    assert outcome.residual is None and outcome.note.startswith("the record has 900 steps, its first window is full after 100")

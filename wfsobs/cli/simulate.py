@@ -35,7 +35,7 @@ from wfsobs.cli.show import (
 )
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.envelope import POINTS, PlantEnvelope, Uncertainty, plant_envelope
-from wfsobs.closed_loop.rows import label, linear, no_theory
+from wfsobs.closed_loop.rows import LIMITED, label, linear, no_theory
 from wfsobs.closed_loop.rows import rows as loop_rows
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.evaluation.evidence import FEWEST, gather_evidence, seeds_interval
@@ -236,7 +236,7 @@ def loop(
         click.echo(json.dumps(all_rows, allow_nan=False))
     else:
         show_table(loop_table(all_rows))
-        for line in dict.fromkeys(f"{label(r['controller'])}: {r['note']}" for r in all_rows if r["alarms"]):
+        for line in dict.fromkeys(f"{label(r['controller'])}: {r['note']}" for r in all_rows if r["note"] not in ("", LIMITED)):
             click.echo(line)
     if with_envelope:
         with progress_bar("envelope") as update:

@@ -34,6 +34,9 @@ LIMITED = "theory and margins are not applicable: a limit of the mirror acts, an
 SUPERVISED = "no theory and no margins under supervision: an integrator may take over"
 """Why the others have none."""
 
+LEARNT = "an integrator closes its loop until its first window is full, at {:.2f} s; residuals count from {:.2f} s: not ranked"
+"""What the residual of a controller that learns is of."""
+
 NOT_APPLICABLE = "n/a"
 
 
@@ -46,6 +49,7 @@ class Outcome:
     limited_share : share of the steps after the warm-up in which a limit changed a command, per mode
     note          : why there is no residual
     alarms        : (time [s], reason) of every time that the integrator took over; None without supervision
+    own_from      : time from which its own laws close the loop, an integrator before [s]
     """
 
     controller: str
@@ -55,6 +59,7 @@ class Outcome:
     limited_share: tuple[float, ...] = ()
     note: str = ""
     alarms: tuple[tuple[float, str], ...] | None = None
+    own_from: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -147,7 +152,10 @@ def rows(result: ClosedLoop, seed: int | None, *, source: PriorSource = TRUE) ->
                     disk_margin=m.disk if m else None,
                     limited=limited,
                     alarms=outcome.alarms,
-                    note=outcome.note or took_over(outcome.alarms or ()) or (LIMITED if limited else ""),
+                    note=outcome.note
+                    or took_over(outcome.alarms or ())
+                    or (LIMITED if limited else "")
+                    or (LEARNT.format(outcome.own_from, warm_up) if outcome.own_from > warm_up else ""),
                 )
             )
     (spectra,) = words_for((Spectra,), source=source)
@@ -159,12 +167,15 @@ def rows(result: ClosedLoop, seed: int | None, *, source: PriorSource = TRUE) ->
 def loop_verdict(result: ClosedLoop, mode: str) -> Verdict | None:
     """Return the verdict on the controllers by their residuals in one mode, with the limit; None where none ran.
 
-    The intervals and which residuals do not differ significantly from the least are by the scatter within the record.
+    The intervals and which residuals do not differ significantly from the least are by the scatter within the record. One
+    whose own laws close the loop for a part of that time alone is left out.
     """
     column = [m.name for m in result.scenario.modes].index(mode)
     first = round(result.design.start / result.record.dt)
     left = {
-        o.controller: o.residual[first:, column] for o in result.outcomes if o.residual is not None and o.controller != "none"
+        o.controller: o.residual[first:, column]
+        for o in result.outcomes
+        if o.residual is not None and o.controller != "none" and o.own_from <= result.design.start
     }
     if not left:
         return None

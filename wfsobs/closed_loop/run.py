@@ -133,6 +133,10 @@ def _outcome(
     laws, settings = [d.law for d in designs if d.law is not None], own_settings(controller, plan.scenario)
     try:
         measured, prior = controller_arguments(controller, record, settings, plan.priors[controller.id])
+        sampling = measured.sampling if controller.ngs else measured.sampling._replace(ratio=None)
+        learns = controller.learns(settings, sampling) if controller.learns else 0
+        if record.n_steps <= learns:
+            raise RecordError(f"the record has {record.n_steps} steps, its first window is full after {learns}")
         with detach_watch(watch) as alone:
             supervision, alarms = supervision_of(controller, plan.scenario), None
             if plan.true is None and supervision is None:
@@ -154,7 +158,15 @@ def _outcome(
     start = round(plan.start / record.dt)
     limited = plan.mirror.at_limit(u) if limited is None else limited
     residual = disturbance + correction
-    return Outcome(controller.id, stable, residual, u, tuple(limited[start:].mean(axis=0).tolist()), alarms=alarms)
+    return Outcome(
+        controller.id,
+        stable,
+        residual,
+        u,
+        tuple(limited[start:].mean(axis=0).tolist()),
+        alarms=alarms,
+        own_from=learns * record.dt,
+    )
 
 
 def _plant_generator(scenario: Scenario) -> np.random.Generator:

@@ -82,6 +82,8 @@ class Controller:
         Settings that its laws can be tuned by on an uncertain plant.
     step_law : callable or None
         In place of `law`: laws of all modes, frame by frame, that change as they run.
+    learns : callable or None
+        (settings, sampling) -> steps before its own laws close the loop; None for one that does from the start.
 
     Raises
     ------
@@ -106,6 +108,7 @@ class Controller:
     counts: Callable[[Any], Any] | None = None
     tunable: Tunable = NOT_TUNED
     step_law: MakeStepLaw | None = None
+    learns: Callable[[Any, Sampling], int] | None = None
 
     def __post_init__(self) -> None:
         if self.predict is not None and not asks_for(Bands, self.prior):

@@ -24,6 +24,7 @@ from wfsobs.observers.base import Look, Tunable
 from wfsobs.observers.kalman.adaptive import KF_ADAPTIVE, MULTIRATE_ADAPTIVE
 from wfsobs.observers.kalman.multirate import TUNABLE, matched_noise
 from wfsobs.observers.kalman.single import MODEL
+from wfsobs.observers.kalman.window_model import window_lengths
 from wfsobs.prior import (
     Bands,
     Beams,
@@ -38,6 +39,7 @@ from wfsobs.prior import (
     Spectra,
     Training,
 )
+from wfsobs.record import Sampling
 from wfsobs.registry import Registry
 from wfsobs.settings.tree import Plain
 
@@ -80,6 +82,11 @@ def _online_used(settings: Any) -> Plain:
 def _adaptive_used(settings: Any) -> Any:
     assert MULTIRATE_ADAPTIVE.counts is not None
     return *MULTIRATE_ADAPTIVE.counts(Prior(), settings.adaptive), settings.control.fallback_gain, settings.control.leak
+
+
+def _first_window(settings: Any, sampling: Sampling) -> int:
+    lengths = window_lengths(settings.adaptive, sampling.dt, sampling.ratio, sampling.delay)
+    return lengths.first + lengths.window
 
 
 def _adaptive_seconds(settings: Any, n_steps: int, n_modes: int) -> float:
@@ -195,6 +202,7 @@ CONTROLLERS = Registry(
             weight=20.0,
             seconds=_adaptive_seconds,
             counts=_adaptive_used,
+            learns=_first_window,
             look=Look("LQG adaptive", "#522C0A", "#F4C173", (20, 2)),
         ),
         Controller(
@@ -207,6 +215,7 @@ CONTROLLERS = Registry(
             weight=20.0,
             seconds=_adaptive_seconds,
             counts=_adaptive_used,
+            learns=_first_window,
             look=Look("LQG adaptive multi-rate", "#591677", "#F3C1F7", (20, 2, 3, 2)),
         ),
         Controller(
