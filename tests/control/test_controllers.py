@@ -48,6 +48,7 @@ MATCHED = Scenario().replace(
 QUICK = {
     "run.duration": 1.5,
     "run.warm_up": 0.5,
+    "adaptive.window": 0.4,
     "gpr_offline.training_size": 60,
     "gpr_offline.depth": 20,
     "gpr_online.training_size": 40,
