@@ -17,7 +17,8 @@ from wfsobs.evaluation.scores import COMMON_BOUNDS
 from wfsobs.scenario import configfile
 from wfsobs.simulation.loop import simulate
 
-QUICK = ["--set", "run.duration=2", "--set", "gpr_online.training_size=20", "--set", "gpr_offline.training_size=50"]
+QUICK = ["--set", "run.duration=2", "--set", "adaptive.window=0.8"]
+QUICK += ["--set", "gpr_online.training_size=20", "--set", "gpr_offline.training_size=50"]
 ASKED = {"controller", "mode", "residual_rms_nm", "residual_rms_mas", "strehl", "stable", "seed"}
 
 
