@@ -11,7 +11,6 @@ import wfsobs
 from wfsobs.closed_loop.design import design as design_laws
 from wfsobs.closed_loop.rows import residual_rms
 from wfsobs.closed_loop.run import closed_loop
-from wfsobs.live.beside import Beside
 from wfsobs.live.checks import make_design
 from wfsobs.live.control_crew import SEATS, ControlCrew, ControlView, row_width
 from wfsobs.live.loop import LiveLoop
@@ -40,7 +39,7 @@ def crew_of(scenario, names, said=None):
     record = wfsobs.simulate(scenario)
     crew = ControlCrew(record.sampling, round(scenario.run.warm_up / record.dt), (said or queue.Queue()).put)
     for name in names:
-        crew.follow({"id": name, "design": Beside(wfsobs.design(name, scenario))}, 0)
+        crew.follow({"id": name, "design": make_design(name, scenario.to_dict(), record.sampling)}, 0)
     return crew, record
 
 
@@ -111,8 +110,8 @@ def test_controllers_come_and_go_and_take_over():
     crew, record = crew_of(scenario, ("lqg-kf-multi",), said)
     frames = list(frames_of(record))
     rows = [crew.take(frames[k], k).copy() for k in range(503)]
-    crew.follow({"id": "integrator", "design": Beside(wfsobs.design("integrator", scenario))}, 503)
-    crew.follow({"id": "lqg-kf-multi", "design": Beside(wfsobs.design("lqg-kf-multi", scenario))}, 503)
+    crew.follow({"id": "integrator", "design": make_design("integrator", scenario.to_dict(), record.sampling)}, 503)
+    crew.follow({"id": "lqg-kf-multi", "design": make_design("lqg-kf-multi", scenario.to_dict(), record.sampling)}, 503)
     rows += [crew.take(frames[k], k).copy() for k in range(503, 900)]
     crew.follow({"id": "lqg-kf-multi", "design": None}, 900)
     rows += [crew.take(frames[k], k).copy() for k in range(900, 1000)]
@@ -200,7 +199,9 @@ def test_what_diverges_is_switched_off_and_a_supervised_one_is_not():
 
 
 def test_a_new_design_goes_on_with_the_mirror_where_it_is():
-    scenario = paper().replace({**SMALL, "run.duration": 2.5, "control.supervised": True, "plant.resonance": 400.0})
+    scenario = paper().replace(
+        {**SMALL, "run.duration": 2.5, "control.supervised": True, "plant.resonance": 400.0, "plant.hysteresis": 0.1}
+    )
     record = wfsobs.simulate(scenario)
     rows = []
     for swaps in ((), (1200,)):

@@ -20,6 +20,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from wfsobs.control.step import StepController
+from wfsobs.control.step_laws import push_row
 from wfsobs.control.supervisor import SupervisedController
 from wfsobs.observers.step import EVERY
 from wfsobs.progress import QUIET, Watch
@@ -141,6 +142,7 @@ class ActingPlant:
         self.ahead[:] = old.position
         if old.ahead.shape == self.ahead.shape:
             self.ahead[:], self.swing = old.ahead, old.swing
+        self._plays = old._plays
 
     def take(self, v: Array, late: float = 0.0, is_lost: bool = False) -> Array:
         """Take a command (n_modes, ...) [um] and return phi_corr of its frame, the same shape."""
@@ -165,6 +167,58 @@ class ActingPlant:
         return out
 
 
+class ActingLoop:
+    """A controller and the plant that it acts on, one frame at a time, both from rest.
+
+    Parameters
+    ----------
+    controller : StepController or SupervisedController
+        Before its first frame.
+    plant : TruePlant
+        As it is.
+    ratio : int, optional
+        LGS frames in a frame of the NGS.
+    """
+
+    def __init__(self, controller: StepController | SupervisedController, plant: TruePlant, ratio: int | None = None):
+        self.controller: StepController | SupervisedController = controller
+        self.acting: ActingPlant = ActingPlant(plant)
+        self.has_diverged: bool = False
+        self._corrections = np.zeros((ratio or 1, len(plant.matrix)))  # newest first
+
+    @property
+    def correction(self) -> Array:
+        """What the mirror does in the last frame, phi_corr, (n_modes,) [um]."""
+        return self._corrections[0]
+
+    def take(
+        self,
+        z: Array,
+        ngs: Array | None,
+        *,
+        gain: float = 1.0,
+        late: float = 0.0,
+        is_lost: bool = False,
+        stars: int | None = None,
+    ) -> Array:
+        """Take the measurements of the disturbance alone, and return the command, both (n_modes,) [um].
+
+        gain : of the LGS measurement;  late, is_lost : of the command [frames];  stars : in the LGS measurement, None for all.
+        A command beyond FAR does not reach the plant.
+        """
+        slow = None if ngs is None else ngs + self._corrections.mean(axis=0)
+        u = self.controller.update(gain * (z + self.correction), slow, stars=stars)
+        self.has_diverged = not np.abs(u).max() < FAR
+        if not self.has_diverged:
+            push_row(self._corrections, self.acting.take(u, late, is_lost))
+        return u
+
+    def go_on(self, old: ActingLoop) -> None:
+        """Go on with the mirror where that of another loop is."""
+        self.acting.go_on(old.acting)
+        self._corrections[...] = old._corrections
+
+
 def drive(
     controller: StepController | SupervisedController,
     measurements: Measurements,
@@ -177,23 +231,20 @@ def drive(
     It ends where a command is beyond FAR: later rows are infinite. Raises Cancelled.
     """
     measurements = replace(measurements, u=hold_last(measurements.u))
-    z, n, acting = measurements.z, measurements.ratio, ActingPlant(plant)
+    z, n, loop = measurements.z, measurements.ratio, ActingLoop(controller, plant, measurements.ratio)
     z_ngs = None if n is None or measurements.y_ngs is None else measurements.z_ngs
     gain = plant.sensor_gain(len(z), rng)
     late, lost = plant.jitter * rng.uniform(-1.0, 1.0, len(z)), rng.uniform(size=len(z)) < plant.loss
     u, correction = np.full_like(z, inf), np.full_like(z, inf)
-    seen = np.zeros(z.shape[1])
     for k in range(len(z)):
         if k % EVERY == 0:
             watch.step(k / len(z))
-        ngs = None
-        if z_ngs is not None and n is not None and k > 0 and k % n == 0:
-            ngs = z_ngs[k] + correction[k - n : k].mean(axis=0)
+        ngs = z_ngs[k] if z_ngs is not None and n is not None and k > 0 and k % n == 0 else None
         stars = None if measurements.lgs_stars is None else int(measurements.lgs_stars[k])
-        u[k] = controller.update(gain[k] * (z[k] + seen), ngs, stars=stars)
-        if not np.abs(u[k]).max() < FAR:
+        u[k] = loop.take(z[k], ngs, gain=gain[k], late=float(late[k]), is_lost=bool(lost[k]), stars=stars)
+        if loop.has_diverged:
             break
-        correction[k] = seen = acting.take(u[k], float(late[k]), bool(lost[k]))
+        correction[k] = loop.correction
     return u, correction
 
 

@@ -17,7 +17,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, Observer
 from wfsobs.observers.step import StepObserver
 from wfsobs.prior import Training
-from wfsobs.priors_from.controllers import full_plant_of, supervision_of, true_plant_of
+from wfsobs.priors_from.controllers import full_plant_of, supervision_of
 from wfsobs.priors_from.scenario import observer_settings
 from wfsobs.priors_from.selection import has_prior
 from wfsobs.record import Sampling
@@ -35,10 +35,9 @@ def make_design(name: str, settings: dict[str, Any], sampling: Sampling) -> Step
     made = design(name, scenario, sampling=sampling)
     if not isinstance(made, StepController):
         return made
-    supervision, n = supervision_of(CONTROLLERS[name], scenario), sampling.n_modes
-    plant = full_plant_of(scenario) if supervision else true_plant_of(scenario)
-    of_modes = None if plant is None else replace(plant, matrix=plant.matrix[:n, :n])
-    return Beside(made, of_modes, supervision, np.random.default_rng(scenario.run.seed))
+    plant, n = full_plant_of(scenario), sampling.n_modes
+    of_modes = replace(plant, matrix=plant.matrix[:n, :n])
+    return Beside(made, of_modes, np.random.default_rng(scenario.run.seed), supervision_of(CONTROLLERS[name], scenario))
 
 
 def check_slot(name: str) -> None:
