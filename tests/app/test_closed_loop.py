@@ -191,7 +191,7 @@ def test_an_uncertain_plant_adds_columns_a_sentence_and_a_figure(page: ClosedLoo
     expected = plant_envelope(page.results.result.scenario, points=few)
     assert box.finding is not None and box.finding.rows() == expected.rows()
     assert "Worst [nm]" in page.table.object and box.room.visible
-    for line in expected.sentences(0, 1e3, "nm"):
+    for line in expected.sentences(1e3, "nm", 0):
         assert line.replace("+-", "±").replace(" deg", "°") in page.verdict.object
     x, _, most = expected.curves("delay", 1)["integrator"]
     dashboard.display.param.update(mode="tilt", unit="mas")

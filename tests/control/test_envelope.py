@@ -13,6 +13,7 @@ from wfsobs.cli.group import main
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.envelope import PlantEnvelope, Spread, Uncertainty, plant_envelope
 from wfsobs.settings.errors import SettingError
+from wfsobs.tuning import tuned_envelope
 
 NAMES = ["integrator", "lqg-kf-lgs", "lqg-multirate-multi"]
 RESONANT = MATCHED.replace({"plant.resonance": 100.0, "plant.damping": 0.6, "plant.gain_error": [-0.5, -0.5]})
@@ -69,6 +70,9 @@ def test_what_is_not_linear_is_left_out_and_says_so(result: PlantEnvelope) -> No
     assert list(result.notes) == ["integrator+gpr-online"]
     with pytest.raises(SettingError, match="an envelope is by theory, for a plant that is linear"):
         plant_envelope(MATCHED.replace({"plant.hysteresis": 0.1}), controllers=NAMES)
+    for of in (plant_envelope, tuned_envelope):
+        with pytest.raises(SettingError, match=r"controllers: an envelope takes integrator, .*, not none"):
+            of(MATCHED, controllers=["none"])
     with pytest.raises(SettingError, match=r"delay: 1.2 - 0.5 frames are below 1"):
         plant_envelope(MATCHED.replace({"control.delay": 1.2}), controllers=NAMES)
 
@@ -85,14 +89,16 @@ def test_shares_and_ranks_are_counted() -> None:
     assert safe.unstable_interval == pytest.approx((0.0, 1.0 - 0.025**0.25)), "none of four"
     assert np.isinf(bold.p95) and safe.p95 == 2.0
     assert both.ranking() == ["lqg-kf-lgs", "integrator"] and both.ranking(by_worst=True) == ["integrator", "lqg-kf-lgs"]
-    assert "Best at the worst plant: Integrator. LQG, LGS KF is unstable at 25 %." in both.verdict()
-    assert both.sentences(0, 1e3, "nm") == [
-        "With the plant uncertain (delay +-0.5 frames), Integrator is best at worst: 2e+03 nm, 2e+03 nm at the nominal plant.",
-        "LQG, LGS KF is best at the nominal plant: 1e+03 nm, at worst unstable.",
-        "LQG, LGS KF is unstable for 25 % of the plants.",
-    ]
+    for mode in (0, None):  # there is one mode
+        assert both.sentences(1.0, "um", mode) == [
+            "With the plant uncertain (delay +-0.5 frames), Integrator leaves least at the worst plant: 2 um, "
+            "2 um at the nominal one.",
+            "LQG, LGS KF leaves least at the nominal plant: 1 um, unstable at the worst.",
+            "LQG, LGS KF is unstable for 25 % of the plants.",
+        ]
     alone = PlantEnvelope(MATCHED, Uncertainty(), {"delay": np.zeros(4)}, {}, (bold,))
-    assert "None is stable over the whole envelope" in alone.verdict()
+    assert alone.sentences()[0].endswith("no controller is stable everywhere.")
+    assert PlantEnvelope(MATCHED, Uncertainty(), {"delay": np.zeros(4)}, {}, ()).sentences() == []
 
 
 def test_curves_are_means_and_maxima_of_their_parts() -> None:
@@ -110,7 +116,7 @@ def test_the_command_prints_table_and_rows(tmp_path) -> None:
     arguments = ["envelope", "--config", str(file), "--controller", "integrator", "--controller", "lqg-kf-lgs", "--points", "16"]
     shown = CliRunner().invoke(main, arguments)
     assert shown.exit_code == 0, shown.output
-    assert "Best at the nominal plant:" in shown.output and "rotation +-10 deg" in shown.output
+    assert "at the nominal one." in shown.output and "rotation +-10 deg" in shown.output
     rows = json.loads(CliRunner().invoke(main, [*arguments, "--json"]).output)
     assert [(r["controller"], r["mode"]) for r in rows] == [(n, m) for n in ("integrator", "lqg-kf-lgs") for m in ("tip", "tilt")]
     tuned = json.loads(CliRunner().invoke(main, [*arguments, "--json", "--tune"]).output)

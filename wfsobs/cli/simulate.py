@@ -297,4 +297,5 @@ def _show_envelope(result: PlantEnvelope) -> None:
     show_table(envelope_table(result))
     for name, reason in result.notes.items():
         click.echo(f"{label(name)}: {reason}")
-    click.echo(result.verdict())
+    for line in result.sentences():
+        click.echo(line)

@@ -142,8 +142,8 @@ def tune(
 ) -> None:
     """Search for the best settings of an observer on a record, or of a controller on uncertain plants (docs/tuning.md)."""
     goal, record = EnvelopeGoal(uncertainty, by, loss), None
-    name = controller if on_envelope else observer
-    if name is None or (controller if not on_envelope else observer) is not None:
+    name, other = (controller, observer) if on_envelope else (observer, controller)
+    if name is None or other is not None:
         raise SettingError("give --observer, or --envelope and --controller")
     if not on_envelope and goal != EnvelopeGoal():
         raise SettingError("--delay, --gain, --rotation, --resonance, --by, --loss: only with --envelope")

@@ -199,47 +199,39 @@ class PlantEnvelope:
             out[spread.controller] = 0.5 * (edges[:-1] + edges[1:]), mean, most
         return out
 
-    def sentences(self, mode: int, scale: float, unit: str) -> list[str]:
-        """Return which controller is best at worst in one mode, at what cost, and which are not stable; scale [unit per um]."""
+    def sentences(self, scale: float = 1e3, unit: str = "nm", mode: int | None = None) -> list[str]:
+        """Return which controller leaves least at the worst plant, at what cost, and which are not stable.
 
-        def text(rms: float) -> str:
-            return "unstable" if np.isinf(rms) else f"{scale * rms:.3g} {unit}"
+        scale : from [um] to the unit;  mode : column, None for all modes together. Empty without controllers.
+        """
+
+        def left(spread: Spread, at: str) -> float:
+            rms = getattr(spread, at)
+            return float(np.sqrt(np.sum(rms**2)) if mode is None else rms[mode])
+
+        def text(spread: Spread, at: str) -> str:
+            rms = left(spread, at)
+            return "unstable" if rms == inf else f"{scale * rms:.3g} {unit}"
 
         if not self.spreads:
             return []
-        first, safest = (min(self.spreads, key=lambda one: getattr(one, key)[mode]) for key in ("nominal", "worst"))
-        if np.isinf(safest.worst[mode]):
-            out = [f"With the plant uncertain ({self.ranges}) no controller is stable everywhere."]
+        first, safest = (min(self.spreads, key=lambda one: left(one, at)) for at in ("nominal", "worst"))
+        of_first, of_safest = (CONTROLLERS[one.controller].label for one in (first, safest))
+        where = f"With the plant uncertain ({self.ranges})"
+        if left(safest, "worst") == inf:
+            out = [f"{where} no controller is stable everywhere."]
         else:
-            name, worst, nominal = CONTROLLERS[safest.controller].label, text(safest.worst[mode]), text(safest.nominal[mode])
-            out = [f"With the plant uncertain ({self.ranges}), {name} is best at worst: {worst}, {nominal} at the nominal plant."]
-        if first.controller != safest.controller:
-            name = CONTROLLERS[first.controller].label
-            out.append(f"{name} is best at the nominal plant: {text(first.nominal[mode])}, at worst {text(first.worst[mode])}.")
+            worst, nominal = (text(safest, at) for at in ("worst", "nominal"))
+            out = [f"{where}, {of_safest} leaves least at the worst plant: {worst}, {nominal} at the nominal one."]
+        if first is not safest:
+            nominal, worst = (text(first, at) for at in ("nominal", "worst"))
+            out.append(f"{of_first} leaves least at the nominal plant: {nominal}, {worst} at the worst.")
         for spread in self.spreads:
-            if np.isinf(spread.worst[mode]):
-                share = (
-                    f"for {100.0 * spread.unstable / len(spread.points):.2g} % of the plants" if spread.unstable else "at corners"
-                )
-                out.append(f"{CONTROLLERS[spread.controller].label} is unstable {share}.")
+            if left(spread, "worst") == inf:
+                share = 100.0 * spread.unstable / len(spread.points)
+                at = f"for {share:.2g} % of the plants" if spread.unstable else "at corners"
+                out.append(f"{CONTROLLERS[spread.controller].label} is unstable {at}.")
         return out
-
-    def verdict(self) -> str:
-        """Return which controller is best at the nominal plant, and which at worst."""
-        by = {spread.controller: spread for spread in self.spreads}
-        first, safest = self.ranking()[0], self.ranking(by_worst=True)[0]
-        bears = [name for name in self.ranking() if np.isfinite(by[name].worst).all()]
-        label = {name: CONTROLLERS[name].label for name in by}
-        nominal = ", then ".join(label[name] for name in self.ranking()[:3])
-        if not bears:
-            return f"Best at the nominal plant: {nominal}. None is stable over the whole envelope; {label[safest]} at most of it."
-        worst = ", then ".join(label[name] for name in self.ranking(by_worst=True)[:3] if name in bears)
-        fails = (
-            ""
-            if first in bears
-            else f" {label[first]} is unstable at {100.0 * by[first].unstable / len(by[first].points):.2g} %."
-        )
-        return f"Best at the nominal plant: {nominal}. Best at the worst plant: {worst}.{fails}"
 
 
 @dataclass(frozen=True)
@@ -297,7 +289,7 @@ def plant_envelope(
     of = uncertainty or Uncertainty()
     errors, corners, plants = uncertain_plants(scenario, of, points)
     spectra = known_spectra(scenario)
-    linear = [c.id for c in select_controllers(controllers) if c.law is not None]
+    linear = with_laws(controllers)
     spreads, notes = list[Spread](), dict[str, str]()
     for i, name in enumerate(linear):
         watch.check()
@@ -309,6 +301,15 @@ def plant_envelope(
         if on_spread:
             on_spread(PlantEnvelope(scenario, of, errors, corners, tuple(spreads), dict(notes)))
     return PlantEnvelope(scenario, of, errors, corners, tuple(spreads), notes)
+
+
+def with_laws(controllers: Sequence[str] | None) -> list[str]:
+    """Return those of some controllers, by default of all, that have linear laws. Raises SettingError for none."""
+    out = [c.id for c in select_controllers(controllers) if c.law is not None]
+    if not out:
+        linear = [c.id for c in CONTROLLERS.values() if c.law is not None and c.is_quick]
+        raise SettingError(f"controllers: an envelope takes {', '.join(linear)}, not {', '.join(controllers or ())}")
+    return out
 
 
 def known_spectra(scenario: Scenario) -> list[TrueSpectra]:

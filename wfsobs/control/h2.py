@@ -28,7 +28,11 @@ from wfsobs.prior import Prior, Spectra
 from wfsobs.typing import Array
 
 TAPS = 64
+"""Length of Q."""
+
 PEAK = 2.0
+"""Largest amplification of a disturbance."""
+
 ROBUST = 0.8
 """Part of what small gain allows that a law of caution 1 takes."""
 
@@ -39,17 +43,18 @@ GRID = np.unique(np.concatenate([np.geomspace(1e-3, pi, 60), np.linspace(0.02, p
 """Frequencies of the limits [rad per step]."""
 
 ROUNDS = 300
+"""Of the multipliers; after a third of them the taps change by less than 1e-6."""
 
 
 def h2_fir(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
-    """Return the law of least residual by the spectra within the limits."""
+    """Return the law of one mode of least residual within the limits, by the spectra in the prior; `control.caution` counts."""
     q = taps_of(prior.spectra[mode], plant.mirror, settings.control.caution)
     gains = GainCycle([Gain(np.eye(q.size, k=-1), np.zeros((1, q.size)), np.eye(q.size)[:, :1])])  # the state is the last z
     return replace(steady_law(gains.filter(-q[None])), gains=gains, row=-q)
 
 
 def taps_of(spectra: Spectra, mirror: Mirror, caution: float) -> Array:
-    """Return the taps of Q (TAPS,)."""
+    """Return the taps of Q (TAPS,), of commands over measurements; spectra : on equidistant frequencies up to half the rate."""
     n = spectra.measurement.size
     P = mirror.response(pi * np.arange(n) / (n - 1))
     power = toeplitz(np.fft.irfft(np.abs(P) ** 2 * spectra.measurement)[:TAPS])
@@ -69,7 +74,7 @@ def taps_of(spectra: Spectra, mirror: Mirror, caution: float) -> Array:
 
 
 def uncertainty(mirror: Mirror, omega: Array) -> Array:
-    """Return W at omega (n,)."""
+    """Return W at omega [rad per step], the same shape (n,)."""
     lags = np.linspace(max(-DELAY, 1.0 - mirror.delay), DELAY, 5)
     turned = [replace(mirror, delay=mirror.delay + lag).response(omega) / mirror.response(omega) for lag in lags]
     angles = np.exp(1j * np.radians([-ROTATION, 0.0, ROTATION]))

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 from math import isfinite, nan
 from typing import TYPE_CHECKING
 
-from wfsobs.closed_loop.design import select_controllers
-from wfsobs.closed_loop.envelope import POINTS, PlantEnvelope, plant_envelope
+from wfsobs.closed_loop.envelope import POINTS, PlantEnvelope, plant_envelope, with_laws
 from wfsobs.closed_loop.rows import label
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import row_label
@@ -196,7 +195,7 @@ def tuned_envelope(
 ) -> PlantEnvelope:
     """Return `plant_envelope` of controllers each tuned by `tune`, by its usual settings. Raises SettingError, Cancelled."""
     goal = goal or EnvelopeGoal()
-    names, parts = [c.id for c in select_controllers(controllers) if c.law is not None], list[PlantEnvelope]()
+    names, parts = with_laws(controllers), list[PlantEnvelope]()
     for i, name in enumerate(names):
         inner, tuned = Watch(is_cancelled=watch.is_cancelled), scenario
         if CONTROLLERS[name].tunable.usual:

@@ -40,7 +40,15 @@ from wfsobs.app.service import BackgroundTask
 from wfsobs.app.store import Store
 from wfsobs.app.style import look, swatch
 from wfsobs.app.views.gain_editor import GainEditor, plane
-from wfsobs.app.views.plots import LoopLines, add_line, envelope, envelope_times, in_view, new_figure, on_settle, restyle
+from wfsobs.app.views.plots import (
+    LoopLines,
+    PairedLines,
+    envelope,
+    envelope_times,
+    in_view,
+    new_figure,
+    on_settle,
+)
 from wfsobs.app.views.strip import Cards, card_of
 from wfsobs.app.views.table import SMALLEST
 from wfsobs.closed_loop.envelope import PlantEnvelope
@@ -154,18 +162,12 @@ class LoopSpectrum(LoopLines):
         self.figure.y_range.update(start=top * 10.0**-DECADES, end=top)
 
 
-class Response(LoopLines):
+class Response(PairedLines):
     """Rejection and noise transfer of the loops that have them."""
 
     def __init__(self) -> None:
         fig = new_figure(x_range=Range1d(start=0.5, end=500.0), y_range=Range1d(start=-50.0, end=15.0), x_axis_type="log")
         super().__init__(fig, CURVES)
-        self.noise: Final = {name: ColumnDataSource({"x": [], "y": []}) for name in CURVES}
-        self.faint: Final = {name: add_line(fig, name, source) for name, source in self.noise.items()}
-        for line in self.lines.values():
-            line.glyph.line_width = 2.2
-        for line in self.faint.values():
-            line.glyph.update(line_alpha=0.45, line_width=1.2)
         fig.xaxis.axis_label, fig.yaxis.axis_label = "frequency [Hz]", "amplitude [dB]"
 
     def draw(self, results: LoopResults, display: Display) -> None:
@@ -177,12 +179,7 @@ class Response(LoopLines):
             curves = of[display.column] if of else None
             x, rejection, noise = (curves.frequency, curves.rejection, curves.noise) if curves else NOWHERE
             self.sources[name].data = {"x": x, "y": _decibel(rejection)}
-            self.noise[name].data = {"x": x, "y": _decibel(noise)}
-
-    def restyle(self, dark: bool, hidden_names: list[str]) -> None:
-        """Restyle the faint lines too."""
-        super().restyle(dark, hidden_names)
-        restyle(self.faint, dark, hidden_names)
+            self.faint_sources[name].data = {"x": x, "y": _decibel(noise)}
 
 
 def _decibel(x: Complex) -> Array:
@@ -277,7 +274,7 @@ def loop_verdict_html(results: LoopResults, display: Display, envelope: PlantEnv
     scale = per_micrometre(display.unit, results.result.scenario.telescope.diameter)
     said = [*found.sentences(scale, display.unit_label)] if found else []
     if envelope is not None:
-        lines = envelope.sentences(display.column, scale, display.unit_label)
+        lines = envelope.sentences(scale, display.unit_label, display.column)
         said += [line.replace("+-", "±").replace(" deg", "°") for line in lines]
     return f'<p class="verdict">{escape(" ".join(said))}</p>' if said else ""
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Final
 
 import numpy as np
 import panel as pn
-from bokeh.models import ColumnDataSource, DataRange1d, Range1d
+from bokeh.models import DataRange1d, Range1d
 
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs import BATCH, DONE, Job
@@ -17,7 +16,7 @@ from wfsobs.app.render import macro, number
 from wfsobs.app.service import IDLE, BackgroundTask
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
-from wfsobs.app.views.plots import LoopLines, add_line, new_figure, restyle
+from wfsobs.app.views.plots import PairedLines, new_figure
 from wfsobs.closed_loop.envelope import POINTS, PlantEnvelope, Uncertainty
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.settings.errors import SettingError
@@ -53,18 +52,12 @@ def uncertain_cells(envelope: PlantEnvelope, column: int, scale: float) -> dict[
     return out
 
 
-class DelayFigure(LoopLines):
+class DelayFigure(PairedLines):
     """The residual against the error of the delay: the worst plant, and the mean."""
 
     def __init__(self) -> None:
         fig = new_figure(x_range=Range1d(start=-1.0, end=1.0), y_range=DataRange1d(only_visible=True), y_axis_type="log")
         super().__init__(fig, LINEAR)
-        self.means: Final = {name: ColumnDataSource({"x": [], "y": []}) for name in LINEAR}
-        self.faint: Final = {name: add_line(fig, name, source) for name, source in self.means.items()}
-        for drawn in self.lines.values():
-            drawn.glyph.line_width = 2.2
-        for drawn in self.faint.values():
-            drawn.glyph.update(line_alpha=0.45, line_width=1.2)
         fig.xaxis.axis_label = "error of the delay [frames]"
 
     def draw(self, envelope: PlantEnvelope, display: Display) -> None:
@@ -75,13 +68,8 @@ class DelayFigure(LoopLines):
         self.figure.x_range.update(start=-end, end=end)
         for name in LINEAR:
             x, mean, most = of.get(name, (np.empty(0),) * 3)
-            self.sources[name].data, self.means[name].data = {"x": x, "y": scale * most}, {"x": x, "y": scale * mean}
+            self.sources[name].data, self.faint_sources[name].data = {"x": x, "y": scale * most}, {"x": x, "y": scale * mean}
         self.figure.yaxis.axis_label = f"residual {display.mode_label} [{display.unit_label}]"
-
-    def restyle(self, dark: bool, hidden_names: list[str]) -> None:
-        """Restyle the faint lines too."""
-        super().restyle(dark, hidden_names)
-        restyle(self.faint, dark, hidden_names)
 
 
 class UncertainPlant:

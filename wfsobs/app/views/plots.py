@@ -154,6 +154,24 @@ class LoopLines:
         restyle(self.lines, dark, hidden_names)
 
 
+class PairedLines(LoopLines):
+    """A figure with a strong and a faint line per controller."""
+
+    def __init__(self, fig: figure, names: tuple[str, ...]):
+        super().__init__(fig, names)
+        self.faint_sources: Final = {name: ColumnDataSource({"x": [], "y": []}) for name in names}
+        self.faint: Final = {name: add_line(fig, name, source) for name, source in self.faint_sources.items()}
+        for drawn in self.lines.values():
+            drawn.glyph.line_width = 2.2
+        for drawn in self.faint.values():
+            drawn.glyph.update(line_alpha=0.45, line_width=1.2)
+
+    def restyle(self, dark: bool, hidden_names: list[str]) -> None:
+        """Set the colours of light or dark mode, and hide lines."""
+        super().restyle(dark, hidden_names)
+        restyle(self.faint, dark, hidden_names)
+
+
 def marked_peaks(scenario: Scenario) -> list[Peak]:
     """List the peaks in the scenario's vibration; of a measured spectrum, its stronger lines."""
     vibration = scenario.vibration

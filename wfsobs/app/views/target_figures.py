@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from typing import Final, Protocol
@@ -95,7 +96,7 @@ class Drawing(Protocol):
     lines: FigureLines
 
 
-class TargetFigures:
+class TargetFigures(ABC):
     """A figure per target, drawn when results or switches change while the page shows them."""
 
     def __init__(self, run: BackgroundTask, display: Display, drawings: Mapping[str, Drawing], switches: Sequence[str]):
@@ -129,9 +130,9 @@ class TargetFigures:
                     drawing.lines.restyle(self.display.dark, hidden, named)
                 self._draw(results)
 
+    @abstractmethod
     def _draw(self, results: RunResults) -> None:
         """Send the data of every figure, whose lines are shown or hidden by now."""
-        raise NotImplementedError
 
 
 def shows_error(results: RunResults, target: str, display: Display) -> bool:
