@@ -297,5 +297,5 @@ def _show_envelope(result: PlantEnvelope) -> None:
     show_table(envelope_table(result))
     for name, reason in result.notes.items():
         click.echo(f"{label(name)}: {reason}")
-    for line in result.sentences():
-        click.echo(line)
+    if result.spreads:
+        click.echo(f"All modes together. {' '.join(result.sentences())}")
