@@ -5,8 +5,11 @@ from __future__ import annotations
 import pytest
 
 from wfsobs import PRESETS, close_loop
+from wfsobs.app.display import Display
+from wfsobs.app.loop_work import LoopResults
+from wfsobs.app.pages.closed_loop import loop_html
 from wfsobs.closed_loop.rows import loop_verdict, rows
-from wfsobs.evaluation.scores import BOUND_BOTH
+from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS
 
 
 @pytest.mark.slow
@@ -43,7 +46,11 @@ def test_a_controller_that_learns_is_ranked_where_its_own_laws_close_the_loop() 
         result = close_loop(scenario.replace({"run.warm_up": warm_up}), controllers=names)
         found = loop_verdict(result, "tip")
         assert found is not None and {place.observer for place in found.places} == ranked
-        notes = {r["note"] for r in rows(result, 1) if r["controller"] == "lqg-kf-adaptive"}
+        table = rows(result, 1)
+        assert {r["controller"] for r in table if r["ranked"]} - set(BOUNDS) == ranked
+        notes = {r["note"] for r in table if r["controller"] == "lqg-kf-adaptive"}
         assert len(notes) == 1 and said in notes.pop()
+        page = loop_html(LoopResults(result, tuple(table)), Display())
+        assert ('<p class="text">LQG, adaptive KF: an integrator' in page) == (said != "") and 'class="failure"' not in page
     (outcome,) = close_loop(scenario.replace({"run.duration": 0.9}), controllers=names[1:]).outcomes
     assert outcome.residual is None and outcome.note.startswith("the record has 900 steps, its first window is full after 100")

@@ -95,6 +95,7 @@ def rows(result: ClosedLoop, seed: int | None, *, source: PriorSource = TRUE) ->
     limited : share of the steps in which a limit of the mirror changed the command. Where it is above 0 the loop is not the
         linear one that theory and margins are of: these are null, and `note` says why
     alarms : time [s] and reason of every time that the integrator took over, null without supervision; `note` has the first
+    ranked : false where another controller closed the loop for a part of that time
     source : where the prior of the controllers comes from
     """
     plan, warm_up = result.design, result.design.start
@@ -125,6 +126,7 @@ def rows(result: ClosedLoop, seed: int | None, *, source: PriorSource = TRUE) ->
             "residual_rms_mas": None if left is None or modes[mode].radial_order > 1 else left[mode] / mas,
             "strehl": None if left is None else strehl(left, wavelength),
             **known,
+            "ranked": more.get("ranked", True),
             "note": more.get("note", ""),
             "seed": seed,
         }
@@ -152,6 +154,7 @@ def rows(result: ClosedLoop, seed: int | None, *, source: PriorSource = TRUE) ->
                     disk_margin=m.disk if m else None,
                     limited=limited,
                     alarms=outcome.alarms,
+                    ranked=outcome.own_from <= warm_up,
                     note=outcome.note
                     or took_over(outcome.alarms or ())
                     or (LIMITED if limited else "")

@@ -258,14 +258,17 @@ def loop_html(results: LoopResults, display: Display, envelope: PlantEnvelope | 
         "Prior knowledge": TERMS[NEEDS],
     }
     rows = of_mode(results, display)
-    smallest = next((r["controller"] for r in rows if r["controller"] not in BOUNDS and r["residual_rms_nm"] is not None), None)
+    ranked = (r["controller"] for r in rows if r["controller"] not in BOUNDS and r["residual_rms_nm"] is not None and r["ranked"])
+    smallest = next(ranked, None)
     scale = 1e-3 * per_micrometre(display.unit, results.result.scenario.telescope.diameter)
     more = uncertain_cells(envelope, display.column, 1e3 * scale) if envelope is not None else {}
     empty = [NOTHING] * len(added)
     body = [_row(r, display, scale, r["controller"] == smallest, more.get(r["controller"], empty)) for r in rows]
-    notes = {r["note"]: label(r["controller"]) for r in reversed(rows) if r["note"] not in ("", LIMITED)}
-    failures = macro("texts", "failure", [f"{name}: {note}" for note, name in notes.items()])
-    return f"{table('Controllers', columns, [('', body)])}{limits_note(rows)}{failures}"
+    noted = {r["note"]: r for r in reversed(rows) if r["note"] not in ("", LIMITED)}.values()
+    kinds = [("text", [r for r in noted if r["residual_rms_nm"] is not None])]
+    kinds += [("failure", [r for r in noted if r["residual_rms_nm"] is None])]
+    notes = "".join(macro("texts", kind, [f"{label(r['controller'])}: {r['note']}" for r in some]) for kind, some in kinds)
+    return f"{table('Controllers', columns, [('', body)])}{limits_note(rows)}{notes}"
 
 
 def loop_verdict_html(results: LoopResults, display: Display, envelope: PlantEnvelope | None = None) -> str:
