@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 import wfsobs
 from wfsobs.cli.group import main
-from wfsobs.closed_loop.promise import DRAWS, _interval_of, as_seen, draw_plants, make_promise
+from wfsobs.closed_loop.promise import DRAWS, _interval_of, as_seen, draw_plants, draw_spectra, make_promise
 from wfsobs.control.true_plant import ActingPlant
 from wfsobs.identification.plant import GroupPlant, PlantNumber
 from wfsobs.priors_from.controllers import full_plant_of
@@ -71,6 +71,17 @@ def test_plants_are_drawn_from_their_deviations() -> None:
         unsure = group(**{name: unknown, "delay": (PlantNumber(), PlantNumber())})  # type: ignore[arg-type]
         with pytest.raises(RecordError, match="do not switch on"):
             draw_plants([unsure], 2, np.random.default_rng(1))
+
+
+def test_spectra_are_drawn_from_their_deviations() -> None:
+    rng = np.random.default_rng(5)
+    y = 0.02 * rng.standard_normal((20_000, 1))
+    found = wfsobs.identify(Record(y, np.zeros_like(y), 1e-3))
+    noises = np.array([one.modes[0].prior.noise for _ in range(20) for one in draw_spectra(found, rng)])
+    # a mean square of n samples of white noise has a relative deviation of sqrt(2 / n), its root one of sqrt(1 / 2n), of which
+    # the taper takes 2 %; 640 draws tell it to 2.8 %, and their mean to 4 % of it
+    assert noises.std() == pytest.approx(0.02 / np.sqrt(40_000), rel=0.13)
+    assert noises.mean() == pytest.approx(found.modes[0].noise.value, abs=4 * 0.02 / np.sqrt(40_000 * len(noises)))
 
 
 def test_the_record_as_its_plant_makes_it_has_the_disturbance(telemetry: Record) -> None:

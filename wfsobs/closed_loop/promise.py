@@ -1,19 +1,20 @@
 """What a controller will leave of a loop that another one closes now, with an interval, from a record of that loop alone.
 
 Plant and disturbance are identified (`wfsobs.identification`), the controllers are designed from what was found, and theory tells
-what each leaves on the identified spectra with plants that are drawn from their uncertainty. The next record is another one than
-that which was identified: both means of the square differ from that of the process by what a record of this length tells of it,
-which the scatter of sections shows in a simulation of what was identified.
+what each leaves with plants and on spectra that are drawn from their uncertainty: a design fits the spectra that it was made for
+better than any other. The mean square of the next record differs from that of the process by what a record of this length tells
+of it, which the scatter over simulations of what was identified shows; it is distributed as gamma.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from math import sqrt
+from math import pi
 from typing import Any
 
 import numpy as np
+from scipy.stats import gamma
 
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.envelope import residuals
@@ -22,23 +23,30 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.true_plant import TruePlant
 from wfsobs.identification.identification import identify
 from wfsobs.identification.plant import GroupPlant, identify_plant
+from wfsobs.identification.result import Identification
 from wfsobs.pipeline import as_stated
+from wfsobs.prior import Line, Lines
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import true_spectra
+from wfsobs.spectral.periodogram import Cells, fast_length, inflation, periodogram_frequencies
+from wfsobs.spectral.whittle import spectrum_information
 from wfsobs.typing import Array
 
-DRAWS = 256
-"""Plants that are drawn."""
+DRAWS, SPECTRA = 256, 32
+"""Plants that are drawn, and spectra: as many plants meet each of them."""
 
-SECTIONS = 16
-"""Of a residual, whose scatter tells how well a record knows its mean square."""
+HIGHEST = 0.49
+"""Largest frequency of a drawn resonance, over the rate."""
 
-LONGEST = 60_000
-"""Steps of the simulation that tells this."""
+SECTIONS = 32
+"""Simulated records, whose scatter tells how well one knows its mean square."""
+
+LONGEST = 500_000
+"""Steps of all of them: beyond, they are shorter than the record."""
 
 START = 500
 """Steps that a filter takes to start."""
@@ -151,16 +159,23 @@ def make_promise(
     corrected = as_seen(record, delay, matrix)
     found = identify(corrected, watch=Watch(is_cancelled=watch.is_cancelled))
     known = {"control.delay": float(delay), **{f"plant.{name}": value for name, value in Scenario().plant.to_dict().items()}}
-    told = found.scenario(as_stated(corrected, scenario)).replace(known)
+
+    def of(identification: Identification) -> Scenario:
+        out = identification.scenario(as_stated(corrected, scenario)).replace(known)
+        return out.replace({"vibration.source": "ar2"}) if out.vibration.source == "peaks" else out  # no cut-off
+
+    told = of(found)
     names = None if controllers is None else [INTEGRATOR, *(name for name in controllers if name != INTEGRATOR)]
     plan = design(told, names)
-    length = min(record.n_steps, LONGEST)
-    model = simulate(told.replace({"run.duration": (length + START) * record.dt, "run.seed": seed}))
+    length = min(record.n_steps, LONGEST // SECTIONS)
+    model = simulate(told.replace({"run.duration": (SECTIONS * length + START) * record.dt, "run.seed": seed}))
     inverse = np.linalg.inv(matrix)
     plants = [TruePlant(one @ inverse, float(late)) for one, late in zip(matrices, delays, strict=True)]
-    spectra = [true_spectra(told, mode) for mode in range(record.n_modes)]
+    rng = np.random.default_rng(seed)
+    drawn = [of(one) for one in draw_spectra(found, rng)]
+    spectra = [[true_spectra(one, mode) for mode in range(record.n_modes)] for one in drawn]
     left, out = dict[str, Array](), list[ResidualPromise]()
-    common = np.random.default_rng(seed).standard_normal(len(plants) - 1)
+    common = rng.uniform(size=(DRAWS, 1))
     for i, name in enumerate(plan.laws):
         watch.check()
         laws = [one.law for one in plan.laws[name] if one.law is not None]
@@ -171,11 +186,13 @@ def make_promise(
             notes = ["the record has no NGS"] if lacks_ngs else [one.note for one in plan.laws[name] if one.note]
             out.append(ResidualPromise(name, note=next(iter(notes), "not stable")))
             continue
-        squares = residuals(laws, plan.mirror, plants, spectra, watch)[1:] ** 2
+        squares = np.concatenate(
+            [residuals(laws, plan.mirror, plants[1 + i :: SPECTRA], one, watch) ** 2 for i, one in enumerate(spectra)]
+        )
         (outcome,) = each_outcome(model, plan, watch, [name])
         assert outcome.residual is not None
-        spread = sqrt(2.0 * length / record.n_steps) * _scatter(outcome.residual[START:])
-        left[name] = squares * np.maximum(1.0 + spread * common[:, None], 0.0)
+        shape = record.n_steps / length / _scatter(outcome.residual[START:]) ** 2
+        left[name] = squares * gamma.ppf(common, shape) / shape
         out.append(_interval_of(name, left[name], left[INTEGRATOR]))
         watch.step((i + 1) / len(plan.laws))
     return Promise(told, groups, matrix, tuple(mode.noise.value for mode in found.modes), tuple(out))
@@ -220,6 +237,25 @@ def draw_plants(groups: Sequence[GroupPlant], n_modes: int, rng: np.random.Gener
     return np.maximum(delays, 1.0), matrices
 
 
+def draw_spectra(identification: Identification, rng: np.random.Generator) -> Iterator[Identification]:
+    """Yield SPECTRA models of the disturbance from the uncertainty of what was identified; undamped lines stay."""
+    n = fast_length(identification.n_steps)
+    f = periodogram_frequencies(n, identification.dt)
+    spread = []
+    for mode in identification.modes:
+        cells = Cells(f, np.zeros_like(f), np.ones_like(f), [p.omega / (2.0 * pi) for p in mode.spectrum.resonances])
+        information = spectrum_information(mode.spectrum, cells) / inflation(n)
+        spread.append(np.linalg.cholesky(np.linalg.inv(information + np.eye(len(information)))))  # none by more than e
+    for _ in range(SPECTRA):
+        modes = []
+        for mode, of in zip(identification.modes, spread, strict=True):
+            s = mode.spectrum.with_vector(mode.spectrum.vector + of @ rng.standard_normal(len(of)))
+            lines = tuple(Line(min(p.omega / (2.0 * pi), HIGHEST / s.dt), p.damping, p.rms) for p in s.resonances)
+            prior = Lines(s.noise, s.dt, s.continuum, (*lines, *(line for line in mode.prior.lines if not line.damping)))
+            modes.append(replace(mode, prior=prior))
+        yield replace(identification, modes=tuple(modes))
+
+
 def as_seen(record: Record, delay: float, matrix: Array) -> Record:
     """Return a record whose commands are what the measurements see of them, by an identified plant."""
     whole, part = int(delay), delay % 1.0
@@ -228,6 +264,6 @@ def as_seen(record: Record, delay: float, matrix: Array) -> Record:
 
 
 def _scatter(residual: Array) -> Array:
-    """Return the relative standard deviation of the mean square of a residual, per mode, from its sections."""
+    """Return the relative standard deviation of the mean square of a section of a residual, per mode."""
     squares = np.square(residual[len(residual) % SECTIONS :]).reshape(SECTIONS, -1, residual.shape[1]).mean(axis=1)
-    return np.asarray(squares.std(axis=0, ddof=1) / squares.mean(axis=0) / sqrt(SECTIONS))
+    return np.asarray(squares.std(axis=0, ddof=1) / squares.mean(axis=0))
