@@ -316,6 +316,19 @@ def test_vibration_is_not_called_turbulence_where_there_is_none(seed: int) -> No
     assert found < 1.01 * true
 
 
+def test_a_slow_vibration_is_not_called_turbulence_where_there_is_none() -> None:
+    """Below the lowest frequency of a peak: too narrow for turbulence, and told to the filters."""
+    rng, n = np.random.default_rng(1), 20_000
+    sway = Ar2(2 * pi * 3.0, 0.003, 0.1, DT)
+    z = 0.014 * rng.standard_normal(2 * n) + sway.sample(2 * n, rng)
+    (mode,) = identify(Record(z[:n, None], np.zeros((n, 1)), DT)).modes
+    assert mode.turbulence is None and not mode.peaks
+    (slow,) = [row for row in mode_rows(mode) if row[0] == "slow, of the continuum"]
+    assert slow[1] is not None and abs(slow[1].value - 3.0) < 4.0 * slow[1].std
+    found, true = (np.std(innovations(z[n:], spectrum)) for spectrum in (mode.spectrum, Spectrum(0.014, DT, None, (sway,))))
+    assert found < 1.01 * true and len(mode.prior.turbulence) == 1
+
+
 def test_third_order_and_background_are_found_where_they_are() -> None:
     """Turbulence that falls as f^-6, and coloured noise such as aliasing; a scenario holds both, and the means over the modes."""
     s = known().replace(

@@ -82,6 +82,17 @@ def without_vibration(spectrum: Spectrum, cells: Cells, lowest: float) -> Spectr
     return best if slow and gain > BACKGROUND_WORTH else rest
 
 
+def without_sway(spectrum: Spectrum) -> Spectrum:
+    """Return a spectrum of the chosen order whose turbulence, if as narrow as modes of structures, is a resonance.
+
+    That of second order fits frozen flow with a damping as low.
+    """
+    t = spectrum.turbulence
+    if not isinstance(t, Ar2) or t.damping > BROAD:
+        return spectrum
+    return replace(spectrum, turbulence=None, resonances=(*spectrum.resonances, t))
+
+
 def _beyond_turbulence(spectrum: Spectrum) -> bool:
     """Return whether a background differs from the turbulence's own shape."""
     assert spectrum.background is not None
@@ -334,7 +345,7 @@ class OneMode:
         self.spectrum = without_vibration(fit_spectrum(self.spectrum, cells), cells, self.lowest)
         if reshape:
             cells = self.cells()
-            self.spectrum = with_background(choose_order(self.spectrum, cells, third), cells)
+            self.spectrum = with_background(without_sway(choose_order(self.spectrum, cells, third)), cells)
         for p in [p for p in self.spectrum.resonances if not is_peak(p, self.f[0])]:
             self.spectrum = self.spectrum.without(p)
             self.rejections.append(Candidate(p.omega / (2 * pi), WIDEST_LINE, 0.0))  # or it would come back

@@ -7,7 +7,7 @@ from math import nan, pi, sqrt
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from wfsobs.identification.both_sensors import SensorDifference, error_of_a_star, without_error
-from wfsobs.identification.one_mode import OneMode, is_continuum
+from wfsobs.identification.one_mode import BROAD, OneMode, is_continuum
 from wfsobs.identification.process import (
     IdentifiedPeak,
     IdentifiedProcess,
@@ -224,7 +224,8 @@ def mode_rows(mode: IdentifiedMode) -> list[Row]:
         out.append(("white noise of an NGS frame", None, None, d.noise))
         if (e := d.error) is not None:
             out.append(("slow error of the LGS", e.frequency, e.damping, e.rms))
-    out += [("broad, of the continuum", p.frequency, p.damping, p.rms) for p in mode.broad]
+    for p in mode.broad:
+        out.append((f"{'broad' if p.damping.value > BROAD else 'slow'}, of the continuum", p.frequency, p.damping, p.rms))
     return out + [("line" if p.pure else "resonance", p.frequency, p.damping, p.rms) for p in mode.peaks]
 
 
