@@ -224,8 +224,8 @@ def mode_rows(mode: IdentifiedMode) -> list[Row]:
         out.append(("white noise of an NGS frame", None, None, d.noise))
         if (e := d.error) is not None:
             out.append(("slow error of the LGS", e.frequency, e.damping, e.rms))
-    for p in mode.broad:
-        out.append((f"{'broad' if p.damping.value > BROAD else 'slow'}, of the continuum", p.frequency, p.damping, p.rms))
+    widths = ["broad" if p.damping.value > BROAD else "slow" for p in mode.broad]
+    out += [(f"{width}, of the continuum", p.frequency, p.damping, p.rms) for width, p in zip(widths, mode.broad, strict=True)]
     return out + [("line" if p.pure else "resonance", p.frequency, p.damping, p.rms) for p in mode.peaks]
 
 
