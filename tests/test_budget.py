@@ -105,6 +105,17 @@ def test_observers_that_are_not_linear_add_up_too_if_they_are_named() -> None:
     assert_adds_up(found)
 
 
+def test_the_budget_of_a_mode_does_not_depend_on_which_others_are_asked_for() -> None:
+    scenario = PRESETS["paper"]().replace({"run.duration": 3.0, "gpr_offline.training_size": 40, "gpr_offline.depth": 30})
+    names = [*LINEAR, "gpr-offline"]
+    result = without_bounds(scenario, names)
+    every = error_budget(result, observers=names)
+    for mode in ("tip", "tilt"):
+        for one, it in zip(error_budget(result, observers=names, mode=mode), [b for b in every if b.mode == mode], strict=True):
+            assert (one.observer, one.target, one.total) == (it.observer, it.target, it.total)
+            assert one.terms == pytest.approx(it.terms, abs=1e-12 * it.total)  # rounding
+
+
 def test_an_observer_that_looks_ahead_has_no_budget() -> None:
     (one, _) = budgets(PRESETS["paper"]().replace({"run.duration": 2.0}), "butterworth-ol")
     assert one.reason == "looks ahead" and not one.terms

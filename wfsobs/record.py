@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
@@ -57,9 +57,12 @@ class Training:
     u: Array
     open_loop_y: Array | None = None
 
-    def copy(self) -> Training:
-        """Return a copy in memory of its own."""
-        return Training(_own(self.y_lgs), _own(self.u), None if self.open_loop_y is None else _own(self.open_loop_y))
+    def copy(self, modes: Sequence[int] | None = None) -> Training:
+        """Return a copy in memory of its own; modes : of these alone."""
+        own = slice(None) if modes is None else list(modes)
+        y, u, open_loop_y = (None if x is None else _own(x[:, own]) for x in (self.y_lgs, self.u, self.open_loop_y))
+        assert y is not None and u is not None
+        return Training(y, u, open_loop_y)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, lru_cache
 from itertools import combinations
 from math import factorial
 from typing import TYPE_CHECKING, Any
@@ -40,12 +40,13 @@ from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Observer
 from wfsobs.observers.estimates import TOTAL
 from wfsobs.observers.kalman.multirate import beam_model, estimated_cycle, optimal_filter
 from wfsobs.observers.kalman.single import MIN_NOISE, steady_filter
+from wfsobs.observers.step import Estimator
 from wfsobs.prior import Beams, Line, Lines
-from wfsobs.priors_from.scenario import arguments
+from wfsobs.priors_from.scenario import observer_settings, prior_of
 from wfsobs.priors_from.turbulence import beams_of, modelled_turbulence
 from wfsobs.priors_from.vibration import vibration_continuum
 from wfsobs.progress import QUIET, Watch, detach_watch
-from wfsobs.record import Record, delay_signal, frame_mean
+from wfsobs.record import Measurements, Record, delay_signal, frame_mean
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
@@ -63,6 +64,8 @@ if TYPE_CHECKING:
 NOISE, CONE, LINES, SIGNAL = "noise", "cone", "lines", "signal"
 """White noise of the sensors; what they see beside the turbulence on the axis; vibration lines that an observer is not given;
 turbulence on the axis and the lines that it is given."""
+
+SOURCES = (NOISE, CONE, LINES, SIGNAL)
 
 LAG, MISMATCH = "lag", "mismatch"
 
@@ -179,12 +182,13 @@ def error_budget(
     if scenario.vibration.source == "psd":
         raise ValueError("error budget: vibration.source = psd is a table, not lines that a model could have")
     chosen = [name for name in dict.fromkeys(e.observer for e in result.estimates) if observers is None or name in observers]
-    out: list[Budget] = []
-    for i, name in enumerate(chosen):
+    parts, out = _Parts(scenario, record), dict[str, list[Budget]]()
+    linewise = sorted(
+        (name for name in chosen if name != NO_ESTIMATE), key=parts.given_lines
+    )  # the same lines one after the other
+    for i, name in enumerate(linewise):
         watch.step(i / len(chosen))
         own = [s for s in result.scores if s.observer == name and mode in (None, s.mode)]
-        if name == NO_ESTIMATE or not own:
-            continue
         observer, limit, reason = OBSERVERS[name], own_bound(name), ""
         if not observer.causal:
             reason = "looks ahead"
@@ -193,41 +197,67 @@ def error_budget(
         elif not observer.linear and observers is None:
             reason = f"not linear, takes 16 runs: {ONLY_NAMED}"
         values = with_total({e.target: e.values for e in result.estimates if e.observer == name})
-        terms = [dict[str, float]()] * len(own) if reason else _terms(observer, scenario, record, values, own, watch)
+        terms = [dict[str, float]()] * len(own) if reason or not own else _terms(observer, parts, values, own, watch)
         bounds = {(s.target, s.mode): s.rms**2 for s in result.scores if s.observer == limit}
         method = LINEAR if reason or observer.linear else AVERAGED
-        for s, of in zip(own, terms, strict=True):
-            out.append(Budget(name, s.target, s.mode, s.rms**2, of, bounds.get((s.target, s.mode)), method, reason))
-    return out
+        out[name] = [
+            Budget(name, s.target, s.mode, s.rms**2, of, bounds.get((s.target, s.mode)), method, reason)
+            for s, of in zip(own, terms, strict=True)
+        ]
+    return [it for name in chosen for it in out.get(name, ())]
 
 
-def _terms(
-    observer: Observer, scenario: Scenario, record: Record, values: Estimates, scores: Iterable[Score], watch: Watch
-) -> list[dict[str, float]]:
+ModeLines = tuple[tuple[float, ...], ...]
+"""Lines that an observer is given [Hz], mode by mode."""
+
+
+class _Parts:
+    """The sources of a record and what the loop makes of them, kept as long as they are asked for the same lines."""
+
+    def __init__(self, scenario: Scenario, record: Record):
+        self.scenario, self.record = scenario, record
+        self.all_lines = [[line[0] for line in vibration_lines(scenario, i)] for i in range(record.n_modes)]
+        self.sources = lru_cache(1)(lambda lines: split_record(scenario, record, self.all_lines, lines))
+        self.measurements = lru_cache(2 * (len(SOURCES) + 1))(self._measure)
+
+    def given_lines(self, name: str) -> ModeLines:
+        """Return which lines an observer is given; one without a prior that learns can find every line."""
+        observer, before = OBSERVERS[name], self.scenario.before_events
+        finds_all = not observer.prior and not observer.linear
+        columns = range(self.record.n_modes)
+        return tuple(tuple(self.all_lines[i] if finds_all else given_lines(before, name, i)) for i in columns)
+
+    def _measure(self, lines: ModeLines, names: tuple[str, ...], modes: tuple[int, ...]) -> Measurements:
+        sources = self.sources(lines)
+        seen = _add([sources[name].measurement for name in names], sources[SIGNAL].measurement)
+        return measure_closed_loop(self.scenario, OpenLoop(seen.lgs.take(modes, 1), seen.ngs.take(modes, 1), seen.stars))
+
+
+def _terms(observer: Observer, of: _Parts, values: Estimates, scores: Iterable[Score], watch: Watch) -> list[dict[str, float]]:
     """Return the terms of the budget of every score: the mean of part times error over its samples."""
-    before, columns = scenario.before_events, [mode.name for mode in scenario.modes]
-    lines = [[line[0] for line in vibration_lines(scenario, i)] for i in range(record.n_modes)]
-    finds_all = not observer.prior and not observer.linear  # one without a prior that learns can find every line
-    given = lines if finds_all else [given_lines(before, observer.id, i) for i in range(record.n_modes)]
-    sources = split_record(scenario, record, lines, given)
-    responses, rest = _responses(observer, scenario, record, sources, watch)
-    seen, out = sources[SIGNAL].measurement, []
+    before, columns = of.scenario.before_events, [mode.name for mode in of.scenario.modes]
+    lines = of.given_lines(observer.id)
+    sources, out = of.sources(lines), []
+    modes = tuple(range(len(columns)) if observer.couples_modes else sorted({columns.index(s.mode) for s in scores}))
+    responses, rest = _responses(observer, of, lines, modes, watch)
+    seen = sources[SIGNAL].measurement
     signal = OpenLoop(np.nan_to_num(seen.lgs), np.nan_to_num(seen.ngs))
 
     @cache
     def reference(i: int) -> Estimates:
         watch.check()
-        return with_total(follow_signal(before, i, given[i], observer.sensors, signal))
+        return with_total(follow_signal(before, i, lines[i], observer.sensors, signal))
 
     for s in scores:
         i = columns.index(s.mode)
+        at = modes.index(i)
         truth = {name: part.truth[s.target][:, i] for name, part in sources.items()}
-        parts = {name: responses[name][s.target][:, i] - truth[name] for name in sources}
+        parts = {name: responses[name][s.target][:, at] - truth[name] for name in sources}
         lag = reference(i)[s.target] - truth[SIGNAL]
-        parts |= {LAG: lag, MISMATCH: parts.pop(SIGNAL) - lag + rest[s.target][:, i]}
+        parts |= {LAG: lag, MISMATCH: parts.pop(SIGNAL) - lag + rest[s.target][:, at]}
         error = values[s.target][:, i] - sum(truth.values())
         assert s.start is not None and s.stop is not None
-        scored = slice(round(s.start / record.dt), round(s.stop / record.dt))
+        scored = slice(round(s.start / of.record.dt), round(s.stop / of.record.dt))
         out.append({name: float(np.nanmean(parts[name][scored] * error[scored])) for name in TERMS})
     return out
 
@@ -308,8 +338,11 @@ def split_lines(vibration: Array, dt: float, lines: Sequence[float], given_lines
 
 def _add(parts: Iterable[OpenLoop], total: OpenLoop) -> OpenLoop:
     """Return several measurements together, zero without any, where the whole is measured."""
-    parts = [OpenLoop(0.0 * total.lgs, 0.0 * total.ngs), *parts]
-    return OpenLoop(np.sum([one.lgs for one in parts], axis=0), np.sum([one.ngs for one in parts], axis=0), total.stars)
+    lgs, ngs = 0.0 * total.lgs, 0.0 * total.ngs
+    for one in parts:
+        lgs += one.lgs
+        ngs += one.ngs
+    return OpenLoop(lgs, ngs, total.stars)
 
 
 def _see(signal: Array, ratio: int) -> OpenLoop:
@@ -321,16 +354,25 @@ def _see(signal: Array, ratio: int) -> OpenLoop:
 
 
 def _responses(
-    observer: Observer, scenario: Scenario, record: Record, sources: dict[str, Source], watch: Watch
+    observer: Observer, of: _Parts, lines: ModeLines, modes: tuple[int, ...], watch: Watch
 ) -> tuple[dict[str, Estimates], Estimates]:
     """Split an observer's estimate into source -> target -> response, and the estimate from nothing; the sum is the estimate."""
-    _, prior, settings = arguments(observer, record, scenario.before_events)
+    before = of.scenario.before_events
+    settings = observer_settings(observer, before)
+    prior = prior_of(before, of.record, observer.parts(settings), modes=modes)
     silent = replace(watch, progress=lambda _: None, partial=lambda *_: None)
+    if observer.linear and observer.step is not None and observer.run is None:
+        designed = observer.step(prior, settings, of.measurements(lines, (), modes).sampling, 0.0)  # once for all sources
 
-    def estimate(names: Iterable[str]) -> Estimates:
+        def from_rest(*_: object) -> Estimator:
+            designed.reset()
+            return designed
+
+        observer = replace(observer, step=from_rest)
+
+    def estimate(names: tuple[str, ...]) -> Estimates:
         watch.check()
-        chosen = [sources[name].measurement for name in names]
-        measured = measure_closed_loop(scenario, _add(chosen, sources[SIGNAL].measurement))
+        measured = of.measurements(lines, names, modes)
         own = measured if "open_loop_y" in observer.needs else replace(measured, open_loop_y=None)
         with detach_watch(silent) as alone:
             found = observer.estimate(own, prior, settings, alone)
@@ -338,11 +380,13 @@ def _responses(
 
     rest = estimate(())
     if not observer.linear:
-        return shapley_shares(tuple(sources), estimate, rest), rest
-    return {name: {target: x - rest[target] for target, x in estimate((name,)).items()} for name in sources}, rest
+        return shapley_shares(SOURCES, estimate, rest), rest
+    return {name: {target: x - rest[target] for target, x in estimate((name,)).items()} for name in SOURCES}, rest
 
 
-def shapley_shares(names: Sequence[str], estimate: Callable[[Iterable[str]], Estimates], rest: Estimates) -> dict[str, Estimates]:
+def shapley_shares(
+    names: Sequence[str], estimate: Callable[[tuple[str, ...]], Estimates], rest: Estimates
+) -> dict[str, Estimates]:
     """Return the mean over all orders of what a source adds to the estimate from those before it."""
     n = len(names)
     found = {frozenset(of): estimate(of) if of else rest for size in range(n + 1) for of in combinations(names, size)}

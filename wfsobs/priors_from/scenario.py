@@ -128,7 +128,7 @@ def prior_of(
         asterism=_asterism(asked, scenario, len(modes), dt),
         bands=bands_of(scenario, bands) if bands else None,
         spectra=tuple(spectra or [spectra_of(scenario, mode) for mode in modes]) if Spectra in asked else (),
-        training=record.training.copy() if Training in asked and record and record.training else None,
+        training=record.training.copy(modes) if Training in asked and record and record.training else None,
     )
 
 
