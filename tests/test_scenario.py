@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
 import re
+import subprocess
+import sys
 from typing import Any
 
 import numpy as np
@@ -63,6 +66,15 @@ def test_modes_up_to_an_order(order: int, count: int) -> None:
     assert len(modes) == count == len({mode.name for mode in modes})
     assert [mode.noll for mode in modes] == list(range(2, count + 2))
     assert [mode.name for mode in modes[:2]] == ["tip", "tilt"] and modes[-1].radial_order == order
+
+
+def test_a_pickled_scenario_is_whole_where_no_observer_is_known_yet() -> None:
+    path = "multipeak.line_width"
+    content = pickle.dumps(Scenario().replace({path: 0.123}))
+    code = f"import pickle, sys; print(pickle.load(sys.stdin.buffer).{path})"
+    assert subprocess.run([sys.executable, "-c", code], input=content, check=True, capture_output=True).stdout.split() == [
+        b"0.123"
+    ]
 
 
 def test_steps_and_time_step() -> None:

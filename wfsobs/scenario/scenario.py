@@ -115,6 +115,10 @@ class Scenario(Group):
         before = rest.index("control")
         return {name: declared[name] for name in (*rest[:before], *names, *rest[before:])}
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle plain values: where they are read, the settings of observers may not have been declared yet."""
+        return type(self).from_dict, (self.to_dict(),)
+
     @property
     def modes(self) -> tuple[Mode, ...]:
         """The Zernike modes of the run, one column of every array each."""
