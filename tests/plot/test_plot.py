@@ -296,6 +296,16 @@ def test_the_command_draws_from_a_record_of_ones_own(tmp_path: Path, monkeypatch
         assert refused.exit_code == 2 and why in refused.output and "Traceback" not in refused.output
 
 
+def test_what_is_composed_keeps_its_units_and_a_title_its_place(result: wfsobs.Result) -> None:
+    """The title stands with the legend of a column, not under it."""
+    both = result.record.plot.traces() * result.record.plot.traces(mode="tilt")
+    for figure in (both, both.opts(title="Night", clone=True, backend="matplotlib")):
+        (axes,) = to_matplotlib(figure).axes
+        assert (axes.get_xlabel(), axes.get_ylabel()) == ("time [s]", "tip [nm]")
+    legend = axes.get_legend()
+    assert legend is not None and (legend.get_title().get_text(), axes.get_title()) == ("Night", "")
+
+
 def test_two_columns_have_legends_beside(result: wfsobs.Result) -> None:
     paper = to_matplotlib(result.plot.traces(), 180.0, 100.0)
     assert tuple(25.4 * paper.get_size_inches()) == pytest.approx((180.0, 100.0))

@@ -26,7 +26,14 @@ from wfsobs.settings.errors import SettingError
 from wfsobs.signal.envelope import envelope, envelope_times
 from wfsobs.typing import Array
 
-TIME, FREQUENCY = hv.Dimension("time", unit="s"), hv.Dimension("frequency", unit="Hz")
+
+class Quantity(hv.Dimension):
+    """What an axis is of, its unit in brackets."""
+
+    unit_format = " [{unit}]"
+
+
+TIME, FREQUENCY = Quantity("time", unit="s"), Quantity("frequency", unit="Hz")
 
 BINS = 500
 """Pairs of extremes that are drawn of a long line: more than a column of a paper, or half a screen, can show."""
@@ -62,7 +69,7 @@ SUFFIXES = (".pdf", ".svg", ".pgf", ".png", ".html")
 
 def quantity(name: str, unit: str, label: str = "") -> hv.Dimension:
     """Return what an axis is of; plots that share it are linked."""
-    return hv.Dimension((name, label or name), unit=unit)
+    return Quantity((name, label or name), unit=unit or None)
 
 
 def style(element: Any, *, bokeh: Mapping[str, Any], matplotlib: Mapping[str, Any], **both: Any) -> Any:
@@ -90,24 +97,22 @@ def draw_trace(values: Array, dt: float, of: hv.Dimension, name: str | Look, sam
     return draw_line(envelope_times(first, last, BINS, dt), envelope(values[first:last], BINS), (TIME, of), name)
 
 
-def overlay(
-    parts: Iterable[Any], *, log: str = "", legend: str = "right", rows: int = 0, decades: int = 8, **both: Any
-) -> hv.Overlay:
+def overlay(parts: Iterable[Any], *, log: str = "", rows: int = 0, decades: int = 8, **both: Any) -> hv.Overlay:
     """Lay elements over each other.
 
     log : axes that are logarithmic, of "xy"; rows : number of bars, where they are what is drawn; decades :
     the most that a logarithmic axis of y spans; both : further options
     """
     drawn = hv.Overlay(list(parts))
-    x, y = next(iter(drawn)).dimensions()[:2]
-    both = {"xlabel": _axis_label(x), "ylabel": _axis_label(y), "logx": "x" in log, "logy": "y" in log, "show_grid": True} | both
+    both = {"logx": "x" in log, "logy": "y" in log, "show_grid": True} | both
     if "y" in log:
         highest = max(float(np.nanmax(part.dimension_values(1))) for part in drawn)
         lowest = min(float(np.nanmin(part.dimension_values(1))) for part in drawn)
         both["ylim"] = (max(lowest, highest * 10.0**-decades) / 2.0, 2.0 * highest)
     width, height = PIXELS
     if rows:
-        both |= {"ylabel": "", "invert_yaxis": True, "ylim": (-0.6, rows - 0.4), "show_grid": False}
+        label = next(iter(drawn)).kdims[0].pprint_label
+        both |= {"xlabel": label, "ylabel": "", "invert_yaxis": True, "ylim": (-0.6, rows - 0.4), "show_grid": False}
         height = 90 + 22 * rows
     return style(
         drawn,
@@ -116,10 +121,6 @@ def overlay(
         bokeh={"width": width, "height": height, "click_policy": "hide"},
         matplotlib={"aspect": width / height, "fig_size": NOTEBOOK},
     )
-
-
-def _axis_label(of: hv.Dimension) -> str:
-    return f"{of.label} [{of.unit}]" if of.unit else str(of.label)
 
 
 def stack(figures: Sequence[hv.Overlay]) -> hv.Layout:
@@ -234,8 +235,10 @@ def to_matplotlib(figure: Any, width: float = COLUMN, height: float = 0.0) -> An
             else:  # there is no room beside
                 legend.remove()
                 if names != above:
-                    axes.legend(handles, names, loc="lower center", ncols=2, bbox_to_anchor=(0.45, 1.0), frameon=False)
+                    place = {"loc": "lower center", "ncols": 2, "bbox_to_anchor": (0.45, 1.0), "frameon": False}
+                    axes.legend(handles, names, title=axes.get_title() or None, **place)
                     tall = max(tall, HEIGHT) + LINE * ((len(names) + 1) // 2)
+                    axes.set_title("")  # which would be below it
                 above = names
         heights[i // columns] = max(heights[i // columns], tall)
     for axes, place in zip(every, drawn.add_gridspec(rows, columns, height_ratios=heights), strict=False):

@@ -277,7 +277,7 @@ class SweepPlots:
         style(field, cmap="cividis", alpha=0.5, bokeh={}, matplotlib={"show_values": False})
         names = hv.Labels([(a, b, f"{name}\n{error:.1f} nm") for a, b, error, name in cells], axes, "best")
         style(names, bokeh={"text_font_size": "8pt", "text_color": "black"}, matplotlib={"size": 6, "color": "black"})
-        return overlay([field, names], xlabel=first.path, ylabel=second.path)
+        return overlay([field, names])
 
 
 class LoopPlots:
