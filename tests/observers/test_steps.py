@@ -29,7 +29,7 @@ from wfsobs.priors_from.scenario import arguments, kalman_model, observer_settin
 from wfsobs.priors_from.selection import has_prior
 from wfsobs.priors_from.turbulence import measurement_noise
 from wfsobs.progress import QUIET
-from wfsobs.record import Record, hold_last, pseudo_open_loop
+from wfsobs.record import Record, Sampling, hold_last, pseudo_open_loop
 from wfsobs.scenario import Scenario
 from wfsobs.signal.joint_states import RIDGE
 from wfsobs.signal.riccati import steady_state
@@ -228,7 +228,7 @@ def test_wrong_input_is_one_line_and_takes_no_frame() -> None:
     with refused("^multirate: stars takes a whole number, 0 or more, not 'x'$"):
         observer.update([0.0, 0.0], stars="x")  # type: ignore[arg-type]
     assert observer.frame == 0
-    for z in ([0.0, np.nan], np.float32([1.0, 2.0]), [1, 2], [True, False], [None, 1.0]):
+    for z in ([0.0, np.nan], np.float32([1.0, 2.0]), [1, 2], [True, False], [None, 1.0], [1e300, -1e300]):
         observer.update(z)
     observer.reset()
     observer.update([0.0, np.nan])
@@ -294,6 +294,13 @@ def test_a_prior_that_lacks_something_is_one_line(name: str) -> None:
     assert ("modes, the loop has 5" in refusal(name, scenario, sampling=known._replace(n_modes=5))) == bool(of_modes)
     for wrong in ({"n_modes": 0}, {"dt": 0.0}, {"dt": np.nan}, {"ratio": 0}, {"delay": 0}):
         assert "takes 1 mode at least" in refusal(name, scenario, sampling=known._replace(**wrong))
+
+
+@pytest.mark.parametrize("name", ["kf-multi", "lqg-kf-multi"])
+def test_an_identification_of_fewer_modes_is_one_line(name: str) -> None:
+    found = wfsobs.identify(Record(np.random.default_rng(1).standard_normal((2000, 1)), np.zeros((2000, 1)), 1e-3))
+    assert refusal(name, found, sampling=Sampling(2, 1e-3, 5)) == f"{name}: the identification has 1 modes, the loop has 2"
+    assert not refusal(name, found)
 
 
 @pytest.mark.parametrize(("name", "ahead"), [("gpr-offline", gpr_offline_ahead), ("gpr-online", gpr_online_ahead)])
