@@ -19,7 +19,7 @@ from wfsobs.control.integrator import highest_stable_gain, integrator_law
 from wfsobs.control.law import Law
 from wfsobs.control.margins import disk_margin, frequencies
 from wfsobs.control.mirror import Mirror
-from wfsobs.control.mismatch import loops, margins_of, one_loop, radius
+from wfsobs.control.mismatch import draws_of, loops, margins_of, one_loop, radius, step_matrices
 from wfsobs.control.true_plant import ActingPlant, TruePlant, true_matrix
 from wfsobs.priors_from.controllers import true_plant_of
 from wfsobs.scenario import Scenario
@@ -100,6 +100,25 @@ def test_frame_by_frame_it_is_the_loop_of_the_record() -> None:
     for a, b in zip(perfect.outcomes, nearly.outcomes, strict=True):
         assert a.residual is not None and b.residual is not None, b.note
         assert np.allclose(a.residual, b.residual, rtol=0, atol=1e-8), a.controller
+
+
+@pytest.mark.parametrize("name", ["integrator", "lqg-kf-lgs"])
+def test_errors_that_begin_later_are_none_before_and_in_the_end_as_if_they_had_always_been(name: str) -> None:
+    s = MATCHED.replace({"run.duration": 6.0})
+    errors = {"plant.delay_error": 0.3, "plant.gain_error": [0.1, -0.1], "plant.rotation": 5.0}
+    without, always, later, never = (
+        closed_loop(simulate(s), design(s.replace(of), [name]))
+        for of in ({}, errors, {**errors, "plant.start": 3.0}, {**errors, "plant.start": 7.0})
+    )
+    none, whole, part, late = (made.outcomes[0].residual for made in (without, always, later, never))
+    assert none is not None and whole is not None and part is not None and late is not None
+    at = round(3.0 / s.dt)
+    assert np.allclose(part[:at], none[:at], rtol=0, atol=1e-12) and np.allclose(late, none, rtol=0, atol=1e-12)
+    assert not np.allclose(part[at : at + 2], none[at : at + 2], rtol=0, atol=1e-6)
+    # a stable linear loop forgets where it was
+    assert np.allclose(part[-100:], whole[-100:], rtol=0, atol=1e-6)
+    law = later.design.laws[name][0]
+    assert law.stable and law.predicted_rms is None and law.margins is None and not later.design.bounds
 
 
 def test_a_pair_is_turned_by_its_order() -> None:
@@ -262,6 +281,26 @@ def test_lost_commands_are_judged_by_the_mean_square(lost: float) -> None:
     known = np.abs(np.linalg.eigvals((1.0 - lost) * np.kron(arrives, arrives) + lost * np.kron(is_lost, is_lost))).max()
     law = integrator_law(Mirror(2.0), gain, 1.0)
     assert radius([law], Mirror(2.0), TruePlant(ONE, 2.0, loss=lost)) == pytest.approx(known, rel=1e-8)
+
+
+@pytest.mark.parametrize("name", ["integrator", "lqg-kf-lgs", "lqg-multirate"])
+@settings(max_examples=3, deadline=None, derandomize=True)
+@given(st.floats(2.0, 3.2), st.floats(0.0, 0.5), st.floats(0.0, 0.3), st.floats(0.7, 1.3), st.sampled_from([0.0, 0.4]))
+def test_the_growth_in_the_mean_square_is_that_of_the_kronecker_product(
+    name: str, delay: float, jitter: float, loss: float, gain: float, resonance: float
+) -> None:
+    """Poles as near to each other as those of a pair of modes are: any search among the n^2 eigenvalues has trouble with them."""
+    plan = design(PRESETS["paper"](), [name])
+    laws = [one.law for one in plan.laws[name] if one.law]
+    turned = gain * true_matrix([(1, 1), (1, -1)], [], 5.0, 0.0)
+    plant = TruePlant(turned, delay, jitter + 1e-3, resonance, 0.3, loss)
+    draws = [(w, step_matrices(laws, plan.mirror, plant, late, lost)) for w, late, lost in draws_of(plant)]
+    n = len(draws[0][1][0])
+    product = np.eye(n * n)
+    for phase in range(len(draws[0][1])):
+        product = sum(w * np.kron(A[phase], A[phase]) for w, A in draws) @ product
+    known = np.abs(np.linalg.eigvals(product)).max()
+    assert radius(laws, plan.mirror, plant) == pytest.approx(known, rel=1e-8)  # of eigenvalues of a matrix of 1,024 rows
 
 
 # ---------------------------------------------------------------------- residual

@@ -93,7 +93,8 @@ def design(scenario: Scenario, controllers: Sequence[str] | None = None, start: 
     """Make the laws of the controllers (all unless named) and judge them by theory. Raises SettingError.
 
     start : from which a residual counts [s], or from the end of the warm-up
-    Laws are those of the scenario before its events. What they will leave is then not known by theory, nor a bound.
+    Laws are those of the scenario before its events. What they will leave is then not known by theory, nor a bound; neither where
+    errors of the plant begin later.
     """
     scenario.validate()
     before, plant = scenario.before_events, plant_of(scenario)
@@ -107,7 +108,7 @@ def design(scenario: Scenario, controllers: Sequence[str] | None = None, start: 
         delay = actual.delay
     for name in [name for name in laws if supervision_of(CONTROLLERS[name], scenario)]:
         laws[name] = tuple(replace(one, predicted_rms=None, margins=None) for one in made[name][0])
-    if scenario.events:
+    if scenario.events or (actual is not None and actual.start):
         laws = {name: tuple(replace(one, predicted_rms=None) for one in designed) for name, designed in laws.items()}
         return Design(scenario, plant, laws, {}, priors, max(scenario.run.warm_up, start), actual)
     given = ("lgs", "both") if true else ()

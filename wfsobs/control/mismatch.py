@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from math import pi
 
 import numpy as np
-from scipy.sparse.linalg import LinearOperator, eigs
 
 from wfsobs.control.law import Law
 from wfsobs.control.margins import Margins, Response, frequencies, margins
+from wfsobs.control.mean_square import mean_square_radius
 from wfsobs.control.mirror import Mirror
 from wfsobs.control.true_plant import ActingPlant, TruePlant
 from wfsobs.signal.periodic import FilterStep, PeriodicFilter
@@ -276,25 +276,12 @@ def step_matrices(
 
 
 def radius(laws: Sequence[Law], nominal: Mirror, plant: TruePlant) -> float:
-    """Spectral radius of coupled loops over a cycle; below 1 they are stable, in the mean square where delays are random.
-
-    With delays and losses that are independent from step to step, the covariance of the state goes from step to step by
-    E[A x A], x the Kronecker product, whose radius it is (O. Costa, M. Fragoso, R. Marques, Discrete-Time Markov Jump Linear
-    Systems, 2005).
-    """
-    if plant.time_invariant:
+    """Spectral radius of coupled loops over a cycle; below 1 they are stable, in the mean square where delays are random."""
+    if not (plant.jitter or plant.loss):
         return float(np.abs(np.linalg.eigvals(_product(step_matrices(laws, nominal, plant)))).max())
-    steps = [(w, step_matrices(laws, nominal, plant, late, lost)) for w, late, lost in _draws(plant)]
-    n = len(steps[0][1][0])
-
-    def advance(x: Array) -> Array:
-        S = x.reshape(n, n)
-        for phase in range(len(steps[0][1])):
-            S = sum((w * (A[phase] @ S @ A[phase].T) for w, A in steps), np.zeros((n, n)))
-        return S.ravel()
-
-    operator = LinearOperator((n * n, n * n), matvec=advance, dtype=float)
-    return float(np.abs(eigs(operator, 1, v0=np.eye(n).ravel(), return_eigenvectors=False)).max())
+    draws = draws_of(plant)
+    steps = [step_matrices(laws, nominal, plant, late, lost) for _, late, lost in draws]
+    return mean_square_radius([weight for weight, *_ in draws], steps)
 
 
 def _product(steps: Sequence[Array]) -> Array:
@@ -304,7 +291,7 @@ def _product(steps: Sequence[Array]) -> Array:
     return out
 
 
-def _draws(plant: TruePlant) -> list[tuple[float, float, bool]]:
+def draws_of(plant: TruePlant) -> list[tuple[float, float, bool]]:
     """(weight, late, lost) whose mean is the expectation: Gauss points between the delays at which a frame begins."""
     points, weights = np.polynomial.legendre.leggauss(8 if plant.resonance else 2)  # exact for straight lines
     edges = np.arange(plant.size + 1) - (plant.delay - 1.0)

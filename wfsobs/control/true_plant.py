@@ -55,6 +55,8 @@ class TruePlant:
         Width of the loop over its height, and the commands either way that it is of [um].
     gain_drift, gain_rms, gain_time : float
         Gain of the LGS measurements less 1: its change per frame; deviation and correlation time of a random part.
+    start : int
+        Frame from which it is so; before, it is the plant that the controllers are designed for.
     """
 
     matrix: Array
@@ -69,6 +71,7 @@ class TruePlant:
     gain_drift: float = 0.0
     gain_rms: float = 0.0
     gain_time: float = 1000.0
+    start: int = 0
 
     @property
     def is_linear(self) -> bool:
@@ -78,7 +81,7 @@ class TruePlant:
     @property
     def time_invariant(self) -> bool:
         """Whether it is linear and the same at every step."""
-        return self.is_linear and not (self.jitter or self.loss)
+        return self.is_linear and not (self.jitter or self.loss or self.start)
 
     @property
     def pole(self) -> complex:
@@ -116,7 +119,7 @@ class TruePlant:
         return back * ((1.0 - back) * (out + back**self.size * left) + back**self.size)
 
     def sensor_gain(self, n: int, rng: np.random.Generator) -> Array:
-        """Gain of the LGS measurements of n frames, (n,)."""
+        """Gain of the LGS measurements of n frames from `start` on, (n,)."""
         keeps = np.exp(-1.0 / self.gain_time)
         noise = rng.standard_normal(n) * np.append(1.0, np.full(n - 1, np.sqrt(1.0 - keeps**2)))
         return 1.0 + self.gain_drift * np.arange(n) + self.gain_rms * lfilter([1.0], [1.0, -keeps], noise)
@@ -213,6 +216,11 @@ class ActingLoop:
             push_row(self._corrections, self.acting.take(u, late, is_lost))
         return u
 
+    def change(self, plant: TruePlant) -> None:
+        """Act on another plant, from where the mirror is."""
+        old, self.acting = self.acting, ActingPlant(plant)
+        self.acting.go_on(old)
+
     def go_on(self, old: ActingLoop) -> None:
         """Go on with the mirror where that of another loop is."""
         self.acting.go_on(old.acting)
@@ -231,14 +239,19 @@ def drive(
     It ends where a command is beyond FAR: later rows are infinite. Raises Cancelled.
     """
     measurements = replace(measurements, u=hold_last(measurements.u))
-    z, n, loop = measurements.z, measurements.ratio, ActingLoop(controller, plant, measurements.ratio)
+    z, n, start = measurements.z, measurements.ratio, plant.start
+    known = controller.mirror if isinstance(controller, SupervisedController) else controller.plant.mirror
+    loop = ActingLoop(controller, TruePlant(np.eye(z.shape[1]), known.delay) if start else plant, n)
     z_ngs = None if n is None or measurements.y_ngs is None else measurements.z_ngs
-    gain = plant.sensor_gain(len(z), rng)
+    gain = np.append(np.ones(start), plant.sensor_gain(len(z), rng))
     late, lost = plant.jitter * rng.uniform(-1.0, 1.0, len(z)), rng.uniform(size=len(z)) < plant.loss
+    late[:start], lost[:start] = 0.0, False
     u, correction = np.full_like(z, inf), np.full_like(z, inf)
     for k in range(len(z)):
         if k % EVERY == 0:
             watch.step(k / len(z))
+        if k == start > 0:
+            loop.change(plant)
         ngs = z_ngs[k] if z_ngs is not None and n is not None and k > 0 and k % n == 0 else None
         stars = None if measurements.lgs_stars is None else int(measurements.lgs_stars[k])
         u[k] = loop.take(z[k], ngs, gain=gain[k], late=float(late[k]), is_lost=bool(lost[k]), stars=stars)

@@ -43,6 +43,7 @@ def full_plant_of(scenario: Scenario, rotation: float = 0.0) -> TruePlant:
         p.optical_gain_drift * dt,
         p.optical_gain_rms,
         p.optical_gain_time / dt,
+        round(p.start / dt),
     )
 
 

@@ -12,6 +12,14 @@ class PlantErrors(Group):
     The plant of the controllers is the mirror of `control`, of gain 1, and its delay.
     """
 
+    start: Real = Real(
+        0.0,
+        bounds=(0.0, 3600.0),
+        softbounds=(0.0, 60.0),
+        step=0.5,
+        label="Errors begin at",
+        doc="Time from which the plant differs [s]; a live loop has its errors at once.",
+    )
     delay_error: Real = Real(
         0.0,
         bounds=(-9.0, 10.0),
