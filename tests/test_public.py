@@ -63,6 +63,12 @@ def test_every_public_name_is_there_and_listed() -> None:
         wfsobs.nothing  # type: ignore[attr-defined]  # noqa: B018
 
 
+@pytest.mark.parametrize(("name", "library"), [("explore", "panel"), ("export", "jinja2")])
+def test_without_the_dashboard_the_extra_is_named(name: str, library: str) -> None:
+    code = f"import sys; sys.modules['{library}'] = None\nimport wfsobs\ntry: wfsobs.{name}\nexcept ImportError as error: print(error)"
+    assert in_a_new_process(code) == f"{name} needs {library}: pip install wfsobs[app]\n"
+
+
 def test_the_names_that_a_type_checker_sees_are_those_that_are_imported() -> None:
     tree = ast.parse(Path(inspect.getfile(wfsobs)).read_text())
     (for_types,) = (node for node in tree.body if isinstance(node, ast.If))

@@ -111,7 +111,10 @@ def __getattr__(name: str) -> Any:
     """Import a public name when it is first used (PEP 562)."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    try:
+        value = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    except ModuleNotFoundError as error:  # of the core everything is there
+        raise ImportError(f"{name} needs {error.name}: pip install wfsobs[app]") from None
     globals()[name] = value
     return value
 
