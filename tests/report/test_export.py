@@ -56,7 +56,9 @@ def test_every_state_has_the_numbers_of_its_own_run(tmp_path: Path, parse: Any) 
     )
     assert (done.exit_code, done.output) == (0, "")
     assert [p.name for p in tmp_path.iterdir()] == ["r.html"]
-    states = parse(path.read_text(encoding="utf-8")).data("rows")
+    parsed = parse(path.read_text(encoding="utf-8"))
+    assert "left out" not in parsed.text, "of observers that were not to run"
+    states = parsed.data("rows")
     alone = [
         json.loads(
             call(

@@ -163,10 +163,18 @@ def bins_for(states: int, observers: int, modes: int) -> int:
     return int(np.clip(points / 2, FEWEST, MOST_BINS))
 
 
-def state_of(result: Result, states: int = 1, *, is_simulated: bool = True, evidence: Evidence | None = None) -> State:
+def state_of(
+    result: Result,
+    states: int = 1,
+    *,
+    is_simulated: bool = True,
+    evidence: Evidence | None = None,
+    observers: Sequence[str] | None = None,
+) -> State:
     """Select what a report of so many states keeps of a run.
 
-    is_simulated : whether the record was made from the settings; evidence : errors over several seeds
+    is_simulated : whether the record was made from the settings; evidence : errors over several seeds; observers : those that
+    were to run, by default the usual ones
     """
     record, scenario = result.record, result.scenario
     names = [m.name for m in scenario.modes][: record.n_modes]
@@ -195,7 +203,7 @@ def state_of(result: Result, states: int = 1, *, is_simulated: bool = True, evid
     return State(
         scenario,
         rows,
-        tuple(_reasons(result)),
+        tuple(_reasons(result, usual_observers(scenario, record) if observers is None else observers)),
         grid,
         lines,
         loop_rows(result),
@@ -253,11 +261,10 @@ def loop_rows(result: Result) -> list[Row]:
         return []
 
 
-def _reasons(result: Result) -> list[str]:
+def _reasons(result: Result, observers: Sequence[str]) -> list[str]:
     """Why an observer gave nothing."""
     done = {item.observer for item in (*result.estimates, *result.failures)}
-    usual = usual_observers(result.scenario, result.record)
-    waiting = [f"{name} left out: not finished when the report was made" for name in usual if name not in done]
+    waiting = [f"{name} left out: not finished when the report was made" for name in observers if name not in done]
     return [f.reason for f in result.failures] + waiting
 
 
