@@ -120,7 +120,18 @@ FILTERS = "kf-lgs kf-multi kf-coupled gp-lgs gp-both multirate multirate-optimal
 
 @pytest.fixture(scope="module")
 def ut4() -> Record:
-    return replace(wfsobs.simulate(UT4), training=None)
+    return wfsobs.simulate(UT4)
+
+
+def with_ngs_outliers(record: Record, sigmas: float, seed: int = 1) -> tuple[Record, Array]:
+    """Return a record of which 1 % of NGS frames are off by so many sigma of their noise, and in which steps."""
+    rng = np.random.default_rng(seed)
+    assert record.y_ngs is not None and record.ratio is not None
+    y_ngs = record.y_ngs.copy()
+    frames = np.arange(record.ratio, record.n_steps, record.ratio)
+    hit = frames[rng.random(len(frames)) < 0.01]
+    y_ngs[hit] += sigmas * UT4.sensors.ngs_noise * rng.choice([-1.0, 1.0], size=(len(hit), 1))
+    return replace(record, y_ngs=y_ngs), hit
 
 
 def errors(record: Record, **settings: str) -> dict[tuple[str, str, str], float]:
@@ -137,10 +148,11 @@ def test_one_percent_of_outliers_costs_less_than_five_percent(ut4: Record) -> No
     clean = errors(ut4, gate="off")
     assert max(abs(e / clean[key] - 1.0) for key, e in errors(ut4).items()) < 1e-3
     for sigmas in (40.0, 10.0, 6.0):
-        broken, _ = with_outliers(ut4, sigmas)
-        found = errors(broken)
-        assert found.keys() == clean.keys()
-        assert max(e / clean[key] - 1.0 for key, e in found.items()) < 0.05
+        of_ngs = [with_ngs_outliers(ut4, sigmas)] if sigmas > 6.0 else []  # of 6 a third is within the level
+        for broken, _ in (with_outliers(ut4, sigmas), *of_ngs):
+            found = errors(broken)
+            assert found.keys() == clean.keys()
+            assert max(e / clean[key] - 1.0 for key, e in found.items()) < 0.05
     kf = "kf-multi", "vibration", "tilt"
     assert errors(with_outliers(ut4, 40.0)[0], gate="off")[kf] > 2.0 * clean[kf], "without a gate they ruin it"
 
@@ -166,10 +178,50 @@ def test_outliers_are_found_and_counted(ut4: Record) -> None:
     assert replace(broken, gate=None).outliers == 0
 
 
+@pytest.mark.parametrize("sigmas", [10.0, 40.0])
+def test_ngs_frames_are_tested_by_what_the_lgs_see_meanwhile(ut4: Record, sigmas: float) -> None:
+    """Of the difference noise is all that moves within a frame: 10 sigma of the NGS are 8 of it. A frame without LGS passes."""
+    broken, hit = with_ngs_outliers(replace(ut4, y_lgs=ut4.y_lgs.copy()), sigmas)
+    alone = hit[len(hit) // 2]
+    broken.y_lgs[alone - 4 : alone + 1] = np.nan
+    passed = replace(broken, gate=REJECT).without_outliers.y_ngs
+    assert passed is not None and broken.y_ngs is not None
+    gone = np.any(np.isnan(passed[5::5]), axis=1)
+    is_hit = np.isin(np.arange(5, broken.n_steps, 5), hit[hit != alone])
+    settled = np.arange(len(gone)) >= 6 * BLOCK
+    assert gone[settled & is_hit].all()
+    assert gone[settled & ~is_hit].sum() <= 3, "0.4 are expected"
+    np.testing.assert_array_equal(passed[alone], broken.y_ngs[alone])
+
+
+def test_training_data_pass_the_gate(ut4: Record) -> None:
+    """Taps that are learnt from 1 % of outliers: 5.5 % worse without a gate, within 2 % of those of clean data with it."""
+    training = ut4.training
+    assert training is not None and training.open_loop_y is not None
+    y, y_open = training.y_lgs.copy(), training.open_loop_y.copy()
+    rng = np.random.default_rng(1)
+    hit = rng.random(len(y)) < 0.01
+    steps = 40.0 * NOISE * rng.choice([-1.0, 1.0], size=(hit.sum(), 1))
+    y[hit] += steps
+    y_open[hit] += steps
+    broken = replace(ut4, training=replace(training, y_lgs=y, open_loop_y=y_open))
+
+    def error(record: Record, gate: bool) -> float:
+        return max(
+            s.rms for s in wfsobs.observe(record, UT4, observers=["ridge-30"], gate=gate).scores if s.target == "vibration"
+        )
+
+    clean = error(ut4, gate=False)
+    assert error(ut4, gate=True) < 1.001 * clean
+    assert error(broken, gate=True) < 1.02 * clean
+    assert error(broken, gate=False) > 1.02 * clean
+
+
 @pytest.mark.parametrize("name", ["kf-multi", "multirate-multi", "gp-both", "persistence", "kf-ngs"])
 def test_an_observer_with_a_gate_is_the_same_step_by_step(ut4: Record, name: str) -> None:
     short = replace(ut4, **{key: x[:2000] for key, x in vars(ut4).items() if isinstance(x, np.ndarray)}, gate=REJECT)
-    broken = replace(with_outliers(short, 30.0)[0], gate=REJECT)
+    broken = replace(with_ngs_outliers(with_outliers(short, 30.0)[0], 30.0)[0], gate=REJECT)
+    broken.y_lgs[700:720] = np.nan  # some NGS frames have no LGS beside them
     measurements, prior, own = arguments(OBSERVERS[name], broken, UT4)
     expected = OBSERVERS[name].estimate(measurements, prior, own)
     raw = replace(broken, gate=None).measurements()

@@ -21,7 +21,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import observe
 from wfsobs.prior import Lines
 from wfsobs.priors_from.identification import prior_of, told_by
-from wfsobs.priors_from.training import with_training
+from wfsobs.priors_from.training import training_of, with_training
 from wfsobs.record import Record, Training
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS
@@ -101,7 +101,7 @@ def test_missing_samples_of_training_data_are_held(night: Record, other: Record)
     """z keeps its last value: y = z + u[k - delay]."""
     y = other.y_lgs.copy()
     y[100:103, 0] = np.nan
-    training = with_training(night, replace(other, y_lgs=y), S).training
+    training = training_of(with_training(night, replace(other, y_lgs=y), S))
     assert training is not None
     expected = other.z[99, 0] + other.u[98:101, 0]
     np.testing.assert_allclose(training.y_lgs[100:103, 0], expected, rtol=0, atol=1e-12)

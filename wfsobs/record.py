@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 import numpy as np
 
 from wfsobs.notebook import PlotAccessor, html_table, import_extra
-from wfsobs.signal.gate import GateSettings, OutlierGate
+from wfsobs.signal.gate import GateSettings, OutlierGate, frame_mean_of, let_through
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:
@@ -248,15 +248,16 @@ class Record(Signals):
         def gate(y: Array, z: Array, first: int) -> Array:
             """Test all but the first samples, which lack commands of before the record."""
             n_columns = int(np.prod(z.shape[1:]))
-            tested = OutlierGate(n_columns, settings).check_all(z[first:].reshape(-1, n_columns))
-            tested = np.concatenate([z[:first], tested.reshape(z[first:].shape)])
-            return np.where(tested == z, y, tested + (y - z))
+            passed = OutlierGate(n_columns, settings).check_all(z[first:].reshape(-1, n_columns))
+            return let_through(y, z, np.concatenate([z[:first], passed.reshape(z[first:].shape)]))
 
         n, y_ngs = self.ratio, self.y_ngs
-        if y_ngs is not None and n is not None:
-            y_ngs = y_ngs.copy()
-            y_ngs[n::n] = gate(y_ngs[n::n], self.z_ngs[n::n], -(-(self.delay - 1) // n))
         y_lgs = gate(self.y_lgs, self.z, self.delay)
+        if y_ngs is not None and n is not None:
+            y_ngs, whole = y_ngs.copy(), (self.n_steps - 1) // n * n
+            beside = frame_mean_of(replace(self, y_lgs=y_lgs).z[1 : 1 + whole].reshape(-1, n, self.n_modes))
+            passed = gate(y_ngs[n::n], self.z_ngs[n::n] - beside, -(-(self.delay - 1) // n))
+            y_ngs[n::n] = np.where(np.isnan(beside), y_ngs[n::n], passed)
         y_stars = None if self.y_stars is None else gate(self.y_stars, self.z_stars, self.delay)
         y_open = None if self.open_loop_y is None else gate(self.open_loop_y, self.open_loop_y, self.delay)
         return replace(self, y_lgs=y_lgs, y_ngs=y_ngs, y_stars=y_stars, open_loop_y=y_open, gate=None)

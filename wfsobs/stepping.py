@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.missing import fill_missing
 from wfsobs.observers.step import StepError
 from wfsobs.prior import LgsStars, Part, Prior, Spectra, Training
 from wfsobs.priors_from.controllers import own_settings, plant_of
 from wfsobs.priors_from.identification import told_by
 from wfsobs.priors_from.scenario import SHARED, as_sampled, observer_settings, prior_of
+from wfsobs.priors_from.training import as_training
 from wfsobs.record import Record, Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
@@ -166,5 +166,4 @@ def _training(scenario: Scenario, train: Record | Training | None) -> Training:
         return made
     if isinstance(train, Training):
         return train
-    whole = fill_missing(train.without_outliers, Prior())
-    return Training(whole.y_lgs, whole.u, whole.open_loop_y).copy()
+    return as_training(train)

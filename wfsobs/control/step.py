@@ -53,7 +53,7 @@ class StepController(StepBase):
         self._taps = plant.mirror.taps[1:]
         self._commands = np.zeros((len(self._taps), n))  # commands, newest first
         self._mirror = np.zeros((max(self._ratio, 1), n))  # the mirror in the last measurements, newest first
-        self._arrays = {"sent": self._commands, "mirror": self._mirror}
+        self._arrays |= {"sent": self._commands, "mirror": self._mirror}
         self._none = np.zeros(n)
         self._parts |= {} if law is None else {"law": law}
         self._parts |= {} if ahead is None else ahead.parts

@@ -16,7 +16,7 @@ from wfsobs.live.paced import SOURCE, Desk, Staff, enter_process
 from wfsobs.live.ring import Ring
 from wfsobs.live.source import STREAM
 from wfsobs.record import Sampling
-from wfsobs.signal.gate import GateSettings, OutlierGate
+from wfsobs.signal.gate import GateSettings, OutlierGate, frame_mean_of
 from wfsobs.streams.attach import LONGEST_GAP
 from wfsobs.streams.layout import StreamError
 from wfsobs.streams.network import Subscription, is_address
@@ -175,6 +175,7 @@ class StreamFrames:
         self._is_playing = self._is_stuck = False
         self._spells: dict[str, float] = {}
         self._gates = source.gate and tuple(OutlierGate(desk.n_modes, source.gate) for _ in range(2))
+        self._lgs_history = np.full((source.sampling.ratio or 1, desk.n_modes), np.nan)  # newest last
 
     def run(self) -> None:
         """Follow the stream until the process is ended, or all frames have been sent."""
@@ -240,7 +241,9 @@ class StreamFrames:
         assert self._gates
         ratio = self._source.sampling.ratio
         is_due = ratio is not None and self._ring.count > 0 and self._ring.count % ratio == 0
-        tested = self._gates[0].check(z), self._gates[1].check(ngs) if is_due else ngs
+        lgs = self._gates[0].check(z)
+        self._lgs_history[:-1], self._lgs_history[-1] = self._lgs_history[1:], lgs
+        tested = lgs, self._gates[1].check_beside(ngs, frame_mean_of(self._lgs_history)) if is_due else ngs
         if any(not np.array_equal(new, old, equal_nan=True) for new, old in zip(tested, (z, ngs), strict=True)):
             counts = [", ".join(map(str, gate.outliers)) for gate in self._gates]
             done = "clipped" if self._gates[0].settings.action == "clip" else "taken for missing"

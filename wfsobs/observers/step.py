@@ -22,7 +22,7 @@ from wfsobs.observers.stepping import StateArrays, Stateful, load_parts, save_pa
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
-from wfsobs.signal.gate import GateSettings, OutlierGate
+from wfsobs.signal.gate import GateSettings, OutlierGate, frame_mean_of
 from wfsobs.typing import Array
 
 
@@ -182,9 +182,10 @@ class StepBase:
         if not uses_ngs:
             self._ngs = None
         self._gates = make_gates(gate, sampling, uses_ngs, each_shape)
+        self._lgs_history = np.zeros((self._ratio if "gate_ngs" in self._gates else 0, sampling.n_modes))  # newest last
         known = {"lgs": self._lgs, "ngs": self._ngs, **self._gates}
         self._parts: dict[str, Stateful] = {name: part for name, part in known.items() if part is not None}
-        self._arrays: dict[str, Array] = {}
+        self._arrays: dict[str, Array] = {"lgs_history": self._lgs_history} if self._lgs_history.size else {}
 
     def reset(self) -> None:
         """Go back to before the first frame, a mirror at rest."""
@@ -221,11 +222,14 @@ class StepBase:
         if self._gates:
             z = pass_gate(self._gates, "gate_lgs", z, self.frame, self.sampling)
             is_whole = is_whole and not np.isnan(z).any()
+        if self._lgs_history.size:
+            self._lgs_history[:-1], self._lgs_history[-1] = self._lgs_history[1:], z
         return z if self._lgs is None else self._lgs.complete(z, is_whole)
 
     def _complete_ngs(self, z: Array) -> Array:
         """Pass the gate and the bridge of NGS frames."""
-        z = pass_gate(self._gates, "gate_ngs", z, self.frame, self.sampling)
+        if self._lgs_history.size and self.frame >= self.sampling.delay + self._ratio - 1:
+            z = self._gates["gate_ngs"].check_beside(z, frame_mean_of(self._lgs_history))
         return z if self._ngs is None else self._ngs.complete(z)
 
     def _take_over(self, old: StepBase) -> None:
@@ -396,9 +400,8 @@ def make_gates(
 
 
 def pass_gate(gates: Mapping[str, OutlierGate], name: str, z: Array, frame: int, sampling: Sampling) -> Array:
-    """Return a measurement of any shape [um] with outliers missing, or clipped; those that lack earlier commands pass."""
-    first = sampling.delay + (sampling.ratio or 1) - 1 if name == "gate_ngs" else sampling.delay
-    if name not in gates or frame < first:
+    """Return an LGS measurement of any shape [um] with outliers missing, or clipped; those that lack earlier commands pass."""
+    if name not in gates or frame < sampling.delay:
         return z
     return gates[name].check(z.ravel()).reshape(z.shape)
 

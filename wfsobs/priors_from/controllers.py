@@ -14,6 +14,7 @@ from wfsobs.control.supervisor import Supervision
 from wfsobs.control.true_plant import TruePlant, true_matrix
 from wfsobs.prior import Prior, Spectra, Training
 from wfsobs.priors_from.scenario import prior_of
+from wfsobs.priors_from.training import training_of
 from wfsobs.record import Measurements, Record
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.zernike import noll
@@ -76,5 +77,4 @@ def prior_for(controller: Controller, scenario: Scenario, spectra: Sequence[Spec
 
 def controller_arguments(controller: Controller, record: Record, settings: Settings, prior: Prior) -> tuple[Measurements, Prior]:
     """Return the arguments of a controller from a record: measurements and prior, with the training record where it needs one."""
-    asked = record.training is not None and Training in controller.parts(settings)
-    return record.measurements(), replace(prior, training=record.training.copy() if asked and record.training else None)
+    return record.measurements(), replace(prior, training=training_of(record) if Training in controller.parts(settings) else None)

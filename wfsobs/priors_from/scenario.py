@@ -35,6 +35,7 @@ from wfsobs.prior import (
     Training,
 )
 from wfsobs.priors_from.flow import asterism_of, flow_of, flow_of_both
+from wfsobs.priors_from.training import training_of
 from wfsobs.priors_from.turbulence import beams_of, lgs_error_of, lines_turbulence, measurement_noise, one_process, stars_of
 from wfsobs.priors_from.vibration import vibration_continuum
 from wfsobs.record import Measurements, Record, Sampling
@@ -128,7 +129,7 @@ def prior_of(
         asterism=_asterism(asked, scenario, len(modes), dt),
         bands=bands_of(scenario, bands) if bands else None,
         spectra=tuple(spectra or [spectra_of(scenario, mode) for mode in modes]) if Spectra in asked else (),
-        training=record.training.copy(modes) if Training in asked and record and record.training else None,
+        training=training_of(record, modes) if Training in asked and record else None,
     )
 
 

@@ -1,7 +1,8 @@
-"""Training data from telemetry: another record of the same loop, or the first part of the record itself."""
+"""Training data: of a record, from another record of the same loop, or the first part of the record itself."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,7 +31,7 @@ def with_training(record: Record, train: Record | float, scenario: Scenario) -> 
     Returns
     -------
     Record
-        With the same measurements. Missing samples of the training data are bridged by the last value.
+        With the same measurements.
 
     Raises
     ------
@@ -38,8 +39,25 @@ def with_training(record: Record, train: Record | float, scenario: Scenario) -> 
         The other record has another rate, number of modes or delay, is the record itself, or either has too few samples or an
         impossible duration.
     """
-    whole = fill_missing(training_part(record, train, scenario).without_outliers, Prior())
-    return replace(record, training=Training(whole.y_lgs, whole.u, whole.open_loop_y).copy())
+    part = training_part(record, train, scenario)
+    return replace(record, training=Training(part.y_lgs, part.u, part.open_loop_y).copy())
+
+
+def training_of(record: Record, modes: Sequence[int] | None = None) -> Training | None:
+    """Return the training data of a record as observers receive them: by its gate, missing samples bridged by the last value.
+
+    modes : of these alone
+    """
+    if record.training is None:
+        return None
+    t = record.training.copy(modes)
+    return as_training(Record(t.y_lgs, t.u, record.dt, open_loop_y=t.open_loop_y, delay=record.delay, gate=record.gate))
+
+
+def as_training(record: Record) -> Training:
+    """Return a record as training data, without outliers, missing samples bridged by the last value."""
+    whole = fill_missing(record.without_outliers, Prior())
+    return Training(whole.y_lgs, whole.u, whole.open_loop_y).copy()
 
 
 def training_part(record: Record, train: Record | float, scenario: Scenario) -> Record:
@@ -75,4 +93,4 @@ def _first(record: Record, seconds: float) -> Record:
         raise RecordError(f"the first {seconds:g} s as training data: takes more than 0 and less than the record's {length:g} s")
     end = round(seconds / record.dt)
     twin = None if record.open_loop_y is None else record.open_loop_y[:end]
-    return Record(record.y_lgs[:end], record.u[:end], record.dt, open_loop_y=twin, delay=record.delay, gate=record.gate)
+    return Record(record.y_lgs[:end], record.u[:end], record.dt, open_loop_y=twin, delay=record.delay)

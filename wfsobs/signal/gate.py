@@ -5,7 +5,8 @@ every `BLOCK` samples. A measurement further than `level` deviations from its pr
 running median of the magnitudes of the prediction errors themselves, since under a wrong model a stated one is wrong. After five
 in a row the level has moved, or a vibration has appeared: the gate is open for `OPEN` samples, and all pass. No filter starves:
 never more than a fifth of the samples of a mode is rejected for long. The prediction is of the measurements alone, so that one
-gate serves every observer.
+gate serves every observer. Of a slower sensor, between two frames of which the disturbance moves far, it is the difference from a
+faster one that is tested.
 
 Least squares with a memory: Ljung, System Identification, section 11.2. The clipped innovation: Huber, Robust Statistics.
 """
@@ -120,6 +121,11 @@ class OutlierGate:
             self.settle()
         return np.where(is_outlier, expected + kept, z)
 
+    def check_beside(self, z: Array, beside: Array, *, settles: bool = True) -> Array:
+        """Return z (n_modes,) [um] as `check`, tested by its difference from `beside`; where that is NaN it passes."""
+        passed = let_through(z, z - beside, self.check(z - beside, settles=settles))
+        return np.where(np.isnan(beside), z, passed)
+
     def settle(self) -> None:
         """Fit after the last sample of a block: the part of the work that can wait."""
         if self.count % BLOCK == 0:
@@ -214,6 +220,18 @@ class OutlierGate:
         self._is_usual[mode] &= ~is_far
         for k in np.flatnonzero(is_far):
             self._past[mode, ORDER + k] = self._past[mode, ORDER + k - 1]
+
+
+def let_through(z: Array, argument: Array, result: Array) -> Array:
+    """Return z without outliers; argument, result : what a gate was given of it and has returned."""
+    return np.where(result == argument, z, result + (z - argument))
+
+
+def frame_mean_of(z: Array) -> Array:
+    """Return the mean of samples z (..., n, n_modes) [um] over a frame, of those that are there; NaN where none is."""
+    is_there = ~np.isnan(z)
+    count = is_there.sum(axis=-2)
+    return np.where(count > 0, np.where(is_there, z, 0.0).sum(axis=-2) / np.maximum(count, 1), np.nan)
 
 
 STATE = (

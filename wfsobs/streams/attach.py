@@ -13,7 +13,7 @@ from wfsobs.latencies import Latencies
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.step import StepObserver
 from wfsobs.record import Sampling
-from wfsobs.signal.gate import OutlierGate
+from wfsobs.signal.gate import OutlierGate, frame_mean_of
 from wfsobs.streams.layout import Semaphore, StreamError
 from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.stream import FrameStream, SinkStream, SourceStream
@@ -129,20 +129,26 @@ class SafeGate:
     ----------
     wiring : Wiring
         Gate, rms of a measurement, largest estimate.
+    recent : int
+        Measurements that are kept.
 
     Attributes
     ----------
+    history : Array
+        The last measurements as they have passed, the newest first, (recent, n_modes) [um].
     outliers : Array of int
         How many there were, (n_modes,).
     beyond : int
         How many there were in a row in a mode, the last one among them.
     """
 
+    history: Array
     outliers: Array
     beyond: int
 
-    def __init__(self, wiring: Wiring):
+    def __init__(self, wiring: Wiring, recent: int = 1):
         n = wiring.spread.size
+        self.history = np.full((recent, n), np.nan)
         self._gate = None if wiring.gate is None else OutlierGate(n, wiring.gate)
         self._possible, self.outliers = wiring.largest + FAR * wiring.spread, np.zeros(n, dtype=int)
         self.restart()
@@ -153,11 +159,16 @@ class SafeGate:
         if self._gate is not None:
             self._gate.reset()
 
-    def accept(self, z: Array) -> Array:
-        """Return a measurement, any numbers (n_modes,) [um], with outliers NaN, or clipped; `settle` has to follow."""
+    def accept(self, z: Array, beside: Array | None = None) -> Array:
+        """Return a measurement, any numbers (n_modes,) [um], with outliers NaN, or clipped; `settle` has to follow.
+
+        beside : what a faster sensor has measured meanwhile
+        """
         taken = np.where(np.abs(z) <= self._possible, z, np.nan)
         if self._gate is not None:
-            taken = self._gate.check(taken, settles=False)
+            expected = np.zeros_like(taken) if beside is None else beside
+            taken = self._gate.check_beside(taken, expected, settles=False)
+        self.history[1:], self.history[0] = self.history[:-1], taken
         is_out = ~np.isnan(z) & (taken != z)
         self.outliers += is_out
         self._row = np.where(is_out, self._row + 1, np.where(np.isnan(z), self._row, 0))
@@ -393,7 +404,7 @@ class Attachment:
         self._source, self._sink, self._observer, self._wiring, self._say = source, sink, observer, wiring, say
         self._elements = np.array(wiring.elements)
         self._watchdog = Watchdog(wiring.largest, wiring.safety, say, wiring.warm_up)
-        self._gate, self._ngs_gate = SafeGate(wiring), SafeGate(wiring)
+        self._gate, self._ngs_gate = SafeGate(wiring, 2 * ngs.ratio if ngs else 1), SafeGate(wiring)
         self._semaphore: Semaphore | None = None
         self._semaphore_number: int | None = None
         self._missing = self._forecast = np.full(len(wiring.elements), np.nan)
@@ -478,10 +489,13 @@ class Attachment:
             measured = values[self._elements] * self._wiring.unit
             if self._commands is not None:
                 measured = self._commands.open_loop(count, measured)
-        found_ngs = self._look_for_ngs()
+        ngs, late = self._look_for_ngs()
         z, error = self._gate.accept(measured), measured - self._forecast
+        if ngs is not None and self._ngs is not None:
+            ngs = self._ngs_gate.accept(ngs, frame_mean_of(self._gate.history[late : late + self._ngs.ratio]))
+            self._ngs_gate.settle()
         beyond = max(self._gate.beyond, self._ngs_gate.beyond)
-        output = self._watchdog.output(self._step(z, *found_ngs), z, beyond, lost)
+        output = self._watchdog.output(self._step(z, ngs, late), z, beyond, lost)
         self._is_overtaken = self._source.count != count and not self._is_overtaken
         if not self._is_overtaken:  # else the next answer follows at once, and who waits for it must not get this one
             self._send(output)
@@ -508,9 +522,8 @@ class Attachment:
             self._watchdog.fall_back("the NGS frames have found their place")
         if found is None:
             return None, 0
-        ngs = self._ngs_gate.accept(found[1])
-        self._ngs_gate.settle()
-        return ngs, found[0]
+        late, ngs = found
+        return ngs, late
 
     def _step(self, z: Array, ngs: Array | None, late: int) -> Array:
         self._frames.update(z, ngs, late)
