@@ -65,7 +65,7 @@ def test_every_public_name_is_there_and_listed() -> None:
 
 @pytest.mark.parametrize(("name", "library"), [("explore", "panel"), ("export", "jinja2")])
 def test_without_the_dashboard_the_extra_is_named(name: str, library: str) -> None:
-    code = f"import sys; sys.modules['{library}'] = None\nimport wfsobs\ntry: wfsobs.{name}\nexcept ImportError as error: print(error)"
+    code = f"import sys; sys.modules['{library}'] = None\nimport wfsobs\ntry: wfsobs.{name}\nexcept ImportError as it: print(it)"
     assert in_a_new_process(code) == f"{name} needs {library}: pip install wfsobs[app]\n"
 
 

@@ -38,7 +38,15 @@ XYZ = np.array([[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721
 TOGETHER = {**{target: [TRUTH, *observers_of(target)] for target in TARGETS}, "controllers": list(CONTROLLERS)}
 """Lines that share a figure."""
 
-OFTEN_FIRST = ("kf-lgs", "gpr-online", "multirate-optimal", "multirate-multi", "multirate-adaptive", "gp-both")
+OFTEN_FIRST = (
+    "kf-lgs",
+    "gpr-online",
+    "multirate-optimal",
+    "multirate-multi",
+    "multirate-adaptive",
+    "multirate-coupled",
+    "gp-both",
+)
 """The references, and those that are the best of most scenarios."""
 
 CLEARLY_APART = 25.0

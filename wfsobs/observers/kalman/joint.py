@@ -314,7 +314,7 @@ MULTIRATE_COUPLED = Observer(
     sensors=("lgs", "ngs"),
     weight=3.0,
     tunable=Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
-    look=Look("Coupled, both", "#5343AF", "#9E6FA9", (10, 2, 4, 2)),
+    look=Look("Coupled, both", "#3806FF", "#2C49F5", (10, 2, 4, 2)),
     step=multirate_coupled,
     counts=vibration_used,
 )
