@@ -12,13 +12,14 @@ import pytest
 
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.pages import model
-from wfsobs.app.pages.figures import PSD_TOP_HZ, Figures
+from wfsobs.app.pages.figures import Figures
 from wfsobs.app.pages.pages import EXPLORE, FIGURES, MODEL
 from wfsobs.app.pages.parts import example
 from wfsobs.app.render import matrix, short, tex
 from wfsobs.app.style import look
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.description import describe
+from wfsobs.plot.paper import PSD_TOP_HZ
 from wfsobs.scenario import Scenario
 
 

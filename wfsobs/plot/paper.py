@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from wfsobs.evaluation.error_spectra import TRUTH, spectra
 from wfsobs.evaluation.result import Result
@@ -23,7 +22,7 @@ ZOOM_S = 0.5
 """Length of a zoomed plot [s], in the middle of the record."""
 
 BINS = 700
-PSD_TOP_HZ = 100.0
+PSD_TOP_HZ, DECADES = 100.0, 5
 WHOLE, ZOOMED, SPECTRUM = "whole record", "zoomed", "power spectrum"
 
 
@@ -33,6 +32,26 @@ class Plot:
 
     what: str
     column: int = 0
+
+    @property
+    def is_spectrum(self) -> bool:
+        """Whether it is over frequency."""
+        return self.what == SPECTRUM
+
+    @property
+    def window(self) -> str:
+        """Which samples it is of."""
+        return WHOLE if self.is_spectrum else self.what
+
+    @property
+    def label(self) -> str:
+        """What its axis of y is of."""
+        mode = TIP_TILT[self.column].name
+        return f"PSD, {mode}" if self.is_spectrum else mode
+
+    def unit(self, length: str) -> str:
+        """Return the unit of its axis of y, made of one of length."""
+        return f"{length}²/Hz" if self.is_spectrum else length
 
 
 @dataclass(frozen=True)
@@ -104,16 +123,33 @@ def samples_of(record: Record, warm_up: float) -> dict[str, tuple[int, int]]:
     return {WHOLE: (begin, n), ZOOMED: (middle - half, middle + half)}
 
 
-def trace_of(record: Record, values: Array | None, column: int, first: int, last: int) -> tuple[Array, Array]:
-    """Return times [s] and values [um] of a trace, NaN where there are no values, the extremes of bins where they are many."""
-    shown = np.full(last - first, np.nan) if values is None else values[first:last, column]
-    return envelope_times(first, last, BINS, record.dt), envelope(shown, BINS)
+@dataclass(frozen=True)
+class PlotLines:
+    """What a plot shows.
+
+    lines : name of an observer or of the truth, which is last and so on top -> x [s or Hz], y [um, or um^2/Hz of a spectrum]
+    ends  : of the axis of x
+    """
+
+    lines: dict[str, tuple[Array, Array]]
+    ends: tuple[float, float]
 
 
-def spectrum_part(frequency: Array, density: Array) -> tuple[Array, Array]:
-    """Return the part of a spectrum (n,) that is drawn."""
-    within = (frequency > 0) & (frequency <= PSD_TOP_HZ)
-    return frequency[within], density[within]
+def drawn_lines(
+    of: PaperFigure, plot: Plot, record: Record, warm_up: float, values: Callable[[str, str], Array | None]
+) -> PlotLines:
+    """Return the lines of a plot; values : (name, target) -> (n_steps, n_modes) [um], None where there are none."""
+    lines, (first, last) = dict[str, tuple[Array, Array]](), samples_of(record, warm_up)[plot.window]
+    for name in (*of.observers, TRUTH):
+        x = values(name, of.target)
+        if x is None:
+            continue
+        if not plot.is_spectrum:
+            lines[name] = envelope_times(first, last, BINS, record.dt), envelope(x[first:last, plot.column], BINS)
+        elif (found := spectra(record, of.target, x, warm_up, [plot.column])) is not None:
+            within = (found[0] > 0) & (found[0] <= PSD_TOP_HZ)
+            lines[name] = found[0][within], found[1][within, 0]
+    return PlotLines(lines, (0.0, PSD_TOP_HZ) if plot.is_spectrum else (first * record.dt, last * record.dt))
 
 
 NUMBERS = {f"paper-{number}": tuple(it for it in FIGURES if it.number.startswith(number)) for number in "456"}
@@ -157,22 +193,18 @@ def draw_paper_figure(name: str, result: Result) -> hv.Layout:
 def _draw_plot(of: PaperFigure, plot: Plot, result: Result) -> hv.Overlay:
     from wfsobs.plot.elements import FREQUENCY, TIME, draw_line, overlay, quantity
 
-    record, warm_up, mode = result.record, result.scenario.run.warm_up, TIP_TILT[plot.column].name
-    values = {name: it.values for name in of.observers if (it := result.estimate(name, of.target))}
-    if (truth := record.truth(of.target)) is not None:
-        values[TRUTH] = truth
-    label, unit = (f"PSD, {mode}", "µm²/Hz") if plot.what == SPECTRUM else (f"{of.target}, {mode}", "µm")
-    first, last = samples_of(record, warm_up)[plot.what if plot.what != SPECTRUM else WHOLE]
-    x_axis, ends = (FREQUENCY, (0.0, PSD_TOP_HZ)) if plot.what == SPECTRUM else (TIME, (first * record.dt, last * record.dt))
-    y, lines = quantity(f"{of.number} {plot.what} {mode}", unit, label), []
-    for name, x in values.items():
+    def values(name: str, target: str) -> Array | None:
+        estimate = result.estimate(name, target)
+        return result.record.truth(target) if name == TRUTH else estimate and estimate.values
+
+    shown, drawn = drawn_lines(of, plot, result.record, result.scenario.run.warm_up, values), []
+    label = plot.label if plot.is_spectrum else f"{of.target}, {plot.label}"
+    y = quantity(f"{of.number} {plot.what} {plot.column}", plot.unit("µm"), label)
+    for name, line in shown.lines.items():
         its = replace(look(name), label=of.reference if name == TRUTH else LABELS.get(name, look(name).label))
         its = its if is_dashed(name, of) else replace(its, dash=())
-        if plot.what != SPECTRUM:
-            lines.append(draw_line(*trace_of(record, x, plot.column, first, last), (x_axis, y), its))
-        elif (found := spectra(record, of.target, x, warm_up, [plot.column])) is not None:
-            lines.append(draw_line(*spectrum_part(found[0], found[1][:, 0]), (x_axis, y), its))
-    return overlay(lines, log="y" if plot.what == SPECTRUM else "", decades=5, xlim=ends)
+        drawn.append(draw_line(*line, (FREQUENCY if plot.is_spectrum else TIME, y), its))
+    return overlay(drawn, log="y" if plot.is_spectrum else "", decades=DECADES, xlim=shown.ends)
 
 
 def is_dashed(name: str, of: PaperFigure) -> bool:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from html import escape
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import panel as pn
-from bokeh.models import BoxAnnotation, ColumnDataSource, DataRange1d, GlyphRenderer, Range1d
+from bokeh.models import BoxAnnotation, ColumnDataSource, DataRange1d, Range1d
 from bokeh.plotting import figure
 
 from wfsobs.app.display import Display, per_micrometre
@@ -15,22 +15,10 @@ from wfsobs.app.pages.parts import WIDE, Page, boxes, html
 from wfsobs.app.render import number
 from wfsobs.app.store import Store
 from wfsobs.app.style import look, sheets, swatch
-from wfsobs.app.views.plots import call, new_figure
+from wfsobs.app.views.plots import add_line, call, new_figure
 from wfsobs.app.views.table import find
 from wfsobs.app.work import TRUTH, RunResults
-from wfsobs.plot.paper import (
-    FIGURES,
-    PSD_TOP_HZ,
-    SPECTRUM,
-    WHOLE,
-    ZOOMED,
-    PaperFigure,
-    Plot,
-    is_dashed,
-    samples_of,
-    spectrum_part,
-    trace_of,
-)
+from wfsobs.plot.paper import DECADES, FIGURES, WHOLE, ZOOMED, PaperFigure, Plot, drawn_lines, is_dashed, samples_of
 from wfsobs.sensors.modes import TIP_TILT
 
 
@@ -101,65 +89,36 @@ class _PlotLines:
 
     def __init__(self, plot: Plot, names: tuple[str, ...], of: PaperFigure):
         self.plot, self.of = plot, of
-        if plot.what == SPECTRUM:
-            self.figure: figure = new_figure(
-                x_range=Range1d(start=0.0, end=PSD_TOP_HZ), y_range=Range1d(start=1e-3, end=1.0), y_axis_type="log"
-            )
-        else:
-            self.figure = new_figure(x_range=Range1d(start=0.0, end=1.0), y_range=DataRange1d())
-        self.figure.xaxis.axis_label = "frequency [Hz]" if plot.what == SPECTRUM else "time [s]"
+        y_range = Range1d(start=1e-3, end=1.0) if plot.is_spectrum else DataRange1d()
+        kind = "log" if plot.is_spectrum else "linear"
+        self.figure: figure = new_figure(x_range=Range1d(start=0.0, end=1.0), y_range=y_range, y_axis_type=kind)
+        self.figure.xaxis.axis_label = "frequency [Hz]" if plot.is_spectrum else "time [s]"
         call(self.figure, f"{of.title}, {TIP_TILT[plot.column].name}, {plot.what}")
         self.sources = {name: ColumnDataSource({"x": [], "y": []}) for name in names}
-        self.lines: dict[str, GlyphRenderer[Any]] = {
-            name: self.figure.line(
-                "x",
-                "y",
-                source=source,
-                line_width=1.6,
-                line_dash=list(look(name).dash) if is_dashed(name, of) else [],
-                name=name,
-            )
-            for name, source in self.sources.items()
-        }
+        self.lines = {name: add_line(self.figure, name, source) for name, source in self.sources.items()}
+        for name, line in self.lines.items():
+            line.glyph.update(line_width=1.6, line_dash=list(look(name).dash) if is_dashed(name, of) else [])
         self.window = BoxAnnotation(left=0, right=0, fill_color="#808080", fill_alpha=0.15, line_width=0, level="underlay")
         if plot.what == WHOLE and any(p.what == ZOOMED for p in of.plots):
             self.figure.add_layout(self.window)
 
     def draw(self, results: RunResults, display: Display) -> None:
         """Send every line in the colours of the paper."""
-        scale = per_micrometre(display.unit, results.scenario.telescope.diameter)
+        record, warm_up = results.result.record, results.scenario.run.warm_up
+        shown = drawn_lines(self.of, self.plot, record, warm_up, results.values)
+        scale = per_micrometre(display.unit, results.scenario.telescope.diameter) ** (1 + self.plot.is_spectrum)
         for name, line in self.lines.items():
             line.glyph.line_color = look(name).colour(display.dark)
-        mode = TIP_TILT[self.plot.column].name
-        if self.plot.what == SPECTRUM:
-            self.figure.yaxis.axis_label = f"PSD, {mode} [{display.unit_label}²/Hz]"
-            self._draw_spectra(results, scale**2)
-        else:
-            self.figure.yaxis.axis_label = f"{mode} [{display.unit_label}]"
-            self._draw_traces(results, scale)
-
-    def _draw_traces(self, results: RunResults, scale: float) -> None:
-        record, dt = results.result.record, results.result.record.dt
-        shown = samples_of(record, results.scenario.run.warm_up)
-        first, last = shown[self.plot.what]
-        for name, source in self.sources.items():
-            x, y = trace_of(record, results.values(name, self.of.target), self.plot.column, first, last)
-            source.data = {"x": x, "y": (scale * y).astype(np.float32)}
-        self.figure.x_range.update(start=first * dt, end=last * dt, reset_start=first * dt, reset_end=last * dt)
-        self.window.update(left=shown[ZOOMED][0] * dt, right=shown[ZOOMED][1] * dt)
-
-    def _draw_spectra(self, results: RunResults, scale: float) -> None:
-        tops: list[float] = []
-        for name, source in self.sources.items():
-            spectrum = results.spectra.get((name, self.of.target))
-            if spectrum is None:
-                source.data = {"x": [], "y": []}
-                continue
-            x, y = spectrum_part(spectrum.frequency, scale * spectrum.signal[:, self.plot.column])
-            source.data = {"x": x, "y": y}
-            tops.append(float(y.max()))
-        if tops and max(tops) > 0:
-            self.figure.y_range.update(start=1e-5 * max(tops), end=2 * max(tops))
+            x, y = shown.lines.get(name, (np.zeros(0), np.zeros(0)))
+            self.sources[name].data = {"x": x, "y": (scale * y).astype(np.float32)}
+        self.figure.yaxis.axis_label = f"{self.plot.label} [{self.plot.unit(display.unit_label)}]"
+        start, end = shown.ends
+        self.figure.x_range.update(start=start, end=end, reset_start=start, reset_end=end)
+        first, last = samples_of(record, warm_up)[ZOOMED]
+        self.window.update(left=first * record.dt, right=last * record.dt)
+        top = scale * max((float(y.max()) for _, y in shown.lines.values()), default=0.0)
+        if self.plot.is_spectrum and top > 0:
+            self.figure.y_range.update(start=top / 10**DECADES, end=2 * top)
 
 
 def _label(name: str) -> str:
