@@ -152,6 +152,12 @@ CASES: list[tuple[str, bytes, dict[str, Any], str]] = [
     ("a.mat", with_object(matlab(**OWN)), {}, "unit nm, column night not used"),
     ("a.mat", matlab(y_lgs=Y.T, u=U.T, time=1e-3 * STEPS), NM, "unit nm, y_lgs and u with a row per mode"),
     ("a.mat", matlab(d={"s": Y, "c": U, "fs": 1000}), NM | {"columns": {"y_lgs": "d.s", "u": "d.c"}}, "unit nm, 1000 Hz by d.fs"),
+    (
+        "a.mat",
+        matlab(d={"s": Y, "c": U, "fs": 1000, "unit": "nm"}),
+        {"columns": {"y_lgs": "d.s", "u": "d.c"}},
+        "unit nm, 1000 Hz by d.fs",
+    ),
     ("a.mat", hdf5(of_matlab_73, 512), NM, "unit nm, y_lgs and u with a row per mode"),
     (
         "a.h5",
@@ -237,6 +243,11 @@ def test_a_folder_of_arrays_on_the_command_line(tmp_path: Path) -> None:
     done = CliRunner().invoke(main, words)
     assert done.exit_code == 2 and "as its names suggest: --column 'u=commands' --column 'y_lgs=slopes'" in done.output
     assert not (tmp_path / "out.h5").exists()
+    (tmp_path / "night" / "slopes.npy").rename(tmp_path / "night" / "primary.npy")
+    done = CliRunner().invoke(main, words)
+    assert "suggest: --column 'u=commands'; which of its columns is what? It has primary\n" in done.output, (
+        "arrays, not their columns"
+    )
 
 
 # ---------------------------------------------------------------------- what the loop is

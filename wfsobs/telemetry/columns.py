@@ -53,6 +53,7 @@ WORDS = {
         "centroids",
         "wfs",
         "residual",
+        "residuals",
         "res",
         "err",
     }
@@ -128,8 +129,9 @@ def to_contents(file: FileColumns, roles: Mapping[str, str]) -> Contents:
     suggested = {role: name for role, name in (suggest_roles(unused) | _many_in_one(unused)).items() if role not in roles}
     if suggested:
         contents.hint = "; as its names suggest: " + " ".join(f"--column '{role}={name}'" for role, name in _by_array(suggested))
-    elif unused:
-        contents.hint = f"; which of its columns is what? It has {', '.join(unused[:20])}"
+    if unused and "y_lgs" not in {role.partition("/")[0] for role in (*suggested, *contents.arrays)}:
+        there = dict.fromkeys(re.sub(r"\[\d+\]$", "", name) for name in unused if name not in suggested.values())
+        contents.hint += f"; which of its columns is what? It has {', '.join([*there][:20])}"
     return contents
 
 

@@ -157,6 +157,8 @@ class FileColumns:
     def _add_texts(self, name: str, texts: list[str]) -> None:
         if name.lower() in TEXTS and len(texts) == 1:
             self.contents.arrays[name.lower()] = np.array(texts[0])
+        elif UNIT.fullmatch(name) and len(texts) == 1 and "unit" not in self.contents.arrays and parse_unit(texts[0]):
+            self.contents.arrays["unit"] = np.array(texts[0])
         elif len(texts) > 1 and STAMP.fullmatch(texts[0].strip()):
             self.add(name, np.array([parse_cell(text) for text in texts]), "s")
         else:
@@ -183,6 +185,9 @@ def is_rate(name: str) -> bool:
     """
     return RATE.fullmatch(name) is not None
 
+
+UNIT = re.compile(r"(?:.*[/.])?units?", re.I)
+"""Name of the unit of a structure or a group."""
 
 KINDS = {"O": "objects", "b": "yes or no", "c": "complex numbers", "V": "structures too deep"}
 """Kinds of array that are not read, by numpy's letter."""
