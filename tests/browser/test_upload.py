@@ -11,11 +11,14 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
+from tests.browser.conftest import until
 from wfsobs.scenario.presets import paper
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.records import save_record
 
 SHORT = "run.duration=2&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40"
+
+ABOVE = "([one, other]) => one.getBoundingClientRect().bottom <= other.getBoundingClientRect().top"
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +43,8 @@ def test_a_record_is_previewed_used_and_taken_back(page: Page, tmp_path: Path) -
     expect(page.get_by_text("7000 steps at 1000 Hz, 7 s, 3 missing")).to_be_visible()
     page.get_by_role("button", name="Use this record").click()
     expect(page.get_by_text("Record night.csv: 7000 steps")).to_be_visible()
+    switch, back = page.get_by_role("button", name="Tilt", exact=True).first, page.locator("button[data-do=simulate]")
+    until(page, ABOVE, arg=[switch.element_handle(), back.element_handle()])
     expect(page.get_by_text("one step ahead: the record has no truth")).to_be_visible()
     expect(page.get_by_role("row", name=re.compile("^Residual, tip, what the recorded loop left"))).to_be_visible()
     page.get_by_role("button", name="Back to the simulation").click()

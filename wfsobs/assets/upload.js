@@ -7,7 +7,7 @@ export function render({model, el}) {
     setMarkup(el, model.html)
     el.getRootNode().host.style.position = model.source_title || model.message ? "" : "absolute"
   }
-  model.on("html", draw)
+  for (const name of ["html", "source_title", "message"]) model.on(name, draw)  // which come one after the other
   draw()
   const [input, sheet, cover] = ["input", "#load", ".cover"].map((it) => el.querySelector(it))
   const take = async (file) => {
