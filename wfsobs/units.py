@@ -32,6 +32,15 @@ _SYNONYMS = {"µm": "um", "micron": "um", "microns": "um", "\u03bcm": "um", "met
 _ENDING = re.compile(r"[_ \[(]+(?P<unit>[A-Za-zµμ]+)[\])]?$")
 
 
+def unit_text(unit: str) -> str:
+    """Write a unit as people do.
+
+    >>> unit_text("um^2/Hz")
+    'µm²/Hz'
+    """
+    return re.sub(r"\bum\b", "µm", unit).replace("^2", "²")
+
+
 def micrometres_per(unit: str, diameter: float) -> float:
     """Return the micrometres rms of tip or tilt per `unit`, on an aperture of `diameter` [m]."""
     return LENGTHS[unit] if unit in LENGTHS else ANGLES[unit] * 1e6 * diameter / 4.0

@@ -324,6 +324,21 @@ def test_a_sweep_is_drawn_with_its_own_numbers(sweep: SweepResults, field: Sweep
     assert {text.split("\n")[0] for text in names.dimension_values("best")} == {look(it.name).label for it in best if it}
 
 
+def test_a_sweep_over_words_has_them_as_ticks() -> None:
+    """One after the other, by both backends."""
+    lines = sweep_over("turbulence.source=ar2,ar3,none").plot.errors()
+    assert [tick.get_text() for tick in to_matplotlib(lines).axes[0].get_xticklabels()] == ["ar2", "ar3", "none"]
+    (made,) = hv.renderer("bokeh").get_plot(lines).state.xaxis
+    assert made.major_label_overrides == {0.0: "ar2", 1.0: "ar3", 2.0: "none"} and made.axis_label == "turbulence.source"
+    grid = sweep_over("sensors.lgs_noise=0.01,0.02", "loop.closed=true,false").plot.errors()
+    axes = to_matplotlib(grid).axes[0]
+    assert [tick.get_text() for tick in axes.get_yticklabels()] == ["True", "False"]
+    assert axes.get_xlabel() == "sensors.lgs_noise [µm]"
+    (field,) = grid.traverse(lambda x: x, [hv.HeatMap])
+    x, y, _ = (field.dimension_values(i) for i in range(3))
+    assert {*zip(x, y, strict=True)} == {(0.01, 0.0), (0.01, 1.0), (0.02, 0.0), (0.02, 1.0)}
+
+
 def test_a_paper_figure_is_the_result(of_paper: wfsobs.Result) -> None:
     """Its zoomed plot has every sample of half a second."""
     figure = draw_paper_figure("paper-4", of_paper)
@@ -444,6 +459,7 @@ def test_arrays_are_those_of_the_result(result: wfsobs.Result) -> None:
 
 def test_arrays_of_a_sweep(field: SweepResults) -> None:
     data = field.to_xarray()
+    assert data["turbulence.wind_speed"].attrs == {"units": "m/s"} and data["rms"].attrs == {"units": "um"}
     assert data["rms"].dims == ("turbulence.wind_speed", "sensors.lgs_noise", "observer", "target", "mode")
     for cell, changes in enumerate(field.sweep.cells):
         for key in field.known_keys():

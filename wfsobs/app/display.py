@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
@@ -14,6 +13,7 @@ from wfsobs.app.compared import ComparedRun, DrawnLines
 from wfsobs.app.glossary import LAG, REAL_TIME, RELATIVE, RMS_ERROR, STATED, TERMS
 from wfsobs.sensors.modes import HIGHEST_ORDER, TIP_TILT, Mode, modes_up_to
 from wfsobs.settings.parameters import unit_of
+from wfsobs.units import unit_text
 
 SIGNAL, ERROR, RUNNING_RMS = "signal", "error", "running rms"
 PSD, CUMULATIVE = "psd", "cumulative"
@@ -44,15 +44,6 @@ def per_micrometre(unit: str, diameter: float) -> float:
     103.1
     """
     return {"nm": 1e3, "mas": 4e-6 / diameter * MAS_PER_RADIAN, "um": 1.0}[unit]
-
-
-def unit_text(unit: str) -> str:
-    """Write a unit as the page does.
-
-    >>> unit_text("um^2/Hz")
-    'µm²/Hz'
-    """
-    return re.sub(r"\bum\b", "µm", unit).replace("^2", "²")
 
 
 def label_of(p: param.Parameter[Any]) -> str:

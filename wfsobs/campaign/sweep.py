@@ -361,7 +361,8 @@ class SweepResults:
                     values[(cell, *(of.index(name) for of, name in zip(labels, key, strict=True)))] = error
         shaped = values.reshape(*map(len, dims.values()), 3)
         ends = {name: (tuple(dims), shaped[..., i], {"units": "um"}) for i, name in enumerate(("rms", "low", "high"))}
-        return import_extra("xarray", "arrays").Dataset(ends, dims)
+        units = {name: {"units": unit} for name in dims if (unit := self.sweep.base.unit(name))}
+        return import_extra("xarray", "arrays").Dataset(ends, {name: (name, of, units.get(name)) for name, of in dims.items()})
 
     def to_dataframe(self) -> pandas.DataFrame:
         """Return `rows` as a pandas table. Raises ImportError without pandas."""

@@ -38,9 +38,11 @@ from wfsobs.plot.elements import (
 )
 from wfsobs.plot.looks import TERM_COLOURS, look
 from wfsobs.record import Record, hold_last
+from wfsobs.scenario.grid import Variation
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.signal.welch import psd
 from wfsobs.typing import Array
+from wfsobs.units import unit_text
 
 NM = 1e3
 """Nanometres in a micrometre."""
@@ -256,9 +258,9 @@ class SweepPlots:
         if len(self.results.sweep.axes) == 2:
             return self._map(target, name, y)
         (axis,) = self.results.sweep.axes
-        x, parts = quantity(axis.path, ""), []
+        (x, places, ticks), parts = self._place("x", axis), []
         for key in [k for k in known if k[1:] == (target, name) and (observers is None or k[0] in observers)]:
-            cells = [(value, self.results.error(i, key)) for i, value in enumerate(axis.values)]
+            cells = [(at, self.results.error(i, key)) for i, at in enumerate(places)]
             points = np.array([(value, *(NM * e for e in error)) for value, error in cells if error is not None])
             if key[0] != NO_ESTIMATE and len(points):
                 at, mean, low, high = points.T
@@ -266,18 +268,29 @@ class SweepPlots:
                 colour = look(key[0]).light
                 style(band, alpha=0.15, color=colour, show_legend=False, bokeh={}, matplotlib={"facecolor": colour})
                 parts += [band, draw_line(at, mean, (x, y), key[0])]
-        return overlay(_some(parts, f"an error of {target}"))
+        return overlay(_some(parts, f"an error of {target}"), **ticks)
 
-    def _map(self, target: str, mode: str, y: hv.Dimension) -> hv.Overlay:
+    def _place(self, name: str, axis: Variation) -> tuple[hv.Dimension, list[float], dict[str, Any]]:
+        """Return what an axis is of, where its values lie, and options with what stands there, where they are no numbers."""
+        x, is_numeric = (
+            quantity(axis.path, unit_text(self.results.sweep.base.unit(axis.path))),
+            set(map(type, axis.values)) <= {int, float},
+        )
+        places = [float(value) if is_numeric else float(i) for i, value in enumerate(axis.values)]
+        ticks = [(at, str(value)) for at, value in zip(places, axis.values, strict=True)]
+        return x, places, {} if is_numeric else {f"{name}ticks": ticks}
+
+    def _map(self, target: str, mode: str, of: hv.Dimension) -> hv.Overlay:
         first, second = self.results.sweep.axes
-        best = {i: self.results.winner(i, target, mode) for i in range(len(self.results.sweep.cells))}
-        cells = [(*self.results.sweep.cells[i].values(), NM * it.rms, look(it.name).label) for i, it in best.items() if it]
-        axes = [quantity(first.path, ""), quantity(second.path, "")]
-        field = hv.HeatMap([cell[:3] for cell in cells], axes, y)
+        (x, across, x_ticks), (y, up, y_ticks) = self._place("x", first), self._place("y", second)
+        places = [(a, b) for a in across for b in up]
+        best = {i: self.results.winner(i, target, mode) for i in range(len(places))}
+        cells = [(*places[i], NM * it.rms, look(it.name).label) for i, it in best.items() if it]
+        field = hv.HeatMap([cell[:3] for cell in cells], [x, y], of)
         style(field, cmap="cividis", alpha=0.5, bokeh={}, matplotlib={"show_values": False})
-        names = hv.Labels([(a, b, f"{name}\n{error:.1f} nm") for a, b, error, name in cells], axes, "best")
+        names = hv.Labels([(a, b, f"{name}\n{error:.1f} nm") for a, b, error, name in cells], [x, y], "best")
         style(names, bokeh={"text_font_size": "8pt", "text_color": "black"}, matplotlib={"size": 6, "color": "black"})
-        return overlay([field, names])
+        return overlay([field, names], **x_ticks, **y_ticks)
 
 
 class LoopPlots:

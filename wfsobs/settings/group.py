@@ -14,7 +14,7 @@ import param
 
 from wfsobs.notebook import html_table
 from wfsobs.settings.errors import SettingError, shorten
-from wfsobs.settings.parameters import allowed_values, hint, settings_once
+from wfsobs.settings.parameters import Reals, allowed_values, hint, settings_once, unit_of
 from wfsobs.settings.tree import Plain, leaves, put_value, to_native
 
 UsedWhen = Mapping[str, tuple[str, tuple[Any, ...]]]
@@ -229,6 +229,17 @@ class Group(param.Parameterized):
                     yield from item.walk(f"{prefix}{name}.{i}.")
             else:
                 yield f"{prefix}{name}", self, p
+
+    def parameter(self, path: str) -> param.Parameter[Any] | None:
+        """Return the parameter of a setting, that of the list for a number in it; None where there is no such setting."""
+        known = {at: p for at, _, p in self.walk()}
+        above, _, number = path.rpartition(".")
+        return known.get(path) or (p if number.isdecimal() and isinstance(p := known.get(above), Reals) else None)
+
+    def unit(self, path: str) -> str:
+        """Return the unit of a setting, empty where it has none or there is no such setting."""
+        p = self.parameter(path)
+        return "" if p is None else unit_of(p)
 
     def lists(self, prefix: str = "") -> Iterator[tuple[str, param.List[Any]]]:
         """Yield (dotted path, parameter) of every list of groups."""

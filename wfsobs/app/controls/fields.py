@@ -18,9 +18,10 @@ import param
 from bokeh.models import CustomJSTickFormatter
 
 from wfsobs.app.controls.names import name_settings
-from wfsobs.app.display import label_of, unit_text
+from wfsobs.app.display import label_of
 from wfsobs.app.store import Store
 from wfsobs.settings.parameters import Reals
+from wfsobs.units import unit_text
 
 ROOM = {"sizing_mode": "stretch_width", "margin": (4, 0)}
 

@@ -12,13 +12,13 @@ import param
 from wfsobs.app.component import HtmlComponent
 from wfsobs.app.controls.fields import TAG, idle_html, parse_number, short_number
 from wfsobs.app.controls.names import column_of, name_settings
-from wfsobs.app.display import unit_text
 from wfsobs.app.render import render
 from wfsobs.app.store import Store
 from wfsobs.app.style import script, sheets
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.settings.group import Group
 from wfsobs.settings.parameters import Reals, unit_of
+from wfsobs.units import unit_text
 
 
 class RowTable(HtmlComponent):

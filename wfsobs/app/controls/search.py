@@ -8,10 +8,11 @@ from typing import Any
 import param
 
 from wfsobs.app.component import Component
-from wfsobs.app.display import label_of, unit_text
+from wfsobs.app.display import label_of
 from wfsobs.app.style import script, sheets
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.idle import why_idle_at
+from wfsobs.units import unit_text
 
 
 class Search(Component):

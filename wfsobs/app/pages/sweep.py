@@ -44,7 +44,6 @@ from wfsobs.app.pages.sweep_views import (
     legend_of_shades,
     line_part,
     map_grid,
-    parameter_of,
     verdict_of_sweep,
 )
 from wfsobs.app.render import render
@@ -168,7 +167,7 @@ def usual_values(scenario: Scenario, path: str) -> str:
 
     Empty where there is nothing to go by.
     """
-    p = parameter_of(scenario, path)
+    p = scenario.parameter(path)
     if isinstance(p, param.Boolean):
         return "false,true"
     if isinstance(p, param.Selector):
@@ -249,7 +248,7 @@ class AxisFields:
 
     def offer(self, path: str) -> bool:
         """Have a setting among those to choose from; return whether there is one of that path."""
-        if path not in self.select.options.values() and parameter_of(self.store.scenario, path) is not None:
+        if path not in self.select.options.values() and self.store.scenario.parameter(path) is not None:
             self.select.options = {**self.select.options, axis_title(self.store.scenario, path): path}
         return path in self.select.options.values()
 

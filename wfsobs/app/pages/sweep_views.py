@@ -6,13 +6,12 @@ from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
 import numpy as np
-import param
 from bokeh.colors import RGB
 from bokeh.models import ColumnDataSource, FixedTicker, Range1d
 from bokeh.plotting import figure
 
 from wfsobs.app.controls.names import setting_name
-from wfsobs.app.display import Display, per_micrometre, unit_text
+from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.render import number
 from wfsobs.app.report.sections import value_of
 from wfsobs.app.style import look, observers_of
@@ -23,8 +22,8 @@ from wfsobs.evaluation.rows import row_label
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH
 from wfsobs.evaluation.verdict import sentence_of_several
 from wfsobs.scenario import Scenario
-from wfsobs.settings.parameters import Reals, unit_of
 from wfsobs.typing import Array
+from wfsobs.units import unit_text
 
 APART = 0.12
 """Of the smallest step between values, what the lines lie apart from the first to the last."""
@@ -116,17 +115,8 @@ OPEN, DECIDED, WAITING, FAILED, LEFT_OUT = "open", "decided", "waiting", "failed
 
 def axis_title(scenario: Scenario, path: str) -> str:
     """Name a setting of an axis, with its unit in [brackets]."""
-    p = parameter_of(scenario, path)
-    unit = unit_text(unit_of(p)) if p is not None else ""
+    unit = unit_text(scenario.unit(path))
     return f"{setting_name(path)} [{unit}]" if unit else setting_name(path)
-
-
-def parameter_of(scenario: Scenario, path: str) -> param.Parameter[Any] | None:
-    """Return the parameter of a setting, that of the list for a number in it; None where there is no such setting."""
-    known: dict[str, param.Parameter[Any]] = {path: p for path, _, p in scenario.walk()}
-    above, _, number = path.rpartition(".")
-    p = known.get(path) or known.get(above)
-    return p if path in known or (isinstance(p, Reals) and number.isdecimal()) else None
 
 
 def map_grid(results: SweepResults, target: str, display: Display) -> dict[str, Any]:
