@@ -12,7 +12,6 @@ The names below are imported when they are first used: `import wfsobs` alone tak
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from wfsobs.notebook import PlotAccessor
 from wfsobs.version import __version__ as __version__
 
 if TYPE_CHECKING:
@@ -95,16 +94,13 @@ __all__ = [
 ]
 
 
-def _open_plots(source: object) -> Any:
+def open_plots(source: object) -> Any:
     """Return the figures of an object; what draws them is imported now. Raises ImportError."""
     try:
         from wfsobs.plot.figures import plots_of
     except ModuleNotFoundError as error:
         raise ImportError(f"figures need {error.name}: pip install wfsobs[plot]") from None
     return plots_of(source)
-
-
-PlotAccessor.open_plots = _open_plots
 
 
 def __getattr__(name: str) -> Any:

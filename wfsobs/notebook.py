@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from importlib import import_module
-from typing import Any, ClassVar
+from typing import Any
 
 
 def html_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -32,9 +32,8 @@ def import_extra(name: str, extra: str) -> Any:
 class PlotAccessor:
     """The attribute `plot` of a result: its figures, made by `wfsobs.plot`, which is imported when it is first used."""
 
-    open_plots: ClassVar[Callable[[object], Any]]
-    """Set by the package itself: what is drawn knows nothing of what draws it."""
-
     def __get__(self, source: object, owner: type | None = None) -> Any:
         """Return the figures of an object."""
-        return self if source is None else PlotAccessor.open_plots(source)
+        if source is None:
+            return self
+        return import_module("wfsobs").open_plots(source)  # the package itself: what is drawn knows nothing of what draws it
