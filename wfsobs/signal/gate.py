@@ -25,7 +25,8 @@ from wfsobs.typing import Array
 ORDER = 64
 """Past samples that predict the next one."""
 BLOCK = 128
-"""Samples between two fits; before the first one all pass."""
+"""Samples between two fits; in the first block all pass, in the second the last sample is the prediction: one block has too few
+samples for a fit of so many weights, which would reject a clean record's turbulence."""
 MEMORY = 64
 """Blocks after which a sample has 1/e of its weight in the fit."""
 FORGET = 0.1
@@ -211,7 +212,7 @@ class OutlierGate:
         trace = np.trace(square, axis1=1, axis2=2)
         diagonal = np.where(trace > 0.0, RIDGE * trace, 1.0)[:, None, None] * np.eye(ORDER)
         fitted = np.linalg.solve(square + diagonal, cross)[:, :, 0]
-        self._weights = np.where((trace > 0.0)[:, None], fitted, self._weights)
+        self._weights = np.where((trace > 0.0)[:, None] & (self.count > BLOCK), fitted, self._weights)
         self._past = np.concatenate([self._past[:, BLOCK:], np.zeros((self._n_modes, BLOCK))], axis=1)
 
     def _clean(self, mode: int) -> None:

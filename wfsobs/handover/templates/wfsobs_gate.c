@@ -139,7 +139,7 @@ void wfsobs_gate_check(wfsobs_gate *g, wfsobs_real *z)
         if (k == BLOCK - 1) {
             fit_deviation(g, m);
             for (int j = 0; !blocks && j < BLOCK; j++) add_row(m, j); /* of the first block what is far out is known now */
-            fit_weights(g, m);
+            if (blocks) fit_weights(g, m); /* one block has too few samples for them */
             for (int j = 0; j < ORDER; j++) m->past[j] = m->past[BLOCK + j];
         }
     }
