@@ -23,7 +23,7 @@ from wfsobs.priors_from.scenario import kalman_model
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.simulation.loop import simulate
+from wfsobs.simulation.loop import simulate, simulate_noise
 
 LINEAR = ("kf-lgs", "kf-ngs", "multirate", "multirate-optimal", "ridge", "ridge-30", "butterworth-cl", "persistence")
 QUIET_SKY = {
@@ -214,7 +214,7 @@ def test_the_bound_beside_a_budget_is_that_of_what_the_observer_measures() -> No
 def test_the_sources_are_the_record() -> None:
     scenario = PRESETS["lost-frames"]().replace({"run.duration": 14.0})
     record = simulate(scenario)
-    sources = split_record(scenario, record, [[17.25, 47.44]] * 2, [[47.44]] * 2)
+    sources = split_record(record, simulate_noise(scenario), [[17.25, 47.44]] * 2, [[47.44]] * 2)
     seen = [source.measurement for source in sources.values()]
     assert record.open_loop_y is not None
     np.testing.assert_allclose(sum(one.lgs for one in seen), record.open_loop_y, rtol=0, atol=1e-12)

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, lru_cache
+from functools import lru_cache
 from itertools import combinations
 from math import factorial
 from typing import TYPE_CHECKING, Any
@@ -217,7 +217,9 @@ class _Parts:
     def __init__(self, scenario: Scenario, record: Record):
         self.scenario, self.record = scenario, record
         self.all_lines = [[line[0] for line in vibration_lines(scenario, i)] for i in range(record.n_modes)]
-        self.sources = lru_cache(1)(lambda lines: split_record(scenario, record, self.all_lines, lines))
+        noise = simulate_noise(scenario)
+        self.sources = lru_cache(1)(lambda lines: split_record(record, noise, self.all_lines, lines))
+        self.reference = lru_cache(4 * record.n_modes)(self._follow_signal)
         self.measurements = lru_cache(2 * (len(SOURCES) + 1))(self._measure)
 
     def given_lines(self, name: str) -> ModeLines:
@@ -232,28 +234,26 @@ class _Parts:
         seen = _add([sources[name].measurement for name in names], sources[SIGNAL].measurement)
         return measure_closed_loop(self.scenario, OpenLoop(seen.lgs.take(modes, 1), seen.ngs.take(modes, 1), seen.stars))
 
+    def _follow_signal(self, lines: ModeLines, mode: int, sensors: tuple[str, ...]) -> Estimates:
+        seen = self.sources(lines)[SIGNAL].measurement
+        signal = OpenLoop(np.nan_to_num(seen.lgs), np.nan_to_num(seen.ngs))
+        return with_total(follow_signal(self.scenario.before_events, mode, lines[mode], sensors, signal))
+
 
 def _terms(observer: Observer, of: _Parts, values: Estimates, scores: Iterable[Score], watch: Watch) -> list[dict[str, float]]:
     """Return the terms of the budget of every score: the mean of part times error over its samples."""
-    before, columns = of.scenario.before_events, [mode.name for mode in of.scenario.modes]
+    columns = [mode.name for mode in of.scenario.modes]
     lines = of.given_lines(observer.id)
     sources, out = of.sources(lines), []
     modes = tuple(range(len(columns)) if observer.couples_modes else sorted({columns.index(s.mode) for s in scores}))
     responses, rest = _responses(observer, of, lines, modes, watch)
-    seen = sources[SIGNAL].measurement
-    signal = OpenLoop(np.nan_to_num(seen.lgs), np.nan_to_num(seen.ngs))
-
-    @cache
-    def reference(i: int) -> Estimates:
-        watch.check()
-        return with_total(follow_signal(before, i, lines[i], observer.sensors, signal))
-
     for s in scores:
         i = columns.index(s.mode)
         at = modes.index(i)
         truth = {name: part.truth[s.target][:, i] for name, part in sources.items()}
         parts = {name: responses[name][s.target][:, at] - truth[name] for name in sources}
-        lag = reference(i)[s.target] - truth[SIGNAL]
+        watch.check()
+        lag = of.reference(lines, i, observer.sensors)[s.target] - truth[SIGNAL]
         parts |= {LAG: lag, MISMATCH: parts.pop(SIGNAL) - lag + rest[s.target][:, at]}
         error = values[s.target][:, i] - sum(truth.values())
         assert s.start is not None and s.stop is not None
@@ -283,16 +283,16 @@ def budget_row(budget: Budget) -> dict[str, Any]:
 
 
 def split_record(
-    scenario: Scenario, record: Record, lines: Sequence[Sequence[float]], given_lines: Sequence[Sequence[float]]
+    record: Record, noise: OpenLoop, lines: Sequence[Sequence[float]], given_lines: Sequence[Sequence[float]]
 ) -> dict[str, Source]:
     """Split a record into its sources.
 
     Parameters
     ----------
-    scenario : Scenario
-        Settings that the record was simulated from.
     record : Record
         The record.
+    noise : OpenLoop
+        White noise of the sensors in it, of `simulate_noise`.
     lines, given_lines : sequence
         All the lines [Hz] of the vibration, and those that an observer is given, mode by mode.
 
@@ -304,7 +304,7 @@ def split_record(
     assert record.turbulence is not None and record.vibration is not None and record.ratio is not None
     assert record.open_loop_y is not None
     total = OpenLoop(record.open_loop_y, record.z_ngs, record.lgs_stars)
-    noise, nothing = simulate_noise(scenario), np.zeros_like(record.vibration)
+    nothing = np.zeros_like(record.vibration)
     columns = zip(record.vibration.T, lines, given_lines, strict=True)
     known = np.column_stack([split_lines(x, record.dt, *of) for x, *of in columns])
     others = record.vibration - known
