@@ -102,7 +102,7 @@ class _Tables:
         return f"{{{n}, {len(steps)}, {int(gains.first is not None)}, {name}_steps, {first}}}"
 
 
-GATE_NUMBERS = ("ORDER", "BLOCK", "RUN", "OPEN", "FORGET", "LASTING", "EARLY", "MEDIAN", "RIDGE", "FIRST")
+GATE_NUMBERS = ("ORDER", "BLOCK", "RUN", "OPEN", "FORGET", "LASTING", "EARLY", "EARLIEST", "MEDIAN", "RIDGE", "FIRST")
 """Numbers of the gate that its source has."""
 
 

@@ -40,6 +40,8 @@ OPEN = 20
 """Samples that pass then, while the deviation is doubled."""
 EARLY = 1.0
 """Part of itself by which the level is larger after the first block, less with every one: a fit to few samples predicts badly."""
+EARLIEST = 3.0
+"""The same until the second fit: the first one has hardly more samples than weights."""
 PACE = 0.25
 """Weight of the median of a block in the deviation."""
 MEDIAN = 0.6745
@@ -157,7 +159,8 @@ class OutlierGate:
         self.count = int(self.count)
 
     def _limit(self) -> Array:
-        return self.settings.level * (1.0 + EARLY / max(self.count // BLOCK, 1)) * self._deviation
+        blocks = self.count // BLOCK
+        return self.settings.level * (1.0 + (EARLY / blocks if blocks > 1 else EARLIEST)) * self._deviation
 
     def _count(self, is_outlier: Array) -> None:
         """Count a sample, and open the gate where outliers last.
