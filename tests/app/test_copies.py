@@ -66,6 +66,7 @@ def board(request: Any, dashboard: Dashboard, loop: Any, short: Scenario, tmp_pa
     if request.param == LOADED:
         content = file_of(simulation)
         upload = dashboard.upload
+        upload.handle({"action": "part", "name": FILE, "index": 0, "count": 1, "data": base64.b64encode(content).decode()})
         for widget, value in (
             (upload.fields.unit, "nm"),
             (upload.fields.sign, -1),
@@ -73,8 +74,7 @@ def board(request: Any, dashboard: Dashboard, loop: Any, short: Scenario, tmp_pa
             (upload.fields.rate, "1000"),
         ):
             widget.value = value
-        upload.handle({"action": "part", "name": FILE, "index": 0, "count": 1, "data": base64.b64encode(content).decode()})
-        loop.until(lambda: not upload.picker.message.startswith(("Reading", "Waiting")))
+        loop.until(lambda: upload._preview is not None)
         upload.confirm()
         assert isinstance(dashboard.store.source, LoadedRecord), upload.picker.message
         (tmp_path / dashboard.store.source.name).write_bytes(content)

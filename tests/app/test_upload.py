@@ -162,9 +162,13 @@ def test_what_is_said_of_the_mirror(dashboard: Dashboard, loop: Any, short: Scen
     found = dashboard.upload._preview
     assert re.fullmatch(r"\d+ commands beyond the rail of 0\.1, delay 1\.5, command gain 1\.2", found.record.origin)
     assert np.abs(found.record.u).max() == pytest.approx(0.12)
+    assert "a command is seen 1.5 steps later" in dashboard.upload.content.text.object
     fields.open_loop.value = True
     loop.until(lambda: not dashboard.upload.picker.message.startswith(("Reading", "Waiting")))
     assert not dashboard.upload._preview.record.u.any() and not dashboard.upload.use.disabled
+    previewed(dashboard, loop, content)
+    assert "a command is seen 2 steps later" in dashboard.upload.content.text.object, "what was said of the file before is gone"
+    assert not fields.trust.value and dashboard.upload._preview.record.u.any()
 
 
 def test_a_vibration_spectrum(dashboard: Dashboard, loop: Any) -> None:

@@ -291,7 +291,9 @@ def test_names_that_suggest_nothing() -> None:
 def test_slopes_and_commands_of_actuators_are_suggested_whole() -> None:
     file = io.BytesIO()
     np.savez(file, slopes=np.ones((N, 9)), dm_cmd=np.ones((N, 5)), recon=np.ones((2, 9)))
-    with pytest.raises(RecordError, match=r"has no y_lgs.*: --column 'y_lgs=slopes' --column 'u=dm_cmd'$"):
+    with pytest.raises(
+        RecordError, match=r"has no y_lgs.*: --column 'y_lgs=slopes' --column 'u=dm_cmd'; slopes need a --reconstructor"
+    ):
         read_record(file, "a.npz", declaration=DeclaredFormat(rate=500.0))
 
 

@@ -59,8 +59,14 @@ class UploadFields:
             for label in ("Trust sign and delay as stated", "Open loop: the mirror was at rest")
         )
         self.widgets: Final = (self.unit, self.sign, self.delay, self.rate, self.gain, self.rail, self.trust, self.open_loop)
+        self._first: Final = [widget.value for widget in self.widgets]
         for widget in self.widgets:
             widget.param.watch(lambda _event: on_change(), "value")
+
+    def clear(self) -> None:
+        """Leave every question to the file."""
+        for widget, value in zip(self.widgets, self._first, strict=True):
+            widget.value = value
 
     def read(self, roles: dict[str, str]) -> DeclaredFormat:
         """Read the fields; roles : of columns that have been chosen. Raises RecordError where a field holds no number."""
@@ -414,6 +420,7 @@ class Upload:
         self._content, self._digest, self._preview = b"", "", None
         self._parcel.drop()
         self._entitle()
+        self.fields.clear()  # what was said of one file is not true of the next
         if self.form is not None:
             self.form.view.visible = False
             self.form.show({}, {})

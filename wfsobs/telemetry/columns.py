@@ -126,9 +126,12 @@ def to_contents(file: FileColumns, roles: Mapping[str, str]) -> Contents:
         contents.arrays["dt"] = np.array(1.0 / rate)
         contents.guesses.append(f"{rate:g} Hz by {name}")
     contents.leftovers = [*unused, *(f"{name} (text)" if why.endswith("number") else name for name, why in file.texts.items())]
-    suggested = {role: name for role, name in (suggest_roles(unused) | _many_in_one(unused)).items() if role not in roles}
+    many = _many_in_one(unused)
+    suggested = {role: name for role, name in (suggest_roles(unused) | many).items() if role not in roles}
     if suggested:
         contents.hint = "; as its names suggest: " + " ".join(f"--column '{role}={name}'" for role, name in _by_array(suggested))
+    if "y_lgs" in many:
+        contents.hint += "; slopes need a --reconstructor, as wfsobs convert takes it"
     if unused and "y_lgs" not in {role.partition("/")[0] for role in (*suggested, *contents.arrays)}:
         there = dict.fromkeys(re.sub(r"\[\d+\]$", "", name) for name in unused if name not in suggested.values())
         contents.hint += f"; which of its columns is what? It has {', '.join([*there][:20])}"

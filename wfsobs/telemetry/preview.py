@@ -128,7 +128,7 @@ class Preview:
             f"{r.n_steps} steps at {self.rate:.6g} Hz, {self.duration:.4g} s, {r.missing} missing"
             + (f", {r.outliers} outlying" if r.outliers else ""),
             f"{r.n_modes} modes, read as um rms" + (f" ({r.origin})" if r.origin else ""),
-            f"a command is seen {r.delay} steps later",
+            f"a command is seen {self.reading.delay:g} step{'s' * (self.reading.delay != 1)} later",
             f"NGS: {ngs}",
             f"truth: {' and '.join(truth) or 'none, scored by prediction of the next measurement'}",
         ]
@@ -216,7 +216,9 @@ def _preview_columns(data: bytes, name: str, no_record: RecordError) -> ColumnsP
     clock = suggest_clock({key: values for key, values in offered.items() if key not in roles.values()})
     if TIME not in roles and clock is not None:
         roles[TIME] = clock
-    return ColumnsPreview(name, str(no_record), {k: describe_values(v) for k, v in offered.items()}, roles)
+    needless = "a record needs", "as its names suggest", "which of its columns"  # beside lists of the columns
+    why = "; ".join(part for part in str(no_record).split("; ") if not part.startswith(needless))
+    return ColumnsPreview(name, why, {k: describe_values(v) for k, v in offered.items()}, roles)
 
 
 def preview(data: bytes, name: str, scenario: Scenario | None = None, declaration: DeclaredFormat | None = None) -> Preview:
