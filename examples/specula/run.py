@@ -22,8 +22,9 @@ from specula.simul import Simul  # noqa: E402
 
 import wfsobs  # noqa: E402
 from wfsobs.control.controllers import CONTROLLERS  # noqa: E402
-from wfsobs.control.residual import residual_density, residual_variance  # noqa: E402
-from wfsobs.prior import Spectra  # noqa: E402
+from wfsobs.control.mismatch import SensorSpectra, loops, radius, weigh  # noqa: E402
+from wfsobs.control.residual import residual_density  # noqa: E402
+from wfsobs.control.true_plant import TruePlant  # noqa: E402
 from wfsobs.priors_from.controllers import own_settings, plant_of, prior_for  # noqa: E402
 from wfsobs.scenario.configfile import load_scenario, save_scenario  # noqa: E402
 from wfsobs.simulation.flow_spectra import flow_spectra  # noqa: E402
@@ -32,6 +33,8 @@ BASE = Path(__file__).with_name("tiptilt.yml")
 DT, GAIN, START = 1e-3, 0.3, 1000
 LINES = ((18.0, 0.02, 80.0), (47.0, 0.01, 60.0))
 """Frequency [Hz], damping and rms [nm] of the vibrations."""
+OFF_GAIN, OFF_DELAY = 1.15, 3
+"""Gain over what a controller is told, and delay [frames], in the loops whose plant is not as told."""
 AIR = ("atmo", "seeing", "wind_speed", "wind_direction", "vibration", "shaker", "truth", "control")
 
 
@@ -127,10 +130,11 @@ def learn(seconds):
     return float(gain), 2 + int(np.argmin(lags)), (f, noise.mean(axis=1))
 
 
-def theory(name, gain, noise):
+def theory(name, gain, noise, error=1.0, delay=2):
     """Return what the spectra of atmosphere, vibrations and noise say of a controller's residual, tip and tilt together.
 
-    Frequencies [Hz], one-sided spectrum [nm^2/Hz] and rms [nm].
+    Frequencies [Hz], one-sided spectrum of a plant as told [nm^2/Hz] and rms [nm]; error, delay : gain over what is told, and
+    delay [frames]. A sensor of another gain is a mirror of that gain in a world that is larger by it.
     """
     layer = [{"height": 0.0, "fraction": 1.0, "wind_factor": 1.0, "wind_direction": 0.0}]
     r0 = 0.9759 * 500e-9 / np.deg2rad(0.65 / 3600.0)
@@ -145,9 +149,13 @@ def theory(name, gain, noise):
         turbulence = flow_spectra(scenario, mode, np.maximum(frequency, frequency[1])).own
         disturbance = turbulence + 1e-6 * vibration_spectrum(frequency)
         measured = disturbance + np.interp(frequency, *noise)
-        per_sample = [0.5 / DT * one for one in (disturbance, measured, disturbance)]
+        per_sample = [0.5 / DT * error**2 * one for one in (disturbance, measured, disturbance)]
         law = controller.law(prior_for(controller, told), mode, plant, own_settings(controller, told))
-        total += residual_variance(law, Spectra(*per_sample), plant.mirror)
+        true, of = TruePlant(np.array([[error]]), delay), loops([law], plant.mirror)
+        assert radius([law], plant.mirror, true) < 1.0, f"{name} is not stable"
+        response = true.response(of.images)
+        Q = of.solve(response, true.matrix)[1]
+        total += of.residual(Q, response, true.matrix, [weigh(SensorSpectra(*per_sample), of)])[0] / error**2
         omega = 2.0 * np.pi * DT * frequency
         through = plant.mirror.response(omega) * law.response(omega)
         density += residual_density(through, disturbance, disturbance, measured)
@@ -169,9 +177,9 @@ def main():
         "n_modes": 2,
     }
     ours |= {"delay": 1.0, "gain": gain, "inputs": {"delta_comm": "rec.out_modes"}, "outputs": ["out_comm", "out_comm_no_delay"]}
-    plant = [generate_avc_init_conditions(f0, DT, GAIN * gain, 2 * DT, -DT) for f0, *_ in LINES]
+    poles = [generate_avc_init_conditions(f0, DT, GAIN * gain, 2 * DT, -DT) for f0, *_ in LINES]
     avc = {"class": "AVC", "simul_params_ref": "main", "freq": [[f0 for f0, *_ in LINES]] * 2, "gx": 6.0, "gomega": 0.0, "k": 0.0}
-    avc |= {"plant_re": [[p[0] for p in plant]] * 2, "plant_im": [[p[1] for p in plant]] * 2}
+    avc |= {"plant_re": [[p[0] for p in poles]] * 2, "plant_im": [[p[1] for p in poles]] * 2}
     both = {"class": "BaseOperation", "sum": True, "inputs": {"in_value1": "control.out_comm", "in_value2": "avc.out_comm"}}
     runs = {
         "integrator": {"store": store()},
@@ -184,6 +192,10 @@ def main():
         "lqg-kf-multi": {"control_new": ours, "store": store("control_new.out_comm_no_delay"), "remove": ["control"]},
     }
     runs["lqg-kf-multi"]["dm_override"] = {"inputs": {"in_command": "control_new.out_comm"}}
+    off = {"common_layer_list": ["pupilstop", "shaker.out_layer", f"dm.out_layer:-{OFF_DELAY - 1}"]}
+    off = {"prop_override": {"inputs": {"atmo_layer_list": ["atmo.layer_list"], **off}}}
+    runs["integrator, off"] = runs["integrator"] | off | {"control_override": {"int_gain": [GAIN * OFF_GAIN]}}
+    runs["lqg-kf-multi, off"] = runs["lqg-kf-multi"] | off | {"control_new": ours | {"gain": gain / OFF_GAIN}}
     series = {}
     wanted = sys.argv[3:] or runs
     for name in wanted:
@@ -191,8 +203,9 @@ def main():
         series[name] = [simulate("run", changes, seconds, seed)["truth"][START:] for seed in range(1, seeds + 1)]
         rms = np.sqrt([np.mean(np.sum(one**2, axis=1)) for one in series[name]])
         print(f"{name}: {rms.mean():.1f} +- {rms.std(ddof=1) / np.sqrt(seeds):.1f} nm", flush=True)
-    for name in set(wanted) & {"integrator", "lqg-kf-multi"}:
-        frequency, density, rms = theory(name, gain, noise)
+    for name in set(wanted) - {"integrator + AVC"}:
+        plant = (OFF_GAIN, OFF_DELAY) if name.endswith("off") else ()
+        frequency, density, rms = theory(name.removesuffix(", off"), gain, noise, *plant)
         series |= {"theory frequency": frequency, f"theory {name}": density, f"theory rms {name}": rms}
         print(f"theory, {name}: {rms:.1f} nm", flush=True)
     np.savez("series.npz", gain=gain, frequency=noise[0], noise=noise[1], **series)

@@ -50,26 +50,31 @@ def telemetry() -> Record:
     return Record(y, outcome.u, SCENARIO.dt)
 
 
-def group(**numbers: PlantNumber) -> GroupPlant:
-    one = PlantNumber(1.0, 0.02)
-    given = {"delay": (one, one), "gain": (one, one), "common_delay": PlantNumber(2.3, 0.05), **numbers}
+def group(**numbers: PlantNumber | tuple[PlantNumber, ...]) -> GroupPlant:
+    """One delay of 2.3 +- 0.05 frames with which the gain of both modes rises."""
+    one, late = PlantNumber(1.0, 0.02), PlantNumber(2.3, 0.05)
+    common = np.outer([0.05, 0.05, 0.02, 0.02, 0.0], [0.05, 0.05, 0.02, 0.02, 0.0])
+    given = {"delay": (late, late), "gain": (one, one), "common_delay": late, "rotation": PlantNumber(0.1, 0.01), **numbers}
     return GroupPlant(
-        ("tip", "tilt"), rotation=PlantNumber(0.1, 0.01), common_gain=one, uncertainty=0.0, peaks=(1, 1), has_background=False,
-        own_share=0.0, **given,  # type: ignore[arg-type]
+        ("tip", "tilt"), common_gain=one, uncertainty=0.0, peaks=(1, 1), has_background=False, own_share=0.0,
+        covariance=common + np.diag([0.0, 0.0, 0.0, 0.0, 1e-4]), **given,  # type: ignore[arg-type]
     )  # fmt: skip
 
 
-def test_plants_are_drawn_from_their_deviations() -> None:
+def test_plants_are_drawn_from_their_deviations_and_correlations() -> None:
     delays, matrices = draw_plants([group()], 2, np.random.default_rng(1))
     assert delays[0] == 2.3 and np.allclose(matrices[0], [[np.cos(0.1), -np.sin(0.1)], [np.sin(0.1), np.cos(0.1)]])
     # 256 draws tell a deviation to 4.4 %
     assert delays[1:].std() == pytest.approx(0.05, rel=0.18) and abs(delays[1:].mean() - 2.3) < 4 * 0.05 / np.sqrt(DRAWS)
     angles = np.arctan2(matrices[1:, 1, 0], matrices[1:, 0, 0])
     assert angles.std() == pytest.approx(0.01, rel=0.18)
-    for name in ("common_delay", "gain"):
-        unknown = PlantNumber() if name == "common_delay" else (PlantNumber(), PlantNumber(1.0, 0.1))
-        unsure = group(**{name: unknown, "delay": (PlantNumber(), PlantNumber())})  # type: ignore[arg-type]
-        with pytest.raises(RecordError, match="do not switch on"):
+    gains = np.hypot(matrices[1:, 0, 0], matrices[1:, 1, 0])
+    assert np.allclose(gains - 1.0, 0.4 * (delays[1:] - 2.3), rtol=0, atol=1e-6), (
+        "fully correlated; the root of a singular matrix"
+    )
+    for name in ("delay", "gain"):
+        unsure = group(**{name: (PlantNumber(), PlantNumber(1.0, 0.1))})
+        with pytest.raises(RecordError, match=f"do not decide the {name} .*do not switch on"):
             draw_plants([unsure], 2, np.random.default_rng(1))
 
 

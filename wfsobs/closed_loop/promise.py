@@ -214,22 +214,19 @@ def draw_plants(groups: Sequence[GroupPlant], n_modes: int, rng: np.random.Gener
     """
     delays, matrices = np.zeros(1 + DRAWS), np.zeros((1 + DRAWS, n_modes, n_modes))
     order = [mode.name for mode in modes_up_to(HIGHEST_ORDER)]
-
-    def drawn(value: float | None, sd: float | None, what: str) -> Array:
-        if value is None or sd is None:
-            raise RecordError(f"the data do not decide the {what}: do not switch on; wfsobs probe designs a probe")
-        return value + sd * np.append(0.0, rng.standard_normal(DRAWS))
-
     for group in groups:
         names, n = " and ".join(group.modes), len(group.modes)
-        common = group.common_delay
-        each = [common] if common.value is not None else group.delay
-        delays += n / n_modes * np.mean([drawn(d.value, d.sd, f"delay ({names})") for d in each], axis=0)
-        block = np.zeros((1 + DRAWS, n, n))
-        for i, number in enumerate(group.gain):
-            block[:, i, i] = drawn(number.value, number.sd, f"gain ({names})")
+        numbers = [("delay", x) for x in group.delay] + [("gain", x) for x in group.gain]
+        numbers += [("rotation", group.rotation)] if group.rotation is not None else []
+        for what, number in numbers:
+            if number.value is None:
+                raise RecordError(f"the data do not decide the {what} ({names}): do not switch on; wfsobs probe designs a probe")
+        theta = np.tile([number.value or 0.0 for _, number in numbers], (1 + DRAWS, 1))
+        theta[1:] = rng.multivariate_normal(theta[0], group.covariance, DRAWS, check_valid="ignore")  # delays may be one
+        delays += theta[:, :n].sum(axis=1) / n_modes
+        block = theta[:, n : 2 * n, None] * np.eye(n)
         if group.rotation is not None:
-            angle = drawn(group.rotation.value, group.rotation.sd, f"rotation ({names})")
+            angle = theta[:, -1]
             turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
             block = np.moveaxis(turn, 2, 0) @ block
         columns = [order.index(name) for name in group.modes]

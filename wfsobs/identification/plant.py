@@ -7,13 +7,21 @@ which the loop would be stable fits some spectrum: the result is as good as the 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
 
-from wfsobs.identification.plant_likelihood import MOST_PEAKS, STEPS, PlantFit, PlantLikelihood, guess_plant, known_signals
+from wfsobs.identification.plant_likelihood import (
+    LONGEST,
+    MOST_PEAKS,
+    STEPS,
+    PlantFit,
+    PlantLikelihood,
+    guess_plant,
+    known_signals,
+)
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
@@ -36,10 +44,14 @@ THIRD = (1.5, 6.0)
 RIVAL, APART = 4.0, 4.0
 """Another maximum counts if its log-likelihood is lower by no more than this, and if it is as many standard deviations away."""
 
+STEP, MOST, NEGLIGIBLE, ACROSS = (0.002, 0.1), 16, 6.0, 0.2
+"""Of the delays at which the likelihood is looked at: distance at least and at most [frames], most of them on either side of a
+maximum, and by how much lower the log-likelihood is where the last one is; where the search in the next frame begins."""
+
 WIDEST_DELAY, WIDEST_GAIN, WIDEST_ANGLE = 0.25, 0.25, np.radians(15.0)
 """Standard deviation, of the gain over itself, beyond which a number is not identifiable."""
 
-DIFFERS = 0.01
+DIFFERS = 0.001
 """Probability with which two modes of one delay, or of one gain, are taken for different."""
 
 EXCITED = 1e-3
@@ -85,6 +97,8 @@ class GroupPlant:
         Whether the spectrum of a mode has a coloured background.
     own_share : float
         Share of what is new in the commands that the measurements do not explain: of a probe, or a change of the controller.
+    covariance : Array
+        Of delays [frames], gains and, of two modes, the rotation [rad] together.
     """
 
     modes: tuple[str, ...]
@@ -97,6 +111,7 @@ class GroupPlant:
     peaks: tuple[int, ...]
     has_background: bool
     own_share: float
+    covariance: Array = field(repr=False, compare=False)
 
     @property
     def degrees(self) -> PlantNumber:
@@ -229,16 +244,22 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
         third = [_third_order(s, corner) for s in each.spectra]
         each = min(each, data.fit(replace(each, spectra=third), gains, STEPS), key=lambda fit: fit.criterion)
     apart = data.fit(each, np.eye(len(pooled)), STEPS)
-    difference = np.append(-1.0, 1.0) if k == 2 else np.zeros(1)
-    signs = np.sign(each.theta[k : 2 * k])
-    one_delay, one_gain = (
-        (c @ apart.theta[at]) ** 2 <= chi2.isf(DIFFERS, 1) * (c @ apart.covariance[at, at] @ c)
-        for at, c in ((slice(0, k), difference), (slice(k, 2 * k), difference * signs))
-    )
-    middle = np.concatenate([each.theta[:k], signs * np.abs(each.theta[k : 2 * k]).mean(), each.theta[2 * k :]])
-    common = data.fit(replace(each, theta=middle), pooled, STEPS) if one_delay and one_gain else each
+    together = np.append(np.full(k, apart.theta[:k].mean()), apart.theta[k:])
+    each = min(each, data.fit(replace(apart, theta=together), gains, STEPS), key=lambda fit: fit.criterion)
+    one_delay = each.value - apart.value <= 0.5 * chi2.isf(DIFFERS, 1)
     rivals = [fit.theta - each.theta for fit in fits if fit.criterion - each.criterion < RIVAL]
-    each = each if one_delay else apart
+    both = np.column_stack([pooled[:, 0], np.eye(len(pooled))[:, 1:]])
+    each = _over_delays(data, each, gains) if one_delay else _over_delays(data, apart, both)
+    equal = np.zeros(len(pooled))
+    equal[k : 2 * k] = np.sign(each.theta[k : 2 * k]) * ([1.0, -1.0] if k == 2 else 0.0)
+    variance, off = equal @ each.covariance @ equal, equal @ each.theta
+    one_gain = off**2 <= chi2.isf(DIFFERS, 1) * variance
+    common = each
+    if variance and one_delay and one_gain:  # given that the gains are one
+        gain_of = each.covariance @ equal / variance
+        common = replace(
+            each, theta=each.theta - off * gain_of, covariance=each.covariance - np.outer(gain_of, gain_of) * variance
+        )
 
     def number(fit: PlantFit, i: int) -> PlantNumber:
         """Return a number of the plant, if it is near enough to that of every other plant that is as likely."""
@@ -258,7 +279,60 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
         rotation = replace(rotation, value=float(-((np.pi - rotation.value) % (2.0 * np.pi) - np.pi)))
     uncertainty = data.uncertainty(each) if all(n.value is not None for n in (*delay, *gain)) else np.inf
     peaks, coloured = tuple(len(s.resonances) for s in each.spectra), any(s.background for s in each.spectra)
-    return GroupPlant(names, delay, gain, rotation, common_delay, common_gain, uncertainty, peaks, coloured, excited)
+    numbers = delay, gain, rotation, common_delay, common_gain
+    return GroupPlant(names, *numbers, uncertainty, peaks, coloured, excited, each.covariance)
+
+
+def _over_delays(data: PlantLikelihood, fit: PlantFit, ties: Array) -> PlantFit:
+    """Return a fit with the mean and the covariance of its likelihood over the delay, all else likeliest for each.
+
+    That has a kink at whole numbers of frames, often a maximum on either side, and is no parabola where little is known. Each
+    frame is looked at by steps of its own; the first number of the ties is the delay.
+    """
+    k, lower = data.k, np.floor(fit.theta[: data.k])
+    points = list[tuple[float, PlantFit]]()  # weight but for the likelihood
+    tops = [fit]
+    for frame, place in ((-1, 1.0 - ACROSS), (0, 0.0), (1, ACROSS)):
+        if lower.min() + frame < 1 or lower.max() + frame >= LONGEST:
+            continue
+        theta = fit.theta.copy()
+        theta[:k] = lower + frame + (place or theta[:k] - lower)
+        top = data.fit(replace(fit, theta=theta), ties, STEPS, stays=True)
+        tops.append(top)
+        if top.value - min(one.value for one in tops) < NEGLIGIBLE:
+            points += _along(data, top, ties[:, 1:], lower + frame)
+    if not points:  # a likelihood that is no number
+        return fit
+    best = min((one for _, one in points), key=lambda one: one.value)
+    weights = np.array([width * np.exp(best.value - one.value) for width, one in points])
+    weights /= weights.sum()
+    theta = sum((w * one.theta for w, (_, one) in zip(weights, points, strict=True)), np.zeros_like(fit.theta))
+    off = [one.theta - theta for _, one in points]
+    parts = [w * (one.covariance + np.outer(d, d)) for w, (_, one), d in zip(weights, points, off, strict=True)]
+    return replace(best, theta=theta, covariance=np.sum(parts, axis=0))
+
+
+def _along(data: PlantLikelihood, top: PlantFit, rest: Array, lower: Array) -> list[tuple[float, PlantFit]]:
+    """Return (step, fit) at delays around a maximum within a frame, evenly spaced; rest : ties of all other numbers."""
+    k = data.k
+    step = float(np.clip(0.5 * np.sqrt(max(top.covariance[:k, :k].mean(), 0.0)), *STEP))
+
+    def at(near: PlantFit, shift: float) -> PlantFit:
+        theta = near.theta.copy()
+        theta[:k] = np.clip(theta[:k] + shift, lower, lower + 1.0)
+        return data.fit(replace(near, theta=theta), rest, STEPS)
+
+    found = {0: at(top, 0.0)}
+    for way in (-1, 1):
+        last = 0
+        for i in range(way, way * (MOST + 1), way):
+            ahead = found[last].theta[:k] + way * step
+            if (ahead < lower).any() or (ahead > lower + 1.0).any() or found[last].value - found[0].value > NEGLIGIBLE:
+                break
+            found[i], last = at(found[last], way * step), i
+        for i in range(last - way, -way, -way):  # back: what a fit has missed
+            found[i] = min(found[i], at(found[i + way], -way * step), key=lambda one: one.value)
+    return [(step, one) for one in found.values()]
 
 
 def _third_order(s: Spectrum, corner: float) -> Spectrum:

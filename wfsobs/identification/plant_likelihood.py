@@ -136,8 +136,11 @@ class PlantLikelihood:
         by_angle = [-self._matrix(theta, np.pi / 2.0) @ m] if self.k == 2 else []
         return self.Y - matrix @ m, np.array(by_delay + by_gain + by_angle)
 
-    def fit(self, start: PlantFit, ties: Array, steps: int) -> PlantFit:
-        """Take damped Newton steps with the expected second derivatives; ties : theta by its free numbers (p, q)."""
+    def fit(self, start: PlantFit, ties: Array, steps: int, *, stays: bool = False) -> PlantFit:
+        """Take damped Newton steps with the expected second derivatives.
+
+        ties : theta by its free numbers (p, q);  stays : delays do not go beyond the whole numbers on either side
+        """
         theta, spectra = start.theta, list(start.spectra)
         cells = [
             Cells(self.f, np.zeros_like(self.f), np.ones_like(self.f), [p.omega / (2.0 * np.pi) for p in s.resonances])
@@ -166,7 +169,7 @@ class PlantLikelihood:
             step = np.linalg.solve(F + np.diag(held * np.diag(F) + 1e-9), -gradient)
             q = ties.shape[1]
             theta_there = theta + np.clip(ties @ step[:q], -REACH, REACH)
-            theta_there, lower_there = self._within(theta_there, lower)
+            theta_there, lower_there = self._within(theta_there, lower, stays)
             spectra_there, at = [], q
             for s in spectra:
                 vector, free = s.vector.copy(), _free(s)
@@ -177,14 +180,14 @@ class PlantLikelihood:
         covariance /= 1.0 - max(missing.is_missing.mean() for missing in self.missing)  # filled ones tell nothing
         return PlantFit(theta, spectra, float(best), ties @ covariance @ ties.T, self.f.size)
 
-    def _within(self, theta: Array, lower: Array) -> tuple[Array, Array]:
-        """Stop delays at the next whole number, where the derivative changes; they go on from there in the next step."""
+    def _within(self, theta: Array, lower: Array, stays: bool) -> tuple[Array, Array]:
+        """Stop delays at the next whole number, where the derivative changes; from there they go on in the next step, or stay."""
         theta, out = theta.copy(), lower.copy()
         for j, d in enumerate(lower):
             if theta[j] >= d + 1:
-                theta[j], out[j] = d + 1, min(d + 1, LONGEST)
+                theta[j], out[j] = d + 1, d if stays else min(d + 1, LONGEST)
             elif theta[j] <= d:
-                theta[j], out[j] = d, max(d - 1, 1)
+                theta[j], out[j] = d, d if stays else max(d - 1, 1)
         return theta, out
 
     def _second_derivatives(
