@@ -8,7 +8,7 @@ of it, which the scatter over simulations of what was identified shows; it is di
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from math import pi
 from typing import Any
@@ -23,6 +23,7 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.true_plant import TruePlant
 from wfsobs.identification.identification import identify
 from wfsobs.identification.plant import GroupPlant, identify_plant
+from wfsobs.identification.plant_likelihood import LONGEST
 from wfsobs.identification.result import Identification
 from wfsobs.pipeline import as_stated
 from wfsobs.prior import Line, Lines
@@ -32,20 +33,21 @@ from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import true_spectra
-from wfsobs.spectral.periodogram import Cells, fast_length, inflation, periodogram_frequencies
-from wfsobs.spectral.whittle import spectrum_information
+from wfsobs.spectral.missing import MissingSamples, find_outlying
+from wfsobs.spectral.periodogram import Cells, fast_length, inflation, periodogram, periodogram_frequencies
+from wfsobs.spectral.whittle import fit_spectrum, spectrum_information
 from wfsobs.typing import Array
 
-DRAWS, SPECTRA = 256, 32
-"""Plants that are drawn, and spectra: as many plants meet each of them."""
+DRAWS, RECORDS = 64, 8
+"""Plants that are drawn, each with the spectra that the record has by it, and next records of each."""
 
-HIGHEST = 0.49
-"""Largest frequency of a drawn resonance, over the rate."""
+HIGHEST, NEAR_LINE = 0.49, 4
+"""Largest frequency of a drawn resonance, over the rate; bins on either side of an undamped line that do not count."""
 
 SECTIONS = 32
 """Simulated records, whose scatter tells how well one knows its mean square."""
 
-LONGEST = 500_000
+MOST_STEPS = 500_000
 """Steps of all of them: beyond, they are shorter than the record."""
 
 START = 500
@@ -154,7 +156,8 @@ def make_promise(
         A controller is unknown.
     """
     groups = identify_plant(record, Watch(is_cancelled=watch.is_cancelled))
-    delays, matrices = draw_plants(groups, record.n_modes, np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
+    delays, matrices = draw_plants(groups, record.n_modes, rng)
     delay, matrix = delays[0], matrices[0]
     corrected = as_seen(record, delay, matrix)
     found = identify(corrected, watch=Watch(is_cancelled=watch.is_cancelled))
@@ -167,15 +170,17 @@ def make_promise(
     told = of(found)
     names = None if controllers is None else [INTEGRATOR, *(name for name in controllers if name != INTEGRATOR)]
     plan = design(told, names)
-    length = min(record.n_steps, LONGEST // SECTIONS)
+    length = min(record.n_steps, MOST_STEPS // SECTIONS)
     model = simulate(told.replace({"run.duration": (SECTIONS * length + START) * record.dt, "run.seed": seed}))
     inverse = np.linalg.inv(matrix)
-    plants = [TruePlant(one @ inverse, float(late)) for one, late in zip(matrices, delays, strict=True)]
-    rng = np.random.default_rng(seed)
-    drawn = [of(one) for one in draw_spectra(found, rng)]
+    plants = [TruePlant(one @ inverse, float(late)) for one, late in zip(matrices[1:], delays[1:], strict=True)]
+    outlying = np.column_stack([find_outlying(column) for column in corrected.z.T])
+    clean = replace(record, y_lgs=np.where(outlying, np.nan, record.y_lgs))
+    seen = (as_seen(clean, float(late), one).z for late, one in zip(delays[1:], matrices[1:], strict=True))
+    drawn = [of(draw_spectra(found, z, rng)) for z in seen]
     spectra = [[true_spectra(one, mode) for mode in range(record.n_modes)] for one in drawn]
     left, out = dict[str, Array](), list[ResidualPromise]()
-    common = rng.uniform(size=(DRAWS, 1))
+    common = rng.uniform(size=(DRAWS, RECORDS, 1))
     for i, name in enumerate(plan.laws):
         watch.check()
         laws = [one.law for one in plan.laws[name] if one.law is not None]
@@ -186,13 +191,12 @@ def make_promise(
             notes = ["the record has no NGS"] if lacks_ngs else [one.note for one in plan.laws[name] if one.note]
             out.append(ResidualPromise(name, note=next(iter(notes), "not stable")))
             continue
-        squares = np.concatenate(
-            [residuals(laws, plan.mirror, plants[1 + i :: SPECTRA], one, watch) ** 2 for i, one in enumerate(spectra)]
-        )
+        pairs = zip(plants, spectra, strict=True)
+        squares = np.concatenate([residuals(laws, plan.mirror, [plant], one, watch) ** 2 for plant, one in pairs])
         (outcome,) = each_outcome(model, plan, watch, [name])
         assert outcome.residual is not None
         shape = record.n_steps / length / _scatter(outcome.residual[START:]) ** 2
-        left[name] = squares * gamma.ppf(common, shape) / shape
+        left[name] = (squares[:, None] * gamma.ppf(common, shape) / shape).reshape(-1, record.n_modes)
         out.append(_interval_of(name, left[name], left[INTEGRATOR]))
         watch.step((i + 1) / len(plan.laws))
     return Promise(told, groups, matrix, tuple(mode.noise.value for mode in found.modes), tuple(out))
@@ -234,23 +238,29 @@ def draw_plants(groups: Sequence[GroupPlant], n_modes: int, rng: np.random.Gener
     return np.maximum(delays, 1.0), matrices
 
 
-def draw_spectra(identification: Identification, rng: np.random.Generator) -> Iterator[Identification]:
-    """Yield SPECTRA models of the disturbance from the uncertainty of what was identified; undamped lines stay."""
-    n = fast_length(identification.n_steps)
-    f = periodogram_frequencies(n, identification.dt)
-    spread = []
-    for mode in identification.modes:
-        cells = Cells(f, np.zeros_like(f), np.ones_like(f), [p.omega / (2.0 * pi) for p in mode.spectrum.resonances])
-        information = spectrum_information(mode.spectrum, cells) / inflation(n)
-        spread.append(np.linalg.cholesky(np.linalg.inv(information + np.eye(len(information)))))  # none by more than e
-    for _ in range(SPECTRA):
-        modes = []
-        for mode, of in zip(identification.modes, spread, strict=True):
-            s = mode.spectrum.with_vector(mode.spectrum.vector + of @ rng.standard_normal(len(of)))
-            lines = tuple(Line(min(p.omega / (2.0 * pi), HIGHEST / s.dt), p.damping, p.rms) for p in s.resonances)
-            prior = Lines(s.noise, s.dt, s.continuum, (*lines, *(line for line in mode.prior.lines if not line.damping)))
-            modes.append(replace(mode, prior=prior))
-        yield replace(identification, modes=tuple(modes))
+def draw_spectra(identification: Identification, z: Array, rng: np.random.Generator) -> Identification:
+    """Return a model of the disturbance from the uncertainty of that which fits z, (n_steps, n_modes), best; undamped lines stay.
+
+    It is fitted from what was identified, which the z of another plant is near to.
+    """
+    modes, dt = [], identification.dt
+    z = z[LONGEST + 1 :]
+    z = z[: fast_length(len(z))]
+    f = periodogram_frequencies(len(z), dt)
+    for mode, column in zip(identification.modes, z.T, strict=True):
+        missing, pure = MissingSamples(np.isnan(column), dt), [line for line in mode.prior.lines if not line.damping]
+        keep = np.ones_like(f)
+        for line in pure:
+            keep[np.abs(f - line.frequency) < NEAR_LINE * f[0]] = 0.0
+        resonances = [p.omega / (2.0 * pi) for p in mode.spectrum.resonances]
+        cells = Cells(f, periodogram(missing.fill(column, mode.spectrum.psd(f)), dt), keep, resonances)
+        s = fit_spectrum(mode.spectrum, cells)
+        information = spectrum_information(s, cells) / inflation(len(z))
+        spread = np.linalg.cholesky(np.linalg.inv(information + np.eye(len(information))))  # none by more than e
+        s = s.with_vector(s.vector + spread @ rng.standard_normal(len(spread)))
+        lines = tuple(Line(min(p.omega / (2.0 * pi), HIGHEST / dt), p.damping, p.rms) for p in s.resonances)
+        modes.append(replace(mode, prior=Lines(s.noise, dt, s.continuum, (*lines, *pure))))
+    return replace(identification, modes=tuple(modes))
 
 
 def as_seen(record: Record, delay: float, matrix: Array) -> Record:
