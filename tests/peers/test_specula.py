@@ -88,14 +88,14 @@ def test_a_mistake_in_the_file_is_told(tmp_path: Path) -> None:
 
 @pytest.mark.timeout(3600)
 def test_theory_says_what_the_loop_of_the_example_leaves(tmp_path: Path) -> None:
-    """4 seeds of 3 s: within 3 standard errors and 3 % of theory. Its spectrum above 60 Hz within 20 %.
+    """4 seeds of 3 s: within 3 standard errors and 3 % of theory, "off" with another gain than told. Spectrum above 60 Hz: 20 %.
 
     A band has 16 s of each of two modes, 960 independent numbers or more, and the noise that theory is told is of 8 s: 4 %
     together. Below, the windows of that noise are too short, and a damped line has some twenty independent amplitudes.
     """
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
     script = ROOT / "examples" / "specula" / "run.py"
-    loops = ("integrator", "lqg-kf-multi")
+    loops = ("integrator", "lqg-kf-multi", "integrator, off", "lqg-kf-multi, off")
     done = subprocess.run(
         [sys.executable, str(script), "4", "3", *loops], cwd=tmp_path, env=environment, capture_output=True, text=True
     )
@@ -107,6 +107,8 @@ def test_theory_says_what_the_loop_of_the_example_leaves(tmp_path: Path) -> None
         standard_error = rms.std(ddof=1) / np.sqrt(len(rms))
         print(f"{name}: {np.round(rms, 1)} nm, {rms.mean():.1f} +- {standard_error:.1f} nm; theory {told:.1f} nm")
         assert abs(rms.mean() - told) < 3 * standard_error + 0.03 * told
+        if name.endswith("off"):
+            continue
         f, spectra = welch(found[name], 1e3, nperseg=1024, axis=1, detrend=False)
         fine, density = found["theory frequency"], found[f"theory {name}"]
         for low, high in ((60, 120), (120, 250), (250, 500)):
