@@ -12,7 +12,9 @@ from tests.records import MATCHED
 from wfsobs.cli.group import main
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.envelope import PlantEnvelope, Spread, Uncertainty, plant_envelope
+from wfsobs.closed_loop.run import closed_loop
 from wfsobs.settings.errors import SettingError
+from wfsobs.simulation.loop import simulate
 from wfsobs.tuning import tuned_envelope
 
 NAMES = ["integrator", "lqg-kf-lgs", "lqg-multirate-multi"]
@@ -131,3 +133,36 @@ def test_it_draws_residuals_against_the_delay(result: PlantEnvelope) -> None:
     assert len(drawn) == 4, "mean and worst of each"
     with pytest.raises(ValueError, match="error 'wind'"):
         result.plot.residuals(over="wind")
+
+
+def test_controllers_that_are_not_linear_are_simulated() -> None:
+    """Each plant is the loop of it; what comes before the end is what there is by then."""
+    s = MATCHED.replace({"run.duration": 3.0, "run.warm_up": 0.5, "gpr_online.training_size": 40, "gpr_online.depth": 20})
+    seen = list[int]()
+    found = plant_envelope(
+        s,
+        controllers=["integrator+gpr-online", "integrator"],
+        points=8,
+        simulation_points=3,
+        on_spread=lambda part: seen.append(sum(len(spread.points) for spread in part.spreads)),
+    )
+    linear, gpr = found.spreads
+    assert (linear.controller, len(linear.points), gpr.controller, len(gpr.points)) == (
+        "integrator",
+        8,
+        "integrator+gpr-online",
+        3,
+    )
+    assert seen == [8, 9, 10, 11, 11] and len(gpr.corners) == 8 and not found.notes
+    delay, gain, rotation = (float(found.errors[name][2]) for name in ("delay", "gain", "rotation"))
+    third = {"plant.delay_error": delay, "plant.gain_error": [gain, gain], "plant.rotation": rotation}
+    for rms, changes in ((gpr.points[2], third), (gpr.nominal, {})):
+        (outcome,) = closed_loop(simulate(s), design(s.replace(changes), ["integrator+gpr-online"])).outcomes
+        assert outcome.residual is not None
+        start = round(design(s, ["integrator+gpr-online"]).start / s.dt)
+        assert rms == pytest.approx(np.sqrt(np.square(outcome.residual[start:]).mean(axis=0)), rel=1e-6)
+    rows = {row["controller"]: row for row in found.rows()}
+    assert rows["integrator+gpr-online"]["simulated"] and not rows["integrator"]["simulated"]
+    assert set(found.curves("delay", 0)) == {"integrator", "integrator+gpr-online"}
+    refused = CliRunner().invoke(main, ["envelope", "--simulate", "2", "--tune"])
+    assert refused.exit_code == 2 and "--simulate: not with --tune" in refused.output

@@ -258,9 +258,16 @@ def envelope_table(result: PlantEnvelope) -> Table:
             share = "{:.1f} ({:.1f} to {:.1f})".format(*(100.0 * r[f"unstable_{k}"] for k in ("share", "low", "high")))
             shown = ["unstable" if x is None else f"{x:.2f}" for x in left]
             out.add_row(
-                mode, label(r["controller"]), f"{r['caution']:.3g}", *shown, share, f"{r['unstable_corners']} of {r['corners']}"
+                mode,
+                label(r["controller"]) + (f" ({r['points']} simulated)" if r["simulated"] else ""),
+                f"{r['caution']:.3g}",
+                *shown,
+                share,
+                f"{r['unstable_corners']} of {r['corners']}",
             )
     out.caption = "mean and 95 % of the stable plants; worst of all and of the corners; share with its 95 % interval"
+    if any(r["simulated"] for r in rows):
+        out.caption += "; simulated: of one record, to be compared with its own nominal"
     return out
 
 
@@ -268,6 +275,14 @@ def envelope_table(result: PlantEnvelope) -> Table:
 @scenario_options
 @click.option("--controller", "controllers", multiple=True, metavar="NAME", help="Of this controller alone; can be repeated.")
 @click.option("--points", type=click.IntRange(1, 100_000), default=POINTS, show_default=True, metavar="N", help="Plants.")
+@click.option(
+    "--simulate",
+    "simulation_points",
+    type=click.IntRange(1, POINTS),
+    default=None,
+    metavar="N",
+    help="Others too, at N plants and corners.",
+)
 @uncertainty_options
 @click.option("--tune", "is_tuned", is_flag=True, help="Of each controller after `wfsobs tune --envelope`.")
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
@@ -275,18 +290,28 @@ def envelope(
     scenario: Scenario,
     controllers: tuple[str, ...],
     points: int,
+    simulation_points: int | None,
     uncertainty: Uncertainty,
     is_tuned: bool,
     as_json: bool,
 ) -> None:
     """Compute what every linear controller leaves of the disturbance over an uncertain plant (docs/trust.md)."""
     names = controllers or None
+    if simulation_points and is_tuned:
+        raise SettingError("--simulate: not with --tune, which is by theory")
     with progress_bar("controllers") as update:
         watch = Watch(progress=update)
         if is_tuned:
             result = tuned_envelope(scenario, controllers=names, goal=EnvelopeGoal(uncertainty), points=points, watch=watch)
         else:
-            result = plant_envelope(scenario, controllers=names, uncertainty=uncertainty, points=points, watch=watch)
+            result = plant_envelope(
+                scenario,
+                controllers=names,
+                uncertainty=uncertainty,
+                points=points,
+                simulation_points=simulation_points or 0,
+                watch=watch,
+            )
     if as_json:
         click.echo(json.dumps(result.rows(), allow_nan=False))
         return

@@ -1,12 +1,13 @@
 """Every linear controller over an uncertain plant: what it leaves at the plant that it is designed for, on average and at worst.
 
 The errors of the plant are independent and uniform around those of the scenario. They are taken at the points of Sobol's sequence
-and at all corners; stability and residual are by theory (`control.mismatch`), on fewer frequencies than for a single loop.
+and at all corners; stability and residual are by theory (`control.mismatch`), on fewer frequencies than for a single loop. Other
+controllers are simulated, at fewer points.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -17,7 +18,8 @@ import numpy as np
 from scipy.stats import binomtest
 from scipy.stats.qmc import Sobol
 
-from wfsobs.closed_loop.design import loop_spectra, select_controllers
+from wfsobs.closed_loop.design import design, loop_spectra, select_controllers
+from wfsobs.closed_loop.run import each_outcome
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.law import Law
 from wfsobs.control.mirror import Mirror
@@ -30,6 +32,7 @@ from wfsobs.priors_from.scenario import told_spectra
 from wfsobs.progress import QUIET, Watch
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
+from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, true_spectra
 from wfsobs.typing import Array
 
@@ -67,9 +70,11 @@ class Spread:
     nominal : Array
         rms of the residual at the plant of the scenario, per mode [um]; infinite where it is not stable.
     points, corners : Array
-        The same at the points and corners, (n, n_modes).
+        The same at the points and corners, (n, n_modes); of a controller that is simulated the first points alone.
     caution : float
         `control.caution` that it was designed with.
+    is_simulated : bool
+        Whether it is what is left of one record, which scatters, and not the expectation.
     """
 
     controller: str
@@ -77,6 +82,7 @@ class Spread:
     points: Array
     corners: Array
     caution: float = 1.0
+    is_simulated: bool = False
 
     @property
     def unstable(self) -> int:
@@ -138,6 +144,7 @@ class PlantEnvelope:
         nominal_rms_nm, mean_rms_nm, p95_rms_nm, worst_rms_nm : null where not stable; mean and 95 % of the stable points
         unstable_share, unstable_low, unstable_high : of the points, and its 95 % interval
         unstable_corners : how many of `corners`
+        points, simulated : how many, and whether by simulation and not by theory
         """
         out = []
         for spread in self.spreads:
@@ -150,6 +157,8 @@ class PlantEnvelope:
                         "controller": spread.controller,
                         "mode": mode.name,
                         "caution": spread.caution,
+                        "points": len(spread.points),
+                        "simulated": spread.is_simulated,
                         **{f"{k}_rms_nm": None if x is None or np.isinf(x) else float(x) * 1e3 for k, x in numbers.items()},
                         "unstable_share": spread.unstable / len(spread.points),
                         "unstable_low": low,
@@ -192,7 +201,7 @@ class PlantEnvelope:
         out = {}
         for spread in self.spreads:
             rms = spread.points[:, mode]
-            counted = inside & np.isfinite(rms)
+            counted = inside[:, : len(rms)] & np.isfinite(rms)
             total, n = np.where(counted, rms, 0.0).sum(axis=1), counted.sum(axis=1)
             mean = np.where(n > 0, total / np.maximum(n, 1), np.nan)
             most = np.where(n > 0, np.where(counted, rms, 0.0).max(axis=1), np.nan)
@@ -213,9 +222,10 @@ class PlantEnvelope:
             rms = left(spread, at)
             return "unstable" if rms == inf else f"{scale * rms:.3g} {unit}"
 
-        if not self.spreads:
+        spreads = [one for one in self.spreads if not one.is_simulated] or self.spreads  # one record is not the expectation
+        if not spreads:
             return []
-        first, safest = (min(self.spreads, key=lambda one: left(one, at)) for at in ("nominal", "worst"))
+        first, safest = (min(spreads, key=lambda one: left(one, at)) for at in ("nominal", "worst"))
         of_first, of_safest = (CONTROLLERS[one.controller].label for one in (first, safest))
         where = f"With the plant uncertain ({self.ranges})"
         if left(safest, "worst") == inf:
@@ -249,10 +259,11 @@ def plant_envelope(
     controllers: Sequence[str] | None = None,
     uncertainty: Uncertainty | None = None,
     points: int = POINTS,
+    simulation_points: int = 0,
     on_spread: Callable[[PlantEnvelope], None] | None = None,
     watch: Watch = QUIET,
 ) -> PlantEnvelope:
-    """Compute what every linear controller leaves over an uncertain plant.
+    """Compute what every linear controller leaves over an uncertain plant, and by simulation what others leave.
 
     Parameters
     ----------
@@ -264,8 +275,10 @@ def plant_envelope(
         Largest errors.
     points : int
         Points of Sobol's sequence; corners come on top.
+    simulation_points : int
+        First points at which controllers that are not linear are simulated, and corners; by default they are left out.
     on_spread : callable, optional
-        Receives what there is after every controller.
+        Receives what there is after every controller, and after every plant of one that is simulated.
     watch : Watch, optional
         Receives the progress, and is asked whether to stop.
 
@@ -289,18 +302,32 @@ def plant_envelope(
     of = uncertainty or Uncertainty()
     errors, corners, plants = uncertain_plants(scenario, of, points)
     spectra = known_spectra(scenario)
-    linear = with_laws(controllers)
-    spreads, notes = list[Spread](), dict[str, str]()
-    for i, name in enumerate(linear):
+    names = [c.id for c in select_controllers(controllers) if not c.is_idle] if simulation_points else with_laws(controllers)
+    names.sort(key=lambda name: not is_linear(name))
+    spreads, notes = dict[str, Spread](), dict[str, str]()
+    first = replace(plants, points=plants.points[:simulation_points])
+    for i, name in enumerate(names):
         watch.check()
         try:
-            spreads.append(spread_of(name, scenario, plants, spectra, watch))
+            if simulation_points and not is_linear(name):
+                inner = Watch(lambda share, i=i: watch.progress((i + share) / len(names)), watch.is_cancelled)
+                for spread in simulated_spreads(name, scenario, first, inner):
+                    spreads[name] = spread
+                    if on_spread:
+                        on_spread(PlantEnvelope(scenario, of, errors, corners, tuple(spreads.values()), dict(notes)))
+            else:
+                spreads[name] = spread_of(name, scenario, plants, spectra, watch)
         except ValueError as error:
             notes[name] = str(error)
-        watch.step((i + 1) / len(linear))
+        watch.step((i + 1) / len(names))
         if on_spread:
-            on_spread(PlantEnvelope(scenario, of, errors, corners, tuple(spreads), dict(notes)))
-    return PlantEnvelope(scenario, of, errors, corners, tuple(spreads), notes)
+            on_spread(PlantEnvelope(scenario, of, errors, corners, tuple(spreads.values()), dict(notes)))
+    return PlantEnvelope(scenario, of, errors, corners, tuple(spreads.values()), notes)
+
+
+def is_linear(name: str) -> bool:
+    """Whether a controller has a linear law alone."""
+    return CONTROLLERS[name].law is not None and CONTROLLERS[name].predict is None
 
 
 def with_laws(controllers: Sequence[str] | None) -> list[str]:
@@ -340,7 +367,7 @@ def spread_of(name: str, scenario: Scenario, plants: Plants, spectra: Sequence[T
     """Return what a controller leaves of these plants. Raises ValueError saying why it cannot, Cancelled."""
     controller, told = CONTROLLERS[name], [told_spectra(one) for one in spectra]
     if controller.law is None or controller.predict is not None:
-        raise ValueError("its prediction is not linear: an envelope by simulation is not there")
+        raise ValueError("its prediction is not linear: by simulation alone (--simulate N, `simulation_points=N`)")
     prior, plant = prior_for(controller, scenario, told), plant_of(scenario)
     laws = controller.laws(prior, plant, own_settings(controller, scenario), len(spectra))
     if not all(law.stable for law in laws):
@@ -348,6 +375,30 @@ def spread_of(name: str, scenario: Scenario, plants: Plants, spectra: Sequence[T
     left = residuals(laws, plant.mirror, [plants.nominal, *plants.points, *plants.corners], spectra, watch)
     end = 1 + len(plants.points)
     return Spread(name, left[0], left[1:end], left[end:], scenario.control.caution)
+
+
+def simulated_spreads(name: str, scenario: Scenario, plants: Plants, watch: Watch = QUIET) -> Iterator[Spread]:
+    """Yield what a controller leaves of these plants in one record, the points one by one. Raises ValueError, Cancelled."""
+    believed = scenario.replace({f"plant.{key}": value for key, value in type(scenario)().plant.to_dict().items()})
+    plan, record = design(believed, [name]), simulate(believed, watch=Watch(is_cancelled=watch.is_cancelled))
+    total = 1 + len(plants.corners) + len(plants.points)
+
+    def left(plant: TruePlant, number: int) -> Array:
+        inner = Watch(lambda share: watch.progress((number + share) / total), watch.is_cancelled)
+        (outcome,) = each_outcome(record, replace(plan, true=plant), inner, [name])
+        if outcome.residual is None:
+            if None in outcome.stable:
+                raise ValueError(outcome.note)
+            return np.full(record.n_modes, inf)
+        start = round(max(plan.start, outcome.own_from) / record.dt)
+        return np.sqrt(np.square(outcome.residual[start:]).mean(axis=0))
+
+    nominal = left(plants.nominal, 0)
+    corners = np.array([left(plant, 1 + i) for i, plant in enumerate(plants.corners)])
+    points = list[Array]()
+    for plant in plants.points:
+        points.append(left(plant, 1 + len(corners) + len(points)))
+        yield Spread(name, nominal, np.array(points), corners, scenario.control.caution, is_simulated=True)
 
 
 def error_samples(uncertainty: Uncertainty, base: TruePlant, points: int) -> tuple[dict[str, Array], dict[str, Array]]:
