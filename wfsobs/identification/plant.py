@@ -57,6 +57,9 @@ DIFFERS = 0.001
 EXCITED = 1e-3
 """Share of what is new in the commands that the measurements do not explain, from which on they have a probe."""
 
+OTHERWISE = 1e-4
+"""Probability of what a plant leaves of a probe, below which the commands act otherwise, such as by a mirror with dynamics."""
+
 
 @dataclass(frozen=True)
 class PlantNumber:
@@ -99,6 +102,9 @@ class GroupPlant:
         Share of what is new in the commands that the measurements do not explain: of a probe, or a change of the controller.
     covariance : Array
         Of delays [frames], gains and, of two modes, the rotation [rad] together.
+    chance : float
+        Probability that what the measurements hold of a probe beside this plant is chance; below `OTHERWISE` the mirror is not
+        one of a delay and a gain, and nothing is identifiable. 1 without a probe.
     """
 
     modes: tuple[str, ...]
@@ -112,6 +118,7 @@ class GroupPlant:
     has_background: bool
     own_share: float
     covariance: Array = field(repr=False, compare=False)
+    chance: float = 1.0
 
     @property
     def degrees(self) -> PlantNumber:
@@ -201,7 +208,10 @@ def plant_lines(groups: Sequence[GroupPlant]) -> list[str]:
         if np.isfinite(worst)
         else "to no known extent: the plant is not identifiable"
     )
+    other = "the probe acts otherwise than by a delay and a gain, as through a mirror with dynamics"
+    otherwise = [f"{' and '.join(g.modes)}: {other} (probability {g.chance:.0e})" for g in groups if g.chance < OTHERWISE]
     return [
+        *otherwise,
         "gain: of mirror and sensor (optical gain) together, which cannot be told apart; negative of a flipped axis",
         "delay: group delay at low frequencies, that of the mirror included",
         f"disturbance: {form}; {basis}",
@@ -218,7 +228,7 @@ def _groups(n_modes: int) -> Iterator[list[int]]:
 
 def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> GroupPlant:
     data, k = PlantLikelihood(y, u, dt), len(names)
-    guess, excited = guess_plant(data)
+    guess, excited, own = guess_plant(data)
     pooled = np.zeros((2 * k + (k == 2), 2 + (k == 2)))
     pooled[:k, 0], pooled[k : 2 * k, 1], pooled[2 * k :, 2:] = 1.0, np.sign(guess[k : 2 * k]), 1.0
     fits: list[PlantFit] = []
@@ -261,12 +271,14 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
             each, theta=each.theta - off * gain_of, covariance=each.covariance - np.outer(gain_of, gain_of) * variance
         )
 
+    chance = data.response_left(each, own) if excited > EXCITED else 1.0
+
     def number(fit: PlantFit, i: int) -> PlantNumber:
         """Return a number of the plant, if it is near enough to that of every other plant that is as likely."""
         value, sd = float(fit.theta[i]), float(np.sqrt(max(fit.covariance[i, i], 0.0)))
         widest = WIDEST_DELAY if i < k else WIDEST_GAIN * abs(value) if i < 2 * k else WIDEST_ANGLE
         near = all(abs(rival[i]) <= APART * sd for rival in rivals)
-        return PlantNumber(value, sd) if near and 0.0 < sd < widest else PlantNumber()
+        return PlantNumber(value, sd) if near and 0.0 < sd < widest and chance >= OTHERWISE else PlantNumber()
 
     def positive(n: PlantNumber) -> PlantNumber:
         return n if n.value is None else replace(n, value=abs(n.value))
@@ -280,7 +292,7 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
     uncertainty = data.uncertainty(each) if all(n.value is not None for n in (*delay, *gain)) else np.inf
     peaks, coloured = tuple(len(s.resonances) for s in each.spectra), any(s.background for s in each.spectra)
     numbers = delay, gain, rotation, common_delay, common_gain
-    return GroupPlant(names, *numbers, uncertainty, peaks, coloured, excited, each.covariance)
+    return GroupPlant(names, *numbers, uncertainty, peaks, coloured, excited, each.covariance, chance)
 
 
 def _over_delays(data: PlantLikelihood, fit: PlantFit, ties: Array) -> PlantFit:

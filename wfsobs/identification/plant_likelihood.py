@@ -222,6 +222,21 @@ class PlantLikelihood:
         frequency, mean = (np.bincount(band, cell.count * one)[some] / weight[some] for one in (cell.frequency, x))
         return frequency, mean
 
+    def response_left(self, fit: PlantFit, own: Array) -> float:
+        """Return the probability of what the measurements still hold of the commands' own part (n, k), were it chance.
+
+        Score test of a further response, as many numbers as lags for each mode, with the spectra of the fit.
+        """
+        Z = self.z(fit.theta, np.minimum(fit.theta[: self.k].astype(int), LONGEST))[0]
+        seen = self._matrix(fit.theta) @ self._transform(own)
+        turn = np.exp(-2j * np.pi * self.f * self.dt * np.arange(1, LONGEST + 3)[:, None])
+        total = 0.0
+        for z, one, s in zip(Z, seen, fit.spectra, strict=True):
+            D = turn * one / np.sqrt(s.psd(self.f))
+            score, F = (D.conj() @ (z / np.sqrt(s.psd(self.f)))).real, (D.conj() @ D.T).real
+            total += 2.0 * float(score @ np.linalg.solve(F + 1e-9 * np.trace(F) * np.eye(len(F)), score))
+        return float(chi2.sf(total, len(turn) * self.k))
+
     def uncertainty(self, fit: PlantFit) -> float:
         """Return the 95 % limit of the rms of the error of z over the rms of z, in the worst octave."""
         Z, dZ = self.z(fit.theta, np.minimum(fit.theta[: self.k].astype(int), LONGEST))
@@ -263,8 +278,8 @@ def _means(x: Array, cells: Cells) -> Array:
     return np.add.reduceat(x, _edges(cells)) / cells.count
 
 
-def guess_plant(data: PlantLikelihood) -> tuple[Array, float]:
-    """Return a plant to start from, but for its delay, and the share of what is new in u that y does not explain.
+def guess_plant(data: PlantLikelihood) -> tuple[Array, float, Array]:
+    """Return a plant to start from, but for its delay, the share of what is new in u that y does not explain, and that (n, k).
 
     Sign and angle are those under which the commands reduce what is new in the measurements, or, where most of the commands does
     not follow from them, those of the strongest response to it; the gain is 1 or, where that is far
@@ -300,4 +315,5 @@ def guess_plant(data: PlantLikelihood) -> tuple[Array, float]:
             best = max(best, (product**2 / power, product / power))
     explained = best[0] > 0.5 * np.sum(rough(h[1:]) ** 2)
     gain = best[1] if explained and not FAR < best[1] < 1.0 / FAR else 1.0
-    return np.concatenate([np.zeros(k), gain * np.diag(flip), [angle] * (k == 2)]), excited
+    own = np.vstack([np.zeros((ORDER, k)), own])
+    return np.concatenate([np.zeros(k), gain * np.diag(flip), [angle] * (k == 2)]), excited, own

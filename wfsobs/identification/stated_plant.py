@@ -63,7 +63,7 @@ def contradiction(record: Record, sign: int = 1, delay: float | None = None, gai
 
 
 def _contradiction_of(data: PlantLikelihood, delay: int, statement: tuple[int, float, Sequence[float]], moving: Array) -> str:
-    k, (guess, excited) = moving.size, guess_plant(data)
+    k, (guess, excited, _) = moving.size, guess_plant(data)
     names, ways = [TIP_TILT[i].name for i in moving], (*statement[:2], np.resize(statement[2], k))
     stated = np.concatenate([np.full(k, float(delay)), np.ones(k), np.zeros(k - 1)])
     is_turned = excited < REVERSED and bool((guess[k : 2 * k] < 0).any() or (k == 2 and abs(guess[-1]) > np.pi / 4))
