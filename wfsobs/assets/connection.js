@@ -132,7 +132,11 @@ class Link {
     const {socket} = this
     if (!await reachable()) return
     const {ticks} = this
-    setTimeout(() => { if (this.ticks >= ticks && socket === this.socket) socket?.close() }, TIMEOUT)
+    setTimeout(() => {
+      if (this.ticks < ticks || socket !== this.socket || !socket) return
+      socket.send = () => {} // until it is closed: what is changed is kept
+      socket.close()
+    }, TIMEOUT)
   }
 
   // ---------------------------------------------------------------- lost, and found again
