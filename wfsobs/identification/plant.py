@@ -57,8 +57,9 @@ DIFFERS = 0.001
 EXCITED = 1e-3
 """Share of what is new in the commands that the measurements do not explain, from which on they have a probe."""
 
-OTHERWISE = 1e-4
-"""Probability of what a plant leaves of a probe, below which the commands act otherwise, such as by a mirror with dynamics."""
+PROBED, OTHERWISE = 0.05, 1e-4
+"""Share from which on a probe is tested for what a plant leaves of it; and the probability of that below which the commands act
+otherwise, such as by a mirror with dynamics."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ class GroupPlant:
         Of delays [frames], gains and, of two modes, the rotation [rad] together.
     chance : float
         Probability that what the measurements hold of a probe beside this plant is chance; below `OTHERWISE` the mirror is not
-        one of a delay and a gain, and nothing is identifiable. 1 without a probe.
+        one of a delay and a gain, and nothing is identifiable. 1 where a probe is small.
     """
 
     modes: tuple[str, ...]
@@ -271,7 +272,7 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
             each, theta=each.theta - off * gain_of, covariance=each.covariance - np.outer(gain_of, gain_of) * variance
         )
 
-    chance = data.response_left(each, own) if excited > EXCITED else 1.0
+    chance = data.response_left(each, own) if excited > PROBED else 1.0
 
     def number(fit: PlantFit, i: int) -> PlantNumber:
         """Return a number of the plant, if it is near enough to that of every other plant that is as likely."""
