@@ -82,7 +82,7 @@ def test_without_dynamics_it_is_the_mirror(delay: float) -> None:
 
 def test_no_errors_are_no_plant_of_its_own() -> None:
     assert true_plant_of(Scenario()) is None
-    assert true_plant_of(Scenario().replace({"plant.damping": 0.5, "plant.optical_gain_time": 3.0})) is None
+    assert true_plant_of(Scenario().replace({"plant.damping": 0.5, "plant.optical_gain_time": 3.0, "plant.start": 2.0})) is None
     plant = true_plant_of(Scenario().replace({"plant.delay_error": 0.5, "plant.resonance": 100.0, "plant.gain_error": [0.1]}))
     assert plant is not None and plant.delay == 2.5 and plant.matrix.tolist() == [[1.1, 0.0], [0.0, 1.0]]
     assert plant.resonance == pytest.approx(0.2 * np.pi)

@@ -51,7 +51,7 @@ def full_plant_of(scenario: Scenario, rotation: float = 0.0) -> TruePlant:
 def true_plant_of(scenario: Scenario) -> TruePlant | None:
     """Return the plant as it is; None where it is the one that the controllers are designed for."""
     out, is_moved = full_plant_of(scenario), scenario.plant.delay_error or scenario.plant.resonance
-    is_perfect = out.time_invariant and not is_moved and np.array_equal(out.matrix, np.eye(len(out.matrix)))
+    is_perfect = replace(out, start=0).time_invariant and not is_moved and np.array_equal(out.matrix, np.eye(len(out.matrix)))
     return None if is_perfect else out
 
 
