@@ -215,31 +215,30 @@ def _run_at_once(model: AsterismModel, each: Array, frames: Array, watch: Watch)
     plans = {name: model.plan(0.0, name) for name in (*TARGETS, TOTAL)}
     weights = np.concatenate([plans[name][0] for name in TARGETS], axis=1)
     out, seen, at = np.zeros((steps, 2 * m)), np.einsum("ab,kbi->kai", model.basis, each), 0
-    phase = np.where(np.arange(steps) < n, n, np.arange(steps) % n)
-    of_phase = [np.flatnonzero(phase == p) for p in range(n + 1)]
     for star in range(model.n_stars):
         for mode, one in enumerate(model.fast):
             watch.step((star * m + mode) / (model.n_stars * m))
-            x, own = _states(one, seen[:, star, mode]), slice(at, at + len(one.first))
-            for rows, steps_of in zip(weights[:, :, own], of_phase, strict=True):
-                out[steps_of] += x[steps_of] @ rows.T
-            at = own.stop
+            own, y = weights[:, :, at : at + len(one.first)], seen[:, star, mode]
+            out[:n] += _outputs(one, y[:n], own[n:])
+            out[n:] += _outputs(one, y, own[:n], since=n)
+            at += len(one.first)
     for mode, late in enumerate(model.slow):
-        x, own = _states(late, frames[:, mode]), slice(at, at + len(late.first))
-        for rows, steps_of in zip(weights[:-1, :, own], of_phase, strict=False):
-            out[steps_of] += x[steps_of // n - 1] @ rows.T
-        at = own.stop
+        own = weights[:n, :, at : at + len(late.first)].reshape(1, n * 2 * m, -1)  # of all steps until the next frame
+        out[n:] += _outputs(late, frames[:, mode], own).reshape(-1, 2 * m)[: max(steps - n, 0)]
+        at += len(late.first)
+    phase = np.where(np.arange(steps) < n, n, np.arange(steps) % n)
     sd = {name: spread[phase] for name, (_, spread) in plans.items()}
     values = by_name(out.reshape(steps, 2, m))
     return Estimates(values, sd | {NEXT_Z: model.next_z_sd((True,) * model.n_stars)[phase]})
 
 
-def _states(one: Beginning, y: Array) -> Array:
-    """Return the states after every measurement of y (n,), (n, n_states)."""
-    F, G = one.filter.F, one.filter.G[:, None]
+def _outputs(one: Beginning, y: Array, weights: Array, *, since: int = 0) -> Array:
+    """Return weighted states after every measurement of y (n,), (n - since, p); weights : repeat, (cycle, p, n_states)."""
     if not len(y):
-        return np.empty((0, len(F)))
-    return PeriodicFilter([(F, G, F, G)]).run(y[:, None, None], one.first[:, None] * y[0])[:, :, 0]
+        return np.empty((0, weights.shape[1]))
+    F, G = one.filter.F, one.filter.G[:, None]
+    steps = [(F, G, W @ F, W @ G) for W in weights]
+    return PeriodicFilter(steps).run(y[:, None, None], one.first[:, None] * y[0], since=since)[:, :, 0]
 
 
 class AsterismEstimator(JointEstimator):
