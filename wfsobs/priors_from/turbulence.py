@@ -79,9 +79,18 @@ def modelled_turbulence(
     process = one_process(scenario, mode, dt)
     if not _is_third_order(scenario, process):
         return process
+    return _fit_seen(scenario, mode, dt) if spectrum is None else _fit_third_order(scenario, mode, dt, spectrum, fits)
+
+
+@lru_cache(maxsize=32)
+def _fit_seen(scenario: Scenario, mode: int, dt: float) -> Ar3:
+    """Return the fit to the spectrum of the LGS, which takes a while and is asked for by every observer of many lines."""
+    return _fit_third_order(scenario, mode, dt, lgs_turbulence_spectrum(scenario, mode))
+
+
+def _fit_third_order(scenario: Scenario, mode: int, dt: float, spectrum: Array, fits: Ar3Fits | None = None) -> Ar3:
     noise, _ = measurement_noise(scenario, mode)
-    spectrum = lgs_turbulence_spectrum(scenario, mode) if spectrum is None else spectrum
-    return (fits or Ar3Fits()).fit("LGS", spectrum, noise**2, _third_order(process))
+    return (fits or Ar3Fits()).fit("LGS", spectrum, noise**2, _third_order(one_process(scenario, mode, dt)))
 
 
 def beams_of(
