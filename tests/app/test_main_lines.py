@@ -16,7 +16,7 @@ from wfsobs.app.jobs import DONE, RUNNING
 from wfsobs.app.render import number
 from wfsobs.app.style import look, observers_of
 from wfsobs.app.views.main_lines import REFERENCES, MainLines, main_observers
-from wfsobs.app.views.plots import APART, GREY, MOST_COLOURED
+from wfsobs.app.views.plots import GREY, MOST_COLOURED, ROOM_OF_NAME
 from wfsobs.app.views.traces import first_window
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.evidence import gather_evidence, rank_observers
@@ -186,7 +186,9 @@ class TestNamesAndGrey:
                 low, high = scale(axis.start), scale(axis.end)
                 places = (scale(source["y"]) - low) / (high - low)
                 assert 0.0 < places.min() and places.max() < 1.0
-                assert np.diff(places).min(initial=1.0) >= min(APART, 1.0 / len(places)) - 1e-9
+                sizes = np.array([ROOM_OF_NAME["\n" in text] for text in source["text"]])
+                sizes /= max(sizes.sum(), 1.0)
+                assert (np.diff(places) >= 0.5 * (sizes[1:] + sizes[:-1]) - 1e-9).all()
 
     def test_of_many_lines_those_that_the_verdict_does_not_name_recede(self, dashboard: Dashboard) -> None:
         main = dashboard.display.named_lines["vibration"]

@@ -237,7 +237,7 @@ class TestNumbers:
         )
         assert cards["gpr-online"]["value"] == number(1e3 * score.rms)
         low, high = score.interval or (0.0, 0.0)
-        assert float(cards["gpr-online"]["half"]) == pytest.approx(500.0 * (high - low), abs=0.051)
+        assert float(cards["gpr-online"]["half"].removeprefix("± ")) == pytest.approx(500.0 * (high - low), abs=0.051)
         assert dashboard.explore.strips["vibration"].cards.heads["value"] == "RMS error [nm]"
         assert cards["gpr-online"]["colour"] == look("gpr-online").light
         assert cards[TRUTH]["value"] == number(1e3 * score.truth_rms)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from wfsobs.evaluation.scores import (
@@ -100,6 +100,16 @@ def score_rows(scores: Iterable[Score], seed: int | None, *, source: PriorSource
 def interval_text(interval: Sequence[float] | None, scale: float) -> str:
     """Return the interval of the rms of an optimal observer in 95 % of records, "low - high"; "-" where there is none."""
     return "-" if interval is None else f"{interval[0] * scale:.2f} - {interval[1] * scale:.2f}"
+
+
+def uncertainty_text(x: float, interval: Sequence[float], write: Callable[[float], str]) -> str:
+    """Return how exactly a value is known, by `write`: half of its interval, or both ends of one that is wider than the value.
+
+    >>> uncertainty_text(9.63, (9.21, 10.05), "{:.2f}".format), uncertainty_text(21.9, (2.57, 187.0), "{:.1f}".format)
+    ('± 0.42', '(2.6 to 187.0)')
+    """
+    low, high = interval
+    return f"± {write(0.5 * (high - low))}" if high - low <= x else f"({write(low)} to {write(high)})"
 
 
 def row_label(observer: str) -> str:

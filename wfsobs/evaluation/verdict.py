@@ -22,7 +22,7 @@ from wfsobs.evaluation.known_lines import (
     is_near,
     prior_knowledge,
 )
-from wfsobs.evaluation.rows import JOINT_BOUNDS, above_bound, row_label, target_title
+from wfsobs.evaluation.rows import JOINT_BOUNDS, above_bound, row_label, target_title, uncertainty_text
 from wfsobs.evaluation.scores import (
     BOUND_ASTERISM,
     BOUND_BOTH,
@@ -105,8 +105,10 @@ class Contender:
 
     def with_error(self, scale: float, unit: str) -> str:
         """Write the name and the error with its interval; scale : from micrometres to the unit."""
-        half = 0.5 * (self.interval[1] - self.interval[0]) * scale if self.interval else None
-        return f"{self.name} {_format_number(self.rms * scale, half)} {unit}"
+        text = _format_number(self.rms * scale)
+        if self.interval:
+            text += " " + uncertainty_text(self.rms, self.interval, lambda x: f"{x * scale:.{len(text.partition('.')[2])}f}")
+        return f"{self.name} {text} {unit}"
 
     def knowledge_clause(self, lines: int, several: bool = False) -> str:
         """Write what it knows before it measures; lines : of the vibration, 0 where that is not known."""
@@ -176,6 +178,17 @@ class Verdict:
         """Observers whose error is larger, but not significantly so."""
         return tuple(place.observer for place in self.places[1:] if place.is_tie)
 
+    @property
+    def named(self) -> tuple[Contender, ...]:
+        """Those whose errors the sentences say, the smallest first."""
+        return tuple(place for place in self.places if place.observer in (*self._chosen, *ALWAYS))
+
+    @property
+    def _chosen(self) -> dict[str, Contender]:
+        """The best with each kind of prior knowledge, and of all."""
+        of_kind = (place for kind in (NOTHING, PEAKS) if (place := self.best_with(kind)))
+        return {place.observer: place for place in (*of_kind, self.best)}
+
     def best_with(self, *knowledge: str) -> Contender | None:
         """Return the best of those with these kinds of prior knowledge (`prior_knowledge`); None where there is none."""
         return next((place for place in self.places if place.knowledge in knowledge), None)
@@ -185,8 +198,7 @@ class Verdict:
 
         scale : from micrometres to the unit
         """
-        chosen = {place.observer: place for kind in (NOTHING, PEAKS) if (place := self.best_with(kind))}
-        chosen.setdefault(self.best.observer, self.best)
+        chosen = self._chosen
         equal = [place.name for place in self.places[1:] if place.is_tie and place.observer not in chosen]
         parts = []
         for place in chosen.values():
@@ -354,11 +366,10 @@ def _join(names: Sequence[str]) -> str:
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
-def _format_number(x: float, half_width: float | None = None) -> str:
-    """Return three digits of a number, and its interval to the last of them.
+def _format_number(x: float) -> str:
+    """Return three digits of a number.
 
-    >>> _format_number(14.96), _format_number(0.5), _format_number(120.4), _format_number(1234.0), _format_number(9.63, 0.418)
-    ('15.0', '0.500', '120', '1234', '9.63 ± 0.42')
+    >>> _format_number(14.96), _format_number(0.5), _format_number(120.4), _format_number(1234.0)
+    ('15.0', '0.500', '120', '1234')
     """
-    text = f"{x:#.3g}".rstrip(".") if x < 999.5 else f"{x:.0f}"
-    return text if half_width is None else f"{text} ± {half_width:.{len(text.partition('.')[2])}f}"
+    return f"{x:#.3g}".rstrip(".") if x < 999.5 else f"{x:.0f}"

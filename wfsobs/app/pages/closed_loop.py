@@ -49,7 +49,7 @@ from wfsobs.app.views.plots import (
     new_figure,
     on_settle,
 )
-from wfsobs.app.views.strip import Cards, card_of
+from wfsobs.app.views.strip import Cards, card_of, error_fields
 from wfsobs.app.views.table import SMALLEST
 from wfsobs.closed_loop.envelope import PlantEnvelope
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label, loop_verdict, no_theory
@@ -328,9 +328,6 @@ def _line(row: Score, display: Display, cells: list[str]) -> Row:
     return Row(swatch(name, display.dark) + label(name), cells, {"controller": name})
 
 
-REFERENCES = ("integrator", "lqg-kf-lgs")
-"""Shown at first beside the best, of which there are two."""
-
 FIRST_S, ZOOM_S = 2.0, 0.5
 """Length of the two traces at first [s], in the middle of the record."""
 
@@ -509,30 +506,32 @@ class ClosedLoopPage(Page):
             self.cards.hidden_lines = names
 
     def _show_main(self) -> None:
-        """Show the few lines that matter: the references, and the best two of the mode."""
+        """Show the few lines that matter: of those that the verdict names."""
         shown = self.results
         if shown is None:
             return
-        of_mode = [r for r in shown.rows if r["mode"] == self.display.mode and r["controller"] in CONTROLLERS]
-        ranked = sorted((r for r in of_mode if r["residual_rms_nm"] is not None), key=lambda r: r["residual_rms_nm"])
-        main = {*REFERENCES, *(r["controller"] for r in ranked[:2])}
+        found = loop_verdict(shown.result, self.display.mode)
+        main = [place.observer for place in found.named] if found else [*CONTROLLERS]
         self._main = [name for name in CONTROLLERS if name not in main]
         self.cards.hidden_lines = self._main
 
     def _items(self, results: LoopResults) -> list[dict[str, Any]]:
         """Describe a card per controller."""
-        scale = 1e-3 * per_micrometre(self.display.unit, results.result.scenario.telescope.diameter)
+        scale = per_micrometre(self.display.unit, results.result.scenario.telescope.diameter)
         left = {r["controller"]: r for r in results.rows if r["mode"] == self.display.mode}
+        found = loop_verdict(results.result, self.display.mode)
+        intervals = {place.observer: place.interval for place in found.places} if found else {}
         out = []
         for name in CONTROLLERS:
             row = left.get(name)
-            value, unit = NOTHING, ""
+            fields: dict[str, Any] = {"main": name not in self._main}
             if row is None:
                 note = f"left out, {seconds(name, results.result.scenario):.0f} s" if results.complete else "computing …"
             elif row["residual_rms_nm"] is None:
                 note = "unstable" if row["stable"] is False else "could not run"
             else:
-                value, unit = number(row["residual_rms_nm"] * scale), self.display.unit_label
                 note = f"Strehl {row['strehl']:.3f}"
-            out.append(card_of(name, self.display.dark, note, value, unit=unit, main=name not in self._main))
+                fields |= error_fields(1e-3 * row["residual_rms_nm"], intervals.get(name), scale)
+                fields["unit"] = self.display.unit_label
+            out.append(card_of(name, self.display.dark, note, **fields))
         return out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -92,8 +93,8 @@ GREY = {False: "#B4B4B4", True: "#666666"}
 MOST_COLOURED = 6
 """Of more lines in a figure those recede that the verdict does not name, until their cards are pointed at."""
 
-APART = 0.13
-"""Between the names at the ends of two lines, of the height of the axis: two lines of text."""
+ROOM_OF_NAME = (0.075, 0.13)
+"""A name of one line of text, and of two, of the height of the lowest axis."""
 
 ROOM_FOR_NAMES = 78
 """Beside a figure, for the names of its lines [px]."""
@@ -280,7 +281,8 @@ class EndLabels:
             if seen.size:
                 places[name] = (float(scale(np.median(seen))) - low) / (high - low)
         names = sorted(places, key=places.__getitem__)
-        apart = spread([places[name] for name in names], APART)
+        texts = [_in_two_lines(look(name).label) for name in names]
+        apart = spread([places[name] for name in names], [ROOM_OF_NAME["\n" in text] for text in texts])
         at = [low + (high - low) * place for place in apart]
         self.labels.update(text_color="#E8E8E8" if dark else "#202020")
         send(
@@ -288,7 +290,7 @@ class EndLabels:
             {
                 "x": [end] * len(names),
                 "y": [float(10**y) for y in at] if is_log else at,
-                "text": [_in_two_lines(look(name).label) for name in names],
+                "text": texts,
                 "colour": [look(name).colour(dark) for name in names],
                 "dash": [list(look(name).dash) for name in names],
             },
@@ -303,20 +305,21 @@ LAST = 20
 """Samples at the right end of a line whose median says where it ends."""
 
 
-def spread(places: Sequence[float], least: float) -> list[float]:
-    """Move places from 0 to 1, in order, as little apart as their distances need.
+def spread(places: Sequence[float], sizes: Sequence[float]) -> list[float]:
+    """Move places from 0 to 1, in order, as little apart as the sizes of what stands there need.
 
-    >>> [round(place, 3) for place in spread([0.0, 0.5, 0.52, 2.0], 0.1)]
+    >>> [round(place, 3) for place in spread([0.0, 0.5, 0.52, 2.0], [0.1] * 4)]
     [0.05, 0.5, 0.6, 0.95]
-    >>> [round(place, 3) for place in spread([0.9, 0.9, 0.9], 0.1)]
-    [0.75, 0.85, 0.95]
+    >>> [round(place, 3) for place in spread([0.9, 0.9, 0.9], [0.2, 0.1, 0.1])]
+    [0.7, 0.85, 0.95]
     """
-    least = min(least, 1.0 / max(len(places), 1))
+    half = [0.5 * size / max(sum(sizes), 1.0) for size in sizes]
+    apart = [a + b for a, b in pairwise(half)]
     moved: list[float] = []
-    for place in places:
-        moved.append(max(place, moved[-1] + least if moved else 0.5 * least))
+    for i, place in enumerate(places):
+        moved.append(max(place, moved[-1] + apart[i - 1] if moved else half[0]))
     for i in reversed(range(len(moved))):
-        moved[i] = min(moved[i], moved[i + 1] - least if i + 1 < len(moved) else 1.0 - 0.5 * least)
+        moved[i] = min(moved[i], moved[i + 1] - apart[i] if i + 1 < len(moved) else 1.0 - half[-1])
     return moved
 
 

@@ -23,7 +23,7 @@ from wfsobs.app.views.table import find
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.budget import TERMS as BUDGET_TERMS
 from wfsobs.evaluation.evidence import Evidence, gather_evidence
-from wfsobs.evaluation.rows import NOT_OBSERVERS, own_interval, score_rows
+from wfsobs.evaluation.rows import NOT_OBSERVERS, own_interval, score_rows, uncertainty_text
 from wfsobs.evaluation.scores import LOOP, PREDICTION, RESIDUAL, Score
 from wfsobs.priors_from.selection import usual_observers
 
@@ -92,6 +92,16 @@ def card_of(name: str, dark: bool, note: str, value: str = NOTHING, **fields: An
     known = {"name": name, "label": it.label, "colour": it.colour(dark), "dash": it.dash, "about": sentence_on(name)}
     empty = {"unit": "", "half": "", "change": "", "parts": (), "size": 0.0, "limit": 0.0, "compared": ()}
     return {**known, "note": note, "value": value, **empty, **fields}
+
+
+FROM_RECORD = "from one record"
+
+
+def error_fields(rms: float, interval: Sequence[float] | None, scale: float, of: str = FROM_RECORD) -> dict[str, str]:
+    """Write an error and how exactly it is known; scale : to the unit shown;  of : what the interval is from."""
+    value = number(rms * scale)
+    half = uncertainty_text(rms, interval, lambda x: with_decimals_of(value, x * scale)) if interval else ""
+    return {"value": value, "half": half, "meaning": f"{OVER_SEEDS}, {of}"}
 
 
 class Strip:
@@ -204,12 +214,10 @@ class Strip:
 
     def _score_fields(self, name: str, score: Score, results: RunResults) -> dict[str, Any]:
         mean, own = self._mean(score), own_interval(score_rows([score], None)[0])
-        fields = self._card(name, self._in_unit(mean.rms, results), own or number(mean.normalised_rms, 2))
-        if mean.interval is not None:
-            half = self._in_unit(0.5 * (mean.interval[1] - mean.interval[0]), results)
-            evidence = self.seeds.evidence if self.seeds else None
-            meaning = f"{OVER_SEEDS}, {f'{evidence.n_seeds} seeds' if evidence else 'from one record'}"
-            fields |= {"half": with_decimals_of(fields["value"], half), "meaning": meaning}
+        evidence = self.seeds.evidence if self.seeds else None
+        of = f"{evidence.n_seeds} seeds" if evidence else FROM_RECORD
+        fields = self._card(name, None, own or number(mean.normalised_rms, 2))
+        fields |= error_fields(mean.rms, mean.interval, self._in_unit(1.0, results), of)
         change = self._change(score)
         return fields | {
             "change": "" if change is None else with_decimals_of(fields["value"], self._in_unit(change, results), "+")
