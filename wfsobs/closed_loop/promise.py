@@ -220,6 +220,8 @@ def draw_plants(groups: Sequence[GroupPlant], n_modes: int, rng: np.random.Gener
     order = [mode.name for mode in modes_up_to(HIGHEST_ORDER)]
     for group in groups:
         names, n = " and ".join(group.modes), len(group.modes)
+        if group.has_dynamics:
+            raise RecordError(f"the mirror has dynamics ({names}), which no promise takes into account: do not switch on")
         numbers = [("delay", x) for x in group.delay] + [("gain", x) for x in group.gain]
         numbers += [("rotation", group.rotation)] if group.rotation is not None else []
         for what, number in numbers:

@@ -11,8 +11,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.stats import chi2
 
+from wfsobs.identification.mirror_response import SHAPES, Response, few_lags, second_order
 from wfsobs.identification.plant_likelihood import (
     LONGEST,
     MOST_PEAKS,
@@ -57,9 +59,9 @@ DIFFERS = 0.001
 EXCITED = 1e-3
 """Share of what is new in the commands that the measurements do not explain, from which on they have a probe."""
 
-PROBED, OTHERWISE = 0.05, 1e-4
-"""Share from which on a probe is tested for what a plant leaves of it; and the probability of that below which the commands act
-otherwise, such as by a mirror with dynamics."""
+PROBED, OTHERWISE, SWINGS = 0.05, 1e-4, 3.0
+"""Share from which on a probe tells the dynamics of the mirror, and is tested for what a plant leaves of it; the probability of
+that below which the commands act otherwise; log-likelihood by which a second-order mirror is likelier than any of few lags."""
 
 
 @dataclass(frozen=True)
@@ -103,9 +105,9 @@ class GroupPlant:
         Share of what is new in the commands that the measurements do not explain: of a probe, or a change of the controller.
     covariance : Array
         Of delays [frames], gains and, of two modes, the rotation [rad] together.
-    chance : float
-        Probability that what the measurements hold of a probe beside this plant is chance; below `OTHERWISE` the mirror is not
-        one of a delay and a gain, and nothing is identifiable. 1 where a probe is small.
+    chance, rigid : float
+        Probability that what the measurements hold of a probe beside this plant, and beside one of a delay and a gain alone, is
+        chance; where the first is below `OTHERWISE` nothing is identifiable. 1 where a probe is small.
     """
 
     modes: tuple[str, ...]
@@ -120,6 +122,12 @@ class GroupPlant:
     own_share: float
     covariance: Array = field(repr=False, compare=False)
     chance: float = 1.0
+    rigid: float = 1.0
+
+    @property
+    def has_dynamics(self) -> bool:
+        """Whether a probe shows that the mirror does more than delay."""
+        return self.rigid < OTHERWISE
 
     @property
     def degrees(self) -> PlantNumber:
@@ -209,8 +217,15 @@ def plant_lines(groups: Sequence[GroupPlant]) -> list[str]:
         if np.isfinite(worst)
         else "to no known extent: the plant is not identifiable"
     )
-    other = "the probe acts otherwise than by a delay and a gain, as through a mirror with dynamics"
-    otherwise = [f"{' and '.join(g.modes)}: {other} (probability {g.chance:.0e})" for g in groups if g.chance < OTHERWISE]
+    otherwise = [
+        f"{' and '.join(g.modes)}: the probe acts otherwise than {through} (probability {chance:.0e})"
+        for g in groups
+        for chance, through in (
+            (g.rigid, "by a delay and a gain: the mirror has dynamics"),
+            (g.chance, "by any mirror of second order"),
+        )
+        if chance < OTHERWISE
+    ]
     return [
         *otherwise,
         "gain: of mirror and sensor (optical gain) together, which cannot be told apart; negative of a flipped axis",
@@ -260,7 +275,12 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
     one_delay = each.value - apart.value <= 0.5 * chi2.isf(DIFFERS, 1)
     rivals = [fit.theta - each.theta for fit in fits if fit.criterion - each.criterion < RIVAL]
     both = np.column_stack([pooled[:, 0], np.eye(len(pooled))[:, 1:]])
-    each = _over_delays(data, each, gains) if one_delay else _over_delays(data, apart, both)
+    each, ties = (_over_delays(data, each, gains), gains) if one_delay else (_over_delays(data, apart, both), both)
+    chance, rigid, mirror = 1.0, 1.0, each
+    if excited > PROBED:
+        rigid, mirror = data.response_left(each, own), _with_dynamics(data, each, ties)
+        chance = data.response_left(mirror, own)
+        each = replace(each, theta=mirror.theta[: data.size], covariance=mirror.covariance[: data.size, : data.size])
     equal = np.zeros(len(pooled))
     equal[k : 2 * k] = np.sign(each.theta[k : 2 * k]) * ([1.0, -1.0] if k == 2 else 0.0)
     variance, off = equal @ each.covariance @ equal, equal @ each.theta
@@ -271,8 +291,6 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
         common = replace(
             each, theta=each.theta - off * gain_of, covariance=each.covariance - np.outer(gain_of, gain_of) * variance
         )
-
-    chance = data.response_left(each, own) if excited > PROBED else 1.0
 
     def number(fit: PlantFit, i: int) -> PlantNumber:
         """Return a number of the plant, if it is near enough to that of every other plant that is as likely."""
@@ -290,10 +308,26 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
     common_gain = positive(number(common, k)) if one_delay and one_gain else PlantNumber()
     if rotation is not None and rotation.value is not None:
         rotation = replace(rotation, value=float(-((np.pi - rotation.value) % (2.0 * np.pi) - np.pi)))
-    uncertainty = data.uncertainty(each) if all(n.value is not None for n in (*delay, *gain)) else np.inf
+    uncertainty = (
+        data.uncertainty(each, mirror if rigid < OTHERWISE else each)
+        if all(n.value is not None for n in (*delay, *gain))
+        else np.inf
+    )
     peaks, coloured = tuple(len(s.resonances) for s in each.spectra), any(s.background for s in each.spectra)
     numbers = delay, gain, rotation, common_delay, common_gain
-    return GroupPlant(names, *numbers, uncertainty, peaks, coloured, excited, each.covariance, chance)
+    return GroupPlant(names, *numbers, uncertainty, peaks, coloured, excited, each.covariance, chance, rigid)
+
+
+def _with_dynamics(data: PlantLikelihood, fit: PlantFit, ties: Array) -> PlantFit:
+    """Return the fit of a mirror with dynamics: any response of few lags, or of second order where that is likelier by SWINGS."""
+    ties = block_diag(ties, np.eye(2))
+
+    def of(mirror: Response, shape: Sequence[float]) -> PlantFit:
+        return data.fit(replace(fit, theta=np.append(fit.theta, shape), mirror=mirror), ties, STEPS)
+
+    few = of(few_lags(int(fit.theta[: data.k].mean())), (0.0, 0.0))
+    swinging = min((of(second_order, shape) for shape in SHAPES), key=lambda one: one.value)
+    return swinging if few.value - swinging.value > SWINGS else few
 
 
 def _over_delays(data: PlantLikelihood, fit: PlantFit, ties: Array) -> PlantFit:

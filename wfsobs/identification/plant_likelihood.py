@@ -21,8 +21,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.fft import rfft
+from scipy.signal import lfilter
 from scipy.stats import chi2
 
+from wfsobs.identification.mirror_response import RANGE, Response, second_order
 from wfsobs.record import Record, hold_last
 from wfsobs.spectral.missing import MissingSamples, find_outlying
 from wfsobs.spectral.model import Spectrum
@@ -49,6 +51,9 @@ NARROW, BAND, LOOSE = 10.0, 0.1, 0.1
 each number of a spectrum beside that of the data, which keeps those that the data say nothing of.
 """
 
+SMALL = 1e-4
+"""Difference over which a response is differentiated."""
+
 FAR = 0.05
 """Gain of the first guess below which, or over whose inverse, it is not taken for 1."""
 
@@ -64,13 +69,17 @@ def known_signals(record: Record, most: int) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class PlantFit:
-    """Plant: delays, gains and, of two modes, the angle; spectra; - log L; covariance of the plant; bins."""
+    """Plant: delays, gains and, of two modes, the angle; spectra; - log L; covariance of the plant; bins.
+
+    With the response of a mirror its shape follows the other numbers of the plant.
+    """
 
     theta: Array
     spectra: Sequence[Spectrum]
     value: float = np.inf
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
     bins: int = 0
+    mirror: Response | None = None
 
     @property
     def criterion(self) -> float:
@@ -102,12 +111,20 @@ class PlantLikelihood:
         """Return the Fourier transform of the columns (k, bins), such that its square is the periodogram."""
         return np.sqrt(2.0 * self.dt / self.n) * rfft(taper(self.n)[:, None] * x, axis=0)[1 : (self.n + 1) // 2].T
 
-    def with_spectra(self, theta: Array, spectra: Sequence[Spectrum] = (), most: int = PEAKS, *, plain: bool = True) -> PlantFit:
+    def with_spectra(
+        self,
+        theta: Array,
+        spectra: Sequence[Spectrum] = (),
+        most: int = PEAKS,
+        *,
+        plain: bool = True,
+        mirror: Response | None = None,
+    ) -> PlantFit:
         """Return a plant with first guesses of the spectra; missing samples are filled by those before.
 
         plain : without a background, which the commands of a wrong plant look like
         """
-        seen = self._mirror_signal(theta)
+        seen = self._mirror_signal(theta, mirror)
         z = self.y - seen
         for i, missing in enumerate(self.missing):
             z[:, i] = missing.interpolate(z[:, i]) if not spectra else missing.fill(z[:, i], spectra[i].psd(self.f))
@@ -115,33 +132,59 @@ class PlantLikelihood:
             self.Y = self._transform(z + seen)
         some = zip(z.T, spectra or [None] * self.k, strict=True)
         found = [quick_spectrum(x, self.dt, most, LOWEST, s, complete=not plain) for x, s in some]
-        return PlantFit(theta, [replace(s, background=None) if plain else s for s in found])
+        return PlantFit(theta, [replace(s, background=None) if plain else s for s in found], mirror=mirror)
 
-    def _mirror_signal(self, theta: Array) -> Array:
+    def _mirror_signal(self, theta: Array, mirror: Response | None) -> Array:
         """Return the commands as the measurements see them, (n, k)."""
+        if mirror is not None:
+            m = [lfilter(mirror(x), [1.0], u) for x, u in zip(self._of_modes(theta), self.u[1].T, strict=True)]
+            return np.array(m).T @ self._matrix(theta).T
         whole = np.minimum(theta[: self.k].astype(int), LONGEST)
         part = theta[: self.k] - whole
         m = [(1.0 - p) * self.u[d, :, j] + p * self.u[d + 1, :, j] for j, (d, p) in enumerate(zip(whole, part, strict=True))]
         return np.array(m).T @ self._matrix(theta).T
 
-    def _matrix(self, theta: Array, turn: float = 0.0) -> Array:
-        return rotation_matrix((theta[-1] if self.k == 2 else 0.0) + turn)[: self.k, : self.k] * theta[self.k : 2 * self.k]
+    @property
+    def size(self) -> int:
+        """Numbers of a plant but for the shape of its mirror."""
+        return 2 * self.k + (self.k == 2)
 
-    def z(self, theta: Array, lower: Array) -> tuple[Array, Array]:
+    def _of_modes(self, theta: Array) -> list[Array]:
+        """Return the delay of each mode, with the shape of the mirror."""
+        return [np.append(delay, theta[self.size :]) for delay in theta[: self.k]]
+
+    def _matrix(self, theta: Array, turn: float = 0.0) -> Array:
+        return (
+            rotation_matrix((theta[2 * self.k] if self.k == 2 else 0.0) + turn)[: self.k, : self.k] * theta[self.k : 2 * self.k]
+        )
+
+    def _mirror_transform(self, theta: Array, lower: Array | None, mirror: Response | None) -> tuple[Array, Array]:
+        """Return the commands as they are measured (k, bins), and their derivatives by delay and shape (k, 1 or 3, bins)."""
+        if mirror is None:
+            lower = np.minimum(theta[: self.k].astype(int), LONGEST) if lower is None else lower
+            before, change = (np.array([x[d, j] for j, d in enumerate(lower)]) for x in (self.U, self.U[1:] - self.U[:-1]))
+            return before + (theta[: self.k] - lower)[:, None] * change, change[:, None]
+        steps = SMALL * np.eye(3)
+        taps = [[mirror(x), *((mirror(x + e) - mirror(x - e)) / (2.0 * SMALL) for e in steps)] for x in self._of_modes(theta)]
+        out = rfft(taps, self.n)[..., 1 : (self.n + 1) // 2] * self.U[1][:, None]
+        return out[:, 0], out[:, 1:]
+
+    def z(self, theta: Array, lower: Array | None = None, mirror: Response | None = None) -> tuple[Array, Array]:
         """Return the transform of z (k, bins) and its derivatives by theta (p, k, bins); lower : whole part of the delays."""
-        before, change = (np.array([x[d, j] for j, d in enumerate(lower)]) for x in (self.U, self.U[1:] - self.U[:-1]))
-        m, matrix = before + (theta[: self.k] - lower)[:, None] * change, self._matrix(theta)
-        by_delay = [-matrix[:, j, None] * change[j] for j in range(self.k)]
+        m, slopes = self._mirror_transform(theta, lower, mirror)
+        matrix = self._matrix(theta)
+        by_delay = [-matrix[:, j, None] * slopes[j, 0] for j in range(self.k)]
         by_gain = [-matrix[:, j, None] / theta[self.k + j] * m[j] for j in range(self.k)]
         by_angle = [-self._matrix(theta, np.pi / 2.0) @ m] if self.k == 2 else []
-        return self.Y - matrix @ m, np.array(by_delay + by_gain + by_angle)
+        by_shape = [-matrix @ slopes[:, i] for i in range(1, slopes.shape[1])]
+        return self.Y - matrix @ m, np.array(by_delay + by_gain + by_angle + by_shape)
 
     def fit(self, start: PlantFit, ties: Array, steps: int, *, stays: bool = False) -> PlantFit:
         """Take damped Newton steps with the expected second derivatives.
 
         ties : theta by its free numbers (p, q);  stays : delays do not go beyond the whole numbers on either side
         """
-        theta, spectra = start.theta, list(start.spectra)
+        theta, spectra, mirror = start.theta, list(start.spectra), start.mirror
         cells = [
             Cells(self.f, np.zeros_like(self.f), np.ones_like(self.f), [p.omega / (2.0 * np.pi) for p in s.resonances])
             for s in spectra
@@ -151,7 +194,7 @@ class PlantLikelihood:
         theta_there, spectra_there, lower_there = theta, spectra, lower
         step = gradient = np.zeros(0)
         for _ in range(steps):
-            Z, dZ = self.z(theta_there, lower_there)
+            Z, dZ = self.z(theta_there, lower_there, mirror)
             for cell, z in zip(cells, Z, strict=True):
                 cell.mean = _means(np.abs(z) ** 2, cell)
             there = sum(spectrum_negative_log_likelihood(s, cell) for s, cell in zip(spectra_there, cells, strict=True))
@@ -169,7 +212,10 @@ class PlantLikelihood:
             step = np.linalg.solve(F + np.diag(held * np.diag(F) + 1e-9), -gradient)
             q = ties.shape[1]
             theta_there = theta + np.clip(ties @ step[:q], -REACH, REACH)
-            theta_there, lower_there = self._within(theta_there, lower, stays)
+            if mirror is None:
+                theta_there, lower_there = self._within(theta_there, lower, stays)
+            elif mirror is second_order:
+                theta_there[-2:] = np.clip(theta_there[-2:], *RANGE)
             spectra_there, at = [], q
             for s in spectra:
                 vector, free = s.vector.copy(), _free(s)
@@ -178,7 +224,7 @@ class PlantLikelihood:
                 spectra_there.append(s.with_vector(vector))
         covariance = np.linalg.inv(F)[: ties.shape[1], : ties.shape[1]] * inflation(self.n)
         covariance /= 1.0 - max(missing.is_missing.mean() for missing in self.missing)  # filled ones tell nothing
-        return PlantFit(theta, spectra, float(best), ties @ covariance @ ties.T, self.f.size)
+        return PlantFit(theta, spectra, float(best), ties @ covariance @ ties.T, self.f.size, mirror)
 
     def _within(self, theta: Array, lower: Array, stays: bool) -> tuple[Array, Array]:
         """Stop delays at the next whole number, where the derivative changes; from there they go on in the next step, or stay."""
@@ -227,7 +273,7 @@ class PlantLikelihood:
 
         Score test of a further response, as many numbers as lags for each mode, with the spectra of the fit.
         """
-        Z = self.z(fit.theta, np.minimum(fit.theta[: self.k].astype(int), LONGEST))[0]
+        Z = self.z(fit.theta, mirror=fit.mirror)[0]
         seen = self._matrix(fit.theta) @ self._transform(own)
         turn = np.exp(-2j * np.pi * self.f * self.dt * np.arange(1, LONGEST + 3)[:, None])
         total = 0.0
@@ -237,9 +283,12 @@ class PlantLikelihood:
             total += 2.0 * float(score @ np.linalg.solve(F + 1e-9 * np.trace(F) * np.eye(len(F)), score))
         return float(chi2.sf(total, len(turn) * self.k))
 
-    def uncertainty(self, fit: PlantFit) -> float:
-        """Return the 95 % limit of the rms of the error of z over the rms of z, in the worst octave."""
-        Z, dZ = self.z(fit.theta, np.minimum(fit.theta[: self.k].astype(int), LONGEST))
+    def uncertainty(self, fit: PlantFit, true: PlantFit) -> float:
+        """Return the 95 % limit of the rms of the error of z over the rms of z, in the worst octave.
+
+        true : the plant whose delay, gain and rotation are those of the fit
+        """
+        (Z, dZ), right = self.z(fit.theta), self.z(true.theta, mirror=true.mirror)[0]
         values, vectors = np.linalg.eigh(fit.covariance)
         dZ = np.tensordot((vectors * np.sqrt(np.maximum(values, 0.0))).T, dZ, 1)
         low, worst = 1.0, 0.0
@@ -250,7 +299,8 @@ class PlantLikelihood:
                 sizes = np.maximum(np.linalg.eigvalsh(np.real(part @ part.conj().T)), 0.0)
                 freedom = sizes.sum() ** 2 / max((sizes**2).sum(), 1e-300)  # as of a multiple of chi squared
                 limit = sizes.sum() * chi2.ppf(0.95, freedom) / freedom if freedom > 0 else 0.0
-                worst = max(worst, limit / max(float(np.sum(np.abs(Z[i, octave]) ** 2)), 1e-300))
+                limit += float(np.sum(np.abs(Z[i, octave] - right[i, octave]) ** 2))
+                worst = max(worst, limit / max(float(np.sum(np.abs(right[i, octave]) ** 2)), 1e-300))
             low *= 2.0
         return float(np.sqrt(worst))
 

@@ -30,8 +30,8 @@ class Probe:
     rms : float
         Of the commands of each mode [um].
     bound : dict of str to float
-        Cramer-Rao bounds of the probe alone, whatever the plant's own motion tells: `delay_frames`, `gain` of a mode, and
-        `rotation_deg`, the largest of the modes.
+        Cramer-Rao bounds of the probe alone, whatever the plant's own motion tells, if the lag of the mirror is unknown (any
+        response of four lags): `delay_frames`, one of both modes, `gain`, that of the worse mode, and `rotation_deg`.
     cost : float
         What it adds to the rms of the residual of a mode while it lasts, over that; the largest of the modes.
     """
@@ -70,7 +70,7 @@ def design_probe(scenario: Scenario, seconds: float, accuracy: Mapping[str, floa
     spectra = [true_spectra(scenario, mode) for mode in modes]
     probes = []
     for share in LOW:
-        information, rotation, excess = np.zeros((2, 2, 2)), 0.0, []
+        information, rotation, excess = np.zeros((5, 5)), 0.0, []
         density = []
         for s in spectra:
             omega = np.pi * np.arange(s.measurement.size) / (s.measurement.size - 1)
@@ -83,12 +83,14 @@ def design_probe(scenario: Scenario, seconds: float, accuracy: Mapping[str, floa
         n = seconds / scenario.dt
         for mode, s in enumerate(spectra):
             (omega, power), other = density[mode], density[1 - mode][1]
-            slopes = np.array([np.exp(-1j * omega) - 1.0, np.ones_like(omega)])  # by delay and gain, but for two frames
+            back = np.exp(-1j * omega)
+            # by delay, two numbers of the mirror's shape, and gain, but for two frames
+            slopes = np.array([back - 1.0, (1.0 - back) ** 2 / back, (1.0 - back) ** 2, np.ones_like(omega)])
             products = np.real(slopes[:, None] * slopes.conj()) * power / s.measurement
-            information[mode] = n * np.array([[circle_mean(x) for x in row] for row in products])
+            information[np.ix_(*[[0, 1, 2, 3 + mode]] * 2)] += n * np.array([[circle_mean(x) for x in row] for row in products])
             rotation += n * circle_mean(other / s.measurement) if other.size == omega.size else 0.0
-        sd = np.sqrt(np.diagonal(np.linalg.inv(information), axis1=1, axis2=2).max(axis=0))
-        unit = {"delay_frames": sd[0], "gain": sd[1], "rotation_deg": np.degrees(1.0 / sqrt(rotation))}
+        sd = np.sqrt(np.diag(np.linalg.inv(information)))
+        unit = {"delay_frames": sd[0], "gain": sd[3:].max(), "rotation_deg": np.degrees(1.0 / sqrt(rotation))}
         rms = max(unit[name] / accuracy[name] for name in unit)
         cost = sqrt(1.0 + rms**2 * max(excess)) - 1.0
         probes.append(Probe(share / scenario.dt, float(rms), {name: float(x / rms) for name, x in unit.items()}, cost))
