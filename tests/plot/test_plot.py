@@ -394,6 +394,37 @@ def test_what_is_composed_keeps_its_units_and_a_title_its_place(result: wfsobs.R
     assert legend is not None and (legend.get_title().get_text(), axes.get_title()) == ("Night", "")
 
 
+def test_what_is_composed_begins_a_row_where_it_does_not_fit(result: wfsobs.Result) -> None:
+    """At 40 mm each, bars with their names at 80 mm; nothing is cut off."""
+    traces, bars = result.plot.traces() + result.plot.spectra(), result.plot.errors() + result.plot.budget()
+    for figure, width, columns in ((traces, 88.0, 2), (traces, 180.0, 4), (bars, 88.0, 1), (bars, 180.0, 2)):
+        paper = to_matplotlib(figure, width)
+        paper.savefig(BytesIO())  # which warns where there is no room
+        for axes in paper.axes:
+            place = axes.get_subplotspec()
+            assert place is not None and place.get_gridspec().ncols == columns
+            box = axes.get_tightbbox()
+            assert box is not None and box.x0 >= -1.0 and box.x1 <= paper.bbox.width + 1.0  # a pixel
+
+
+def test_a_line_alone_is_named_once(result: wfsobs.Result) -> None:
+    """In the legend, not by a title as well."""
+    alone = result.plot.traces(target="vibration", observers=["kf-lgs"], of_error=True)
+    (axes,) = to_matplotlib(alone).axes
+    legend = axes.get_legend()
+    assert legend is not None and [text.get_text() for text in legend.get_texts()] == ["LGS KF"]
+    assert axes.get_title() == legend.get_title().get_text() == ""
+    (made,) = (m for m in hv.renderer("bokeh").get_plot(alone).state.references() if isinstance(m, Plot))
+    assert made.title.text == ""  # type: ignore[union-attr]
+
+
+def test_spectra_of_nothing_are_zero() -> None:
+    """Without a logarithmic axis, which they would not be on."""
+    axes = to_matplotlib(wfsobs.Record(y_lgs=np.zeros((100, 1)), u=np.zeros((100, 1)), dt=1e-2).plot.spectra()).axes[0]
+    assert (axes.get_xscale(), axes.get_yscale()) == ("log", "linear")
+    assert all(not np.any(line.get_ydata()) for line in axes.lines)
+
+
 def test_two_columns_have_legends_beside(result: wfsobs.Result) -> None:
     paper = to_matplotlib(result.plot.traces(), 180.0, 100.0)
     assert tuple(25.4 * paper.get_size_inches()) == pytest.approx((180.0, 100.0))
@@ -421,13 +452,26 @@ def test_legends_of_all_observers_do_not_cover_each_other_in_a_notebook(result: 
     assert above.y0 > below.y1
 
 
-def test_what_cannot_be_drawn_is_one_line(result: wfsobs.Result, loop: ClosedLoop) -> None:
+def test_what_cannot_be_drawn_is_one_line(
+    result: wfsobs.Result, loop: ClosedLoop, envelope: PlantEnvelope, sweep: SweepResults
+) -> None:
     for draw, why in (
         (lambda: result.plot.traces(mode="focus"), "mode 'focus': there are tip, tilt"),
         (lambda: result.plot.spectra(target="noise"), "target 'noise': there are turbulence, vibration"),
         (lambda: result.plot.traces(observers=["kf"]), "observer 'kf': there are kf-lgs, "),
         (lambda: result.plot.traces(observers=["gpr-online"], target="turbulence", of_error=True), "no estimate of turbulence"),
-        (lambda: loop.plot.rejection(controllers=["none"]), "nothing to draw"),
+        (lambda: result.plot.errors(target="noise"), "there is no error of noise"),
+        (lambda: result.plot.traces(start=2.0, stop=2.0), "from 2 s to 2 s: the record has 3 s"),
+        (lambda: result.record.plot.traces(start=-1.0), "from -1 s to 3 s: the record has 3 s"),
+        (lambda: loop.plot.rejection(controllers=["none"]), "there is no time-invariant loop"),
+        (lambda: loop.plot.residuals(controllers=["pid"]), "controller 'pid': there are none, integrator, lqg-kf-lgs"),
+        (lambda: loop.plot.nyquist(controllers=["pid"]), "controller 'pid': there are none, integrator, lqg-kf-lgs"),
+        (lambda: envelope.plot.residuals(controllers=["pid"]), "controller 'pid': there are integrator, lqg-kf-lgs"),
+        (lambda: sweep.plot.errors(observers=["kf"]), "observer 'kf': there are kf-lgs, kf-multi"),
+        (
+            lambda: wfsobs.Record(y_lgs=np.zeros((15, 1)), u=np.zeros((15, 1)), dt=0.1).plot.spectra(),
+            "no spectrum of fewer than 16 samples",
+        ),
     ):
         with pytest.raises(ValueError, match=why):
             draw()

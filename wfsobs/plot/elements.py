@@ -41,6 +41,9 @@ BINS = 500
 COLUMN, PAGE = 88.0, 180.0
 """Width of one and of two columns of a paper [mm]."""
 
+NARROW = 40.0
+"""Least width of one plot in a file [mm], of bars with their names twice that; what does not fit into a row begins another."""
+
 HEIGHT, LINE = 40.0, 3.3
 """Height of one plot in a file, and of a line of its legend or a bar [mm]."""
 
@@ -104,11 +107,12 @@ def overlay(parts: Iterable[Any], *, log: str = "", rows: int = 0, decades: int 
     the most that a logarithmic axis of y spans; both : further options
     """
     drawn = hv.Overlay(list(parts))
-    both = {"logx": "x" in log, "logy": "y" in log, "show_grid": True} | both
-    if "y" in log:
-        highest = max(float(np.nanmax(part.dimension_values(1))) for part in drawn)
-        lowest = min(float(np.nanmin(part.dimension_values(1))) for part in drawn)
-        both["ylim"] = (max(lowest, highest * 10.0**-decades) / 2.0, 2.0 * highest)
+    both = {"logx": "x" in log, "show_grid": True, "title": ""} | both  # by itself the title is the label of a line alone
+    values = np.concatenate([part.dimension_values(1) for part in drawn])
+    positive = values[values > 0.0] if "y" in log else values[:0]
+    if positive.size:  # what is nothing but zero has no logarithmic axis
+        highest = float(positive.max())
+        both |= {"logy": True, "ylim": (max(float(positive.min()), highest * 10.0**-decades) / 2.0, 2.0 * highest)}
     width, height = PIXELS
     if rows:
         label = next(iter(drawn)).kdims[0].pprint_label
@@ -218,8 +222,10 @@ def to_matplotlib(figure: Any, width: float = COLUMN, height: float = 0.0) -> An
     layout: Any = figure if isinstance(figure, hv.Layout) else stack([figure])
     inches = width / 25.4, HEIGHT / 25.4  # both given, so that the width stays; the height comes below
     sized = layout.opts(fig_inches=inches, fig_size=100, sublabel_format="", clone=True, backend="matplotlib")
+    least = 2.0 * NARROW if layout.traverse(specs=[hv.Rectangles]) else NARROW
+    sized.cols(min(layout.shape[1], max(1, int(width / least))))
     drawn: Any = hv.renderer("matplotlib").get_plot(sized).state
-    rows, columns = layout.shape
+    rows, columns = sized.shape
     above, heights = None, np.full(rows, HEIGHT)
     every = [axes for axes in drawn.axes if axes.get_subplotspec() is not None]
     for i, axes in enumerate(every):
@@ -227,17 +233,20 @@ def to_matplotlib(figure: Any, width: float = COLUMN, height: float = 0.0) -> An
         axes.set_aspect("auto")
         for axis in (axes.xaxis, axes.yaxis):
             axis.label.set_size(mpl.rcParams["axes.labelsize"])
-        tall = LINE * (len(axes.get_yticks()) + 4) if axes.yaxis_inverted() else HEIGHT  # of bars, a line of text each
+        tall, loc, x = HEIGHT, "lower center", 0.45
+        if axes.yaxis_inverted():  # of bars: a line of text each, beside which little room can be left
+            tall, loc, x = LINE * (len(axes.get_yticks()) + 4), "lower right", 1.0
+            axes.xaxis.label.set(x=x, horizontalalignment="right")
         if (legend := axes.get_legend()) is not None:
             handles, names = axes.get_legend_handles_labels()
-            if width >= PAGE:
+            if width >= PAGE and columns <= 2:
                 tall = max(tall, LINE * (len(names) + 2))
             else:  # there is no room beside
                 legend.remove()
                 if names != above:
-                    place = {"loc": "lower center", "ncols": 2, "bbox_to_anchor": (0.45, 1.0), "frameon": False}
-                    axes.legend(handles, names, title=axes.get_title() or None, **place)
-                    tall = max(tall, HEIGHT) + LINE * ((len(names) + 1) // 2)
+                    beside, title = 1 if columns > 1 else 2, axes.get_title() or None
+                    axes.legend(handles, names, title=title, loc=loc, bbox_to_anchor=(x, 1.0), ncols=beside, frameon=False)
+                    tall = max(tall, HEIGHT) + LINE * -(-len(names) // beside)
                     axes.set_title("")  # which would be below it
                 above = names
         heights[i // columns] = max(heights[i // columns], tall)

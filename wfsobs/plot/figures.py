@@ -68,17 +68,17 @@ class RecordPlots:
     def traces(self, *, mode: str | None = None, start: float = 0.0, stop: float | None = None) -> hv.Overlay:
         """Draw measurements and truth over time, from `start` to `stop` [s]."""
         name, dt = _one_of(self.names, mode, "mode"), self.record.dt
-        y, part = quantity(f"signal {name}", "nm", name), _samples(start, stop, dt)
+        y, part = quantity(f"signal {name}", "nm", name), _samples(self.record, start, stop)
         return overlay(draw_trace(NM * x, dt, y, SIGNALS[key], part) for key, x in self._signals(name).items())
 
     def spectra(self, *, mode: str | None = None) -> hv.Overlay:
         """Draw power spectral densities of measurements and truth; a missing sample has the value of the one before."""
         name, dt = _one_of(self.names, mode, "mode"), self.record.dt
         y, lines = quantity(f"PSD {name}", "nm²/Hz", f"PSD, {name}"), []
-        for key, x in self._signals(name).items():
+        for key, x in self._signals(name).items() if self.record.n_steps >= FEWEST else ():
             frequency, density = psd(hold_last(x[:, None]), dt)
             lines.append(draw_line(frequency[1:], NM**2 * density[1:, 0], (FREQUENCY, y), SIGNALS[key]))
-        return overlay(lines, log="xy")
+        return overlay(_some(lines, f"spectrum of fewer than {FEWEST} samples"), log="xy")
 
     def _signals(self, mode: str) -> dict[str, Array]:
         column = self.names.index(mode)
@@ -111,7 +111,7 @@ class ResultPlots:
         name, dt, figures = _one_of(self.names, mode, "mode"), self.result.record.dt, []
         for of, signals in self._signals(observers, target, of_error).items():
             y = quantity(f"{of} {name} {of_error}", "nm", f"{'error of ' if of_error else ''}{of}, {name}")
-            column, part = self.names.index(name), _samples(start, stop, dt)
+            column, part = self.names.index(name), _samples(self.result.record, start, stop)
             figures.append(overlay(draw_trace(NM * x[:, column], dt, y, key, part) for key, x in signals.items()))
         return stack(figures)
 
@@ -151,7 +151,7 @@ class ResultPlots:
                 of_rows = [(row_label(s.observer), [NM * s.rms], [look(s.observer).light]) for s in rows]
                 ends = [None if s.interval is None else (NM * s.interval[0], NM * s.interval[1]) for s in rows]
                 figures.append(overlay([draw_bars(of_rows, x), draw_intervals(ends, x)], rows=len(rows)))
-        return stack(_some(figures, f"errors of {target}"))
+        return stack(_some(figures, f"error of {target or 'any target'}"))
 
     def budget(self, *, observers: Sequence[str] | None = None, target: str | None = None, mode: str | None = None) -> hv.Layout:
         """Draw the error budgets as stacked bars of mean squares, the least on top, and the limit of each as a line.
@@ -170,7 +170,7 @@ class ResultPlots:
                 at = [None if it.bound is None else NM**2 * it.bound for it in rows]
                 legend = legend_of({label: TERM_COLOURS[term] for term, label in TERMS.items()}, x)
                 figures.append(overlay([draw_bars(boxes, x), draw_marks(at, x), *legend], rows=len(rows)))
-        return stack(_some(figures, f"an error budget of {target or 'any target'}"))
+        return stack(_some(figures, f"error budget of {target or 'any target'}"))
 
     def _signals(self, observers: Sequence[str] | None, target: str | None, of_error: bool) -> dict[str, dict[str, Array]]:
         """Return target -> what is drawn of it -> (n_steps, n_modes) [um]: the truth, last and so on top, where there is one."""
@@ -181,7 +181,7 @@ class ResultPlots:
             own = {e.observer: e.values for e in self.result.estimates if e.target == of and e.observer != NO_ESTIMATE}
             own = {key: x for key, x in own.items() if observers is None or key in observers}
             if of_error and truth is None:
-                raise ValueError(f"the record has no true {of}, so that there is no error of an estimate")
+                raise ValueError(f"the record has no true {of}, so no error of an estimate: of_error=False draws estimates")
             if of_error:
                 out[of] = {key: x - truth for key, x in own.items()}
             else:
@@ -192,9 +192,7 @@ class ResultPlots:
 
     def _check(self, observers: Sequence[str] | None) -> None:
         """Raise ValueError for an observer that has neither an estimate nor a score."""
-        known = list(dict.fromkeys([e.observer for e in self.result.estimates] + [s.observer for s in self.result.scores]))
-        for name in observers or ():
-            _one_of(known, name, "observer")
+        _check(observers, list(dict.fromkeys(it.observer for it in (*self.result.estimates, *self.result.scores))), "observer")
 
     def _of_frequency(
         self,
@@ -216,7 +214,7 @@ class ResultPlots:
                 if known.size >= FEWEST:
                     frequency, density = psd(known[:, None], dt)
                     lines.append(draw_line(frequency[1:], curve(frequency[1:], density[1:, 0]), (FREQUENCY, y), key))
-            figures.append(overlay(_some(lines, f"a spectrum of {of}"), log="xy"))
+            figures.append(overlay(_some(lines, f"spectrum of {of}"), log="xy"))
         return stack(figures)
 
 
@@ -254,6 +252,7 @@ class SweepPlots:
         known = self.results.known_keys()
         name = _one_of(list(dict.fromkeys(key[2] for key in known)), mode, "mode")
         _one_of(list(dict.fromkeys(key[1] for key in known)), target, "target")
+        _check(observers, list(dict.fromkeys(key[0] for key in known)), "observer")
         y = quantity(f"mean rms {target} {name}", "nm", f"mean rms error\n{target}, {name}")
         if len(self.results.sweep.axes) == 2:
             return self._map(target, name, y)
@@ -268,7 +267,7 @@ class SweepPlots:
                 colour = look(key[0]).light
                 style(band, alpha=0.15, color=colour, show_legend=False, bokeh={}, matplotlib={"facecolor": colour})
                 parts += [band, draw_line(at, mean, (x, y), key[0])]
-        return overlay(_some(parts, f"an error of {target}"), **ticks)
+        return overlay(_some(parts, f"error of {target}"), **ticks)
 
     def _place(self, name: str, axis: Variation) -> tuple[hv.Dimension, list[float], dict[str, Any]]:
         """Return what an axis is of, where its values lie, and options with what stands there, where they are no numbers."""
@@ -302,22 +301,22 @@ class LoopPlots:
 
     def residuals(self, *, controllers: Sequence[str] | None = None, mode: str | None = None) -> hv.Overlay:
         """Draw power spectral densities of what every controller left."""
-        name, dt = _one_of(self.names, mode, "mode"), self.loop.record.dt
+        name, dt = self._mode(controllers, mode), self.loop.record.dt
         y, lines = quantity(f"PSD of residual {name}", "nm²/Hz", f"PSD of residual\n{name}"), []
         for it in self.loop.outcomes:
             if it.residual is not None and (controllers is None or it.controller in controllers):
                 frequency, density = psd(it.residual[round(self.loop.design.start / dt) :], dt)
                 lines.append(draw_line(frequency[1:], NM**2 * density[1:, self.names.index(name)], (FREQUENCY, y), it.controller))
-        return overlay(_some(lines, "a residual"), log="xy")
+        return overlay(_some(lines, "residual"), log="xy")
 
     def errors(self, *, controllers: Sequence[str] | None = None, mode: str | None = None) -> hv.Overlay:
         """Draw the rms of what every controller left as bars, the least on top."""
-        name = _one_of(self.names, mode, "mode")
+        name = self._mode(controllers, mode)
         left = {it.controller: residual_rms(it, self.loop.record, self.loop.design.start) for it in self.loop.outcomes}
         known = {key: NM * rms[self.names.index(name)] for key, rms in left.items() if rms is not None}
         known = {key: known[key] for key in sorted(known, key=known.__getitem__) if controllers is None or key in controllers}
         x = quantity(f"rms of residual {name}", "nm", f"rms of residual, {name}")
-        _some(list(known), "a residual")
+        _some(list(known), "residual")
         return overlay([draw_bars([(look(k).label, [v], [look(k).light]) for k, v in known.items()], x)], rows=len(known))
 
     def rejection(self, *, controllers: Sequence[str] | None = None, mode: str | None = None) -> hv.Overlay:
@@ -325,7 +324,7 @@ class LoopPlots:
         y = quantity("rejection", "dB")
         found = self._curves(controllers, mode).items()
         lines = [draw_line(c.frequency, 20.0 * np.log10(np.abs(c.rejection)), (FREQUENCY, y), key) for key, c in found]
-        return overlay(_some(lines, "a time-invariant loop"), log="x")
+        return overlay(_some(lines, "time-invariant loop"), log="x")
 
     def nyquist(self, *, controllers: Sequence[str] | None = None, mode: str | None = None) -> hv.Overlay:
         """Draw the loop gain of every time-invariant loop in the complex plane, around the point -1."""
@@ -334,13 +333,17 @@ class LoopPlots:
         for key, c in self._curves(controllers, mode).items():
             gain = c.loop_gain[np.isfinite(c.loop_gain)]
             parts.append(draw_line(gain.real, gain.imag, axes, key))
-        _some(parts, "a time-invariant loop")
+        _some(parts, "time-invariant loop")
         point = hv.Scatter(([-1.0], [0.0]), *axes, label="-1")
         style(point, color="black", bokeh={"marker": "star", "size": 9}, matplotlib={"marker": "*", "s": 30})
         return overlay([*parts, point], xlim=(-3.0, 1.5), ylim=(-2.0, 2.0))
 
+    def _mode(self, controllers: Sequence[str] | None, mode: str | None) -> str:
+        _check(controllers, [it.controller for it in self.loop.outcomes], "controller")
+        return _one_of(self.names, mode, "mode")
+
     def _curves(self, controllers: Sequence[str] | None, mode: str | None) -> dict[str, Curves]:
-        column, plan = self.names.index(_one_of(self.names, mode, "mode")), self.loop.design
+        column, plan = self.names.index(self._mode(controllers, mode)), self.loop.design
         laws = {key: of[column] for key, of in plan.laws.items() if controllers is None or key in controllers}
         known = {key: it.law.poles for key, it in laws.items() if it.law and it.margins}
         return {key: curves(plan.loop(key, column), poles, self.loop.record.dt) for key, poles in known.items()}
@@ -361,14 +364,15 @@ class EnvelopePlots:
         of, column = self.envelope, self.names.index(_one_of(self.names, mode, "mode"))
         over, unit = _one_of(list(of.errors), over, "error"), {"delay": "frames", "rotation": "deg"}.get(over, "")
         x, y = quantity(f"error of {over}", unit), quantity(f"rms {self.names[column]}", "nm", f"residual, {self.names[column]}")
-        lines: list[Any] = []
-        for name, (at, mean, most) in of.curves(over, column).items():
+        lines, found = list[Any](), of.curves(over, column)
+        _check(controllers, list(found), "controller")
+        for name, (at, mean, most) in found.items():
             if controllers is None or name in controllers:
                 it, known = look(name), np.isfinite(mean)
                 lines.append(draw_line(at[known], NM * mean[known], (x, y), it))
                 worst = Look(f"{it.label}, worst", it.light, it.dark, (2, 2))
                 lines.append(draw_line(at[known], NM * most[known], (x, y), worst))
-        return overlay(_some(lines, "a stable plant"), log="y")
+        return overlay(_some(lines, "stable plant"), log="y")
 
 
 @singledispatch
@@ -398,9 +402,20 @@ def _one_of(names: Sequence[str], name: str | None, what: str) -> str:
 def _some(parts: list[Any], what: str) -> list[Any]:
     """Return a list that is not empty. Raises ValueError."""
     if not parts:
-        raise ValueError(f"nothing to draw: there is not {what}")
+        raise ValueError(f"nothing to draw: there is no {what}")
     return parts
 
 
-def _samples(start: float, stop: float | None, dt: float) -> slice:
-    return slice(round(start / dt), None if stop is None else round(stop / dt))
+def _check(chosen: Sequence[str] | None, names: Sequence[str], what: str) -> None:
+    """Raise ValueError for a name that is not there."""
+    for name in chosen or ():
+        _one_of(names, name, what)
+
+
+def _samples(record: Record, start: float, stop: float | None) -> slice:
+    """Return which samples lie between two times [s]. Raises ValueError where there are not two of them."""
+    n, dt = record.n_steps, record.dt
+    first, last = round(start / dt), n if stop is None else min(round(stop / dt), n)
+    if not 0 <= first < last - 1:
+        raise ValueError(f"nothing to draw from {start:g} s to {last * dt:g} s: the record has {n * dt:g} s")
+    return slice(first, last)
