@@ -406,9 +406,9 @@ def _some(parts: list[Any], what: str) -> list[Any]:
     return parts
 
 
-def _check(chosen: Sequence[str] | None, names: Sequence[str], what: str) -> None:
+def _check(selection: Sequence[str] | None, names: Sequence[str], what: str) -> None:
     """Raise ValueError for a name that is not there."""
-    for name in chosen or ():
+    for name in selection or ():
         _one_of(names, name, what)
 
 
