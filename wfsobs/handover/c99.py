@@ -102,7 +102,22 @@ class _Tables:
         return f"{{{n}, {len(steps)}, {int(gains.first is not None)}, {name}_steps, {first}}}"
 
 
-GATE_NUMBERS = ("ORDER", "BLOCK", "RUN", "OPEN", "FORGET", "LASTING", "EARLY", "EARLIEST", "MEDIAN", "RIDGE", "FIRST")
+GATE_NUMBERS = (
+    "ORDER",
+    "BLOCK",
+    "RUN",
+    "OPEN",
+    "FORGET",
+    "LASTING",
+    "EARLIEST",
+    "MEDIAN",
+    "RIDGE",
+    "FIRST",
+    "PACE",
+    "USUAL",
+    "RAREST",
+    "START",
+)
 """Numbers of the gate that its source has."""
 
 

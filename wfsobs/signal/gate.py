@@ -2,7 +2,8 @@
 
 Every mode of a sensor is predicted one step ahead by an autoregression, fitted by least squares to what has passed so far, anew
 every `BLOCK` samples. A measurement further than `level` deviations from its prediction is an outlier; the deviation is the
-running median of the magnitudes of the prediction errors themselves, since under a wrong model a stated one is wrong. After five
+running median of the magnitudes of the prediction errors themselves, since under a wrong model a stated one is wrong. The level
+is higher where outliers are rare, since nearly all that is far out is then noise. After five
 in a row the level has moved, or a vibration has appeared: the gate is open for `OPEN` samples, and all pass. No filter starves:
 never more than a fifth of the samples of a mode is rejected for long. The prediction is of the measurements alone, so that one
 gate serves every observer. Of a slower sensor, between two frames of which the disturbance moves far, it is the difference from a
@@ -38,12 +39,15 @@ RUN = 5
 not known well enough."""
 OPEN = 20
 """Samples that pass then, while the deviation is doubled."""
-EARLY = 1.0
-"""Part of itself by which the level is larger after the first block, less with every one: a fit to few samples predicts badly."""
-EARLIEST = 3.0
-"""The same until the second fit: the first one has hardly more samples than weights."""
-PACE = 0.25
-"""Weight of the median of a block in the deviation."""
+EARLIEST = 4.0
+"""Times the level until the second fit: the first one has hardly more samples than weights."""
+PACE = 0.125
+"""Weight of a block in the deviation, by its median, and in the part of samples that are outliers."""
+USUAL, RAREST, START = 1e-2, 5e-5, 1e-3
+"""Part of samples that are outliers: where the level is as stated, the least that is believed, and before the first block."""
+RARITY = 0.0625
+"""Power by which the level rises where outliers are rarer, without a logarithm: at the default within 4 % of the level at which
+a sample is as likely an outlier as noise, sqrt(level^2 + 2 log(USUAL / part))."""
 MEDIAN = 0.6745
 """Median of the magnitude of a Gaussian variable, over its standard deviation."""
 RIDGE = 1e-12
@@ -56,11 +60,11 @@ FIRST = 2.0
 class GateSettings:
     """What a gate does.
 
-    level  : deviations of the prediction error beyond which a measurement is an outlier
+    level  : deviations of the prediction error beyond which a measurement is an outlier where 1 % are, more where fewer are
     action : "reject", it is missing, or "clip", it is taken at that level
     """
 
-    level: float = 4.0
+    level: float = 3.6
     action: Literal["reject", "clip"] = "reject"
 
 
@@ -95,6 +99,7 @@ class OutlierGate:
         n = self._n_modes
         self.count, self.outliers = 0, np.zeros(n, dtype=int)
         self._offset = np.zeros(n)
+        self._part, self._outliers_before = np.full(n, START), np.zeros(n, dtype=int)  # of outliers; those before this block
         self._past = np.zeros((n, ORDER + BLOCK))  # ORDER samples before this block, and its own, less the offset
         self._normal = np.zeros((n, ORDER + 1, ORDER + 1))
         self._weights = np.zeros((n, ORDER))  # of the oldest sample first
@@ -159,8 +164,8 @@ class OutlierGate:
         self.count = int(self.count)
 
     def _limit(self) -> Array:
-        blocks = self.count // BLOCK
-        return self.settings.level * (1.0 + (EARLY / blocks if blocks > 1 else EARLIEST)) * self._deviation
+        rarity = (USUAL / np.clip(self._part, RAREST, USUAL)) ** RARITY
+        return self.settings.level * rarity * (1.0 if self.count >= 2 * BLOCK else EARLIEST) * self._deviation
 
     def _count(self, is_outlier: Array) -> None:
         """Count a sample, and open the gate where outliers last.
@@ -198,7 +203,9 @@ class OutlierGate:
         return n
 
     def _fit(self) -> None:
-        """Fit the deviation to the errors of this block, and the autoregression to what has passed."""
+        """Fit the deviation to the errors of this block, the level to its outliers, the autoregression to what has passed."""
+        self._part += PACE * ((self.outliers - self._outliers_before) / BLOCK - self._part)
+        self._outliers_before = self.outliers.copy()
         seen = self._is_usual.sum(axis=1) > BLOCK // 4
         counted = self._is_usual | ~seen[:, None]  # their median by sorting: `nanmedian` takes ten times as long
         magnitudes = np.sort(np.where(counted, np.nan_to_num(np.abs(self._errors)), np.inf), axis=1)
@@ -241,6 +248,8 @@ def frame_mean_of(z: Array) -> Array:
 STATE = (
     "count",
     "outliers",
+    "_part",
+    "_outliers_before",
     "_offset",
     "_past",
     "_normal",

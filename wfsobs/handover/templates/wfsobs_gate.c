@@ -1,8 +1,9 @@
 #include "wfsobs_gate.h"
 
 enum { ORDER = WFSOBS_ORDER, BLOCK = WFSOBS_BLOCK, RUN = @RUN@, OPEN = @OPEN@ };
-static const double memory = @MEMORY@, forget = @FORGET@, most = @LASTING@, early = @EARLY@, earliest = @EARLIEST@,
-                    median_share = @MEDIAN@, ridge = @RIDGE@, first_levels = @FIRST@;
+static const double memory = @MEMORY@, forget = @FORGET@, most = @LASTING@, earliest = @EARLIEST@, median_share = @MEDIAN@,
+                    ridge = @RIDGE@, first_levels = @FIRST@, pace = @PACE@, usual_part = @USUAL@, least_part = @RAREST@,
+                    first_part = @START@;
 
 typedef struct wfsobs_gate_mode mode;
 
@@ -40,7 +41,7 @@ static void fit_deviation(wfsobs_gate *g, mode *m)
     if (n <= BLOCK / 4) return;
     median = median_of(g->sorted, n) / median_share;
     if (m->is_known) {
-        if (m->deviation > 0) m->deviation *= square_root(square_root(median / m->deviation));
+        if (m->deviation > 0) m->deviation *= square_root(square_root(square_root(median / m->deviation))); /* pace: 1/8 */
         return;
     }
     m->deviation = median;
@@ -50,6 +51,16 @@ static void fit_deviation(wfsobs_gate *g, mode *m)
             m->usual[i] = 0;
             m->past[ORDER + i] = m->past[ORDER + i - 1];
         }
+}
+
+/* Take the outliers of this block into the level, which is higher where they are rare. */
+static void fit_level(mode *m)
+{
+    double part;
+    m->part += pace * ((double)(m->outliers - m->counted) / BLOCK - m->part);
+    m->counted = m->outliers;
+    part = m->part > usual_part ? usual_part : m->part < least_part ? least_part : m->part;
+    m->level = WFSOBS_LEVEL * square_root(square_root(square_root(square_root(usual_part / part))));
 }
 
 /* Add a sample and those before it to the normal equations. */
@@ -115,12 +126,12 @@ void wfsobs_gate_check(wfsobs_gate *g, wfsobs_real *z)
         mode *m = g->modes + i;
         double limit, error, expected = 0;
         int is_there = z[i] == z[i], is_outlier;
-        if (g->call == 0) m->offset = is_there ? (double)z[i] : 0;
+        if (g->call == 0) m->offset = is_there ? (double)z[i] : 0, m->part = first_part;
         if (m->is_fitted)
             for (int j = 0; j < ORDER; j++) expected += m->weights[j] * m->past[k + j];
         else
             expected = m->past[k + ORDER - 1];
-        limit = WFSOBS_LEVEL * (1 + (blocks > 1 ? early / (double)blocks : earliest)) * m->deviation;
+        limit = m->level * (blocks > 1 ? 1 : earliest) * m->deviation;
         error = is_there ? (double)z[i] - m->offset - expected : 0;
         if (m->settling > 0) m->settling--;
         if (is_there && m->gap >= RUN) m->open = m->settling = OPEN; /* after a gap the prediction is worth little */
@@ -137,6 +148,7 @@ void wfsobs_gate_check(wfsobs_gate *g, wfsobs_real *z)
         for (int j = 0; blocks && k == 0 && j < (ORDER + 1) * (ORDER + 1); j++) m->normal[j] *= memory;
         if (blocks) add_row(m, k);
         if (k == BLOCK - 1) {
+            fit_level(m);
             fit_deviation(g, m);
             for (int j = 0; !blocks && j < BLOCK; j++) add_row(m, j); /* of the first block what is far out is known now */
             if (blocks) fit_weights(g, m); /* one block has too few samples for them */

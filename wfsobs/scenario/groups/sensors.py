@@ -227,12 +227,13 @@ class Sensors(Group):
         "are taken at the level below; off: they are taken as they are. A simulation has none.",
     )
     gate_level: Real = Real(
-        4.0,
+        3.6,
         bounds=(2.5, 100.0),
         softbounds=(3.0, 10.0),
-        step=0.5,
+        step=0.1,
         label="Outliers beyond",
-        doc="Deviation of a measurement from its prediction beyond which it is an outlier, in standard deviations.",
+        doc="Deviation of a measurement from its prediction beyond which it is an outlier where 1 % are, in standard deviations; "
+        "up to 1.4 times this where fewer are.",
     )
     tip_tilt_indetermination: param.Boolean[bool] = param.Boolean(
         False,
