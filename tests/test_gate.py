@@ -243,6 +243,21 @@ def test_training_data_pass_the_gate(ut4: Record) -> None:
     assert error(broken, gate=False) > 1.02 * clean
 
 
+def test_the_gate_of_training_data_is_run_once(ut4: Record, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For all observers that learn from them: of y and of y in open loop."""
+    record, lengths, check_all = replace(ut4, gate=REJECT), [], OutlierGate.check_all
+
+    def counted(gate: OutlierGate, z: Array) -> Array:
+        lengths.append(len(z))
+        return check_all(gate, z)
+
+    monkeypatch.setattr(OutlierGate, "check_all", counted)
+    parts = [arguments(OBSERVERS[name], record, UT4)[1].training for name in ("ridge", "ridge-30", "gpr-offline")]
+    assert record.training is not None and None not in parts
+    n = len(record.training.y_lgs)
+    assert sorted(length for length in lengths if length <= n) == [n - record.delay] * 2
+
+
 @pytest.mark.parametrize("name", ["kf-multi", "multirate-multi", "gp-both", "persistence", "kf-ngs"])
 def test_an_observer_with_a_gate_is_the_same_step_by_step(ut4: Record, name: str) -> None:
     short = replace(ut4, **{key: x[:2000] for key, x in vars(ut4).items() if isinstance(x, np.ndarray)}, gate=REJECT)

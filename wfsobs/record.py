@@ -262,6 +262,12 @@ class Record(Signals):
         y_open = None if self.open_loop_y is None else gate(self.open_loop_y, self.open_loop_y, self.delay)
         return replace(self, y_lgs=y_lgs, y_ngs=y_ngs, y_stars=y_stars, open_loop_y=y_open, gate=None)
 
+    @cached_property
+    def training_record(self) -> Record | None:
+        """The training data as a record that has the gate of this one, or None: whoever learns from it, the gate is run once."""
+        t = self.training
+        return t and Record(t.y_lgs, t.u, self.dt, open_loop_y=t.open_loop_y, delay=self.delay, gate=self.gate)
+
     @property
     def outliers(self) -> int:
         """Number of steps whose LGS measurement the gate does not let through as it is, but for those whose command is lost."""

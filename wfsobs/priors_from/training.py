@@ -48,10 +48,7 @@ def training_of(record: Record, modes: Sequence[int] | None = None) -> Training 
 
     modes : of these alone
     """
-    if record.training is None:
-        return None
-    t = record.training.copy(modes)
-    return as_training(Record(t.y_lgs, t.u, record.dt, open_loop_y=t.open_loop_y, delay=record.delay, gate=record.gate))
+    return None if record.training_record is None else as_training(record.training_record).copy(modes)
 
 
 def as_training(record: Record) -> Training:
