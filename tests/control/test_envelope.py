@@ -11,10 +11,12 @@ from click.testing import CliRunner
 from tests.records import MATCHED
 from wfsobs.cli.group import main
 from wfsobs.closed_loop.design import design
-from wfsobs.closed_loop.envelope import PlantEnvelope, Spread, Uncertainty, plant_envelope
+from wfsobs.closed_loop.envelope import PlantEnvelope, Spread, Uncertainty, plant_envelope, residuals
 from wfsobs.closed_loop.run import closed_loop
+from wfsobs.control.true_plant import TruePlant
 from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.loop import simulate
+from wfsobs.simulation.true_spectra import true_spectra
 from wfsobs.tuning import tuned_envelope
 
 NAMES = ["integrator", "lqg-kf-lgs", "lqg-multirate-multi"]
@@ -24,6 +26,19 @@ RESONANT = MATCHED.replace({"plant.resonance": 100.0, "plant.damping": 0.6, "pla
 @pytest.fixture(scope="module")
 def result() -> PlantEnvelope:
     return plant_envelope(RESONANT, controllers=[*NAMES, "integrator+gpr-online"], points=40)
+
+
+def test_spectra_of_each_plant() -> None:
+    """All at once they leave what each does alone, with one sensor and with both."""
+    plan = design(MATCHED, ["lqg-kf-lgs", "lqg-multirate-multi"])
+    plants = [TruePlant(np.array([[1.0, -turn], [turn, 1.0]]), 2.0 + turn) for turn in (0.05, 0.1, 0.2)]
+    scenarios = [MATCHED.replace({"sensors.lgs_noise": noise}) for noise in (0.01, 0.02, 0.03)]
+    spectra = [[true_spectra(s, mode) for mode in range(2)] for s in scenarios]
+    for designs in plan.laws.values():
+        laws = [one.law for one in designs if one.law is not None]
+        alone = [residuals(laws, plan.mirror, [plant], [own])[0] for plant, own in zip(plants, spectra, strict=True)]
+        together = residuals(laws, plan.mirror, plants, spectra)
+        assert np.allclose(together, alone, rtol=1e-9, atol=0) and np.ptp(together, axis=0).min() > 1e-4
 
 
 def test_every_point_is_the_loop_of_its_plant(result: PlantEnvelope) -> None:

@@ -76,6 +76,8 @@ def test_plants_are_drawn_from_their_deviations_and_correlations() -> None:
         unsure = group(**{name: (PlantNumber(), PlantNumber(1.0, 0.1))})
         with pytest.raises(RecordError, match=f"do not decide the {name} .*do not switch on"):
             draw_plants([unsure], 2, np.random.default_rng(1))
+    with pytest.raises(RecordError, match=r"the mirror has dynamics \(tip and tilt\).*do not switch on"):
+        draw_plants([replace(group(), rigid=1e-9)], 2, np.random.default_rng(1))
 
 
 def test_spectra_are_drawn_from_their_deviations() -> None:

@@ -23,7 +23,7 @@ from wfsobs.closed_loop.run import each_outcome
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.law import Law
 from wfsobs.control.mirror import Mirror
-from wfsobs.control.mismatch import loops, pairs, radius, weigh
+from wfsobs.control.mismatch import loops, pairs, radius, stack, weigh
 from wfsobs.control.true_plant import TruePlant
 from wfsobs.evaluation.rows import Row
 from wfsobs.notebook import PlotAccessor, import_extra
@@ -372,7 +372,7 @@ def spread_of(name: str, scenario: Scenario, plants: Plants, spectra: Sequence[T
     laws = controller.laws(prior, plant, own_settings(controller, scenario), len(spectra))
     if not all(law.stable for law in laws):
         raise ValueError("not stable")
-    left = residuals(laws, plant.mirror, [plants.nominal, *plants.points, *plants.corners], spectra, watch)
+    left = residuals(laws, plant.mirror, [plants.nominal, *plants.points, *plants.corners], [spectra], watch)
     end = 1 + len(plants.points)
     return Spread(name, left[0], left[1:end], left[end:], scenario.control.caution)
 
@@ -427,20 +427,27 @@ def plant_at(scenario: Scenario, base: TruePlant, errors: dict[str, float]) -> T
 
 
 def residuals(
-    laws: Sequence[Law], nominal: Mirror, plants: Sequence[TruePlant], spectra: Sequence[TrueSpectra], watch: Watch = QUIET
+    laws: Sequence[Law],
+    nominal: Mirror,
+    plants: Sequence[TruePlant],
+    spectra: Sequence[Sequence[TrueSpectra]],
+    watch: Watch = QUIET,
 ) -> Array:
-    """Rms of the residual [um] of every plant and mode, (plants, modes), infinite where a loop is not stable."""
+    """Rms of the residual [um] of every plant and mode, (plants, modes), infinite where a loop is not stable.
+
+    spectra : of the modes, once for all plants or for each
+    """
     matrices = np.array([plant.matrix for plant in plants])
     out = np.empty(matrices.shape[:2])
     for columns in pairs(np.abs(matrices).max(axis=0)):
         mine = [laws[column] for column in columns]
         of = loops(mine, nominal, is_coarse=True)
-        weights = [weigh(loop_spectra(spectra[column]), of) for column in columns]
+        common = [weigh(loop_spectra(spectra[0][column]), of) for column in columns] if len(spectra) == 1 else []
         images, size = of.images, len(columns) * of.K.shape[-1]
         block = max(1, AT_ONCE // (of.omega.size * size * size))
         parts = [slice(i, i + block) for i in range(0, len(plants), block)]
 
-        def one(part: slice, of=of, weights=weights, images=images, columns=columns, mine=mine) -> Array:
+        def one(part: slice, of=of, common=common, images=images, columns=columns, mine=mine) -> Array:
             watch.check()
             chosen = plants[part]
             response = np.array([plant.response(images) for plant in chosen])
@@ -449,6 +456,8 @@ def residuals(
             stable, is_sure = of.stable(determinant)
             for i in np.flatnonzero(~is_sure).tolist():
                 stable[i] = radius(mine, nominal, replace(chosen[i], matrix=matrix[i])) < 1.0
+            each = (stack([weigh(loop_spectra(own[column]), of) for own in spectra[part]]) for column in columns)
+            weights = common or list(each)
             left = of.residual(Q, response, matrix, weights)
             return np.where(stable[:, None], np.sqrt(np.maximum(left, 0.0)), inf)
 

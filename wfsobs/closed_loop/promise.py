@@ -191,8 +191,7 @@ def make_promise(
             notes = ["the record has no NGS"] if lacks_ngs else [one.note for one in plan.laws[name] if one.note]
             out.append(ResidualPromise(name, note=next(iter(notes), "not stable")))
             continue
-        pairs = zip(plants, spectra, strict=True)
-        squares = np.concatenate([residuals(laws, plan.mirror, [plant], one, watch) ** 2 for plant, one in pairs])
+        squares = residuals(laws, plan.mirror, plants, spectra, watch) ** 2
         (outcome,) = each_outcome(model, plan, watch, [name])
         assert outcome.residual is not None
         shape = record.n_steps / length / _scatter(outcome.residual[START:]) ** 2

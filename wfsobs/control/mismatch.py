@@ -132,7 +132,7 @@ class Loops:
                 if w.ngs is not None:
                     signal, shared, truth = w.ngs
                     power = (np.abs(slow) ** 2).sum(axis=-1)
-                    density = density + power[..., None] * (np.abs(self.exposure) ** 2 * signal + w.ngs_noise[:, None])
+                    density = density + power[..., None] * (np.abs(self.exposure) ** 2 * signal + w.ngs_noise[..., None])
                     mixed = np.einsum("...ml,...m->...l", lgs, np.conj(slow))
                     density = density + 2.0 * (mixed * np.conj(step * self.exposure * shared)).real
                     if i == j:
@@ -143,7 +143,7 @@ class Loops:
 
 @dataclass(frozen=True)
 class Weights:
-    """`SensorSpectra` as sums over the frequencies of loops and their images, (n, c); all else is straight between these."""
+    """`SensorSpectra` as sums over the frequencies of loops and their images, (..., n, c); all else is straight between these."""
 
     disturbance: Array
     measurement: Array
@@ -219,6 +219,18 @@ def weigh(spectra: SensorSpectra, of: Loops) -> Weights:
         both(spectra.cross),
         ngs and (ngs[0].real, ngs[1], ngs[2]),
         spectra.ngs_noise * even / c,
+    )
+
+
+def stack(weights: Sequence[Weights]) -> Weights:
+    """Return the weights of a mode in several plants as one, with the plants first."""
+    ngs = [w.ngs for w in weights if w.ngs is not None]
+    return Weights(
+        np.array([w.disturbance for w in weights]),
+        np.array([w.measurement for w in weights]),
+        np.array([w.cross for w in weights]),
+        (np.array([x[0] for x in ngs]), np.array([x[1] for x in ngs]), np.array([x[2] for x in ngs])) if ngs else None,
+        np.array([w.ngs_noise for w in weights]),
     )
 
 
