@@ -59,7 +59,7 @@ DIFFERS = 0.001
 EXCITED = 1e-3
 """Share of what is new in the commands that the measurements do not explain, from which on they have a probe."""
 
-PROBED, OTHERWISE, SWINGS = 0.05, 1e-4, 3.0
+PROBED, OTHERWISE, SWINGS = 0.05, 1e-4, 1.0
 """Share from which on a probe tells the dynamics of the mirror, and is tested for what a plant leaves of it; the probability of
 that below which the commands act otherwise; log-likelihood by which a second-order mirror is likelier than any of few lags."""
 
@@ -351,6 +351,8 @@ def _over_delays(data: PlantLikelihood, fit: PlantFit, ties: Array) -> PlantFit:
     if not points:  # a likelihood that is no number
         return fit
     best = min((one for _, one in points), key=lambda one: one.value)
+    if best.value < fit.value - 1.0:  # with spectra that are likelier in the other frames, too
+        return _over_delays(data, best, ties)
     weights = np.array([width * np.exp(best.value - one.value) for width, one in points])
     weights /= weights.sum()
     theta = sum((w * one.theta for w, (_, one) in zip(weights, points, strict=True)), np.zeros_like(fit.theta))
