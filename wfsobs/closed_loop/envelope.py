@@ -23,7 +23,7 @@ from wfsobs.closed_loop.run import each_outcome
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.law import Law
 from wfsobs.control.mirror import Mirror
-from wfsobs.control.mismatch import loops, pairs, radius, stack, weigh
+from wfsobs.control.mismatch import loops, pairs, radius, stack_weights, weigh
 from wfsobs.control.true_plant import TruePlant
 from wfsobs.evaluation.rows import Row
 from wfsobs.notebook import PlotAccessor, import_extra
@@ -456,7 +456,7 @@ def residuals(
             stable, is_sure = of.stable(determinant)
             for i in np.flatnonzero(~is_sure).tolist():
                 stable[i] = radius(mine, nominal, replace(chosen[i], matrix=matrix[i])) < 1.0
-            each = (stack([weigh(loop_spectra(own[column]), of) for own in spectra[part]]) for column in columns)
+            each = (stack_weights([weigh(loop_spectra(own[column]), of) for own in spectra[part]]) for column in columns)
             weights = common or list(each)
             left = of.residual(Q, response, matrix, weights)
             return np.where(stable[:, None], np.sqrt(np.maximum(left, 0.0)), inf)

@@ -222,7 +222,7 @@ def weigh(spectra: SensorSpectra, of: Loops) -> Weights:
     )
 
 
-def stack(weights: Sequence[Weights]) -> Weights:
+def stack_weights(weights: Sequence[Weights]) -> Weights:
     """Return the weights of a mode in several plants as one, with the plants first."""
     ngs = [w.ngs for w in weights if w.ngs is not None]
     return Weights(
