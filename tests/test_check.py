@@ -15,9 +15,9 @@ from click.testing import CliRunner
 from scipy.stats import binom
 
 from tests.test_plant import closed_loop, rotation
-from wfsobs import PRESETS, simulate
+from wfsobs import PRESETS, load, simulate
 from wfsobs.cli import main
-from wfsobs.record import Record
+from wfsobs.record import Record, RecordError
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.telemetry.check import LEVEL, find_changes
 from wfsobs.telemetry.records import save_record
@@ -119,8 +119,14 @@ def test_delay_and_gain_are_put_right_by_the_next_command(tmp_path: Path) -> Non
 
 @pytest.mark.slow
 def test_a_rotation_and_a_flipped_axis_are_excluded(tmp_path: Path) -> None:
-    seen = verdicts(checked(tmp_path, closed_loop(5000, 2.0, rotation(np.radians(96.0)))))
-    assert (seen["command sign"], seen["command rotation"]) == ("ok", "excluded")
+    turned = closed_loop(5000, 2.0, rotation(np.radians(96.0)))
+    found = checked(tmp_path, turned)
+    assert (verdicts(found)["command sign"], verdicts(found)["command rotation"]) == ("ok", "excluded")
+    file = tmp_path / "r.npz"
+    assert found["next"] == f"wfsobs identify {file} --trust", "without that it is refused"
+    assert load(file, trust=True).n_steps == turned.n_steps
+    with pytest.raises(RecordError, match="rotation 0 is excluded"):
+        load(file)
     seen = verdicts(checked(tmp_path, closed_loop(5000, 2.0, np.diag([1.0, -1.0]))))
     assert (seen["command sign"], seen["command rotation"]) == ("excluded", "ok")
 

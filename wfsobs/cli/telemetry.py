@@ -338,7 +338,8 @@ def check(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha
     with progress_bar("sweeps") as update:
         result = check_record(record, reading, raw, Watch(progress=update))
     own = {"command-delay": "delay", "command-sign": "command_sign"}  # which the file states otherwise
-    trust = declaration.trust or any(own.get(name) in contents.arrays for name in result.corrections)
+    is_refused = bool(reading.contradiction) and not result.corrections  # there is no option for a rotation
+    trust = declaration.trust or is_refused or any(own.get(name) in contents.arrays for name in result.corrections)
     words = replace(declaration, trust=trust).options(result.corrections)
     command = shlex.join(["wfsobs", "identify", record_file, *scenario_words(), *words])
     if as_json:
@@ -356,7 +357,7 @@ def check(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha
         click.echo(json.dumps(found, allow_nan=False))
         return
     show_table(check_table(result, record_file))
-    click.echo(f"{result.summary} Go on with:\n  {command}")
+    click.echo(f"{result.summary} {'It is refused as it is; all the same' if is_refused else 'Go on with'}:\n  {command}")
 
 
 def check_table(result: Check, name: str) -> Table:
