@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import html
 import re
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
@@ -23,7 +22,7 @@ class LivePage(Visitor):
     async def watch(self, tell: Callable[[tuple[float, float]], None]) -> None:
         """Take pictures until the server ends."""
         pulse = next(name for name, model in self.models.items() if model.get("name") == "Pulse" and "class_name" in model)
-        number = self.models[self.find("Pulse")]
+        number = self.models[pulse]
         painted = number.get("picture", 0)
         await self.message(pulse, {"painted": painted})
         with contextlib.suppress(ConnectionError):
@@ -39,7 +38,7 @@ class LivePage(Visitor):
         steps = next(iter(pulse.get("changes") or [[]]))
         axis = next((values for *_, values in steps if values), None)
         for model in self.models.values() if axis else ():
-            if isinstance(text := model.get("text"), str) and (found := SHOWN.search(html.unescape(text))):
+            if isinstance(text := model.get("html"), str) and (found := SHOWN.search(text)):
                 end = dict(axis)["end"]
                 assert abs(end - float(found[1])) < 0.051, (end, found[1])
                 return end

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import html
 import itertools
 import json
 import re
@@ -161,8 +160,7 @@ class Visitor:
     @property
     def numbers(self) -> str:
         """The table as it came."""
-        texts = (html.unescape(m["text"]) for m in self.models.values() if isinstance(m.get("text"), str))
-        return next(text for text in texts if 'class="rms"' in text)
+        return next(text for m in self.models.values() if isinstance(text := m.get("html"), str) and 'class="rms"' in text)
 
     def table(self) -> dict[tuple[str, str], tuple[str, ...]]:
         """(observer, target) -> error and truth [nm] as the table has them."""
@@ -205,6 +203,16 @@ class Visitor:
                     self.said.append(event["new"])
             elif event["kind"] == "ColumnDataChanged":
                 self.drawn.append(now)
+            elif event["kind"] == "MessageSent" and isinstance(sent := _plain(event["msg_data"].get("values")), dict):
+                if isinstance(data := sent.get("data"), dict):  # a component's own message, kept as its attributes
+                    self.models.setdefault(sent["model"]["id"], {"kind": ""}).update(data)
+
+
+def _plain(value: Any) -> Any:
+    """Return a mapping as the server has it, from the form in which it is sent."""
+    if isinstance(value, dict) and value.get("type") == "map":
+        return {key: _plain(it) for key, it in value["entries"]}
+    return value
 
 
 def _objects(value: Any) -> Iterator[dict[str, Any]]:

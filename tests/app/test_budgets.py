@@ -154,7 +154,7 @@ def test_the_verdict_names_the_largest_term_of_those_that_do_harm_when_it_is_kno
         terms = page.terms("kf-lgs", mode)
         assert max(terms, key=terms.__getitem__) == "lines"
         assert "error comes from unmodelled peaks." in line.html()
-        assert line.pane.object == line.html()
+        assert line.pane.html == line.html()
     page.store.run_on(LoadedRecord(simulate(page.store.scenario), "mine", "key"), page.store.scenario)
     loop.finish(page.store)
     assert "unmodelled peaks" not in line.html()

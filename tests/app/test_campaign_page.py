@@ -86,13 +86,13 @@ def test_a_campaign_is_followed_and_opened(dashboard: Dashboard, loop: Any, plan
     page.tick()
     loop.until(lambda: "8 of 8 runs" in page.status.text)
     assert page.status.text.endswith(", finished")
-    assert "Persistence" in page.table.object
+    assert "Persistence" in page.table.html
     page.target.value = "vibration"
     grid = page.map.grid
     assert (grid["columns"], grid["rows"]) == (["5", "20"], ["10", "5"]), "the smallest value is at the bottom"
     best = {c.cell: c for c in compare(read_results(tmp_path)) if (c.target, c.mode, c.is_best) == ("vibration", "tip", True)}
     assert {cell: square["text"] for cell, square in squares(page).items()} == {c: number(one.rms) for c, one in best.items()}
-    assert "Persistence" not in page.table.object, "it has no estimate of the vibration"
+    assert "Persistence" not in page.table.html, "it has no estimate of the vibration"
     assert page.slice is not None
     y = page.slice.sources["kf-lgs"].data["y"]
     rms = {c.cell: c.rms for c in compare(read_results(tmp_path)) if (c.target, c.mode, c.name) == ("vibration", "tip", "kf-lgs")}
@@ -149,8 +149,8 @@ def test_a_campaign_that_was_stopped_is_said_to_be(
 
 
 def cells_of(page: CampaignPage, name: str) -> dict[str, str]:
-    headings = re.findall(r"<th scope=col>(?:<button[^>]*>)?([^<]*)", page.table.object)
-    row = re.search(rf'<tr data-name="{name}">.*</tr>', page.table.object)
+    headings = re.findall(r"<th scope=col>(?:<button[^>]*>)?([^<]*)", page.table.html)
+    row = re.search(rf'<tr data-name="{name}">.*</tr>', page.table.html)
     assert row is not None
     return dict(zip(headings[1:], re.findall(r"<td[^>]*>(.*?)</td>", row[0]), strict=True))
 
@@ -182,7 +182,7 @@ def test_a_reload_returns_to_the_fields(dashboard: Dashboard, loop: Any) -> None
         "view.page=campaign&view.campaign.target=vibration&view.campaign.only.sensors.exposure_ratio=7"
     )
     page = open_campaign(dashboard, loop)
-    assert said == [] and "only.sensors.exposure_ratio = 7: takes one of , 5, 10" in page.failure.object
+    assert said == [] and "only.sensors.exposure_ratio = 7: takes one of , 5, 10" in page.failure.html
     assert page.target.value == "vibration" and page.filters["sensors.exposure_ratio"].value == ""
     page.across.value, page.down.value = "sensors.exposure_ratio", ""
     page.filters["turbulence.wind_speed"].value = "20"
@@ -244,7 +244,7 @@ def test_what_is_copied_has_the_numbers_of_the_page(
     monkeypatch.chdir(tmp_path.parent)
     printed = in_a_shell(f"{dashboard.actions.toolbar.command} --csv")
     rows = {row["name"]: row for row in csv.DictReader(printed.splitlines())}
-    assert [*rows] == re.findall(r'<tr data-name="([^"]*)"', page.table.object), "the same rows in the same order"
+    assert [*rows] == re.findall(r'<tr data-name="([^"]*)"', page.table.html), "the same rows in the same order"
     squares: dict[str, list[float]] = {}
     for one in compare(read_results(tmp_path)):
         if (one.target, one.mode) == (target, mode) and one.cell in cells:
@@ -293,7 +293,7 @@ def test_the_fields_stay_where_nothing_has_their_values(
     dashboard.page()
     page = open_campaign(dashboard, loop)
     page.filters["turbulence.wind_speed"].value, page.filters["turbulence.r0"].value = "5", "0.2"
-    assert page.room.visible and page.room[0].visible and "No scenario has all of these values" in page.table.object
+    assert page.room.visible and page.room[0].visible and "No scenario has all of these values" in page.table.html
     assert [part.visible for part in page.room[2:]] == [False, False]
     page.filters["turbulence.r0"].value = "0.1"
-    assert "Persistence" in page.table.object and all(part.visible for part in page.room)
+    assert "Persistence" in page.table.html and all(part.visible for part in page.room)

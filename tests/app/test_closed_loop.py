@@ -62,11 +62,11 @@ def test_it_says_what_the_command_says(page: ClosedLoopPage, dashboard: Dashboar
     assert list(cards) == list(CONTROLLERS)
     for row in (r for r in expected if r["mode"] == "tip" and r["controller"] not in BOUNDS):
         assert float(cards[row["controller"]]["value"]) == pytest.approx(row["residual_rms_nm"], rel=5e-3)
-        assert f'data-controller="{row["controller"]}"' in page.table.object
-    assert page.table.object.count("smallest</span>") == 1
-    assert all(f'data-controller="{name}"' in page.table.object for name in COMMON_BOUNDS)
-    assert page.margins.object.count("data-controller") == len(CURVES)
-    assert page.note.object == ""
+        assert f'data-controller="{row["controller"]}"' in page.table.html
+    assert page.table.html.count("smallest</span>") == 1
+    assert all(f'data-controller="{name}"' in page.table.html for name in COMMON_BOUNDS)
+    assert page.margins.html.count("data-controller") == len(CURVES)
+    assert page.note.html == ""
     the_lines_are_the_results(page, dashboard)
     page.trace.zoom(0.5)
     middle = 0.5 * (of.scenario.run.warm_up + 2.0)
@@ -100,7 +100,7 @@ def test_the_lines_that_matter_come_first_until_others_are_chosen(page: ClosedLo
         return {name for name, line in page.trace.lines.items() if line.visible} - {"none"}
 
     def named() -> set[str]:
-        return {name for name in CONTROLLERS if re.search(rf"[:.] {label(name)} [\d.]+ ", page.verdict.object)}
+        return {name for name in CONTROLLERS if re.search(rf"[:.] {label(name)} [\d.]+ ", page.verdict.html)}
 
     def best(mode: str) -> str:
         rows = [r for r in page.results.rows if r["mode"] == mode and r["controller"] in page.trace.lines]
@@ -125,7 +125,7 @@ def test_marks_hiding_colours_and_reasons(page: ClosedLoopPage, dashboard: Dashb
     dashboard.display.dark = True
     assert page.trace.lines["integrator"].glyph.line_color == look("integrator").dark
     page.work.refuse("the record has no truth")
-    assert "No closed loop: the record has no truth" in page.note.object
+    assert "No closed loop: the record has no truth" in page.note.html
     assert not page.cards.visible and page.results is None, "those of other results"
 
 
@@ -144,7 +144,7 @@ def test_it_follows_the_settings_while_it_is_seen(page: ClosedLoopPage, dashboar
     dashboard.store.change("control.gain", 1.5)
     loop.finish(dashboard.store)
     done(page, loop)
-    assert page.table.object.count("unstable</span>") == 3
+    assert page.table.html.count("unstable</span>") == 3
     assert {c["note"] for c in page.cards.items if "integrator" in c["name"]} == {"unstable"}
     assert not len(page.trace.sources["integrator"].data["x"])
     dashboard.pages.current = EXPLORE
@@ -153,7 +153,7 @@ def test_it_follows_the_settings_while_it_is_seen(page: ClosedLoopPage, dashboar
     loop.finish(dashboard.store)
     assert page.results is before
     done(opened(dashboard), loop)
-    assert "unstable</span>" not in page.table.object
+    assert "unstable</span>" not in page.table.html
 
 
 def test_it_comes_back_as_the_switches_are_by_then(page: ClosedLoopPage, dashboard: Dashboard) -> None:
@@ -179,14 +179,14 @@ def test_what_would_take_minutes_is_left_out(dashboard: Dashboard, loop: Any, mo
     monkeypatch.setattr(loop_work, "PATIENCE", 0.1)
     page = done(opened(dashboard), loop)
     (card,) = [c for c in page.cards.items if c["name"] == "integrator+gpr-online"]
-    assert card["note"].startswith("left out") and "integrator+gpr-online" not in page.table.object
+    assert card["note"].startswith("left out") and "integrator+gpr-online" not in page.table.html
     dashboard.close()
     assert page.run.session.is_closed, "a session that ends takes its loop with it"
 
 
 def test_an_uncertain_plant_adds_columns_a_sentence_and_a_figure(page: ClosedLoopPage, dashboard: Dashboard, loop: Any) -> None:
     few, box = 12, page.uncertain
-    assert "Worst [" not in page.table.object and not box.room.visible
+    assert "Worst [" not in page.table.html and not box.room.visible
     with pytest.MonkeyPatch.context() as m:
         m.setattr(loop_work, "plant_envelope", partial(plant_envelope, points=few))
         box.starter.start.clicks += 1
@@ -194,9 +194,9 @@ def test_an_uncertain_plant_adds_columns_a_sentence_and_a_figure(page: ClosedLoo
     assert page.results is not None
     expected = plant_envelope(page.results.result.scenario, points=few)
     assert box.finding is not None and box.finding.rows() == expected.rows()
-    assert "Worst [nm]" in page.table.object and box.room.visible
+    assert "Worst [nm]" in page.table.html and box.room.visible
     for line in expected.sentences(1e3, "nm", 0):
-        assert line.replace("+-", "±").replace(" deg", "°") in page.verdict.object
+        assert line.replace("+-", "±").replace(" deg", "°") in page.verdict.html
     x, _, most = expected.curves("delay", 1)["integrator"]
     dashboard.display.param.update(mode="tilt", unit="mas")
     drawn = box.figure.sources["integrator"].data
@@ -205,7 +205,7 @@ def test_an_uncertain_plant_adds_columns_a_sentence_and_a_figure(page: ClosedLoo
     dashboard.store.replace({"turbulence.wind_speed": 9.0})
     loop.until(lambda: page.run.result is not None and page.run.result.scenario.turbulence.wind_speed == 9.0)
     done(page, loop)
-    assert box.finding is None and not box.room.visible and "Worst [" not in page.table.object, "it was of other results"
+    assert box.finding is None and not box.room.visible and "Worst [" not in page.table.html, "it was of other results"
 
 
 def test_an_uncertain_plant_stops_when_told(page: ClosedLoopPage) -> None:

@@ -71,7 +71,7 @@ def test_a_slider_moved_on_is_not_called_back(controls: Controls) -> None:
 
 
 def error_of(controls: Controls, path: str) -> str:
-    return "".join(pane.object for pane in controls.fields[path].view[1:])
+    return "".join(pane.html for pane in controls.fields[path].view[1:])
 
 
 def test_every_setting_has_one_field(controls: Controls) -> None:

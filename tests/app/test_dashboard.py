@@ -56,12 +56,12 @@ def test_a_failing_run_shows_inline(loop: Any, short: Scenario, enter: Any) -> N
     dashboard.page()
     dashboard.start()
     loop.finish(dashboard.store)
-    table = dashboard.explore.table.pane.object
+    table = dashboard.explore.table.pane.html
     dashboard.store.change("loop.gain", 0.1)
     loop.finish(dashboard.store)
     assert dashboard.alert.visible and "no such luck" in dashboard.alert.object
     assert dashboard.stale.visible and faded(dashboard)
-    assert dashboard.explore.table.pane.object == table, "the last result stands"
+    assert dashboard.explore.table.pane.html == table, "the last result stands"
     dashboard.store.change("loop.gain", 0.2)
     loop.finish(dashboard.store)
     assert not dashboard.alert.visible and not dashboard.stale.visible and not faded(dashboard)
@@ -89,7 +89,7 @@ def test_results_are_marked_stale_until_new_ones_land(loop: Any, short: Scenario
 
 def test_done_is_said_of_what_stands_in_the_table(dashboard: Dashboard, loop: Any) -> None:
     status, table, seen = dashboard.controls.status, dashboard.explore.table, list[tuple[str, str]]()
-    status.param.watch(lambda event: seen.append((event.new, table.pane.object)), "text")
+    status.param.watch(lambda event: seen.append((event.new, table.pane.html)), "text")
     dashboard.store.change("turbulence.wind_speed", 31)
     loop.finish(dashboard.store)
     text, drawn = seen[-1]

@@ -88,7 +88,7 @@ def test_only_what_counts_is_in_the_drawer(make_store: Callable[..., Store]) -> 
         field = controls.fields[path]
         assert field.idle == source + value and seen(path) and all(widget.disabled for widget in field.widgets)
     assert controls.lists["turbulence.layers"].idle == source + "frozen-flow"
-    assert source + "psd" in controls.headings["vibration.psd"][1].object and not seen("vibration.psd.tip")
+    assert source + "psd" in controls.headings["vibration.psd"][1].html and not seen("vibration.psd.tip")
     store.load(store.scenario.replace({"events": [], "vibration.source": "measured", "turbulence.source": "frozen-flow"}))
     assert not any(controls.fields[path].idle or controls.fields[path].widgets[0].disabled for path in grey)
     assert controls.lists["turbulence.layers"].idle == "" and controls.lists["vibration.peaks"].idle == source + "peaks or ar2"

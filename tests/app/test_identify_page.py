@@ -66,12 +66,12 @@ def test_it_shows_what_the_core_finds(page: IdentifyPage, dashboard: Dashboard, 
     found, expected = identified(page, loop), identify(of.result.record)
     assert found.modes == expected.modes and not page.stale.visible
     for line in whiteness_lines(expected):
-        assert line.replace("<", "&lt;") in page.verdict.object
+        assert line.replace("<", "&lt;") in page.verdict.html
     (line,) = (p for p in expected.modes[0].peaks if p.pure)
     assert line.frequency.value == pytest.approx(LINE, abs=0.1)
     noise = Number(*(1e3 * x for x in expected.modes[0].noise))
     for number in (line.frequency, noise, Number(*(1e3 * x for x in line.rms))):
-        assert f"<td>{format_number(number).replace('+-', '±')}</td>" in page.table.object
+        assert f"<td>{format_number(number).replace('+-', '±')}</td>" in page.table.html
     the_measured_spectrum_holds_the_variance(page)
     dashboard.display.param.update(unit="mas")
     scale = per_micrometre("mas", 8.0) ** 2
@@ -184,11 +184,11 @@ def test_the_first_suggestion_for_a_loaded_record(dashboard: Dashboard, loop: An
     it = dashboard.pages.suggestion
     assert not it.view.visible, "of a simulation the settings are known"
     load_record(dashboard, loop, short)
-    assert it.view.visible and it.button.visible and NEXT in it.words.object
+    assert it.view.visible and it.button.visible and NEXT in it.words.html
     before = dashboard.store.run.result
     it.button.param.trigger("clicks")
-    assert it.button.disabled and "Identifying" in it.words.object
-    loop.until(lambda: IDENTIFIED in it.words.object)
+    assert it.button.disabled and "Identifying" in it.words.html
+    loop.until(lambda: IDENTIFIED in it.words.html)
     loop.finish(dashboard.store)
     assert not it.button.visible and dashboard.pages.current == EXPLORE
     (peak,) = dashboard.store.scenario.vibration.peaks
@@ -198,7 +198,7 @@ def test_the_first_suggestion_for_a_loaded_record(dashboard: Dashboard, loop: An
     sentence = re.sub("<.*?>", "", dashboard.explore.verdicts["turbulence"].html())
     assert "next measurement" in sentence.lower() and "peak" in sentence
     dashboard.store.undo()
-    assert it.button.visible and NEXT in it.words.object
+    assert it.button.visible and NEXT in it.words.html
 
 
 def test_a_loaded_record_stays(page: IdentifyPage, dashboard: Dashboard, loop: Any, short: Scenario) -> None:
@@ -252,7 +252,7 @@ def test_it_comes_back_as_the_switches_are_by_then(page: IdentifyPage, dashboard
     dashboard.display.param.update(dark=True, mode="tilt", unit="mas")
     dashboard.pages.current = IDENTIFY
     line = page.figure.figure.renderers[1]
-    assert line.glyph.line_color == LOOKS["measured"].dark and LOOKS["measured"].dark in page.legend.object
+    assert line.glyph.line_color == LOOKS["measured"].dark and LOOKS["measured"].dark in page.legend.html
     assert page.figure.figure.yaxis.axis_label == "PSD of z, tilt [mas²/Hz]"
 
 

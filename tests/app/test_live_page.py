@@ -90,10 +90,10 @@ def test_a_loop_from_start_to_the_end_of_the_session(page: LivePage, dashboard: 
     view = live.view(page.controls.window.value)
     best, rms = ranking(view, live.board.active(), "turbulence", 0)[0]
     assert rms == pytest.approx(np.sqrt(np.mean(view.error(best, "turbulence")[:, 0] ** 2)), rel=1e-12)
-    rows = re.findall(r'data-name="([^"]+)".*?</tr>', page.picture.table.object, re.S)
-    assert rows[0] == best and number(1e3 * rms) in page.picture.table.object
-    assert f"{live.count} frames · 0 lost" in page.status.object
-    assert f"{live.count * 0.001:.1f} s" in page.status.object
+    rows = re.findall(r'data-name="([^"]+)".*?</tr>', page.picture.table.html, re.S)
+    assert rows[0] == best and number(1e3 * rms) in page.picture.table.html
+    assert f"{live.count} frames · 0 lost" in page.status.html
+    assert f"{live.count * 0.001:.1f} s" in page.status.html
     check_controllers(page, live)
     # a change in the drawer is one in the loop; what it cannot take is said
     dashboard.store.change("turbulence.wind_speed", 20.0)
@@ -101,7 +101,7 @@ def test_a_loop_from_start_to_the_end_of_the_session(page: LivePage, dashboard: 
     wait(lambda: any("Wind speed" in event.line for event in live.events))
     assert live.scenario.turbulence.wind_speed == 20.0 and live.scenario.sensors.exposure_ratio == 5
     page.draw()
-    assert "modes and rates cannot change" in page.picture.news.object and "Wind speed" in page.picture.news.object
+    assert "modes and rates cannot change" in page.picture.news.html and "Wind speed" in page.picture.news.html
     # the page is left, the loop goes on; the session ends, nothing is left
     page.show(False)
     assert not page.draw() and page.work.state == RUNNING
@@ -119,7 +119,7 @@ def check_controllers(page: LivePage, live: LiveLoop) -> None:
     rms = seen(page, live, "integrator")
     page.controls.whose.value = "none"
     assert page.controls.names_to_design == ["none"]
-    cells = re.findall(r'data-controller="integrator".*?</tr>', page.picture.control_table.object, re.S)[0]
+    cells = re.findall(r'data-controller="integrator".*?</tr>', page.picture.control_table.html, re.S)[0]
     mas = 4e-6 / 8.0 * np.degrees(1.0) * 3.6e6  # per micrometre of a Noll tip on 8 m
     lost = (2 * np.pi / 2.2) ** 2 * np.sum(rms**2)
     for value in (number(1e3 * rms[0]), number(mas * rms[0]), f"{np.exp(-lost):.4f}"):
@@ -199,7 +199,7 @@ def test_one_place_is_kept_for_jobs_that_end() -> None:
 def test_one_job_at_once_is_too_few(page: LivePage, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(page.store.session.service.queue, "_threads", [])
     page.start()
-    assert page.work.state == FAILED and "--runs 2" in page.status.object
+    assert page.work.state == FAILED and "--runs 2" in page.status.html
 
 
 def test_pages_open_with_the_settings_of_the_loop_that_all_watch(loop: Any, enter: Any) -> None:
@@ -263,7 +263,7 @@ def test_a_record_that_is_loaded_is_played(page: LivePage, dashboard: Dashboard,
     wait(lambda: live.count > 450)
     view = live.view(0.1)
     np.testing.assert_array_equal(view.frames.z, made.z[view.first : view.first + view.n])
-    assert page.draw() and page.picture is not None and "kf-multi" in page.picture.table.object
+    assert page.draw() and page.picture is not None and "kf-multi" in page.picture.table.html
     c = page.controls
     assert [f.disabled for f in (c.lasers, c.ngs, c.losses, c.target, c.speed)] == [True, True, True, True, False]
     assert c.target.value == NEXT

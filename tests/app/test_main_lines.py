@@ -207,7 +207,7 @@ class TestNamesAndGrey:
         before = dashboard.store.run.result.result.scores
         dashboard.store.change("turbulence.wind_speed", 25.0)
         loop.finish(dashboard.store)
-        html = dashboard.controls.fields["turbulence.wind_speed"].view[-1].object
+        html = dashboard.controls.fields["turbulence.wind_speed"].view[-1].html
         target, old, new = re.fullmatch(r"(\w+), .*: ([\d.]+) → ([\d.]+) nm on this record", html).groups()
         after = dashboard.store.run.result.result.scores
         pairs = {

@@ -76,12 +76,12 @@ class TestPages:
     def test_a_hidden_page_rests(self, dashboard: Dashboard, loop: Any) -> None:
         figures, equations = opened(dashboard, FIGURES), opened(dashboard, MODEL)
         assert not figures.visible and equations.visible
-        data, html = figures.sheets[2].plots[0].sources[TRUTH].data, equations.pane.object
+        data, html = figures.sheets[2].plots[0].sources[TRUTH].data, equations.pane.html
         dashboard.pages.current = EXPLORE
         dashboard.store.change("turbulence.wind_speed", 30)
         loop.finish(dashboard.store)
-        assert figures.sheets[2].plots[0].sources[TRUTH].data is data and equations.pane.object == html
-        assert opened(dashboard, MODEL).pane.object != html
+        assert figures.sheets[2].plots[0].sources[TRUTH].data is data and equations.pane.html == html
+        assert opened(dashboard, MODEL).pane.html != html
         assert not np.array_equal(opened(dashboard, FIGURES).sheets[2].plots[0].sources[TRUTH].data["y"], data["y"])
 
 
@@ -116,14 +116,14 @@ class TestFigures:
         for sheet in figures.sheets:
             for plot in sheet.plots:
                 assert {n: line.glyph.line_color for n, line in plot.lines.items()} == {n: look(n).light for n in plot.lines}
-        heads = [words(sheet.head.object) for sheet in figures.sheets]
+        heads = [words(sheet.head.html) for sheet in figures.sheets]
         assert [head.split(" of the paper")[0] for head in heads] == ["Figure 4a", "Figure 4b", "Figure 5", "Figure 6"]
-        captions = [words(sheet.caption.object) for sheet in figures.sheets]
+        captions = [words(sheet.caption.html) for sheet in figures.sheets]
         assert "RMS error of tilt [nm]: LGS KF" in captions[2]
         assert re.search(r"LGS KF [\d.]+ \(paper 16\.6\)", captions[3]), "beside the one of the run, in its unit"
         dashboard.display.param.update(unit="mas", dark=True)
         # an rms coefficient of 16.6 nm is a slope of four times that over 8 m, 8.3 nrad
-        assert f"(paper {8.3e-9 * np.degrees(1.0) * 3.6e6:.2f})" in words(figures.sheets[3].caption.object)
+        assert f"(paper {8.3e-9 * np.degrees(1.0) * 3.6e6:.2f})" in words(figures.sheets[3].caption.html)
         assert figures.sheets[0].plots[0].figure.yaxis.axis_label == "tip [mas]"
         assert figures.sheets[0].plots[0].lines[TRUTH].glyph.line_color == look(TRUTH).dark
 
@@ -137,7 +137,7 @@ class TestModel:
     def test_the_numbers_are_there(self, dashboard: Dashboard) -> None:
         page = opened(dashboard, MODEL)
         told = describe(dashboard.store.scenario, 0)
-        text = words(page.pane.object)
+        text = words(page.pane.html)
         for number in (told.turbulence.a1, -told.turbulence.a2):
             assert short(number, 7) in text
         assert short(told.filters["kf-lgs"].gains["LGS"][0]) in text
@@ -150,9 +150,9 @@ class TestModel:
     def test_it_follows_settings_and_mode(self, dashboard: Dashboard) -> None:
         page = opened(dashboard, MODEL)
         dashboard.store.change("turbulence.wind_speed", 30)
-        assert short(describe(dashboard.store.scenario, 0).turbulence.a1, 7) in words(page.pane.object)
+        assert short(describe(dashboard.store.scenario, 0).turbulence.a1, 7) in words(page.pane.html)
         dashboard.display.mode = "tilt"
-        assert "mode tilt" in words(page.pane.object)
+        assert "mode tilt" in words(page.pane.html)
 
     def test_an_unstable_cycle_says_why(self) -> None:
         told = describe(
@@ -209,6 +209,6 @@ def test_the_first_page_rests_while_another_shows(dashboard: Dashboard, loop: An
 def test_an_example_stands_where_there_are_no_results_yet(name: str) -> None:
     results = pn.Column(visible=False)
     pane = example(name, results)
-    assert pane.visible and "Example: " in words(pane.object)
+    assert pane.visible and "Example: " in words(pane.html)
     results.visible = True
     assert not pane.visible and not example(name, results).visible

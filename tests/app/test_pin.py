@@ -34,7 +34,7 @@ def pinned(dashboard: Dashboard, loop: Any) -> Dashboard:
 
 
 def order(dashboard: Dashboard, target: str) -> list[str]:
-    return re.findall(rf'data-observer="([\w-]+)" data-target="{target}"', dashboard.explore.table.pane.object)
+    return re.findall(rf'data-observer="([\w-]+)" data-target="{target}"', dashboard.explore.table.pane.html)
 
 
 class TestPin:
@@ -43,7 +43,7 @@ class TestPin:
         before = kept.score("kf-lgs", "turbulence", "tip").rms
         now = next(s for s in shown.result.scores if (s.observer, s.target, s.mode) == ("kf-lgs", "turbulence", "tip")).rms
         assert now != before
-        html = pinned.explore.table.pane.object
+        html = pinned.explore.table.pane.html
         assert f'<td><span class="range">{change(before, now)} %</span> {number(1e3 * before)}</td>' in html
         assert ">A [nm]<" in html and "RMS error in Preset Paper" in html
 
@@ -59,10 +59,10 @@ class TestPin:
             assert cards[name] == [["A", number(1e3 * before), f"{change(before, now)} %"]]
 
     def test_the_name_says_what_differs(self, pinned: Dashboard, loop: Any) -> None:
-        assert "Wind speed V₀ 15 → 30 m/s" in pinned.explore.pinning.note.object and pinned.explore.pinning.note.visible
+        assert "Wind speed V₀ 15 → 30 m/s" in pinned.explore.pinning.note.html and pinned.explore.pinning.note.visible
         pinned.store.change("turbulence.wind_speed", 15)
         loop.finish(pinned.store)
-        assert "the same settings" in pinned.explore.pinning.note.object
+        assert "the same settings" in pinned.explore.pinning.note.html
 
     def test_faint_lines(self, pinned: Dashboard) -> None:
         pinned.display.param.update(show="signal", hidden_lines={})
@@ -87,7 +87,7 @@ class TestPin:
         assert pinned.explore.pinning.button.label == "Unpin"
         press(pinned)
         assert pinned.display.compared_runs == [] and pinned.explore.pinning.button.label == "Pin"
-        assert ">A [nm]<" not in pinned.explore.table.pane.object and not pinned.explore.pinning.note.visible
+        assert ">A [nm]<" not in pinned.explore.table.pane.html and not pinned.explore.pinning.note.visible
         assert pinned.explore.traces.traces["turbulence"].faint.source.data["xs"] == []
 
     def test_nothing_is_drawn_before(self, dashboard: Dashboard) -> None:
@@ -148,12 +148,12 @@ class TestTable:
         }
         groups = group_by_knowledge(sorted(rms_of, key=lambda name: rms_of[name]))
         assert order(dashboard, "vibration") == [name for of in groups.values() for name in of]
-        html = dashboard.explore.table.pane.object.partition(">Vibration, tip")[2]
+        html = dashboard.explore.table.pane.html.partition(">Vibration, tip")[2]
         places = [html.index(f">{title}<") for title in groups]
         assert places == sorted(places) and "Prior knowledge: none" in groups
 
     def test_marks(self, dashboard: Dashboard) -> None:
-        html = dashboard.explore.table.pane.object
+        html = dashboard.explore.table.pane.html
         assert html.count(">smallest<") == 3, "one causal observer per target and for both together, of one record"
         assert ">best<" not in html
         worse = [
@@ -166,7 +166,7 @@ class TestTable:
     def test_real_time_factor(self, dashboard: Dashboard) -> None:
         score = next(s for s in dashboard.store.run.result.result.scores if s.observer == "gpr-online" and s.mode == "tip")
         shown = f"<td>{hundredths(1e6 * score.seconds_per_step)}</td><td>{hundredths(1e3 * score.seconds_per_step)}</td>"
-        assert shown in dashboard.explore.table.pane.object
+        assert shown in dashboard.explore.table.pane.html
 
 
 def test_cumulative_rms(dashboard: Dashboard) -> None:

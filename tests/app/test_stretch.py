@@ -32,7 +32,7 @@ def test_a_band_holds_the_line_that_lies_in_it() -> None:
 
 class TestStretch:
     def test_nothing_where_nothing_is_zoomed(self, dashboard: Dashboard) -> None:
-        assert dashboard.explore.stretches["vibration"].pane.object == "", "two seconds are the whole record"
+        assert dashboard.explore.stretches["vibration"].pane.html == "", "two seconds are the whole record"
 
     def test_the_rms_over_the_time_in_view(self, dashboard: Dashboard) -> None:
         dashboard.explore.traces.x_range.update(start=1.0, end=1.5)

@@ -59,7 +59,7 @@ def test_a_map_is_what_the_core_finds(page: SweepPage, dashboard: Dashboard, loo
     store = dashboard.store
     page.values[0].value, page.values[1].value, page.seeds.value = "5,20", "5,10", "3"
     said = f'<p class="text" role="status">2 × 2 scenarios × 3 seeds = 12 runs, about {page.plan().seconds:.0f} s'
-    assert page.estimate.object.startswith(said)
+    assert page.estimate.html.startswith(said)
     sweep = page.plan()
     assert "kf-adaptive" not in sweep.observers and "kf-multi" in sweep.observers
     finish(page, loop)
@@ -244,23 +244,21 @@ def test_what_cannot_be_run_is_said_in_one_line(page: SweepPage, dashboard: Dash
     ):
         before = field.value
         field.value = text
-        assert (
-            line in unescape(page.estimate.object) and 'class="failure"' in page.estimate.object and page.starter.start.disabled
-        )
+        assert line in unescape(page.estimate.html) and 'class="failure"' in page.estimate.html and page.starter.start.disabled
         page.start()
         assert page.work.state == FAILED and line in page.starter.status.note and "\n" not in page.starter.status.note
         field.value = before
-        assert 'class="text"' in page.estimate.object and not page.starter.start.disabled
+        assert 'class="text"' in page.estimate.html and not page.starter.start.disabled
     store.limits = Limits(sweep_seconds=10.0)
     page.observers.value = EVERY
     seconds = plan_sweep(store.scenario, [parse_axis(f"{WIND}=5:25:5"), parse_axis(f"{RATIO}=2,5,10,20")], 4).seconds
-    assert f"80 runs would take about {seconds:.0f} s, at most 10 on this server" in page.estimate.object
+    assert f"80 runs would take about {seconds:.0f} s, at most 10 on this server" in page.estimate.html
     store.limits = Limits(duration=1.0)
     page.seeds.value = "3"
-    assert "Duration = 2: at most 1 s on this server" in page.estimate.object
+    assert "Duration = 2: at most 1 s on this server" in page.estimate.html
     store.limits = NONE
     store.source = SimulatedRecord(store.scenario)
-    assert "go back to the simulation first" in page.estimate.object
+    assert "go back to the simulation first" in page.estimate.html
 
 
 @pytest.fixture

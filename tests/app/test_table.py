@@ -18,10 +18,10 @@ def test_lines_are_true_for_the_simulation_of_the_settings_and_given_for_a_loade
     table = Table(store.run, Display())
     store.start()
     loop.until(lambda: store.run.state == DONE)
-    assert "Prior knowledge: peak frequencies<" in table.pane.object and "given peak" not in table.pane.object
+    assert "Prior knowledge: peak frequencies<" in table.pane.html and "given peak" not in table.pane.html
     store.run_on(LoadedRecord(simulate(store.scenario), "mine", "key"), store.scenario)
     loop.until(lambda: store.run.state == DONE and store.run.result.is_recorded)
-    assert "Prior knowledge: given peak frequencies<" in table.pane.object and ": peak freq" not in table.pane.object
+    assert "Prior knowledge: given peak frequencies<" in table.pane.html and ": peak freq" not in table.pane.html
 
 
 def test_every_dash_has_a_reason_and_no_number_an_exponent(make_store: Any, loop: Any) -> None:

@@ -57,7 +57,7 @@ def test_it_shows_what_the_core_finds(page: TunePage, dashboard: Dashboard, loop
     expected = tune(dashboard.store.scenario, "kf-lgs", evaluations=8, target="vibration")
     found = tuned(page, loop)
     assert found.history == expected.history and found.scenario == expected.scenario != expected.before.scenario
-    (before, after), table = (expected.before, expected.after), page.table.object
+    (before, after), table = (expected.before, expected.after), page.table.html
     for section, errors in (("validation", [s.validation for s in (before, after)]), ("test", [s.test for s in (before, after)])):
         one, other = errors
         assert one and other
@@ -92,13 +92,13 @@ def using_it_leaves_the_other_settings(page: TunePage, dashboard: Dashboard, fou
 
 def test_a_gpr_and_its_likelihood(page: TunePage, dashboard: Dashboard, loop: Any) -> None:
     page.observer.value, page.evaluations.value = "gpr-offline", "3"
-    assert page.target.options == ["vibration"] and "Offline GPR: Noise" in page.search_space.object
+    assert page.target.options == ["vibration"] and "Offline GPR: Noise" in page.search_space.html
     found = tuned(page, loop)
     assert found.before.likelihood and found.after.likelihood
-    cells = row(page.table.object, "likelihood", "tilt")
+    cells = row(page.table.html, "likelihood", "tilt")
     assert cells == [number(found.before.likelihood[1], 4), number(found.after.likelihood[1], 4), ""]
     dashboard.display.unit = "mas"
-    assert "test record, not used in the search [mas]" in page.table.object
+    assert "test record, not used in the search [mas]" in page.table.html
     focus = Errors({"tip": 0.01, "defocus": 0.01})
     assert unit_for(replace(found, before=replace(found.before, validation=focus)), dashboard.display) == "nm", "it has no angle"
     assert unit_for(found, dashboard.display) == unit_for(None, dashboard.display) == "mas"
@@ -109,8 +109,8 @@ def test_a_loaded_record_is_cut(page: TunePage, dashboard: Dashboard, loop: Any,
     dashboard.store.run_on(LoadedRecord(record, "night.npz", "key"), dashboard.store.scenario.replace({"run.duration": 9.0}))
     loop.finish(dashboard.store)
     found = tuned(page, loop)
-    assert "RMS one-step prediction error of z on the validation record" in page.table.object
-    assert page.figure.figure.yaxis.axis_label == "prediction error, validation [nm]" and "RMS error" not in page.table.object
+    assert "RMS one-step prediction error of z on the validation record" in page.table.html
+    assert page.figure.figure.yaxis.axis_label == "prediction error, validation [nm]" and "RMS error" not in page.table.html
     again = tune(dashboard.store.scenario, "kf-lgs", evaluations=8, record=record)
     assert found.target == "next z" and found.history == again.history
 

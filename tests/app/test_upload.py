@@ -59,7 +59,7 @@ def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: 
     content = file_of(short)
     before = dashboard.store.run.result
     previewed(dashboard, loop, content)
-    assert "750 steps at 500 Hz, 1.5 s, 0 missing" in dashboard.upload.content.text.object and dashboard.upload.room.visible
+    assert "750 steps at 500 Hz, 1.5 s, 0 missing" in dashboard.upload.content.text.html and dashboard.upload.room.visible
     assert dashboard.store.run.result is before  # nothing runs before it is confirmed
     dashboard.upload.confirm()
     loop.finish(dashboard.store)
@@ -98,7 +98,7 @@ def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: 
     stated = {s.observer: number(1e3 * s.calibration.sd) for s in expected.scores if s.mode == "tip" and s.calibration}
     said = dict(re.findall(r'<tr data-observer="([^"]*)".*?<td>([^<]*)</td></tr>', pinned))
     assert len(stated) > 2 and stated.items() <= said.items()
-    assert "The record has no truth" in dashboard.explore.verdicts["vibration"].pane.object
+    assert "The record has no truth" in dashboard.explore.verdicts["vibration"].pane.html
     faint = [
         figures["vibration"].faint.source for figures in (dashboard.explore.traces.traces, dashboard.explore.spectra.spectra)
     ]
@@ -141,7 +141,7 @@ def test_what_is_said_of_it(dashboard: Dashboard, loop: Any, short: Scenario) ->
     loop.until(lambda: not dashboard.upload.picker.message.startswith(("Reading", "Waiting")))
     on_eight = dashboard.upload._preview.rms["y_lgs"][0]
     dashboard.store.change("telescope.diameter", 10.0)
-    loop.until(lambda: "aperture 10 m" in dashboard.upload.content.text.object)
+    loop.until(lambda: "aperture 10 m" in dashboard.upload.content.text.html)
     assert dashboard.upload._preview.rms["y_lgs"][0] == pytest.approx(1.25 * on_eight)
     dashboard.upload.fields.delay.value = "soon"
     assert dashboard.upload.picker.message == "Delay of commands [steps]: takes a number from 1, not 'soon'"
@@ -162,12 +162,12 @@ def test_what_is_said_of_the_mirror(dashboard: Dashboard, loop: Any, short: Scen
     found = dashboard.upload._preview
     assert re.fullmatch(r"\d+ commands beyond the rail of 0\.1, delay 1\.5, command gain 1\.2", found.record.origin)
     assert np.abs(found.record.u).max() == pytest.approx(0.12)
-    assert "a command is seen 1.5 steps later" in dashboard.upload.content.text.object
+    assert "a command is seen 1.5 steps later" in dashboard.upload.content.text.html
     fields.open_loop.value = True
     loop.until(lambda: not dashboard.upload.picker.message.startswith(("Reading", "Waiting")))
     assert not dashboard.upload._preview.record.u.any() and not dashboard.upload.use.disabled
     previewed(dashboard, loop, content)
-    assert "a command is seen 2 steps later" in dashboard.upload.content.text.object, "what was said of the file before is gone"
+    assert "a command is seen 2 steps later" in dashboard.upload.content.text.html, "what was said of the file before is gone"
     assert not fields.trust.value and dashboard.upload._preview.record.u.any()
 
 
@@ -178,8 +178,8 @@ def test_a_vibration_spectrum(dashboard: Dashboard, loop: Any) -> None:
     assert dashboard.upload.picker.message.startswith("lines.csv: has no unit of tip")
     dashboard.upload.fields.unit.value = "nm"
     loop.until(lambda: not dashboard.upload.picker.message.startswith(("Reading", "Waiting")))
-    assert "4 frequencies from 29.4 to 30.6 Hz" in dashboard.upload.content.text.object and "3.317 nm rms of tip, 0 nm" in (
-        dashboard.upload.content.text.object
+    assert "4 frequencies from 29.4 to 30.6 Hz" in dashboard.upload.content.text.html and "3.317 nm rms of tip, 0 nm" in (
+        dashboard.upload.content.text.html
     )
     assert dashboard.upload.use.label == "Use this spectrum"
     dashboard.upload.confirm()
@@ -214,7 +214,7 @@ def test_columns_of_other_names(dashboard: Dashboard, loop: Any, short: Scenario
     wanted = {own.removesuffix("_um"): name for name, own in NAMES.items()}
     wanted |= {f"y_ngs/{mode}": f"y_ngs/{mode}_um" for mode in ("tip", "tilt")}  # names of a record suggest what they say
     assert form.roles == wanted
-    assert "750 steps at 500 Hz" in dashboard.upload.content.text.object
+    assert "750 steps at 500 Hz" in dashboard.upload.content.text.html
 
     form.choices["y_lgs/tip"].value = "wfs_y"
     loop.until(lambda: "has the modes tip, tilt; y_lgs has tip" in dashboard.upload.picker.message)
@@ -245,7 +245,7 @@ def test_the_data_propose_sign_and_delay(dashboard: Dashboard, loop: Any, short:
     file = io.BytesIO()
     np.savez(file, y_lgs=y, u=u, dt=np.array(1e-3))
     previewed(dashboard, loop, file.getvalue(), "night.npz")
-    text = dashboard.upload.content.text.object
+    text = dashboard.upload.content.text.html
     assert "sign -1: commands move with the measurement" in text and "delay 3: commands 3 steps earlier explain" in text
     assert "unit proposed: the numbers are plausible as um (" in text, "on 8 m an arcsec would be 10 um"
     assert dashboard.upload.take.visible and dashboard.upload._preview.record.delay == 2
@@ -255,9 +255,7 @@ def test_the_data_propose_sign_and_delay(dashboard: Dashboard, loop: Any, short:
     assert found.record.delay == 3 and found.record.origin == "command sign -1"
     # the disturbance and the noise of one sample are all that is left of z
     assert found.rms["z"][0] == pytest.approx(np.sqrt(0.5 + 0.04), rel=0.02)
-    assert "sign -1: commands move with the measurement" in dashboard.upload.content.text.object, (
-        "of the file, however it is read"
-    )
+    assert "sign -1: commands move with the measurement" in dashboard.upload.content.text.html, "of the file, however it is read"
 
 
 def test_a_record_whose_unit_nobody_knows_waits_for_it(dashboard: Dashboard, loop: Any) -> None:
@@ -267,13 +265,13 @@ def test_a_record_whose_unit_nobody_knows_waits_for_it(dashboard: Dashboard, loo
         file = io.BytesIO()
         np.savez(file, y_lgs=scale * rng.standard_normal((3000, 2)), u=np.zeros((3000, 2)), dt=np.array(1e-3))
         previewed(dashboard, loop, file.getvalue(), "night.npz")
-        assert upload.use.disabled and "Choose the unit first" in upload.missing.object
-        assert ("plausible as um or" in upload.missing.object) == plausible and right in upload.missing.object
+        assert upload.use.disabled and "Choose the unit first" in upload.missing.html
+        assert ("plausible as um or" in upload.missing.html) == plausible and right in upload.missing.html
         upload.confirm()
         assert dashboard.store.source is None
         upload.fields.unit.value = right
         loop.until(lambda: not upload.use.disabled)
-        assert upload.missing.object == "" and upload._preview is not None
+        assert upload.missing.html == "" and upload._preview is not None
         assert upload._preview.rms["z"][0] == pytest.approx(0.2, rel=0.05)  # 1 / sqrt(2 N) = 1.3 %
         upload.fields.unit.value = SILENT
         upload.discard()
@@ -309,7 +307,7 @@ def test_what_is_no_record(dashboard: Dashboard, loop: Any) -> None:
     ):
         previewed(dashboard, loop, content, name)
         assert dashboard.upload.picker.message.startswith(line)
-        assert "<b>.exe" not in dashboard.upload.content.text.object
+        assert "<b>.exe" not in dashboard.upload.content.text.html
         dashboard.upload.confirm()
         assert dashboard.store.source is None and dashboard.store.run.result is before
 
@@ -331,7 +329,7 @@ def test_nothing_of_the_file_before_stays_after_a_refusal(
             upload.handle(refused)
             loop.until(lambda: not upload.picker.message.startswith(("Reading", "Waiting")))
             assert upload.picker.message.startswith("a.npz") or "choose the file again" in upload.picker.message
-            assert not upload.room.visible or ("night.csv" not in upload.content.text.object and upload.use.disabled)
+            assert not upload.room.visible or ("night.csv" not in upload.content.text.html and upload.use.disabled)
             upload.confirm()
             assert dashboard.store.source is None
 
@@ -340,7 +338,7 @@ def test_a_record_that_is_too_short_cannot_be_used(dashboard: Dashboard, loop: A
     """The template as it is: six steps."""
     previewed(dashboard, loop, TEMPLATE.encode(), "template.csv")
     upload = dashboard.upload
-    assert upload.use.disabled and "Duration = 0.006: takes a number from 0.1" in upload.missing.object
+    assert upload.use.disabled and "Duration = 0.006: takes a number from 0.1" in upload.missing.html
     upload.confirm()
     assert dashboard.store.source is None
 

@@ -205,7 +205,7 @@ class TestSpectra:
 
 class TestNumbers:
     def test_the_table_shows_the_scores(self, dashboard: Dashboard) -> None:
-        html = dashboard.explore.table.pane.object
+        html = dashboard.explore.table.pane.html
         for score in dashboard.store.run.result.result.scores:
             if score.mode == "tip":
                 assert number(1e3 * score.rms) in html
@@ -217,8 +217,8 @@ class TestNumbers:
     def test_the_table_follows_mode_and_unit(self, dashboard: Dashboard) -> None:
         dashboard.display.param.update(mode="tilt", unit="mas")
         score = next(s for s in dashboard.store.run.result.result.scores if s.mode == "tilt")
-        assert number(score.rms * per_micrometre("mas", 8.0)) in dashboard.explore.table.pane.object
-        assert "RMS error [mas]" in dashboard.explore.table.pane.object
+        assert number(score.rms * per_micrometre("mas", 8.0)) in dashboard.explore.table.pane.html
+        assert "RMS error [mas]" in dashboard.explore.table.pane.html
 
     def test_a_failure_is_named(self, dashboard: Dashboard, loop: Any) -> None:
         dashboard.store.change("multirate.measurement_noise", "manual")
@@ -226,7 +226,7 @@ class TestNumbers:
         loop.finish(dashboard.store)
         failures = dashboard.store.run.result.result.failures
         for failure in failures:
-            assert failure.observer in dashboard.explore.table.pane.object
+            assert failure.observer in dashboard.explore.table.pane.html
 
     def test_cards(self, dashboard: Dashboard) -> None:
         cards = {c["name"]: c for c in dashboard.explore.strips["vibration"].cards.items}
@@ -251,7 +251,7 @@ class TestNumbers:
         dashboard = Dashboard(loop.queue.put, enter(), short)
         loop.closing.append(dashboard)
         assert all(c["value"] == "–" for c in dashboard.explore.strips["vibration"].cards.items)
-        assert dashboard.explore.table.pane.object.count("–") > 20
+        assert dashboard.explore.table.pane.html.count("–") > 20
 
     @pytest.mark.parametrize(
         ("value", "text"),
@@ -287,7 +287,7 @@ class TestLooks:
         dashboard.display.dark = True
         line = dashboard.explore.traces.traces["vibration"].lines["gpr-online"]
         assert line.renderer.glyph.line_color == look("gpr-online").dark
-        assert look("gpr-online").dark in dashboard.explore.table.pane.object
+        assert look("gpr-online").dark in dashboard.explore.table.pane.html
 
 
 def test_tilt_on_sky() -> None:
@@ -306,7 +306,7 @@ class TestHigherModes:
         switch.list.value = "defocus"
         assert (display.mode, display.column, display.unit) == ("defocus", 2, "nm")
         truth = dashboard.explore.traces.traces["turbulence"].figure
-        assert "defocus" in truth.yaxis[0].axis_label and "Turbulence, defocus" in dashboard.explore.table.pane.object
+        assert "defocus" in truth.yaxis[0].axis_label and "Turbulence, defocus" in dashboard.explore.table.pane.html
         units = dashboard.units
         assert list(units.buttons.options.values()) == ["nm", "um"] and units.note.visible and units.buttons.value == "nm"
         display.mode = "oblique astigmatism"
@@ -323,7 +323,7 @@ class TestHigherModes:
         store.change("telescope.radial_order", 3)
         loop.finish(store)
         switch.list.value = "oblique trefoil"  # the pinned run has no such mode
-        assert display.compared_runs and display.runs_drawn == [] and "oblique trefoil" in dashboard.explore.table.pane.object
+        assert display.compared_runs and display.runs_drawn == [] and "oblique trefoil" in dashboard.explore.table.pane.html
 
     def test_buttons_and_display_agree(self, dashboard: Dashboard) -> None:
         dashboard.modes.buttons.value = "tilt"
@@ -342,19 +342,19 @@ class TestHigherModes:
 def test_the_verdict_stays_dimmed_until_the_next_one(dashboard: Dashboard, loop: Any) -> None:
     """What is below it does not move: its place is never empty, and what it says is marked as that of the run before."""
     line = dashboard.explore.verdicts["vibration"]
-    said = line.pane.object
+    said = line.pane.html
     heading = '<h2 class="title" title="Structural vibration, separated from turbulence.">Vibration, tip</h2>'
     assert said.startswith(heading)
     dashboard.store.change("turbulence.wind_speed", 30)
-    assert line.pane.object == said.replace('"verdict"', '"verdict before"', 1)
+    assert line.pane.html == said.replace('"verdict"', '"verdict before"', 1)
     loop.finish(dashboard.store)
-    assert line.pane.object.startswith(heading) and line.pane.object != said
+    assert line.pane.html.startswith(heading) and line.pane.html != said
     dashboard.store.change("turbulence.wind_speed", 20)
     dashboard.display.mode = "tilt"
-    assert '<p class="verdict before"></p>' not in line.pane.object
-    assert '<p class="verdict"></p>' in line.pane.object, "nothing is known of another mode yet"
+    assert '<p class="verdict before"></p>' not in line.pane.html
+    assert '<p class="verdict"></p>' in line.pane.html, "nothing is known of another mode yet"
     loop.finish(dashboard.store)
-    assert ">Vibration, tilt</h2>" in line.pane.object and "Without prior knowledge: " in line.pane.object
+    assert ">Vibration, tilt</h2>" in line.pane.html and "Without prior knowledge: " in line.pane.html
 
 
 def test_a_record_without_truth_leaves_no_choice_but_its_signals(dashboard: Dashboard, loop: Any, short: Scenario) -> None:

@@ -244,8 +244,8 @@ DRAWN = """() => {
     }
   }
   const models = [...Bokeh.index.roots[0].model.document.all_models]
-  const said = models.map((m) => m.text).find((text) => typeof text === "string" && /table class=.{1,6}rms/.test(text))
-  return said && table(document)?.textContent === table(parse(parse(said).textContent))?.textContent
+  const said = models.map((m) => m.html).find((text) => typeof text === "string" && /table class="rms/.test(text))
+  return said && table(document)?.textContent === table(parse(said))?.textContent
 }"""
 """Whether the table stands on the page as its model has it: on a busy machine that takes a while."""
 

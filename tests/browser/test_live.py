@@ -92,11 +92,11 @@ def test_a_page_that_sleeps_and_wakes_shows_now(running: Page) -> None:
 NOTE = """(name) => {
   const [view] = [...Bokeh.index.query((it) => it.model.type === "Figure" && it.model.name === name)]
   const source = view?.model.renderers[0]?.data_source
-  const pulse = Bokeh.documents.flatMap((it) => [...it.all_models]).find((it) => it.data?.properties?.picture)
+  const pulse = Bokeh.documents.flatMap((it) => [...it.all_models]).find((it) => it.class_name === "Pulse")
   if (!source || !pulse || view.el.getBoundingClientRect().top <= innerHeight) return false
   const changes = window.changes = [], pictures = window.pictures = []
   source.properties.data.change.connect(() => changes.push(performance.now()))
-  pulse.data.properties.picture.change.connect(() => pictures.push(performance.now()))
+  pulse.on_event("esm_event", () => pictures.push(performance.now()))
   return true
 }"""
 """Once a figure is there, below the window: note the times at which it changes, and those of all pictures [ms]."""

@@ -8,9 +8,9 @@ from importlib.resources import files
 from types import MappingProxyType
 from typing import Any
 
-import panel as pn
 from markupsafe import Markup
 
+from wfsobs.app.component import HtmlComponent
 from wfsobs.app.render import macro
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import NO_ESTIMATE
@@ -130,9 +130,15 @@ def sheets(*names: str) -> list[str]:
 WIDE: Mapping[str, Any] = MappingProxyType({"sizing_mode": "stretch_width", "margin": 0})
 
 
-def html(content: str = "", **params: Any) -> pn.pane.HTML:
+class HtmlText(HtmlComponent):
+    """HTML that is brought up to date in place: one may read in it, or have the focus there, while numbers come."""
+
+    _esm = script("patch", "text")
+
+
+def html(content: str = "", **params: Any) -> HtmlText:
     """HTML in the page's style."""
-    return pn.pane.HTML(content, **{**WIDE, "stylesheets": sheets("style"), **params})
+    return HtmlText(html=content, **{**WIDE, "stylesheets": sheets("style"), **params})
 
 
 def run_swatch(letter: str, dark: bool) -> Markup:

@@ -24,6 +24,7 @@ from wfsobs.app.service import BackgroundTask
 from wfsobs.app.session_file import SUFFIX
 from wfsobs.app.sources import fit_to_record
 from wfsobs.app.store import RecordPlace, Store
+from wfsobs.app.style import html
 from wfsobs.app.views.plots import new_figure, send
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
@@ -125,7 +126,7 @@ class PreviewView:
     """The text and the figure of a preview."""
 
     def __init__(self) -> None:
-        self.text: Final = pn.pane.HTML("", sizing_mode="stretch_width", margin=(4, 0), styles=TEXT)
+        self.text: Final = html(margin=(4, 0), styles=TEXT)
         self.figure: Final = new_figure(x_axis_type="log", y_axis_type="log")
         self.figure.name = "Spectrum of the record"
         self.figure.xaxis.axis_label, self.figure.yaxis.axis_label = "frequency [Hz]", "PSD of z [µm²/Hz]"
@@ -137,9 +138,9 @@ class PreviewView:
         """Show what was read of the file of this name, or why it could not be."""
         known = None if isinstance(preview, RecordError) else preview
         self.figure.yaxis.axis_label = "PSD [µm²/Hz]" if isinstance(preview, SpectrumPreview) else "PSD of z [µm²/Hz]"
-        self.text.object = f"<p><b>{escape(name)}</b></p>{_list(known.lines() if known else [str(preview)])}"
+        self.text.html = f"<p><b>{escape(name)}</b></p>{_list(known.lines() if known else [str(preview)])}"
         if isinstance(preview, Preview):
-            self.text.object += f'<p>Evidence in the data:</p><div class="evidence">{_list(preview.reading.lines())}</div>'
+            self.text.html += f'<p>Evidence in the data:</p><div class="evidence">{_list(preview.reading.lines())}</div>'
         self.figure.visible = known is not None
         for mode, source in enumerate(self.sources):
             there = known is not None and mode < known.spectrum.shape[1]
@@ -178,7 +179,7 @@ class ColumnForm:
         for choice in self.choices.values():
             choice.param.watch(self._choose, "value")
         self.view: Final = pn.Column(
-            pn.pane.HTML(f"<p>{HINT}</p>", margin=0, styles=TEXT),
+            html(f"<p>{HINT}</p>", margin=0, styles=TEXT),
             pn.FlexBox(*self.choices.values(), gap="8px", margin=0),
             sizing_mode="stretch_width",
             margin=(4, 0),
@@ -218,7 +219,7 @@ class Upload:
         self.picker.on_message = self.handle
         self.use: Final = pmui.Button(label="Use this record", color="primary", size="small", margin=4)
         self.drop: Final = pmui.Button(label="Discard", variant="outlined", size="small", margin=4)
-        self.missing: Final = pn.pane.HTML("", margin=(8, 4))
+        self.missing: Final = html("", margin=(8, 4))
         self.content: Final = PreviewView()
         self.form: ColumnForm | None = None
         self.take: Final = pmui.Button(
@@ -357,7 +358,7 @@ class Upload:
         self.use.label = "Use this spectrum" if isinstance(preview, SpectrumPreview) else "Use this record"
         self.picker.message = "" if self._preview else str(preview)
         missing = self._obstacle(preview) if isinstance(preview, Preview) else ""
-        self.missing.object = missing and f'<span role="status">{missing}</span>'
+        self.missing.html = missing and f'<span role="status">{missing}</span>'
         self.use.disabled = self._preview is None or bool(missing)
         self.content.show(self._name, preview)
         self.take.visible = isinstance(preview, Preview) and differs_from_proposals(preview)

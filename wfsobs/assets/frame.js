@@ -29,20 +29,6 @@ function themes(model) {
   follow()
 }
 
-// A text is brought to what it is to say, where Panel would draw all of it anew: a table may get numbers while one reads in it.
-function patchTexts() {
-  const kind = Bokeh.Models.get("panel.models.markup.HTML").prototype.default_view.prototype
-  if (kind.patched) return
-  const set = kind.set_html
-  kind.patched = true
-  kind.set_html = function (html) {
-    if (!html || !this.container?.hasChildNodes() || /<(script|a)\b|codehilite/.test(html)) return set.call(this, html)
-    const wanted = document.createElement("div")
-    wanted.innerHTML = html
-    patch(this.container, [...wanted.childNodes])
-  }
-}
-
 // Each part of a figure has an element of its own, and writes the style sheet of its place with every picture: the browser finds its
 // styles anew before the next part asks for some, a hundred times a second on a page that is live. What is the same is not written
 // again; lines are on the canvas, and their elements, which nothing is in, need no place.
@@ -123,7 +109,6 @@ function closeDrawer(doc) {
 
 export function render({model, view, el}) {
   closeDrawer(view.model.document)
-  patchTexts()
   themes(model)
   tellDrawn(model)
   const fade = () => {

@@ -45,10 +45,16 @@ function change([steps, numbers]) {
   for (const place of changed) if (place.seen || performance.now() - place.last > PATIENCE) make(place)
 }
 
+let picture = 0 // the last one, also where this is drawn anew
+
 export function render({model, el}) {
   el.style.display = "none"
-  const answer = () => requestAnimationFrame(() => model.send_msg({painted: model.picture}))
-  model.on("changes", () => { if (model.changes.length) change(model.changes) })
-  model.on("picture", answer)
+  const answer = () => requestAnimationFrame(() => model.send_msg({painted: picture}))
+  model.on("msg:custom", (event) => {
+    const sent = event.data ?? event
+    picture = sent.picture
+    if (sent.changes.length) change(sent.changes)
+    answer()
+  })
   answer()
 }

@@ -179,12 +179,12 @@ class Verdict:
         return tuple(place.observer for place in self.places[1:] if place.is_tie)
 
     @property
-    def named(self) -> tuple[Contender, ...]:
+    def named_places(self) -> tuple[Contender, ...]:
         """Those whose errors the sentences say, the smallest first."""
-        return tuple(place for place in self.places if place.observer in (*self._chosen, *ALWAYS))
+        return tuple(place for place in self.places if place.observer in (*self._best_places, *ALWAYS))
 
     @property
-    def _chosen(self) -> dict[str, Contender]:
+    def _best_places(self) -> dict[str, Contender]:
         """The best with each kind of prior knowledge, and of all."""
         of_kind = (place for kind in (NOTHING, PEAKS) if (place := self.best_with(kind)))
         return {place.observer: place for place in (*of_kind, self.best)}
@@ -198,7 +198,7 @@ class Verdict:
 
         scale : from micrometres to the unit
         """
-        chosen = self._chosen
+        chosen = self._best_places
         equal = [place.name for place in self.places[1:] if place.is_tie and place.observer not in chosen]
         parts = []
         for place in chosen.values():

@@ -20,6 +20,7 @@ from bokeh.models import CustomJSTickFormatter
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.display import label_of
 from wfsobs.app.store import Store
+from wfsobs.app.style import html
 from wfsobs.settings.parameters import Reals
 from wfsobs.units import unit_text
 
@@ -71,11 +72,11 @@ class Field(ABC):
                 self.widgets[-1].helper_text = why
             self.refresh()
 
-    def _note(self, html: str) -> None:
+    def _note(self, words: str) -> None:
         """Show a line below the widgets; none where it is empty."""
-        if html != self._note_html:
-            self._note_html = html
-            self.view[1:] = [pn.pane.HTML(html, margin=(0, 0, 6, 0))] if html else []
+        if words != self._note_html:
+            self._note_html = words
+            self.view[1:] = [html(words, margin=(0, 0, 6, 0))] if words else []
 
     @abstractmethod
     def show(self, value: Any) -> None:

@@ -20,7 +20,7 @@ from wfsobs.app.controls.search import Search
 from wfsobs.app.controls.status import BAR, ON_BAR, STATUS_ON_BAR, Status, status_of
 from wfsobs.app.jobs import DONE, RUNNING
 from wfsobs.app.store import Store, paths_between
-from wfsobs.app.style import PRIMARY
+from wfsobs.app.style import PRIMARY, HtmlText, html
 from wfsobs.app.views.plots import AFTERWARDS_MS, once
 from wfsobs.app.work import RunResults
 from wfsobs.scenario import Scenario
@@ -75,7 +75,7 @@ class Controls:
         self.fields: dict[str, Field] = {}
         self.lists: dict[str, RowEditor] = {}
         self.parts: list[tuple[str, Any]] = []
-        self.headings: dict[str, tuple[str, pn.pane.HTML]] = {}
+        self.headings: dict[str, tuple[str, HtmlText]] = {}
         self.preset: Final = pmui.Select(
             label="Preset",
             tags=[TAG + PRESET],
@@ -99,7 +99,7 @@ class Controls:
         self.status: Final = Status(sizing_mode="stretch_width", max_width=200, margin=0, stylesheets=[STATUS_ON_BAR])
         self.search: Final = Search(self.open_setting, self._idle, sizing_mode="stretch_width", margin=(8, 0, 4, 0))
         self.effect_of: Callable[[RunResults, RunResults], str] = lambda _before, _now: ""
-        self._effect = pn.pane.HTML("", margin=0, styles=EFFECT)
+        self._effect = html("", margin=0, styles=EFFECT)
         self._before: RunResults | None = None
         self._changed_part: Field | RowEditor | None = None
         self.topics: Final = _names()
@@ -123,7 +123,7 @@ class Controls:
         """Make the contents of the drawer."""
         first: list[Any] = []
         for title, paths in FIRST.items():
-            first += [pn.pane.HTML(f"<b>{title}</b>", margin=(8, 0, 0, 0), styles={"font-size": "13px"})] if title else []
+            first += [html(f"<b>{title}</b>", margin=(8, 0, 0, 0), styles={"font-size": "13px"})] if title else []
             first += [self._part(path).view for path in paths]
         self._refresh_parts()
         return pn.Column(
@@ -188,7 +188,7 @@ class Controls:
             for path, editor in self.lists.items():
                 editor.rest(idle.get(path, ""))
             for path, (title, pane) in self.headings.items():
-                pane.object = f"<b>{title}</b>{idle_html(idle.get(path, ''))}"
+                pane.html = f"<b>{title}</b>{idle_html(idle.get(path, ''))}"
 
     def _fields_of(self, name: str) -> list[tuple[str, Any]]:
         """Make the fields of a topic under the headings of its groups, with the paths of both; none where it is a list."""
@@ -203,7 +203,7 @@ class Controls:
             *_, above, _name = setting.split(".")
             if above != heading:
                 heading = above
-                pane = pn.pane.HTML(margin=(8, 0, 0, 0))
+                pane = html(margin=(8, 0, 0, 0))
                 self.headings[f"{name}.{above}"] = escape(str(group.settings()[above].label)), pane
                 views.append((f"{name}.{above}", pane))
             views.append((setting, self._part(setting).view))
@@ -273,7 +273,7 @@ class Controls:
         before, self._before = self._before, now
         changed = paths_between(before.scenario, now.scenario) if before else []
         part = (self.fields.get(changed[0]) or self.lists.get(changed[0])) if len(changed) == 1 else None
-        self._effect.object = self.effect_of(before, now) if before and part else ""
+        self._effect.html = self.effect_of(before, now) if before and part else ""
         for at in (it for it in {self._changed_part, part} if it is not None):
             at.view[:] = [*(it for it in at.view if it is not self._effect), *([self._effect] if at is part else [])]
         self._changed_part = part

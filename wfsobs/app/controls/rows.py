@@ -14,7 +14,7 @@ from wfsobs.app.controls.fields import TAG, idle_html, parse_number, short_numbe
 from wfsobs.app.controls.names import column_of, name_settings
 from wfsobs.app.render import render
 from wfsobs.app.store import Store
-from wfsobs.app.style import script, sheets
+from wfsobs.app.style import html, script, sheets
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.settings.group import Group
 from wfsobs.settings.parameters import Reals, unit_of
@@ -70,7 +70,7 @@ class RowEditor:
         if why != self.idle:
             self.idle = why
             name = f"<b>{escape(self.label)}</b>{idle_html(why)}"
-            self.view[:] = [pn.pane.HTML(name, margin=(8, 0))] if why else [self.table]
+            self.view[:] = [html(name, margin=(8, 0))] if why else [self.table]
 
     def handle(self, msg: dict[str, Any]) -> None:
         """Do what a message of the table says."""

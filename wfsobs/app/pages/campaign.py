@@ -318,7 +318,7 @@ class CampaignPage(Page):
             self._pace()
 
     def _refuse(self, why: str) -> None:
-        self.failure.object = f'<p class="failure" role="status">{escape(why)}</p>'
+        self.failure.html = f'<p class="failure" role="status">{escape(why)}</p>'
 
     def _say(self, *_: object) -> None:
         """Describe how far the campaign is."""
@@ -407,9 +407,9 @@ class CampaignPage(Page):
         for part in self.room.objects[2:]:
             part.visible = view is not None
         if view is None:  # the fields stay, to choose something else
-            self.table.object = "<p>No scenario has all of these values.</p>"
+            self.table.html = "<p>No scenario has all of these values.</p>"
             return
-        self.table.object = standings_html(view, self.display)
+        self.table.html = standings_html(view, self.display)
         if not self.axes:
             return
         x = self.axes[self.across.value]
@@ -423,4 +423,4 @@ class CampaignPage(Page):
             self.slice, self._slice_of = SweepLines(part), (x.path, *part["errors"])
             self.pane[:] = [pn.pane.Bokeh(self.slice.figure, **WIDE)]
         self.slice.draw(part, self.display.dark)
-        self.legend.object = legend({name: name_label(name) for name in part["errors"]}, self.display.dark)
+        self.legend.html = legend({name: name_label(name) for name in part["errors"]}, self.display.dark)

@@ -463,7 +463,7 @@ class ClosedLoopPage(Page):
         work = self.work
         doing = work.line() if work.place else "computing …"
         said = {RUNNING: doing, FAILED: f"No closed loop: {work.message}"}.get(work.state, "")
-        self.note.object = f'<p class="text" role="status">{escape(said)}</p>' if said else ""
+        self.note.html = f'<p class="text" role="status">{escape(said)}</p>' if said else ""
         for room in (self.cards, *self._rooms):  # of other results
             room.visible = work.state != FAILED
 
@@ -488,10 +488,10 @@ class ClosedLoopPage(Page):
                 drawn.fit(self.cards.hidden_lines)
             if self.results is not None:
                 envelope = self.uncertain.finding
-                self.verdict.object = loop_verdict_html(self.results, self.display, envelope if self.uncertain.complete else None)
-                self.table.object = loop_html(self.results, self.display, envelope)
+                self.verdict.html = loop_verdict_html(self.results, self.display, envelope if self.uncertain.complete else None)
+                self.table.html = loop_html(self.results, self.display, envelope)
                 self.uncertain.draw(self.cards.hidden_lines)
-                self.margins.object = margins_html(self.results, self.display)
+                self.margins.html = margins_html(self.results, self.display)
                 self.cards.show(self._items(self.results))
 
     def _choose(self, *_: object) -> None:
@@ -511,7 +511,7 @@ class ClosedLoopPage(Page):
         if shown is None:
             return
         found = loop_verdict(shown.result, self.display.mode)
-        main = [place.observer for place in found.named] if found else [*CONTROLLERS]
+        main = [place.observer for place in found.named_places] if found else [*CONTROLLERS]
         self._main = [name for name in CONTROLLERS if name not in main]
         self.cards.hidden_lines = self._main
 

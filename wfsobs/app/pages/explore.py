@@ -28,7 +28,7 @@ from wfsobs.app.pages.parts import (
 )
 from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
-from wfsobs.app.style import html, sheets
+from wfsobs.app.style import HtmlText, html, sheets
 from wfsobs.app.views.main_lines import MainLines
 from wfsobs.app.views.plots import call
 from wfsobs.app.views.spectra import MODEL, PEAKS, SpectraFigures
@@ -149,7 +149,7 @@ class Explore(Page):
         head = pn.Column(self.verdicts[target].pane, cards, **WIDE, stylesheets=[HEAD, BELOW_FIGURES])
         return pn.Column(head, figures, below, **WIDE, stylesheets=sheets("box"))
 
-    def _room(self, target: str, caption: pn.pane.HTML, pane: pn.pane.Bokeh) -> pn.Column:
+    def _room(self, target: str, caption: HtmlText, pane: pn.pane.Bokeh) -> pn.Column:
         """Lay out a figure; those of the first target stand there at once, the others have their room."""
         if target == TARGETS[0]:
             return pn.Column(caption, pane, **TALL)
@@ -183,5 +183,5 @@ class Explore(Page):
             self.lines.choose(target, names)
 
 
-def _caption(text: str, marks: str = "") -> pn.pane.HTML:
+def _caption(text: str, marks: str = "") -> HtmlText:
     return html(f'<div class="caption">{escape(text)}{marks}</div>', margin=(8, 0, 0, 0))

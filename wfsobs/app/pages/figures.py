@@ -62,8 +62,8 @@ class _Sheet:
             for n in self.names
         )
         title = escape(f"Figure {self.figure.number} of the paper: {self.figure.title}")
-        self.head.object = f'<h2 class="title">{title}</h2><div class="caption legend">{legend}</div>'
-        self.caption.object = f'<p class="text">{escape(self.figure.caption)} {escape(self._errors(results, display))}</p>'
+        self.head.html = f'<h2 class="title">{title}</h2><div class="caption legend">{legend}</div>'
+        self.caption.html = f'<p class="text">{escape(self.figure.caption)} {escape(self._errors(results, display))}</p>'
         for drawn in self.plots:
             drawn.draw(results, display)
 

@@ -402,7 +402,7 @@ class IdentifyPage(Page):
         if task.state in (DONE, FAILED):
             self.of = task.result if task.state == DONE else None
         said = f'<p class="failure">No spectrum: {escape(task.message)}</p>' if task.state == FAILED else ""
-        self.note.object = f'<p class="text">{task.line()}</p>' if task.place else said
+        self.note.html = f'<p class="text">{task.line()}</p>' if task.place else said
         if task.state != RUNNING:
             self.redraw()
 
@@ -418,13 +418,13 @@ class IdentifyPage(Page):
         diameter, column = shown.scenario.telescope.diameter, self.display.column
         result, record = self._model_and_record()
         mode = result.modes[column] if result and column < len(result.modes) else None
-        self.legend.object = legend(NAMES, self.display.dark)
+        self.legend.html = legend(NAMES, self.display.dark)
         self.figure.draw_measured(of, self.display, diameter)
         self.figure.draw_fit(mode, fitted_spectrum(mode, result) if mode and result else None, self.display, diameter)
         self.figure.restyle(self.display.dark)
         if result and record:
-            self.verdict.object = verdict_html(result)
-            self.table.object = identification_html(mode, self.display, diameter) if mode else ""
+            self.verdict.html = verdict_html(result)
+            self.table.html = identification_html(mode, self.display, diameter) if mode else ""
             replaced = self.store.source is None and self._scenario == self.store.scenario
             self.stale.param.update(object=REPLACED if replaced else EARLIER, visible=not same_measurements(record, of.record))
 
@@ -466,6 +466,6 @@ class Suggestion:
         running, used = bool(work and work.state == RUNNING), bool(self.page and self.page.is_used)
         said = IDENTIFIED if used else work.line("Identifying") if work and running else (work and work.message) or NEXT
         with pn.io.hold():
-            self.words.object = f'<p class="text" role="status">{escape(said)}</p>'
+            self.words.html = f'<p class="text" role="status">{escape(said)}</p>'
             self.button.param.update(visible=not used, disabled=running or self.store.run.state != DONE)
             self.view.visible = isinstance(self.store.source, LoadedRecord)

@@ -37,13 +37,12 @@ from wfsobs.app.pages.live_figures import (
     RollingTraces,
     Stars,
     Waterfall,
-    live_text,
 )
 from wfsobs.app.pages.parts import HALVES, WIDE, Page, box, boxes, example, figure_with_caption, group, legend, line, text
 from wfsobs.app.service import IDLE, Post
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
-from wfsobs.app.style import look
+from wfsobs.app.style import html, look
 from wfsobs.app.views.spectrum_editor import Frames, SpectrumEditor
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.error_spectra import Theory
@@ -139,9 +138,9 @@ class LiveRoom:
         self.waterfall: Final = Waterfall()
         self.latencies: Final = LatencyHistogram(painter)
         self.stars: Final = Stars(painter)
-        self.table, self.control_table, self.news, self.peaks = (live_text() for _ in range(4))
+        self.table, self.control_table, self.news, self.peaks = (html() for _ in range(4))
         self.editor: SpectrumEditor | None = None
-        self.legend: Final = live_text()
+        self.legend: Final = html()
         self._second = 0
         self._bounds: Bounds = {}
         self._spectra_room = figure_with_caption("Spectra", self.spectra.figure)
@@ -201,14 +200,14 @@ class LiveRoom:
 
     def _draw_tables(self, loop: LiveLoop, view: LiveView, target: str, scale: float) -> None:
         self._bounds = loop.workshop.bounds(loop.scenario)
-        self.legend.object = self._legend(loop, target)
+        self.legend.html = self._legend(loop, target)
         d, seconds = self.display, self.controls.window.value
         of = (d.column, d.unit, d.dark)
         key = ("table", target, tuple(self._bounds), *of)
-        self.table.object = view.once(key, lambda: live_html(loop, view, target, d, scale, self._bounds))
-        self.control_table.object = view.once(("controls", seconds, *of), lambda: control_html(loop, seconds, d))
-        self.news.object = events_html(loop.events, loop.sampling.dt)
-        self.peaks.object = peaks_html(loop.workshop.change, scale, self.display.unit_label)
+        self.table.html = view.once(key, lambda: live_html(loop, view, target, d, scale, self._bounds))
+        self.control_table.html = view.once(("controls", seconds, *of), lambda: control_html(loop, seconds, d))
+        self.news.html = events_html(loop.events, loop.sampling.dt)
+        self.peaks.html = peaks_html(loop.workshop.change, scale, self.display.unit_label)
 
     def _legend(self, loop: LiveLoop, target: str) -> str:
         """Write what the lines of the figures are."""
@@ -248,7 +247,7 @@ class LivePage(Page):
         self.buttons: Final = c.buttons
         self.link = c.link
         self.intro: Final = text(INTRO)
-        self.status: Final = live_text()
+        self.status: Final = html()
         self.room: Final = boxes()
         self.room.visible = False
         self.pulse: Final = Pulse(width=0, height=0, margin=0)
@@ -354,7 +353,7 @@ class LivePage(Page):
             self.controls.tell(loop)
         view = loop.readings.look(loop.view, self.controls.window.value, anew=not loop.is_playing)
         with pn.io.hold():
-            self.status.object = f'<p class="text" role="status">{escape(status_line(loop, view))}</p>'
+            self.status.html = f'<p class="text" role="status">{escape(status_line(loop, view))}</p>'
             self.buttons["Pause"].label = "Pause" if loop.is_playing else "Play"
             if view.n > 1:
                 self._draw_room(loop, view)
@@ -415,7 +414,7 @@ class LivePage(Page):
         waiting = work.line() if work.place else "Starting …"
         said = {RUNNING: waiting, FAILED: work.message}.get(work.state, "Stopped" if self.picture else "")
         if not runs:
-            self.status.object = f'<p class="{"failure" if work.state == FAILED else "text"}" role="status">{escape(said)}</p>'
+            self.status.html = f'<p class="{"failure" if work.state == FAILED else "text"}" role="status">{escape(said)}</p>'
         if self._beat is not None:
             self.store.session.post(self._pace)  # once the page stands: what comes before that does not reach it
 

@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import numpy as np
 import panel as pn
-import param
 from bokeh.core.validation import silence
 from bokeh.core.validation.warnings import MISSING_RENDERERS
 from bokeh.model import Model
@@ -20,7 +19,7 @@ from bokeh.plotting import figure
 from wfsobs.app.component import Component
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.pages.parts import WIDE, grid_style
-from wfsobs.app.style import html, look, script, sheets
+from wfsobs.app.style import html, look, script
 from wfsobs.app.views.plots import FigureLines, call, envelope, envelope_times, new_figure
 from wfsobs.app.views.traces import WINDOW_S
 from wfsobs.app.work import TRUTH
@@ -43,29 +42,17 @@ PATIENCE = 10.0
 
 
 class Pulse(Component):
-    """Tells when a picture has been painted."""
+    """Has the browser make the changes of a picture, and tells when it has painted it."""
 
-    picture: param.Integer[int] = param.Integer(0, doc="Number of the last one.")
-    changes: param.List[list[Any]] = param.List([], doc="What a Painter changes with it.")
     _esm = script("pulse")
 
     def __init__(self, **params: Any):
         self.answer: int = -1
+        self.picture: int = 0
+        self.changes: list[Any] = []
         self._time = 0.0
         self._waiting: Callable[[], None] | None = None
         super().__init__(self._take, **params)
-
-    def _update_model(self, events: Any, msg: dict[str, Any], root: Any, model: Any, doc: Any, comm: Any) -> None:
-        """Send what changes alone: the usual way looks at all that a component may have, which takes as long as a figure."""
-        if not set(msg) <= {"picture", "changes"}:
-            super()._update_model(events, msg, root, model, doc, comm)
-            return
-        ref = root.ref["id"]
-        self._changing[ref] = list(msg)  # it comes from here, not from the browser
-        try:
-            model.data.update(**msg)
-        finally:
-            self._changing.pop(ref, None)
 
     def _take(self, data: dict[str, Any]) -> None:
         if isinstance(number := data.get("painted"), int):
@@ -90,9 +77,11 @@ class Pulse(Component):
             act()
 
     def beat(self) -> None:
-        """Ask for an answer to the picture that has been sent."""
+        """Send a picture, and ask for an answer to it. By message: a property of a component takes as long as a figure."""
         self._time = monotonic()
         self.picture += 1
+        self._send_msg({"picture": self.picture, "changes": self.changes})
+        self.changes = []
 
 
 class Painter:
@@ -531,15 +520,3 @@ class Stars:
         step = max(1, n // POINTS)
         for name, detector in self._detectors.items():
             detector.draw(scale * signals[name][-n:, :2][::-step][::-1], self._reach, radius, dark)
-
-
-class LiveText(pn.pane.HTML):
-    """HTML of which only the text is sent when it changes: as a usual pane does, all else is looked at, for milliseconds."""
-
-    def _update(self, ref: str, model: Any) -> None:
-        model.text = self._transform_object(self.object)["object"]
-
-
-def live_text() -> LiveText:
-    """Make one in the page's style."""
-    return LiveText("", **WIDE, stylesheets=sheets("style"))

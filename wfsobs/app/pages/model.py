@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Final
 
-import panel as pn
-
 from wfsobs.app.display import Display
-from wfsobs.app.pages.parts import WIDE, Page
+from wfsobs.app.pages.parts import Page
 from wfsobs.app.render import render, short
 from wfsobs.app.store import Store
-from wfsobs.app.style import sheets, swatch
+from wfsobs.app.style import HtmlText, html, sheets, swatch
 from wfsobs.evaluation.description import Description, describe
 from wfsobs.observers import OBSERVERS
 from wfsobs.typing import Array
@@ -21,10 +19,10 @@ class ModelPage(Page):
 
     def __init__(self, store: Store, display: Display):
         super().__init__(store, display, "mode", "dark")
-        self.pane: Final = pn.pane.HTML("", **WIDE, stylesheets=sheets("style", "model"))
+        self.pane: Final = html(stylesheets=sheets("style", "model"))
         store.param.watch(self.redraw, "scenario")
 
-    def view(self) -> pn.pane.HTML:
+    def view(self) -> HtmlText:
         """Return the contents of the page."""
         return self.pane
 
@@ -32,7 +30,7 @@ class ModelPage(Page):
         """Write the equations."""
         scenario = self.store.scenario
         mode = min(self.display.column, len(scenario.modes) - 1)
-        self.pane.object = model_html(describe(scenario, mode), self.display.dark)
+        self.pane.html = model_html(describe(scenario, mode), self.display.dark)
 
 
 def model_html(it: Description, dark: bool) -> str:

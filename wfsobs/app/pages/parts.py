@@ -23,7 +23,7 @@ from wfsobs.app.jobs import CANCELLED, DONE, RUNNING
 from wfsobs.app.render import render
 from wfsobs.app.service import IDLE, BackgroundTask
 from wfsobs.app.store import Store
-from wfsobs.app.style import HEARD, WIDE, html, sheets, swatch
+from wfsobs.app.style import HEARD, WIDE, HtmlText, html, sheets, swatch
 from wfsobs.app.views.plots import call
 from wfsobs.settings.errors import SettingError
 from wfsobs.settings.parameters import hint
@@ -290,18 +290,18 @@ BELOW_FIGURES = "@media (max-height: 560px) { :host { order: 1; } }"
 """Style of what stands above the figures of its box where there is height for both."""
 
 
-def heading(title: str, about: str = "") -> pn.pane.HTML:
+def heading(title: str, about: str = "") -> HtmlText:
     """Make the title of a box; about : beside it, what is in the box."""
     words = f'<span class="about">{escape(about)}</span>' if about else ""
     return html(f'<h2 class="title">{escape(title)}</h2>{words}', sizing_mode=None)
 
 
-def text(content: str) -> pn.pane.HTML:
+def text(content: str) -> HtmlText:
     """Make a paragraph."""
     return html(f'<p class="text">{escape(content)}</p>')
 
 
-def example(name: str, results: Any) -> pn.pane.HTML:
+def example(name: str, results: Any) -> HtmlText:
     """Draw an example of the results of a page, until they are visible themselves."""
     pane = html(render("example.html", name=name))
     pane.visible = not results.visible

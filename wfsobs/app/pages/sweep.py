@@ -447,7 +447,7 @@ class SweepPage(Page):
             said = f"{counts} scenarios × {seeds} = {sweep.n_runs} runs, about {max(sweep.seconds, 1.0):.0f} s"
             kind = "text"
         self.starter.start.disabled = kind == "failure"
-        self.estimate.object = f'<p class="{kind}" role="status">{escape(said)}</p>'
+        self.estimate.html = f'<p class="{kind}" role="status">{escape(said)}</p>'
 
     def _so_far(self) -> str:
         results = self.results
@@ -470,7 +470,7 @@ class SweepPage(Page):
         single = len(results.sweep.axes) == 1
         for target in SCORED:
             self.maps[target].draw(map_grid(results, target, self.display))
-            self.verdicts[target].object = f'<p class="text">{escape(verdict_of_sweep(results, target, self.display))}</p>'
+            self.verdicts[target].html = f'<p class="text">{escape(verdict_of_sweep(results, target, self.display))}</p>'
             if single:
                 self._draw_lines(results, target)
             self.panes[target].visible = self.legends[target].visible = single
@@ -488,7 +488,7 @@ class SweepPage(Page):
             ]
         lines = self.lines[target]
         lines.draw(part, self.display.dark)
-        self.legends[target].object = legend({name: look(name).label for name in lines.sources}, self.display.dark)
+        self.legends[target].html = legend({name: look(name).label for name in lines.sources}, self.display.dark)
 
     def _compare(self, *_: Any) -> None:
         """Whether all other settings are still those of the sweep."""

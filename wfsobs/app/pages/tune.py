@@ -319,7 +319,7 @@ class TunePage(Page):
         targets = list(OBSERVERS[name].targets)
         self.target.param.update(options=targets, value=VIBRATION if VIBRATION in targets else targets[0])
         names = ", ".join(map(setting_name, OBSERVERS[name].tunable.usual))
-        self.search_space.object = f'<p class="text">Searched: {escape(names)}.</p>'
+        self.search_space.html = f'<p class="text">Searched: {escape(names)}.</p>'
 
     def _history(self) -> tuple[Evaluation, ...]:
         """Of the tuning under way, or of the last one."""
@@ -343,12 +343,12 @@ class TunePage(Page):
     def draw(self) -> None:
         """Draw how it went, and what came of it."""
         tuned, (unit, diameter) = self.finding, self._scale()
-        self.legend.object = legend(LEGEND, self.display.dark)
+        self.legend.html = legend(LEGEND, self.display.dark)
         self.figure.draw(self._history(), self.measure, unit, diameter)
         self.figure.restyle(self.display.dark)
         self.history.visible, self.outcome.visible = bool(self._history()), tuned is not None
         if tuned is not None:
-            self.table.object = tuning_html(tuned, self.display, diameter)
+            self.table.html = tuning_html(tuned, self.display, diameter)
         self._compare()
 
     def _compare(self, *_: Any) -> None:

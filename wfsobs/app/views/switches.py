@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
-import panel as pn
 import panel_material_ui as pmui
 from markupsafe import Markup
 
@@ -91,7 +90,7 @@ class UnitSwitch:
             variant="outlined",
             stylesheets=[HEARD],
         )
-        self.note: Final = pn.pane.HTML(NO_MAS, visible=False, margin=0)
+        self.note: Final = html(NO_MAS, visible=False, margin=0)
         self.buttons.param.watch(self._on_choice, "value")
         display.param.watch(self._follow, ["mode", "unit"])
 
@@ -162,7 +161,7 @@ class SeedSwitch:
         return f'<span class="caption seeds">{said}</span>'
 
     def _refresh(self, *_: object) -> None:
-        self.line.object = self.text()
+        self.line.html = self.text()
 
 
 PIN, UNPIN = "Pin this run to compare others with it", "Unpin: compare with no other run"
@@ -201,7 +200,7 @@ class Pinning:
             self.note.visible = bool(runs)
         self.button.disabled = not (runs or self.history.current)
         if runs and shown is not None:
-            self.note.object = str(macro("compared", [self._item(run, shown.scenario) for run in runs]))
+            self.note.html = str(macro("compared", [self._item(run, shown.scenario) for run in runs]))
 
     def _item(self, run: ComparedRun, now: Scenario) -> tuple[Markup, str, str]:
         """Describe a run: its mark, its name, and what has changed since."""

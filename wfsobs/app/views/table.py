@@ -69,7 +69,7 @@ class Table:
         display.param.watch(self._refresh, ["mode", "unit", "dark", "compared_runs"])
 
     def _refresh(self, *_: object) -> None:
-        self.pane.object = self.html()
+        self.pane.html = self.html()
 
     def html(self) -> str:
         """Write the table."""

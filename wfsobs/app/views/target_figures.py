@@ -45,7 +45,7 @@ class Stretch:
         on_settle([times, frequencies], self._refresh)
 
     def _refresh(self, *_: object) -> None:
-        self.pane.object = self.html()
+        self.pane.html = self.html()
 
     def html(self) -> str:
         """Write the errors; nothing where there is no truth or nothing is zoomed."""

@@ -50,7 +50,7 @@ class VerdictLine:
         display.param.watch(self._refresh, ["mode", "unit"])
 
     def _refresh(self, *_: object) -> None:
-        self.pane.object = self.html()
+        self.pane.html = self.html()
 
     def html(self) -> str:
         """Return the title and the sentences; while observers are at work those before, dimmed; without a truth what there is."""
