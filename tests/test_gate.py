@@ -184,6 +184,14 @@ def test_one_percent_of_outliers_costs_less_than_five_percent(ut4: Record) -> No
     assert errors(with_outliers(ut4, 40.0)[0], gate="off")[kf] > 2.0 * clean[kf], "without a gate they ruin it"
 
 
+def test_short_records_without_outliers_lose_nothing(ut4: Record) -> None:
+    """Half a second of each: an autoregression of 64 weights fitted to few samples predicts badly."""
+    for start in range(0, 19_500, 125):
+        gate = OutlierGate(ut4.n_modes, REJECT)
+        gate.check_all(ut4.z[start : start + 500])
+        assert gate.outliers.sum() == 0, start
+
+
 def test_outliers_are_found_and_counted(ut4: Record) -> None:
     broken, hit = with_outliers(ut4, 40.0)
     frames = np.flatnonzero(hit)

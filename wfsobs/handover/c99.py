@@ -109,6 +109,7 @@ GATE_NUMBERS = (
     "OPEN",
     "FORGET",
     "LASTING",
+    "EARLY",
     "EARLIEST",
     "MEDIAN",
     "RIDGE",

@@ -39,8 +39,10 @@ RUN = 5
 not known well enough."""
 OPEN = 20
 """Samples that pass then, while the deviation is doubled."""
-EARLIEST = 4.0
-"""Times the level until the second fit: the first one has hardly more samples than weights."""
+EARLY = 1.0
+"""Part of itself by which the level is larger after the first block, less with every one: a fit to few samples predicts badly."""
+EARLIEST = 3.0
+"""The same until the second fit: the first one has hardly more samples than weights."""
 PACE = 0.125
 """Weight of a block in the deviation, by its median, and in the part of samples that are outliers."""
 USUAL, RAREST, START = 1e-2, 5e-5, 1e-3
@@ -165,7 +167,8 @@ class OutlierGate:
 
     def _limit(self) -> Array:
         rarity = (USUAL / np.clip(self._part, RAREST, USUAL)) ** RARITY
-        return self.settings.level * rarity * (1.0 if self.count >= 2 * BLOCK else EARLIEST) * self._deviation
+        blocks = self.count // BLOCK
+        return self.settings.level * rarity * (1.0 + (EARLY / blocks if blocks > 1 else EARLIEST)) * self._deviation
 
     def _count(self, is_outlier: Array) -> None:
         """Count a sample, and open the gate where outliers last.
