@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 from collections import Counter
 from collections.abc import Collection
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -282,7 +283,7 @@ class TestReuse:
     def test_what_follows_from_an_estimate_is_of_the_truth_too(self, before: tuple[Memo, Record, list[Any]]) -> None:
         memo, record, kept = before
         assert record.turbulence is not None
-        other = Record(**{**vars(record), "turbulence": record.turbulence + 1.0})
+        other = replace(record, turbulence=record.turbulence + 1.0)
         made = [[], []]
         for of, list_of in zip((record, other), made, strict=True):
             known = RecordMemo(memo, of)
@@ -309,7 +310,7 @@ class TestReuse:
         memo, record, _ = before
         y = record.y_lgs.copy()
         y[-1, 0] = np.nextafter(y[-1, 0], np.inf)
-        moved = Record(**{**vars(record), "y_lgs": y})
+        moved = replace(record, y_lgs=y)
         known = RecordMemo(memo, moved)
         list(each_estimate(moved, BASE, observers=["kf-lgs", "persistence"], memo=known))
         assert known.known_observers == set()
