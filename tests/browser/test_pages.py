@@ -150,7 +150,10 @@ def test_a_brush_over_time_and_over_a_band(wide: Page) -> None:
     figure = page.get_by_role("figure", name="Vibration spectrum")
     figure.scroll_into_view_if_needed()
     until(page, PAINTED, arg="Vibration spectrum")
-    at = figure.bounding_box()
+    before = None
+    while (at := figure.bounding_box()) != before:  # texts that come above move it
+        before = at
+        page.wait_for_timeout(200)
     y = at["y"] + at["height"] / 2
     page.mouse.move(at["x"] + 0.5 * at["width"], y)
     page.mouse.down()
