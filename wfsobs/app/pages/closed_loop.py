@@ -56,6 +56,7 @@ from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label, loop_verdict
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import Row as Score
 from wfsobs.evaluation.scores import BOUNDS
+from wfsobs.evaluation.verdict import Verdict
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
 
@@ -271,9 +272,10 @@ def loop_html(results: LoopResults, display: Display, envelope: PlantEnvelope | 
     return f"{table('Controllers', columns, [('', body)])}{limits_note(rows)}{notes}"
 
 
-def loop_verdict_html(results: LoopResults, display: Display, envelope: PlantEnvelope | None = None) -> str:
+def loop_verdict_html(
+    results: LoopResults, found: Verdict | None, display: Display, envelope: PlantEnvelope | None = None
+) -> str:
     """Write the controllers with the smallest residual by prior knowledge, and the limit; and the best over an envelope."""
-    found = loop_verdict(results.result, display.mode)
     scale = per_micrometre(display.unit, results.result.scenario.telescope.diameter)
     said = [*found.sentences(scale, display.unit_label)] if found else []
     if envelope is not None:
@@ -359,6 +361,7 @@ class ClosedLoopPage(Page):
         super().__init__(store, display, "mode", "unit")
         self.work: Final = BackgroundTask(store.session, title="Closed loop")
         self._of = object()
+        self._found: Verdict | None = None
         self._rooms = list[pn.viewable.Viewable]()
         self.note: Final = html()
         self.verdict: Final = html()
@@ -472,6 +475,7 @@ class ClosedLoopPage(Page):
         shown = self.results
         if shown is None or self.display.column >= len(shown.result.scenario.modes):
             return
+        self._found = loop_verdict(shown.result, self.display.mode)
         for drawn in self._figures:
             drawn.draw(shown, self.display)
         if not self._is_chosen:
@@ -488,7 +492,8 @@ class ClosedLoopPage(Page):
                 drawn.fit(self.cards.hidden_lines)
             if self.results is not None:
                 envelope = self.uncertain.finding
-                self.verdict.html = loop_verdict_html(self.results, self.display, envelope if self.uncertain.complete else None)
+                known = envelope if self.uncertain.complete else None
+                self.verdict.html = loop_verdict_html(self.results, self._found, self.display, known)
                 self.table.html = loop_html(self.results, self.display, envelope)
                 self.uncertain.draw(self.cards.hidden_lines)
                 self.margins.html = margins_html(self.results, self.display)
@@ -507,11 +512,9 @@ class ClosedLoopPage(Page):
 
     def _show_main(self) -> None:
         """Show the few lines that matter: of those that the verdict names."""
-        shown = self.results
-        if shown is None:
+        if self.results is None:
             return
-        found = loop_verdict(shown.result, self.display.mode)
-        main = [place.observer for place in found.named_places] if found else [*CONTROLLERS]
+        main = [place.observer for place in self._found.named_places] if self._found else [*CONTROLLERS]
         self._main = [name for name in CONTROLLERS if name not in main]
         self.cards.hidden_lines = self._main
 
@@ -519,8 +522,7 @@ class ClosedLoopPage(Page):
         """Describe a card per controller."""
         scale = per_micrometre(self.display.unit, results.result.scenario.telescope.diameter)
         left = {r["controller"]: r for r in results.rows if r["mode"] == self.display.mode}
-        found = loop_verdict(results.result, self.display.mode)
-        intervals = {place.observer: place.interval for place in found.places} if found else {}
+        intervals = {place.observer: place.interval for place in self._found.places} if self._found else {}
         out = []
         for name in CONTROLLERS:
             row = left.get(name)
