@@ -128,13 +128,7 @@ def probed(loops: int) -> None:
         z = disturbance_of(scenario.replace({"run.seed": i})).z
         dead, gain, angle, omega = rng.uniform(1.5, 2.5), rng.uniform(0.8, 1.2), rng.uniform(-0.2, 0.2), 2.0 * pi * frequency * DT
         mirror = ActingPlant(TruePlant(gain * rotation_matrix(angle), dead, 0.0, omega, damping))
-        own, integral, correction, y, u = (
-            probe.commands(N, 2, DT, rng),
-            np.zeros(2),
-            np.zeros(2),
-            np.zeros((N, 2)),
-            np.zeros((N, 2)),
-        )
+        own, (integral, correction), (y, u) = probe.commands(N, 2, DT, rng), np.zeros((2, 2)), np.zeros((2, N, 2))
         for k in range(N):
             y[k] = z[k] + correction
             integral = integral - scenario.loop.gain * y[k]
@@ -145,32 +139,15 @@ def probed(loops: int) -> None:
         for j, (n, right) in enumerate(zip((found.common_delay, found.common_gain, found.degrees), truth, strict=True)):
             if n.value is not None and n.sd is not None:
                 errors[i, j], scaled[i, j] = (n.value - right) / (gain if j == 1 else 1.0), (n.value - right) / n.sd
-        print(
-            i,
-            frequency,
-            damping,
-            np.round(errors[i], 4),
-            np.round(scaled[i], 2),
-            f"{found.chance:.0e} {found.rigid:.0e}",
-            flush=True,
-        )
+        what = np.round(errors[i], 4), np.round(scaled[i], 2), f"{found.chance:.0e} {found.rigid:.0e}"
+        print(i, frequency, damping, *what, flush=True)
     bound = np.array(list(probe.bound.values()))
-    for name, which in [(str(m), np.arange(loops) % len(MIRRORS) == i) for i, m in enumerate(MIRRORS)] + [
-        ("all", np.ones(loops, bool))
-    ]:
+    of_mirror = {str(mirror): np.arange(loops) % len(MIRRORS) == i for i, mirror in enumerate(MIRRORS)}
+    for name, which in (of_mirror | {"all": np.ones(loops, bool)}).items():
         rms, known = np.sqrt(np.nanmean(errors[which] ** 2, axis=0)), np.isfinite(errors[which])
         inside = (np.abs(scaled[which]) < 1.96).sum(axis=0) / known.sum(axis=0)
-        print(
-            name,
-            "rms",
-            np.round(rms, 4),
-            "over the bound",
-            np.round(rms / bound, 2),
-            "95 %:",
-            np.round(inside, 3),
-            "of",
-            known.sum(axis=0),
-        )
+        shares = f"95 %: {np.round(inside, 3)} of {known.sum(axis=0)}"
+        print(f"{name}: rms {np.round(rms, 4)}, over the bound {np.round(rms / bound, 2)}, {shares}")
 
 
 if __name__ == "__main__":

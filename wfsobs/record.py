@@ -264,9 +264,9 @@ class Record(Signals):
 
     @cached_property
     def training_record(self) -> Record | None:
-        """The training data as a record that has the gate of this one, or None: whoever learns from it, the gate is run once."""
+        """Training data as a record with the gate of this one, which runs once for all observers; None without training data."""
         t = self.training
-        return t and Record(t.y_lgs, t.u, self.dt, open_loop_y=t.open_loop_y, delay=self.delay, gate=self.gate)
+        return None if t is None else Record(t.y_lgs, t.u, self.dt, open_loop_y=t.open_loop_y, delay=self.delay, gate=self.gate)
 
     @property
     def outliers(self) -> int:

@@ -11,6 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bokeh.document import Document
+from bokeh.models import ColumnDataSource
+from bokeh.plotting import figure
 
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.jobs import FAILED, RUNNING, Job
@@ -18,7 +21,7 @@ from wfsobs.app.limits import NONE
 from wfsobs.app.live_work import record_saves
 from wfsobs.app.pages.live import LivePage
 from wfsobs.app.pages.live_controls import events_html, peaks_html, ranking
-from wfsobs.app.pages.live_figures import LiveMarks
+from wfsobs.app.pages.live_figures import LiveMarks, Painter
 from wfsobs.app.pages.pages import EXPLORE, LIVE
 from wfsobs.app.render import number
 from wfsobs.app.serve import opens_on_live
@@ -173,6 +176,28 @@ def test_pictures_wait_for_the_browser(page: LivePage, monkeypatch: pytest.Monke
     assert len(drawn) == 3
     page.pulse._handle_msg({"painted": "x"})
     assert not page.pulse.is_free
+
+
+def test_changes_between_two_pictures_are_all_sent(page: LivePage, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A change of the unit draws at once, and the next picture soon after; what the first one has changed may not come again."""
+    fig, doc, sent = figure(), Document(), list[Any]()
+    source = ColumnDataSource({"x": [0.0]})
+    for model in (fig, source):
+        doc.add_root(model)
+    monkeypatch.setattr(page.pulse, "_send_msg", sent.append)
+    painter = Painter(page.pulse)
+    page.pulse._handle_msg({"painted": 0})
+    for act in (
+        lambda: painter.data(fig, source, {"x": np.array([1.0])}),
+        lambda: painter.update(fig, fig.x_range, start=2.0),
+        lambda: painter.data(fig, source, {"x": np.array([3.0])}),
+    ):
+        act()
+        painter.send()
+    page.pulse.beat()
+    told = [(step[1], step[4], numbers.tolist()) for it in sent[:-1] for [step], numbers in [it["changes"]]]
+    assert told == [(source.id, [], [1.0]), (fig.x_range.id, [["start", 2.0]], []), (source.id, [], [3.0])]
+    assert sent[-1] == {"picture": page.pulse.picture}, "the answer is to what came before"
 
 
 def test_one_place_is_kept_for_jobs_that_end() -> None:

@@ -96,7 +96,7 @@ NOTE = """(name) => {
   if (!source || !pulse || view.el.getBoundingClientRect().top <= innerHeight) return false
   const changes = window.changes = [], pictures = window.pictures = []
   source.properties.data.change.connect(() => changes.push(performance.now()))
-  pulse.on_event("esm_event", () => pictures.push(performance.now()))
+  pulse.on_event("esm_event", ({data}) => { if (data.picture) pictures.push(performance.now()) })
   return true
 }"""
 """Once a figure is there, below the window: note the times at which it changes, and those of all pictures [ms]."""

@@ -131,7 +131,7 @@ WIDE: Mapping[str, Any] = MappingProxyType({"sizing_mode": "stretch_width", "mar
 
 
 class HtmlText(HtmlComponent):
-    """HTML that is brought up to date in place: one may read in it, or have the focus there, while numbers come."""
+    """HTML that is updated in place, so that focus and open definitions survive new numbers."""
 
     _esm = script("patch", "text")
 

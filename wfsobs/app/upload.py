@@ -138,9 +138,10 @@ class PreviewView:
         """Show what was read of the file of this name, or why it could not be."""
         known = None if isinstance(preview, RecordError) else preview
         self.figure.yaxis.axis_label = "PSD [µm²/Hz]" if isinstance(preview, SpectrumPreview) else "PSD of z [µm²/Hz]"
-        self.text.html = f"<p><b>{escape(name)}</b></p>{_list(known.lines() if known else [str(preview)])}"
+        words = f"<p><b>{escape(name)}</b></p>{_list(known.lines() if known else [str(preview)])}"
         if isinstance(preview, Preview):
-            self.text.html += f'<p>Evidence in the data:</p><div class="evidence">{_list(preview.reading.lines())}</div>'
+            words += f'<p>Evidence in the data:</p><div class="evidence">{_list(preview.reading.lines())}</div>'
+        self.text.html = words
         self.figure.visible = known is not None
         for mode, source in enumerate(self.sources):
             there = known is not None and mode < known.spectrum.shape[1]

@@ -52,8 +52,8 @@ export function render({model, el}) {
   const answer = () => requestAnimationFrame(() => model.send_msg({painted: picture}))
   model.on("msg:custom", (event) => {
     const sent = event.data ?? event
+    if (sent.changes) return change(sent.changes)
     picture = sent.picture
-    if (sent.changes.length) change(sent.changes)
     answer()
   })
   answer()

@@ -103,7 +103,7 @@ def interval_text(interval: Sequence[float] | None, scale: float) -> str:
 
 
 def uncertainty_text(x: float, interval: Sequence[float], write: Callable[[float], str]) -> str:
-    """Return how exactly a value is known, by `write`: half of its interval, or both ends of one that is wider than the value.
+    """Return half the width of an interval, or both of its ends where it is wider than the value, as formatted by `write`.
 
     >>> uncertainty_text(9.63, (9.21, 10.05), "{:.2f}".format), uncertainty_text(21.9, (2.57, 187.0), "{:.1f}".format)
     ('± 0.42', '(2.6 to 187.0)')

@@ -180,12 +180,12 @@ class Verdict:
 
     @property
     def named_places(self) -> tuple[Contender, ...]:
-        """Those whose errors the sentences say, the smallest first."""
+        """Places named in the sentences, in order of increasing error."""
         return tuple(place for place in self.places if place.observer in (*self._best_places, *ALWAYS))
 
     @property
     def _best_places(self) -> dict[str, Contender]:
-        """The best with each kind of prior knowledge, and of all."""
+        """Best place for each kind of prior knowledge, and overall, by observer."""
         of_kind = (place for kind in (NOTHING, PEAKS) if (place := self.best_with(kind)))
         return {place.observer: place for place in (*of_kind, self.best)}
 

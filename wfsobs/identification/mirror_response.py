@@ -1,7 +1,7 @@
-"""What a mirror with dynamics makes of commands: responses of a measurement, lag by lag, of gain 1.
+"""Impulse responses, of unit gain, of a measurement to the commands of a mirror with dynamics.
 
-Each has a delay, the group delay at low frequency, and two numbers of its shape. One is any response over few lags; the other
-that of a second-order mirror, which swings on.
+Each has a group delay at low frequency and two shape parameters: an arbitrary response over four lags, or that of a second-order
+mirror.
 """
 
 from __future__ import annotations
@@ -14,20 +14,23 @@ import numpy as np
 from wfsobs.typing import Array
 
 LAGS = 256
-"""Lags of a response, the first is 1."""
+"""Length of a response; its first lag is one frame."""
 
 RANGE = np.log([[0.03, 0.02], [1.0, 3.0]])
-"""Least and largest shape of a second-order mirror: natural frequency over the rate, damping ratio."""
+"""Bounds of the shape of a second-order mirror: logarithms of natural frequency over frame rate, and of damping ratio."""
 
 SHAPES = tuple((np.log(f), np.log(damping)) for f in (0.15, 0.3, 0.6) for damping in (0.3, 0.8))
-"""Where its search starts."""
+"""Starting points of its fit."""
 
 Response = Callable[[Array], Array]
-"""Of delay [frames] and shape (3,) to the response (LAGS,)."""
+"""From delay [frames] and shape, (3,), to the response, (LAGS,)."""
 
 
 def few_lags(base: int) -> Response:
-    """Return the responses of four lags around the whole part of a delay; a second difference moves neither gain nor delay."""
+    """Return the responses over four lags around a delay of `base` whole frames.
+
+    The shape is the size of two second differences, which change neither gain nor group delay at low frequency.
+    """
     return partial(_few_lags, base)
 
 
@@ -40,10 +43,12 @@ def _few_lags(base: int, x: Array) -> Array:
 
 
 def second_order(x: Array) -> Array:
-    """Return the response of a mirror of the natural frequency exp(x[1]) over the rate and the damping ratio exp(x[2]).
+    """Return the response of a second-order mirror, (LAGS,).
 
-    It holds a command for a frame and the sensor averages over one: second differences of the integral of its step response,
-    t - 2 damping / omega at last, which is its group delay.
+    x : delay [frames], logarithms of natural frequency over frame rate and of damping ratio, (3,)
+
+    The mirror holds a command for one frame and the sensor averages over one, so that the response is the second difference of
+    the integral of its step response. That integral tends to t - 2 damping / omega, the group delay at low frequency.
     """
     omega, damping = 2.0 * np.pi * np.exp(x[1]), np.exp(x[2])
     root = np.sqrt(complex(damping**2 - 1.0))

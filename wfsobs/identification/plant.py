@@ -60,8 +60,8 @@ EXCITED = 1e-3
 """Share of what is new in the commands that the measurements do not explain, from which on they have a probe."""
 
 PROBED, OTHERWISE, SWINGS = 0.05, 1e-4, 1.0
-"""Share from which on a probe tells the dynamics of the mirror, and is tested for what a plant leaves of it; the probability of
-that below which the commands act otherwise; log-likelihood by which a second-order mirror is likelier than any of few lags."""
+"""Share of a probe from which the mirror's dynamics are estimated, and the residual tested for what is left of the probe;
+probability below which this test rejects the plant; log-likelihood ratio from which a second-order mirror replaces few lags."""
 
 
 @dataclass(frozen=True)
@@ -308,11 +308,8 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
     common_gain = positive(number(common, k)) if one_delay and one_gain else PlantNumber()
     if rotation is not None and rotation.value is not None:
         rotation = replace(rotation, value=float(-((np.pi - rotation.value) % (2.0 * np.pi) - np.pi)))
-    uncertainty = (
-        data.uncertainty(each, mirror if rigid < OTHERWISE else each)
-        if all(n.value is not None for n in (*delay, *gain))
-        else np.inf
-    )
+    is_known = all(n.value is not None for n in (*delay, *gain))
+    uncertainty = data.uncertainty(each, mirror if rigid < OTHERWISE else each) if is_known else np.inf
     peaks, coloured = tuple(len(s.resonances) for s in each.spectra), any(s.background for s in each.spectra)
     numbers = delay, gain, rotation, common_delay, common_gain
     return GroupPlant(names, *numbers, uncertainty, peaks, coloured, excited, each.covariance, chance, rigid)

@@ -21,7 +21,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.fft import rfft
-from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from wfsobs.identification.mirror_response import RANGE, Response, second_order
@@ -52,7 +51,7 @@ each number of a spectrum beside that of the data, which keeps those that the da
 """
 
 SMALL = 1e-4
-"""Difference over which a response is differentiated."""
+"""Step of the finite differences of a response."""
 
 FAR = 0.05
 """Gain of the first guess below which, or over whose inverse, it is not taken for 1."""
@@ -111,20 +110,12 @@ class PlantLikelihood:
         """Return the Fourier transform of the columns (k, bins), such that its square is the periodogram."""
         return np.sqrt(2.0 * self.dt / self.n) * rfft(taper(self.n)[:, None] * x, axis=0)[1 : (self.n + 1) // 2].T
 
-    def with_spectra(
-        self,
-        theta: Array,
-        spectra: Sequence[Spectrum] = (),
-        most: int = PEAKS,
-        *,
-        plain: bool = True,
-        mirror: Response | None = None,
-    ) -> PlantFit:
+    def with_spectra(self, theta: Array, spectra: Sequence[Spectrum] = (), most: int = PEAKS, *, plain: bool = True) -> PlantFit:
         """Return a plant with first guesses of the spectra; missing samples are filled by those before.
 
         plain : without a background, which the commands of a wrong plant look like
         """
-        seen = self._mirror_signal(theta, mirror)
+        seen = self._mirror_signal(theta)
         z = self.y - seen
         for i, missing in enumerate(self.missing):
             z[:, i] = missing.interpolate(z[:, i]) if not spectra else missing.fill(z[:, i], spectra[i].psd(self.f))
@@ -132,13 +123,10 @@ class PlantLikelihood:
             self.Y = self._transform(z + seen)
         some = zip(z.T, spectra or [None] * self.k, strict=True)
         found = [quick_spectrum(x, self.dt, most, LOWEST, s, complete=not plain) for x, s in some]
-        return PlantFit(theta, [replace(s, background=None) if plain else s for s in found], mirror=mirror)
+        return PlantFit(theta, [replace(s, background=None) if plain else s for s in found])
 
-    def _mirror_signal(self, theta: Array, mirror: Response | None) -> Array:
+    def _mirror_signal(self, theta: Array) -> Array:
         """Return the commands as the measurements see them, (n, k)."""
-        if mirror is not None:
-            m = [lfilter(mirror(x), [1.0], u) for x, u in zip(self._of_modes(theta), self.u[1].T, strict=True)]
-            return np.array(m).T @ self._matrix(theta).T
         whole = np.minimum(theta[: self.k].astype(int), LONGEST)
         part = theta[: self.k] - whole
         m = [(1.0 - p) * self.u[d, :, j] + p * self.u[d + 1, :, j] for j, (d, p) in enumerate(zip(whole, part, strict=True))]
@@ -149,14 +137,9 @@ class PlantLikelihood:
         """Numbers of a plant but for the shape of its mirror."""
         return 2 * self.k + (self.k == 2)
 
-    def _of_modes(self, theta: Array) -> list[Array]:
-        """Return the delay of each mode, with the shape of the mirror."""
-        return [np.append(delay, theta[self.size :]) for delay in theta[: self.k]]
-
     def _matrix(self, theta: Array, turn: float = 0.0) -> Array:
-        return (
-            rotation_matrix((theta[2 * self.k] if self.k == 2 else 0.0) + turn)[: self.k, : self.k] * theta[self.k : 2 * self.k]
-        )
+        angle = theta[2 * self.k] if self.k == 2 else 0.0
+        return rotation_matrix(angle + turn)[: self.k, : self.k] * theta[self.k : 2 * self.k]
 
     def _mirror_transform(self, theta: Array, lower: Array | None, mirror: Response | None) -> tuple[Array, Array]:
         """Return the commands as they are measured (k, bins), and their derivatives by delay and shape (k, 1 or 3, bins)."""
@@ -165,7 +148,8 @@ class PlantLikelihood:
             before, change = (np.array([x[d, j] for j, d in enumerate(lower)]) for x in (self.U, self.U[1:] - self.U[:-1]))
             return before + (theta[: self.k] - lower)[:, None] * change, change[:, None]
         steps = SMALL * np.eye(3)
-        taps = [[mirror(x), *((mirror(x + e) - mirror(x - e)) / (2.0 * SMALL) for e in steps)] for x in self._of_modes(theta)]
+        of_modes = [np.append(delay, theta[self.size :]) for delay in theta[: self.k]]
+        taps = [[mirror(x), *((mirror(x + e) - mirror(x - e)) / (2.0 * SMALL) for e in steps)] for x in of_modes]
         out = rfft(taps, self.n)[..., 1 : (self.n + 1) // 2] * self.U[1][:, None]
         return out[:, 0], out[:, 1:]
 
@@ -283,12 +267,12 @@ class PlantLikelihood:
             total += 2.0 * float(score @ np.linalg.solve(F + 1e-9 * np.trace(F) * np.eye(len(F)), score))
         return float(chi2.sf(total, len(turn) * self.k))
 
-    def uncertainty(self, fit: PlantFit, true: PlantFit) -> float:
+    def uncertainty(self, fit: PlantFit, dynamic: PlantFit) -> float:
         """Return the 95 % limit of the rms of the error of z over the rms of z, in the worst octave.
 
-        true : the plant whose delay, gain and rotation are those of the fit
+        dynamic : the fit with the response of the mirror; what z lacks of that one counts as an error
         """
-        (Z, dZ), right = self.z(fit.theta), self.z(true.theta, mirror=true.mirror)[0]
+        (Z, dZ), right = self.z(fit.theta), self.z(dynamic.theta, mirror=dynamic.mirror)[0]
         values, vectors = np.linalg.eigh(fit.covariance)
         dZ = np.tensordot((vectors * np.sqrt(np.maximum(values, 0.0))).T, dZ, 1)
         low, worst = 1.0, 0.0

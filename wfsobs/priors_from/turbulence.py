@@ -84,7 +84,7 @@ def modelled_turbulence(
 
 @lru_cache(maxsize=32)
 def _fit_seen(scenario: Scenario, mode: int, dt: float) -> Ar3:
-    """Return the fit to the spectrum of the LGS, which takes a while and is asked for by every observer of many lines."""
+    """Return the fit to the spectrum that the LGS measure; kept, since every observer with several lines needs the same one."""
     return _fit_third_order(scenario, mode, dt, lgs_turbulence_spectrum(scenario, mode))
 
 

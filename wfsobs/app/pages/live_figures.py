@@ -49,7 +49,6 @@ class Pulse(Component):
     def __init__(self, **params: Any):
         self.answer: int = -1
         self.picture: int = 0
-        self.changes: list[Any] = []
         self._time = 0.0
         self._waiting: Callable[[], None] | None = None
         super().__init__(self._take, **params)
@@ -77,11 +76,14 @@ class Pulse(Component):
             act()
 
     def beat(self) -> None:
-        """Send a picture, and ask for an answer to it. By message: a property of a component takes as long as a figure."""
+        """Ask for an answer to the picture that has been sent."""
         self._time = monotonic()
         self.picture += 1
-        self._send_msg({"picture": self.picture, "changes": self.changes})
-        self.changes = []
+        self._send_msg({"picture": self.picture})
+
+    def change(self, steps: list[list[Any]], numbers: Array) -> None:
+        """Send the changes of a `Painter`: by message, since setting a property of a component costs as much as a figure."""
+        self._send_msg({"changes": [steps, numbers]})
 
 
 class Painter:
@@ -115,7 +117,7 @@ class Painter:
         """Send what has been collected."""
         if self._steps:
             numbers = np.concatenate(self._numbers) if self._numbers else np.empty(0, dtype=np.float32)
-            self._pulse.changes = [self._steps, numbers]
+            self._pulse.change(self._steps, numbers)
             self._steps, self._numbers = [], []
 
     def _reaches(self, model: Model) -> bool:

@@ -98,7 +98,7 @@ FROM_RECORD = "from one record"
 
 
 def error_fields(rms: float, interval: Sequence[float] | None, scale: float, of: str = FROM_RECORD) -> dict[str, str]:
-    """Write an error and how exactly it is known; scale : to the unit shown;  of : what the interval is from."""
+    """Format an error [um] and its interval; scale : from micrometres to the unit shown;  of : what the interval is from."""
     value = number(rms * scale)
     half = uncertainty_text(rms, interval, lambda x: with_decimals_of(value, x * scale)) if interval else ""
     return {"value": value, "half": half, "meaning": f"{OVER_SEEDS}, {of}"}
