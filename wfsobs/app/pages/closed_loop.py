@@ -273,11 +273,11 @@ def loop_html(results: LoopResults, display: Display, envelope: PlantEnvelope | 
 
 
 def loop_verdict_html(
-    results: LoopResults, found: Verdict | None, display: Display, envelope: PlantEnvelope | None = None
+    results: LoopResults, verdict: Verdict | None, display: Display, envelope: PlantEnvelope | None = None
 ) -> str:
     """Write the controllers with the smallest residual by prior knowledge, and the limit; and the best over an envelope."""
     scale = per_micrometre(display.unit, results.result.scenario.telescope.diameter)
-    said = [*found.sentences(scale, display.unit_label)] if found else []
+    said = [*verdict.sentences(scale, display.unit_label)] if verdict else []
     if envelope is not None:
         lines = envelope.sentences(scale, display.unit_label, display.column)
         said += [line.replace("+-", "±").replace(" deg", "°") for line in lines]
@@ -361,7 +361,7 @@ class ClosedLoopPage(Page):
         super().__init__(store, display, "mode", "unit")
         self.work: Final = BackgroundTask(store.session, title="Closed loop")
         self._of = object()
-        self._found: Verdict | None = None
+        self._verdict: Verdict | None = None
         self._rooms = list[pn.viewable.Viewable]()
         self.note: Final = html()
         self.verdict: Final = html()
@@ -475,7 +475,7 @@ class ClosedLoopPage(Page):
         shown = self.results
         if shown is None or self.display.column >= len(shown.result.scenario.modes):
             return
-        self._found = loop_verdict(shown.result, self.display.mode)
+        self._verdict = loop_verdict(shown.result, self.display.mode)
         for drawn in self._figures:
             drawn.draw(shown, self.display)
         if not self._is_chosen:
@@ -493,7 +493,7 @@ class ClosedLoopPage(Page):
             if self.results is not None:
                 envelope = self.uncertain.finding
                 known = envelope if self.uncertain.complete else None
-                self.verdict.html = loop_verdict_html(self.results, self._found, self.display, known)
+                self.verdict.html = loop_verdict_html(self.results, self._verdict, self.display, known)
                 self.table.html = loop_html(self.results, self.display, envelope)
                 self.uncertain.draw(self.cards.hidden_lines)
                 self.margins.html = margins_html(self.results, self.display)
@@ -514,7 +514,7 @@ class ClosedLoopPage(Page):
         """Show the few lines that matter: of those that the verdict names."""
         if self.results is None:
             return
-        main = [place.observer for place in self._found.named_places] if self._found else [*CONTROLLERS]
+        main = [place.observer for place in self._verdict.named_places] if self._verdict else [*CONTROLLERS]
         self._main = [name for name in CONTROLLERS if name not in main]
         self.cards.hidden_lines = self._main
 
@@ -522,7 +522,7 @@ class ClosedLoopPage(Page):
         """Describe a card per controller."""
         scale = per_micrometre(self.display.unit, results.result.scenario.telescope.diameter)
         left = {r["controller"]: r for r in results.rows if r["mode"] == self.display.mode}
-        intervals = {place.observer: place.interval for place in self._found.places} if self._found else {}
+        intervals = {place.observer: place.interval for place in self._verdict.places} if self._verdict else {}
         out = []
         for name in CONTROLLERS:
             row = left.get(name)
