@@ -13,9 +13,9 @@ import zipfile
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from math import inf
-from typing import Any, TypeVar
+from types import UnionType
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from wfsobs.app.cache import owners_in
 from wfsobs.app.compared import DrawnLines
@@ -48,82 +48,55 @@ class SessionError(ValueError):
 
 def read_declaration(values: Mapping[str, Any]) -> DeclaredFormat:
     """Read what was said of a record's file. Raises SessionError."""
-    unit, sign, delay, rate = (values.get(name) for name in ("unit", "command_sign", "command_delay", "rate"))
-    columns, trust, at_rest = get_value(values, "columns", dict), values.get("trust", False), values.get("open_loop", False)
-    gain, rail = values.get("command_gain"), values.get("rail")
+    said = read_as(DeclaredFormat, values)
+    delay, above_zero = said.command_delay, (said.rate, said.rail, *(said.command_gain or ()))
     valid = (
-        (unit is None or unit in UNITS)
-        and sign in (None, 1, -1)
-        and (delay is None or (type(delay) in (int, float) and 1 <= delay <= LONGEST_DELAY))
-        and (rate is None or (type(rate) in (int, float) and 0 < rate < 1e6))
-        and (rail is None or (type(rail) in (int, float) and 0 < rail < inf))
-        and (gain is None or (len(gain) <= 64 and all(type(g) in (int, float) and 0 < g < inf for g in gain)))
-        and isinstance(trust, bool)
-        and isinstance(at_rest, bool)
-        and len(columns) <= 64
-        and all(isinstance(name, str) and len(name) <= LONGEST_TEXT for name in columns.values())
+        said.unit in (None, *UNITS)
+        and said.command_sign in (None, 1, -1)
+        and (delay is None or 1 <= delay <= LONGEST_DELAY)
+        and all(x is None or 0 < x < inf for x in above_zero)
+        and all(len(name) <= LONGEST_TEXT for name in said.columns.values())
     )
     if not valid:
         raise SessionError("what is said of a record makes no sense")
-    return DeclaredFormat(unit, sign, delay, rate, columns, trust, None if gain is None else tuple(gain), rail, at_rest)
+    return said
 
 
-def read_score(values: Any) -> Score:
-    """Read a score. Raises SessionError."""
+def read_as(kind: type[T], values: Any) -> T:
+    """Read a dataclass from plain values by the types of its fields; other values are passed over. Raises SessionError."""
     if not isinstance(values, dict):
         raise SessionError(DAMAGED)
-    text, one, some = partial(get_text, values), partial(get_number, values), partial(_get_numbers, values)
-    calibration, interval = some("calibration", 4), some("interval", 2)
-    return Score(
-        text("observer"),
-        text("target"),
-        text("mode"),
-        one("rms"),
-        one("truth_rms"),
-        _get_optional(values, "normalised_rms"),
-        _get_optional(values, "lag"),
-        one("seconds_per_step"),
-        _get_optional(values, "start"),
-        _get_optional(values, "stop"),
-        get_value(values, "apart", bool),
-        (interval[0], interval[1]) if interval else None,
-        some("phases", None),
-        Calibration(*calibration) if calibration else None,
-    )
+    hints = get_type_hints(kind)
+    return kind(**{name: get_value(values, name, hint) for name, hint in hints.items() if name in values})
 
 
-def get_value(values: Mapping[str, Any], name: str, kind: type[T]) -> T:
+def get_value(values: Mapping[str, Any], name: str, hint: Any) -> Any:
     """Return a value of one type and no other. Raises SessionError."""
-    value = values.get(name)
-    if type(value) is not kind:
-        raise SessionError(f"{name} is missing or of the wrong kind")
+    try:
+        return _convert(values.get(name), hint)
+    except TypeError:
+        raise SessionError(f"{name} is missing or of the wrong kind") from None
+
+
+def _convert(value: Any, hint: Any) -> Any:
+    """Return a plain value as one of a type; JSON has a tuple as a list. Raises TypeError."""
+    of = get_args(hint)
+    if isinstance(hint, UnionType):
+        return None if value is None else _convert(value, of[0])
+    if isinstance(value, (list, tuple)) and hint is Calibration:
+        return Calibration(*(_convert(item, float) for item in value))
+    if isinstance(value, (list, tuple)) and get_origin(hint) is tuple and len(value) in (len(of), len(value) * (of[-1] is ...)):
+        return tuple(_convert(item, of[0]) for item in value)
+    if isinstance(value, dict) and get_origin(hint) is Mapping:
+        return {_convert(key, of[0]): _convert(item, of[1]) for key, item in value.items()}
+    if type(value) not in ((int, float) if hint is float else (hint,)):
+        raise TypeError
     return value
 
 
 def get_text(values: Mapping[str, Any], name: str, most: int = LONGEST_TEXT) -> str:
     """Return a text, cut at some characters. Raises SessionError."""
     return get_value(values, name, str)[:most]
-
-
-def get_number(values: Mapping[str, Any], name: str) -> float:
-    """Return a number. Raises SessionError."""
-    value = values.get(name)
-    if not isinstance(value, (int, float)) or isinstance(value, bool):
-        raise SessionError(f"{name} takes a number")
-    return float(value)
-
-
-def _get_optional(values: Mapping[str, Any], name: str) -> float | None:
-    return None if values.get(name) is None else get_number(values, name)
-
-
-def _get_numbers(values: Mapping[str, Any], name: str, count: int | None) -> tuple[float, ...] | None:
-    listed = values.get(name)
-    if listed is None:
-        return None
-    if type(listed) is not list or len(listed) > 1000 or (count is not None and len(listed) != count):
-        raise SessionError(f"{name} takes a list of numbers")
-    return tuple(get_number({name: item}, name) for item in listed)
 
 
 MOST = 200
@@ -418,12 +391,12 @@ def _entry(values: Any, records: _Records) -> HistoryEntry:
     return HistoryEntry(
         get_text(values, "key", 64) if lost else run_key(scenario, source),
         " ".join(get_text(values, "name", LONGEST_NAME).split()) or "no name",
-        get_number(values, "time"),
+        get_value(values, "time", float),
         scenario,
         preset,
         source,
         record,
-        tuple(map(read_score, listed)),
+        tuple(read_as(Score, score) for score in listed),
         get_value(values, "star", bool),
         get_text(values, "view"),
         get_value(values, "own_name", bool),
