@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import param
 from numpy.typing import NDArray
 
 from wfsobs.app.controls.names import preset_title, setting_name
@@ -22,9 +20,8 @@ from wfsobs.evaluation.rows import row_label, target_title
 from wfsobs.evaluation.scores import Score
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.configfile import reference_preset
-from wfsobs.settings.group import Group, holds_groups
-from wfsobs.settings.parameters import unit_of
+from wfsobs.scenario.configfile import changed_settings, reference_preset
+from wfsobs.units import unit_text
 
 NAMED = 3
 """How many differing settings are written out."""
@@ -64,46 +61,27 @@ def differences(before: Scenario, now: Scenario) -> list[str]:
     >>> differences(Scenario(), Scenario().replace({"vibration.peaks": peaks[1:]}))
     ['Peak 1 removed']
     """
-    tree = now.difference(before)
-    labels = Counter(str(p.label) for _, _, p in now.walk())
-    return _differences(before, now, tree, labels)
+    lists = dict(now.lists())
+    return [
+        line
+        for path in changed_settings(now, before)
+        for line in (_item_changes(before, now, path) if path in lists else [_change(before, now, path)])
+    ]
 
 
-def _differences(
-    before: Group, now: Group, tree: Mapping[str, Any], labels: Counter[str], path: str = "", above: str = ""
-) -> list[str]:
-    out: list[str] = []
-    for name in tree:
-        p, old, new = now.settings()[name], getattr(before, name), getattr(now, name)
-        if isinstance(new, Group):
-            out += _differences(old, new, tree[name], labels, f"{path}{name}.", str(p.label))
-            continue
-        if isinstance(p, param.List) and holds_groups(p):
-            out += _item_changes(f"{path}{name}", str(p.label), old, new)
-            continue
-        label = f"{above}: {p.label}" if labels[str(p.label)] > 1 else str(p.label)
-        out.append(f"{label} {_change(p, old, new)}")
-    return out
-
-
-def _item_changes(path: str, label: str, old: list[Group], new: list[Group]) -> list[str]:
+def _item_changes(before: Scenario, now: Scenario, path: str) -> list[str]:
     """Name the one item of a list that came, went or changed, and its settings that did; else only that the list changed."""
-    items = [[item.to_dict() for item in of] for of in (old, new)]
+    old, new = items = [[item.to_dict() for item in of.lookup(path)] for of in (before, now)]
     longer, shorter = sorted(items, key=len, reverse=True)
     if len(longer) == len(shorter) + 1:
-        at = next((i for i in range(len(longer)) if [*longer[:i], *longer[i + 1 :]] == shorter), None)
-        if at is not None:
-            return [f"{setting_name(f'{path}.{at}')} {'added' if len(new) > len(old) else 'removed'}"]
-    elsewhere = [i for i, (a, b) in enumerate(zip(*items, strict=False)) if a != b]
-    if len(longer) != len(shorter) or len(elsewhere) != 1:
-        return [f"{label} changed"]
-    at = elsewhere[0]
-    was, is_now, settings = _flat(items[0][at]), _flat(items[1][at]), new[at].settings()
-    return [
-        f"{setting_name(f'{path}.{at}.{key}')} {_change(settings[key.partition('.')[0]], was[key], is_now[key])}"
-        for key in was
-        if key in is_now and was[key] != is_now[key]
-    ] or [f"{label} changed"]
+        for at in range(len(longer)):
+            if [*longer[:at], *longer[at + 1 :]] == shorter:
+                return [f"{setting_name(f'{path}.{at}')} {'added' if longer is new else 'removed'}"]
+    changed = [at for at, (a, b) in enumerate(zip(old, new, strict=False)) if a != b]
+    if len(old) != len(new) or len(changed) != 1:
+        return [f"{setting_name(path)} changed"]
+    was, is_now = (_flat(items[changed[0]]) for items in (old, new))
+    return [_change(before, now, f"{path}.{changed[0]}.{key}") for key in was if key in is_now and was[key] != is_now[key]]
 
 
 def _flat(item: Mapping[str, Any]) -> dict[str, Any]:
@@ -115,18 +93,19 @@ def _flat(item: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _change(p: param.Parameter[Any], old: Any, new: Any) -> str:
-    """Two values of a setting; of lists only that they differ."""
+def _change(before: Scenario, now: Scenario, path: str) -> str:
+    """Write a setting and its two values; of lists only that they differ."""
+    name, old, new = setting_name(path), before.lookup(path), now.lookup(path)
     if isinstance(new, list):
-        return "changed"
-    if isinstance(new, bool) or not isinstance(new, (int, float)):
-        return f"{_word(old)} → {_word(new)}"
-    unit = unit_of(p).replace("um", "µm")
-    return f"{old:.6g} → {new:.6g} {unit}".rstrip()
+        return f"{name} changed"
+    if isinstance(new, bool):
+        old, new = ("on" if value else "off" for value in (old, new))
+    unit = unit_text(now.unit(path))
+    return f"{name} {_word(old)} → {_word(new)} {unit}".rstrip()
 
 
 def _word(value: Any) -> str:
-    return {True: "on", False: "off"}[value] if isinstance(value, bool) else str(value)
+    return f"{value:.6g}" if isinstance(value, (int, float)) else str(value)
 
 
 def name_of_difference(before: Scenario, now: Scenario) -> str:

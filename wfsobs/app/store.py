@@ -206,7 +206,7 @@ class Store(param.Parameterized):
 
     def changed_paths(self) -> list[str]:
         """Dotted paths of the settings that differ from the preset's."""
-        return paths_between(reference_preset(self.preset), self.scenario)
+        return [*changed_settings(self.scenario, reference_preset(self.preset))]
 
     def close(self) -> None:
         """Release what the store holds; called when the session ends."""
@@ -264,16 +264,3 @@ def _of_one_file(steps: list[Step], source: Source | None) -> list[Step]:
 def _covers(path: str, other: str) -> bool:
     """Whether setting `path` replaces what stands at `other`."""
     return other == path or other.startswith(f"{path}.")
-
-
-def paths_between(before: Scenario, now: Scenario) -> list[str]:
-    """Dotted paths of the settings that differ between two scenarios."""
-    return _paths(now.difference(before))
-
-
-def _paths(tree: dict[str, Any], prefix: str = "") -> list[str]:
-    """Dotted paths of the leaves of nested dictionaries."""
-    out: list[str] = []
-    for name, value in tree.items():
-        out += _paths(value, f"{prefix}{name}.") if isinstance(value, dict) else [f"{prefix}{name}"]
-    return out

@@ -19,11 +19,12 @@ from wfsobs.app.controls.rows import RowEditor
 from wfsobs.app.controls.search import Search
 from wfsobs.app.controls.status import BAR, ON_BAR, STATUS_ON_BAR, Status, status_of
 from wfsobs.app.jobs import DONE, RUNNING
-from wfsobs.app.store import Store, paths_between
+from wfsobs.app.store import Store
 from wfsobs.app.style import PRIMARY, HtmlText, html
 from wfsobs.app.views.plots import AFTERWARDS_MS, once
 from wfsobs.app.work import RunResults
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.configfile import changed_settings
 from wfsobs.scenario.idle import idle_settings
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.group import Group
@@ -271,7 +272,7 @@ class Controls:
         if event.new != DONE or now is None or now is self._before:
             return
         before, self._before = self._before, now
-        changed = paths_between(before.scenario, now.scenario) if before else []
+        changed = [*changed_settings(now.scenario, before.scenario)] if before else []
         part = (self.fields.get(changed[0]) or self.lists.get(changed[0])) if len(changed) == 1 else None
         self._effect.html = self.effect_of(before, now) if before and part else ""
         for at in (it for it in {self._changed_part, part} if it is not None):
