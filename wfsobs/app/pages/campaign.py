@@ -223,8 +223,8 @@ def slice_part(view: CampaignView, axis: PlanAxis, names: Sequence[str], display
     }
 
 
-PERIOD = 5000
-"""Time between two looks at a campaign that is not finished [ms]."""
+PERIOD = 5.0
+"""Time between two looks at a campaign that is not finished [s]."""
 NONE = ALL = ""
 FIRST_LINES = 5
 """Observers whose lines are shown first: the best ones."""
@@ -258,7 +258,7 @@ class CampaignPage(Page):
         self._targets = list[str]()
         self.work.param.watch(self._take, ["state", "result"])
         self.work.param.watch(self._say, ["state", "progress", "place", "message"])
-        self._callback = pn.state.add_periodic_callback(self.tick, PERIOD, start=False) if pn.state.curdoc else None
+        self.repeat(self.tick, PERIOD)
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""
@@ -269,7 +269,7 @@ class CampaignPage(Page):
         super().show(visible)
         if visible:
             self.work.look()
-        self._pace()
+        self.pace()
 
     @property
     def task(self) -> CopiedTask:
@@ -286,15 +286,11 @@ class CampaignPage(Page):
         """Look whether there is something new."""
         self.work.look()
 
-    def _pace(self) -> None:
-        if self._callback is not None:
-            self.store.session.post(self._set_pace)  # once the page stands: what comes before that does not reach it
-
-    def _set_pace(self) -> None:
+    @property
+    def goes_on(self) -> bool:
+        """Whether there may be something new to see."""
         state = self.work.campaign
-        wanted = self.visible and (state is None or state.n_done < state.plan.n_runs)
-        if self._callback is not None and wanted != self._callback.running:
-            (self._callback.start if wanted else self._callback.stop)()
+        return self.visible and (state is None or state.n_done < state.plan.n_runs)
 
     def load(self, cell: int) -> None:
         """Open the scenario of a cell in Explore, with the first seed of the campaign."""
@@ -315,7 +311,7 @@ class CampaignPage(Page):
         if state is not None:
             self._make(state)
             self.redraw()
-            self._pace()
+            self.pace()
 
     def _refuse(self, why: str) -> None:
         self.failure.html = f'<p class="failure" role="status">{escape(why)}</p>'

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable, Mapping
 from functools import partial
 from html import escape
@@ -39,7 +38,7 @@ from wfsobs.app.pages.live_figures import (
     Waterfall,
 )
 from wfsobs.app.pages.parts import HALVES, WIDE, Page, box, boxes, example, figure_with_caption, group, legend, line, text
-from wfsobs.app.service import IDLE, Post
+from wfsobs.app.service import IDLE
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.style import html, look
@@ -58,68 +57,6 @@ from wfsobs.live.view import SHARED, LiveView
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.settings.errors import SettingError
-
-PERIOD = SHARED
-"""Between two pictures [s]: of pages that are late with one, those up to the next one still share a reading."""
-
-
-class Beat:
-    """Has a page drawn when a picture is due, on the thread of its session, which has an event loop.
-
-    A picture that is late does not delay those that follow.
-
-    Parameters
-    ----------
-    post : callable
-        Has a function run on that thread.
-    draw : callable
-        Draws.
-    """
-
-    def __init__(self, post: Post, draw: Callable[[], None]):
-        self._post, self._draw = post, draw
-        self._loop = asyncio.get_running_loop()
-        self._due = 0.0
-        self._next: asyncio.TimerHandle | None = None
-
-    @property
-    def runs(self) -> bool:
-        """Whether pictures are due."""
-        return self._next is not None
-
-    def start(self) -> None:
-        """Draw again and again."""
-        if self._next is None:
-            self._plan()
-
-    def stop(self) -> None:
-        """Draw no more."""
-        if self._next is not None:
-            self._next.cancel()
-            self._next = None
-
-    def _plan(self) -> None:
-        """Wait for the next due time; of those that have passed only the last one is left."""
-        now = self._loop.time()
-        self._due = next_due(self._due, now)
-        self._next = self._loop.call_at(self._due, self._post, self._ring)
-
-    def _ring(self) -> None:
-        if self._next is not None:
-            try:
-                self._draw()
-            finally:
-                self._plan()
-
-
-def next_due(due: float, now: float) -> float:
-    """Return the multiple of PERIOD that follows `due`, or the last one before `now` if that is later [s].
-
-    >>> round(next_due(0.32, 0.36), 2), round(next_due(0.32, 0.52), 2), round(next_due(0.32, 0.9), 2)
-    (0.48, 0.48, 0.8)
-    """
-    return PERIOD * max(round(due / PERIOD) + 1, int(now / PERIOD))
-
 
 SLOW = 1.0
 """Between two tables [s]."""
@@ -253,7 +190,7 @@ class LivePage(Page):
         self.pulse: Final = Pulse(width=0, height=0, margin=0)
         self.picture: LiveRoom | None = None
         self._known_loop: LiveLoop | None = None
-        self._beat = Beat(store.session.post, self.tick) if pn.state.curdoc else None
+        self.repeat(self.tick, SHARED)
         self._watch()
         self._say()
 
@@ -415,10 +352,9 @@ class LivePage(Page):
         said = {RUNNING: waiting, FAILED: work.message}.get(work.state, "Stopped" if self.picture else "")
         if not runs:
             self.status.html = f'<p class="{"failure" if work.state == FAILED else "text"}" role="status">{escape(said)}</p>'
-        if self._beat is not None:
-            self.store.session.post(self._pace)  # once the page stands: what comes before that does not reach it
+        self.pace()
 
-    def _pace(self) -> None:
-        """Draw again and again while there is something to see."""
-        if self._beat is not None:
-            (self._beat.start if self.visible and self.loop is not None else self._beat.stop)()
+    @property
+    def goes_on(self) -> bool:
+        """Whether there is something to see."""
+        return self.visible and self.loop is not None

@@ -218,6 +218,7 @@ class Page(ABC):
     link: LinkPart = LinkedFields({})
     files: Mapping[str, tuple[str, Callable[[Any], bytes]]] = MappingProxyType({})
     visible: bool = False
+    _repetition: Any = None
 
     def __init__(self, store: Store, display: Display, *switches: str):
         """Make it. switches : of the display, after whose changes it is drawn; by default mode, unit and theme."""
@@ -249,6 +250,25 @@ class Page(ABC):
     def draw(self) -> object:
         """Draw what has come; a page without figures draws nothing."""
         return None
+
+    def repeat(self, act: Callable[[], object], seconds: float) -> None:
+        """Call a function again and again while the page `goes_on`."""
+        if pn.state.curdoc:
+            self._repetition = pn.state.add_periodic_callback(act, round(1e3 * seconds), start=False)
+
+    def pace(self) -> None:
+        """Begin or end what is repeated, once the page stands: what comes before that does not reach it."""
+        if self._repetition is not None:
+            self.store.session.post(self._set_pace)
+
+    def _set_pace(self) -> None:
+        if self._repetition is not None and self.goes_on != self._repetition.running:
+            (self._repetition.start if self.goes_on else self._repetition.stop)()
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether what is repeated is to be called."""
+        return False
 
     def open_link(self, texts: Mapping[str, str]) -> list[str]:
         """Take what an address has of the page; return a line for each text refused."""
