@@ -40,7 +40,7 @@ not known well enough."""
 OPEN = 20
 """Samples that pass then, while the deviation is doubled."""
 EARLY = 1.0
-"""Part of itself by which the level is larger after the first block, less with every one: a fit to few samples predicts badly."""
+"""Part of itself by which the level is larger with few samples to fit to, over the square of the number of blocks."""
 EARLIEST = 3.0
 """The same until the second fit: the first one has hardly more samples than weights."""
 PACE = 0.125
@@ -168,7 +168,7 @@ class OutlierGate:
     def _limit(self) -> Array:
         rarity = (USUAL / np.clip(self._part, RAREST, USUAL)) ** RARITY
         blocks = self.count // BLOCK
-        return self.settings.level * rarity * (1.0 + (EARLY / blocks if blocks > 1 else EARLIEST)) * self._deviation
+        return self.settings.level * rarity * (1.0 + (EARLY / blocks**2 if blocks > 1 else EARLIEST)) * self._deviation
 
     def _count(self, is_outlier: Array) -> None:
         """Count a sample, and open the gate where outliers last.

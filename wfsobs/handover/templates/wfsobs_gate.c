@@ -131,7 +131,7 @@ void wfsobs_gate_check(wfsobs_gate *g, wfsobs_real *z)
             for (int j = 0; j < ORDER; j++) expected += m->weights[j] * m->past[k + j];
         else
             expected = m->past[k + ORDER - 1];
-        limit = m->level * (1 + (blocks > 1 ? early / (double)blocks : earliest)) * m->deviation;
+        limit = m->level * (1 + (blocks > 1 ? early / ((double)blocks * (double)blocks) : earliest)) * m->deviation;
         error = is_there ? (double)z[i] - m->offset - expected : 0;
         if (m->settling > 0) m->settling--;
         if (is_there && m->gap >= RUN) m->open = m->settling = OPEN; /* after a gap the prediction is worth little */
