@@ -1,5 +1,7 @@
 """The dashboard in a notebook."""
 
+import subprocess
+import sys
 from urllib.error import URLError
 from urllib.request import urlopen
 
@@ -21,3 +23,10 @@ def test_a_cell_shows_the_page_with_the_settings_given_and_gives_them_back() -> 
         page.close()
     with pytest.raises(URLError):
         urlopen(page.url, timeout=5)
+
+
+def test_a_program_that_shows_the_page_ends() -> None:
+    """At a prompt the page is named by its address; it does not keep Python from ending."""
+    program = "import wfsobs; print(wfsobs.explore(wfsobs.Scenario()))"
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True)
+    assert "http://localhost:" in ended.stdout and ended.stderr == ""

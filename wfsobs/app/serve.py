@@ -486,6 +486,7 @@ class Explorer:
             {"/": self._page}, port=port, address="127.0.0.1", websocket_origin=f"localhost:{port}", show=False, threaded=True,
             verbose=False,
         )  # fmt: skip
+        threading.Thread(target=self._close_at_exit, daemon=True).start()
         for _ in range(300):  # a page that is asked for before its thread listens is not there
             with suppress(OSError), socket.create_connection(("127.0.0.1", port), 1.0):
                 return
@@ -497,6 +498,14 @@ class Explorer:
             return self._dashboard
 
         return session_page(build)
+
+    def _close_at_exit(self) -> None:
+        """End with the program: Python waits for the server's thread."""
+        threading.main_thread().join()
+        self._thread.stop()
+
+    def __repr__(self) -> str:
+        return f"<dashboard at {self.url}>"
 
     def _repr_html_(self) -> str:
         return f'<iframe src="{self.url}" title="wfsobs" style="width: 100%; height: {self._height}px; border: 0"></iframe>'
