@@ -228,10 +228,13 @@ def _sum_dips(worth: Array, about: float, level: float) -> tuple[Array, NDArray[
 
 WIDEST_LINE = 9
 """Maximum width of a candidate, in bins, that may be an undamped line."""
-SURE = 2.0
-"""Minimum rms of a resonance, in standard deviations."""
+SURE = 5.0
+"""Minimum rms, in standard deviations, of a resonance that is kept untried."""
 WORTH = 6.0
 """Minimum gain of log-likelihood by three parameters: noise gains as much with a probability of 0.7 % (chi squared of 12)."""
+KEPT = 8.0
+"""The same by a resonance once all is fitted, somewhat below the least of what the search calls a peak among some thousand bins:
+what the skirt of a strong peak was short of while its width was not yet fitted is worth less."""
 
 SETTLED = 0.01
 """Remaining error of repeated filling and fitting: each round leaves about the share that is missing."""
@@ -428,7 +431,7 @@ class OneMode:
     def prune(self) -> bool:
         """Remove the least certain resonance that the likelihood can do without; return whether.
 
-        Those are tried whose rms is below SURE of its standard deviations. That of a narrow one is uncertain since its width is,
+        Those are tried whose rms is below SURE standard deviations. That of a narrow one is uncertain since its width is,
         however high it stands: it is kept. One whose power a neighbour has as well is not worth its parameters.
         """
         std, first = self.errors(), len(self.spectrum.processes) - len(self.spectrum.resonances)
@@ -440,7 +443,7 @@ class OneMode:
         whole, before = self.spectrum, misfit_of(self.spectrum, self.f, self.I)
         for _, p in sorted(unsure, key=lambda pair: pair[0], reverse=True):
             rest = whole.without(p)
-            if misfit_of(fit_spectrum(rest, self.cells(everything=True)), self.f, self.I) - before > WORTH:
+            if misfit_of(fit_spectrum(rest, self.cells(everything=True)), self.f, self.I) - before > KEPT:
                 continue
             frequency = p.omega / (2 * pi)
             self.spectrum: Spectrum = rest
