@@ -109,9 +109,10 @@ def test_a_bad_file_changes_nothing_and_has_one_line(actions: Actions, loop: Any
             loop.until(lambda: actions.toolbar.notes == [])
 
 
-def test_the_scenario_file(actions: Actions) -> None:
+def test_the_scenario_file(actions: Actions, loop: Any) -> None:
     actions.store.change(WIND, 20)
     actions.handle({"action": "toml"})
+    loop.until(lambda: actions.sent != [])  # type: ignore[attr-defined]
     (file,) = actions.sent  # type: ignore[attr-defined]
     text = base64.b64decode(file["content"]).decode()
     assert file["name"] == "wfsobs.toml" and tomllib.loads(text)["preset"] == "paper"

@@ -9,9 +9,9 @@ import pytest
 
 from tests.app.test_session_history import WIND, change, quick
 from wfsobs.app import history as module
+from wfsobs.app.actions import Actions
 from wfsobs.app.display import Display
 from wfsobs.app.history import History, HistorySheet, Sheet
-from wfsobs.app.picker import LARGEST
 from wfsobs.app.session_file import SUFFIX, read_session
 
 
@@ -35,14 +35,16 @@ def model(sheet: HistorySheet) -> Sheet:
     return sheet.sheet
 
 
-def send(sheet: HistorySheet, name: str, content: bytes) -> None:
-    sheet.handle({"action": "part", "name": name, "index": 0, "count": 1, "data": base64.b64encode(content).decode()})
+@pytest.fixture
+def actions(sheet: HistorySheet) -> Actions:
+    """The menu that saves and opens the session."""
+    return Actions(sheet.history.store, sheet)
 
 
-def saved(sheet: HistorySheet, loop: Any, monkeypatch: pytest.MonkeyPatch) -> bytes:
+def saved(actions: Actions, loop: Any, monkeypatch: pytest.MonkeyPatch) -> bytes:
     files: list[dict[str, str]] = []
-    monkeypatch.setattr(model(sheet), "_send_msg", files.append)
-    sheet.handle({"action": "save"})
+    monkeypatch.setattr(actions.toolbar, "_send_msg", files.append)
+    actions.handle({"action": "session"})
     loop.until(lambda: files != [])
     assert files[0]["name"].endswith(SUFFIX)
     return base64.b64decode(files[0]["content"])
@@ -72,7 +74,7 @@ def test_what_is_asked_for(sheet: HistorySheet, loop: Any) -> None:
     assert sheet.history.can_undelete and len(sheet.rows) == 1
     sheet.handle({"action": "undelete"})
     assert not sheet.history.can_undelete and len(sheet.rows) == 2
-    for nonsense in ({}, {"action": 3}, {"action": "star"}, {"action": "restore", "key": ["x"]}, {"action": "part", "index": 3}):
+    for nonsense in ({}, {"action": 3}, {"action": "star"}, {"action": "restore", "key": ["x"]}):
         sheet.handle(nonsense)
     sheet.handle({"action": "close"})
     assert not model(sheet).open and sheet.rows == [], "no rows while it is closed"
@@ -80,33 +82,35 @@ def test_what_is_asked_for(sheet: HistorySheet, loop: Any) -> None:
     assert sheet.rows == []
 
 
-def test_save_and_open(sheet: HistorySheet, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_save_and_open(sheet: HistorySheet, actions: Actions, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     sheet.history.compare(sheet.rows[1]["key"])
-    content = saved(sheet, loop, monkeypatch)
+    content = saved(actions, loop, monkeypatch)
     assert [entry.name for entry in read_session(content).entries] == [row["name"] for row in sheet.rows]
     sheet.history.compare_none()
     for key in [row["key"] for row in sheet.rows]:
         sheet.handle({"action": "delete", "key": key})
     change(sheet.history, loop, WIND, 33)
-    send(sheet, f"mine{SUFFIX}", content)
+    sheet.close()
+    actions.open_session(f"mine{SUFFIX}", content)
     loop.until(lambda: sheet.message.startswith("Opened"))
     loop.finish(sheet.history.store)
+    assert model(sheet).open
     assert sheet.message == f"Opened mine{SUFFIX}: 2 results." and sheet.history.store.value(WIND) == 20.0
     assert sorted(entry.scores[0].rms for entry in sheet.history.entries) == [15.0, 20.0, 33.0], "what was here stays"
     assert [run.letter for run in sheet.display.compared_runs] == ["A"]
 
 
-def test_files_that_are_none(sheet: HistorySheet, loop: Any) -> None:
+def test_files_that_are_none(sheet: HistorySheet, actions: Actions, loop: Any) -> None:
     before, step = [*sheet.history.entries], sheet.history.store.step
-    send(sheet, "night.npz", b"PK nothing")
-    loop.until(lambda: sheet.message.startswith("night.npz: damaged"))
-    sheet.handle({"action": "large", "name": "film.mkv"})
-    assert sheet.message == f"film.mkv: larger than {LARGEST // 1_000_000} MB"
-    sheet.handle({"action": "part", "name": "x", "index": 1, "count": 2, "data": "!"})
+    actions.open_session("night.npz", b"PK nothing")
+    loop.until(lambda: actions.toolbar.notes != [])
+    assert actions.toolbar.notes[0].startswith("night.npz: damaged")
     assert sheet.history.entries == before and sheet.history.store.step == step
 
 
-def test_a_session_too_large_to_be_opened_again(sheet: HistorySheet, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_session_too_large_to_be_opened_again(
+    sheet: HistorySheet, actions: Actions, loop: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(module, "LARGEST", 100)
-    sheet.handle({"action": "save"})
-    loop.until(lambda: "more than can be opened" in sheet.message)
+    actions.handle({"action": "session"})
+    loop.until(lambda: any("more than can be opened" in note for note in actions.toolbar.notes))

@@ -279,10 +279,10 @@ def test_a_record_whose_unit_nobody_knows_waits_for_it(dashboard: Dashboard, loo
 
 def test_template_and_sample(dashboard: Dashboard, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     sent: list[dict[str, str]] = []
-    monkeypatch.setattr(dashboard.upload.picker, "_send_msg", sent.append)
-    dashboard.upload.handle({"action": "template"})
-    dashboard.upload.handle({"action": "sample"})
-    loop.until(lambda: len(sent) == 2)
+    monkeypatch.setattr(dashboard.actions.toolbar, "_send_msg", sent.append)
+    for count, what in enumerate(("template", "sample"), 1):
+        dashboard.upload.handle({"action": what})
+        loop.until(lambda count=count: len(sent) == count)
     files = {it["name"]: base64.b64decode(it["content"]) for it in sent}
     template = read_record(io.BytesIO(files["wfsobs-template.csv"]), "t.csv")
     assert (template.n_steps, template.ratio, template.delay, template.missing) == (6, 5, 2, 1)

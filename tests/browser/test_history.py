@@ -106,7 +106,8 @@ def test_a_session_from_runs_to_a_file_and_back(open_page: Any, server: Any, tmp
     expect(row(page, "windy")).to_be_visible()
 
     with page.expect_download() as download:
-        sheet(page).get_by_role("button", name="Save session").click()
+        page.get_by_role("button", name="File", exact=True).click()
+        page.get_by_role("menuitem", name="Save session").click()
     file = tmp_path / "mine.wfsobs-session"
     download.value.save_as(file)
 
@@ -114,10 +115,10 @@ def test_a_session_from_runs_to_a_file_and_back(open_page: Any, server: Any, tmp
     page.get_by_role("button", name="History").click()
     expect(rows(page)).to_have_count(1)
     (tmp_path / "none.wfsobs-session").write_bytes(file.read_bytes()[:500])
-    sheet(page).get_by_label("Session file").set_input_files(tmp_path / "none.wfsobs-session")
-    expect(sheet(page).get_by_text("none.wfsobs-session: damaged, or no session of wfsobs")).to_be_visible()
+    page.get_by_label("Record file").set_input_files(tmp_path / "none.wfsobs-session")
+    expect(page.get_by_text("none.wfsobs-session: damaged, or no session of wfsobs")).to_be_visible()
     expect(rows(page)).to_have_count(1)
-    sheet(page).get_by_label("Session file").set_input_files(file)
+    page.get_by_label("Record file").set_input_files(file)
     expect(rows(page)).to_have_count(4)
     current(page, first)
     expect(page.get_by_role("textbox", name="m/s")).to_have_value("15")

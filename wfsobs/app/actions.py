@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
@@ -11,6 +12,7 @@ import param
 from wfsobs.app.component import HtmlComponent
 from wfsobs.app.copies import EXPLORED, to_command, to_python
 from wfsobs.app.downloads import Save, TooLarge, data_csv, data_npz
+from wfsobs.app.history import HistorySheet, session_save
 from wfsobs.app.jobs import DONE, FAILED, RUNNING, Job
 from wfsobs.app.pages.pages import Pages, ViewState
 from wfsobs.app.pages.parts import Page
@@ -18,6 +20,7 @@ from wfsobs.app.render import render
 from wfsobs.app.report.export import LIMIT, ReportError, make
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import BackgroundTask
+from wfsobs.app.session_file import SessionError, read_session
 from wfsobs.app.share import FILE, Link, from_file, from_query, name_record, to_file, to_query
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord
 from wfsobs.app.store import Store
@@ -51,6 +54,10 @@ class Toolbar(HtmlComponent):
     _esm = script("patch", "markup", "save", "figures", "actions")
     _stylesheets = sheets("base", "actions")
 
+    def save(self, name: str, kind: str, content: bytes) -> None:
+        """Have the browser save a file."""
+        self._send_msg({"name": name, "kind": kind, "content": base64.b64encode(content).decode()})
+
     @param.depends("ready", "reporting", "saves", watch=True, on_init=True)
     def _draw(self) -> None:
         self.html = render("toolbar.html", ready=self.ready, reporting=self.reporting, saves=self.saves)
@@ -59,15 +66,14 @@ class Toolbar(HtmlComponent):
 class Actions:
     """The toolbar over a store."""
 
-    def __init__(self, store: Store):
+    def __init__(self, store: Store, sheet: HistorySheet):
         self.store = store
+        self.sheet: Final = sheet
         self.toolbar: Final = Toolbar(self.handle, labels=labels(), margin=0)
         self._tasks: dict[str, BackgroundTask] = {}
         self._under_way: dict[str, tuple[str, Callable[[Any], None]]] = {}
         self._pages: Pages | None = None
         self._view: ViewState | None = None
-        self.open_history: Callable[[], None] = lambda: None
-        self.session: Callable[[], Save] | None = None
         store.param.watch(once(self._refresh, AFTERWARDS_MS), ["scenario", "preset", "source", "wanted_record"])
         store.param.watch(lambda _event: self.toolbar.param.update(notes=[]), "source")  # of files before the one that is used
         store.run.param.watch(lambda event: self.toolbar.param.update(ready=event.new is not None), "result")
@@ -101,8 +107,8 @@ class Actions:
         does: dict[str, Callable[[], object]] = {
             "undo": self.store.undo,
             "redo": self.store.redo,
-            "history": self.open_history,
-            "session": lambda: self.session and self._save(self.session()),
+            "history": self.sheet.toggle,
+            "session": lambda: self.save(session_save(self.sheet.history)),
             "unlinked": lambda: self._note("These settings are too long for a link: save the scenario and send the file."),
             "dismiss": lambda: self.toolbar.param.update(notes=[]),
             "read": lambda: self._take_back(msg.get("text")),
@@ -140,9 +146,15 @@ class Actions:
         else:
             self.toolbar.param.update(notes=[], message=f"Opened {name[:80]}.")
 
+    def open_session(self, name: str, content: bytes) -> None:
+        """Read a session's file beside the page, and show it; nothing changes where it cannot be read."""
+        job = Job("upload", lambda _watch, _tell: read_session(content), refusal=SessionError)
+        self._start("open", name[:80], job, partial(self.sheet.show_session, name))
+
     def save_scenario(self) -> None:
         """Send the settings as TOML."""
-        self.toolbar.save(FILE, "application/toml", to_file(self.store.scenario, self.store.preset).encode())
+        text = to_file(self.store.scenario, self.store.preset)
+        self.save(Save(FILE, "application/toml", text.encode))
 
     def save_data(self, name: str, kind: str, make: Callable[[RunResults], bytes]) -> None:
         """Make a file of the results shown, beside the page, and send it."""
@@ -150,17 +162,17 @@ class Actions:
         if shown is None:
             self._note("There are no results to save yet.")
         else:
-            self._save(Save(name, kind, lambda: make(shown)))
+            self.save(Save(name, kind, lambda: make(shown)))
 
     def save_of_page(self, what: str) -> None:
         """Make a file of what the page shown has found, and send it."""
         saves = self._offers.saves() if self._offers else {}
         if (save := saves.get(what)) is not None:
-            self._save(save)
+            self.save(save)
         elif what in saves:
             self._note(f"{what}: there is none yet.")
 
-    def _save(self, save: Save) -> None:
+    def save(self, save: Save) -> None:
         """Make a file beside the page, and send it."""
         job = Job("save", lambda _watch, _tell: save.content(), refusal=TooLarge)
         self._start(save.name, save.name, job, partial(self.toolbar.save, save.name, save.kind))

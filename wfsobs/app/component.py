@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -35,10 +34,6 @@ class Component(JSComponent):
         with pn.io.hold():
             self.on_message(message)
 
-    def save(self, name: str, kind: str, content: bytes) -> None:
-        """Have the browser save a file, where the component's script takes such messages."""
-        self._send_msg(file_message(name, kind, content))
-
 
 class HtmlComponent(Component):
     """A component whose contents are HTML that is made here."""
@@ -46,8 +41,3 @@ class HtmlComponent(Component):
     __abstract = True
 
     html: param.String[str] = param.String("", doc="What is in it.")
-
-
-def file_message(name: str, kind: str, content: bytes) -> dict[str, str]:
-    """Return the message by which a browser saves a file."""
-    return {"name": name, "kind": kind, "content": base64.b64encode(content).decode()}

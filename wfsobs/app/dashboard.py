@@ -19,7 +19,7 @@ from wfsobs.app.controls.panel import Controls
 from wfsobs.app.controls.status import waiting_text
 from wfsobs.app.display import Display
 from wfsobs.app.glossary import Help
-from wfsobs.app.history import History, HistorySheet, session_save
+from wfsobs.app.history import History, HistorySheet
 from wfsobs.app.jobs import FAILED
 from wfsobs.app.pages.explore import Explore
 from wfsobs.app.pages.pages import EXPLORE, LIVE, Pages, ViewState
@@ -137,18 +137,14 @@ class Dashboard:
     def __init__(self, post: Post, session: Session, scenario: Scenario | None = None):
         self._post = post
         self.store: Final = Store(post, session, scenario)
-        self.upload: Final = Upload(self.store)
         self.display: Final = Display()
         self._theme_chosen = False
         self.controls: Final = Controls(self.store)
         self.controls.effect_of = partial(effect_line, self.display)
-        self.actions: Final = Actions(self.store)
-        self.upload.open_scenario = self.actions.open_file
         self.history: Final = History(self.store, self.display)
         self.history_sheet: Final = HistorySheet(self.history, lambda sheet: self.body.append(sheet))
-        self.actions.open_history = self.history_sheet.toggle
-        self.actions.session = lambda: session_save(self.history)
-        self.upload.open_session = self.history_sheet.open_file
+        self.actions: Final = Actions(self.store, self.history_sheet)
+        self.upload: Final = Upload(self.store, self.actions)
         self.modes: Final = ModeSwitch(self.store.run, self.display)
         self.units: Final = UnitSwitch(self.display)
         self.seeds: Final = SeedRuns(self.store)

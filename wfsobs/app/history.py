@@ -17,8 +17,8 @@ from wfsobs.app.component import HtmlComponent
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.downloads import Save, TooLarge
-from wfsobs.app.jobs import DONE, FAILED, RUNNING, Job
-from wfsobs.app.picker import LARGEST, PART, PartialFile, too_large
+from wfsobs.app.jobs import DONE, FAILED
+from wfsobs.app.picker import LARGEST
 from wfsobs.app.render import number, render
 from wfsobs.app.service import BackgroundTask, run_key
 from wfsobs.app.session_file import (
@@ -28,10 +28,8 @@ from wfsobs.app.session_file import (
     SUFFIX,
     HistoryEntry,
     SessionContent,
-    SessionError,
     let_go,
     make_entry,
-    read_session,
     write_session,
 )
 from wfsobs.app.sources import Step
@@ -43,7 +41,6 @@ from wfsobs.evaluation.rows import can_be_best
 from wfsobs.evaluation.scores import PREDICTION, Score
 from wfsobs.observers.base import TARGETS
 from wfsobs.settings.errors import SettingError
-from wfsobs.telemetry.preview import safe_name
 
 AFTER_DRAWING = 1
 """Precedence of a watcher that comes after the figures, whose own is 0, and before the status line, whose own is 2."""
@@ -279,10 +276,8 @@ class Sheet(HtmlComponent):
     """The sheet in the browser; it asks by messages {action, key, name, on}, and has contents only while it is open."""
 
     open: param.Boolean[bool] = param.Boolean(False, doc="Whether it is seen.")
-    largest: param.Integer[int] = param.Integer(LARGEST, doc="The largest file that is sent [bytes].")
-    part: param.Integer[int] = param.Integer(PART, doc="How much is sent at a time [bytes].")
 
-    _esm = script("patch", "markup", "focus", "save", "parts", "history")
+    _esm = script("patch", "markup", "focus", "history")
     _stylesheets = sheets("base", "history")
 
 
@@ -295,13 +290,8 @@ class HistorySheet:
         self.display: Final = history.display
         self._show = show
         self.sheet: Sheet | None = None
-        self._parcel = PartialFile()
-        self._name = self.message = ""
+        self.message = ""
         self.rows, self._stars_alone = list[dict[str, Any]](), False
-        self.saving: Final = BackgroundTask(history.store.session)
-        self.reading: Final = BackgroundTask(history.store.session)
-        self.saving.param.watch(self._save, ["state", "place"])
-        self.reading.param.watch(self._open, ["state", "place"])
 
     def toggle(self) -> None:
         """Open the sheet, or close it."""
@@ -328,50 +318,15 @@ class HistorySheet:
             "delete": lambda: history.delete(key),
             "undelete": history.undelete,
             "filter": lambda: self._show_stars_alone(msg.get("on") is True),
-            "save": self.save,
-            "large": lambda: self._say(too_large(safe_name(str(msg.get("name", ""))))),
-            "part": lambda: self._take(msg),
         }
         if msg.get("action") in does:
             does[msg["action"]]()
 
-    # ------------------------------------------------------------------ the session as a file
-
-    def save(self) -> None:
-        """Make the session's file beside the page, and send it."""
-        save = session_save(self.history)
-        self.saving.start(Job("save", lambda *_: save.content(), refusal=TooLarge))
-
-    def _save(self, *_: object) -> None:
-        task = self.saving
-        self._say({RUNNING: task.line("Writing the session"), FAILED: task.message}.get(task.state, ""))
-        if task.state == DONE:
-            self._sheet().save(FILE, "application/zip", task.result)
-            self._say(f"Saved {FILE}.")
-
-    def _take(self, msg: dict[str, Any]) -> None:
-        try:
-            content = self._parcel.take(msg)
-        except ValueError as error:
-            self._say(str(error))
-            return
-        if content is not None:
-            self.open_file(self._parcel.name, content)
-
-    def open_file(self, name: str, content: bytes) -> None:
-        """Read a session's file beside the page, and open it; nothing changes where it cannot be read."""
+    def show_session(self, name: str, content: SessionContent) -> None:
+        """Add what a session's file of this name holds, where it is seen."""
         if not self._sheet().open:
             self.toggle()
-        self._name = name
-        self.reading.start(Job("upload", lambda _watch, _tell: read_session(content), refusal=SessionError))
-
-    def _open(self, *_: object) -> None:
-        task = self.reading
-        self._say({RUNNING: task.line(f"Reading {self._name}"), FAILED: f"{self._name}: {task.message}"}.get(task.state, ""))
-        if task.state == DONE:
-            self.history.open(task.result, self._name)
-
-    # ------------------------------------------------------------------ the sheet
+        self.history.open(content, name)
 
     def _sheet(self) -> Sheet:
         if self.sheet is None:
@@ -402,7 +357,6 @@ class HistorySheet:
                 room=len(runs) < len(LETTERS),
                 undo=self.history.can_undelete,
                 message=self.message,
-                suffix=SUFFIX,
             )
             sheet.html = html
 

@@ -17,8 +17,10 @@ import panel_material_ui as pmui
 import param
 from bokeh.models import ColumnDataSource
 
+from wfsobs.app.actions import Actions
 from wfsobs.app.controls.names import name_settings
-from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING, Job
+from wfsobs.app.downloads import Save
+from wfsobs.app.jobs import CANCELLED, FAILED, RUNNING, Job
 from wfsobs.app.picker import PartialFile, Picker, too_large
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.session_file import SUFFIX
@@ -214,8 +216,10 @@ class ColumnForm:
 class Upload:
     """How a record comes into a session's store, whose aperture turns angles into wavefronts."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: Store, actions: Actions) -> None:
+        """Make the button. actions : open other files, and save."""
         self.store = store
+        self.actions: Final = actions
         self.picker: Final = Picker(sizing_mode="stretch_width", margin=0)
         self.picker.on_message = self.handle
         self.use: Final = pmui.Button(label="Use this record", color="primary", size="small", margin=4)
@@ -228,10 +232,6 @@ class Upload:
         )
         self.take.on_click(lambda _event: self.take_proposals())
         self.place: Final = RecordPlace(store)
-        self._simulating = BackgroundTask(store.session)
-        self._simulating.param.watch(self._save_sample, ["state", "place"])
-        self.open_scenario: Callable[[str, object], None] = lambda _name, _text: None
-        self.open_session: Callable[[str, bytes], None] = lambda _name, _content: None
         self.room: Final = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
         self._parcel = PartialFile()
         self._name, self._content, self._digest = "", b"", ""
@@ -270,17 +270,11 @@ class Upload:
         elif action == "part":
             self._take(msg)
         elif action == "template":
-            self.picker.save(TEMPLATE_NAME, "text/csv", TEMPLATE.encode())
+            self.actions.save(Save(TEMPLATE_NAME, "text/csv", TEMPLATE.encode))
         elif action == "sample":
-            self._simulating.start(Job("save", lambda watch, _tell: sample_csv(watch)))
+            self.actions.save(Save(SAMPLE_NAME, "text/csv", sample_csv))
         elif action == "scenario":
-            self.open_scenario(str(msg.get("name", "")), msg.get("text"))
-
-    def _save_sample(self, *_: object) -> None:
-        task = self._simulating
-        self._say("" if task.state == DONE else task.message if task.state == FAILED else task.line("Simulating a sample"))
-        if task.state == DONE:
-            self.picker.save(SAMPLE_NAME, "text/csv", task.result)
+            self.actions.open_file(str(msg.get("name", "")), msg.get("text"))
 
     def _take(self, msg: dict[str, Any]) -> None:
         if msg.get("index") == 0:
@@ -293,7 +287,7 @@ class Upload:
         if content is not None:
             name = self._parcel.name
             if name.endswith(SUFFIX):
-                self.open_session(name, content)
+                self.actions.open_session(name, content)
             else:
                 self._name, self._content, self._digest = name, content, hashlib.sha256(content).hexdigest()
                 self._say("" if content else f"{name}: is empty")

@@ -4,7 +4,6 @@ export function render({model, el}) {
   el.innerHTML = `<div class="sheet" popover="manual" role="dialog" aria-label="History"></div>`
   const sheet = el.firstElementChild
   tellActions(sheet, model)
-  handleFiles(sheet, model)
   sheet.addEventListener("keydown", ({key, target}) => {
     const isName = target.matches(".name")
     if (key === "Enter" && isName) target.blur()

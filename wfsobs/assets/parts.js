@@ -1,4 +1,4 @@
-// Files up in parts, and down.
+// Files up in parts.
 
 async function base64(blob) {
   const bytes = new Uint8Array(await blob.arrayBuffer())
@@ -16,13 +16,12 @@ async function send(model, file) {
   }
 }
 
-// The button that chooses a file, and files that the server sends.
-function handleFiles(root, model, take = (file) => send(model, file)) {
+// The button that chooses a file.
+function handleFiles(root, take) {
   root.addEventListener("click", (event) => { if (event.target.matches(".pick")) root.querySelector("[type=file]").click() })
   root.addEventListener("change", ({target}) => {
     if (target.type !== "file" || !target.files[0]) return
     take(target.files[0])
     target.value = ""
   })
-  takeFiles(model)
 }

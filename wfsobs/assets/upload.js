@@ -15,7 +15,7 @@ export function render({model, el}) {
     else send(model, file)
   }
   tellActions(el, model)
-  handleFiles(el, model, take)
+  handleFiles(el, take)
 
   // A file may be dropped anywhere; while one is over the page, a cover says so.
   const over = (event) => {
