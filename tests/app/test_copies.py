@@ -178,7 +178,7 @@ def test_identify(board: Dashboard, loop: Any) -> None:
     page = board.pages.by_name["identify"]
     assert isinstance(page, IdentifyPage)
     page.level.value, page.lowest.value = "0.02", "8"
-    page.start()
+    page.starter.begin()
     loop.until(lambda: page.work.state != RUNNING, 120)
     expected = identified.identification_dict(page.work.result[0])
     for found in (shell(board), identified.identification_dict(script(board)["found"])):
@@ -193,7 +193,7 @@ def test_tune(board: Dashboard, loop: Any) -> None:
     page = board.pages.by_name["tune"]
     assert isinstance(page, TunePage)
     page.observer.value, page.evaluations.value = "kf-lgs", "4"
-    page.start()
+    page.starter.begin()
     loop.until(lambda: page.work.state != RUNNING, 120)
     expected = tunings.tuning_dict(page.work.result)
     for found in (shell(board), tunings.tuning_dict(script(board)["tuned"])):
@@ -216,7 +216,7 @@ def test_sweep(dashboard: Dashboard, loop: Any, tmp_path: Path, monkeypatch: Any
     for path, values in second:
         page.settings[1].value = path
         page.values[1].value = values
-    page.start()
+    page.starter.begin()
     loop.until(lambda: page.work.state != RUNNING, 240)
     assert page.results is not None
     expected = page.results.rows()
@@ -294,7 +294,7 @@ def test_what_pages_have_found_is_saved(dashboard: Dashboard, loop: Any, sent: l
     dashboard.actions.handle({"action": "page", "key": "Model as TOML"})
     assert dashboard.actions.toolbar.notes == ["Model as TOML: there is none yet."]
     page: Any = dashboard.pages.by_name["identify"]
-    page.start()
+    page.starter.begin()
     loop.until(lambda: page.work.state != RUNNING, 120)
     files = saved(dashboard, loop, sent)
     result = page.work.result[0]
@@ -305,7 +305,7 @@ def test_what_pages_have_found_is_saved(dashboard: Dashboard, loop: Any, sent: l
     dashboard.pages.current = "tune"
     page = dashboard.pages.by_name["tune"]
     page.observer.value, page.evaluations.value = "kf-lgs", "3"
-    page.start()
+    page.starter.begin()
     loop.until(lambda: page.work.state != RUNNING, 120)
     files = saved(dashboard, loop, sent)
     table = [*csv.DictReader(io.StringIO(files["wfsobs-tuning.csv"].decode()))]

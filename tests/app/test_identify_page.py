@@ -218,7 +218,7 @@ def test_what_cannot_be_done_is_said_in_one_line(page: IdentifyPage, loop: Any) 
         ("0.04", "300", "lowest peak frequency = 300 Hz: must be below a quarter of the rate, 250 Hz"),
     ):
         page.level.value, page.lowest.value = level, lowest
-        page.start()
+        page.starter.begin()
         loop.until(lambda: page.work.state != RUNNING)
         assert (page.work.state, page.starter.status.note) == (FAILED, reason)
         assert page.starter.uses[0].disabled
@@ -235,15 +235,15 @@ def test_limits_of_a_public_server(loop: Any, short: Scenario, enter: Any, monke
     shown = dashboard.store.run.result
     assert shown is not None
     dashboard.store.limits = Limits(seconds=0.1)
-    page.start()
+    page.starter.begin()
     assert page.work.message == "The identification would take about 0 s, at most 0.1 on this server"
     monkeypatch.setattr(module, "seconds", lambda record: 0.0)
     dashboard.store.limits = Limits(seconds=1e-6)
-    page.start()
+    page.starter.begin()
     loop.until(lambda: page.work.state != RUNNING)
     assert page.work.message == "It took more than 1e-06 s, which is what this server allows"
     longest = replace(shown.result.record, y_lgs=np.zeros((120_000, 2)), u=np.zeros((120_000, 2)))
-    PUBLIC.check_seconds(seconds(longest), "identification")
+    PUBLIC.job("identify", "identification", lambda _watch, _tell: None, seconds(longest))
 
 
 def test_it_comes_back_as_the_switches_are_by_then(page: IdentifyPage, dashboard: Dashboard) -> None:

@@ -245,7 +245,7 @@ def test_what_cannot_be_run_is_said_in_one_line(page: SweepPage, dashboard: Dash
         before = field.value
         field.value = text
         assert line in unescape(page.estimate.html) and 'class="failure"' in page.estimate.html and page.starter.start.disabled
-        page.start()
+        page.starter.begin()
         assert page.work.state == FAILED and line in page.starter.status.note and "\n" not in page.starter.status.note
         field.value = before
         assert 'class="text"' in page.estimate.html and not page.starter.start.disabled

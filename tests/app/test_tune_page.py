@@ -117,17 +117,17 @@ def test_a_loaded_record_is_cut(page: TunePage, dashboard: Dashboard, loop: Any,
 
 def test_progress_cancel_and_errors(page: TunePage, dashboard: Dashboard, loop: Any) -> None:
     page.evaluations.value = "0"
-    page.start()
+    page.starter.begin()
     assert (page.work.state, page.starter.status.note) == (FAILED, "Evaluations = '0': takes a whole number from 1 to 1000")
     page.evaluations.value = "1000"
     page.observer.value = "gpr-online"
-    page.start()
+    page.starter.begin()
     loop.until(lambda: page.work.latest is not None)
     assert re.fullmatch(r"Computing, \d+ % · \d+ evaluations, best [\d.]+ nm, [\d.]+ nm before", page.starter.status.text)
     page.starter.cancel.param.trigger("clicks")
     assert page.work.state == CANCELLED and page.starter.uses[0].disabled and len(page.figure.source.data["x"]) > 0
     dashboard.store.limits = Limits(seconds=0.01)
-    page.start()
+    page.starter.begin()
     shown = dashboard.store.run.result
     assert shown is not None
     estimate = seconds(shown, dashboard.store.scenario, "gpr-online", 1000)
@@ -138,7 +138,7 @@ def test_only_what_is_done_can_be_used(dashboard: Dashboard) -> None:
     """The result may be that of an earlier work."""
     for state, disabled in [(FAILED, True), (CANCELLED, True), (RUNNING, True), (DONE, False)]:
         work = BackgroundTask(dashboard.store.session)
-        starter = Starter(work, "Start", "Progress")
+        starter = Starter(work, lambda: None, "Start", "Progress", uses={"Use it": lambda: None})
         work.param.update(state=state, result=1)
         assert starter.uses[0].disabled == disabled, state
 

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from functools import reduce
 
+from wfsobs.app.jobs import Job, Work
 from wfsobs.cost import run_bytes, run_seconds
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
@@ -59,10 +60,11 @@ class Limits:
         _whole(run_seconds(scenario), self.seconds, "s")
         _whole(run_bytes(scenario) / 1e6, self.megabytes, "MB of memory")
 
-    def check_seconds(self, seconds: float, what: str) -> None:
-        """Raise SettingError where a computation beside the runs would take longer than a run may."""
+    def job(self, kind: str, what: str, work: Work, seconds: float) -> Job:
+        """Make the job of a computation beside the runs. Raises SettingError where it would take longer than a run may."""
         if seconds > self.seconds:
             raise SettingError(f"The {what} would take about {seconds:.0f} s, at most {self.seconds:g} on this server")
+        return Job(kind, work, cost=seconds, time_limit=self.seconds)
 
     def check_sweep(self, seconds: float, runs: int) -> None:
         """Raise SettingError where a sweep of so many runs would take longer than one may."""

@@ -24,6 +24,7 @@ from wfsobs.app.work import RunResults, compute
 from wfsobs.cost import run_seconds
 from wfsobs.dependence import Memo
 from wfsobs.progress import Watch
+from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 
@@ -263,6 +264,15 @@ class BackgroundTask(param.Parameterized):
         """Fail with a reason in one line, without a job."""
         self.close()
         self.param.update(state=FAILED, message=why)
+
+    def attempt(self, act: Callable[[], object]) -> bool:
+        """Do something, or fail with the reason why it is refused in one line; return whether it was done."""
+        try:
+            act()
+        except (SettingError, RecordError) as error:
+            self.refuse(str(error).removeprefix("--over ").partition("\n")[0])
+            return False
+        return True
 
     def close(self) -> None:
         """Leave the job; later news of it is ignored."""

@@ -107,11 +107,8 @@ class Store(param.Parameterized):
 
     def start(self, seconds: float | None = None) -> None:
         """Run the settings as they stand. seconds : about how long that takes, where it is known."""
-        self.waiting = 0.0
-        try:
-            self.run.start(self.session.service.run(self.scenario, self.source, self.seconds if seconds is None else seconds))
-        except SettingError as error:
-            self.run.refuse(str(error))
+        self.waiting, seconds = 0.0, self.seconds if seconds is None else seconds
+        self.run.attempt(lambda: self.run.start(self.session.service.run(self.scenario, self.source, seconds)))
 
     def follow(self) -> None:
         """Run the settings as they stand, unless that takes long: then stop, and wait to be asked; not at all while it rests."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from html import escape
 from typing import Any, Final
 
@@ -316,15 +317,13 @@ class Upload:
         """Read the file, beside the page, as what the fields say."""
         if not self._content:
             return
-        content, name = self._content, self._name
         scenario = self.store.scenario.replace({"telescope.radial_order": 6})  # as many modes as there may be
-        try:
-            stated = self.read_fields()
-        except RecordError as error:
-            self.reading.refuse(str(error))
-            return
 
-        self.reading.start(Job("upload", lambda _watch, _tell: read_stranger(content, name, scenario, stated)))
+        def read() -> None:
+            work = partial(read_stranger, self._content, self._name, scenario, self.read_fields())
+            self.reading.start(Job("upload", lambda _watch, _tell: work()))
+
+        self.reading.attempt(read)
 
     def _read(self, *_: object) -> None:
         task = self.reading

@@ -50,7 +50,6 @@ from wfsobs.priors_from.scenario import prior_of
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.settings.errors import SettingError
 from wfsobs.spectral.periodogram import fast_length, periodogram, periodogram_frequencies, taper
 from wfsobs.spectral.search import LOWEST
 from wfsobs.typing import Array
@@ -301,9 +300,9 @@ class IdentifyPage(Page):
     def __init__(self, store: Store, display: Display):
         super().__init__(store, display)
         self.work: Final = BackgroundTask(store.session, title="Identification")
-        self.starter: Final = Starter(
-            self.work, "Identify the record", "Progress of the identification", uses=("Filters only", "As a new simulation")
-        )
+        uses = {"Filters only": self.tell_filters, "As a new simulation": self.simulate}
+        words = "Identify the record", "Progress of the identification"
+        self.starter: Final = Starter(self.work, self._start, *words, uses=uses)
         self.level: Final = number_field("Level", LEVEL, 120)
         self.lowest: Final = number_field("Lowest peak [Hz]", LOWEST, 120)
         self.link = LinkedFields({"level": self.level, "lowest": self.lowest})
@@ -317,10 +316,6 @@ class IdentifyPage(Page):
         self.measuring: Final = BackgroundTask(store.session)
         self._scenario: Scenario | None = None
         self._spectrum = object()
-        self.starter.start.on_click(lambda _event: self.start())
-        filters, simulation = self.starter.uses
-        filters.on_click(lambda _event: self.tell_filters())
-        simulation.on_click(lambda _event: self.simulate())
         self.work.param.watch(self.redraw, "result")
         self.measuring.param.watch(self._land, ["state", "place"])
         self.run.param.watch(self.follow, ["result", "state"])
@@ -334,21 +329,10 @@ class IdentifyPage(Page):
             box("Model", self.table, text(ABOUT)),
         )
 
-    def start(self) -> None:
-        """Identify the record shown."""
-        of = self.run.result
-        if of is None:
-            self.work.refuse("There is no record yet.")
-            return
-        try:
-            level, lowest = read_number(self.level, 1e-9, 0.5), read_number(self.lowest, 1e-3, 1e4)
-            cost = seconds(of.result.record)
-            self.store.limits.check_seconds(cost, "identification")
-        except SettingError as error:
-            self.work.refuse(str(error))
-        else:
-            work = partial(compute, of, level, lowest)
-            self.work.start(Job("identify", work, cost=cost, time_limit=self.store.limits.seconds))
+    def _start(self) -> None:
+        of = self.shown_results()
+        work = partial(compute, of, read_number(self.level, 1e-9, 0.5), read_number(self.lowest, 1e-3, 1e4))
+        self.work.start(self.store.limits.job("identify", "identification", work, seconds(of.result.record)))
 
     def tell_filters(self) -> None:
         """Take the model into the settings, for the filters alone: the record stays, be it loaded or simulated."""
@@ -381,13 +365,9 @@ class IdentifyPage(Page):
     def _take(self, source: Source | None) -> None:
         result, _ = self._model_and_record()
         if result is not None:
-            try:
-                self.store.run_on(source, result.scenario(self.store.scenario))
-            except SettingError as error:
-                self.work.refuse(str(error))
-            else:
-                self._scenario = self.store.scenario if source is None else None
-                self.redraw()
+            self.store.run_on(source, result.scenario(self.store.scenario))
+            self._scenario = self.store.scenario if source is None else None
+            self.redraw()
 
     def follow(self, *_: object) -> None:
         """Measure the record shown, once its run is over."""
@@ -453,7 +433,7 @@ class Suggestion:
         if self.page is None:
             self.page = self._make_page()
             self.page.work.param.watch(self._refresh, ["state", "progress", "message"])
-        self.page.start()
+        self.page.starter.begin()
         self._waits = self.page.work.state == RUNNING
         self._refresh()
 
@@ -462,7 +442,7 @@ class Suggestion:
         if work and self.page and self._waits and work.state != RUNNING:
             self._waits = False
             if work.state == DONE:
-                self.page.tell_filters()
+                self.page.work.attempt(self.page.tell_filters)
         running, used = bool(work and work.state == RUNNING), bool(self.page and self.page.is_used)
         said = IDENTIFIED if used else work.line("Identifying") if work and running else (work and work.message) or NEXT
         with pn.io.hold():

@@ -236,13 +236,8 @@ class LivePage(Page):
 
     def start(self) -> None:
         """Run the scenario of the drawer, or the record that is loaded, or say in one line why not."""
-        scenario = self.store.scenario
-        try:
-            self.store.validate(scenario)
-        except SettingError as error:
-            self.work.refuse(str(error))
-            return
-        self.work.begin(self._order())
+        if self.work.attempt(lambda: self.store.validate(self.store.scenario)):
+            self.work.begin(self._order())
 
     def _order(self) -> LiveOrder:
         """Return the loop that the page asks for: the one that all pages show, or that of the drawer or of the record loaded."""

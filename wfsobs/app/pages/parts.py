@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import partial
 from html import escape
 from types import MappingProxyType
@@ -25,6 +25,7 @@ from wfsobs.app.service import IDLE, BackgroundTask
 from wfsobs.app.store import Store
 from wfsobs.app.style import HEARD, WIDE, HtmlText, html, sheets, swatch
 from wfsobs.app.views.plots import call
+from wfsobs.app.work import RunResults
 from wfsobs.settings.errors import SettingError
 from wfsobs.settings.parameters import hint
 
@@ -241,6 +242,12 @@ class Page(ABC):
         """Begin what is to be computed of what is shown now; most pages compute nothing."""
         return
 
+    def shown_results(self) -> RunResults:
+        """Return the results shown. Raises SettingError where there are none."""
+        if self.run.result is None:
+            raise SettingError("There is no record yet.")
+        return self.run.result
+
     def redraw(self, *_: object) -> None:
         """Draw what has come, as one message, where it is seen."""
         if self.visible:
@@ -251,7 +258,7 @@ class Page(ABC):
         """Draw what has come; a page without figures draws nothing."""
         return None
 
-    def repeat(self, act: Callable[[], object], seconds: float) -> None:
+    def repeat(self, act: Callable[[], None], seconds: float) -> None:
         """Call a function again and again while the page `goes_on`."""
         if pn.state.curdoc:
             self._repetition = pn.state.add_periodic_callback(act, round(1e3 * seconds), start=False)
@@ -430,9 +437,20 @@ class Starter:
     """The buttons that start, cancel and use something long, and the line on how it is going."""
 
     def __init__(
-        self, work: BackgroundTask, start: str, label: str, detail: Callable[[], str] = str, uses: Sequence[str] = ("Use it",)
+        self,
+        work: BackgroundTask,
+        begin: Callable[[], object],
+        start: str,
+        label: str,
+        detail: Callable[[], str] = str,
+        uses: Mapping[str, Callable[[], object]] = MappingProxyType({}),
     ):
-        """Make the buttons. detail : what to add to the line while the work goes on; uses : what can be done with the result."""
+        """Make the buttons.
+
+        begin  : starts the work, or raises SettingError or RecordError with the reason why not
+        detail : what to add to the line while the work goes on
+        uses   : what can be done with the result
+        """
         self.work = work
         self._detail = detail
         self.start: Final = pmui.Button(label=start, icon="play_arrow", color="primary", size="small", margin=0)
@@ -440,9 +458,15 @@ class Starter:
         self.uses: Final = [
             pmui.Button(label=use, icon="check", variant="outlined", size="small", margin=0, disabled=True) for use in uses
         ]
+        self.begin: Final = partial(work.attempt, begin)
+        for button, act in zip((self.start, *self.uses), (begin, *uses.values()), strict=True):
+            button.on_click(partial(self._do, act))
         self.status: Final = Status(label=label, sizing_mode="stretch_width", margin=(4, 0), visible=False)
         self.cancel.on_click(lambda _event: work.cancel())
         work.param.watch(self.refresh, ["state", "progress", "place", "message", "latest", "result"])
+
+    def _do(self, act: Callable[[], object], _event: object) -> None:
+        self.work.attempt(act)
 
     def view(self) -> list[Any]:
         """Return the row of buttons; the line of progress is `status`."""

@@ -311,7 +311,7 @@ class SweepPage(Page):
         super().__init__(store, display)
         self._explore = explore
         self.work: Final = SweepTask(store.session)
-        self.starter: Final = Starter(self.work, "Run the sweep", "Progress of the sweep", self._so_far, uses=())
+        self.starter: Final = Starter(self.work, self._start, "Run the sweep", "Progress of the sweep", self._so_far)
         names = sweep_settings(store.scenario)
         (first, values), (second, more) = FIRST
         self.axes: Final = (
@@ -353,7 +353,6 @@ class SweepPage(Page):
         self._watch()
 
     def _watch(self) -> None:
-        self.starter.start.on_click(lambda _event: self.start())
         self.link.watch(self.follow)
         self.work.param.watch(self._take, ["state", "result"])
         self.store.param.watch(self._compare, ["scenario", "source"])
@@ -395,26 +394,16 @@ class SweepPage(Page):
         groups = {path.partition(".")[0] for path, _ in self._axes()}
         return quick_observers(self.store.scenario, groups) if self.observers.value == QUICK else None
 
-    def start(self) -> None:
-        """Run the sweep that the fields describe, or say in one line why not."""
-        try:
-            sweep = self.plan()
-        except SettingError as error:
-            self.work.refuse(line_of(error))
-        else:
-            self.lines = {}
-            self.work.begin(sweep)
+    def _start(self) -> None:
+        sweep, self.lines = self.plan(), {}
+        self.work.begin(sweep)
 
     def load(self, cell: int) -> None:
         """Take the scenario of a cell into the drawer, and show it."""
         results = self.results
         if results is None or not 0 <= cell < len(results.sweep.cells):
             return
-        try:
-            self.store.run_on(None, results.sweep.scenario(cell))
-        except SettingError as error:
-            self.work.refuse(line_of(error))
-        else:
+        if self.work.attempt(lambda: self.store.run_on(None, results.sweep.scenario(cell))):
             self._explore()
 
     @property

@@ -20,7 +20,7 @@ from wfsobs.app.controls.names import setting_name
 from wfsobs.app.copies import TUNE, CopiedTask
 from wfsobs.app.display import NO_ANGLE, UNITS, Display, per_micrometre
 from wfsobs.app.downloads import table_csv
-from wfsobs.app.jobs import BATCH, INTERVAL, RUNNING, Job, Tell
+from wfsobs.app.jobs import INTERVAL, RUNNING, Tell
 from wfsobs.app.pages.parts import (
     WIDE,
     LinkedFields,
@@ -46,11 +46,9 @@ from wfsobs.cost import part_seconds
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import VIBRATION
 from wfsobs.progress import Watch
-from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings
 from wfsobs.sensors.modes import TIP_TILT
-from wfsobs.settings.errors import SettingError
 from wfsobs.tuning import Evaluation, Stage, TuningResult, tune
 from wfsobs.tuning.records import MEASURES, NEXT, REFERENCE, TRUTH, judged_by
 from wfsobs.tuning.report import settings, tuning_remarks, tuning_toml
@@ -250,7 +248,9 @@ class TunePage(Page):
     def __init__(self, store: Store, display: Display):
         super().__init__(store, display, "unit", "dark")
         self.work: Final = BackgroundTask(store.session, title="Tuning")
-        self.starter: Final = Starter(self.work, "Start tuning", "Progress of the tuning", self._so_far)
+        self.starter: Final = Starter(
+            self.work, self._start, "Start tuning", "Progress of the tuning", self._so_far, {"Use it": self.use}
+        )
         self.observer: Final = pmui.Select(label="Observer", options=choices(), value=START, size="small", width=250, margin=0)
         self.target: Final = pmui.Select(label="Error of", options=[], size="small", width=130, margin=0)
         self.evaluations: Final = number_field("Evaluations", EVALUATIONS, 110)
@@ -263,8 +263,6 @@ class TunePage(Page):
         self.outcome: Final = box("Before and after", self.table)
         self.history.visible = self.outcome.visible = False
         self.stale: Final = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
-        self.starter.start.on_click(lambda _event: self.start())
-        self.starter.uses[0].on_click(lambda _event: self.use())
         self.observer.param.watch(self._choose, "value")
         self.work.param.watch(self.redraw, ["latest", "result"])
         store.param.watch(self._compare, "scenario")
@@ -277,30 +275,18 @@ class TunePage(Page):
         tuning = box("Tuning", text(INTRO), row, self.search_space, self.starter.status, self.stale)
         return boxes(tuning, example("tune", self.history), self.history, self.outcome)
 
-    def start(self) -> None:
-        """Tune the chosen observer."""
-        of, observer, target, scenario = self.run.result, self.observer.value, self.target.value, self.store.scenario
-        if of is None:
-            self.work.refuse("There is no record yet.")
-            return
-        try:
-            evaluations = read_number(self.evaluations, 1, MOST, whole=True)
-            cost = seconds(of, scenario, observer, evaluations)
-            self.store.limits.check_seconds(cost, "tuning")
-            self.measure = minimised_measure(of, observer, target)
-        except (SettingError, RecordError) as error:
-            self.work.refuse(str(error))
-        else:
-            work = partial(compute, of, scenario, observer, target, evaluations)
-            self.work.start(Job("tune", work, cost=cost, priority=BATCH, time_limit=self.store.limits.seconds))
+    def _start(self) -> None:
+        of, observer, target, scenario = self.shown_results(), self.observer.value, self.target.value, self.store.scenario
+        evaluations = read_number(self.evaluations, 1, MOST, whole=True)
+        cost = seconds(of, scenario, observer, evaluations)
+        job = self.store.limits.job("tune", "tuning", partial(compute, of, scenario, observer, target, evaluations), cost)
+        self.measure = minimised_measure(of, observer, target)
+        self.work.start(job)
 
     def use(self) -> None:
         """Take what was tuned into the settings, and leave the others as they are by now."""
         if (tuned := self.finding) is not None:
-            try:
-                self.store.replace(changed_settings(tuned.scenario, tuned.before.scenario))
-            except SettingError as error:
-                self.work.refuse(str(error))
+            self.store.replace(changed_settings(tuned.scenario, tuned.before.scenario))
 
     @property
     def task(self) -> CopiedTask:

@@ -9,7 +9,7 @@ import panel as pn
 from bokeh.models import DataRange1d, Range1d
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.jobs import BATCH, DONE, Job
+from wfsobs.app.jobs import DONE
 from wfsobs.app.loop_work import uncertain, uncertain_seconds
 from wfsobs.app.pages.parts import WIDE, Starter, box, figure_with_caption, line, text
 from wfsobs.app.render import macro, number
@@ -78,8 +78,7 @@ class UncertainPlant:
     def __init__(self, store: Store, display: Display):
         self.store, self.display = store, display
         self.work = BackgroundTask(store.session, title="Uncertain plant")
-        self.starter = Starter(self.work, "Compute", "Progress of the uncertain plant", uses=())
-        self.starter.start.on_click(lambda _event: self.start())
+        self.starter = Starter(self.work, self._start, "Compute", "Progress of the uncertain plant")
         self.figure = DelayFigure()
         drawn = figure_with_caption("Residual against delay error", self.figure.figure)
         self.room = pn.Column(drawn, text(ABOUT), **WIDE, visible=False)
@@ -98,20 +97,12 @@ class UncertainPlant:
         """Whether all controllers are in it."""
         return self.work.state == DONE and self.finding is not None
 
-    def start(self) -> None:
-        """Compute the envelope of the results shown."""
+    def _start(self) -> None:
         of = self.store.run.result
         if of is None or isinstance(of.source, LoadedRecord):
-            self.work.refuse("An envelope takes the true spectra, which only a simulation has.")
-            return
-        cost = uncertain_seconds(of.scenario)
-        try:
-            self.store.limits.check_seconds(cost, "uncertain plant")
-        except SettingError as error:
-            self.work.refuse(str(error))
-            return
-        work = partial(uncertain, of.scenario)
-        self.work.start(Job("envelope", work, cost=cost, priority=BATCH, time_limit=self.store.limits.seconds))
+            raise SettingError("An envelope takes the true spectra, which only a simulation has.")
+        work, cost = partial(uncertain, of.scenario), uncertain_seconds(of.scenario)
+        self.work.start(self.store.limits.job("envelope", "uncertain plant", work, cost))
 
     def forget(self) -> None:
         """Forget what is of other results."""
