@@ -69,8 +69,6 @@ NONE = "none"
 CURVES = tuple(c.id for c in CONTROLLERS.values() if c.law and not c.predict and not c.ngs)
 """Controllers that may have a transfer function."""
 
-NOWHERE = (np.empty(0), np.empty(0, dtype=complex), np.empty(0, dtype=complex))
-
 
 class Trace(LoopLines):
     """The residual of every controller over time; that of none would dwarf the rest. seconds : shown of a record at first."""
@@ -117,20 +115,19 @@ class Trace(LoopLines):
         scale = per_micrometre(display.unit, results.result.scenario.telescope.diameter)
         times = envelope_times(first, last, BINS, record.dt)
         with pn.io.hold():
-            for name, source in self.sources.items():
-                residual = results.residual(name)
-                source.data = (
-                    {"x": [], "y": []}
-                    if residual is None
-                    else {"x": times, "y": (scale * envelope(residual[first:last, display.column], BINS)).astype(np.float32)}
-                )
+            self.put(
+                {
+                    o.controller: (times, scale * envelope(o.residual[first:last, display.column], BINS))
+                    for o in results.result.outcomes
+                    if o.residual is not None
+                }
+            )
             self.fit(self._invisible_names)
 
     def fit(self, hidden_names: list[str]) -> None:
         """Have the axis hold every visible line."""
         self._invisible_names = hidden_names
-        lines = [np.abs(s.data["y"]) for name, s in self.sources.items() if name not in hidden_names and len(s.data["y"])]
-        top = 1.1 * max((float(y.max()) for y in lines), default=1.0)
+        top = 1.1 * self.highest(hidden_names, 1.0)
         self.figure.y_range.update(start=-top, end=top, reset_start=-top, reset_end=top)
 
 
@@ -149,17 +146,15 @@ class LoopSpectrum(LoopLines):
     def draw(self, results: LoopResults, display: Display) -> None:
         """Send every line."""
         scale = per_micrometre(display.unit, results.result.scenario.telescope.diameter) ** 2
-        for name, source in self.sources.items():
-            frequency, density = results.spectra.get(name, (np.empty(0), np.empty((0, display.column + 1))))
-            source.data = {"x": frequency[1:], "y": scale * density[1:, display.column]}
-            if frequency.size:
-                self.figure.x_range.update(start=float(frequency[1]), end=float(frequency[-1]))
+        lines = {name: (f[1:], scale * density[1:, display.column]) for name, (f, density) in results.spectra.items()}
+        self.put(lines)
+        for frequency, _ in lines.values():
+            self.figure.x_range.update(start=float(frequency[0]), end=float(frequency[-1]))
         self.figure.yaxis.axis_label = f"PSD of residual, {display.mode_label} [{display.unit_label}²/Hz]"
 
     def fit(self, hidden_names: list[str]) -> None:
         """Have the axis hold every visible line, but for what lies too far below the highest."""
-        lines = [s.data["y"] for name, s in self.sources.items() if name not in hidden_names and len(s.data["y"])]
-        top = 3.0 * max((float(np.max(y)) for y in lines), default=0.0) or 1.0
+        top = 3.0 * self.highest(hidden_names, 0.0) or 1.0
         self.figure.y_range.update(start=top * 10.0**-DECADES, end=top)
 
 
@@ -175,12 +170,8 @@ class Response(PairedLines):
         """Send every line."""
         nyquist = 0.5 / results.result.record.dt
         self.figure.x_range.update(start=1e-3 * nyquist, end=nyquist)
-        for name in CURVES:
-            of = results.curves.get(name)
-            curves = of[display.column] if of else None
-            x, rejection, noise = (curves.frequency, curves.rejection, curves.noise) if curves else NOWHERE
-            self.sources[name].data = {"x": x, "y": _decibel(rejection)}
-            self.faint_sources[name].data = {"x": x, "y": _decibel(noise)}
+        curves = {name: of[display.column] for name, of in results.curves.items()}
+        self.put_both({name: (c.frequency, _decibel(c.rejection), _decibel(c.noise)) for name, c in curves.items()})
 
 
 def _decibel(x: Complex) -> Array:
@@ -204,14 +195,12 @@ class Nyquist(LoopLines):
 
     def draw(self, results: LoopResults, display: Display) -> None:
         """Send every line and mark."""
+        gains = {name: of[display.column].loop_gain for name, of in results.curves.items()}
+        self.put({name: plane(L) for name, L in gains.items()})
         self._at = {}
-        for name, source in self.sources.items():
-            of = results.curves.get(name)
-            L = of[display.column].loop_gain if of else np.empty(0, dtype=complex)
-            x, y = plane(L)
-            source.data = {"x": x, "y": y}
-            margins = results.result.design.laws[name][display.column].margins if name in results.result.design.laws else None
-            if margins is None or not L.size:
+        for name, L in gains.items():
+            margins = results.result.design.laws[name][display.column].margins
+            if margins is None or name not in self.sources:
                 continue
             self._at[name] = [(complex(-1.0 / margins.gain), "circle")] if margins.gain else []
             if margins.phase is not None:

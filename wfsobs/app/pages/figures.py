@@ -5,17 +5,15 @@ from __future__ import annotations
 from html import escape
 from typing import Final
 
-import numpy as np
 import panel as pn
-from bokeh.models import BoxAnnotation, ColumnDataSource, DataRange1d, Range1d
-from bokeh.plotting import figure
+from bokeh.models import BoxAnnotation, DataRange1d, Range1d
 
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.pages.parts import WIDE, Page, boxes, html
 from wfsobs.app.render import number
 from wfsobs.app.store import Store
 from wfsobs.app.style import look, sheets, swatch
-from wfsobs.app.views.plots import add_line, call, new_figure
+from wfsobs.app.views.plots import LoopLines, call, new_figure
 from wfsobs.app.views.table import find
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.plot.paper import DECADES, FIGURES, WHOLE, ZOOMED, PaperFigure, Plot, drawn_lines, is_dashed, samples_of
@@ -84,18 +82,17 @@ class _Sheet:
         return "" if error is None else f" (paper {number(error * scale)})"
 
 
-class _PlotLines:
+class _PlotLines(LoopLines):
     """One plot."""
 
     def __init__(self, plot: Plot, names: tuple[str, ...], of: PaperFigure):
         self.plot, self.of = plot, of
         y_range = Range1d(start=1e-3, end=1.0) if plot.is_spectrum else DataRange1d()
         kind = "log" if plot.is_spectrum else "linear"
-        self.figure: figure = new_figure(x_range=Range1d(start=0.0, end=1.0), y_range=y_range, y_axis_type=kind)
-        self.figure.xaxis.axis_label = "frequency [Hz]" if plot.is_spectrum else "time [s]"
-        call(self.figure, f"{of.title}, {TIP_TILT[plot.column].name}, {plot.what}")
-        self.sources = {name: ColumnDataSource({"x": [], "y": []}) for name in names}
-        self.lines = {name: add_line(self.figure, name, source) for name, source in self.sources.items()}
+        fig = new_figure(x_range=Range1d(start=0.0, end=1.0), y_range=y_range, y_axis_type=kind)
+        fig.xaxis.axis_label = "frequency [Hz]" if plot.is_spectrum else "time [s]"
+        call(fig, f"{of.title}, {TIP_TILT[plot.column].name}, {plot.what}")
+        super().__init__(fig, names)
         for name, line in self.lines.items():
             line.glyph.update(line_width=1.6, line_dash=list(look(name).dash) if is_dashed(name, of) else [])
         self.window = BoxAnnotation(left=0, right=0, fill_color="#808080", fill_alpha=0.15, line_width=0, level="underlay")
@@ -107,16 +104,14 @@ class _PlotLines:
         record, warm_up = results.result.record, results.scenario.run.warm_up
         shown = drawn_lines(self.of, self.plot, record, warm_up, results.values)
         scale = per_micrometre(display.unit, results.scenario.telescope.diameter) ** (1 + self.plot.is_spectrum)
-        for name, line in self.lines.items():
-            line.glyph.line_color = look(name).colour(display.dark)
-            x, y = shown.lines.get(name, (np.zeros(0), np.zeros(0)))
-            self.sources[name].data = {"x": x, "y": (scale * y).astype(np.float32)}
+        self.put({name: (x, scale * y) for name, (x, y) in shown.lines.items()})
+        self.restyle(display.dark, [])
         self.figure.yaxis.axis_label = f"{self.plot.label} [{self.plot.unit(display.unit_label)}]"
         start, end = shown.ends
         self.figure.x_range.update(start=start, end=end, reset_start=start, reset_end=end)
         first, last = samples_of(record, warm_up)[ZOOMED]
         self.window.update(left=first * record.dt, right=last * record.dt)
-        top = scale * max((float(y.max()) for _, y in shown.lines.values()), default=0.0)
+        top = self.highest([], 0.0)
         if self.plot.is_spectrum and top > 0:
             self.figure.y_range.update(start=top / 10**DECADES, end=2 * top)
 

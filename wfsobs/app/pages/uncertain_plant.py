@@ -66,9 +66,7 @@ class DelayFigure(PairedLines):
         of = envelope.curves("delay", display.column)
         end = envelope.uncertainty.delay
         self.figure.x_range.update(start=-end, end=end)
-        for name in LINEAR:
-            x, mean, most = of.get(name, (np.empty(0),) * 3)
-            self.sources[name].data, self.faint_sources[name].data = {"x": x, "y": scale * most}, {"x": x, "y": scale * mean}
+        self.put_both({name: (x, scale * most, scale * mean) for name, (x, mean, most) in of.items()})
         self.figure.yaxis.axis_label = f"residual {display.mode_label} [{display.unit_label}]"
 
 

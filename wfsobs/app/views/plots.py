@@ -143,12 +143,21 @@ def add_line(fig: figure, name: str, source: ColumnDataSource, y: str = "y") -> 
 
 
 class LoopLines:
-    """A figure with a line per controller."""
+    """A figure with a line per name, of controllers or observers."""
 
     def __init__(self, fig: figure, names: tuple[str, ...]):
         self.figure = fig
         self.sources: Final = {name: ColumnDataSource({"x": [], "y": []}) for name in names}
         self.lines: Final = {name: add_line(fig, name, source) for name, source in self.sources.items()}
+
+    def put(self, lines: Mapping[str, tuple[Array, Array]]) -> None:
+        """Show these lines (name -> x, y), and nothing of the others."""
+        _put(self.sources, lines)
+
+    def highest(self, hidden_names: Sequence[str], without: float) -> float:
+        """Return the largest value of the visible lines; `without` any another one."""
+        shown = [source.data["y"] for name, source in self.sources.items() if name not in hidden_names]
+        return max((float(np.max(np.abs(y))) for y in shown if len(y)), default=without)
 
     def restyle(self, dark: bool, hidden_names: list[str]) -> None:
         """Set the colours of light or dark mode, and hide lines."""
@@ -167,10 +176,21 @@ class PairedLines(LoopLines):
         for drawn in self.faint.values():
             drawn.glyph.update(line_alpha=0.45, line_width=1.2)
 
+    def put_both(self, lines: Mapping[str, tuple[Array, Array, Array]]) -> None:
+        """Show these lines (name -> x, strong y, faint y), and nothing of the others."""
+        self.put({name: (x, y) for name, (x, y, _) in lines.items()})
+        _put(self.faint_sources, {name: (x, y) for name, (x, _, y) in lines.items()})
+
     def restyle(self, dark: bool, hidden_names: list[str]) -> None:
         """Set the colours of light or dark mode, and hide lines."""
         super().restyle(dark, hidden_names)
         restyle(self.faint, dark, hidden_names)
+
+
+def _put(sources: Mapping[str, ColumnDataSource], lines: Mapping[str, tuple[Array, Array]]) -> None:
+    for name, source in sources.items():
+        x, y = lines.get(name, (np.empty(0), np.empty(0)))
+        source.data = {"x": x, "y": y.astype(np.float32)}
 
 
 def marked_peaks(scenario: Scenario) -> list[Peak]:
