@@ -150,20 +150,6 @@ def test_a_click_before_a_sweep_until_the_sweep_has_waited_long(make_queue: Any,
     log.until(lambda: log.started == ["a", "sweep", "long", "click", "last"])
 
 
-def test_who_waits_too_long_is_told_so(make_queue: Any) -> None:
-    queue, log = make_queue(1), Log()
-    busy = Asked(log, "a", wait_limit=WAIT).into(queue)
-    log.until(lambda: log.started == ["a"])
-    late, after = Asked(log, "b", wait_limit=0.01).into(queue), Asked(log, "c").into(queue)
-    assert late.over.wait(WAIT) and late.known["state"] == FAILED
-    assert late.known["message"] == "the server is busy: no turn within 0.01 s, try again"
-    assert after.places[-1] == 1 and late.job not in queue._timers
-    for one in (busy, after):
-        one.gate.set()
-        assert one.over.wait(WAIT) and one.known["state"] == DONE
-    assert log.started == ["a", "c"]
-
-
 def test_what_takes_too_long_is_stopped_counted_from_its_turn(make_queue: Any) -> None:
     queue, log = make_queue(1), Log()
     first = Asked(log, "a").into(queue)

@@ -187,7 +187,6 @@ class Actions:
             "report",
             partial(make, shown, preset, command=command, **self._extras()),
             time_limit=LIMIT,
-            wait_limit=LIMIT,
             refusal=ReportError,
         )
         self._start("report", "Report", job, partial(self.toolbar.save, REPORT, "text/html"))

@@ -13,15 +13,11 @@ import threading
 from collections.abc import Callable, Hashable, Mapping
 from functools import partial
 from time import monotonic
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from wfsobs.app.cache import Cache
 from wfsobs.app.logs import event
 from wfsobs.progress import Cancelled, Watch
-
-if TYPE_CHECKING:
-    pass
-
 
 log = logging.getLogger(__name__)
 
@@ -55,7 +51,6 @@ class Job:
     cost       : how long it takes, about [s]
     priority   : CLICK or BATCH; by its cost if not given
     time_limit : of the work, after which it is told to stop [s]
-    wait_limit : of the time in the line, after which it is given up [s]
     refusal    : exceptions of the work that are a reason in one line; others are bugs, and logged
     endless    : goes on until it is stopped; one place among the jobs is kept free of such
     quiet      : one of many in a second, of which the log says nothing unless it is asked for everything
@@ -72,7 +67,6 @@ class Job:
         cost: float = 0.0,
         priority: int | None = None,
         time_limit: float = math.inf,
-        wait_limit: float = math.inf,
         refusal: type[Exception] = ValueError,
         endless: bool = False,
         quiet: bool = False,
@@ -82,7 +76,6 @@ class Job:
         self.cost = cost
         self.priority: Final = (CLICK if cost <= LONG else BATCH) if priority is None else priority
         self.time_limit = time_limit
-        self.wait_limit = wait_limit
         self.endless = endless
         self.number: Final = next(Job._numbers)
         self.since: Final = monotonic()
@@ -214,7 +207,6 @@ class JobQueue:
         self._turn = 0  # the latest that has begun
         self._last_answer = -math.inf  # when something was last handed over, which is to be drawn
         self._change = threading.Condition()
-        self._timers: dict[Job, threading.Timer] = {}
         self._threads = [threading.Thread(target=self._work, name=f"wfsobs-work-{i}", daemon=True) for i in range(workers)]
         for thread in self._threads:
             thread.start()
@@ -251,10 +243,6 @@ class JobQueue:
             return
         if job.key:
             self._shared_jobs[job.key] = job
-        if job.wait_limit < math.inf:
-            self._timers[job] = threading.Timer(job.wait_limit, self._overdue, (job,))
-            self._timers[job].daemon = True
-            self._timers[job].start()
         owner = job.owner
         job.turn = max([self._turn, *(other.turn + 1 for other in self._requests if other.owner == owner)])
         self._waiting.append(job)
@@ -266,22 +254,13 @@ class JobQueue:
             with self._change:
                 self._take_out(job)
 
-    def _overdue(self, job: Job) -> None:
-        with self._change:
-            if self._take_out(job):
-                job.tell(state=FAILED, message=f"the server is busy: no turn within {job.wait_limit:g} s, try again")
-
-    def _take_out(self, job: Job) -> bool:
-        """Out of the line and of what is shared; whether it was in the line."""
+    def _take_out(self, job: Job) -> None:
+        """Out of the line and of what is shared."""
         if self._shared_jobs.get(job.key) is job:
             del self._shared_jobs[job.key]
-        if job not in self._waiting:
-            return False
-        self._waiting.remove(job)
-        if job in self._timers:
-            self._timers.pop(job).cancel()
-        self._tell_places()
-        return True
+        if job in self._waiting:
+            self._waiting.remove(job)
+            self._tell_places()
 
     @property
     def workers(self) -> int:
@@ -342,8 +321,6 @@ class JobQueue:
                     rest = math.inf if self.is_busy() else self._last_answer + self.rest - monotonic()
                 if job is not None and rest <= 0.0:
                     self._waiting.remove(job)
-                    if job in self._timers:
-                        self._timers.pop(job).cancel()
                     self._running.append(job)
                     self._turn = max(self._turn, job.turn)
                     job.tell_place(0)
