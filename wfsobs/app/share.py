@@ -9,8 +9,9 @@ Whatever of a query cannot be used is named, and the rest is used. Nothing of it
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import reduce
+from types import MappingProxyType
 from typing import Any
 from urllib.parse import parse_qsl, quote
 
@@ -34,17 +35,21 @@ PREFIX, COLUMN = "record.", "column."
 DIGITS = 64
 """Of a SHA-256 in hexadecimal."""
 
-STATEMENTS: dict[str, tuple[str, Callable[[str], Any], str]] = {
-    "unit": ("unit", str, f"takes one of {', '.join(UNITS)}"),
-    "sign": ("command_sign", int, "takes 1 or -1"),
-    "delay": ("command_delay", float, "takes a number of steps from 1"),
-    "gain": ("command_gain", lambda text: tuple(map(float, text.split(","))), "takes a number above 0, or one per mode"),
-    "rail": ("rail", float, "takes a number above 0"),
-    "open_loop": ("open_loop", lambda text: bool(("False", "True").index(text)), "takes True"),
-    "rate": ("rate", float, "takes a rate above 0 Hz"),
-    "trust": ("trust", lambda text: bool(("False", "True").index(text)), "takes True"),
-}
-"""Field -> part of the declaration, its reading, what it takes."""
+STATEMENTS: Mapping[str, tuple[str, str]] = MappingProxyType(
+    {
+        "unit": ("unit", f"takes one of {', '.join(UNITS)}"),
+        "sign": ("command_sign", "takes 1 or -1"),
+        "delay": ("command_delay", "takes a number of steps from 1"),
+        "gain": ("command_gain", "takes a number above 0, or one per mode"),
+        "rail": ("rail", "takes a number above 0"),
+        "open_loop": ("open_loop", "takes True"),
+        "rate": ("rate", "takes a rate above 0 Hz"),
+        "trust": ("trust", "takes True"),
+    }
+)
+"""Field -> part of the declaration, what it takes."""
+
+FLAGS = {"True": True, "False": False}
 
 
 def name_record(source: Source | None) -> NamedRecord | None:
@@ -56,7 +61,7 @@ def name_record(source: Source | None) -> NamedRecord | None:
 
 def record_fields(record: NamedRecord) -> dict[str, str]:
     """Write a record as fields of a link."""
-    said = {key: getattr(record.declaration, part) for key, (part, _, _) in STATEMENTS.items()}
+    said = {key: getattr(record.declaration, part) for key, (part, _) in STATEMENTS.items()}
     fields = {"name": record.name, "sha256": record.sha256}
     fields |= {key: _write(value) for key, value in said.items() if value not in (None, False)}
     fields |= {COLUMN + role: name for role, name in record.declaration.columns.items()}
@@ -81,25 +86,25 @@ def read_record_fields(fields: Mapping[str, str]) -> tuple[NamedRecord | None, d
     for key, text in given.items():
         try:
             declaration = _with(declaration, key, text)
-        except (SessionError, ValueError) as error:
-            refused[PREFIX + key] = str(error) if isinstance(error, SessionError) else STATEMENTS[key][2]
+        except SessionError as error:
+            refused[PREFIX + key] = str(error)
     return NamedRecord(safe_name(name), digits, declaration), refused
 
 
 def _with(declaration: DeclaredFormat, key: str, text: str) -> DeclaredFormat:
-    """Add what one field says. Raises SessionError, ValueError."""
-    role = key.removeprefix(COLUMN)
+    """Add what one field says. Raises SessionError."""
+    role, takes = key.removeprefix(COLUMN), "takes the name of a column"
     if key.startswith(COLUMN) and role in ROLES | SIGNALS:
-        changed = replace(declaration, columns={**declaration.columns, role: text})
+        part, value = "columns", {**declaration.columns, role: text}
     elif key in STATEMENTS:
-        part, read, takes = STATEMENTS[key]
-        changed = replace(declaration, **{part: read(text)})
+        part, takes = STATEMENTS[key]
+        value = [parse_number(one) for one in text.split(",")] if key == "gain" else FLAGS.get(text, parse_number(text))
     else:
         raise SessionError("there is no such part of a record")
     try:
-        return read_declaration({**vars(changed), "columns": dict(changed.columns)})
+        return read_declaration(vars(declaration) | {part: value})
     except SessionError:
-        raise SessionError(takes if key in STATEMENTS else "takes the name of a column") from None
+        raise SessionError(takes) from None
 
 
 Check = Callable[[Scenario], None]
@@ -186,11 +191,10 @@ def from_query(query: str, check: Check = Scenario.validate) -> Link:
     if name not in PRESETS:
         rejected.append(_line("preset", name, f"takes one of {', '.join(PRESETS)}"))
         name = SHORTEST_NAME
-    kept = {key.removeprefix(f"{KEPT}."): text for key, text in fields.items() if key.startswith(f"{KEPT}.")}
-    named = {key: fields.pop(key) for key in list(fields) if key.startswith(PREFIX)}
-    told = {key: text for key, text in fields.items() if key != KEPT and not key.startswith(f"{KEPT}.")}
-    scenario, refused = _apply(PRESETS[name](), told, check)
-    simulation, more = _apply(PRESETS[name](), kept, check) if kept or KEPT in fields else (None, [])
+    kept, named = ({key: fields.pop(key) for key in [*fields] if key.startswith(start)} for start in (KEPT, PREFIX))
+    of_simulation = {key.removeprefix(f"{KEPT}."): text for key, text in kept.items() if key != KEPT}
+    scenario, refused = _apply(PRESETS[name](), fields, check)
+    simulation, more = _apply(PRESETS[name](), of_simulation, check) if kept else (None, [])
     record, why = read_record_fields(named) if named else (None, {})
     unread = [_line(key, named.get(key, ""), reason) for key, reason in why.items()]
     return Link(scenario, name, (*rejected, *refused, *more, *unread), simulation, record)
