@@ -133,16 +133,15 @@ class Poster:
 
     def deliver(self) -> None:
         """Run what has been posted so far, before the page is sent: known results are part of it."""
-        with self._lock:
-            if not self._waiting:
-                return
-            functions, self._waiting = self._waiting, []
-        for function in functions:
-            _run_held(function)
+        if self._waiting:
+            self._run_waiting([])
 
     def _on_load(self) -> None:
+        self._run_waiting(None)
+
+    def _run_waiting(self, then: list[Callable[[], None]] | None) -> None:
         with self._lock:
-            functions, self._waiting = self._waiting or [], None
+            functions, self._waiting = self._waiting or [], then
         for function in functions:
             _run_held(function)
 
