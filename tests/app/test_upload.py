@@ -14,9 +14,9 @@ import pytest
 from wfsobs.app import picker as module
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.limits import Limits
-from wfsobs.app.picker import LARGEST
 from wfsobs.app.render import number
 from wfsobs.app.service import Service
+from wfsobs.app.session_file import LARGEST
 from wfsobs.app.upload import SILENT
 from wfsobs.pipeline import observe
 from wfsobs.scenario import Scenario

@@ -18,10 +18,10 @@ from wfsobs.app.controls.names import name_settings
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.downloads import Save, TooLarge
 from wfsobs.app.jobs import DONE, FAILED
-from wfsobs.app.picker import LARGEST
 from wfsobs.app.render import number, render
 from wfsobs.app.service import BackgroundTask, run_key
 from wfsobs.app.session_file import (
+    LARGEST,
     LONGEST_NAME,
     MOST,
     RECORD_BYTES,

@@ -99,6 +99,9 @@ def get_text(values: Mapping[str, Any], name: str, most: int = LONGEST_TEXT) -> 
     return get_value(values, name, str)[:most]
 
 
+LARGEST = 20_000_000
+"""Of a file that is opened [bytes]."""
+
 MOST = 200
 """Entries of a history; the oldest that have neither a star nor are compared go first."""
 
