@@ -182,20 +182,24 @@ class Store(param.Parameterized):
 
         preset : the one that they are to be compared with from now on; as it was if not given
         """
-        self._put(scenario, preset or self.preset, self.source if isinstance(self.source, LoadedRecord) else simulation)
+        kept = self.source if isinstance(self.source, LoadedRecord) else simulation
+        self.restore((scenario, preset or self.preset, kept))
 
     def replace(self, changes: Mapping[str, Any]) -> None:
         """Set several settings (dotted path -> value) in one step and run. Raises SettingError."""
-        self._put(self.scenario.replace(changes), self.preset, self.source)
+        self.run_on(self.source, self.scenario.replace(changes))
 
     def run_on(self, source: Source | None, scenario: Scenario) -> None:
         """Run on a record, or on the simulation of the settings (None), and take the settings with it. Raises SettingError."""
-        self._put(scenario, self.preset, source)
+        self.restore((scenario, self.preset, source))
 
     def restore(self, step: Step) -> None:
         """Return to settings, their preset and their record in one step. Raises SettingError."""
-        scenario, preset, source = step
-        self._put(scenario, preset, source)
+        scenario, _, source = step
+        self.validate(scenario)
+        if source is not None:
+            source.check(self.limits)
+        self._accept(step, {})
 
     def choose(self, name: str) -> None:
         """Start again from a preset."""
@@ -213,12 +217,6 @@ class Store(param.Parameterized):
     def step(self) -> Step:
         """Settings, preset and record as they stand."""
         return self.scenario, self.preset, self.source
-
-    def _put(self, scenario: Scenario, preset: str, source: Source | None) -> None:
-        self.validate(scenario)
-        if source is not None:
-            source.check(self.limits)
-        self._accept((scenario, preset, source), {})
 
     def _accept(self, to: Step, refusals: dict[str, Any], step: bool = True) -> None:
         """Accept new settings, the one way in. step : whether it is a change of its own, to be undone later."""
