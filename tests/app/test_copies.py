@@ -322,10 +322,8 @@ def test_what_pages_have_found_is_saved(dashboard: Dashboard, loop: Any, sent: l
         (r["controller"], r["mode"], "" if r["residual_rms_nm"] is None else str(r["residual_rms_nm"])) for r in page.results.rows
     ]
     outcomes = {o.controller: o.residual for o in page.results.result.outcomes if o.residual is not None}
-    with np.load(io.BytesIO(files["wfsobs-residuals.npz"]), allow_pickle=False) as arrays:
-        assert {n for n in arrays.files if "/" in n} == {f"residual/{name}" for name in outcomes}
-        np.testing.assert_array_equal(arrays["residual/integrator"], outcomes["integrator"])
     head, *lines = [x for x in files["wfsobs-residuals.csv"].decode().splitlines() if not x.startswith("#")]
+    assert {name.partition("/")[0] for name in head.split(",")[1:]} == outcomes.keys()
     column = head.split(",").index("integrator/tilt_um")
     np.testing.assert_allclose([float(x.split(",")[column]) for x in lines], outcomes["integrator"][:, 1], rtol=1e-8)
     dashboard.pages.current = "explore"

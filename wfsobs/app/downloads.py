@@ -66,12 +66,6 @@ def record_file(name: str, record: Record, scenario: Scenario) -> bytes:
     return file.getvalue()
 
 
-def residuals_npz(results: LoopResults) -> bytes:
-    """Write the residuals of the controllers, (n_steps, n_modes) [um], as residual/controller; dt; the scenario."""
-    arrays = {f"residual/{o.controller}": o.residual for o in results.result.outcomes if o.residual is not None}
-    return _npz(arrays | {"dt": np.array(results.result.record.dt), "scenario": np.array(to_toml(results.result.scenario))})
-
-
 def residuals_csv(results: LoopResults) -> bytes:
     """Time and the residual of every controller that has one, a row per step; nine digits; the scenario as comments."""
     record, scenario = results.result.record, results.result.scenario

@@ -15,7 +15,7 @@ from markupsafe import Markup
 
 from wfsobs.app.copies import LOOP, CopiedTask
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.downloads import residuals_csv, residuals_npz, table_csv
+from wfsobs.app.downloads import residuals_csv, table_csv
 from wfsobs.app.glossary import NEEDS, STREHL, TERMS
 from wfsobs.app.jobs import CANCELLED, FAILED, RUNNING, Job
 from wfsobs.app.loop_work import LoopResults, compute, cost, seconds
@@ -336,7 +336,6 @@ ABOUT = (
 FILES: Mapping[str, tuple[str, Callable[[LoopResults], bytes]]] = {
     "Controllers as CSV": ("wfsobs-controllers.csv", lambda shown: table_csv(shown.rows)),
     "Residuals as CSV": ("wfsobs-residuals.csv", residuals_csv),
-    "Residuals as NPZ": ("wfsobs-residuals.npz", residuals_npz),
 }
 """The table of `wfsobs loop --json`, and the residuals."""
 
