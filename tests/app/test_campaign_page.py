@@ -70,7 +70,7 @@ def open_campaign(dashboard: Dashboard, loop: Any) -> CampaignPage:
     dashboard.pages.current = CAMPAIGN
     page = dashboard.pages.by_name[CAMPAIGN]
     assert isinstance(page, CampaignPage)
-    loop.until(lambda: page.work.campaign is not None)
+    loop.until(lambda: page.state is not None)
     return page
 
 

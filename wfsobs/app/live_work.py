@@ -10,7 +10,7 @@ from typing import Any
 from wfsobs.app.downloads import Save, TooLarge, record_file
 from wfsobs.app.jobs import CLICK, Job, Tell
 from wfsobs.app.logs import event
-from wfsobs.app.service import BackgroundTask, Service
+from wfsobs.app.service import Service
 from wfsobs.live.loop import LiveLoop, LiveOrder
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError
@@ -64,24 +64,10 @@ def live_counts(loop: LiveLoop | None) -> dict[str, Any]:
     return {"live": {"frames": delivery.frames, "lost": delivery.losses, **late, "behind_s": round(behind, 3)}}
 
 
-class LiveTask(BackgroundTask):
-    """The live loop of a session, or the one that all sessions share."""
-
-    def begin(self, order: LiveOrder) -> None:
-        """Run a loop, in place of the one before."""
-        if self.session.service.queue.workers < 2:
-            self.refuse("A live loop takes one of at least two jobs at once: wfsobs serve --runs 2")
-            return
-        self.start(live_job(order, self.session.service))
-
-    @property
-    def loop(self) -> LiveLoop | None:
-        """The loop, once it runs."""
-        return self.latest
-
-
 def live_job(order: LiveOrder, service: Service) -> Job:
-    """Make the job of a loop."""
+    """Make the job of a loop. Raises SettingError where there is no room for one."""
+    if service.queue.workers < 2:
+        raise SettingError("A live loop takes one of at least two jobs at once: wfsobs serve --runs 2")
     work: Any = lambda watch, tell: compute(order, service, watch, tell)  # noqa: E731
     limits = service.limits
     return Job("live", work, key=order.key, priority=CLICK, time_limit=limits.live_seconds, endless=True, refusal=SettingError)

@@ -14,8 +14,8 @@ import panel_material_ui as pmui
 from wfsobs.app.controls.status import Status
 from wfsobs.app.copies import CAMPAIGN, EXPLORED, CopiedTask
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.jobs import BATCH, FAILED, RUNNING, Job
-from wfsobs.app.pages.parts import WIDE, LinkedFields, LinkedLater, Page, box, boxes, html, legend, line, text
+from wfsobs.app.jobs import BATCH, FAILED, RUNNING, Job, Work
+from wfsobs.app.pages.parts import WIDE, LinkedFields, Page, box, boxes, html, legend, line, text
 from wfsobs.app.pages.sweep import SweepMap, line_of
 from wfsobs.app.pages.sweep_views import DECIDED, LEFT_OUT, OPEN, WAITING, SweepLines, axis_title, map_square, verdict_text
 from wfsobs.app.render import NOTHING, Row, number, table
@@ -24,7 +24,7 @@ from wfsobs.app.service import BackgroundTask
 from wfsobs.app.store import Store
 from wfsobs.app.style import look, swatch
 from wfsobs.campaign.errors import CampaignErrors
-from wfsobs.campaign.follow import CampaignFolder, CampaignState
+from wfsobs.campaign.follow import CampaignState
 from wfsobs.campaign.report import name_label
 from wfsobs.campaign.selection import SCENARIO, PlanAxis, condition, plan_axes
 from wfsobs.campaign.standings import UNTESTED, TogetherRow, standings
@@ -33,27 +33,6 @@ from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 from wfsobs.typing import Array
-
-
-class CampaignTask(BackgroundTask):
-    """A look at the folder of the server's campaign; the result stays the same object while nothing is new."""
-
-    def look(self) -> None:
-        """Read what is new, unless that is under way."""
-        folder = self.folder
-        if folder is not None and self.state != RUNNING:
-            job = Job("campaign", lambda watch, _tell: folder.read(watch), priority=BATCH, refusal=SettingError, quiet=True)
-            self.start(job)
-
-    @property
-    def folder(self) -> CampaignFolder | None:
-        """The campaign that the server was started with."""
-        return self.session.service.campaign
-
-    @property
-    def campaign(self) -> CampaignState | None:
-        """What is known by the last look."""
-        return self.result
 
 
 @dataclass(frozen=True)
@@ -242,7 +221,8 @@ class CampaignPage(Page):
         """Make the page. explore : turns to the page that shows a scenario."""
         super().__init__(store, display)
         self._explore = explore
-        self.work: Final = CampaignTask(store.session)
+        self.work: Final = BackgroundTask(store.session)
+        self.folder: Final = store.session.service.campaign
         self.status: Final = Status(label="Progress of the campaign", sizing_mode="stretch_width", margin=(4, 0))
         self.failure: Final = html()
         self.room: Final = boxes()
@@ -254,7 +234,7 @@ class CampaignPage(Page):
         self._slice_of: tuple[str, ...] = ()
         self.axes: dict[str, PlanAxis] = {}
         self.filters: dict[str, Any] = {}
-        self.link = self._fields = LinkedLater()
+        self.link = self._fields = LinkedFields(None)
         self._targets = list[str]()
         self.work.param.watch(self._take, ["state", "result"])
         self.work.param.watch(self._say, ["state", "progress", "place", "message"])
@@ -268,13 +248,13 @@ class CampaignPage(Page):
         """Look at the folder, and again and again while the page is shown and the campaign goes on."""
         super().show(visible)
         if visible:
-            self.work.look()
+            self.tick()
         self.pace()
 
     @property
     def task(self) -> CopiedTask:
         """To print the table as it is shown; its folder is named as a loaded record is: without where it lies."""
-        folder, state = self.work.folder, self.work.campaign
+        folder, state = self.folder, self.state
         if folder is None:
             return EXPLORED
         target = [self.target.value] if state is not None and self._targets else []
@@ -283,18 +263,26 @@ class CampaignPage(Page):
         return CopiedTask(CAMPAIGN, {"folder": folder.folder.resolve().name, "target": target, "mode": mode, "only": only})
 
     def tick(self) -> None:
-        """Look whether there is something new."""
-        self.work.look()
+        """Read what is new, unless that is under way."""
+        folder = self.folder
+        if folder is not None and self.work.state != RUNNING:
+            work: Work = lambda watch, _tell: folder.read(watch)  # noqa: E731
+            self.work.start(Job("campaign", work, priority=BATCH, refusal=SettingError, quiet=True))
+
+    @property
+    def state(self) -> CampaignState | None:
+        """What is known by the last look: the same object while nothing is new."""
+        return self.work.result
 
     @property
     def goes_on(self) -> bool:
         """Whether there may be something new to see."""
-        state = self.work.campaign
+        state = self.state
         return self.visible and (state is None or state.n_done < state.plan.n_runs)
 
     def load(self, cell: int) -> None:
         """Open the scenario of a cell in Explore, with the first seed of the campaign."""
-        state = self.work.campaign
+        state = self.state
         if state is None or not 0 <= cell < len(state.plan.cells):
             return
         try:
@@ -307,7 +295,7 @@ class CampaignPage(Page):
     def _take(self, *_: object) -> None:
         if self.work.state == FAILED:
             self._refuse(line_of(SettingError(self.work.message)))
-        state = self.work.campaign
+        state = self.state
         if state is not None:
             self._make(state)
             self.redraw()
@@ -318,7 +306,7 @@ class CampaignPage(Page):
 
     def _say(self, *_: object) -> None:
         """Describe how far the campaign is."""
-        state = self.work.campaign
+        state = self.state
         if state is None:
             self.status.param.update(text=self.work.line("Reading"), progress=self.work.progress)
             return
@@ -359,7 +347,7 @@ class CampaignPage(Page):
         )
         only = {f"only.{path}": field for path, field in self.filters.items()}
         linked = {"target": self.target, "across": self.across, "down": self.down, **only, "lines": self.lines}
-        if refused := self._fields.make(LinkedFields(linked)):
+        if refused := self._fields.make(linked):
             self._refuse(f"Not used from the link: {', '.join(refused)}")
         for field in linked.values():
             field.param.watch(self.redraw, "value")
@@ -396,7 +384,7 @@ class CampaignPage(Page):
 
     def draw(self) -> None:
         """Send the picture; only aggregates leave the server."""
-        state = self.work.campaign
+        state = self.state
         if state is None or not self._targets:
             return
         view = self.view_of(state)

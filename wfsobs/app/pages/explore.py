@@ -57,7 +57,7 @@ MARKS = macro("marks", PEAKS, MODEL)
 class Explore(Page):
     """The page; its figures rest while it is hidden."""
 
-    def __init__(self, history: History, seeds: SeedRuns | None = None):
+    def __init__(self, history: History, seeds: SeedRuns):
         run, display = history.store.run, history.display
         self.run = run
         self.display = display
@@ -68,7 +68,7 @@ class Explore(Page):
         self.lines: Final = MainLines(run, display, seeds)
         self.traces: Final = Traces(run, display)
         self.spectra: Final = SpectraFigures(run, display, self.traces.x_range)
-        self.budgets: Final = Budgets(seeds.store, self.lines.names, seeds) if seeds else None
+        self.budgets: Final = Budgets(seeds.store, self.lines.names, seeds)
         self.strips: Final = {target: Strip(target, run, display, seeds, self.lines, self.budgets) for target in TARGETS}
         self.verdicts: Final = {target: VerdictLine(target, run, display, seeds, self.budgets) for target in TARGETS}
         axes = self.traces.x_range, self.spectra.x_range
@@ -100,7 +100,7 @@ class Explore(Page):
             self.show_switch,
             group(self.display, "spectrum", {"PSD": PSD, "Cumulative rms": CUMULATIVE}),
             pn.Row(*zoom_buttons(self.traces.zoom, ZOOMS), margin=0),
-            *([self._tick("editing")] if self.seeds else []),
+            self._tick("editing"),
             *self.pinning.view(),
             margin=0,
             stylesheets=[SWITCHES],
@@ -123,8 +123,7 @@ class Explore(Page):
         )
 
     def _above_table(self) -> pn.FlexBox:
-        seeds = SeedSwitch(self.seeds).view() if self.seeds else []
-        return pn.FlexBox(*seeds, gap="4px 16px", align_items="center", **WIDE)
+        return pn.FlexBox(*SeedSwitch(self.seeds).view(), gap="4px 16px", align_items="center", **WIDE)
 
     def _section(self, target: str) -> pn.Column:
         """Lay out the strip and the two figures of one target."""
@@ -133,7 +132,7 @@ class Explore(Page):
         cards = self.strips[target].cards
         cards.param.watch(lambda event: self._hide(target, event.new), "hidden_lines")
         cards.on_main = lambda: self.lines.reset(target)
-        cards.on_all = self.budgets.ask_for_all if self.budgets else lambda: None
+        cards.on_all = self.budgets.ask_for_all
         marks = MARKS if target == VIBRATION else ""
         traces, self.rooms[target] = (
             self._room(target, *parts)
@@ -164,8 +163,6 @@ class Explore(Page):
 
     def _edit(self, *_: object) -> None:
         """Make the handles when they are first wanted, and room for what stands below them."""
-        if self.seeds is None:
-            return
         self.complete()
         for room in self.rooms.values():
             room.stylesheets = [EDITED] if self.display.editing else TALL["stylesheets"]

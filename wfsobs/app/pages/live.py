@@ -17,7 +17,7 @@ from wfsobs.app.copies import LIVE, CopiedTask
 from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL, Display, per_micrometre
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs import FAILED, RUNNING
-from wfsobs.app.live_work import LiveTask, record_saves
+from wfsobs.app.live_work import live_job, record_saves
 from wfsobs.app.pages.live_controls import (
     LOOP_FIELDS,
     LiveControls,
@@ -38,7 +38,7 @@ from wfsobs.app.pages.live_figures import (
     Waterfall,
 )
 from wfsobs.app.pages.parts import HALVES, WIDE, Page, box, boxes, example, figure_with_caption, group, legend, line, text
-from wfsobs.app.service import IDLE
+from wfsobs.app.service import IDLE, BackgroundTask
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.style import html, look
@@ -179,7 +179,7 @@ class LivePage(Page):
 
     def __init__(self, store: Store, display: Display):
         super().__init__(store, display, "mode", "unit", "dark", "show", "spectrum", "editing")
-        self.work: Final = LiveTask(store.session)
+        self.work: Final = BackgroundTask(store.session)
         self.controls = c = LiveControls()
         self.buttons: Final = c.buttons
         self.link = c.link
@@ -230,14 +230,18 @@ class LivePage(Page):
         self.visible = visible
         shared = self.store.session.service.live
         if visible and shared is not None and self.work.state == IDLE:
-            self.work.begin(shared)
+            self._begin(shared)
         self._say()
         self.draw()
 
     def start(self) -> None:
         """Run the scenario of the drawer, or the record that is loaded, or say in one line why not."""
         if self.work.attempt(lambda: self.store.validate(self.store.scenario)):
-            self.work.begin(self._order())
+            self._begin(self._order())
+
+    def _begin(self, order: LiveOrder) -> None:
+        """Run a loop, in place of the one before."""
+        self.work.attempt(lambda: self.work.start(live_job(order, self.store.session.service)))
 
     def _order(self) -> LiveOrder:
         """Return the loop that the page asks for: the one that all pages show, or that of the drawer or of the record loaded."""

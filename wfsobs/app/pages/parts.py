@@ -52,24 +52,45 @@ class LinkedFields:
 
     Parameters
     ----------
-    fields : dict
-        Name -> a field, or an object and the name of its parameter.
+    fields : dict or None
+        Name -> a field, or an object and the name of its parameter; None for fields that are made later, and anew with other
+        results: until then the texts of an address wait.
     offers : dict
         Name -> a function that has a field offer a text, if there is such a choice. Raises SettingError.
     """
 
-    def __init__(self, fields: Mapping[str, Any], offers: Mapping[str, Callable[[str], object]] = MappingProxyType({})):
+    def __init__(self, fields: Mapping[str, Any] | None, offers: Mapping[str, Callable[[str], object]] = MappingProxyType({})):
         self._offers = offers
+        self._acts: list[Callable[..., object]] = []
+        self._waiting: Mapping[str, str] = {}
+        self._is_made = False
+        if fields is not None:
+            self.make(fields)
+
+    def make(self, fields: Mapping[str, Any]) -> list[str]:
+        """Take fields, in place of those before, with their texts or those that wait; return a line for each that is refused."""
+        before = self.texts() if self._is_made else self._waiting
+        self._is_made = True
         self._fields = {name: field if isinstance(field, tuple) else (field, "value") for name, field in fields.items()}
-        self.fresh: Final = {name: _text(getattr(*field)) for name, field in self._fields.items()}
+        self.fresh = {name: _text(getattr(*field)) for name, field in self._fields.items()}
+        refused = self.open(before) if before else []
+        for act in self._acts:
+            self._watch(act)
+            act()
+        return refused
 
     def texts(self) -> dict[str, str]:
-        """Return the texts that differ from those of a fresh page."""
+        """Return the texts that differ from those of a fresh page, or those that wait."""
+        if not self._is_made:
+            return {**self._waiting}
         now = {name: _text(getattr(*field)) for name, field in self._active_fields()}
         return {name: text for name, text in now.items() if text != self.fresh[name]}
 
     def open(self, texts: Mapping[str, str], leave: Collection[str] = ()) -> list[str]:
         """Fill in texts in the order of the fields, of which one may change the next; but for those to be left alone."""
+        if not self._is_made:
+            self._waiting = {**texts}
+            return []
         refused = not_known(name for name in texts if name not in self._fields)
         for name, (of, attribute) in self._active_fields():
             if name not in leave:
@@ -81,6 +102,11 @@ class LinkedFields:
 
     def watch(self, act: Callable[..., object]) -> None:
         """Call a function after every change."""
+        self._acts.append(act)
+        if self._is_made:
+            self._watch(act)
+
+    def _watch(self, act: Callable[..., object]) -> None:
         for of, attribute in self._fields.values():
             of.param.watch(act, attribute)
 
@@ -111,41 +137,6 @@ class LinkedFields:
             value = int(text)
         setattr(of, attribute, value)
         return []
-
-
-class LinkedLater:
-    """Fields that a page makes once it has results, and anew with others; until then the texts of an address wait."""
-
-    def __init__(self) -> None:
-        self._part: LinkPart | None = None
-        self._waiting: dict[str, str] = {}
-        self._acts: list[Callable[..., object]] = []
-
-    def make(self, part: LinkPart) -> list[str]:
-        """Fill in fields that are there now, as those before or the address have it; return a line for each text refused."""
-        before, self._part = self.texts(), part
-        refused = part.open(before)
-        for act in self._acts:
-            part.watch(act)
-            act()
-        return refused
-
-    def texts(self) -> dict[str, str]:
-        """Return the texts that differ from those of a fresh page, or those that wait."""
-        return self._part.texts() if self._part else self._waiting
-
-    def open(self, texts: Mapping[str, str]) -> list[str]:
-        """Take texts, now or once there are fields; return a line for each that is refused now."""
-        if self._part:
-            return self._part.open(texts)
-        self._waiting = dict(texts)
-        return []
-
-    def watch(self, act: Callable[..., object]) -> None:
-        """Call a function after every change."""
-        self._acts.append(act)
-        if self._part:
-            self._part.watch(act)
 
 
 class LinkedLines:
