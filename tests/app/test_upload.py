@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wfsobs.app import picker as module
+from wfsobs.app import upload as module
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.limits import Limits
 from wfsobs.app.render import number
