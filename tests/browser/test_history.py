@@ -105,7 +105,7 @@ def test_a_session_from_runs_to_a_file_and_back(open_page: Any, server: Any, tmp
     sheet(page).get_by_role("button", name="Undo delete").click()
     expect(row(page, "windy")).to_be_visible()
 
-    page.keyboard.press("Escape")
+    sheet(page).get_by_role("button", name="Close").click()
     expect(sheet(page)).to_be_hidden()
     with page.expect_download() as download:
         page.get_by_role("button", name="File", exact=True).click()

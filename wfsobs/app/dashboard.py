@@ -23,7 +23,7 @@ from wfsobs.app.history import History, HistorySheet
 from wfsobs.app.jobs import FAILED
 from wfsobs.app.pages.explore import Explore
 from wfsobs.app.pages.pages import EXPLORE, LIVE, Pages, ViewState
-from wfsobs.app.pages.parts import ON_ONE_LINE, WIDE
+from wfsobs.app.pages.parts import ON_ONE_LINE, WIDE, warning
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import Post, Session
 from wfsobs.app.store import Store
@@ -154,7 +154,7 @@ class Dashboard:
         self.frame: Final = Frame(width=0, height=0, margin=0)
         self.keyboard: Final = Keyboard(width=0, height=0, margin=0, styles={"position": "absolute"})
         self.alert: Final = pmui.Alert(object="", severity="error", visible=False, **WIDE)
-        self.stale: Final = pmui.Alert(object=STALE, severity="warning", visible=False, **WIDE)
+        self.stale: Final = warning(STALE)
         self.store.run.param.watch(self._refresh, ["state", "message"])
         self.store.param.watch(self._refresh, ["stale", "waiting"])
 

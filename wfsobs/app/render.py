@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
+from math import isnan
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -47,8 +48,8 @@ WHY_NOTHING: Mapping[str, str] = MappingProxyType(
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """Write a number with some significant digits, and without an exponent where it is of common size."""
-    if value is None:
+    """Write a number with some significant digits, without an exponent where it is of common size; a dash for none, or NaN."""
+    if value is None or isnan(value):
         return NOTHING
     if value == 0:
         return "0"

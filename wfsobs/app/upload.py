@@ -25,6 +25,7 @@ from wfsobs.app.component import HtmlComponent
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs import CANCELLED, FAILED, RUNNING, Job
+from wfsobs.app.pages.parts import make_button
 from wfsobs.app.render import render
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.session_file import LARGEST, SUFFIX
@@ -292,15 +293,13 @@ class Upload:
         self.actions: Final = actions
         self.picker: Final = Picker(sizing_mode="stretch_width", margin=0)
         self.picker.on_message = self.handle
-        self.use: Final = pmui.Button(label="Use this record", color="primary", size="small", margin=4)
-        self.drop: Final = pmui.Button(label="Discard", variant="outlined", size="small", margin=4)
+        self.use: Final = make_button("Use this record", self.confirm, color="primary", margin=4)
+        self.drop: Final = make_button("Discard", self.discard, variant="outlined", margin=4)
         self.missing: Final = html("", margin=(8, 4))
         self.content: Final = PreviewView()
         self.form: ColumnForm | None = None
-        self.take: Final = pmui.Button(
-            label="Take the proposed sign and delay", variant="outlined", size="small", margin=4, visible=False
-        )
-        self.take.on_click(lambda _event: self.take_proposals())
+        proposals = {"variant": "outlined", "margin": 4, "visible": False}
+        self.take: Final = make_button("Take the proposed sign and delay", self.take_proposals, **proposals)
         self.place: Final = RecordPlace(store)
         self.room: Final = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
         self._parcel = PartialFile()
@@ -308,8 +307,6 @@ class Upload:
         self._preview: AnyPreview | None = None
         self.reading: Final = BackgroundTask(store.session)
         self.reading.param.watch(self._read, ["state", "place", "message"])
-        self.use.on_click(lambda _event: self.confirm())
-        self.drop.on_click(lambda _event: self.discard())
         self.fields: Final = UploadFields(self.look)
         self._diameter = store.scenario.telescope.diameter
         store.param.watch(self._follow, "scenario")

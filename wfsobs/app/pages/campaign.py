@@ -104,7 +104,7 @@ def standings_html(view: CampaignView, display: Display) -> str:
     for s in standings(view.state, view.target, view.mode, view.cells):
         cells_of = [
             number(scale * s.rms_nm),
-            _number(s.over_bound),
+            number(s.over_bound),
             _interval(s.over_bound_low, s.over_bound_high),
             _above(s),
             NOTHING if s.rank == UNTESTED else s.rank,
@@ -116,17 +116,11 @@ def standings_html(view: CampaignView, display: Display) -> str:
     return str(table("Observers of the campaign", columns, [("", rows)]))
 
 
-def _number(x: float) -> str:
-    return number(float(x)) if np.isfinite(x) else NOTHING
-
-
 def _interval(low: float, high: float) -> str:
     return f"{number(float(low))} – {number(float(high))}" if np.isfinite(low) and np.isfinite(high) else NOTHING
 
 
 def _above(s: TogetherRow) -> str:
-    if np.isnan(s.above):
-        return NOTHING
     around = "" if np.isnan(s.above_low) else f" ({number(100 * s.above_low, 2)} to {number(100 * s.above_high, 2)})"
     return number(100 * s.above, 2) + around
 

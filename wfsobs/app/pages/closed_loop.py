@@ -34,7 +34,7 @@ from wfsobs.app.pages.parts import (
     text,
     zoom_buttons,
 )
-from wfsobs.app.pages.uncertain_plant import UncertainPlant, uncertain_cells, uncertain_columns
+from wfsobs.app.pages.uncertain_plant import UNSTABLE, UncertainPlant, uncertain_cells, uncertain_columns
 from wfsobs.app.render import NOTHING, Row, macro, number, table
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.store import Store
@@ -224,9 +224,6 @@ class Nyquist(LoopLines):
         }
 
 
-UNSTABLE = macro("tag", "above", "unstable")
-
-
 def of_mode(results: LoopResults, display: Display) -> list[Score]:
     """Select the rows of the mode shown, least residual first, those without one last."""
     rows = [r for r in results.rows if r["mode"] == display.mode]
@@ -286,7 +283,7 @@ def linear_text(row: Score, value: str) -> str:
 
 def _row(row: Score, display: Display, scale: float, smallest: bool, more: Sequence[str]) -> Row:
     def scaled(key: str) -> str:
-        return NOTHING if row[key] is None else number(row[key] * scale)
+        return number(row[key] and row[key] * scale)
 
     residual = UNSTABLE if row["stable"] is False else scaled("residual_rms_nm")
     cells = [

@@ -10,7 +10,6 @@ from typing import Final
 
 import numpy as np
 import panel as pn
-import panel_material_ui as pmui
 from bokeh.models import ColumnDataSource, HoverTool, Range1d
 
 from wfsobs.app.controls.fields import parse_number
@@ -27,9 +26,11 @@ from wfsobs.app.pages.parts import (
     html,
     legend,
     line,
+    make_button,
     number_field,
     read_number,
     text,
+    warning,
 )
 from wfsobs.app.render import Row, macro, table
 from wfsobs.app.service import BackgroundTask
@@ -311,7 +312,7 @@ class IdentifyPage(Page):
         self.table: Final = html()
         self.verdict: Final = html()
         self.note: Final = html()
-        self.stale: Final = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
+        self.stale: Final = warning(EARLIER)
         self.of: RecordSpectrum | None = None
         self.measuring: Final = BackgroundTask(store.session)
         self._scenario: Scenario | None = None
@@ -422,14 +423,13 @@ class Suggestion:
         self.page: IdentifyPage | None = None
         self._waits = False  # for a model that is to be used once it is there
         self.words: Final = html()
-        self.button: Final = pmui.Button(label="Identify", icon="troubleshoot", size="small", margin=0)
+        self.button: Final = make_button("Identify", self._identify, icon="troubleshoot")
         self.view: Final = pn.FlexBox(self.words, self.button, gap="8px 12px", align_items="center", visible=False, **WIDE)
         self.words.sizing_mode = None
-        self.button.on_click(self._identify)
         store.param.watch(self._refresh, ["source", "scenario"])
         store.run.param.watch(self._refresh, "state")
 
-    def _identify(self, _event: object) -> None:
+    def _identify(self) -> None:
         if self.page is None:
             self.page = self._make_page()
             self.page.work.param.watch(self._refresh, ["state", "progress", "message"])

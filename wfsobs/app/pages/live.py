@@ -138,11 +138,8 @@ class LiveRoom:
     def _draw_tables(self, loop: LiveLoop, view: LiveView, target: str, scale: float) -> None:
         self._bounds = loop.workshop.bounds(loop.scenario)
         self.legend.html = self._legend(loop, target)
-        d, seconds = self.display, self.controls.window.value
-        of = (d.column, d.unit, d.dark)
-        key = ("table", target, tuple(self._bounds), *of)
-        self.table.html = view.once(key, lambda: live_html(loop, view, target, d, scale, self._bounds))
-        self.control_table.html = view.once(("controls", seconds, *of), lambda: control_html(loop, seconds, d))
+        self.table.html = live_html(loop, view, target, self.display, scale, self._bounds)
+        self.control_table.html = control_html(loop, self.controls.window.value, self.display)
         self.news.html = events_html(loop.events, loop.sampling.dt)
         self.peaks.html = peaks_html(loop.workshop.change, scale, self.display.unit_label)
 

@@ -75,10 +75,10 @@ def _row(loop: LiveLoop, name: str, rms: float, target: str, display: Display, s
     whole = float(counts.rms(target)[display.column]) if target in SCORED else float("nan")
     lacks = [one for one in ((target,) if target in TARGETS else TARGETS) if one not in OBSERVERS[name].targets]
     cells = [
-        Markup('<span title="it has no {}">{}</span>').format(lacks[0], NOTHING) if lacks else _number(scale * rms),
-        _number(scale * whole),
-        _number(rms / least),
-        *(_number(1e6 * counts.latencies.quantile(share)) for share in (0.5, 0.999)),
+        Markup('<span title="it has no {}">{}</span>').format(lacks[0], NOTHING) if lacks else number(scale * rms),
+        number(scale * whole),
+        number(rms / least),
+        *(number(1e6 * counts.latencies.quantile(share)) for share in (0.5, 0.999)),
         str(int(counts.late[0])),
     ]
     return Row(swatch(name, display.dark) + look(name).label, cells, {"name": name})
@@ -104,7 +104,7 @@ def control_html(loop: LiveLoop, seconds: float, display: Display) -> str:
 
     def cells(now: Array, whole: Array) -> list[str]:
         ratios = [NOTHING if np.isnan(rms).any() else f"{strehl(rms.tolist(), c.wavelength):.4f}" for rms in (now, whole)]
-        return [*map(_number, (1e3 * now[column], mas * now[column], 1e3 * whole[column])), *ratios]
+        return [*map(number, (1e3 * now[column], mas * now[column], 1e3 * whole[column])), *ratios]
 
     order = sorted(found, key=lambda name: inf if isnan(found[name][0][column]) else found[name][0][column])
     rows = [Row(swatch(name, display.dark) + look(name).label, cells(*found[name]), {"controller": name}) for name in order]
@@ -131,15 +131,11 @@ def peaks_html(change: Change | None, scale: float, unit: str) -> str:
         return f"{by:+.2f}".replace("-", "−") if by else "0"
 
     rows = [
-        Row(number(p.frequency, 4), [_number(p.frequency_std), moved(p), _number(p.damping), number(scale * p.rms)])
+        Row(number(p.frequency, 4), [number(p.frequency_std), moved(p), number(p.damping), number(scale * p.rms)])
         for p in change.peaks
     ]
     title = "Peaks of the last minute"
     return f'<div class="caption apart">{title}</div>{table(title, columns, [("", rows)])}'
-
-
-def _number(x: float) -> str:
-    return NOTHING if isnan(x) else number(x)
 
 
 def status_line(loop: LiveLoop, view: LiveView) -> str:

@@ -327,14 +327,28 @@ def example(name: str, results: Any) -> HtmlText:
     return pane
 
 
+def make_button(label: str, act: Callable[[], object], **options: Any) -> pmui.Button:
+    """Make a small button. act : called by a click."""
+
+    def do(_event: object) -> None:
+        act()
+
+    button = pmui.Button(label=label, **{"size": "small", "margin": 0, **options})
+    button.on_click(do)
+    return button
+
+
+def warning(words: str) -> pmui.Alert:
+    """Make a warning that is not seen yet."""
+    return pmui.Alert(object=words, severity="warning", visible=False, **WIDE)
+
+
 def zoom_buttons(zoom: Callable[[float | None], None], stretches: Mapping[str, float | None]) -> list[pmui.Button]:
     """Make the buttons of stretches of time [s] by their names; None is all of the record."""
-    buttons = []
-    for label, seconds in stretches.items():
-        button = pmui.Button(label=label, size="small", variant="text", margin=0, description=f"Time window: {label.lower()}")
-        button.on_click(lambda _event, seconds=seconds: zoom(seconds))
-        buttons.append(button)
-    return buttons
+    return [
+        make_button(label, partial(zoom, seconds), variant="text", description=f"Time window: {label.lower()}")
+        for label, seconds in stretches.items()
+    ]
 
 
 def box(title: str, *content: Any, about: str = "") -> pn.Column:
@@ -444,20 +458,15 @@ class Starter:
         """
         self.work = work
         self._detail = detail
-        self.start: Final = pmui.Button(label=start, icon="play_arrow", color="primary", size="small", margin=0)
-        self.cancel: Final = pmui.Button(label="Stop", icon="stop", variant="outlined", size="small", margin=0, disabled=True)
-        self.uses: Final = [
-            pmui.Button(label=use, icon="check", variant="outlined", size="small", margin=0, disabled=True) for use in uses
-        ]
         self.begin: Final = partial(work.attempt, begin)
-        for button, act in zip((self.start, *self.uses), (begin, *uses.values()), strict=True):
-            button.on_click(partial(self._do, act))
+        self.start: Final = make_button(start, self.begin, icon="play_arrow", color="primary")
+        self.cancel: Final = make_button("Stop", work.cancel, icon="stop", variant="outlined", disabled=True)
+        self.uses: Final = [
+            make_button(use, partial(work.attempt, act), icon="check", variant="outlined", disabled=True)
+            for use, act in uses.items()
+        ]
         self.status: Final = Status(label=label, sizing_mode="stretch_width", margin=(4, 0), visible=False)
-        self.cancel.on_click(lambda _event: work.cancel())
         work.param.watch(self.refresh, ["state", "progress", "place", "message", "latest", "result"])
-
-    def _do(self, act: Callable[[], object], _event: object) -> None:
-        self.work.attempt(act)
 
     def view(self) -> list[Any]:
         """Return the row of buttons; the line of progress is `status`."""

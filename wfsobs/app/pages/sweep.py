@@ -37,6 +37,7 @@ from wfsobs.app.pages.parts import (
     number_field,
     read_number,
     text,
+    warning,
 )
 from wfsobs.app.pages.sweep_views import (
     SweepLines,
@@ -340,7 +341,7 @@ class SweepPage(Page):
         self.lines: dict[str, SweepLines] = {}
         self.panes: Final = {target: pn.Column(**WIDE) for target in SCORED}
         self.legends: Final = {target: html() for target in SCORED}
-        self.stale: Final = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
+        self.stale: Final = warning(EARLIER)
         self.verdicts: Final = {target: html() for target in SCORED}
         self.boxes: Final = [
             box(target_title(target), self.verdicts[target], self.legends[target], self.panes[target], self.maps[target])

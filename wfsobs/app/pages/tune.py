@@ -35,6 +35,7 @@ from wfsobs.app.pages.parts import (
     number_field,
     read_number,
     text,
+    warning,
 )
 from wfsobs.app.render import NOTHING, Row, change, macro, number, table
 from wfsobs.app.service import BackgroundTask
@@ -262,7 +263,7 @@ class TunePage(Page):
         self.history: Final = box("History", self.legend, pn.pane.Bokeh(self.figure.figure, **WIDE))
         self.outcome: Final = box("Before and after", self.table)
         self.history.visible = self.outcome.visible = False
-        self.stale: Final = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
+        self.stale: Final = warning(EARLIER)
         self.observer.param.watch(self._choose, "value")
         self.work.param.watch(self.redraw, ["latest", "result"])
         store.param.watch(self._compare, "scenario")
