@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from wfsobs.app.display import Display
-from wfsobs.app.pages.live_figures import COLUMNS, LOWEST, MEASUREMENT, ROWS, Waterfall, second_spectrum
+from wfsobs.app.pages.live_figures import COLUMNS, MEASUREMENT, Waterfall
 from wfsobs.live.crew import trace_width
+from wfsobs.live.finding import LOWEST, ROWS, second_spectrum
 from wfsobs.live.ring import LiveFrame
 from wfsobs.live.view import LiveView
 from wfsobs.signal.welch import psd

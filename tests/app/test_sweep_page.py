@@ -17,7 +17,7 @@ from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING, Job
 from wfsobs.app.limits import NONE, Limits
 from wfsobs.app.pages import sweep as sweep_work
 from wfsobs.app.pages.pages import EXPLORE, SWEEP
-from wfsobs.app.pages.sweep import EVERY, SweepPage, SweepTask, sweep_settings, usual_values
+from wfsobs.app.pages.sweep import EVERY, SweepPage, SweepTask, sweep_settings
 from wfsobs.app.pages.sweep_views import FULL_MARGIN, GROUNDS, mix
 from wfsobs.app.render import number
 from wfsobs.app.seeds import SeedScores
@@ -25,6 +25,7 @@ from wfsobs.app.service import Service
 from wfsobs.app.sources import SimulatedRecord
 from wfsobs.app.style import look
 from wfsobs.campaign.sweep import SweepResults, parse_axis, plan_sweep, run_sweep
+from wfsobs.campaign.usual_values import usual_values
 from wfsobs.evaluation.scores import Score
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.idle import idle_settings, why_idle_at

@@ -16,7 +16,7 @@ from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.limits import Limits
 from wfsobs.app.pages.pages import TUNE
 from wfsobs.app.pages.parts import Starter
-from wfsobs.app.pages.tune import TunePage, best_so_far, choices, seconds, unit_for
+from wfsobs.app.pages.tune import TunePage, choices, seconds, unit_for
 from wfsobs.app.render import number
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.sources import LoadedRecord
@@ -25,6 +25,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings
 from wfsobs.simulation.loop import simulate
 from wfsobs.tuning import Evaluation, TuningResult, tune
+from wfsobs.tuning.report import best_so_far
 from wfsobs.tuning.trials import Errors
 
 

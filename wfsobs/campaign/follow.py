@@ -138,6 +138,29 @@ class CampaignState:
         return 0.0 if self.n_done == self.plan.n_runs else self.pace.silence(time())
 
 
+def progress_text(state: CampaignState) -> str:
+    """Say how far a campaign is, and when it will be done or that nothing comes any more."""
+    plan, silence, left = state.plan, state.silence, state.seconds_left
+    said = f"{plan.name}: {state.n_done} of {plan.n_runs} runs, {len(plan.cells)} scenarios, {state.n_rows} rows"
+    if state.n_done == plan.n_runs:
+        return f"{said}, finished"
+    if silence:
+        ended = "ended, stopped" if plan.stop else "stopped"  # it may need no more seeds
+        return f"{said}; no new batch for {_span(silence)}: {ended}, or slower than before"
+    return f"{said}, about {_span(left)} left" if np.isfinite(left) else said
+
+
+def _span(seconds: float) -> str:
+    """Write a time for people.
+
+    >>> _span(40), _span(600), _span(9000), _span(1e6)
+    ('40 s', '10 min', '2.5 h', '12 days')
+    """
+    if seconds < 5400:
+        return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h" if seconds < 48 * 3600 else f"{seconds / 86400:.0f} days"
+
+
 class CampaignFolder:
     """The folder of a campaign, read only; files that have been read are not read again.
 

@@ -14,6 +14,7 @@ from wfsobs.identification import identify
 from wfsobs.priors_from.identification import told_by
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
+from wfsobs.signal.welch import psd
 from wfsobs.simulation.true_spectra import has_known_spectra
 from wfsobs.spectral.periodogram import periodogram
 from wfsobs.typing import Array
@@ -24,6 +25,13 @@ LOBE = 2.5
 """Half width of a line without damping, in bins: they have 96 % of its power."""
 NEAR, FAR = 0.15, 0.5
 """What is around a band is between these parts of its frequency beside it: beyond the wings of a resonance."""
+
+LENGTH = 1.0
+"""Time that a spectrum of a waterfall is of [s]."""
+ROWS = 128
+"""Frequencies of such a spectrum, in equal steps of the logarithm."""
+LOWEST = 1.0
+"""Frequency at which it begins [Hz]."""
 
 
 @dataclass(frozen=True)
@@ -151,3 +159,19 @@ def bounds_of(settings: dict[str, Any]) -> dict[str, dict[str, list[float]]]:
         modes = bound(scenario, information=information)
         out[INFORMATION[information]] = {target: [one[target].rms for one in modes] for target in modes[0]}
     return out
+
+
+def second_spectrum(x: Array, dt: float) -> Array:
+    """Return the spectrum of a second of a signal (n,) [um] in ROWS equal steps of the logarithm of the frequency [um^2/Hz].
+
+    Each is the mean over its band of the spectrum taken as constant around every frequency. NaN where too much is missing.
+    """
+    whole = bridge_missing(x)
+    if whole is None:
+        return np.full(ROWS, np.nan)
+    frequency, density = psd(whole[:, None], dt, resolution=1.0 / LENGTH)
+    half = 0.5 * frequency[1]
+    edges = np.geomspace(LOWEST, 0.5 / dt, ROWS + 1)
+    power = np.concatenate([[0.0], np.cumsum(density[:, 0] * 2.0 * half)])
+    below = np.interp(edges, np.concatenate([[-half], frequency + half]), power)
+    return np.diff(below) / np.diff(edges)

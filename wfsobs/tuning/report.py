@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import reduce
 from typing import Any
 
@@ -11,9 +12,16 @@ from wfsobs.closed_loop.envelope import Spread
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import add_comments, changed_settings, to_toml
 from wfsobs.tuning.records import P95, TRUTH, WORST
-from wfsobs.tuning.trials import Errors, Stage
+from wfsobs.tuning.trials import Errors, Evaluation, Stage
 from wfsobs.tuning.tuning import TuningResult
 from wfsobs.typing import Array
+
+Rows = list[tuple[str, str, float | str | None, float | str | None]]
+"""(section, name, before, after)."""
+
+SETTING, VALIDATION, TEST, OTHER, LIKELIHOOD = "setting", "validation", "test", "other target", "likelihood"
+
+TOGETHER = "rms over modes"
 
 
 def tuning_dict(result: TuningResult) -> dict[str, Any]:
@@ -126,3 +134,37 @@ def tuning_toml(result: TuningResult) -> str:
 
 def _of(errors: Errors | None) -> str:
     return f"{nm(errors.rms)} nm" if errors else "fails"
+
+
+def best_so_far(history: Sequence[Evaluation]) -> list[float]:
+    """Compute the least error after every evaluation [um], infinite until one has succeeded."""
+    out: list[float] = []
+    for evaluation in history:
+        out.append(min(evaluation.rms, out[-1] if out else evaluation.rms))
+    return out
+
+
+def tuning_rows(result: TuningResult) -> Rows:
+    """List settings as text, errors [um] by mode and together, a GPR's log marginal likelihoods by mode; None for failures."""
+    out: Rows = [(SETTING, *row) for row in settings(result)]
+    stages = result.before, result.after
+    for section, before, after in (
+        (VALIDATION, *(s.validation for s in stages)),
+        (TEST, *(s.test for s in stages)),
+    ):
+        out += [(section, name, _error(before, name), _error(after, name)) for name in (*_mode_names(stages), TOGETHER)]
+    if any(s.other for s in stages):
+        before, after = stages
+        out.append((OTHER, TOGETHER, _error(before.other, TOGETHER), _error(after.other, TOGETHER)))
+    if any(s.likelihood for s in stages):
+        values = [s.likelihood or (None,) * len(_mode_names(stages)) for s in stages]
+        out += [(LIKELIHOOD, *row) for row in zip(_mode_names(stages), *values, strict=True)]
+    return out
+
+
+def _error(errors: Errors | None, name: str) -> float | None:
+    return None if errors is None else errors.rms if name == TOGETHER else errors.modes[name]
+
+
+def _mode_names(stages: Sequence[Stage]) -> tuple[str, ...]:
+    return tuple(next(e.modes for s in stages for e in (s.validation, s.test) if e))

@@ -24,7 +24,7 @@ from wfsobs.app.service import BackgroundTask
 from wfsobs.app.store import Store
 from wfsobs.app.style import look, swatch
 from wfsobs.campaign.errors import CampaignErrors
-from wfsobs.campaign.follow import CampaignState
+from wfsobs.campaign.follow import CampaignState, progress_text
 from wfsobs.campaign.report import name_label
 from wfsobs.campaign.selection import SCENARIO, PlanAxis, condition, plan_axes
 from wfsobs.campaign.standings import UNTESTED, TogetherRow, standings
@@ -49,29 +49,6 @@ class CampaignView:
     def scale(self, display: Display) -> float:
         """Return how many units of the display one nanometre is."""
         return 1e-3 * per_micrometre(display.unit, self.base.telescope.diameter)
-
-
-def progress_text(state: CampaignState) -> str:
-    """Say how far a campaign is, and when it will be done or that nothing comes any more."""
-    plan, silence, left = state.plan, state.silence, state.seconds_left
-    said = f"{plan.name}: {state.n_done} of {plan.n_runs} runs, {len(plan.cells)} scenarios, {state.n_rows} rows"
-    if state.n_done == plan.n_runs:
-        return f"{said}, finished"
-    if silence:
-        ended = "ended, stopped" if plan.stop else "stopped"  # it may need no more seeds
-        return f"{said}; no new batch for {_span(silence)}: {ended}, or slower than before"
-    return f"{said}, about {_span(left)} left" if np.isfinite(left) else said
-
-
-def _span(seconds: float) -> str:
-    """Write a time for people.
-
-    >>> _span(40), _span(600), _span(9000), _span(1e6)
-    ('40 s', '10 min', '2.5 h', '12 days')
-    """
-    if seconds < 5400:
-        return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
-    return f"{seconds / 3600:.1f} h" if seconds < 48 * 3600 else f"{seconds / 86400:.0f} days"
 
 
 def axis_name(axis: PlanAxis, base: Scenario) -> str:

@@ -30,7 +30,7 @@ from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.latencies import EDGES
 from wfsobs.live.board import SLOTS, Board
 from wfsobs.live.control_crew import ControlView
-from wfsobs.live.finding import Bounds, bridge_missing
+from wfsobs.live.finding import LENGTH, LOWEST, ROWS, Bounds, bridge_missing, second_spectrum
 from wfsobs.live.paced import LiveEvent
 from wfsobs.live.view import LiveView
 from wfsobs.scenario import Scenario
@@ -336,12 +336,10 @@ class LatencyHistogram(LiveFigure):
 
 
 MEASUREMENT = "measurement"
-LENGTH, HOP = 1.0, 0.5
-"""Time that a spectrum is of, and between two [s]."""
-COLUMNS, ROWS = 120, 128
-"""Spectra that are kept: a minute. Frequencies of each, in equal steps of the logarithm."""
-LOWEST = 1.0
-"""Frequency at which it begins [Hz]."""
+HOP = 0.5
+"""Time between two spectra [s]."""
+COLUMNS = 120
+"""Spectra that are kept: a minute."""
 FLOOR, SPAN = 0.05, 2.0
 """The darkest colour is that below which this part of the spectra is; the colours span so many decades at least."""
 
@@ -425,22 +423,6 @@ class Waterfall:
         self.figure.x_range.update(start=max(left, 0.0), end=end)  # before the loop there was nothing
         self.figure.y_range.update(start=LOWEST, end=top)
         self.figure.yaxis.axis_label = f"frequency [Hz], {display.mode_label}"
-
-
-def second_spectrum(x: Array, dt: float) -> Array:
-    """Return the spectrum of a second of a signal (n,) [um] in ROWS equal steps of the logarithm of the frequency [um^2/Hz].
-
-    Each is the mean over its band of the spectrum taken as constant around every frequency. NaN where too much is missing.
-    """
-    whole = bridge_missing(x)
-    if whole is None:
-        return np.full(ROWS, np.nan)
-    frequency, density = psd(whole[:, None], dt, resolution=1.0 / LENGTH)
-    half = 0.5 * frequency[1]
-    edges = np.geomspace(LOWEST, 0.5 / dt, ROWS + 1)
-    power = np.concatenate([[0.0], np.cumsum(density[:, 0] * 2.0 * half)])
-    below = np.interp(edges, np.concatenate([[-half], frequency + half]), power)
-    return np.diff(below) / np.diff(edges)
 
 
 TRAIL, POINTS = 0.2, 60

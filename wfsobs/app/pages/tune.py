@@ -50,19 +50,24 @@ from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings
 from wfsobs.sensors.modes import TIP_TILT
-from wfsobs.tuning import Evaluation, Stage, TuningResult, tune
+from wfsobs.tuning import Evaluation, TuningResult, tune
 from wfsobs.tuning.records import MEASURES, NEXT, REFERENCE, TRUTH, judged_by
-from wfsobs.tuning.report import settings, tuning_remarks, tuning_toml
-from wfsobs.tuning.trials import Errors
+from wfsobs.tuning.report import (
+    LIKELIHOOD,
+    OTHER,
+    SETTING,
+    TEST,
+    TOGETHER,
+    VALIDATION,
+    best_so_far,
+    tuning_remarks,
+    tuning_rows,
+    tuning_toml,
+)
 from wfsobs.tuning.tuning import EVALUATIONS
 
 MOST = 1000
 """Evaluations."""
-
-Rows = list[tuple[str, str, float | str | None, float | str | None]]
-"""(section, name, before, after)."""
-
-SETTING, VALIDATION, TEST, OTHER, LIKELIHOOD = "setting", "validation", "test", "other target", "likelihood"
 
 
 def choices() -> dict[str, str]:
@@ -106,43 +111,6 @@ def compute(
 
     record = of.result.record if of.is_recorded else None
     return tune(scenario, observer, evaluations=evaluations, record=record, target=target, on_evaluation=told, watch=watch)
-
-
-def best_so_far(history: Sequence[Evaluation]) -> list[float]:
-    """Compute the least error after every evaluation [um], infinite until one has succeeded."""
-    out: list[float] = []
-    for evaluation in history:
-        out.append(min(evaluation.rms, out[-1] if out else evaluation.rms))
-    return out
-
-
-def tuning_rows(result: TuningResult) -> Rows:
-    """List settings as text, errors [um] by mode and together, a GPR's log marginal likelihoods by mode; None for failures."""
-    out: Rows = [(SETTING, *row) for row in settings(result)]
-    stages = result.before, result.after
-    for section, before, after in (
-        (VALIDATION, *(s.validation for s in stages)),
-        (TEST, *(s.test for s in stages)),
-    ):
-        out += [(section, name, _error(before, name), _error(after, name)) for name in (*_modes(stages), TOGETHER)]
-    if any(s.other for s in stages):
-        before, after = stages
-        out.append((OTHER, TOGETHER, _error(before.other, TOGETHER), _error(after.other, TOGETHER)))
-    if any(s.likelihood for s in stages):
-        values = [s.likelihood or (None,) * len(_modes(stages)) for s in stages]
-        out += [(LIKELIHOOD, *row) for row in zip(_modes(stages), *values, strict=True)]
-    return out
-
-
-TOGETHER = "rms over modes"
-
-
-def _error(errors: Errors | None, name: str) -> float | None:
-    return None if errors is None else errors.rms if name == TOGETHER else errors.modes[name]
-
-
-def _modes(stages: Sequence[Stage]) -> tuple[str, ...]:
-    return tuple(next(e.modes for s in stages for e in (s.validation, s.test) if e))
 
 
 TITLES = {
