@@ -15,7 +15,7 @@ from wfsobs.app.display import per_micrometre
 from wfsobs.app.jobs import DONE, FAILED, RUNNING
 from wfsobs.app.limits import PUBLIC, Limits
 from wfsobs.app.pages import identify as module
-from wfsobs.app.pages.identify import EARLIER, IDENTIFIED, NEXT, IdentifyPage, same_measurements, seconds
+from wfsobs.app.pages.identify import EARLIER, IDENTIFIED, NEXT, IdentifyPage, same_content, seconds
 from wfsobs.app.pages.pages import EXPLORE, IDENTIFY
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord
 from wfsobs.app.style import LOOKS
@@ -262,6 +262,6 @@ def test_same_records(short: Scenario) -> None:
     y = record.y_lgs.copy()
     y[3] = np.nan
     lost = replace(record, y_lgs=y)
-    assert same_measurements(lost, replace(lost, y_lgs=y.copy())) and same_measurements(record, record)
+    assert same_content(lost, replace(lost, y_lgs=y.copy())) and same_content(record, record)
     for other in (lost, replace(record, delay=3), replace(record, dt=2e-3), replace(record, y_lgs=y[:-1])):
-        assert not same_measurements(record, other)
+        assert not same_content(record, other)

@@ -25,5 +25,5 @@ def test_every_template_compiles(name: str) -> None:
 
 
 def test_a_cell_without_a_number_says_why() -> None:
-    html = table("Margins", {"Controller": "", "Gain margin [dB]": "", "Strehl": ""}, [("", [Row("a", [NOTHING, "0.9"])])])
+    html = table("Margins", {"Controller": "", "Gain margin [dB]": "", "Strehl": ""}, [Row("a", [NOTHING, "0.9"])])
     assert f'<td title="{WHY_NOTHING["Gain margin"]}">{NOTHING}</td><td>0.9</td>' in html

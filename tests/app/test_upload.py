@@ -144,7 +144,7 @@ def test_what_is_said_of_it(dashboard: Dashboard, loop: Any, short: Scenario) ->
     loop.until(lambda: "aperture 10 m" in dashboard.upload.content.text.html)
     assert dashboard.upload._preview.rms["y_lgs"][0] == pytest.approx(1.25 * on_eight)
     dashboard.upload.fields.delay.value = "soon"
-    assert dashboard.upload.picker.message == "Delay of commands [steps]: takes a number from 1, not 'soon'"
+    assert dashboard.upload.picker.message == "Delay of commands [steps] = 'soon': takes a number from 1 to 1e+06"
     assert dashboard.upload.use.disabled
     dashboard.upload.fields.delay.value = ""
     loop.until(lambda: not dashboard.upload.picker.message.startswith(("Reading", "Waiting")))

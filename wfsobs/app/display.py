@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
@@ -13,7 +12,7 @@ from wfsobs.app.compared import ComparedRun, DrawnLines
 from wfsobs.app.glossary import LAG, REAL_TIME, RELATIVE, RMS_ERROR, STATED, TERMS
 from wfsobs.sensors.modes import HIGHEST_ORDER, TIP_TILT, Mode, modes_up_to
 from wfsobs.settings.parameters import unit_of
-from wfsobs.units import unit_text
+from wfsobs.units import micrometres_per, unit_text
 
 SIGNAL, ERROR, RUNNING_RMS = "signal", "error", "running rms"
 PSD, CUMULATIVE = "psd", "cumulative"
@@ -32,18 +31,14 @@ NO_ANGLE = ("mas",)
 MODES = [mode.name for mode in modes_up_to(HIGHEST_ORDER)]
 """Every mode that a run can have; it has the first of them."""
 
-MAS_PER_RADIAN = math.degrees(1.0) * 3600.0 * 1000.0
-
 
 def per_micrometre(unit: str, diameter: float) -> float:
     """How many `unit` one micrometre of a tip or tilt coefficient is.
 
-    A Noll-normalised coefficient a tilts the wavefront by 4 a / D on sky; diameter D [m].
-
     >>> round(per_micrometre("mas", 8.0), 1)
     103.1
     """
-    return {"nm": 1e3, "mas": 4e-6 / diameter * MAS_PER_RADIAN, "um": 1.0}[unit]
+    return 1.0 / micrometres_per(unit, diameter)
 
 
 def label_of(p: param.Parameter[Any]) -> str:

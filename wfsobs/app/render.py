@@ -122,10 +122,12 @@ class Row(NamedTuple):
     data: Mapping[str, str] = MappingProxyType({})
 
 
-def table(label: str, columns: Mapping[str, str], groups: Iterable[tuple[str, Iterable[Row]]]) -> Markup:
-    """Write a table that scrolls sideways; columns: heading -> explanation, groups: title, or nothing, and rows."""
+def table(
+    label: str, columns: Mapping[str, str], rows: Iterable[Row] = (), *, groups: Iterable[tuple[str, Iterable[Row]]] = ()
+) -> str:
+    """Write a table that scrolls sideways; columns: heading -> explanation, groups: in place of rows, title and rows of each."""
     why = [WHY_NOTHING.get(re.split(r" \[| at ", name)[0], "") for name in list(columns)[1:]]
-    return macro("table", label, columns, groups, NOTHING, why)
+    return str(macro("table", label, columns, groups or [("", rows)], NOTHING, why))
 
 
 def matrix(entries: ArrayLike) -> Markup:

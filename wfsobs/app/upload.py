@@ -7,7 +7,6 @@ is confirmed. Reading is done beside the page, in a thread.
 from __future__ import annotations
 
 import base64
-import binascii
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -25,7 +24,7 @@ from wfsobs.app.component import HtmlComponent
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs import CANCELLED, FAILED, RUNNING, Job
-from wfsobs.app.pages.parts import make_button
+from wfsobs.app.pages.parts import make_button, read_number
 from wfsobs.app.render import render
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.session_file import LARGEST, SUFFIX
@@ -37,7 +36,6 @@ from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.settings.errors import SettingError
-from wfsobs.settings.parameters import hint
 from wfsobs.telemetry.columns import ROLES
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.preview import ColumnsPreview, Preview, SpectrumPreview, preview_any, safe_name
@@ -67,6 +65,9 @@ class Picker(HtmlComponent):
         self.html = render("upload.html", title=self.source_title, back=self.back, message=self.message)
 
 
+INCOMPLETE = "The upload is incomplete: choose the file again."
+
+
 class PartialFile:
     """A file on its way, in parts that come one after the other; the first part of a file ends the one before."""
 
@@ -76,35 +77,29 @@ class PartialFile:
 
     def take(self, msg: dict[str, Any]) -> bytes | None:
         """Add a part {name, index, count, data}; the whole file with the last one. Raises ValueError, one line."""
-        if msg.get("index") == 0:
+        index, count = msg.get("index"), msg.get("count")
+        if index == 0:
             self.name, self._parts = safe_name(str(msg.get("name", ""))), []
-        if self._parts is None:  # more of a file that has been given up
+        parts = self._parts
+        if parts is None:  # more of a file that has been given up
             return None
+        self._parts = None
+        if type(index) is not int or type(count) is not int or not len(parts) == index < count:
+            raise ValueError(INCOMPLETE)
         try:
-            return self._add(self._parts, msg)
-        except ValueError:
-            self.drop()
-            raise
+            parts.append(base64.b64decode(msg["data"], validate=True))
+        except (KeyError, TypeError, ValueError):
+            raise ValueError(INCOMPLETE) from None
+        if sum(map(len, parts)) > LARGEST:
+            raise ValueError(too_large(self.name))
+        if index == count - 1:
+            return b"".join(parts)
+        self._parts = parts
+        return None
 
     def drop(self) -> None:
         """Give the file up: parts that still come are passed over."""
         self._parts = None
-
-    def _add(self, parts: list[bytes], msg: dict[str, Any]) -> bytes | None:
-        try:
-            index, count = int(msg["index"]), int(msg["count"])
-            part = base64.b64decode(msg["data"], validate=True)
-        except (KeyError, TypeError, ValueError, binascii.Error):
-            index, count, part = 0, 0, b""
-        if index != len(parts) or not index < count:
-            raise ValueError("The upload is incomplete: choose the file again.")
-        parts.append(part)
-        if sum(map(len, parts)) > LARGEST:
-            raise ValueError(too_large(self.name))
-        if index < count - 1:
-            return None
-        self.drop()
-        return b"".join(parts)
 
 
 def too_large(name: str) -> str:
@@ -143,11 +138,10 @@ class UploadFields:
             widget.value = value
 
     def read(self, roles: dict[str, str]) -> DeclaredFormat:
-        """Read the fields; roles : of columns that have been chosen. Raises RecordError where a field holds no number."""
+        """Read the fields; roles : of columns that have been chosen. Raises SettingError where a field holds no number."""
         unit = None if self.unit.value == SILENT else self.unit.value
-        delay, rate = _number(self.delay, float, 1), _number(self.rate, float, 1e-3)
-        delay = int(delay) if delay and delay % 1 == 0 else delay
-        gain, rail = _number(self.gain, float, 1e-3), _number(self.rail, float, 1e-9)
+        delay, rate = _number(self.delay, 1), _number(self.rate, 1e-3)
+        gain, rail = _number(self.gain, 1e-3), _number(self.rail, 1e-9)
         mirror = {"command_gain": None if gain is None else (gain,), "rail": rail, "open_loop": self.open_loop.value}
         return DeclaredFormat(unit, self.sign.value or None, delay, rate, roles, self.trust.value, **mirror)
 
@@ -167,18 +161,9 @@ def differs_from_proposals(preview: Preview) -> bool:
     )
 
 
-def _number(field: Any, kind: type, least: float) -> Any:
+def _number(field: Any, least: float) -> Any:
     """Return the number in a field, None for an empty one."""
-    text = str(field.value or "").strip()
-    if not text:
-        return None
-    try:
-        value = kind(text)
-    except ValueError:
-        value = -1
-    if not least <= value < 1e6:
-        raise RecordError(f"{field.label}: takes a number from {least:g}, not {text[:40]!r}{hint(text)}")
-    return value
+    return read_number(field, least, 1e6) if (field.value or "").strip() else None
 
 
 def _select(label: str, options: Any) -> pmui.Select:
@@ -369,7 +354,7 @@ class Upload:
         return self.store.wanted_record is not None and self.store.wanted_record.sha256 == self._digest
 
     def read_fields(self) -> DeclaredFormat:
-        """Read the fields, or what the link says of its file. Raises RecordError where one holds no number."""
+        """Read the fields, or what the link says of its file. Raises SettingError where one holds no number."""
         if self.store.wanted_record is not None and self._is_wanted:
             return self.store.wanted_record.declaration
         return self.fields.read(self.form.roles if self.form is not None else {})

@@ -90,7 +90,7 @@ def standings_html(view: CampaignView, display: Display) -> str:
             NOTHING if s.failures is None else str(s.failures),
         ]
         rows.append(Row(swatch(s.name, display.dark) + name_label(s.name), cells_of, {"name": s.name}))
-    return str(table("Observers of the campaign", columns, [("", rows)]))
+    return table("Observers of the campaign", columns, rows)
 
 
 def _interval(low: float, high: float) -> str:

@@ -255,7 +255,7 @@ def loop_html(results: LoopResults, display: Display, envelope: PlantEnvelope | 
     kinds = [("text", [r for r in noted if r["residual_rms_nm"] is not None])]
     kinds += [("failure", [r for r in noted if r["residual_rms_nm"] is None])]
     notes = "".join(macro("texts", kind, [f"{label(r['controller'])}: {r['note']}" for r in some]) for kind, some in kinds)
-    return f"{table('Controllers', columns, [('', body)])}{limits_note(rows)}{notes}"
+    return f"{table('Controllers', columns, body)}{limits_note(rows)}{notes}"
 
 
 def loop_verdict_html(
@@ -308,7 +308,7 @@ def margins_html(results: LoopResults, display: Display) -> str:
     }
     rows = [r for r in of_mode(results, display) if r["phase_margin_deg"] is not None]
     keys = ("gain_margin_db", "phase_margin_deg", "delay_margin_ms")
-    return str(table("Margins", columns, [("", [_line(r, display, [number(r[key]) for key in keys]) for r in rows])]))
+    return table("Margins", columns, [_line(r, display, [number(r[key]) for key in keys]) for r in rows])
 
 
 def _line(row: Score, display: Display, cells: list[str]) -> Row:

@@ -33,7 +33,7 @@ from wfsobs.app.pages.parts import (
 )
 from wfsobs.app.render import Row, macro, table
 from wfsobs.app.service import BackgroundTask
-from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source
+from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, record_key
 from wfsobs.app.store import Store
 from wfsobs.app.style import look
 from wfsobs.app.views.plots import call, new_figure
@@ -79,15 +79,9 @@ def seconds(record: Record) -> float:
     return PER_SAMPLE * record.n_steps * record.n_modes
 
 
-def same_measurements(one: Record, other: Record) -> bool:
-    """Whether two records hold the same measurements."""
-    return one is other or (
-        one.y_lgs.shape == other.y_lgs.shape
-        and one.dt == other.dt
-        and one.delay == other.delay
-        and np.array_equal(one.y_lgs, other.y_lgs, equal_nan=True)
-        and np.array_equal(one.u, other.u, equal_nan=True)
-    )
+def same_content(one: Record, other: Record) -> bool:
+    """Whether two records are of the same content."""
+    return one is other or record_key(one) == record_key(other)
 
 
 def compute(of: RunResults, level: float, lowest: float, watch: Watch, _tell: Tell) -> tuple[Identification, Record]:
@@ -194,7 +188,7 @@ def identification_html(mode: IdentifiedMode, display: Display, diameter: float)
     for what, frequency, damping, rms in mode_rows(mode):
         scaled = None if rms is None else Number(rms.value * scale, rms.std * scale)
         body.append(Row(what, ["" if n is None else deviation_text(n) for n in (frequency, damping, scaled)]))
-    return str(table(f"Identified in {mode.name}", columns, [("", body)]))
+    return table(f"Identified in {mode.name}", columns, body)
 
 
 def deviation_text(number: Number) -> str:
@@ -292,7 +286,7 @@ class IdentifyPage(Page):
     def is_used(self) -> bool:
         """Whether the settings are those of the model identified in the record shown."""
         (result, record), shown = self._model_and_record(), self.run.result
-        if result is None or record is None or shown is None or not same_measurements(record, shown.result.record):
+        if result is None or record is None or shown is None or not same_content(record, shown.result.record):
             return False
         return result.scenario(self.store.scenario) == self.store.scenario
 
@@ -356,7 +350,7 @@ class IdentifyPage(Page):
             self.verdict.html = verdict_html(result)
             self.table.html = identification_html(mode, self.display, diameter) if mode else ""
             replaced = self.store.source is None and self._scenario == self.store.scenario
-            self.stale.param.update(object=REPLACED if replaced else EARLIER, visible=not same_measurements(record, of.record))
+            self.stale.param.update(object=REPLACED if replaced else EARLIER, visible=not same_content(record, of.record))
 
 
 NEXT = "Next: identify noise, turbulence and vibration peaks in this record, as prior knowledge of the observers."

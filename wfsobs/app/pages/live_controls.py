@@ -67,7 +67,7 @@ def live_html(loop: LiveLoop, view: LiveView, target: str, display: Display, sca
         Row(swatch(name, display.dark) + row_label(name), [number(scale * rms), *[NOTHING] * 5], {"name": name})
         for name, rms in of.items()
     ]
-    return str(table("Live", columns, [("", rows)]))
+    return table("Live", columns, rows)
 
 
 def _row(loop: LiveLoop, name: str, rms: float, target: str, display: Display, scale: float, least: float) -> Row:
@@ -108,7 +108,7 @@ def control_html(loop: LiveLoop, seconds: float, display: Display) -> str:
 
     order = sorted(found, key=lambda name: inf if isnan(found[name][0][column]) else found[name][0][column])
     rows = [Row(swatch(name, display.dark) + look(name).label, cells(*found[name]), {"controller": name}) for name in order]
-    return str(table("Controllers of the live loop", columns, [("", rows)]))
+    return table("Controllers of the live loop", columns, rows)
 
 
 def peaks_html(change: Change | None, scale: float, unit: str) -> str:
@@ -135,7 +135,7 @@ def peaks_html(change: Change | None, scale: float, unit: str) -> str:
         for p in change.peaks
     ]
     title = "Peaks of the last minute"
-    return f'<div class="caption apart">{title}</div>{table(title, columns, [("", rows)])}'
+    return f'<div class="caption apart">{title}</div>{table(title, columns, rows)}'
 
 
 def status_line(loop: LiveLoop, view: LiveView) -> str:

@@ -172,7 +172,7 @@ def tuning_html(result: TuningResult, display: Display, diameter: float) -> str:
     ]
     columns = {"What": "", "Before": "", "After": "", "Change [%]": ""}
     notes = [f"{line[0].upper()}{line[1:]}." for line in tuning_remarks(result) if "likelihood" not in line]
-    return f"{table('Before and after', columns, groups)}{macro('texts', 'text', notes)}"
+    return f"{table('Before and after', columns, groups=groups)}{macro('texts', 'text', notes)}"
 
 
 def _row(section: str, name: str, before: float | str | None, after: float | str | None, scale: float) -> Row:

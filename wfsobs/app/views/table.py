@@ -76,7 +76,7 @@ class Table:
         shown = self.run.result
         groups = [group for target in self._targets() for group in self._target(target)]
         left_out = lines_of_failures(shown.result.failures) if shown else []
-        return f"{table('RMS errors', self._columns(), groups)}{macro('texts', 'failure', left_out)}"
+        return f"{table('RMS errors', self._columns(), groups=groups)}{macro('texts', 'failure', left_out)}"
 
     def _columns(self) -> dict[str, str]:
         """Heading -> explanation."""
