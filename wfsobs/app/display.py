@@ -79,14 +79,18 @@ class Display(param.Parameterized):
     """The switches above the figures."""
 
     mode: param.Selector[str] = param.Selector(default=MODES[0], objects=MODES, label="Mode")
-    show: param.Selector[str] = param.Selector(default=ERROR, objects=[SIGNAL, ERROR, RUNNING_RMS], label="Show")
+    show: param.Selector[str] = param.Selector(
+        default=ERROR, objects={"Signal": SIGNAL, "Error": ERROR, "Running rms": RUNNING_RMS}, label="Show"
+    )
     unit: param.Selector[str] = param.Selector(default="nm", objects=list(UNITS), label="Unit")
     hidden_lines: param.Parameter[dict[str, list[str]]] = param.Parameter({}, doc="Target -> names of its hidden lines.")
     named_lines: param.Parameter[dict[str, list[str]]] = param.Parameter(
         {}, doc="Target -> names of the lines that matter: those that the verdict names."
     )
     dark: param.Boolean[bool] = param.Boolean(False, doc="Dark mode.")
-    spectrum: param.Selector[str] = param.Selector(default=PSD, objects=[PSD, CUMULATIVE], label="Spectrum")
+    spectrum: param.Selector[str] = param.Selector(
+        default=PSD, objects={"PSD": PSD, "Cumulative rms": CUMULATIVE}, label="Spectrum"
+    )
     window_spectra: param.Boolean[bool] = param.Boolean(
         False, label="Spectra of the window", doc="Spectra of the stretch of time in view alone."
     )

@@ -252,18 +252,15 @@ def _member(number: int) -> str:
     return f"records/{number}.npz"
 
 
+PLAIN = {"name": str, "own_name": bool, "time": float, "star": bool, "record": str, "view": str}
+"""Fields of an entry that are read as they are written, and their types."""
+
+
 def _entry_values(entry: HistoryEntry, numbers: Mapping[str, int]) -> dict[str, Any]:
     return {
-        "key": entry.key,
-        "name": entry.name,
-        "own_name": entry.own_name,
-        "time": entry.time,
-        "star": entry.star,
-        "preset": entry.preset,
+        **{name: getattr(entry, name) for name in ("key", "preset", *PLAIN)},
         "scenario": entry.scenario.to_dict(),
         "source": _source_values(entry.source, numbers),
-        "record": entry.record,
-        "view": entry.view,
         "scores": [asdict(s) | {"calibration": s.calibration and list(s.calibration)} for s in entry.scores],
     }
 
@@ -386,21 +383,16 @@ def _entry(values: Any, records: _Records) -> HistoryEntry:
     if not isinstance(values, dict):
         raise SessionError(DAMAGED)
     scenario, preset, source = _step(values, records)
-    record = safe_name(get_text(values, "record")) if values.get("record") else ""
+    plain = {name: get_value(values, name, kind) for name, kind in PLAIN.items()}
+    record = safe_name(plain["record"]) if plain["record"] else ""
     listed = get_value(values, "scores", list)
     if len(listed) > MOST_SCORES or bool(record and source) != isinstance(source, LoadedRecord):
         raise SessionError(DAMAGED)
     lost = bool(record) and source is None
-    return HistoryEntry(
-        get_text(values, "key", 64) if lost else run_key(scenario, source),
-        " ".join(get_text(values, "name", LONGEST_NAME).split()) or "no name",
-        get_value(values, "time", float),
-        scenario,
-        preset,
-        source,
-        record,
-        tuple(read_as(Score, score) for score in listed),
-        get_value(values, "star", bool),
-        get_text(values, "view"),
-        get_value(values, "own_name", bool),
-    )
+    plain |= {
+        "key": get_text(values, "key", 64) if lost else run_key(scenario, source),
+        "name": " ".join(plain["name"][:LONGEST_NAME].split()) or "no name",
+        "record": record,
+        "scores": tuple(read_as(Score, score) for score in listed),
+    }
+    return HistoryEntry(scenario=scenario, preset=preset, source=source, **plain)

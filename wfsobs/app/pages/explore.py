@@ -11,7 +11,7 @@ import panel as pn
 import panel_material_ui as pmui
 
 from wfsobs.app.budgets import Budgets
-from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL
+from wfsobs.app.display import SIGNAL
 from wfsobs.app.history import History
 from wfsobs.app.pages.parts import (
     BELOW_FIGURES,
@@ -62,7 +62,7 @@ class Explore(Page):
         self.run = run
         self.display = display
         self.seeds = seeds
-        self.show_switch: Final = group(display, "show", {"Signal": SIGNAL, "Error": ERROR, "Running rms": RUNNING_RMS})
+        self.show_switch: Final = group(display, "show")
         self._wanted_show = display.show
         run.param.watch(self._offer_errors, "result")  # before the figures, which then draw once
         self.lines: Final = MainLines(run, display, seeds)
@@ -98,7 +98,7 @@ class Explore(Page):
         """Return the switches of this page alone."""
         return pn.Row(
             self.show_switch,
-            group(self.display, "spectrum", {"PSD": PSD, "Cumulative rms": CUMULATIVE}),
+            group(self.display, "spectrum"),
             pn.Row(*zoom_buttons(self.traces.zoom, ZOOMS), margin=0),
             self._tick("editing"),
             *self.pinning.view(),

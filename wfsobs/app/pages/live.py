@@ -14,7 +14,7 @@ import param
 
 from wfsobs.app.compared import name_of_difference
 from wfsobs.app.copies import LIVE, CopiedTask
-from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL, Display, per_micrometre
+from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs import FAILED, RUNNING
 from wfsobs.app.live_work import live_job, record_saves
@@ -94,8 +94,8 @@ class LiveRoom:
         switches = line(
             c.window,
             c.target,
-            group(self.display, "show", {"Signal": SIGNAL, "Error": ERROR, "Running rms": RUNNING_RMS}),
-            group(self.display, "spectrum", {"PSD": PSD, "Cumulative rms": CUMULATIVE}),
+            group(self.display, "show"),
+            group(self.display, "spectrum"),
             c.waterfall,
             pmui.Checkbox.from_param(self.display.param.editing, size="small", margin=0),
         )

@@ -73,19 +73,20 @@ class Pages(param.Parameterized):
 
     def __init__(self, explore: Page, store: Store, display: Display):
         super().__init__()
+        self.store = store
         self.display = display
         explored = partial(setattr, self, "current", EXPLORE)
-        self._makers: dict[str, Callable[[], Page]] = {
-            IDENTIFY: lambda: IdentifyPage(store, display),
-            TUNE: lambda: TunePage(store, display),
-            SWEEP: lambda: SweepPage(store, display, explored),
-            LOOP: lambda: ClosedLoopPage(store, display),
-            LIVE: lambda: LivePage(store, display),
-            FIGURES: lambda: Figures(store, display),
-            MODEL: lambda: ModelPage(store, display),
+        self._makers: dict[str, Callable[[Store, Display], Page]] = {
+            IDENTIFY: IdentifyPage,
+            TUNE: TunePage,
+            SWEEP: partial(SweepPage, explore=explored),
+            LOOP: ClosedLoopPage,
+            LIVE: LivePage,
+            FIGURES: Figures,
+            MODEL: ModelPage,
         }
         if store.session.service.campaign is not None:
-            self._makers[CAMPAIGN] = lambda: CampaignPage(store, display, explored)
+            self._makers[CAMPAIGN] = partial(CampaignPage, explore=explored)
         self.suggestion: Final = Suggestion(store, self._identify_page)
         known = {title: name for title, name in TITLES.items() if name == EXPLORE or name in self._makers}
         self.param["current"].objects = [*known.values()]
@@ -126,7 +127,7 @@ class Pages(param.Parameterized):
     def _page_of(self, name: str) -> Page:
         """Return a page, made where it has not been opened before."""
         if name not in self.by_name:
-            self.by_name[name] = self._makers[name]()
+            self.by_name[name] = self._makers[name](self.store, self.display)
         return self.by_name[name]
 
     def _turn(self, _event: object) -> None:

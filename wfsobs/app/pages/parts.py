@@ -425,11 +425,9 @@ HALVES = grid_style("minmax(0, 1fr) minmax(0, 1fr)")
 """Two figures beside each other."""
 
 
-def group(display: Display, name: str, options: Any) -> pmui.RadioButtonGroup:
+def group(display: Display, name: str) -> pmui.RadioButtonGroup:
     """Make the buttons of one switch of the display."""
-    return pmui.RadioButtonGroup.from_param(
-        display.param[name], options=options, size="small", margin=0, variant="outlined", stylesheets=[HEARD]
-    )
+    return pmui.RadioButtonGroup.from_param(display.param[name], size="small", margin=0, variant="outlined", stylesheets=[HEARD])
 
 
 def legend(names: Mapping[str, str], dark: bool) -> str:
