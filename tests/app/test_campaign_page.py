@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from wfsobs.app.copies import CAMPAIGN as COPIED
-from wfsobs.app.copies import CopiedTask, to_command, to_python
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.jobs import DONE
 from wfsobs.app.pages.campaign import CampaignPage
 from wfsobs.app.pages.pages import CAMPAIGN, EXPLORE
 from wfsobs.app.render import number
 from wfsobs.app.service import Session
+from wfsobs.app.share import CAMPAIGN as COPIED
+from wfsobs.app.share import CopiedTask, to_command, to_python
 from wfsobs.campaign.compare import compare
 from wfsobs.campaign.follow import CampaignFolder
 from wfsobs.campaign.plan import Campaign, parse_plan

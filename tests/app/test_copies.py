@@ -17,14 +17,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from wfsobs.app.copies import LOOP, OBSERVE, TUNE, CopiedTask, to_command
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.jobs import RUNNING
 from wfsobs.app.pages.closed_loop import ClosedLoopPage
 from wfsobs.app.pages.identify import IdentifyPage
 from wfsobs.app.pages.sweep import SweepPage
 from wfsobs.app.pages.tune import TunePage
-from wfsobs.app.share import from_query
+from wfsobs.app.share import LOOP, OBSERVE, TUNE, CopiedTask, from_query, to_command
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord
 from wfsobs.app.work import RunResults
 from wfsobs.cli import main

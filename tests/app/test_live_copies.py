@@ -15,11 +15,11 @@ import pytest
 from click.testing import CliRunner
 
 from tests.app.test_copies import in_shell
-from wfsobs.app.copies import LIVE as LIVE_TASK
-from wfsobs.app.copies import CopiedTask, to_command, to_python
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.pages.live import LivePage
 from wfsobs.app.pages.pages import LIVE
+from wfsobs.app.share import LIVE as LIVE_TASK
+from wfsobs.app.share import CopiedTask, to_command, to_python
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.cli import main
 from wfsobs.live.loop import LiveOrder

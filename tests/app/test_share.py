@@ -14,8 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import wfsobs
-from wfsobs.app.copies import to_command, to_python
-from wfsobs.app.share import LONGEST, changes, from_file, from_query, to_file, to_query
+from wfsobs.app.share import LONGEST, changes, from_file, from_query, to_command, to_file, to_python, to_query
 from wfsobs.cli import main
 from wfsobs.identification import identify
 from wfsobs.scenario import Scenario

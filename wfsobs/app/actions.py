@@ -10,7 +10,6 @@ from typing import Any, Final
 import param
 
 from wfsobs.app.component import HtmlComponent
-from wfsobs.app.copies import EXPLORED, to_command, to_python
 from wfsobs.app.downloads import Save, TooLarge, data_csv, data_npz
 from wfsobs.app.history import HistorySheet, session_save
 from wfsobs.app.jobs import DONE, FAILED, RUNNING, Job
@@ -21,7 +20,7 @@ from wfsobs.app.report.export import LIMIT, ReportError, make
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.session_file import SessionError, read_session
-from wfsobs.app.share import FILE, Link, from_file, from_query, name_record, to_file, to_query
+from wfsobs.app.share import EXPLORED, FILE, Link, from_file, from_query, name_record, to_command, to_file, to_python, to_query
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.style import labels, script, sheets

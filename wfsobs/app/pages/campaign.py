@@ -12,7 +12,6 @@ import panel as pn
 import panel_material_ui as pmui
 
 from wfsobs.app.controls.status import Status
-from wfsobs.app.copies import CAMPAIGN, EXPLORED, CopiedTask
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs import BATCH, FAILED, RUNNING, Job, Work
 from wfsobs.app.pages.parts import WIDE, LinkedFields, Page, box, boxes, html, legend, line, text
@@ -21,6 +20,7 @@ from wfsobs.app.pages.sweep_views import DECIDED, LEFT_OUT, OPEN, WAITING, Sweep
 from wfsobs.app.render import NOTHING, Row, number, table
 from wfsobs.app.report.sections import value_of
 from wfsobs.app.service import BackgroundTask
+from wfsobs.app.share import CAMPAIGN, EXPLORED, CopiedTask
 from wfsobs.app.store import Store
 from wfsobs.app.style import look, swatch
 from wfsobs.campaign.errors import CampaignErrors

@@ -12,7 +12,6 @@ import panel as pn
 from bokeh.models import ColumnDataSource, HoverTool, Range1d
 
 from wfsobs.app.controls.fields import parse_number
-from wfsobs.app.copies import IDENTIFY, CopiedTask
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs import DONE, FAILED, RUNNING, Job, Tell
 from wfsobs.app.pages.parts import (
@@ -33,6 +32,7 @@ from wfsobs.app.pages.parts import (
 )
 from wfsobs.app.render import Row, macro, table
 from wfsobs.app.service import BackgroundTask
+from wfsobs.app.share import IDENTIFY, CopiedTask
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, record_key
 from wfsobs.app.store import Store
 from wfsobs.app.style import look

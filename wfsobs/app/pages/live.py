@@ -13,7 +13,6 @@ import panel_material_ui as pmui
 import param
 
 from wfsobs.app.compared import name_of_difference
-from wfsobs.app.copies import LIVE, CopiedTask
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs import FAILED, RUNNING
@@ -39,6 +38,7 @@ from wfsobs.app.pages.live_figures import (
 )
 from wfsobs.app.pages.parts import HALVES, WIDE, Page, box, boxes, example, figure_with_caption, group, legend, line, text
 from wfsobs.app.service import IDLE, BackgroundTask
+from wfsobs.app.share import LIVE, CopiedTask
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.style import html, look

@@ -16,12 +16,12 @@ from bokeh.plotting import figure
 from wfsobs.app.controls.fields import parse_number
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.controls.status import Status
-from wfsobs.app.copies import EXPLORED, CopiedTask
 from wfsobs.app.display import Display
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs import CANCELLED, DONE, RUNNING
 from wfsobs.app.render import render
 from wfsobs.app.service import IDLE, BackgroundTask
+from wfsobs.app.share import EXPLORED, CopiedTask
 from wfsobs.app.store import Store
 from wfsobs.app.style import HEARD, WIDE, HtmlText, html, sheets, swatch
 from wfsobs.app.views.plots import call

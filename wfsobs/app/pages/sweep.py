@@ -16,7 +16,6 @@ import param
 from wfsobs.app.cache import key_of
 from wfsobs.app.component import HtmlComponent
 from wfsobs.app.controls.names import name_settings
-from wfsobs.app.copies import SWEEP, CopiedTask
 from wfsobs.app.display import Display
 from wfsobs.app.downloads import table_csv
 from wfsobs.app.jobs import BATCH, CANCELLED, DONE, FAILED, RUNNING, Job, Tell
@@ -49,6 +48,7 @@ from wfsobs.app.pages.sweep_views import (
 from wfsobs.app.render import render
 from wfsobs.app.seeds import SeedScores
 from wfsobs.app.service import BackgroundTask, Session
+from wfsobs.app.share import SWEEP, CopiedTask
 from wfsobs.app.store import Store
 from wfsobs.app.style import look, script, sheets
 from wfsobs.campaign.sweep import MOST_SEEDS, SEED, Sweep, SweepResults, parse_axis, plan_sweep, run_cell

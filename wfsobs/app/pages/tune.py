@@ -17,7 +17,6 @@ from markupsafe import Markup
 
 from wfsobs.app.controls.fields import parse_number
 from wfsobs.app.controls.names import setting_name
-from wfsobs.app.copies import TUNE, CopiedTask
 from wfsobs.app.display import NO_ANGLE, UNITS, Display, per_micrometre
 from wfsobs.app.downloads import table_csv
 from wfsobs.app.jobs import INTERVAL, RUNNING, Tell
@@ -39,6 +38,7 @@ from wfsobs.app.pages.parts import (
 )
 from wfsobs.app.render import NOTHING, Row, change, macro, number, table
 from wfsobs.app.service import BackgroundTask
+from wfsobs.app.share import TUNE, CopiedTask
 from wfsobs.app.store import Store
 from wfsobs.app.style import look
 from wfsobs.app.views.plots import call, new_figure
