@@ -93,12 +93,12 @@ def test_a_campaign_is_followed_and_opened(dashboard: Dashboard, loop: Any, plan
     best = {c.cell: c for c in compare(read_results(tmp_path)) if (c.target, c.mode, c.is_best) == ("vibration", "tip", True)}
     assert {cell: square["text"] for cell, square in squares(page).items()} == {c: number(one.rms) for c, one in best.items()}
     assert "Persistence" not in page.table.html, "it has no estimate of the vibration"
-    assert page.slice is not None
-    y = page.slice.sources["kf-lgs"].data["y"]
+    assert page.slice.lines is not None
+    y = page.slice.lines.sources["kf-lgs"].data["y"]
     rms = {c.cell: c.rms for c in compare(read_results(tmp_path)) if (c.target, c.mode, c.name) == ("vibration", "tip", "kf-lgs")}
     assert y == pytest.approx([(rms[0] * rms[1]) ** 0.5, (rms[2] * rms[3]) ** 0.5]), "geometric mean over the other condition"
     page.filters["sensors.exposure_ratio"].value = "5"
-    assert page.slice.sources["kf-lgs"].data["y"] == pytest.approx([rms[0], rms[2]])
+    assert page.slice.lines.sources["kf-lgs"].data["y"] == pytest.approx([rms[0], rms[2]])
     of_states = [[(s["state"], s["title"].rpartition(": ")[2]) for s in row] for row in page.map.grid["cells"]]
     assert of_states[0] == [("left-out", "left out by the fields Only …")] * 2, "not as if they were to be run yet"
     assert {state for state, _ in of_states[1]} <= {"open", "decided"}

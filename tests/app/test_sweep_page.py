@@ -149,7 +149,8 @@ def test_lines_over_one_setting(page: SweepPage, dashboard: Dashboard, loop: Any
     finish(page, loop)
     results = page.results
     assert results is not None
-    lines = page.lines["vibration"]
+    lines = page.lines["vibration"].lines
+    assert lines is not None
     data = lines.sources["kf-multi"].data
     assert list(data["x"]) == [5.0, 20.0], "sorted"
     for i, index in enumerate((1, 0)):
@@ -159,7 +160,7 @@ def test_lines_over_one_setting(page: SweepPage, dashboard: Dashboard, loop: Any
     assert np.isfinite(lines.sources["bound"].data["y"]).all() and "kf-adaptive" not in lines.sources
     assert lines.figure.xaxis[0].axis_label == "Wind speed V₀ [m/s]"
     assert len(page.maps["vibration"].grid["cells"]) == 1
-    assert page.panes["vibration"].visible
+    assert page.lines["vibration"].view.visible
 
 
 def test_settings_and_their_usual_values(page: SweepPage, dashboard: Dashboard) -> None:
@@ -182,7 +183,7 @@ def test_settings_and_their_usual_values(page: SweepPage, dashboard: Dashboard) 
     dashboard.controls.search._handle_msg({"over": "vibration.peaks.0.rms.0"})  # a number of a list
     tip = scenario.vibration.peaks[0].rms[0]
     assert page.plan().scenario(4).vibration.peaks[0].rms[0] == pytest.approx(2.0 * tip)
-    assert page.lines == {} and "Peak 1: tip [µm]" in page.settings[0].options
+    assert page.lines["vibration"].lines is None and "Peak 1: tip [µm]" in page.settings[0].options
     dashboard.controls.search._handle_msg({"over": "gpr_online.length_scale"})
     assert "gpr-online" in page.plan().observers and "kf-adaptive" not in page.plan().observers, "its own observer runs"
 

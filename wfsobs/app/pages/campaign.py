@@ -14,9 +14,9 @@ import panel_material_ui as pmui
 from wfsobs.app.controls.status import Status
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs import BATCH, FAILED, RUNNING, Job, Work
-from wfsobs.app.pages.parts import WIDE, LinkedFields, Page, box, boxes, html, legend, line, text
-from wfsobs.app.pages.sweep import SweepMap, line_of
-from wfsobs.app.pages.sweep_views import DECIDED, LEFT_OUT, OPEN, WAITING, SweepLines, axis_title, map_square, verdict_text
+from wfsobs.app.pages.parts import WIDE, LinkedFields, Page, box, boxes, html, line, text
+from wfsobs.app.pages.sweep import ErrorLines, SweepMap, line_of
+from wfsobs.app.pages.sweep_views import DECIDED, LEFT_OUT, OPEN, WAITING, axis_title, map_square, verdict_text
 from wfsobs.app.render import NOTHING, Row, number, table
 from wfsobs.app.report.sections import value_of
 from wfsobs.app.service import BackgroundTask
@@ -198,11 +198,8 @@ class CampaignPage(Page):
         self.failure: Final = html()
         self.room: Final = boxes()
         self.table: Final = html()
-        self.legend: Final = html()
         self.map: Final = SweepMap(self.load, **WIDE)
-        self.pane: Final = pn.Column(**WIDE)
-        self.slice: SweepLines | None = None
-        self._slice_of: tuple[str, ...] = ()
+        self.slice: Final = ErrorLines()
         self.axes: dict[str, PlanAxis] = {}
         self.filters: dict[str, Any] = {}
         self.link = self._fields = LinkedFields(None)
@@ -328,7 +325,7 @@ class CampaignPage(Page):
             self.room.extend(
                 [
                     box("Best observers", self.map, text(SHADES)),
-                    box("Errors over one condition", self.lines, self.legend, self.pane),
+                    box("Errors over one condition", self.lines, self.slice.view),
                 ]
             )
 
@@ -370,12 +367,4 @@ class CampaignPage(Page):
         x = self.axes[self.across.value]
         y = self.axes[self.down.value] if self.down.value not in (NONE, self.across.value) else None
         self.map.draw(winners_grid(view, x, y, self.display))
-        self._draw_slice(view, x)
-
-    def _draw_slice(self, view: CampaignView, x: PlanAxis) -> None:
-        part = slice_part(view, x, self.lines.value, self.display)
-        if self.slice is None or self._slice_of != (x.path, *part["errors"]):
-            self.slice, self._slice_of = SweepLines(part), (x.path, *part["errors"])
-            self.pane[:] = [pn.pane.Bokeh(self.slice.figure, **WIDE)]
-        self.slice.draw(part, self.display.dark)
-        self.legend.html = legend({name: name_label(name) for name in part["errors"]}, self.display.dark)
+        self.slice.draw(slice_part(view, x, self.lines.value, self.display), self.display.dark, name_label)

@@ -235,6 +235,27 @@ class SweepMap(HtmlComponent):
             self._load(int(cell))
 
 
+class ErrorLines:
+    """The figure of errors over one setting under its legend; made anew for other values or names."""
+
+    def __init__(self) -> None:
+        self.view: Final = pn.Column(**WIDE)
+        self.legend: Final = html()
+        self.lines: SweepLines | None = None
+        self._of: tuple[object, ...] = ()
+
+    def draw(self, part: Mapping[str, Any], dark: bool, label: Callable[[str], str]) -> None:
+        """Send a part as `SweepLines` takes it. label : writes the name of a line."""
+        of = (part["across"], *part["values"], *part["errors"])
+        if self.lines is None or of != self._of:
+            self.lines, self._of = SweepLines(part), of
+            self.lines.figure.sizing_mode = "stretch_both"
+            figure = pn.pane.Bokeh(self.lines.figure, sizing_mode="stretch_both", margin=0)
+            self.view[:] = [self.legend, pn.Column(figure, **TALL)]
+        self.lines.draw(part, dark)
+        self.legend.html = legend({name: label(name) for name in part["errors"]}, dark)
+
+
 FILES = {"Sweep as CSV": ("wfsobs-sweep.csv", table_csv)}
 
 
@@ -274,14 +295,11 @@ class SweepPage(Page):
         self.link = LinkedFields(linked, {"over": first_axis.offer, "second": second_axis.offer})
         self.estimate: Final = html()
         self.maps: Final = {target: SweepMap(self.load, **WIDE) for target in SCORED}
-        self.lines: dict[str, SweepLines] = {}
-        self.panes: Final = {target: pn.Column(**WIDE) for target in SCORED}
-        self.legends: Final = {target: html() for target in SCORED}
+        self.lines: Final = {target: ErrorLines() for target in SCORED}
         self.stale: Final = warning(EARLIER)
         self.verdicts: Final = {target: html() for target in SCORED}
         self.boxes: Final = [
-            box(target_title(target), self.verdicts[target], self.legends[target], self.panes[target], self.maps[target])
-            for target in SCORED
+            box(target_title(target), self.verdicts[target], self.lines[target].view, self.maps[target]) for target in SCORED
         ]
         self.shades: Final = text(f"{legend_of_shades()} Click a cell to load its scenario in Explore.")
         self._draw_time = 0.0
@@ -332,8 +350,7 @@ class SweepPage(Page):
         return quick_observers(self.store.scenario, groups) if self.observers.value == QUICK else None
 
     def _start(self) -> None:
-        sweep, self.lines = self.plan(), {}
-        self.work.begin(sweep)
+        self.work.begin(self.plan())
 
     def load(self, cell: int) -> None:
         """Take the scenario of a cell into the drawer, and show it."""
@@ -398,23 +415,12 @@ class SweepPage(Page):
             self.maps[target].draw(map_grid(results, target, self.display))
             self.verdicts[target].html = f'<p class="text">{escape(verdict_of_sweep(results, target, self.display))}</p>'
             if single:
-                self._draw_lines(results, target)
-            self.panes[target].visible = self.legends[target].visible = single
+                part = line_part(results, target, self.display)
+                self.lines[target].draw(part, self.display.dark, lambda name: look(name).label)
+            self.lines[target].view.visible = single
         for part in (*self.boxes, self.shades):
             part.visible = True
         self._compare()
-
-    def _draw_lines(self, results: SweepResults, target: str) -> None:
-        part = line_part(results, target, self.display)
-        if target not in self.lines:
-            self.lines[target] = SweepLines(part)
-            self.lines[target].figure.sizing_mode = "stretch_both"
-            self.panes[target][:] = [
-                pn.Column(pn.pane.Bokeh(self.lines[target].figure, sizing_mode="stretch_both", margin=0), **TALL)
-            ]
-        lines = self.lines[target]
-        lines.draw(part, self.display.dark)
-        self.legends[target].html = legend({name: look(name).label for name in lines.sources}, self.display.dark)
 
     def _compare(self, *_: Any) -> None:
         """Whether all other settings are still those of the sweep."""
