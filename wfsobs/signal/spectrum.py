@@ -49,14 +49,6 @@ def resonance_power(frequency: float, damping: float, edges: ArrayLike) -> Array
     return np.maximum(np.diff(integral) / total, 0.0)
 
 
-def resonance_rms(height: float, frequency: float, damping: float) -> float:
-    """Return the rms of a lightly damped resonance whose density is `height` [unit^2/Hz] at its frequency [Hz].
-
-    A Lorentzian of FWHM 2 xi f0 has pi / 2 times its height times its width as its area.
-    """
-    return float(np.sqrt(height * np.pi * damping * frequency))
-
-
 def bin_edges(n: int, dt: float) -> Array:
     """Return the edges [Hz] of the DFT bins; the first bin (frequency 0) and the last are half as wide."""
     f = bin_frequencies(n, dt)

@@ -30,7 +30,6 @@ from wfsobs.observers.base import TURBULENCE, VIBRATION
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.vibration import Peak
 from wfsobs.settings.errors import SettingError
-from wfsobs.signal.spectrum import resonance_rms
 from wfsobs.simulation.turbulence import turbulence_process
 from wfsobs.typing import Array
 
@@ -78,7 +77,7 @@ FAINTEST = 1e-4
 """Strength from which a peak grows that has none in a mode [um]."""
 
 NEW_DAMPING, NEW_RMS = 0.01, 5e-3
-"""Damping of a peak that is added, and its rms [um] where no height is given."""
+"""Damping of a peak that is added, and its rms [um]."""
 
 
 @dataclass(frozen=True)
@@ -207,8 +206,8 @@ def changes_of(scenario: Scenario, target: str, mode: int, to: Handle) -> dict[s
     return out
 
 
-def with_new_peak(scenario: Scenario, mode: int, frequency: float, height: float | None = None) -> dict[str, Any]:
-    """Return the settings with one more peak, at a height of the spectrum [um^2/Hz].
+def with_new_peak(scenario: Scenario, mode: int, frequency: float) -> dict[str, Any]:
+    """Return the settings with one more peak.
 
     Raises SettingError where there are no peaks, and above the highest frequency of one.
     """
@@ -216,9 +215,8 @@ def with_new_peak(scenario: Scenario, mode: int, frequency: float, height: float
         raise SettingError(f"vibration.source = {scenario.vibration.source} has no peaks of its own: set it to peaks")
     if frequency > (highest := highest_frequency(scenario, PEAK)):
         raise SettingError(f"no peak above the cut-off of the vibration, {highest:g} Hz")
-    rms = NEW_RMS if height is None else resonance_rms(height, frequency, NEW_DAMPING)
     strengths = [0.0] * max(mode + 1, 2)
-    strengths[mode] = round_off(rms)
+    strengths[mode] = NEW_RMS
     peak = Peak.from_dict({"frequency": round_off(frequency), "damping": NEW_DAMPING, "rms": strengths})
     return {"vibration.peaks": [*(p.to_dict() for p in scenario.vibration.peaks), peak.to_dict()]}
 
@@ -317,9 +315,7 @@ class SpectrumEditor:
             frequency, strength, damping = (positive(message[name]) for name in ("frequency", "strength", "damping"))
             return changes_of(base, self.target, mode, handle.at(frequency, strength, damping))
         if action == "add":
-            height = message.get("height")
-            own = None if height is None or self.display.cumulative else positive(height) / self._scale(base) ** 2
-            return with_new_peak(base, mode, positive(message["frequency"]), own)
+            return with_new_peak(base, mode, positive(message["frequency"]))
         if action == "remove":
             return without_peak(base, self._handle(base, message).index)
         return {}
