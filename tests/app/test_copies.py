@@ -210,7 +210,7 @@ def test_sweep(dashboard: Dashboard, loop: Any, tmp_path: Path, monkeypatch: Any
     page = dashboard.pages.by_name["sweep"]
     assert isinstance(page, SweepPage)
     (first, values), *second = over.items()
-    page.choose(first)
+    page.settings[0].value, page.settings[1].value = first, ""
     page.values[0].value, page.seeds.value = values, "2"
     for path, values in second:
         page.settings[1].value = path

@@ -13,20 +13,20 @@ def titles(dashboard: Dashboard) -> dict[str, str]:
 
 class TestSearch:
     def test_every_setting_has_a_name_and_a_topic(self) -> None:
-        found = {item["path"]: item for item in settings_found({})}
+        found = {item["path"]: item for item in settings_found()}
         scenario = Scenario()
         lists = dict(scenario.lists())
         single = {path for path, _, _ in scenario.walk() if not any(path.startswith(f"{it}.") for it in lists)}
         assert set(found) == single | set(lists)
-        assert all(item["label"] and item["topic"] for item in found.values())
-        assert found["turbulence.wind_speed"]["label"] == "Wind speed V₀ [m/s]"
-        assert found["vibration.peaks"]["topic"] == "Vibration"
+        assert len({item["name"] for item in found.values()}) == len(found), "each its own"
+        assert found["turbulence.wind_speed"]["name"] == "Wind speed V₀ [m/s] · Turbulence"
+        assert found["vibration.peaks"]["name"].endswith(" · Vibration")
 
     def test_the_browser_gets_them_when_it_asks(self, dashboard: Dashboard) -> None:
         search = dashboard.controls.search
         assert search.items == [], "not with the page"
         search._handle_msg({"open": True})
-        assert len(search.items) == len(settings_found({}))
+        assert len(search.items) == len(settings_found())
 
     def test_the_topic_of_the_one_chosen_opens(self, dashboard: Dashboard) -> None:
         search, controls = dashboard.controls.search, dashboard.controls

@@ -164,7 +164,6 @@ class Dashboard:
         self.actions.attach(self.pages, self.seeds)
         if self.store.session.service.live is not None:
             self.pages.current = LIVE
-        self.controls.search.on_sweep = self.pages.sweep_over
         self.view_state = ViewState(self.display, self.pages, self.explore.lines, self.explore.traces, self.seeds)
         self.actions.follow_view(self.view_state)
         self.history.open_view = self.view_state.open

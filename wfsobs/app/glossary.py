@@ -101,7 +101,6 @@ SHORTCUTS: Mapping[str, str] = MappingProxyType(
         "/": "Find a setting",
         "H": "The history: every result of the session",
         "Ctrl+Z, Ctrl+Shift+Z": "Undo and redo a change of the settings",
-        "Alt+O in a setting": "Sweep this setting",
         "Enter or Space on a row beside the verdict": "Hide or show its line",
         "S on such a row": "Its line alone, and those before again",
         "Double click on a figure": "All of it again, after a zoom",

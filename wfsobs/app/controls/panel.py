@@ -98,7 +98,7 @@ class Controls:
             label="Cancel", icon="stop", variant="outlined", size="small", margin=(0, 10, 0, 6), sx=ON_BAR
         )
         self.status: Final = Status(sizing_mode="stretch_width", max_width=200, margin=0, stylesheets=[STATUS_ON_BAR])
-        self.search: Final = Search(self.open_setting, self._idle, sizing_mode="stretch_width", margin=(8, 0, 4, 0))
+        self.search: Final = Search(self.open_setting, sizing_mode="stretch_width", margin=(8, 0, 4, 0))
         self.effect_of: Callable[[RunResults, RunResults], str] = lambda _before, _now: ""
         self._effect = html("", margin=0, styles=EFFECT)
         self._before: RunResults | None = None

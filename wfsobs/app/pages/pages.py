@@ -106,13 +106,6 @@ class Pages(param.Parameterized):
         """The page that is shown."""
         return self.by_name[self.current]
 
-    def sweep_over(self, path: str) -> None:
-        """Turn to the error over one setting."""
-        page = self._page_of(SWEEP)
-        assert isinstance(page, SweepPage)
-        page.choose(path)  # before the page is sent: a field that the browser is about to make may miss a change
-        self.current = SWEEP
-
     def _identify_page(self) -> IdentifyPage:
         page = self._page_of(IDENTIFY)
         assert isinstance(page, IdentifyPage)

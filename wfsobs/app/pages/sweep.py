@@ -189,12 +189,6 @@ class AxisFields:
             self.select.options = {**self.select.options, axis_title(self.store.scenario, path): path}
         return path in self.select.options.values()
 
-    def choose(self, path: str) -> None:
-        """Choose a setting, and its usual values though it was chosen before."""
-        if self.path == path != NONE:
-            self.values.value = usual_values(self.store.scenario, path)
-        self.select.value = path
-
     def _suggest(self, event: param.parameterized.Event) -> None:
         if event.new != NONE:
             self.values.value = usual_values(self.store.scenario, event.new)
@@ -319,14 +313,6 @@ class SweepPage(Page):
         more = line(self.seeds, self.observers, *self.starter.view())
         sweep = box("Sweep", text(INTRO), row, more, self.estimate, self.starter.status, self.stale)
         return boxes(sweep, example("sweep", self.boxes[0]), *self.boxes, self.shades)
-
-    def choose(self, path: str) -> None:
-        """Prepare the error over one setting, by its path."""
-        first, second = self.axes
-        if first.offer(path):
-            with pn.io.hold():  # what is typed then is typed after it
-                second.choose(NONE)
-                first.choose(path)
 
     def plan(self) -> Sweep:
         """Return the sweep that the fields describe. Raises SettingError."""
