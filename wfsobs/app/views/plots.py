@@ -9,7 +9,18 @@ from typing import Any, Final
 import numpy as np
 import panel as pn
 from bokeh.events import DoubleTap
-from bokeh.models import AllIndices, CDSView, ColumnDataSource, CustomJS, GlyphRenderer, HTMLLabelSet, Line, LogAxis, Range1d
+from bokeh.models import (
+    AllIndices,
+    CDSView,
+    ColumnDataSource,
+    CustomJS,
+    GlyphRenderer,
+    HTMLLabelSet,
+    Legend,
+    Line,
+    LogAxis,
+    Range1d,
+)
 from bokeh.plotting import figure
 from numpy.typing import ArrayLike, NDArray
 
@@ -118,6 +129,8 @@ def new_figure(**options: Any) -> figure:
         **options,
     )
     fig.outline_line_color = None  # of which a theme has its own idea, the dark one alone
+    # For the files of the figure alone: on the page there are cards.
+    fig.add_layout(Legend(visible=False, margin=0, spacing=0, border_line_color=None, label_text_font_size="12px"), "above")
     fig.toolbar.logo = None
     fig.toolbar.autohide = True
     return fig
