@@ -190,7 +190,7 @@ def test_a_run_of_more_modes_has_a_list_of_them(short: Scenario, parse: Any) -> 
     it = parse(page(Report("paper", short, variations, states), MADE))
     modes = [m.name for m in states[1].scenario.modes]
     assert len(modes) == 5 and it.data("data")["modes"] == modes
-    assert [a["value"] for tag, a in it.tags if tag == "option"] == modes
+    assert [a["value"] for tag, a in it.tags if tag == "option"][: len(modes)] == modes
     assert "psd/vibration/kf-lgs/defocus" in it.data("data")["states"][1]["lines"]
 
 

@@ -3,16 +3,16 @@
 const read = (id) => JSON.parse(document.getElementById(id).textContent)
 const data = read("data")
 const states = read("rows")
-const shown = {state: data.start, mode: data.modes[0], over: Object.keys(data.sweeps)[0]}
-for (const it of document.querySelectorAll(".switches input:checked")) shown[it.name] = it.value
+const switches = [...document.querySelectorAll(".switches select")]
+const shown = {state: data.start, mode: data.modes[0], over: Object.keys(data.sweeps)[0], ...Object.fromEntries(switches.map((it) => [it.name, it.value]))}
 const boxes = [...document.querySelectorAll("[data-target] input")]  // a line each, those of both figures of the target
 const boxesOf = (target) => boxes.filter((it) => it.closest("[data-target]").dataset.target === target)
 const linesOf = (target) => boxesOf(target).map((it) => it.name)
 const isShown = (target, name) => boxesOf(target).some((it) => it.name === name && it.checked)
 const night = matchMedia("screen and (prefers-color-scheme: dark)")
-let dark = night.matches
 
 const DECADES = 8  // that an axis of densities spans at most; one of amplitudes half of it
+const VIEW = 2  // of a trace at first; the reset of the toolbar shows all [s]
 const NONE = 65535
 
 // ------------------------------------------------------------------ numbers and lines
@@ -75,69 +75,42 @@ async function embed() {
 }
 
 function lines(figure) {
-  return figure.renderers.filter((r) => r.name in data.looks)
+  return figure.renderers.filter((r) => data.names.includes(r.name))
 }
 
-function fill(figure, x, columns) {
-  for (const it of lines(figure).slice(0, 1)) it.data_source.data = {x, ...columns}  // they share it
+// The lines of a figure over x, and of those that are shown the lowest point but for a share of them, and the highest.
+function fill(figure, target, x, share, kindOf, scale, from = -Infinity) {
+  const columns = Object.fromEntries(linesOf(target).map((name) => {
+    const y = points(data.states[shown.state], kindOf(name), target, name)
+    return [name, y ? y.map((v) => v * scale) : new Float64Array(x.length).fill(NaN)]
+  }))
+  lines(figure)[0].data_source.data = {x, ...columns}  // they share it
+  const seen = linesOf(target).filter((name) => isShown(target, name)).map((name) => columns[name])
+  const sorted = seen.map((y) => y.filter((v, i) => Number.isFinite(v) && x[i] >= from).sort()).filter((y) => y.length > 0)
+  return [Math.min(...sorted.map((y) => y[Math.floor(share * y.length)])), Math.max(...sorted.map((y) => y.at(-1)))]
 }
+
+const fit = (axis, start, end) => { if (start < end) axis.setv({start, end, reset_start: start, reset_end: end}) }
 
 function drawTrace(figure, target, state) {
-  const scale = state.scale[shown.unit]
-  const x = axis(state, "time")
-  const columns = {}
-  const seen = []
-  for (const name of linesOf(target)) {
-    const y = points(state, shown.show, target, name)
-    columns[name] = y ? y.map((v) => v * scale) : new Float64Array(x.length).fill(NaN)
-    if (isShown(target, name)) seen.push(columns[name])
-  }
-  fill(figure, x, columns)
-  fitTrace(figure, x, seen, state.warm_up)
+  // What a filter does while it settles does not count.
+  const [low, high] = fill(figure, target, axis(state, "time"), 0, () => shown.show, state.scale[shown.unit], state.warm_up)
+  const room = 0.05 * (high - low) || 1
+  fit(figure.y_range, low - room, high + room)
   figure.left[0].axis_label = `${shown.show === "error" ? "error of " : ""}${shown.mode} [${data.units[shown.unit]}]`
   const boxes = Object.fromEntries(figure.center.filter((r) => r.type === "BoxAnnotation").map((r) => [r.name, r]))
   boxes["warm-up"].right = state.warm_up
-  const [start, end] = data.window ?? [0, 0]
-  boxes.window.setv({left: start, right: end})
-}
-
-// The axis holds every visible line; what a filter does while it settles does not count.
-function fitTrace(figure, x, seen, from) {
-  let low = Infinity, high = -Infinity
-  for (const y of seen) {
-    for (let i = 0; i < y.length; i++) {
-      if (x[i] >= from && y[i] < low) low = y[i]
-      if (x[i] >= from && y[i] > high) high = y[i]
-    }
-  }
-  if (low <= high) {
-    const room = 0.05 * (high - low) || 1
-    figure.y_range.setv({start: low - room, end: high + room, reset_start: low - room, reset_end: high + room})
-  }
+  const [left, right] = data.window ?? [0, 0]
+  boxes.window.setv({left, right})
 }
 
 function drawSpectrum(figure, target, state) {
-  const cumulative = shown.spectrum === "cumulative"
-  const scale = state.scale[shown.unit] ** (cumulative ? 1 : 2)
-  const x = axis(state, cumulative ? "frequency-cumulative" : "frequency")
-  const columns = {}
-  const seen = []
-  for (const name of linesOf(target)) {
-    const error = shown.show === "error" && name !== "truth"
-    const y = points(state, shown.spectrum + (error ? "-error" : ""), target, name)
-    columns[name] = y ? y.map((v) => v * scale) : new Float64Array(x.length).fill(NaN)
-    if (isShown(target, name)) seen.push(columns[name].filter((v) => v > 0).sort())
-  }
-  fill(figure, x, columns)
-  const full = seen.filter((y) => y.length > 0)
-  if (full.length > 0) {
-    const low = Math.min(...full.map((y) => y[Math.floor(0.02 * y.length)]))
-    const high = Math.max(...full.map((y) => y[y.length - 1]))
-    const room = cumulative ? 1.5 : 3
-    const start = Math.max(low / room, high / 10 ** (cumulative ? DECADES / 2 : DECADES))
-    figure.y_range.setv({start, end: high * room, reset_start: start, reset_end: high * room})
-  }
-  const what = `${cumulative ? "cumulative rms" : "PSD"}${shown.show === "error" ? " of error" : ""}`
+  const cumulative = shown.spectrum === "cumulative", ofError = shown.show === "error"
+  const kindOf = (name) => shown.spectrum + (ofError && name !== "truth" ? "-error" : "")
+  const x = axis(state, cumulative ? "frequency-cumulative" : "frequency"), scale = state.scale[shown.unit] ** (cumulative ? 1 : 2)
+  const [low, high] = fill(figure, target, x, 0.02, kindOf, scale), room = cumulative ? 1.5 : 3
+  fit(figure.y_range, Math.max(low / room, high / 10 ** (cumulative ? DECADES / 2 : DECADES)), high * room)
+  const what = `${cumulative ? "cumulative rms" : "PSD"}${ofError ? " of error" : ""}`
   figure.left[0].axis_label = `${what}, ${shown.mode} [${data.units[shown.unit]}${cumulative ? "" : "²/Hz"}]`
   for (const mark of figure.renderers.filter((r) => ["peaks", "model"].includes(r.name))) {
     const marks = state[mark.name]
@@ -164,8 +137,8 @@ function drawSweep(figure, target) {
   const order = values.map((_, i) => i).sort((a, b) => values[a] - values[b])
   const runs = order.map((place) => stateAt(now.with(Number(shown.over), place)))
   const error = (index, name) => (rowOf(index, target, name)?.rms_um ?? NaN) * data.states[index].scale[shown.unit]
-  fill(figure, order.map((place) => values[place]),
-       Object.fromEntries(linesOf(target).map((name) => [name, runs.map((index) => error(index, name))])))
+  const columns = linesOf(target).map((name) => [name, runs.map((index) => error(index, name))])
+  lines(figure)[0].data_source.data = {x: order.map((place) => values[place]), ...Object.fromEntries(columns)}
   figure.renderers.find((it) => it.name === "now").data_source.data = {x: [values[now[shown.over]]]}
   figure.below[0].axis_label = label
   figure.left[0].axis_label = `rms error, ${shown.mode} [${data.units[shown.unit]}]`
@@ -176,24 +149,20 @@ function rowOf(index, target, name) {
   return name === "truth" ? rows.find((r) => !r.apart) : rows.find((r) => r.observer === name)
 }
 
-function paint(figure) {
-  const text = dark ? "#e8e8e8" : "#1c1c1c"
-  const line = dark ? "#777777" : "#999999"
-  figure.setv({outline_line_color: line, outline_line_alpha: 0.5})
-  for (const it of [...figure.left, ...figure.below]) {
-    it.setv({
-      axis_label_text_color: text, major_label_text_color: text, axis_line_color: line, major_tick_line_color: line,
-      minor_tick_line_color: line, axis_label_text_font_style: "normal"})
-  }
-  for (const it of figure.center.filter((r) => r.type === "Grid")) it.setv({grid_line_color: line, grid_line_alpha: 0.25})
-  for (const it of lines(figure)) {
-    const colour = {value: data.looks[it.name][dark ? "dark" : "light"]}
+// Axes have their colours from the style sheet.
+function paint() {
+  const style = getComputedStyle(document.documentElement)
+  for (const it of Object.values(figures).flatMap(lines)) {
+    const colour = {value: style.getPropertyValue(`--line-${it.name}`)}
     it.glyph.setv(it.glyph.type === "Scatter" ? {line_color: colour, fill_color: colour} : {line_color: colour})
   }
 }
 
-// Figures are as wide as the window: on paper stands a picture of each, as wide as the page has room.
-function toPaper() {
+// Figures are as wide as the window: on paper stands a picture of each, as wide as the page has room, in the colours of light mode.
+function toPaper(isPaper) {
+  document.documentElement.classList.toggle("paper", isPaper)
+  paint()
+  if (!isPaper) return
   for (const it of document.querySelectorAll("canvas.paper")) it.remove()
   for (const [name, figure] of Object.entries(figures)) {
     const [view] = Bokeh.index.query((it) => it.model === figure)
@@ -202,14 +171,6 @@ function toPaper() {
     canvas.removeAttribute("style")
     document.getElementById(name).after(canvas)
   }
-}
-
-// ------------------------------------------------------------------ time window
-
-function zoom(figure, state) {
-  const width = shown.zoom === "whole" ? state.length : Math.min(Number(shown.zoom), state.length)
-  const start = 0.5 * (state.length - width)
-  figure.x_range.setv({start, end: start + width, reset_start: 0, reset_end: state.length})
 }
 
 // ------------------------------------------------------------------ numbers of lines, and table
@@ -266,14 +227,10 @@ function draw() {
 }
 
 function drawAxes() {
-  const [target] = data.targets
-  const state = data.states[shown.state]
-  zoom(figures[`trace-${target}`], state)
-  const f = axis(state, "frequency")
-  if (f.length > 0) {
-    const limits = {start: f[0], end: f[f.length - 1]}
-    figures[`spectrum-${target}`].x_range.setv({...limits, reset_start: limits.start, reset_end: limits.end})
-  }
+  const [target] = data.targets, state = data.states[shown.state], f = axis(state, "frequency")
+  const middle = state.length / 2, half = Math.min(VIEW, state.length) / 2
+  figures[`trace-${target}`].x_range.setv({start: middle - half, end: middle + half, reset_start: 0, reset_end: state.length})
+  fit(figures[`spectrum-${target}`].x_range, f[0], f.at(-1))
 }
 
 function sliders() {
@@ -297,27 +254,11 @@ function sliders() {
   say()
 }
 
-function switches() {
-  for (const input of document.querySelectorAll(".switches input, .switches select")) {
-    input.onchange = () => {
-      shown[input.name] = input.value
-      if (input.name === "mode") withoutAngle()
-      if (input.name === "zoom") drawAxes()
-      else draw()
-    }
-  }
-}
-
 // What is no tilt of the wavefront has no angle.
 function withoutAngle() {
-  const tilt = data.tilts.includes(shown.mode)
-  for (const unit of document.querySelectorAll(".switches input[name=unit]")) {
-    unit.disabled = !tilt && data.angles.includes(unit.value)
-    if (unit.disabled && unit.checked) {
-      document.querySelector(".switches input[name=unit]").checked = true
-      shown.unit = "nm"
-    }
-  }
+  const unit = switches.find((it) => it.name === "unit")
+  for (const it of unit.options) it.disabled = !data.tilts.includes(shown.mode) && data.angles.includes(it.value)
+  if (unit.selectedOptions[0].disabled) unit.value = shown.unit = "nm"
 }
 
 try {
@@ -325,15 +266,18 @@ try {
   figures = await embed()
   for (const it of boxes) it.onchange = () => toggled(it.closest("[data-target]").dataset.target)
   sliders()
-  switches()
-  Object.values(figures).forEach(paint)
+  for (const it of switches) it.onchange = () => {
+    shown[it.name] = it.value
+    withoutAngle()
+    draw()
+  }
+  paint()
   drawAxes()
   draw()
   data.targets.forEach(toggled)
-  const turn = (to) => { dark = to; Object.values(figures).forEach(paint) }
-  night.onchange = () => turn(night.matches)
-  window.addEventListener("beforeprint", () => { turn(false); toPaper() })
-  window.addEventListener("afterprint", () => turn(night.matches))
+  night.onchange = paint
+  window.addEventListener("beforeprint", () => toPaper(true))
+  window.addEventListener("afterprint", () => toPaper(false))
 } catch (error) {
   document.documentElement.classList.remove("js")
   console.error(error)

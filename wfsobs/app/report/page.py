@@ -161,7 +161,7 @@ def _data(report: Report) -> dict[str, Any]:
     pool = Pool()
     states = [_state(state, pool) for state in report.states]
     return {
-        "looks": {name: {"light": look(name).light, "dark": look(name).dark} for name in _line_names()},
+        "names": _line_names(),
         "targets": TARGETS,
         "modes": _modes(report),
         "tilts": [m.name for m in TIP_TILT],
