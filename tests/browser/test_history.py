@@ -109,7 +109,7 @@ def test_a_session_from_runs_to_a_file_and_back(open_page: Any, server: Any, tmp
     expect(sheet(page)).to_be_hidden()
     with page.expect_download() as download:
         page.get_by_role("button", name="File", exact=True).click()
-        page.get_by_role("menuitem", name="Save session").click()
+        page.get_by_role("button", name="Save session").click()
     file = tmp_path / "mine.wfsobs-session"
     download.value.save_as(file)
 

@@ -79,7 +79,7 @@ def test_nothing_moves_under_the_pointer(wide: Page) -> None:
     before = [place(it) for it in (load, run, box, source)]
     page.evaluate("() => { navigator.clipboard.writeText = () => Promise.resolve() }")
     page.get_by_role("button", name="Share", exact=True).click()
-    page.get_by_role("menuitem", name="Copy link", exact=True).click()
+    page.get_by_role("button", name="Copy link", exact=True).click()
     expect(page.get_by_text("Copied the link.")).to_be_visible()
     assert place(load) == before[0]
     box.fill("22")

@@ -44,7 +44,7 @@ def set_speed(page: Page, text: str) -> None:
 
 def choose(page: Page, menu: str, item: str) -> None:
     page.get_by_role("button", name=menu, exact=True).click()
-    page.get_by_role("menuitem", name=item, exact=True).click()
+    page.get_by_role("button", name=item, exact=True).click()
 
 
 def saved(page: Page, item: str, to: Path) -> Path:
@@ -164,8 +164,6 @@ def test_data_and_figures(short: Page, tmp_path: Path) -> None:
         cards = strip.locator(".card[aria-pressed=true]").evaluate_all("cards => cards.map(it => it.dataset.name)")
         labels = {look(line).label for line in cards if line != "truth"}  # of errors at first, which truth has none of
         assert labels <= {it.text for it in root.iter("{http://www.w3.org/2000/svg}text")}, "the legend"
-        png = saved(page, f"{name} as PNG", tmp_path).read_bytes()
-        assert png.startswith(b"\x89PNG") and int.from_bytes(png[20:24]) == 3 * int(float(root.get("height", 0))) > 720
 
 
 def test_a_scenario_out_and_in_again(short: Page, tmp_path: Path) -> None:
@@ -202,13 +200,11 @@ def test_menus_by_keyboard(short: Page) -> None:
     button = page.get_by_role("button", name="Share", exact=True)
     button.focus()
     page.keyboard.press("Enter")
-    expect(button).to_have_attribute("aria-expanded", "true")
-    expect(page.get_by_role("menuitem", name="Copy link")).to_be_focused()
-    page.keyboard.press("ArrowDown")
-    page.keyboard.press("ArrowDown")
-    expect(page.get_by_role("menuitem", name="Copy as Python")).to_be_focused()
+    expect(page.get_by_role("group", name="Share", exact=True)).to_be_visible()
+    page.keyboard.press("Tab")
+    expect(page.get_by_role("button", name="Copy link")).to_be_focused()
     page.keyboard.press("Escape")
-    expect(button).to_have_attribute("aria-expanded", "false")
+    expect(page.get_by_role("group", name="Share", exact=True)).to_be_hidden()
     expect(button).to_be_focused()
 
 

@@ -57,7 +57,7 @@ def test_template_and_sample(page: Page, tmp_path: Path) -> None:
     dialog = page.get_by_role("dialog", name="Load data")
     for button, name in (("Template CSV", "wfsobs-template.csv"), ("Sample record", "wfsobs-sample.csv")):
         page.get_by_role("button", name="File", exact=True).click()
-        page.get_by_role("menuitem", name="Load data").click()
+        page.get_by_role("button", name="Load data").click()
         expect(dialog.get_by_text("a row per step")).to_be_visible()
         with page.expect_download() as waiting:
             dialog.get_by_role("button", name=button).click()

@@ -50,7 +50,7 @@ class Toolbar(HtmlComponent):
     labels = param.Dict({}, doc="Name of a line in the figures -> what it is called, for the legends of figures that are saved.")
     saves = param.List([], doc="What the page can save beside the data, as it is called in the menu.")
 
-    _esm = script("patch", "markup", "save", "figures", "actions")
+    _esm = script("listen", "patch", "markup", "save", "figures", "actions")
     _stylesheets = sheets("base", "actions")
 
     def save(self, name: str, kind: str, content: bytes) -> None:

@@ -65,7 +65,7 @@ class Readout(Component):
 
     labels = param.Dict({}, doc="Name of a line in the figures -> what it is called.")
 
-    _esm = script("readout")
+    _esm = script("listen", "readout")
     _stylesheets = sheets("base", "readout")
 
     def __init__(self, **params: Any):
@@ -115,14 +115,13 @@ class Frame(Component):
     stale = param.Boolean(False, doc="Whether to fade the results.")
     dark = param.Boolean(False, doc="Whether the page is dark.")
 
-    _esm = script("patch", "frame")
+    _esm = script("frame")
 
 
 class Keyboard(Component):
     """What the keyboard needs, and a first stop that leads to what is after it."""
 
-    _esm = script("focus", "keyboard")
-    _stylesheets = sheets("base", "readout")
+    _esm = script("listen", "focus", "keyboard")
 
 
 class Idle(param.Parameterized):

@@ -115,7 +115,7 @@ SHORTCUTS: Mapping[str, str] = MappingProxyType(
 class Help(HtmlComponent):
     """The button at the top, and what it opens."""
 
-    _esm = script("help")
+    _esm = script("listen", "help")
     _stylesheets = sheets("base", "help")
 
     def __init__(self, **params: Any):

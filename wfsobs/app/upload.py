@@ -57,7 +57,7 @@ class Picker(HtmlComponent):
     largest = param.Integer(LARGEST, doc="The largest file that is sent [bytes].")
     part = param.Integer(PART, doc="How much is sent at a time [bytes].")
 
-    _esm = script("patch", "markup", "parts", "upload")
+    _esm = script("listen", "patch", "markup", "upload")
     _stylesheets = sheets("base", "upload")
 
     @param.depends("message", "source_title", "back", watch=True, on_init=True)

@@ -5,7 +5,7 @@ const SAID_MS = 6_000 // for which something that was done is told
 
 export function render({model, view, el}) {
   el.innerHTML = `<div class="bar"></div><span class="said" role="status"></span>
-    <div class="text" hidden><label>Copy this by hand<textarea readonly></textarea></label><button type="button">Close</button></div>
+    <label class="text" popover>Copy this by hand<textarea readonly></textarea></label>
     <div class="notes" hidden><div role="alert"></div><button type="button">Dismiss</button></div>`
   const [bar, said, text, notes] = el.children
 
@@ -44,47 +44,33 @@ export function render({model, view, el}) {
     const content = what === "link" ? here() : model[what]
     try {
       await navigator.clipboard.writeText(content)
-      text.hidden = true
       say(`Copied the ${{link, command: "command line", python: "Python"}[what]}.`)
     } catch {
-      text.hidden = false
-      Object.assign(text.querySelector("textarea"), {value: content}).select()
+      text.showPopover()
+      Object.assign(text.lastElementChild, {value: content}).select()
       say("The browser does not let this page copy.")
     }
   }
-  text.querySelector("button").onclick = () => { text.hidden = true }
 
-  const saveFigure = async (name, view, kind) => {
-    save(`${name.toLowerCase().replaceAll(/[^a-z0-9]+/g, "-")}.${kind}`, await exported(view, kind, model.labels))
-    say(`Saved ${name} as ${kind.toUpperCase()}.`)
+  const saveFigure = async (name, view) => {
+    save(`${name.toLowerCase().replaceAll(/[^a-z0-9]+/g, "-")}.svg`, await exported(view, model.labels))
+    say(`Saved ${name}.`)
   }
-  const itemOf = ([name, view], kind) => {
-    const it = Object.assign(document.createElement("button"), {type: "button", role: "menuitem", tabIndex: -1, className: "figure"})
-    return Object.assign(it, {textContent: `Save ${name} as ${kind.toUpperCase()}`, act: () => saveFigure(name, view, kind)})
-  }
+  const itemOf = ([name, view]) => Object.assign(document.createElement("button"), {
+    type: "button", className: "figure", textContent: `Save ${name} as SVG`, act: () => saveFigure(name, view)})
 
   const draw = () => setMarkup(bar, model.html)
   model.on("html", draw)
   draw()
   tellActions(bar, model)
   bar.addEventListener("beforetoggle", ({target, newState}) => {
-    target.previousElementSibling.setAttribute("aria-expanded", newState === "open")
+    if (target.matches(":focus-within")) target.previousElementSibling.focus()  // the browser knows the host of the shadow alone
     for (const it of target.querySelectorAll(".figure")) it.remove()
-    if (newState === "open" && target.id === "File") target.append(...figures().flatMap((it) => KINDS.map((kind) => itemOf(it, kind))))
+    if (newState === "open" && target.id === "File") target.append(...figures().map(itemOf))
   }, true)
-  bar.addEventListener("toggle", ({target, newState}) => { if (newState === "open") target.firstElementChild.focus() }, true)
-  const leave = (menu) => { menu.hidePopover(); menu.previousElementSibling.focus() }
-  bar.addEventListener("keydown", (event) => {
-    const items = [...event.target.closest(".menu")?.children ?? []], at = items.indexOf(event.target), n = items.length
-    const to = {ArrowDown: at + 1, ArrowUp: at - 1 + n, Home: 0, End: n - 1}[event.key]
-    if (!n || (to === undefined && event.key !== "Escape")) return
-    event.preventDefault()
-    if (event.key === "Escape") leave(event.target.parentElement)
-    else items[to % n].focus()
-  })
   bar.addEventListener("click", ({target}) => {
-    if (!target.matches("[role=menuitem]")) return
-    leave(target.parentElement)
+    if (!target.matches(".menu > button")) return
+    target.parentElement.hidePopover()
     const {event, copy: what, do: does} = target.dataset
     if (event) document.dispatchEvent(new Event(event))
     if (what) copy(what)
@@ -98,9 +84,7 @@ export function render({model, view, el}) {
   travel(model, doc, address, () => history.pushState(null, "", here()))
   if (known.has(doc)) address()
   known.add(doc)
-  const pressed = (event) => keyPressed(event, model)
-  document.addEventListener("keydown", pressed)
-  model.on("remove", () => document.removeEventListener("keydown", pressed))
+  listen(model, {keydown: (event) => keyPressed(event, model)})
 }
 
 const TEXT = "[contenteditable], textarea, input:not([type=range], [type=checkbox], [type=radio], [type=button], [type=file])"
@@ -109,7 +93,7 @@ function keyPressed(event, model) {
   const at = event.composedPath()[0], key = event.key.toLowerCase()
   if (event.altKey || at.matches?.(TEXT)) return
   if (!(event.ctrlKey || event.metaKey)) {
-    if (key === "h" && !at.matches?.("[role=option], [role=combobox], [role=menuitem]")) model.send_msg({action: "history"})
+    if (key === "h" && !at.matches?.("[role=option], [role=combobox]")) model.send_msg({action: "history"})
     return
   }
   const action = key === "z" ? (event.shiftKey ? "redo" : "undo") : key === "y" ? "redo" : ""

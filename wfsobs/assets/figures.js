@@ -1,7 +1,5 @@
-// Figures as files, with a legend that on the page the cards above them are.
+// Figures as SVG, with a legend that on the page the cards above them are; as PNG the toolbar of a figure saves it.
 
-const KINDS = ["svg", "png"]
-const PNG_SCALE = 3 // 400 px on the page make 1200
 const ENTRY = 170 // of the legend [px]
 
 function figures() {
@@ -13,7 +11,7 @@ function figures() {
 }
 
 // The figure as a blob, with its legend. labels: name of a line -> what it is called.
-async function exported(view, kind, labels) {
+async function exported(view, labels) {
   const legend = view.model.above.find((it) => it.type === "Legend"), LegendItem = Bokeh.Models.get("LegendItem")
   const isDrawn = ({glyph, data_source}) => glyph.type === "Line" && [...data_source.data[glyph.y.field] ?? []].some(Number.isFinite)
   const lines = new Map(view.model.renderers.filter((it) => it.visible && it.name in labels && isDrawn(it)).map((it) => [it.name, it]))
@@ -23,20 +21,5 @@ async function exported(view, kind, labels) {
   for (let frames = 0; frames < 3; frames++) await new Promise(requestAnimationFrame)  // until it has its room
   const blob = await view.export("svg").to_blob()
   legend?.setv({items: [], visible: false}, {sync: false})
-  return kind === "svg" ? blob : pngOf(blob)
-}
-
-// The drawing at several times its size on the page.
-async function pngOf(blob) {
-  const url = URL.createObjectURL(blob)
-  try {
-    const image = new Image()
-    image.src = url
-    await image.decode()
-    const canvas = Object.assign(document.createElement("canvas"), {width: PNG_SCALE * image.width, height: PNG_SCALE * image.height})
-    canvas.getContext("2d").drawImage(image, 0, 0, canvas.width, canvas.height)
-    return await new Promise((done) => canvas.toBlob(done, "image/png"))
-  } finally {
-    URL.revokeObjectURL(url)
-  }
+  return blob
 }

@@ -29,57 +29,32 @@ function themes(model) {
   follow()
 }
 
-// Each part of a figure has an element of its own, and writes the style sheet of its place with every picture: the browser finds its
-// styles anew before the next part asks for some, a hundred times a second on a page that is live. What is the same is not written
-// again; lines are on the canvas, and their elements, which nothing is in, need no place.
-function placePartsOnce() {
-  const sheet = Bokeh.require("core/dom").InlineStyleSheet.prototype
-  if (sheet.writesOnChange) return
-  const {replace} = sheet
-  sheet.writesOnChange = true
-  sheet.replace = function (...rules) {
-    const asked = JSON.stringify(rules)
-    if (asked === this.asked && this.css === this.written) return
-    replace.apply(this, rules)
-    Object.assign(this, {asked, written: this.css})
-  }
-  Bokeh.Models.get("GlyphRenderer").prototype.default_view.prototype.update_position = function () {
-    this.position.replace(":host { display: none; }")
-  }
-}
-placePartsOnce()
-
 // A React component gives what the server sets back to its model a moment later. By then the server may have set something newer,
 // which the older would undo, on the page and in the server. What comes back is left out; it is what the model had been given.
 const ECHO_MS = 2000
-function ignoreEchoes(view) {
-  const data = view.model.data
+function ignoreEchoes({model: {data}}) {
   if (!data || Object.hasOwn(data, "setv")) return
-  const set = data.setv, given = new Map()
-  const due = (name) => (given.get(name) ?? []).filter((it) => performance.now() - it.at < ECHO_MS)
+  const {setv} = data
+  let given = []  // {name, value, at} of the last moments
   data.setv = function (changes, options = {}) {
-    const names = Object.keys(changes)
-    if (options.sync === false) {
-      set.call(this, changes, options)
-      for (const name of names) given.set(name, [...due(name), {value: this.attributes[name], at: performance.now()}])
-      return
-    }
-    const echoes = names.length === 1 ? due(names[0]) : []
-    const which = echoes.findIndex((it) => it.value === changes[names[0]])
-    for (const name of names) given.set(name, which < 0 ? [] : echoes.slice(which + 1))
-    if (which < 0) set.call(this, changes, options)
+    given = given.filter(({at}) => performance.now() - at < ECHO_MS)
+    const [[name, value] = [], ...more] = Object.entries(changes)
+    const which = options.sync === false || more.length ? -1 : given.findIndex((it) => it.name === name && it.value === value)
+    if (which >= 0) return given = given.filter((it, i) => it.name !== name || i > which)
+    setv.call(this, changes, options)
+    if (options.sync !== false) given = given.filter((it) => !(it.name in changes))
+    else for (const name in changes) given.push({name, value: this.attributes[name], at: performance.now()})
   }
 }
 function ignoreAllEchoes() {
-  const kind = Bokeh.Models.get("panel.models.esm.ReactComponent").prototype.default_view.prototype
+  const type = "panel.models.esm.ReactComponent", kind = Bokeh.Models.get(type).prototype.default_view.prototype, {initialize} = kind
   if (kind.ignoresEchoes) return
-  const initialize = kind.initialize
   kind.ignoresEchoes = true
   kind.initialize = function () {
     initialize.call(this)
     ignoreEchoes(this)
   }
-  for (const view of Bokeh.index.query((it) => it.model.type === "panel.models.esm.ReactComponent")) ignoreEchoes(view)
+  for (const view of Bokeh.index.query((it) => it.model.type === type)) ignoreEchoes(view)
 }
 ignoreAllEchoes()
 

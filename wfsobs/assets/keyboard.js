@@ -2,26 +2,37 @@
 // them is chosen, tips where the focus is.
 
 export function render({model, el}) {
-  el.innerHTML = `<div class="tip" role="tooltip" popover="manual"></div>`
-  const stop = new AbortController()
-  const on = (type, heard) => document.addEventListener(type, heard, {signal: stop.signal, capture: true})
   const skip = skipLink(() => el.getRootNode().host.nextElementSibling)
-  model.on("remove", () => { stop.abort(); skip.remove() })
-  const tips = tipsAt(el.firstElementChild)
-  for (const type of ["keydown", "keyup"]) on(type, openList)
-  on("click", (event) => markItems(event.composedPath()[0]))
+  model.on("remove", () => skip.remove())
   // What moves the focus within one shadow root is not heard of out here: so every key is followed.
-  let last = null
-  on("pointerdown", tips.hide)
-  on("keyup", () => name(focused()))  // at once: the focus has moved by then
-  on("keydown", (event) => setTimeout(() => {
-    const at = focused()
-    name(at)
-    if (at !== last || event.key === "Escape") tips.hide()
-    if (at !== last) tips.show(at)
+  let last = null, mark = null
+  const tell = (at, isEnded) => {
+    if (at === last && !isEnded) return
+    const point = (type) => mark?.dispatchEvent(new MouseEvent(type, {bubbles: true}))
+    point("mouseout")
+    mark = at && at !== last ? at.getRootNode().querySelector(MARK) : null
+    point("mouseover")
     last = at
-  }))
+  }
+  listen(model, {
+    click: (event) => markItems(event.composedPath()[0]),
+    pointerdown: () => tell(null),
+    keyup: (event) => {
+      openList(event)
+      name(focused())  // at once: the focus has moved by then
+    },
+    keydown: (event) => {
+      openList(event)
+      setTimeout(() => {
+        name(focused())
+        tell(focused(), event.key === "Escape")
+      })
+    },
+  }, {capture: true})
 }
+
+// The mark beside a field's name, whose tip is told where the focus is.
+const MARK = "label > svg.MuiSvgIcon-root, .MuiFormControlLabel-label > svg.MuiSvgIcon-root"
 
 // Names for what Bokeh and panel-material-ui leave without: a plot that has the focus, and a fieldset whose group within has one.
 function name(at) {
@@ -35,15 +46,10 @@ function name(at) {
 
 // The first stop of the page, seen while it has the focus.
 function skipLink(results) {
-  const room = Object.assign(document.createElement("nav"), {ariaLabel: "Skip", innerHTML: `<button type="button">Skip to figures</button>`})
-  const link = room.firstElementChild
-  link.style = "position: fixed; left: 8px; z-index: 10000; padding: 10px 14px; border: 0; border-radius: 4px; background: #fff; " +
-    "color: #0b4f6c; font: 14px sans-serif; outline: 3px solid #0b4f6c"
-  const put = (top) => { link.style.top = top }
-  put("-60px")
-  link.onfocus = () => put("8px")
-  link.onblur = () => put("-60px")
-  link.onclick = () => {
+  const room = Object.assign(document.createElement("nav"), {ariaLabel: "Skip", innerHTML: `<style>
+    .skip { position: fixed; left: 8px; top: 8px; z-index: 10000; padding: 10px 14px; background: #fff; color: #0b4f6c; outline: 3px solid }
+    .skip:not(:focus) { top: -60px }</style><button type="button" class="skip">Skip to figures</button>`})
+  room.lastElementChild.onclick = () => {
     const to = results()
     to.tabIndex = -1
     to.style.outline = "none"
@@ -79,28 +85,4 @@ function markItems(at, tries = 600) {
   }
   const isThere = items.includes(box.getRootNode().activeElement)
   if (!isThere) requestAnimationFrame(() => markItems(box, tries - 1))  // the list is on its way
-}
-
-const MARK = "label > svg.MuiSvgIcon-root, .MuiFormControlLabel-label > svg.MuiSvgIcon-root"
-
-// The tip of whatever has the focus: that of the mark beside a field's name, or its title.
-function tipsAt(own) {
-  let mark = null
-  const point = (type) => mark?.dispatchEvent(new MouseEvent(type, {bubbles: true}))
-  const hide = () => {
-    point("mouseout")
-    mark = null
-    own.hidePopover()
-  }
-  const show = (at) => {
-    mark = at.getRootNode().querySelector?.(MARK) ?? null
-    point("mouseover")
-    if (mark || !at.title) return
-    own.textContent = at.title
-    own.showPopover()
-    const box = at.getBoundingClientRect()
-    own.style.top = `${Math.min(box.bottom + 4, innerHeight - own.offsetHeight - 4)}px`
-    own.style.left = `${Math.min(box.left, innerWidth - own.offsetWidth - 8)}px`
-  }
-  return {hide, show}
 }

@@ -33,15 +33,9 @@ const pool = await new Response(new Blob([packed]).stream().pipeThrough(new Deco
 const ends = data.lengths.reduce((sums, length) => [...sums, sums.at(-1) + length], [0])
 const bytes = (index) => pool.slice(ends[index], ends[index + 1])
 
-const decoded = new Map()
-function once(key, make) {
-  if (!decoded.has(key)) decoded.set(key, make())
-  return decoded.get(key)
-}
-
 function axis(state, name) {
   const index = state.axes[name]
-  return index === undefined ? new Float32Array(0) : once(index, () => new Float32Array(bytes(index)))
+  return new Float32Array(index === undefined ? 0 : bytes(index))
 }
 
 // The points of a line [um], or of a density [um^2/Hz]; nothing where there is no such line.
@@ -50,15 +44,13 @@ function points(state, kind, target, name) {
   if (!line) return null
   const [index, low, step] = line
   const logarithmic = kind.startsWith("psd") || kind.startsWith("cumulative")
-  return once(`${index} ${low} ${step}`, () => {
-    const raw = new Uint8Array(bytes(index)), n = raw.length / 2
-    let level = 0
-    return Float64Array.from({length: n}, (_, i) => {
-      const change = raw[i] | raw[n + i] << 8
-      level = level + (change >> 1 ^ -(change & 1)) & NONE
-      const value = level === NONE ? NaN : low + step * level
-      return logarithmic ? 10 ** value : value
-    })
+  const raw = new Uint8Array(bytes(index)), n = raw.length / 2
+  let level = 0
+  return Float64Array.from({length: n}, (_, i) => {
+    const change = raw[i] | raw[n + i] << 8
+    level = level + (change >> 1 ^ -(change & 1)) & NONE
+    const value = level === NONE ? NaN : low + step * level
+    return logarithmic ? 10 ** value : value
   })
 }
 
@@ -201,18 +193,12 @@ function inUnit(table, scale) {
 // ------------------------------------------------------------------ all together
 
 let figures = {}
-function toggled(target) {
-  for (const kind of ["trace", "spectrum", ...shown.over ? ["sweep"] : []]) {
-    for (const it of lines(figures[`${kind}-${target}`])) it.visible = isShown(target, it.name)
-  }
-  drawFigures(target)
-}
-
 function drawFigures(target) {
-  const state = data.states[shown.state]
-  drawTrace(figures[`trace-${target}`], target, state)
-  drawSpectrum(figures[`spectrum-${target}`], target, state)
-  if (shown.over) drawSweep(figures[`sweep-${target}`], target)
+  const state = data.states[shown.state], of = (kind) => figures[`${kind}-${target}`]
+  for (const it of [of("trace"), of("spectrum"), of("sweep")].filter(Boolean).flatMap(lines)) it.visible = isShown(target, it.name)
+  drawTrace(of("trace"), target, state)
+  drawSpectrum(of("spectrum"), target, state)
+  if (shown.over) drawSweep(of("sweep"), target)
 }
 
 function draw() {
@@ -264,7 +250,7 @@ function withoutAngle() {
 try {
   for (const it of document.querySelectorAll("[data-state]")) it.parentElement.open = false  // the one shown stands above
   figures = await embed()
-  for (const it of boxes) it.onchange = () => toggled(it.closest("[data-target]").dataset.target)
+  for (const it of boxes) it.onchange = () => drawFigures(it.closest("[data-target]").dataset.target)
   sliders()
   for (const it of switches) it.onchange = () => {
     shown[it.name] = it.value
@@ -274,7 +260,6 @@ try {
   paint()
   drawAxes()
   draw()
-  data.targets.forEach(toggled)
   night.onchange = paint
   window.addEventListener("beforeprint", () => toPaper(true))
   window.addEventListener("afterprint", () => toPaper(false))

@@ -35,6 +35,11 @@ export function render({model, el}) {
   }
   model.on("items", fill)
   fill()
+  listen(model, {keydown: (event) => {
+    if (event.key !== "/" || event.composedPath()[0].matches?.("input, textarea, [contenteditable]")) return
+    event.preventDefault()
+    box.focus()
+  }})
 }
 
 // Give a setting the focus, as soon as its topic has opened, unless the visitor has gone on to something else by then.

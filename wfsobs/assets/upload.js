@@ -1,6 +1,23 @@
-// Loading a record: the sheet, the file sent in parts, and what there is to say about it.
+// Loading a file: the sheet, the file sent in parts, and what there is to say about it.
 
 const RECORDS = ".npz,.npy,.csv,.txt,.dat,.tsv,.asc,.fits,.fit,.fts,.mat,.h5,.hdf5,.hdf,.he5,.sav,.idl,.parquet,.pq"
+
+const base64 = (blob) => new Promise((done) => {
+  const reader = new FileReader()
+  reader.onload = () => done(reader.result.split(",")[1] ?? "")
+  reader.readAsDataURL(blob)
+})
+
+async function send(model, file) {
+  const {name, size} = file
+  if (/\.toml$/i.test(name) && size <= model.part) return model.send_msg({action: "scenario", name, text: await file.text()})
+  if (size > model.largest) return model.send_msg({action: "large", name})
+  const count = Math.max(1, Math.ceil(size / model.part))
+  for (let index = 0; index < count; index++) {
+    const data = await base64(file.slice(index * model.part, (index + 1) * model.part))
+    model.send_msg({action: "part", name, index, count, data})
+  }
+}
 
 export function render({model, el}) {
   const draw = () => {
@@ -9,31 +26,21 @@ export function render({model, el}) {
   }
   for (const name of ["html", "source_title", "message"]) model.on(name, draw)  // which come one after the other
   draw()
-  const [input, sheet, cover] = ["input", "#load", ".cover"].map((it) => el.querySelector(it))
-  const take = async (file) => {
-    if (/\.toml$/i.test(file.name) && file.size <= model.part) model.send_msg({action: "scenario", name: file.name, text: await file.text()})
-    else send(model, file)
-  }
+  const [input, sheet, pick] = ["input", "#load", ".pick"].map((it) => el.querySelector(it))
+  const take = ([file]) => { if (file) send(model, file) }
   tellActions(el, model)
-  handleFiles(el, take)
+  pick.onclick = () => input.click()
+  input.onchange = () => { take(input.files); input.value = "" }
 
-  // A file may be dropped anywhere; while one is over the page, a cover says so.
+  // A file may be dropped anywhere.
   const over = (event) => {
-    if (!event.dataTransfer?.types.includes("Files")) return false
+    if (!event.dataTransfer?.types.includes("Files")) return
     event.preventDefault()
-    event.dataTransfer.dropEffect = "copy"
-    cover.hidden = event.type === "drop"
-    return true
+    if (event.type === "drop") take(event.dataTransfer.files)
   }
-  const events = {
-    dragover: over,
-    dragenter: over,
-    dragleave: (event) => { cover.hidden ||= !event.relatedTarget },
-    drop: (event) => { if (over(event) && event.dataTransfer.files[0]) take(event.dataTransfer.files[0]) },
+  listen(model, {
+    dragover: over, dragenter: over, drop: over,
     "wfsobs:load": () => { input.accept = RECORDS; sheet.showPopover() },
     "wfsobs:open": () => { input.accept = ".toml,.wfsobs-session"; input.click() },
-  }
-  const stop = new AbortController()
-  for (const [type, act] of Object.entries(events)) document.addEventListener(type, act, {signal: stop.signal})
-  model.on("remove", () => stop.abort())
+  })
 }
