@@ -13,8 +13,9 @@ from click.testing import CliRunner
 import wfsobs
 from wfsobs.cli.group import main
 from wfsobs.closed_loop.promise import DRAWS, _interval_of, as_seen, draw_plants, draw_spectra, make_promise
-from wfsobs.control.true_plant import ActingPlant
+from wfsobs.control.true_plant import ActingPlant, TruePlant, drive
 from wfsobs.identification.plant import GroupPlant, PlantNumber
+from wfsobs.identification.plant_likelihood import PlantFit
 from wfsobs.priors_from.controllers import full_plant_of
 from wfsobs.record import Record, RecordError
 from wfsobs.typing import Array
@@ -62,7 +63,8 @@ def group(**numbers: PlantNumber | tuple[PlantNumber, ...]) -> GroupPlant:
 
 
 def test_plants_are_drawn_from_their_deviations_and_correlations() -> None:
-    delays, matrices = draw_plants([group()], 2, np.random.default_rng(1))
+    plants = draw_plants([group()], 2, np.random.default_rng(1))
+    delays, matrices = np.array([plant.delay for plant in plants]), np.array([plant.matrix for plant in plants])
     assert delays[0] == 2.3 and np.allclose(matrices[0], [[np.cos(0.1), -np.sin(0.1)], [np.sin(0.1), np.cos(0.1)]])
     # 256 draws tell a deviation to 4.4 %
     assert delays[1:].std() == pytest.approx(0.05, rel=0.18) and abs(delays[1:].mean() - 2.3) < 4 * 0.05 / np.sqrt(DRAWS)
@@ -76,8 +78,25 @@ def test_plants_are_drawn_from_their_deviations_and_correlations() -> None:
         unsure = group(**{name: (PlantNumber(), PlantNumber(1.0, 0.1))})
         with pytest.raises(RecordError, match=f"do not decide the {name} .*do not switch on"):
             draw_plants([unsure], 2, np.random.default_rng(1))
-    with pytest.raises(RecordError, match=r"the mirror has dynamics \(tip and tilt\).*do not switch on"):
-        draw_plants([replace(group(), rigid=1e-9)], 2, np.random.default_rng(1))
+    swings = replace(group(), rigid=1e-9)
+    with pytest.raises(RecordError, match=r"the mirror has dynamics \(tip and tilt\), not those of one.*do not switch on"):
+        draw_plants([swings], 2, np.random.default_rng(1))
+
+
+def test_mirrors_are_drawn_from_their_deviations() -> None:
+    """Of a group delay of 2.3 frames, 2 damping / omega is that of the mirror."""
+    theta = np.array([2.3, 2.3, 1.0, 1.0, 0.1, np.log(0.3), np.log(0.5)])
+    fit = PlantFit(theta, [], covariance=np.diag([0.0] * 5 + [0.02**2, 0.1**2]))
+    swings = replace(group(), rigid=1e-9, swinging=fit)
+    first, *others = draw_plants([swings], 2, np.random.default_rng(1))
+    assert first.group_delay == pytest.approx(2.3) and first.resonance == pytest.approx(0.6 * np.pi)
+    assert first.delay == pytest.approx(2.3 - 1.0 / (0.6 * np.pi)) and first.damping == pytest.approx(0.5)
+    # 64 draws tell a deviation to 8.8 %
+    assert np.std(np.log([plant.resonance for plant in others])) == pytest.approx(0.02, rel=0.35)
+    assert np.std(np.log([plant.damping for plant in others])) == pytest.approx(0.1, rel=0.35)
+    assert {round(plant.group_delay, 9) for plant in others} == {2.3}
+    with pytest.raises(RecordError, match="modes of several orders"):
+        draw_plants([swings, group()], 2, np.random.default_rng(1))
 
 
 def test_spectra_are_drawn_from_their_deviations() -> None:
@@ -95,10 +114,25 @@ def test_spectra_are_drawn_from_their_deviations() -> None:
 
 def test_the_record_as_its_plant_makes_it_has_the_disturbance(telemetry: Record) -> None:
     true = full_plant_of(SCENARIO)
-    seen = as_seen(telemetry, true.delay, true.matrix)
+    seen = as_seen(telemetry, true)
     disturbance, noise = noise_of(wfsobs.simulate(SCENARIO))
     expected = noise + np.vstack([np.zeros(2), disturbance[:-1]])
     np.testing.assert_allclose(seen.z[10:], expected[10:], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("resonance", [0.0, 0.5, 2.0])
+def test_the_record_of_a_mirror_with_dynamics(resonance: float) -> None:
+    """As the mirror takes the commands frame by frame; a lost one is missing where it is seen, and held."""
+    rng = np.random.default_rng(3)
+    u, mirror = rng.standard_normal((600, 2)), TruePlant(np.array([[1.1, -0.2], [0.1, 0.9]]), 2.4, 0.0, resonance, 0.3)
+    u[0] = 0.0
+    acting = ActingPlant(mirror)
+    y = np.vstack([np.zeros(2), [acting.take(one) for one in u[:-1]]])
+    seen = as_seen(Record(y, u, 1e-3), mirror)
+    np.testing.assert_allclose(seen.z[1:], 0.0, rtol=0, atol=1e-9)
+    u[300] = np.nan
+    gone = np.isnan(as_seen(Record(y, u, 1e-3), mirror).z).any(axis=1)
+    assert gone[303] and not gone[:301].any() and not gone[340:].any()
 
 
 def test_a_worse_and_an_unsteady_one_are_not_to_be_switched_on() -> None:
@@ -112,6 +146,31 @@ def test_a_worse_and_an_unsteady_one_are_not_to_be_switched_on() -> None:
     shaky[: DRAWS * 3 // 4] = np.inf
     found = _interval_of("lqg-kf-lgs", shaky, integrator)
     assert found.rms is None and "not stable" in found.note and found.stable_share == 0.25
+
+
+@pytest.mark.slow
+def test_the_promise_takes_a_mirror_with_dynamics_into_account() -> None:
+    """A probe shows it; the controller on the mirror as it is keeps the promise."""
+    mirror = TruePlant(1.1 * np.eye(2), 1.4, 0.0, 2.0 * np.pi * 0.2, 0.5)
+    record, rng = wfsobs.simulate(SCENARIO.replace({"run.duration": 20.0})), np.random.default_rng(6)
+    acting, probe = ActingPlant(mirror), 0.01 * rng.standard_normal(record.z.shape)
+    y, u, own, seen = np.zeros_like(record.z), np.zeros_like(record.z), np.zeros(2), np.zeros(2)
+    for k, z in enumerate(record.z):
+        y[k] = z + seen
+        own = own - 0.3 * y[k]
+        u[k] = own + probe[k]
+        seen = acting.take(u[k])
+    found = make_promise(Record(y, u, record.dt), SCENARIO, controllers=["lqg-kf-multi"])
+    assert found.plant[0].has_dynamics and found.matrix == pytest.approx(mirror.matrix, abs=0.05)
+    (one,) = [one for one in found.residuals if one.controller == "lqg-kf-multi"]
+    next_one = wfsobs.simulate(SCENARIO.replace({"run.duration": 20.0, "run.seed": 41}))
+    plant = replace(mirror, matrix=mirror.matrix @ np.linalg.inv(found.matrix))
+    _, correction = drive(wfsobs.design("lqg-kf-multi", found.scenario), next_one.measurements(), plant, rng)
+    left = np.sqrt(np.square(noise_of(next_one)[0] + correction)[1000:].mean(axis=0))
+    assert one.rms is not None and one.low is not None and one.high is not None
+    middle, low, high = np.array(one.rms), np.array(one.low), np.array(one.high)
+    assert (np.abs(left - middle) < 1.5 * (high - low)).all(), "a 95 % interval: three of its halves hold in more than 0.999"
+    assert (high - low < 0.5 * middle).all(), "it says something"
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from math import pi
 from typing import Any
 
 import numpy as np
+from scipy.signal import lfilter
 from scipy.stats import gamma
 
 from wfsobs.closed_loop.design import design
@@ -22,13 +23,14 @@ from wfsobs.closed_loop.run import each_outcome
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.true_plant import TruePlant
 from wfsobs.identification.identification import identify
+from wfsobs.identification.mirror_response import LAGS
 from wfsobs.identification.plant import GroupPlant, identify_plant
 from wfsobs.identification.plant_likelihood import LONGEST
 from wfsobs.identification.result import Identification
 from wfsobs.pipeline import as_stated
 from wfsobs.prior import Line, Lines
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Record, RecordError
+from wfsobs.record import Record, RecordError, hold_last
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.simulation.loop import simulate
@@ -43,6 +45,12 @@ DRAWS, RECORDS = 64, 8
 
 HIGHEST, NEAR_LINE = 0.49, 4
 """Largest frequency of a drawn resonance, over the rate; bins on either side of an undamped line that do not count."""
+
+CRITICAL = 0.999
+"""Largest damping ratio of a mirror."""
+
+SEEN = 0.01
+"""Part of a command that a measurement has to hold to see it."""
 
 SECTIONS = 32
 """Simulated records, whose scatter tells how well one knows its mean square."""
@@ -157,11 +165,13 @@ def make_promise(
     """
     groups = identify_plant(record, Watch(is_cancelled=watch.is_cancelled))
     rng = np.random.default_rng(seed)
-    delays, matrices = draw_plants(groups, record.n_modes, rng)
-    delay, matrix = delays[0], matrices[0]
-    corrected = as_seen(record, delay, matrix)
+    likeliest, *others = draw_plants(groups, record.n_modes, rng)
+    corrected = as_seen(record, likeliest)
     found = identify(corrected, watch=Watch(is_cancelled=watch.is_cancelled))
-    known = {"control.delay": float(delay), **{f"plant.{name}": value for name, value in Scenario().plant.to_dict().items()}}
+    known = {
+        "control.delay": likeliest.group_delay,
+        **{f"plant.{name}": value for name, value in Scenario().plant.to_dict().items()},
+    }
 
     def of(identification: Identification) -> Scenario:
         out = identification.scenario(as_stated(corrected, scenario)).replace(known)
@@ -172,11 +182,11 @@ def make_promise(
     plan = design(told, names)
     length = min(record.n_steps, MOST_STEPS // SECTIONS)
     model = simulate(told.replace({"run.duration": (SECTIONS * length + START) * record.dt, "run.seed": seed}))
-    inverse = np.linalg.inv(matrix)
-    plants = [TruePlant(one @ inverse, float(late)) for one, late in zip(matrices[1:], delays[1:], strict=True)]
+    inverse = np.linalg.inv(likeliest.matrix)
+    plants = [replace(one, matrix=one.matrix @ inverse) for one in others]
     outlying = np.column_stack([find_outlying(column) for column in corrected.z.T])
     clean = replace(record, y_lgs=np.where(outlying, np.nan, record.y_lgs))
-    seen = (as_seen(clean, float(late), one).z for late, one in zip(delays[1:], matrices[1:], strict=True))
+    seen = (as_seen(clean, one).z for one in others)
     drawn = [of(draw_spectra(found, z, rng)) for z in seen]
     spectra = [[true_spectra(one, mode) for mode in range(record.n_modes)] for one in drawn]
     left, out = dict[str, Array](), list[ResidualPromise]()
@@ -198,7 +208,7 @@ def make_promise(
         left[name] = (squares[:, None] * gamma.ppf(common, shape) / shape).reshape(-1, record.n_modes)
         out.append(_interval_of(name, left[name], left[INTEGRATOR]))
         watch.step((i + 1) / len(plan.laws))
-    return Promise(told, groups, matrix, tuple(mode.noise.value for mode in found.modes), tuple(out))
+    return Promise(told, groups, likeliest.matrix, tuple(mode.noise.value for mode in found.modes), tuple(out))
 
 
 def _interval_of(name: str, squares: Array, integrator: Array) -> ResidualPromise:
@@ -210,33 +220,42 @@ def _interval_of(name: str, squares: Array, integrator: Array) -> ResidualPromis
     return ResidualPromise(name, tuple(middle.tolist()), tuple(low.tolist()), tuple(high.tolist()), float(stable.mean()), better)
 
 
-def draw_plants(groups: Sequence[GroupPlant], n_modes: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return delays (1 + DRAWS,) and matrices (1 + DRAWS, n_modes, n_modes), the likeliest first. Raises RecordError.
+def draw_plants(groups: Sequence[GroupPlant], n_modes: int, rng: np.random.Generator) -> list[TruePlant]:
+    """Return the likeliest plant and DRAWS others. Raises RecordError.
 
-    Where modes have delays of their own, each draw has the mean of theirs.
+    Where modes have delays of their own, each draw has the mean of theirs. A damping beyond the critical one is that.
     """
-    delays, matrices = np.zeros(1 + DRAWS), np.zeros((1 + DRAWS, n_modes, n_modes))
+    delays, matrices, shape = np.zeros(1 + DRAWS), np.zeros((1 + DRAWS, n_modes, n_modes)), np.zeros((1 + DRAWS, 0))
     order = [mode.name for mode in modes_up_to(HIGHEST_ORDER)]
     for group in groups:
-        names, n = " and ".join(group.modes), len(group.modes)
-        if group.has_dynamics:
-            raise RecordError(f"the mirror has dynamics ({names}), which no promise takes into account: do not switch on")
+        names, n, fit = " and ".join(group.modes), len(group.modes), group.swinging
+        if group.has_dynamics and (fit is None or len(groups) > 1):
+            no = "not those of one mirror of second order" if fit is None else "and there are modes of several orders"
+            raise RecordError(f"the mirror has dynamics ({names}), {no}, which no promise takes into account: do not switch on")
         numbers = [("delay", x) for x in group.delay] + [("gain", x) for x in group.gain]
         numbers += [("rotation", group.rotation)] if group.rotation is not None else []
         for what, number in numbers:
             if number.value is None:
                 raise RecordError(f"the data do not decide the {what} ({names}): do not switch on; wfsobs probe designs a probe")
-        theta = np.tile([number.value or 0.0 for _, number in numbers], (1 + DRAWS, 1))
-        theta[1:] = rng.multivariate_normal(theta[0], group.covariance, DRAWS, check_valid="ignore")  # delays may be one
+        mean = fit.theta if fit else np.array([number.value or 0.0 for _, number in numbers])
+        theta = np.tile(mean, (1 + DRAWS, 1))
+        spread = fit.covariance if fit else group.covariance
+        theta[1:] = rng.multivariate_normal(mean, spread, DRAWS, check_valid="ignore")  # delays may be one
         delays += theta[:, :n].sum(axis=1) / n_modes
         block = theta[:, n : 2 * n, None] * np.eye(n)
         if group.rotation is not None:
-            angle = theta[:, -1]
+            angle = theta[:, 2 * n]
             turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
             block = np.moveaxis(turn, 2, 0) @ block
         columns = [order.index(name) for name in group.modes]
         matrices[np.ix_(range(1 + DRAWS), columns, columns)] = block
-    return np.maximum(delays, 1.0), matrices
+        shape = theta[:, len(numbers) :]
+    if not shape.size:
+        return [TruePlant(one, max(late, 1.0)) for one, late in zip(matrices, delays.tolist(), strict=True)]
+    omega, damping = 2.0 * pi * np.exp(shape[:, 0]), np.minimum(np.exp(shape[:, 1]), CRITICAL)
+    dead = np.maximum(delays - 2.0 * damping / omega, 1.0)
+    each = zip(matrices, dead.tolist(), omega.tolist(), damping.tolist(), strict=True)
+    return [TruePlant(one, late, 0.0, *mirror) for one, late, *mirror in each]
 
 
 def draw_spectra(identification: Identification, z: Array, rng: np.random.Generator) -> Identification:
@@ -264,11 +283,15 @@ def draw_spectra(identification: Identification, z: Array, rng: np.random.Genera
     return replace(identification, modes=tuple(modes))
 
 
-def as_seen(record: Record, delay: float, matrix: Array) -> Record:
-    """Return a record whose commands are what the measurements see of them, by an identified plant."""
-    whole, part = int(delay), delay % 1.0
-    before = np.vstack([np.zeros((1, record.n_modes)), record.u[:-1]])
-    return replace(record, u=((1.0 - part) * record.u + part * before) @ matrix.T, delay=whole)
+def as_seen(record: Record, plant: TruePlant) -> Record:
+    """Return a record whose commands are what the measurements see of them, by an identified plant, one frame later.
+
+    Before the record a command has been as its first one; one that is lost is missing where it would be seen.
+    """
+    u, response = hold_last(record.u), plant.frame_response(LAGS)
+    moved = lfilter(response, [1.0], u - u[0], axis=0) + u[0]
+    lost = np.convolve(np.isnan(record.u).any(axis=1), np.abs(response) > SEEN)[: len(u)] > 0
+    return replace(record, u=np.where(lost[:, None], np.nan, moved @ plant.matrix.T), delay=1)
 
 
 def _scatter(residual: Array) -> Array:

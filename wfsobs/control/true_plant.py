@@ -89,6 +89,11 @@ class TruePlant:
         return self.resonance * complex(-self.damping, np.sqrt(1.0 - self.damping**2))
 
     @property
+    def group_delay(self) -> float:
+        """Delay of a slow command [frames], that of the mirror included."""
+        return self.delay + (2.0 * self.damping / self.resonance if self.resonance else 0.0)
+
+    @property
     def size(self) -> int:
         """Frames that a switch of the mirror may be ahead."""
         return int(self.delay - 1.0 + self.jitter) + 1
@@ -106,6 +111,12 @@ class TruePlant:
         pole = self.pole
         swing = (-1.0 - 1j * pole.real / pole.imag) * np.exp(pole * after)
         return means + np.diff(swing / pole).real, complex(swing[-1])
+
+    def frame_response(self, n: int) -> Array:
+        """Response of the measurements of the next n frames to a command, (n,), the matrix aside; without jitter."""
+        means, swing = self.step_means()
+        turn = np.exp(self.pole * np.arange(n + 1)) / self.pole if self.resonance else np.zeros(n + 1)
+        return np.diff(np.append(means, 1.0 + (swing * np.diff(turn)).real)[:n], prepend=0.0)
 
     def response(self, omega: Array) -> Complex:
         """Response of a measurement to a command, at omega [rad per step], the matrix aside; without jitter. Same shape."""

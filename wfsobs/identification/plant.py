@@ -105,6 +105,9 @@ class GroupPlant:
         Share of what is new in the commands that the measurements do not explain: of a probe, or a change of the controller.
     covariance : Array
         Of delays [frames], gains and, of two modes, the rotation [rad] together.
+    swinging : PlantFit or None
+        The mirror of second order that is as likely as any, where a probe shows dynamics: the numbers above, then the
+        logarithms of natural frequency over frame rate and of damping ratio.
     chance, rigid : float
         Probability that what the measurements hold of a probe beside this plant, and beside one of a delay and a gain alone, is
         chance; where the first is below `OTHERWISE` nothing is identifiable. 1 where a probe is small.
@@ -123,6 +126,7 @@ class GroupPlant:
     covariance: Array = field(repr=False, compare=False)
     chance: float = 1.0
     rigid: float = 1.0
+    swinging: PlantFit | None = field(default=None, repr=False, compare=False)
 
     @property
     def has_dynamics(self) -> bool:
@@ -276,9 +280,9 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
     rivals = [fit.theta - each.theta for fit in fits if fit.criterion - each.criterion < RIVAL]
     both = np.column_stack([pooled[:, 0], np.eye(len(pooled))[:, 1:]])
     each, ties = (_over_delays(data, each, gains), gains) if one_delay else (_over_delays(data, apart, both), both)
-    chance, rigid, mirror = 1.0, 1.0, each
+    chance, rigid, mirror, swinging = 1.0, 1.0, each, None
     if excited > PROBED:
-        rigid, mirror = data.response_left(each, own), _with_dynamics(data, each, ties)
+        rigid, (mirror, swinging) = data.response_left(each, own), _with_dynamics(data, each, ties)
         chance = data.response_left(mirror, own)
         each = replace(each, theta=mirror.theta[: data.size], covariance=mirror.covariance[: data.size, : data.size])
     equal = np.zeros(len(pooled))
@@ -312,11 +316,15 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
     uncertainty = data.uncertainty(each, mirror if rigid < OTHERWISE else each) if is_known else np.inf
     peaks, coloured = tuple(len(s.resonances) for s in each.spectra), any(s.background for s in each.spectra)
     numbers = delay, gain, rotation, common_delay, common_gain
-    return GroupPlant(names, *numbers, uncertainty, peaks, coloured, excited, each.covariance, chance, rigid)
+    swinging = swinging if rigid < OTHERWISE <= chance else None
+    return GroupPlant(names, *numbers, uncertainty, peaks, coloured, excited, each.covariance, chance, rigid, swinging)
 
 
-def _with_dynamics(data: PlantLikelihood, fit: PlantFit, ties: Array) -> PlantFit:
-    """Return the fit of a mirror with dynamics: any response of few lags, or of second order where that is likelier by SWINGS."""
+def _with_dynamics(data: PlantLikelihood, fit: PlantFit, ties: Array) -> tuple[PlantFit, PlantFit | None]:
+    """Return the fit of a mirror with dynamics, and that of second order where no other is likelier by RIVAL.
+
+    The first is any response of few lags, or the second where that is likelier by SWINGS.
+    """
     ties = block_diag(ties, np.eye(2))
 
     def of(mirror: Response, shape: Sequence[float]) -> PlantFit:
@@ -324,7 +332,8 @@ def _with_dynamics(data: PlantLikelihood, fit: PlantFit, ties: Array) -> PlantFi
 
     few = of(few_lags(int(fit.theta[: data.k].mean())), (0.0, 0.0))
     swinging = min((of(second_order, shape) for shape in SHAPES), key=lambda one: one.value)
-    return swinging if few.value - swinging.value > SWINGS else few
+    better = few.value - swinging.value
+    return swinging if better > SWINGS else few, swinging if better > -RIVAL else None
 
 
 def _over_delays(data: PlantLikelihood, fit: PlantFit, ties: Array) -> PlantFit:
