@@ -28,7 +28,6 @@ from wfsobs.app.pages.live_controls import (
 )
 from wfsobs.app.pages.live_figures import (
     MEASUREMENT,
-    LatencyHistogram,
     Painter,
     Pulse,
     RollingSpectra,
@@ -73,7 +72,6 @@ class LiveRoom:
         self.traces: Final = RollingTraces(painter)
         self.spectra: Final = RollingSpectra(painter)
         self.waterfall: Final = Waterfall()
-        self.latencies: Final = LatencyHistogram(painter)
         self.stars: Final = Stars(painter)
         self.table, self.control_table, self.news, self.peaks = (html() for _ in range(4))
         self.editor: SpectrumEditor | None = None
@@ -88,8 +86,7 @@ class LiveRoom:
         figures = [
             figure_with_caption("The last seconds", self.traces.figure),
             self._spectra_room,
-            pn.Column(figure_with_caption("Waterfall", self.waterfall.figure), **WIDE),
-            figure_with_caption("Latencies", self.latencies.figure),
+            pn.Column(figure_with_caption("Waterfall", self.waterfall.figure), **WIDE, styles={"grid-column": "1 / -1"}),
         ]
         switches = line(
             c.window,
@@ -128,7 +125,6 @@ class LiveRoom:
         if (second := int(monotonic() / SLOW)) != self._second or not loop.is_playing:  # all pages at the same time
             self._second = second
             self._draw_tables(loop, view, target, scale)
-            self.latencies.draw(loop.board, names, loop.sampling.dt, dark)
         self._painter.send()
 
     def _target(self, loop: LiveLoop) -> str:

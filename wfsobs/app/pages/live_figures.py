@@ -1,4 +1,4 @@
-"""The figures of the live loop: traces that roll, spectra, latencies, waterfall, detectors; and how they are sent."""
+"""The figures of the live loop: traces that roll, spectra, waterfall, detectors; and how they are sent."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import panel as pn
 from bokeh.core.validation import silence
 from bokeh.core.validation.warnings import MISSING_RENDERERS
 from bokeh.model import Model
-from bokeh.models import BasicTicker, ColorBar, ColumnDataSource, Image, LogColorMapper, Range1d, Span
+from bokeh.models import BasicTicker, ColorBar, ColumnDataSource, Image, LogColorMapper, Range1d
 from bokeh.palettes import Viridis256
 from bokeh.plotting import figure
 
@@ -27,8 +27,7 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.error_spectra import cumulative_rms
 from wfsobs.evaluation.recovery import trailing_rms
 from wfsobs.evaluation.scores import BOUNDS
-from wfsobs.latencies import EDGES
-from wfsobs.live.board import SLOTS, Board
+from wfsobs.live.board import SLOTS
 from wfsobs.live.control_crew import ControlView
 from wfsobs.live.finding import LENGTH, LOWEST, ROWS, Bounds, bridge_missing, second_spectrum
 from wfsobs.live.paced import LiveEvent
@@ -134,8 +133,6 @@ ROOM = 30
 """Characters of an event that the height of a figure takes."""
 CLOSE = 0.05
 """Part of the window within which the words of two events would cover each other."""
-COARSE = 20
-"""Bins of the histogram of latencies that are drawn as one."""
 NAMES = (TRUTH, *BOUNDS, *SLOTS)
 silence(MISSING_RENDERERS)  # of figures whose lines are made when they are first shown
 
@@ -307,32 +304,6 @@ def _last_spectrum(view: LiveView, name: str, target: str, display: Display, n: 
         return None
     frequency, density = psd(x[:, None], view.dt, resolution=1.0 / (n * view.dt))
     return frequency, density[:, 0]
-
-
-class LatencyHistogram(LiveFigure):
-    """How long the steps of each observer take, beside the time of a frame."""
-
-    def __init__(self, painter: Painter) -> None:
-        super().__init__(
-            new_figure(x_range=Range1d(start=1.0, end=1e5), y_range=Range1d(start=0.0, end=100.0), x_axis_type="log"), painter
-        )
-        self._limit = Span(location=1000.0, dimension="height", line_dash=[6, 3], line_color="#888888")
-        self.figure.add_layout(self._limit)
-        self.figure.xaxis.axis_label, self.figure.yaxis.axis_label = "time of a step [µs]", "share of frames [%]"
-        edges = 1e6 * EDGES[::COARSE]
-        self._x = np.repeat(edges, 2)[1:-1]
-
-    def draw(self, board: Board, names: Sequence[str], dt: float, dark: bool) -> None:
-        """Send the histograms since the start."""
-        self._limit.location = 1e6 * dt
-        data = {}
-        for name in names:
-            counts = board[name].latencies.counts[1:-1]
-            shares = 100.0 * np.add.reduceat(counts, np.arange(0, len(counts), COARSE)) / max(1, counts.sum())
-            data[name] = self._x, np.repeat(shares, 2)
-        self.put(data, dark)
-        top = 1.1 * max((float(y.max()) for _, y in data.values()), default=1.0) or 1.0
-        self.figure.y_range.update(end=top)
 
 
 MEASUREMENT = "measurement"
