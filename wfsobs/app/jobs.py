@@ -11,9 +11,10 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Hashable, Mapping
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from time import monotonic
-from typing import Any, Final
+from typing import Any, ClassVar
 
 from wfsobs.app.cache import Cache
 from wfsobs.app.logs import event
@@ -43,6 +44,7 @@ Listener = Callable[[Mapping[str, Any]], None]
 """Receives changes of state, place, progress, latest, result and message, from any thread. Must not block."""
 
 
+@dataclass(eq=False)
 class Job:
     """A computation, shared by its listeners; it stops when the last of them leaves.
 
@@ -56,32 +58,27 @@ class Job:
     quiet      : one of many in a second, of which the log says nothing unless it is asked for everything
     """
 
-    _numbers = itertools.count(1)
+    _numbers: ClassVar = itertools.count(1)
 
-    def __init__(
-        self,
-        kind: str,
-        work: Work,
-        *,
-        key: str = "",
-        cost: float = 0.0,
-        priority: int | None = None,
-        time_limit: float = math.inf,
-        refusal: type[Exception] = ValueError,
-        endless: bool = False,
-        quiet: bool = False,
-    ):
-        self.kind = kind
-        self.key = key
-        self.cost = cost
-        self.priority: Final = (CLICK if cost <= LONG else BATCH) if priority is None else priority
-        self.time_limit = time_limit
-        self.endless = endless
-        self.number: Final = next(Job._numbers)
-        self.since: Final = monotonic()
-        self.turn = 0
-        self._work, self._refusal = work, refusal
-        self._level = logging.DEBUG if quiet else logging.INFO
+    kind: str
+    work: Work
+    _: KW_ONLY
+    key: str = ""
+    cost: float = 0.0
+    priority: int = -1
+    time_limit: float = math.inf
+    refusal: type[Exception] = ValueError
+    endless: bool = False
+    quiet: bool = False
+
+    def __post_init__(self) -> None:
+        """Choose the priority by the cost, if it was not given."""
+        if self.priority < CLICK:
+            self.priority = CLICK if self.cost <= LONG else BATCH
+        self.number: int = next(Job._numbers)
+        self.since: float = monotonic()
+        self.turn: int = 0
+        self._level = logging.DEBUG if self.quiet else logging.INFO
         self._lock = threading.RLock()  # where a session has no thread of its own, a listener may leave
         self._listeners: dict[Listener, Hashable] = {}
         self._is_unwanted = False
@@ -155,7 +152,7 @@ class Job:
 
         said, news = "failed", {"state": FAILED}
         try:
-            result = self._work(
+            result = self.work(
                 Watch(progress, lambda: stopped() or gives_way() or monotonic() - start > self.time_limit), self.tell
             )
             if self.key:
@@ -169,7 +166,7 @@ class Job:
                 said, news = "cancelled", {"state": CANCELLED}
             else:
                 said, news["message"] = "late", f"It took more than {self.time_limit:g} s, which is what this server allows"
-        except self._refusal as error:
+        except self.refusal as error:
             said, news["message"] = "refused", str(error)
         except Exception as error:  # a bug, but the server goes on
             log.exception("%s %d failed", self.kind, self.number)

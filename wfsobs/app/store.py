@@ -137,15 +137,16 @@ class Store(param.Parameterized):
 
     def undo(self) -> None:
         """Take back the last change that was accepted."""
-        if self._past:
-            self._future.append(self.step)
-            self._accept(self._past.pop(), {}, step=False)
+        self._go(self._past, self._future)
 
     def redo(self) -> None:
         """Make the last change again that was taken back."""
-        if self._future:
-            self._past.append(self.step)
-            self._accept(self._future.pop(), {}, step=False)
+        self._go(self._future, self._past)
+
+    def _go(self, there: list[Step], back: list[Step]) -> None:
+        if there:
+            back.append(self.step)
+            self._accept(there.pop(), {}, step=False)
 
     def value(self, path: str) -> Any:
         """Look up the accepted value of a setting, by dotted path."""

@@ -50,6 +50,7 @@ from wfsobs.app.views.plots import (
     in_view,
     new_figure,
     on_settle,
+    set_ends,
 )
 from wfsobs.app.views.strip import Cards, card_of, error_fields
 from wfsobs.app.views.table import SMALLEST
@@ -131,7 +132,7 @@ class Trace(LoopLines):
         """Have the axis hold every visible line."""
         self._invisible_names = hidden_names
         top = 1.1 * self.highest(hidden_names, 1.0)
-        self.figure.y_range.update(start=-top, end=top, reset_start=-top, reset_end=top)
+        set_ends(self.figure.y_range, -top, top)
 
 
 class LoopSpectrum(LoopLines):

@@ -13,7 +13,7 @@ from wfsobs.app.pages.parts import WIDE, Page, boxes, html
 from wfsobs.app.render import number
 from wfsobs.app.store import Store
 from wfsobs.app.style import look, sheets, swatch
-from wfsobs.app.views.plots import LoopLines, call, new_figure
+from wfsobs.app.views.plots import LoopLines, call, new_figure, set_ends
 from wfsobs.app.views.table import find
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.plot.paper import DECADES, FIGURES, WHOLE, ZOOMED, PaperFigure, Plot, drawn_lines, is_dashed, samples_of
@@ -107,8 +107,7 @@ class _PlotLines(LoopLines):
         self.put({name: (x, scale * y) for name, (x, y) in shown.lines.items()})
         self.restyle(display.dark, [])
         self.figure.yaxis.axis_label = f"{self.plot.label} [{self.plot.unit(display.unit_label)}]"
-        start, end = shown.ends
-        self.figure.x_range.update(start=start, end=end, reset_start=start, reset_end=end)
+        set_ends(self.figure.x_range, *shown.ends)
         first, last = samples_of(record, warm_up)[ZOOMED]
         self.window.update(left=first * record.dt, right=last * record.dt)
         top = self.highest([], 0.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from html import escape
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import panel as pn
@@ -36,7 +36,7 @@ from wfsobs.app.share import IDENTIFY, CopiedTask
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, record_key
 from wfsobs.app.store import Store
 from wfsobs.app.style import look
-from wfsobs.app.views.plots import call, new_figure
+from wfsobs.app.views.plots import call, new_figure, set_ends
 from wfsobs.app.work import RunResults
 from wfsobs.identification import Identification, identify
 from wfsobs.identification.identification import LEVEL
@@ -116,16 +116,15 @@ class SpectrumFigure:
         self.spikes: Final = ColumnDataSource({"x": [], "low": [], "high": []})
         self.peaks: Final = ColumnDataSource({"x": [], "y": [], "text": []})
         fig = self.figure
-        self._renderers = {
-            "highest": [fig.line("x", "highest", source=self.measurement, line_alpha=0.45, line_width=1.0)],
-            "measured": [fig.line("x", "mean", source=self.measurement, line_width=1.0)],
-            "parts": [fig.multi_line("xs", "ys", source=self.parts, line_width=1.2, line_dash=list(look("parts").dash))],
-            "fitted": [fig.line("x", "y", source=self.total, line_width=2.2)],
-        }
-        marks = fig.scatter("x", "y", source=self.peaks, marker="inverted_triangle", size=8)
-        spikes = fig.segment("x", "low", "x", "high", source=self.spikes, line_width=2.2)
-        self._renderers["found"] = [marks, spikes]
-        fig.add_tools(HoverTool(renderers=[marks], tooltips="@text"))
+        self._glyphs: list[tuple[str, Any]] = [
+            ("highest", fig.line("x", "highest", source=self.measurement, line_alpha=0.45, line_width=1.0)),
+            ("measured", fig.line("x", "mean", source=self.measurement, line_width=1.0)),
+            ("parts", fig.multi_line("xs", "ys", source=self.parts, line_width=1.2, line_dash=list(look("parts").dash))),
+            ("fitted", fig.line("x", "y", source=self.total, line_width=2.2)),
+            ("found", fig.segment("x", "low", "x", "high", source=self.spikes, line_width=2.2)),
+            ("found", fig.scatter("x", "y", source=self.peaks, marker="inverted_triangle", size=8)),
+        ]
+        fig.add_tools(HoverTool(renderers=[self._glyphs[-1][1]], tooltips="@text"))
 
     def draw_measured(self, of: RecordSpectrum, display: Display, diameter: float) -> None:
         """Send what was measured, and have the axes hold it."""
@@ -134,10 +133,8 @@ class SpectrumFigure:
         self.measurement.data = {"x": of.frequency, "mean": mean, "highest": highest}
         positive = mean[mean > 0]
         if positive.size:
-            low, high = float(np.quantile(positive, 0.01)) / 5.0, float(highest.max()) * 6.0
-            self.figure.y_range.update(start=low, end=high, reset_start=low, reset_end=high)
-        ends = float(of.frequency[0]), float(of.frequency[-1])
-        self.figure.x_range.update(start=ends[0], end=ends[1], reset_start=ends[0], reset_end=ends[1])
+            set_ends(self.figure.y_range, float(np.quantile(positive, 0.01)) / 5.0, float(highest.max()) * 6.0)
+        set_ends(self.figure.x_range, float(of.frequency[0]), float(of.frequency[-1]))
         self.figure.yaxis.axis_label = f"PSD of z, {display.mode_label} [{display.unit_label}²/Hz]"
 
     def draw_fit(self, mode: IdentifiedMode | None, of: Fit | None, display: Display, diameter: float) -> None:
@@ -165,11 +162,9 @@ class SpectrumFigure:
 
     def restyle(self, dark: bool) -> None:
         """Set the colours of light or dark mode."""
-        for name, renderers in self._renderers.items():
-            for renderer in renderers:
-                renderer.glyph.line_color = look(name).colour(dark)
-                if "fill_color" in renderer.glyph.properties():
-                    renderer.glyph.fill_color = look(name).colour(dark)
+        for name, renderer in self._glyphs:
+            colour = look(name).colour(dark)
+            renderer.glyph.update(**dict.fromkeys({"line_color", "fill_color"} & renderer.glyph.properties(), colour))
 
 
 WHITE, COLOURED = macro("tag", "best", "white"), macro("tag", "above", "not white")
@@ -236,6 +231,10 @@ def model_toml(finding: tuple[Identification, Record, Scenario]) -> bytes:
 FILES = {"Model as TOML": ("wfsobs-model.toml", model_toml)}
 
 
+NEITHER: tuple[Identification | None, Record | None] = (None, None)
+"""No model, and no record from which it was identified."""
+
+
 class IdentifyPage(Page):
     """The page. The measured spectrum follows the results shown while it is visible; the model comes when asked for."""
 
@@ -285,7 +284,7 @@ class IdentifyPage(Page):
     @property
     def is_used(self) -> bool:
         """Whether the settings are those of the model identified in the record shown."""
-        (result, record), shown = self._model_and_record(), self.run.result
+        (result, record), shown = self.work.result or NEITHER, self.run.result
         if result is None or record is None or shown is None or not same_content(record, shown.result.record):
             return False
         return result.scenario(self.store.scenario) == self.store.scenario
@@ -307,7 +306,7 @@ class IdentifyPage(Page):
         return None if self.work.result is None else (*self.work.result, self.store.scenario)
 
     def _take(self, source: Source | None) -> None:
-        result, _ = self._model_and_record()
+        result, _ = self.work.result or NEITHER
         if result is not None:
             self.store.run_on(source, result.scenario(self.store.scenario))
             self._scenario = self.store.scenario if source is None else None
@@ -330,17 +329,13 @@ class IdentifyPage(Page):
         if task.state != RUNNING:
             self.redraw()
 
-    def _model_and_record(self) -> tuple[Identification, Record] | tuple[None, None]:
-        """Return the model and the record from which it was identified."""
-        return self.work.result or (None, None)
-
     def draw(self) -> None:
         """Draw the spectrum, and the model of it where there is one."""
         of, shown = self.of, self.run.result
         if of is None or shown is None or self.display.column >= of.mean.shape[1]:
             return
         diameter, column = shown.scenario.telescope.diameter, self.display.column
-        result, record = self._model_and_record()
+        result, record = self.work.result or NEITHER
         mode = result.modes[column] if result and column < len(result.modes) else None
         self.legend.html = legend(NAMES, self.display.dark)
         self.figure.draw_measured(of, self.display, diameter)

@@ -15,7 +15,7 @@ from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.render import number
 from wfsobs.app.report.sections import value_of
 from wfsobs.app.style import look, observers_of
-from wfsobs.app.views.plots import add_line, call, new_figure
+from wfsobs.app.views.plots import add_line, call, new_figure, set_ends
 from wfsobs.campaign.sweep import SweepResults
 from wfsobs.evaluation.evidence import FEWEST
 from wfsobs.evaluation.rows import row_label
@@ -79,7 +79,7 @@ class SweepLines:
         largest = max((float(np.nanmax(all_errors[name][0])) for name in drawn), default=1.0)
         above = max((float(np.nanmax(all_errors[name])) for name in drawn), default=1.0)
         top = 1.08 * min(above, HIGHEST * largest)
-        self.figure.y_range.update(start=0.0, end=top, reset_start=0.0, reset_end=top)
+        set_ends(self.figure.y_range, 0.0, top)
         self.figure.yaxis.axis_label = part["up"]
         for name, (line, bar, dots) in self.glyphs.items():
             colour = look(name).colour(dark)

@@ -76,6 +76,11 @@ def in_view(axis: Any) -> tuple[float, float]:
     return min(axis.start, axis.end), max(axis.start, axis.end)
 
 
+def set_ends(axis: Any, start: float, end: float) -> None:
+    """Show this much of an axis, now and after a reset."""
+    axis.update(start=start, end=end, reset_start=start, reset_end=end)
+
+
 def zoom_of(axis: Any) -> tuple[float, float] | None:
     """Return what of an axis is in view; None where all of it is."""
     start, end = in_view(axis)
