@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import base64
+from types import SimpleNamespace
 from typing import Any
 
+import param
 import pytest
 
 from tests.app.test_session_history import WIND, change, quick
@@ -12,7 +14,9 @@ from wfsobs.app import history as module
 from wfsobs.app.actions import Actions
 from wfsobs.app.display import Display
 from wfsobs.app.history import History, HistorySheet, Sheet
+from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.session_file import SUFFIX, read_session
+from wfsobs.app.share import EXPLORED
 
 
 @pytest.fixture
@@ -35,10 +39,23 @@ def model(sheet: HistorySheet) -> Sheet:
     return sheet.sheet
 
 
+class NoPages(param.Parameterized):
+    """In the place of the pages and of their view: nothing is opened."""
+
+    current = param.String("explore")
+    query = param.String("")
+    page = SimpleNamespace(task=EXPLORED, saves=dict)
+
+    @property
+    def pages(self) -> NoPages:
+        return self
+
+
 @pytest.fixture
 def actions(sheet: HistorySheet) -> Actions:
     """The menu that saves and opens the session."""
-    return Actions(sheet.history.store, sheet)
+    view: Any = NoPages()
+    return Actions(sheet.history.store, sheet, view, SeedRuns(sheet.history.store))
 
 
 def saved(actions: Actions, loop: Any, monkeypatch: pytest.MonkeyPatch) -> bytes:

@@ -189,7 +189,7 @@ def test_everything_is_done_never_too_much_at_once(workers: int, jobs: list[tupl
 def test_a_job_that_fails_leaves_the_thread_to_others(make_queue: Any, caplog: Any) -> None:
     queue, log = make_queue(1), Log()
     fails, after = Asked(log, "a"), Asked(log, "b")
-    fails.job._work = lambda *_: 1 / 0
+    fails.job.work = lambda *_: 1 / 0
     fails.into(queue)
     after.into(queue)
     log.until(lambda: log.started == ["b"])

@@ -13,14 +13,13 @@ from wfsobs.app.component import HtmlComponent
 from wfsobs.app.downloads import Save, TooLarge, data_csv, data_npz
 from wfsobs.app.history import HistorySheet, session_save
 from wfsobs.app.jobs import DONE, FAILED, RUNNING, Job
-from wfsobs.app.pages.pages import Pages, ViewState
-from wfsobs.app.pages.parts import Page
+from wfsobs.app.pages.pages import ViewState
 from wfsobs.app.render import render
 from wfsobs.app.report.export import LIMIT, ReportError, make
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.session_file import SessionError, read_session
-from wfsobs.app.share import EXPLORED, FILE, Link, from_file, from_query, name_record, to_command, to_file, to_python, to_query
+from wfsobs.app.share import FILE, Link, from_file, from_query, name_record, to_command, to_file, to_python, to_query
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.style import labels, script, sheets
@@ -65,40 +64,35 @@ class Toolbar(HtmlComponent):
 class Actions:
     """The toolbar over a store."""
 
-    def __init__(self, store: Store, sheet: HistorySheet):
+    def __init__(self, store: Store, sheet: HistorySheet, view: ViewState, seeds: SeedRuns):
+        """Make the menus. view : of the page, and its pages;  seeds : what a report says of further seeds."""
         self.store = store
         self.sheet: Final = sheet
+        self.view: Final = view
+        self.pages: Final = view.pages
+        self._seeds = seeds
         self.toolbar: Final = Toolbar(self.handle, labels=labels(), margin=0)
         self._tasks: dict[str, BackgroundTask] = {}
         self._under_way: dict[str, tuple[str, Callable[[Any], None]]] = {}
-        self._pages: Pages | None = None
-        self._view: ViewState | None = None
         store.param.watch(once(self._refresh, AFTERWARDS_MS), ["scenario", "preset", "source", "wanted_record"])
         store.param.watch(lambda _event: self.toolbar.param.update(notes=[]), "source")  # of files before the one that is used
         store.run.param.watch(lambda event: self.toolbar.param.update(ready=event.new is not None), "result")
+        self.pages.param.watch(self._turn, "current")
+        view.param.watch(self._follow_view, "query", onlychanged=False)
         self._refresh()
 
-    def attach(self, pages: Pages, seeds: SeedRuns) -> None:
-        """Watch the pages: the one that is shown says what is copied and saved; seeds : what a report says of further seeds."""
-        self._pages, self._seeds = pages, seeds
-        pages.param.watch(self._turn, "current")
-
-    def follow_view(self, state: ViewState) -> None:
+    def _follow_view(self, event: param.parameterized.Event) -> None:
         """Keep the view in the address, behind settings that wait for theirs: an entry of the browser's history has both."""
-        self._view = state
-        state.param.watch(lambda event: (self._refresh(), self.toolbar.param.update(view=event.new)), "query", onlychanged=False)
+        self._refresh()
+        self.toolbar.view = event.new
 
     def open_view(self, query: str) -> None:
         """Bring the page to the view of an address, and name what cannot be taken."""
-        if self._view is not None and (refused := self._view.open(query)):
+        if refused := self.view.open(query):
             self.toolbar.notes = [*self.toolbar.notes, *(f"Not used from the link: {line}" for line in refused)]
 
-    @property
-    def _offers(self) -> Page | None:
-        return self._pages.page if self._pages else None
-
     def _turn(self, _event: object) -> None:
-        self.toolbar.saves = [*self._offers.saves()] if self._offers else []
+        self.toolbar.saves = [*self.pages.page.saves()]
         self._refresh()
 
     def handle(self, msg: dict[str, Any]) -> None:
@@ -165,7 +159,7 @@ class Actions:
 
     def save_of_page(self, what: str) -> None:
         """Make a file of what the page shown has found, and send it."""
-        saves = self._offers.saves() if self._offers else {}
+        saves = self.pages.page.saves()
         if (save := saves.get(what)) is not None:
             self.save(save)
         elif what in saves:
@@ -184,18 +178,11 @@ class Actions:
         command = to_command(shown.scenario, preset, shown.source) if shown.is_recorded else ""
         job = Job(
             "report",
-            partial(make, shown, preset, command=command, **self._extras()),
+            partial(make, shown, preset, command=command, **self.pages.shown_beside(shown.result), evidence=self._seeds.evidence),
             time_limit=LIMIT,
             refusal=ReportError,
         )
         self._start("report", "Report", job, partial(self.toolbar.save, REPORT, "text/html"))
-
-    def _extras(self) -> dict[str, Any]:
-        """Return what the report has beside the results shown."""
-        shown = self.store.run.result
-        if self._pages is None or shown is None:
-            return {}
-        return {**self._pages.shown_beside(shown.result), "evidence": self._seeds.evidence}
 
     def _start(self, which: str, name: str, job: Job, then: Callable[[Any], None]) -> None:
         """Have a job done, one of each at a time, say under a name how it goes, and then do something with its result."""
@@ -228,7 +215,7 @@ class Actions:
         scenario, preset, source = self.store.scenario, self.store.preset, self.store.source
         named = name_record(source) or self.store.wanted_record
         query = to_query(scenario, preset, source.simulation if source else None, named)
-        task = self._offers.task if self._offers else EXPLORED
+        task = self.pages.page.task
         self.toolbar.param.update(
             has_link=query is not None,
             query=query or "",

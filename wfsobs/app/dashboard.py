@@ -142,12 +142,14 @@ class Dashboard:
         self.controls.effect_of = partial(effect_line, self.display)
         self.history: Final = History(self.store, self.display)
         self.history_sheet: Final = HistorySheet(self.history, lambda sheet: self.body.append(sheet))
-        self.actions: Final = Actions(self.store, self.history_sheet)
-        self.upload: Final = Upload(self.store, self.actions)
         self.modes: Final = ModeSwitch(self.store.run, self.display)
         self.units: Final = UnitSwitch(self.display)
         self.seeds: Final = SeedRuns(self.store)
         self.explore: Final = Explore(self.history, self.seeds)
+        self.pages: Final = Pages(self.explore, self.store, self.display)
+        self.view_state: Final = ViewState(self.display, self.pages, self.explore, self.seeds)
+        self.actions: Final = Actions(self.store, self.history_sheet, self.view_state, self.seeds)
+        self.upload: Final = Upload(self.store, self.actions)
         self.connection: Final = Connection(self.controls.take, width=0, height=0, margin=0)
         self.drawer: Final = pn.Column(sizing_mode="stretch_width", margin=0)
         self.frame: Final = Frame(width=0, height=0, margin=0)
@@ -159,12 +161,8 @@ class Dashboard:
 
     def page(self) -> pmui.Page:
         """Build the whole page."""
-        self.pages = Pages(self.explore, self.store, self.display)
-        self.actions.attach(self.pages, self.seeds)
         if self.store.session.service.live is not None:
             self.pages.current = LIVE
-        self.view_state = ViewState(self.display, self.pages, self.explore.lines, self.explore.traces, self.seeds)
-        self.actions.follow_view(self.view_state)
         self.history.open_view = self.view_state.open
         self.view_state.param.watch(lambda event: self.history.follow_view(event.new), "query")
         self.body = pn.Column(

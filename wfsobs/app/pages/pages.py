@@ -16,6 +16,7 @@ from wfsobs.app.compared import comparison_of
 from wfsobs.app.display import Display
 from wfsobs.app.pages.campaign import CampaignPage
 from wfsobs.app.pages.closed_loop import ClosedLoopPage
+from wfsobs.app.pages.explore import Explore
 from wfsobs.app.pages.figures import Figures
 from wfsobs.app.pages.identify import IdentifyPage, Suggestion
 from wfsobs.app.pages.live import LivePage
@@ -27,9 +28,7 @@ from wfsobs.app.pages.tune import TunePage
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.store import Store
 from wfsobs.app.style import HEARD, PRIMARY, observers_of
-from wfsobs.app.views.main_lines import MainLines
 from wfsobs.app.views.plots import on_settle
-from wfsobs.app.views.traces import Traces
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.result import Result
 from wfsobs.observers.base import TARGETS
@@ -150,12 +149,12 @@ class ViewState(param.Parameterized):
 
     query = param.String("", doc="What the address has of the view, without ?.")
 
-    def __init__(self, display: Display, pages: Pages, lines: MainLines, traces: Traces, seeds: SeedRuns):
+    def __init__(self, display: Display, pages: Pages, explore: Explore, seeds: SeedRuns):
         super().__init__()
         self.display = display
         self.pages = pages
-        self.lines = lines
-        self.traces = traces
+        self.lines = explore.lines
+        self.traces = explore.traces
         switches = LinkedFields({PAGE: (pages, "current")} | {name: (display, name) for name in SWITCHES})
         switches.fresh[PAGE] = EXPLORE
         self._parts: list[tuple[Collection[str], LinkPart]] = [
@@ -167,7 +166,7 @@ class ViewState(param.Parameterized):
         for _names, part in self._parts:
             part.watch(self._refresh)
         pages.param.watch(self._turn, "current")
-        on_settle([traces.x_range], self._refresh)
+        on_settle([self.traces.x_range], self._refresh)
 
     def _lines_of(self, target: str) -> LinkedLines:
         def hide(names: list[str] | None) -> None:
