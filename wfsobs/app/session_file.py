@@ -252,7 +252,7 @@ def _member(number: int) -> str:
     return f"records/{number}.npz"
 
 
-PLAIN = {"name": str, "own_name": bool, "time": float, "star": bool, "record": str, "view": str}
+PLAIN: Mapping[str, type] = {"name": str, "own_name": bool, "time": float, "star": bool, "record": str, "view": str}
 """Fields of an entry that are read as they are written, and their types."""
 
 

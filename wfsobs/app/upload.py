@@ -72,7 +72,7 @@ class PartialFile:
     """A file on its way, in parts that come one after the other; the first part of a file ends the one before."""
 
     def __init__(self) -> None:
-        self.name = ""
+        self.name: str = ""
         self._parts: list[bytes] | None = None
 
     def take(self, msg: dict[str, Any]) -> bytes | None:

@@ -72,7 +72,7 @@ class LinkedFields:
         before = self.texts() if self._is_made else self._waiting
         self._is_made = True
         self._fields = {name: field if isinstance(field, tuple) else (field, "value") for name, field in fields.items()}
-        self.fresh = {name: _text(getattr(*field)) for name, field in self._fields.items()}
+        self.fresh: dict[str, str] = {name: _text(getattr(*field)) for name, field in self._fields.items()}
         refused = self.open(before) if before else []
         for act in self._acts:
             self._watch(act)
