@@ -17,8 +17,10 @@ from scipy.stats import binom
 from tests.test_plant import closed_loop, rotation
 from wfsobs import PRESETS, load, simulate
 from wfsobs.cli import main
+from wfsobs.identification.plant import PlantNumber, identify_plant
 from wfsobs.record import Record, RecordError
 from wfsobs.signal.ar2 import Ar2
+from wfsobs.telemetry import check
 from wfsobs.telemetry.check import LEVEL, find_changes
 from wfsobs.telemetry.records import save_record
 from wfsobs.typing import Array
@@ -142,6 +144,21 @@ def test_a_delay_in_which_the_halves_differ_is_not_decided(tmp_path: Path) -> No
     first, second = (float(n) for n in re.findall(r"(\d\.\d+) \+-", text))
     assert (first, second) == (pytest.approx(1.4, abs=0.1), pytest.approx(2.5, abs=0.1)), "five deviations of 10 s"
     assert "--command-delay" not in found["next"]
+
+
+@pytest.mark.slow
+def test_halves_are_compared_by_what_their_modes_have_in_common(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The delays of both modes together may be known where that of neither is."""
+    record = closed_loop(4000, 2.0, np.eye(2), gain=0.4)
+    (whole,) = identify_plant(record)
+    none = (PlantNumber(), PlantNumber())
+    early = replace(whole, delay=none, common_delay=PlantNumber(2.5, 0.2))
+    late = replace(whole, delay=(PlantNumber(1.4, 0.05),) * 2, common_delay=PlantNumber(1.4, 0.05))
+    halves = iter([(early,), (late,)])
+    monkeypatch.setattr(check, "identify_plant", lambda _: next(halves))
+    (group,), (remark,) = check._in_halves((whole,), record)
+    assert remark.subject == "command delay" and remark.text.startswith("2.50 +- 0.20 and 1.400 +- 0.050 in the halves")
+    assert group.delay == none and group.common_delay == PlantNumber() and group.common_gain == whole.common_gain
 
 
 def test_an_offset_and_a_few_outliers_are_no_fault(tmp_path: Path, record: Record) -> None:

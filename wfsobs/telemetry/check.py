@@ -200,7 +200,8 @@ def _in_halves(plant: tuple[GroupPlant, ...], record: Record) -> tuple[tuple[Gro
     for group, *found in zip(plant, *halves, strict=True):
         of = f" of {' and '.join(group.modes)}" * (len(plant) > 1)
         for name, common in (("delay", "common_delay"), ("gain", "common_gain")):
-            pairs = list(zip(*(getattr(one, name) for one in found), strict=True))
+            both = [(one,) * len(group.modes) if (one := getattr(part, common)).sd else getattr(part, name) for part in found]
+            pairs = list(zip(*both, strict=True))
             if any(n.sd and m.sd and abs(abs(n.value) - abs(m.value)) > SURE * hypot(n.sd, m.sd) for n, m in pairs):
                 blank = {name: (PlantNumber(),) * len(group.modes), common: PlantNumber()}
                 group = replace(group, **blank)
