@@ -1,25 +1,30 @@
-"""How promises hold in loops whose plant and spectra are hidden: python scripts/measure_promise.py [LOOPS] [FIRST]
+"""How promises hold in loops whose plant and spectra are hidden: python scripts/measure_promise.py [LOOPS] [FIRST] [probe]
 
 Turbulence of 5 to 15 m/s, one to four lines per mode, noise of an LGS of 10 to 40 nm; delay +-0.5 frame, gain +-20 %, rotation
 +-10 degrees; an integrator of 0.2 to 0.5 closes the loop for 20 s, the other controllers the next 20 s, on the plant as it is.
+
+With `probe`: the mirror has dynamics, of 150 to 600 Hz in turn, and the integrator adds the probe of `wfsobs probe`.
 """
 
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from time import process_time
 
 import numpy as np
 
 import wfsobs
 from wfsobs.closed_loop.promise import make_promise
-from wfsobs.control.true_plant import TruePlant, drive
+from wfsobs.control.true_plant import FAR, ActingPlant, TruePlant, drive
+from wfsobs.identification.probe import design_probe
 from wfsobs.priors_from.controllers import full_plant_of
 from wfsobs.record import Record, RecordError
-from wfsobs.typing import Array
 
 CONTROLLERS = ("integrator", "lqg-kf-lgs", "lqg-kf-multi", "h2-fir")
 START = 1000
+MIRRORS = ((300.0, 0.3), (300.0, 0.7), (600.0, 0.3), (150.0, 0.5))
+"""Natural frequency [Hz] and damping."""
 
 
 def hidden(rng: np.random.Generator, seed: int) -> wfsobs.Scenario:
@@ -46,35 +51,44 @@ def hidden(rng: np.random.Generator, seed: int) -> wfsobs.Scenario:
     )
 
 
-def measured(record: Record, residual: Array) -> Array:
-    """Return the measurements (n_steps, n_modes) of a residual, with the noise of a record."""
-    assert record.turbulence is not None and record.vibration is not None
-    disturbance = record.turbulence + record.vibration
-    return record.z + np.vstack([np.zeros(record.n_modes), (residual - disturbance)[:-1]])
+def telemetry_of(scenario: wfsobs.Scenario, plant: TruePlant, has_probe: bool, rng: np.random.Generator) -> Record:
+    """Return measurements and commands of an integrator on a plant."""
+    z = wfsobs.simulate(scenario).z
+    y, u, probe, own, seen = np.zeros_like(z), np.zeros_like(z), np.zeros_like(z), np.zeros(2), np.zeros(2)
+    if has_probe:
+        wanted = {"delay_frames": 0.03, "gain": 0.02, "rotation_deg": 1.0}
+        probe = design_probe(scenario, len(z) * scenario.dt, wanted).commands(len(z), 2, scenario.dt, rng)
+    mirror = ActingPlant(plant)
+    for k in range(len(z)):
+        y[k] = z[k] + seen
+        own = own - scenario.control.gain * y[k]
+        u[k] = own + probe[k]
+        seen = mirror.take(u[k])
+    return Record(y, u, scenario.dt)
 
 
-def main(loops: int, first: int) -> None:
+def main(loops: int, first: int, has_probe: bool) -> None:
     """Print a line per loop and controller, and the shares at the end."""
     inside: dict[bool, list[bool]] = {True: [], False: []}
     said, undecided, widths = list[bool](), 0, list[float]()
     for i in range(first, first + loops):
         rng = np.random.default_rng(i)
         scenario, begun = hidden(rng, i), process_time()
-        made = wfsobs.close_loop(scenario, controllers=["integrator"])
-        (outcome,) = made.outcomes
-        if outcome.residual is None:
-            print(i, "integrator:", outcome.note)
+        if has_probe:
+            frequency, damping = MIRRORS[i % len(MIRRORS)]
+            scenario = scenario.replace({"plant.resonance": frequency, "plant.damping": damping})
+        true = full_plant_of(scenario)
+        telemetry = telemetry_of(scenario, true, has_probe, rng)
+        if not np.abs(telemetry.y_lgs).max() < FAR:
+            print(i, "the integrator is not stable")
             continue
-        assert outcome.u is not None
-        telemetry = Record(measured(made.record, outcome.residual), outcome.u, scenario.dt)
         try:
             found = make_promise(telemetry, scenario.replace({"control.integrator": "optimised"}), controllers=CONTROLLERS)
         except RecordError as error:
             undecided += 1
             print(i, error, flush=True)
             continue
-        true, inverse = full_plant_of(scenario), np.linalg.inv(found.matrix)
-        plant = TruePlant(true.matrix @ inverse, true.delay)
+        plant = replace(true, matrix=true.matrix @ np.linalg.inv(found.matrix))
         ahead = wfsobs.simulate(scenario.replace({"run.seed": i + 100_000}))
         assert ahead.turbulence is not None and ahead.vibration is not None
         left = {}
@@ -100,5 +114,5 @@ def main(loops: int, first: int) -> None:
 
 
 if __name__ == "__main__":
-    given = [*sys.argv[1:], *("200", "0")[len(sys.argv) - 1 :]]
-    main(int(given[0]), int(given[1]))
+    numbers = [int(word) for word in sys.argv[1:] if word != "probe"]
+    main(*numbers, *(200, 0)[len(numbers) :], has_probe="probe" in sys.argv)
