@@ -216,6 +216,8 @@ def suggest_roles(names: Iterable[str]) -> dict[str, str]:
     {'time': 't [ms]', 'y_lgs/tip': 'wfs_x', 'y_lgs/tilt': 'wfs_y', 'u/tip': 'dm_cmd[0]', 'u/tilt': 'dm_cmd[1]'}
     >>> suggest_roles(["tip_res_nm", "tilt_cmd_nm"])
     {'y_lgs/tip': 'tip_res_nm', 'u/tilt': 'tilt_cmd_nm'}
+    >>> suggest_roles(["tip [nm]", "tilt [nm]", "DM tip [nm]", "DM tilt [nm]"])  # modes without another word are measured
+    {'u/tip': 'DM tip [nm]', 'u/tilt': 'DM tilt [nm]', 'y_lgs/tip': 'tip [nm]', 'y_lgs/tilt': 'tilt [nm]'}
     """
     found: dict[str, str] = {}
     names = [*names]
@@ -224,6 +226,9 @@ def suggest_roles(names: Iterable[str]) -> dict[str, str]:
         role = _role_of(name)
         if role is not None and re.sub(r"\[\d+\]$", "", name) not in many:  # of many columns it is not known which
             found.setdefault(role, name)
+    modes = {split_unit(name)[0].rpartition(".")[2].strip().lower(): name for name in names}
+    if modes.keys() >= AXES.keys() and not any(role.startswith("y_lgs") for role in found):
+        found |= {f"y_lgs/{mode}": modes[mode] for mode in AXES}
     return found
 
 
