@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import struct
 import tracemalloc
@@ -160,6 +161,20 @@ def test_a_zip_bomb_is_not_unpacked(monkeypatch) -> None:
         assert tracemalloc.get_traced_memory()[1] < 5_000_000
     finally:
         tracemalloc.stop()
+
+
+def test_a_gzip_bomb_and_a_damaged_file(monkeypatch) -> None:
+    monkeypatch.setattr(module, "MOST_NUMBERS", 10_000_000)
+    bomb = gzip.compress(bytes(32_000_000))
+    tracemalloc.start()
+    try:
+        assert "holds more than 10 MB" in refused(bomb, "bomb.csv.gz")
+        assert tracemalloc.get_traced_memory()[1] < 40_000_000, "a few times what is allowed"
+    finally:
+        tracemalloc.stop()
+    packed = gzip.compress(b"y_lgs,u\n" + b"0.5,0.25\n" * 2000)
+    assert "cannot be unpacked" in refused(packed[:-20], "cut.csv.gz")
+    assert "cannot be unpacked" in refused(b"y_lgs,u\n0.5,0.25\n", "no.csv.GZ")
 
 
 def test_zeros_that_no_measurement_packs_like_are_not_unpacked(monkeypatch) -> None:

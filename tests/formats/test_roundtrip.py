@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import re
 import sys
@@ -22,7 +23,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.formats import FORMATS, format_of
-from wfsobs.telemetry.records import load_record, read_record, record_arrays, save_record
+from wfsobs.telemetry.records import load_record, name_differences, read_record, record_arrays, save_record
 from wfsobs.units import micrometres_per
 
 AOT = ".aot.fits"
@@ -130,6 +131,17 @@ def test_npz_of_either_byte_order(record: Record, order: str, single: bool) -> N
     np.testing.assert_array_equal(again.y_lgs, record.y_lgs.astype(kind))
     np.testing.assert_array_equal(again.u, record.u.astype(kind))
     assert again.y_lgs.dtype.isnative and again.dt == record.dt
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_packed_by_gzip(ending: str, tmp_path: Path) -> None:
+    record = simulate(paper().replace({"run.duration": 0.5, "run.warm_up": 0.1}))
+    plain, packed = tmp_path / f"r{ending}", tmp_path / f"r{ending}.gz"
+    wfsobs.save(plain, record)
+    packed.write_bytes(gzip.compress(plain.read_bytes(), 1))
+    assert not name_differences(wfsobs.load(plain), wfsobs.load(packed))
+    with pytest.raises(RecordError, match=r"r2.*\.gz: its name ends in none of"):
+        wfsobs.save(tmp_path / f"r2{ending}.gz", record)
 
 
 @pytest.mark.parametrize("kind", ["f8", "f4", "i4", "i2"])

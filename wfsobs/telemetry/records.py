@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import re
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -22,7 +23,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.columns import join_clock, to_contents
-from wfsobs.telemetry.formats import format_of, writer_of
+from wfsobs.telemetry.formats import format_of, from_gzip, writer_of
 from wfsobs.telemetry.formats.aot import TRANSLATED, translate
 from wfsobs.telemetry.formats.contents import Contents, FileColumns
 from wfsobs.telemetry.formats.csv import write
@@ -306,8 +307,9 @@ def read_contents(file: IO[bytes], name: str, roles: Mapping[str, str], most: in
 
 
 def read_columns(file: IO[bytes], name: str, most: int = MOST_BYTES) -> FileColumns:
-    """Read the columns of an open file under its own names; its name gives the format. Raises RecordError."""
-    return join_clock(format_of(name).read(file, most))
+    """Read the columns of an open file under its own names; its name gives the format, before .gz as well. Raises RecordError."""
+    inner = re.sub(r"\.gz$", "", name, flags=re.I)
+    return join_clock(format_of(inner).read(file if inner == name else from_gzip(file, most), most))
 
 
 TEMPLATE = """\

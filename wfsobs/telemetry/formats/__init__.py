@@ -6,13 +6,16 @@ in one place, `wfsobs.telemetry.intake`. A new format is one more module and one
 
 from __future__ import annotations
 
+import gzip
+import io
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import IO
 
 from wfsobs.record import RecordError
 from wfsobs.telemetry.formats import aot, csv, fits, libraries, npz
-from wfsobs.telemetry.formats.contents import FileColumns
+from wfsobs.telemetry.formats.contents import FileColumns, TooLargeError
 from wfsobs.typing import Array
 
 
@@ -54,6 +57,18 @@ def format_of(name: str) -> Format:
         if name.lower().endswith(fmt.endings):
             return fmt
     raise RecordError(f"its name ends in none of {', '.join(ending for fmt in FORMATS for ending in fmt.endings)}")
+
+
+def from_gzip(file: IO[bytes], most: int) -> IO[bytes]:
+    """Return the content of an open gzip file. Raises RecordError where it is damaged, TooLargeError beyond `most` bytes."""
+    try:
+        with gzip.open(file) as packed:
+            content = packed.read(most + 1)
+    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+        raise RecordError(f"cannot be unpacked: {error}") from None
+    if len(content) > most:
+        raise TooLargeError(most)
+    return io.BytesIO(content)
 
 
 def writer_of(name: str) -> Callable[[IO[bytes], Mapping[str, Array]], None]:
