@@ -7,6 +7,7 @@ export function render({model, el}) {
   let before = hidden  // the click: a double click is about what stood there before its first one
   let among = []  // what is hidden again once a line is no longer alone
   let asked = model.last_arrival
+  let told = null  // whose row is pointed at or has the focus
   let open = false  // whether there are rows of all, or of the main ones and those whose lines are shown
 
   const rows = () => [...el.querySelectorAll(".card")]
@@ -51,6 +52,13 @@ export function render({model, el}) {
     }
     el.style.setProperty("--longest", longest)
     mark()
+    describe()
+  }
+
+  // What an observer is, in place of the legend.
+  const describe = () => {
+    const about = el.querySelector(".about")
+    if (about) about.textContent = rows().find((it) => it.dataset.name === told)?.dataset.about ?? ""
   }
 
   const turn = (to) => {
@@ -71,8 +79,10 @@ export function render({model, el}) {
     if (nameAt(target) && key.toLowerCase() === "s" && !ctrlKey && !metaKey && !altKey) solo(nameAt(target), hidden)
   }
 
-  // What an observer is, of the row that is pointed at or has the focus, in place of the legend.
-  const tell = ({target}) => { el.querySelector(".about").textContent = target.closest(".card")?.dataset.about ?? "" }
+  const tell = ({target}) => {
+    told = nameAt(target)
+    describe()
+  }
   for (const type of ["pointerover", "focusin", "focusout"]) el.addEventListener(type, tell)
   el.onpointerleave = () => tell({target: el})
 
