@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -191,3 +192,14 @@ def test_the_verdict_on_a_cell_is_its_winner_and_that_on_all_counts_them(results
             if counts:
                 assert sum(map(int, re.findall(r" in (\d+)", counts[1]))) == int(counts[2]) == len(best)
                 assert f"{row_label(best[0].observer)} in " in counts[1]
+
+
+def test_an_error_of_a_wide_interval_is_not_at_the_limit(results: SweepResults) -> None:
+    """Four times the limit, with the limit in its interval; over the same records another is better."""
+    found = results.verdict(0, "turbulence", "tip")
+    assert found is not None
+    wide = replace(found.best, knowledge="nothing", rms=0.04, interval=(0.005, 0.075), limit=(0.01, "bound-both"), is_tie=False)
+    assert wide.above_limit == 0.0
+    for is_tie in (False, True):
+        said = sentence_of_several([replace(found, places=(replace(wide, is_tie=is_tie),))], [1e3], "nm")
+        assert said.endswith(f"40.0 to 40.0 nm{', at the theoretical limit in 1' * is_tie}.")
