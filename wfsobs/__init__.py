@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 from wfsobs.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from wfsobs.app.notebook_page import explore
     from wfsobs.app.report.export import export
-    from wfsobs.app.serve import explore
     from wfsobs.closed_loop.envelope import plant_envelope
     from wfsobs.closed_loop.run import close_loop
     from wfsobs.evaluation.bound import bound
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "bound": "evaluation.bound",
-    "explore": "app.serve",
+    "explore": "app.notebook_page",
     "export": "app.report.export",
     "close_loop": "closed_loop.run",
     "plant_envelope": "closed_loop.envelope",

@@ -103,7 +103,7 @@ class PartialFile:
 
 
 def too_large(name: str) -> str:
-    """Says that a file is."""
+    """Return the message for a file of this name that is too large."""
     return f"{name}: larger than {LARGEST // 1_000_000} MB"
 
 

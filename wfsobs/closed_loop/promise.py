@@ -47,10 +47,10 @@ HIGHEST, NEAR_LINE = 0.49, 4
 """Largest frequency of a drawn resonance, over the rate; bins on either side of an undamped line that do not count."""
 
 CRITICAL = 0.999
-"""Largest damping ratio of a mirror."""
+"""Largest damping ratio of a mirror that `TruePlant` takes."""
 
 SEEN = 0.01
-"""Part of a command that a measurement has to hold to see it."""
+"""Magnitude of the response from which a measurement is affected by a command that is lost."""
 
 SECTIONS = 32
 """Simulated records, whose scatter tells how well one knows its mean square."""
@@ -221,9 +221,14 @@ def _interval_of(name: str, squares: Array, integrator: Array) -> ResidualPromis
 
 
 def draw_plants(groups: Sequence[GroupPlant], n_modes: int, rng: np.random.Generator) -> list[TruePlant]:
-    """Return the likeliest plant and DRAWS others. Raises RecordError.
+    """Return the most likely plant and DRAWS plants drawn from the covariance of its parameters.
 
-    Where modes have delays of their own, each draw has the mean of theirs. A damping beyond the critical one is that.
+    Modes with different delays are given their mean. Damping ratios are limited to CRITICAL.
+
+    Raises
+    ------
+    RecordError
+        A parameter is not identifiable, or the mirror has dynamics other than those of one second-order system.
     """
     delays, matrices, shape = np.zeros(1 + DRAWS), np.zeros((1 + DRAWS, n_modes, n_modes)), np.zeros((1 + DRAWS, 0))
     order = [mode.name for mode in modes_up_to(HIGHEST_ORDER)]
@@ -284,9 +289,10 @@ def draw_spectra(identification: Identification, z: Array, rng: np.random.Genera
 
 
 def as_seen(record: Record, plant: TruePlant) -> Record:
-    """Return a record whose commands are what the measurements see of them, by an identified plant, one frame later.
+    """Return the record with its commands replaced by the correction that the plant makes of them, with a delay of one frame.
 
-    Before the record a command has been as its first one; one that is lost is missing where it would be seen.
+    Commands before the record are taken to equal the first one. A lost command is held, and the measurements that it affects
+    are missing.
     """
     u, response = hold_last(record.u), plant.frame_response(LAGS)
     moved = lfilter(response, [1.0], u - u[0], axis=0) + u[0]

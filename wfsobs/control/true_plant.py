@@ -90,7 +90,7 @@ class TruePlant:
 
     @property
     def group_delay(self) -> float:
-        """Delay of a slow command [frames], that of the mirror included."""
+        """Group delay at low frequency [frames], including that of the mirror, 2 damping / resonance."""
         return self.delay + (2.0 * self.damping / self.resonance if self.resonance else 0.0)
 
     @property
@@ -113,7 +113,7 @@ class TruePlant:
         return means + np.diff(swing / pole).real, complex(swing[-1])
 
     def frame_response(self, n: int) -> Array:
-        """Response of the measurements of the next n frames to a command, (n,), the matrix aside; without jitter."""
+        """Impulse response of the measurements over n frames, (n,), without the matrix and jitter; its first lag is one frame."""
         means, swing = self.step_means()
         turn = np.exp(self.pole * np.arange(n + 1)) / self.pole if self.resonance else np.zeros(n + 1)
         return np.diff(np.append(means, 1.0 + (swing * np.diff(turn)).real)[:n], prepend=0.0)

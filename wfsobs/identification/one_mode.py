@@ -229,12 +229,12 @@ def _sum_dips(worth: Array, about: float, level: float) -> tuple[Array, NDArray[
 WIDEST_LINE = 9
 """Maximum width of a candidate, in bins, that may be an undamped line."""
 SURE = 5.0
-"""Minimum rms, in standard deviations, of a resonance that is kept untried."""
+"""Ratio of rms to its standard deviation from which a resonance is kept without a test."""
 WORTH = 6.0
 """Minimum gain of log-likelihood by three parameters: noise gains as much with a probability of 0.7 % (chi squared of 12)."""
 KEPT = 8.0
-"""The same by a resonance once all is fitted, somewhat below the least of what the search calls a peak among some thousand bins:
-what the skirt of a strong peak was short of while its width was not yet fitted is worth less."""
+"""Minimum gain of log-likelihood by a resonance once all parameters are fitted, somewhat below that which the search requires
+among some thousand bins. Spurious ones beside a strong peak, found before its width was fitted, gain 2 to 6."""
 
 SETTLED = 0.01
 """Remaining error of repeated filling and fitting: each round leaves about the share that is missing."""
@@ -431,8 +431,8 @@ class OneMode:
     def prune(self) -> bool:
         """Remove the least certain resonance that the likelihood can do without; return whether.
 
-        Those are tried whose rms is below SURE standard deviations. That of a narrow one is uncertain since its width is,
-        however high it stands: it is kept. One whose power a neighbour has as well is not worth its parameters.
+        Only those are tested whose rms is below SURE standard deviations, and they stay where they gain more than KEPT: the rms
+        of a narrow one is uncertain because its width is, however high it stands.
         """
         std, first = self.errors(), len(self.spectrum.processes) - len(self.spectrum.resonances)
         unsure = [

@@ -106,8 +106,8 @@ class GroupPlant:
     covariance : Array
         Of delays [frames], gains and, of two modes, the rotation [rad] together.
     swinging : PlantFit or None
-        The mirror of second order that is as likely as any, where a probe shows dynamics: the numbers above, then the
-        logarithms of natural frequency over frame rate and of damping ratio.
+        Fit of a second-order mirror, where a probe shows dynamics and no other response is more likely by `RIVAL`: delays, gains
+        and rotation, then the logarithms of natural frequency over frame rate and of damping ratio.
     chance, rigid : float
         Probability that what the measurements hold of a probe beside this plant, and beside one of a delay and a gain alone, is
         chance; where the first is below `OTHERWISE` nothing is identifiable. 1 where a probe is small.
@@ -321,9 +321,10 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
 
 
 def _with_dynamics(data: PlantLikelihood, fit: PlantFit, ties: Array) -> tuple[PlantFit, PlantFit | None]:
-    """Return the fit of a mirror with dynamics, and that of second order where no other is likelier by RIVAL.
+    """Fit a mirror with dynamics.
 
-    The first is any response of few lags, or the second where that is likelier by SWINGS.
+    Returns the response over few lags, or the second-order one where its log-likelihood is larger by SWINGS; and the second-order
+    one, None where its log-likelihood is smaller by RIVAL.
     """
     ties = block_diag(ties, np.eye(2))
 

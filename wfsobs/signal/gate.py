@@ -40,9 +40,9 @@ not known well enough."""
 OPEN = 20
 """Samples that pass then, while the deviation is doubled."""
 EARLY = 1.0
-"""Part of itself by which the level is larger with few samples to fit to, over the square of the number of blocks."""
+"""Relative increase of the level, times the square of the number of blocks: a fit to few samples predicts badly."""
 EARLIEST = 3.0
-"""The same until the second fit: the first one has hardly more samples than weights."""
+"""Relative increase of the level until the second fit: the first one has hardly more samples than weights."""
 PACE = 0.125
 """Weight of a block in the deviation, by its median, and in the part of samples that are outliers."""
 USUAL, RAREST, START = 1e-2, 5e-5, 1e-3

@@ -173,7 +173,7 @@ class LoopLines:
         _put(self.sources, lines)
 
     def highest(self, hidden_names: Sequence[str], without: float) -> float:
-        """Return the largest value of the visible lines; `without` any another one."""
+        """Return the largest magnitude of the visible lines, or `without` where there are none."""
         shown = [source.data["y"] for name, source in self.sources.items() if name not in hidden_names]
         return max((float(np.max(np.abs(y))) for y in shown if len(y)), default=without)
 
