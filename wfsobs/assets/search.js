@@ -19,20 +19,27 @@ export function render({model, el}) {
     return all.find((it) => it.name.toLowerCase().startsWith(text)) ?? all[0]
   }
 
-  const fill = () => list.replaceChildren(...model.items.map(({name, path}) => new Option(path, name)))
-  box.onfocus = () => model.send_msg({open: true})
-  box.oninput = () => {
-    box.setCustomValidity("")
-    const chosen = model.items.find(({name}) => name === box.value)
-    if (chosen) choose(chosen)
-  }
-  box.onkeydown = ({key}) => {
-    if (key !== "Enter" || !box.value.trim() || !model.items.length) return
+  let isEntered = false // before the settings have come, which they do when the box is first used
+  const enter = () => {
+    isEntered = !model.items.length
+    if (isEntered) return
     const found = find()
     if (found) return choose(found)
     box.setCustomValidity("No setting of that name")
     box.reportValidity()
   }
+  const fill = () => {
+    list.replaceChildren(...model.items.map(({name, path}) => new Option(path, name)))
+    if (isEntered) enter()
+  }
+  box.onfocus = () => model.send_msg({open: true})
+  box.oninput = () => {
+    isEntered = false
+    box.setCustomValidity("")
+    const chosen = model.items.find(({name}) => name === box.value)
+    if (chosen) choose(chosen)
+  }
+  box.onkeydown = ({key}) => { if (key === "Enter" && box.value.trim()) enter() }
   model.on("items", fill)
   fill()
   listen(model, {keydown: (event) => {
