@@ -9,8 +9,11 @@ from contextlib import closing, contextmanager
 
 import click
 import numpy as np
+from click.core import ParameterSource
 
 from wfsobs.cli.options import ngs_options, ngs_wiring, scenario_options, stream_elements, told_scenario
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.control.supervisor import SupervisedController, Supervision
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.step import StepError, StepObserver
 from wfsobs.prior import LgsError, Lines, Model, Training
@@ -20,6 +23,8 @@ from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 from wfsobs.stepping import design, prior_in
 from wfsobs.streams.attach import Attachment, CommandStream
+from wfsobs.streams.attach_controller import ControllerAttachment
+from wfsobs.streams.follower import StreamFollower
 from wfsobs.streams.layout import StreamError
 from wfsobs.streams.network import Publication, Subscription, is_address
 from wfsobs.streams.ngs_frames import NgsStream
@@ -27,6 +32,9 @@ from wfsobs.streams.shared_image import SharedImage, stream_path
 from wfsobs.streams.watchdog import LIMIT, Fallback, Safety
 from wfsobs.streams.wiring import STUCK, Wiring
 from wfsobs.units import UNITS, micrometres_per
+
+OBSERVERS_ALONE = ("name", "shadow", "commands", "ngs", "ngs_modes", "ngs_lag", "delay", "fallback")
+"""Options that a controller does not take."""
 
 
 @click.command()
@@ -36,7 +44,7 @@ from wfsobs.units import UNITS, micrometres_per
     "source",
     required=True,
     metavar="STREAM",
-    help="Pseudo-open-loop modes, or residuals beside --commands: a name, the path of a file, or tcp://host:port.",
+    help="Pseudo-open-loop modes, or residuals beside --commands or for --controller: a name, a path, or tcp://host:port.",
 )
 @click.option(
     "--commands",
@@ -52,10 +60,11 @@ from wfsobs.units import UNITS, micrometres_per
     help="Frames from a command to the first measurement that sees it, such as 1.5.",
 )
 @click.option("--command-gain", type=float, default=1.0, show_default=True, metavar="G", help="What the mirror does of them.")
-@click.option("--out", "sink", metavar="STREAM", help="Where the estimates go, made if there is none; or tcp://*:port.")
+@click.option("--out", "sink", metavar="STREAM", help="Where what is sent goes, made if there is none; or tcp://*:port.")
 @click.option("--shadow", is_flag=True, help="Write nothing.")
 @click.option("--prior", metavar="FOUND.toml", help="Prior of the observer: the file of `wfsobs identify --out`.")
 @click.option("--observer", "name", default="kf-multi", show_default=True, metavar="ID", help="Observer that runs.")
+@click.option("--controller", metavar="ID", help="Close the loop: a controller under supervision, its commands go to --out.")
 @click.option(
     "--modes",
     default=None,
@@ -79,7 +88,7 @@ from wfsobs.units import UNITS, micrometres_per
     "--limit",
     type=click.FloatRange(0, 1e12, min_open=True),
     metavar="X",
-    help=f"Magnitude that no estimate may exceed; by default {LIMIT:g} times the rms of a measurement by the prior.",
+    help=f"Magnitude that nothing sent may exceed; by default {LIMIT:g} times the rms of a measurement by the prior.",
 )
 @click.option(
     "--stuck", type=click.FloatRange(1e-3, 60), default=STUCK, show_default=True, metavar="S", help="Time without a frame."
@@ -102,6 +111,7 @@ def attach(
     shadow: bool,
     prior: str | None,
     name: str,
+    controller: str | None,
     modes: str | None,
     ngs: str | None,
     ngs_modes: str | None,
@@ -115,18 +125,22 @@ def attach(
     seconds: float | None,
     as_json: bool,
 ) -> None:
-    """Run an observer on the streams of a running loop, in shared memory or by ZeroMQ (docs/streams.md)."""
+    """Run an observer or a controller on the streams of a running loop, in shared memory or by ZeroMQ (docs/streams.md)."""
     if bool(sink) == shadow:
         raise SettingError("attach: takes --out STREAM, or --shadow to write nothing")
+    if controller is not None:
+        _check_options(click.get_current_context())
     if limit is not None and np.isnan(limit):
         raise SettingError("--limit nan: takes a number above 0")
     scenario = told_scenario(prior, scenario)
     elements = stream_elements(modes, len(scenario.modes))
+    is_told = click.get_current_context().get_parameter_source("command_delay") is ParameterSource.COMMANDLINE
+    scenario = scenario.replace({"control.delay": command_delay}) if controller and is_told else scenario
     per_unit = micrometres_per(unit, scenario.telescope.diameter)
     try:
         given = _open_source(source)
         taken = None if sink is None else _open_sink(sink, given, ngs, commands)
-        observer, spread = _design(name, scenario, len(elements), delay - 1, ngs is not None)
+        spread = _spread(controller or name, scenario, len(elements))
         warm_up = max(round(scenario.run.warm_up / scenario.dt), 1)
         limits = Safety(fallback, None if limit is None else limit * per_unit, calm=warm_up)
         wiring = Wiring(elements, per_unit, delay, spread, limits, warm_up, stuck, semaphore, scenario.gate)
@@ -137,7 +151,13 @@ def attach(
         third = None
         if commands is not None:
             third = CommandStream(_open_source(commands), elements, np.array(command_gain * per_unit), command_delay)
-        attachment = Attachment(given, taken, observer, wiring, _say, second, third)
+        attachment: StreamFollower
+        if controller is None:
+            observer = _design(name, scenario, len(elements), delay - 1, ngs is not None)
+            attachment = Attachment(given, taken, observer, wiring, _say, second, third)
+        else:
+            law = _supervise(controller, scenario, wiring, command_gain)
+            attachment = ControllerAttachment(given, taken, law, command_gain, _sent_last(taken, wiring), wiring, _say)
         with _stop_signals() as stop:
             attachment.run(seconds or np.inf, report=_say, stop=stop)
     except (StreamError, StepError) as error:
@@ -173,8 +193,36 @@ def _open_sink(name: str, source: SharedImage | Subscription, *others: str | Non
     return SharedImage.create(path, source.header.shape, dtype=dtype, layout=source.header.layout)
 
 
-def _design(name: str, scenario: Scenario, n_modes: int, horizon: float, has_ngs: bool) -> tuple[StepObserver, np.ndarray]:
-    """Return the observer, and by its prior the rms of a measurement, (n_modes,) [um]."""
+def _check_options(context: click.Context) -> None:
+    """Raise SettingError where an option beside --controller says something of observers."""
+    for parameter in context.command.params:
+        is_given = context.get_parameter_source(parameter.name or "") is ParameterSource.COMMANDLINE
+        if is_given and parameter.name in OBSERVERS_ALONE:
+            raise SettingError(f"{parameter.opts[0]}: is of an observer; leave it out beside --controller")
+
+
+def _supervise(name: str, scenario: Scenario, wiring: Wiring, gain: float) -> SupervisedController:
+    """Return the controller; no command that it gives exceeds the limits of the scenario and of the wiring."""
+    if name not in CONTROLLERS:
+        raise SettingError(f"controller {name!r}: no such controller; there are {', '.join(CONTROLLERS)}")
+    if CONTROLLERS[name].ngs:
+        raise StepError(f"{name}: takes an NGS, which has no stream here: takes a controller of the LGS alone")
+    if not gain:
+        raise SettingError("--command-gain 0: the mirror does nothing")
+    largest = float(wiring.largest.min()) * (1.0 if wiring.safety.largest is None else abs(gain))
+    stroke = min(scenario.control.stroke or np.inf, largest)
+    told = scenario.replace({"control.stroke": stroke})
+    stepper = design(name, told, sampling=Sampling(len(wiring.elements), scenario.dt), gate=scenario.gate)
+    return SupervisedController(stepper, Supervision(scenario.control.fallback_gain, scenario.control.leak))
+
+
+def _sent_last(sink: SharedImage | Publication | None, wiring: Wiring) -> np.ndarray:
+    """Return the commands that are there, (n_modes,) [unit of the stream]; 0 where that is not known."""
+    found = sink.read() if isinstance(sink, SharedImage) else None
+    return np.zeros(len(wiring.elements)) if found is None else found[1][list(wiring.elements)]
+
+
+def _design(name: str, scenario: Scenario, n_modes: int, horizon: float, has_ngs: bool) -> StepObserver:
     if name not in OBSERVERS:
         raise SettingError(f"observer {name!r}: no such observer; there are {', '.join(OBSERVERS)}")
     declared = OBSERVERS[name]
@@ -190,11 +238,16 @@ def _design(name: str, scenario: Scenario, n_modes: int, horizon: float, has_ngs
     observer = design(name, scenario, sampling=sampling, horizon=horizon)
     if observer.estimator.needs_command:
         raise StepError(f"{name}: its windows hold commands, which the stream has not; set its inputs to z")
-    known = prior_in(name, scenario, (Model, Lines, LgsError), scenario, sampling, None)
+    return observer
+
+
+def _spread(name: str, scenario: Scenario, n_modes: int) -> np.ndarray:
+    """Return the rms of a pseudo-open-loop measurement by the prior, (n_modes,) [um]."""
+    known = prior_in(name, scenario, (Model, Lines, LgsError), scenario, Sampling(n_modes, scenario.dt), None)
     noise = np.array([mode.lgs_noise for mode in known.model])
     disturbance = [(*lines.turbulence, *lines.lines, *lines.continuum) for lines in known.lines]
     parts = [[one.rms for one in (*of_mode, error.process)] for of_mode, error in zip(disturbance, known.lgs_error, strict=True)]
-    return observer, np.array([np.linalg.norm([sd, *rms]) for sd, rms in zip(noise, parts, strict=True)])
+    return np.array([np.linalg.norm([sd, *rms]) for sd, rms in zip(noise, parts, strict=True)])
 
 
 @contextmanager

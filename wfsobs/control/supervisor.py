@@ -203,9 +203,13 @@ class SupervisedController(StateArrays):
             u = self._within(command + self._offset)
             is_clipped = (np.abs(u) >= self.mirror.stroke) | (np.abs(u - self._command) >= self.mirror.slew)
             self._limit_share += (bool(is_clipped.any()) - self._limit_share) / 100.0
-        self.controller.amend(u)
-        self._command = u
+        self.amend(u)
         return u
+
+    def amend(self, command: Array) -> None:
+        """Take what the mirror was sent, (n_modes,) [um], where that is another command than the one of the last frame."""
+        self.controller.amend(command)
+        self._command = command.copy()
 
     def _fault(self, command: Array, excess: bool) -> int:
         """Return why the controller may not go on, an index of `REASONS`; 0 where it may."""

@@ -17,7 +17,7 @@ from wfsobs.live.ring import Ring
 from wfsobs.live.source import STREAM
 from wfsobs.record import Sampling
 from wfsobs.signal.gate import GateSettings, OutlierGate, frame_mean_of
-from wfsobs.streams.attach import LONGEST_GAP
+from wfsobs.streams.follower import LONGEST_GAP
 from wfsobs.streams.layout import StreamError
 from wfsobs.streams.network import Subscription, is_address
 from wfsobs.streams.ngs_frames import NgsStream

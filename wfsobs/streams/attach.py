@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Callable, Mapping, Sequence
 from time import monotonic
 from typing import Any, Protocol
 
 import numpy as np
 
-from wfsobs.latencies import Latencies
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.step import StepObserver
 from wfsobs.record import Sampling
 from wfsobs.signal.gate import OutlierGate, frame_mean_of
-from wfsobs.streams.layout import Semaphore, StreamError
+from wfsobs.streams.follower import LONGEST_GAP, StreamFollower
 from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.stream import FrameStream, SinkStream, SourceStream
 from wfsobs.streams.watchdog import Watchdog
@@ -108,14 +106,6 @@ class GoingBack:
         self._observer.load_state_dict(self._state)
         for k, z in enumerate(self._since):
             self._observer.update(z, ngs if k == 0 else None)
-
-
-SLOW = 1.5
-"""A frame is late if it comes more than so many frame times after the one before."""
-RATE_ERROR = 0.05
-"""Part of the rate by which a loop may be off the design."""
-NANOMETRE = 1e-6
-"""What stands for it in a histogram, which then goes from 0.1 nm to 1 cm."""
 
 
 FAR = 6.0
@@ -245,124 +235,7 @@ FIRST = 9
 """Commands from which their place is found: fewer than the measurements that may be missing."""
 
 
-class _Span:
-    """What is counted over a stretch of time."""
-
-    def __init__(self) -> None:
-        self.frames = self.missing = self.late = self.out_of_band = 0
-        self.latencies, self.errors, self.sizes = Latencies(), Latencies(), Latencies()
-
-    def quantile(self, share: float) -> float | None:
-        """Return a quantile of the latencies [us]."""
-        return round(self.latencies.quantile(share) * 1e6, 1) if self.frames else None
-
-    def medians(self) -> tuple[float | None, float | None]:
-        """Return the medians of the magnitudes of errors and of what was measured [nm]; None where nothing was predicted."""
-        found = [one.quantile(0.5) / NANOMETRE for one in (self.errors, self.sizes)]
-        return (None, None) if np.isnan(found[0]) else (round(found[0], 3), round(found[1], 3))
-
-
-class Tally:
-    """Statistics.
-
-    Parameters
-    ----------
-    dt : float
-        Time between two frames by the design of the observer [s].
-
-    Attributes
-    ----------
-    torn, stuck : int
-        Frames that were written without an end; times that no frame came.
-    """
-
-    def __init__(self, dt: float):
-        self.torn = self.stuck = 0
-        self._dt, self._last = dt, None
-        self._second, self._all = _Span(), _Span()
-        self._first: float | None = None
-        self._is_off_rate = False
-
-    def add(self, arrival: float, end: float, missing: int, z: Array, error: Array, is_out: bool = False) -> None:
-        """Count a frame.
-
-        Parameters
-        ----------
-        arrival, end : float
-            When it was there and when its estimate was out [s].
-        missing : int
-            Frames missing before it.
-        z, error : Array
-            Measurement, and how far off its prediction was, (n_modes,) [um]; NaN where there is none.
-        is_out : bool
-            Whether a measurement was not taken.
-        """
-        late = self._last is not None and arrival - self._last > SLOW * self._dt * (1 + missing)
-        known = np.isfinite(error)
-        errors, sizes = (1e3 * NANOMETRE * np.abs(x[known]) for x in (error, z))
-        for span in (self._second, self._all):
-            span.frames += 1
-            span.missing += missing
-            span.late += late
-            span.out_of_band += is_out
-            span.latencies.add(end - arrival)
-            span.errors.add(errors)
-            span.sizes.add(sizes)
-        self._first, self._last = self._first or arrival, arrival
-
-    @property
-    def rate(self) -> float | None:
-        """Frames per second that were sent, missing ones too [Hz]."""
-        if self._first is None or self._last is None or self._last <= self._first:
-            return None
-        return (self._all.frames - 1 + self._all.missing) / (self._last - self._first)
-
-    def find_rate_error(self) -> str:
-        """Return once that the loop runs at another rate than the observer is designed for; "" at other times."""
-        rate = self.rate
-        if rate is None or self._is_off_rate or abs(rate * self._dt - 1.0) <= RATE_ERROR:
-            return ""
-        self._is_off_rate = True
-        return f"{rate:.0f} frames per second, the observer is designed for {1.0 / self._dt:g}"
-
-    def line(self, reason: str) -> str:
-        """Return the line of the last second, and begin the next one."""
-        span, self._second = self._second, _Span()
-        if not span.frames:
-            return f"no frame; output: {reason or 'on'}"
-        error, size = span.medians()
-        scores = "" if error is None else f"; next measurement: {error:.1f} of {size:.1f} nm (medians)"
-        return (
-            f"{span.frames} frames, {span.missing} missing, {span.out_of_band} with outliers, {span.late} late; "
-            f"{span.quantile(0.5):.0f}, {span.quantile(0.999):.0f} us (p50, p99.9){scores}; output: {reason or 'on'}"
-        )
-
-    def summary(self) -> dict[str, Any]:
-        """Return the statistics since the start."""
-        span = self._all
-        error, size = span.medians()
-        return {
-            "frames": span.frames,
-            "missing": span.missing,
-            "out_of_band": span.out_of_band,
-            "late": span.late,
-            "torn": self.torn,
-            "stuck": self.stuck,
-            "rate_hz": None if self.rate is None else round(self.rate, 2),
-            "p50_us": span.quantile(0.5),
-            "p99_9_us": span.quantile(0.999),
-            "next_median_nm": error,
-            "median_nm": size,
-        }
-
-
-TICK = 0.05
-"""Longest wait for a frame before a look at the clock and at the wish to stop [s]."""
-LONGEST_GAP = 1000
-"""Missing frames that an observer is taken through; after more of them it starts anew."""
-
-
-class Attachment:
+class Attachment(StreamFollower):
     """An observer between two streams.
 
     Parameters
@@ -398,108 +271,40 @@ class Attachment:
         ngs: NgsStream | None = None,
         commands: CommandStream | None = None,
     ):
-        for stream in (source, sink):
-            if stream is not None:
-                check_elements(stream, wiring.elements)
-        self._source, self._sink, self._observer, self._wiring, self._say = source, sink, observer, wiring, say
-        self._elements = np.array(wiring.elements)
+        super().__init__(source, sink, wiring, observer.sampling.dt, say)
+        self._observer, self._forecast = observer, self._missing
         self._watchdog = Watchdog(wiring.largest, wiring.safety, say, wiring.warm_up)
         self._gate, self._ngs_gate = SafeGate(wiring, 2 * ngs.ratio if ngs else 1), SafeGate(wiring)
-        self._semaphore: Semaphore | None = None
-        self._semaphore_number: int | None = None
-        self._missing = self._forecast = np.full(len(wiring.elements), np.nan)
-        self._count, self._alive = source.first, 0.0
-        self._is_stuck = self._is_overtaken = False
         self._ngs, self._commands, self._frames = ngs, commands, GoingBack(observer)
-        self.tally: Tally = Tally(observer.sampling.dt)
 
-    def run(
-        self, seconds: float, *, report: Callable[[str], None] = lambda _: None, stop: Callable[[], bool] = lambda: False
-    ) -> None:
-        """Follow the stream for so long [s], or until `stop` says so; at the end, whatever ends it, the safe output is sent.
+    @property
+    def reason(self) -> str:
+        """Why the estimate is not sent; "" while it is."""
+        return self._watchdog.reason
 
-        Parameters
-        ----------
-        seconds : float
-            Duration.
-        report : callable
-            Receives a line of statistics each second.
-        stop : callable
-            Whether to end.
-        """
-        self._claim()
-        gc.collect()
-        gc.freeze()
-        self._alive = now = monotonic()
-        end, spoken = now + seconds, now + 1.0
-        try:
-            while now < end and not stop():
-                if self._source.wait(self._count, min(TICK, self._wiring.stuck, end - now), self._semaphore):
-                    self._alive, self._is_stuck = monotonic(), False
-                    self._take(self._alive)
-                elif monotonic() - self._alive >= self._wiring.stuck:
-                    self._stand_still()
-                now = monotonic()
-                if now >= spoken:
-                    report(self._line())
-                    if off_rate := self.tally.find_rate_error():
-                        self._say(f"{self._source.path}: {off_rate}")
-                    spoken += 1.0
-        finally:
-            gc.unfreeze()
-            self._send(self._watchdog.safe)
-            self._release()
+    @property
+    def safe(self) -> Array:
+        """What is sent in place of an estimate, (n_modes,) [um]."""
+        return self._watchdog.safe
 
-    def _claim(self) -> None:
-        """Take the semaphore that is wanted, or another one where a process waits for it: two would take each other's frames."""
-        if (wanted := self._wiring.semaphore) is None:
-            return
-        self._semaphore_number = self._source.claim(wanted)
-        if self._semaphore_number != wanted:
-            self._say(f"{self._source.path}: another process waits for semaphore {wanted}; taking {self._semaphore_number}")
-        self._semaphore = self._source.semaphore(self._semaphore_number)
-        if self._semaphore is not None:
-            self._semaphore.drain()
-
-    def _release(self) -> None:
-        if self._semaphore_number is not None:
-            self._source.release(self._semaphore_number)
-            self._semaphore_number = None
-
-    def _take(self, arrival: float) -> None:
-        """Take the newest frame, and send what is expected of a later one."""
-        found = self._source.read()
-        if found is None:
-            self.tally.torn += 1
-            self._watchdog.fall_back("a frame is being written without an end")
-            self._send(self._watchdog.safe)
-            return
-        count, values = found
-        lost = count - self._count - 1
-        if lost < 0 or lost > LONGEST_GAP:
-            self._start_anew(count, f"the counter went from {self._count} to {count}")
-            lost = 0
-        self._count = count
-        for _ in range(lost):
+    def _answer(self, arrival: float, measurement: Array, missing: int) -> None:
+        """Take a measurement, and send what is expected of a later one."""
+        for _ in range(missing):
             self._frames.update(self._gate.accept(self._missing))
             self._gate.settle()
-        if lost:
+        if missing:
             self._expect()
-        with np.errstate(over="ignore", invalid="ignore"):
-            measured = values[self._elements] * self._wiring.unit
-            if self._commands is not None:
-                measured = self._commands.open_loop(count, measured)
+        if self._commands is not None:
+            with np.errstate(over="ignore", invalid="ignore"):
+                measurement = self._commands.open_loop(self._count, measurement)
         ngs, late = self._look_for_ngs()
-        z, error = self._gate.accept(measured), measured - self._forecast
+        z, error = self._gate.accept(measurement), measurement - self._forecast
         if ngs is not None and self._ngs is not None:
             ngs = self._ngs_gate.accept(ngs, frame_mean_of(self._gate.history[late : late + self._ngs.ratio]))
             self._ngs_gate.settle()
         beyond = max(self._gate.beyond, self._ngs_gate.beyond)
-        output = self._watchdog.output(self._step(z, ngs, late), z, beyond, lost)
-        self._is_overtaken = self._source.count != count and not self._is_overtaken
-        if not self._is_overtaken:  # else the next answer follows at once, and who waits for it must not get this one
-            self._send(output)
-        self.tally.add(arrival, monotonic(), lost, measured, error, not np.array_equal(z, measured, equal_nan=True))
+        self._send_in_time(self._watchdog.output(self._step(z, ngs, late), z, beyond, missing))
+        self.tally.add(arrival, monotonic(), missing, measurement, error, not np.array_equal(z, measurement, equal_nan=True))
         self._observer.settle()
         self._gate.settle()
         self._frames.keep()
@@ -542,31 +347,7 @@ class Attachment:
         self._gate.restart()
         self._ngs_gate.restart()
 
-    def _stand_still(self) -> None:
-        """No frame has come: send the safe output once, and look for a new stream at the same place."""
-        if not self._is_stuck:
-            self._is_stuck = True
-            self.tally.stuck += 1
-            self._say(f"{self._source.path}: no frame for {self._wiring.stuck:g} s")
-            self._watchdog.fall_back("stuck")
-            self._send(self._watchdog.safe)
-        if not self._source.is_current:
-            self._follow_new_file()
-
-    def _follow_new_file(self) -> None:
-        try:
-            new = self._source.reopen()
-        except StreamError:
-            return
-        if new.n != self._source.n:
-            raise StreamError(f"{new.path}: made anew with {new.n} numbers a frame, it had {self._source.n}")
-        self._release()
-        self._source = new
-        self._claim()
-        self._start_anew(new.count, "the stream was made anew")
-
-    def _start_anew(self, count: int, reason: str) -> None:
-        """Begin at a counter that has nothing to do with the one before."""
+    def _begin(self) -> None:
         if self._ngs is not None:
             self._ngs.restart()
         if self._commands is not None:
@@ -574,21 +355,16 @@ class Attachment:
         self._observer.reset()
         self._frames.forget()
         self._restart_gates()
-        self._count = count
-        self._say(reason)
+
+    def _fall_back(self, reason: str) -> None:
         self._watchdog.fall_back(reason)
 
-    def _send(self, estimate: Array) -> None:
-        if self._sink is not None:
-            self._sink.write(estimate / self._wiring.unit, self._elements)
-
     def _line(self) -> str:
-        line = self.tally.line(self._watchdog.reason)
+        line = super()._line()
         return line if self._ngs is None else f"{line}; {self._ngs.line()}"
 
     def summary(self) -> dict[str, Any]:
         """Return counts, latencies [us] and errors [nm] so far, as JSON takes them."""
         ngs = {} if self._ngs is None else {**self._ngs.summary(), "ngs_outliers": self._ngs_gate.outliers.tolist()}
         ngs |= {} if self._commands is None else {"commands_missing": self._commands.missing}
-        counts = {"outliers": self._gate.outliers.tolist(), **ngs}
-        return {**self.tally.summary(), **counts, "fallbacks": self._watchdog.trips, "output": self._watchdog.reason or "on"}
+        return {**super().summary(), "outliers": self._gate.outliers.tolist(), **ngs, "fallbacks": self._watchdog.trips}
