@@ -170,7 +170,7 @@ def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.chdir(tmp_path)
     shutil.copy(ROOT / "examples" / "wind.toml", tmp_path)
     monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path))
-    for name in ("aol1_modevalOL", "aol2_modevalOL"):
+    for name in ("aol1_modevalOL", "aol2_modevalOL", "aol1_modevalWFS"):
         SharedImage.create(stream_path(name), (2,))
     for line in "".join(blocks(page, "sh")).splitlines():
         words = shlex.split(line)

@@ -20,7 +20,7 @@ class Place(NamedTuple):
 
 
 COMMANDS = {
-    "attach": Place("attach", "Run an observer on the streams of a running loop, in shared memory or by ZeroMQ."),
+    "attach": Place("attach", "Run an observer or a controller on the streams of a running loop, in shared memory or by ZeroMQ."),
     "bench": Place("bench", "Time the observers beside textbook versions."),
     "campaign": Place("campaign", "Run many scenarios and seeds, on many processes or machines."),
     "check": Place("telemetry", "Check a record: what was read, and what of it can be relied on."),
