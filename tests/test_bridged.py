@@ -126,6 +126,10 @@ def test_a_file_that_tells_what_is_missing_is_taken_at_its_word(tmp_path: Path) 
     y[1500] = 0.0
     save_record(tmp_path / "r.npz", Record(y, np.zeros_like(y), 1e-3))
     assert load(tmp_path / "r.npz").missing == 99
+    u = np.zeros_like(y)
+    u[1200:1300] = np.nan
+    save_record(tmp_path / "r.npz", Record(noisy(2000, 1), u, 1e-3))
+    assert load(tmp_path / "r.npz").missing == 0, "a lost command is no measurement that was filled in"
 
 
 @pytest.mark.parametrize(("share", "size"), [(0.0, 0.0), (0.01, 0.8), (1.0 / 3000, 1e6)])

@@ -19,7 +19,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from wfsobs.record import Record, hold_last
+from wfsobs.record import Record
 from wfsobs.typing import Array
 
 WINDOW = 28
@@ -48,7 +48,7 @@ def without_bridged(record: Record) -> Record:
     """Return a record that tells no missing frames with those missing that were filled in; its origin says how many."""
     seen = slice(record.delay, None)  # z before has no commands
     bridged = np.zeros(record.n_steps, dtype=bool)
-    bridged[seen] = find_bridged(record.y_lgs[seen], hold_last(record.z)[seen], record.dt)
+    bridged[seen] = find_bridged(record.y_lgs[seen], record.z[seen], record.dt)
     if not bridged.any():
         return record
     said = f"{bridged.sum()} LGS frames without noise of their own taken for missing"

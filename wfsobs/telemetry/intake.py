@@ -142,7 +142,8 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
     beside = {"lgs_stars": stars, "y_stars": apart}
     record = Record(**fields, dt=dt, ratio=ratio, training=_training(signals), delay=int(delay + WHOLE), origin=origin, **beside)
     record = replace(record, gate=scenario.gate)
-    return record if stars is not None or record.missing else without_bridged(record)
+    is_told = np.isnan(record.z[record.delay :]).any()
+    return record if stars is not None or is_told else without_bridged(record)
 
 
 def _signal(name: str, raw: Array) -> Array:
