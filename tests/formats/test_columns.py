@@ -154,7 +154,8 @@ def test_columns_that_nobody_names_keep_their_names(ending: str) -> None:
         columns += [fits.Column(name, "D", array=u) for name, u in zip("ab", U.T, strict=True)]
         fits.BinTableHDU.from_columns(columns).writeto(file)
     file.seek(0)
-    is_as_clean(read_record(file, f"a{ending}", declaration=stated), "unit nm" + ", column cube not used" * (ending == ".npz"))
+    unused = ", columns cube, note not used" * (ending == ".npz")
+    is_as_clean(read_record(file, f"a{ending}", declaration=stated), f"unit nm{unused}")
 
 
 @pytest.mark.parametrize("name", ["frame", "FrameCounter", "frame_no", "wfs frame counter"])
@@ -266,6 +267,26 @@ def test_columns_of_text() -> None:
             read_record(io.BytesIO(content), "a.csv", declaration=DeclaredFormat(columns={"u/tip": name}))
     with pytest.raises(RecordError, match=r"a.csv: line 51, u/tilt_nm: 'saturated' is not a number"):
         read_record(io.BytesIO(table(OWN, TIME, *Y.T, U.T[0], late)), "a.csv")
+
+
+@pytest.mark.parametrize("word", ["NA", "-", "null", ""])
+def test_words_for_a_missing_sample(word: str) -> None:
+    tip = np.array([word, *map(repr, Y[1:, 0].tolist())])
+    record = read_record(io.BytesIO(table(OWN, TIME, tip, Y[:, 1], *U.T)), "a.csv")
+    assert np.flatnonzero(np.isnan(record.y_lgs[:, 0])).tolist() == [0] and record.origin == "unit nm"
+
+
+def test_tilt_alone_is_said_to_be_called_tip() -> None:
+    record = read_record(io.BytesIO(table([OWN[0], *OWN[2::2]], TIME, Y[:, 1], U[:, 1])), "a.csv")
+    np.testing.assert_allclose(record.y_lgs, 1e-3 * Y[:, 1:], rtol=1e-12)
+    assert record.origin == "unit nm, tilt alone, called tip"
+
+
+@pytest.mark.parametrize("name", ["unit", "UNIT", "units"])
+def test_the_unit_of_an_npz_in_any_spelling(name: str) -> None:
+    file = io.BytesIO()
+    np.savez(file, **{"y_lgs": Y, "U": U, "time": TIME, name: "nm"})
+    is_as_clean(read_record(file, "a.npz"), "unit nm")
 
 
 def test_a_micro_sign_of_an_old_code_page() -> None:

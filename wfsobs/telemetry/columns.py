@@ -107,7 +107,7 @@ def to_contents(file: FileColumns, roles: Mapping[str, str]) -> Contents:
     contents = from_columns(found)
     contents.units |= {name: unit for name, unit in file.contents.units.items() if name not in contents.arrays}
     contents.arrays = file.contents.arrays | contents.arrays
-    contents.guesses = [*file.contents.guesses]
+    contents.guesses = [*file.contents.guesses, *contents.guesses]
     n_rows = len(contents.arrays["y_lgs"]) if np.ndim(contents.arrays.get("y_lgs", 0)) else 0
     counters = [name for name in unused if _has_counter_name(name) and is_counter(file.columns[name], n_rows)]
     if FRAME not in found and len(counters) == 1:

@@ -259,6 +259,8 @@ def from_columns(columns: Mapping[str, tuple[Array, str]]) -> Contents:
             modes = sorted(by_mode, key=lambda mode: first.index(mode) if mode in first else len(first))
         elif set(by_mode) != set(modes):
             raise RecordError(f"{name} has the modes {', '.join(by_mode)}; y_lgs has {', '.join(modes)}")
+        if name == "y_lgs" and modes == first[1:]:
+            contents.guesses.append(f"{modes[0]} alone, called {first[0]}")
         longest = max(map(len, by_mode.values()))
         contents.arrays[name] = np.column_stack([_pad(by_mode[mode], longest) for mode in modes])
     _pad_fast(contents)

@@ -93,7 +93,7 @@ def read(file: IO[bytes], most: int) -> FileColumns:
                 continue
             if STAMP.fullmatch(text):
                 out.units[heading[i]] = "s"
-            commas |= np.isfinite(column[-1]) and heading[i] not in out.units
+            commas |= "," in text and heading[i] not in out.units
     out.columns = {heading[i]: np.array(column[: ends[i]]) for i, column in cells_of.items() if heading[i] or ends[i]}
     out.contents.guesses += ["heading of the comment above"] * named
     out.contents.guesses += [f"cells separated by {separator}"] * (separator != "commas") + ["decimal commas"] * commas

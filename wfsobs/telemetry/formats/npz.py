@@ -36,7 +36,7 @@ HEADER = 10_000
 
 
 def read(file: IO[bytes], most: int) -> FileColumns:
-    """Read the arrays of known names, and those of others that are columns of numbers, as far as there is room.
+    """Read the arrays of known names, and those of others that are columns or texts, as far as there is room.
 
     Raises RecordError, and TooLargeError before the memory is used.
     """
@@ -46,7 +46,7 @@ def read(file: IO[bytes], most: int) -> FileColumns:
     try:
         with zipfile.ZipFile(file) as archive:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            known = {name: members[name] for name in NAMES if name in members}
+            known = {name: info for name, info in members.items() if name.lower() in NAMES}
             size, packed = (sum(getattr(info, what) for info in known.values()) for what in ("file_size", "compress_size"))
             if (room := most - size) < 0:
                 raise TooLargeError(most)
@@ -66,13 +66,13 @@ def read(file: IO[bytes], most: int) -> FileColumns:
 
 
 def _is_table(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bool:
-    """Return whether a member holds numbers or times in three dimensions at most, or fields of them."""
+    """Return whether a member holds numbers, times or texts in three dimensions at most, or fields of them."""
     try:
         with archive.open(info) as stream:
             shape, _, dtype = _header(stream)
     except DAMAGES:
         return False
-    return dtype.kind in "fiuMV" and not dtype.hasobject and len(shape) <= 3
+    return dtype.kind in "fiuMVSU" and not dtype.hasobject and len(shape) <= 3
 
 
 def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
