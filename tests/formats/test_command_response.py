@@ -134,6 +134,7 @@ def test_commands_beyond_a_rail(rate: float, tmp_path: Path, capsys: pytest.Capt
     save_record(path, rails)
     shown = preview(path.read_bytes(), path.name).reading.lines()
     assert [line for line in shown if "do nothing" in line] == lines, "on the page"
+    assert preview(path.read_bytes(), path.name, declaration=DeclaredFormat(rail=0.6)).reading.limits == []
     load_declared(str(path), Scenario(), DeclaredFormat())
     said = capsys.readouterr().err
     assert all(f"wfsobs: {path}: {line}\n" in said for line in lines), "on the command line"
@@ -209,6 +210,16 @@ def test_what_does_not_decide_is_not_excluded() -> None:
     for y, commands in ((noise, u), (noise[:300], u[:300]), (noise, 0.0 * u), (noise, -slow), (u, u), *last):
         for sign in (1, -1):
             assert contradiction(Record(y, sign * commands, 1e-3)) == ""
+    assert command_response(Record(np.ones_like(noise), u, 1e-3)) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rows", [slice(1, None, 2), slice(2, None, 3)])
+def test_missing_frames_exclude_no_delay(disturbance: Array, rows: slice) -> None:
+    """Of a sensor that is slower than the commands, one row in two or three."""
+    record = closed_loop(disturbance, NOISE * np.random.default_rng(1).standard_normal(disturbance.shape), 1, 2)
+    record.y_lgs[rows] = np.nan
+    assert contradiction(record) == ""
 
 
 @pytest.mark.slow

@@ -248,7 +248,7 @@ def load_with_delay(
             f"(sensors.gate); {expected:.1g} are expected of Gaussian noise",
             err=True,
         )
-    for line in saturation_lines(record):
+    for line in saturation_lines(record, declaration.rail):
         click.echo(f"wfsobs: {record_file}: {line}", err=True)
     return record, delay
 

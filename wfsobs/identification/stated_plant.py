@@ -31,6 +31,9 @@ FORM = 10.0
 REVERSED = 0.5
 """Share of what is new in the commands that the measurements do not explain, beyond which their signs say nothing."""
 
+MOST_MISSING = 0.2
+"""Share of missing frames beyond which nothing is excluded: where a third is missing a shorter delay seems likelier."""
+
 NEAR = (0.3, 1.7)
 """Gains between which a plant is near a stated one."""
 
@@ -54,7 +57,7 @@ def contradiction(record: Record, sign: int = 1, delay: float | None = None, gai
     """
     y, u = (x[:, : len(TIP_TILT)] for x in known_signals(record, CHECKED))
     moving = np.flatnonzero(np.ptp(u, axis=0) > 0)
-    if len(y) < SHORTEST or not moving.size or record.delay > LONGEST or np.isnan(y).mean(axis=0).max() > 0.5:
+    if len(y) < SHORTEST or not moving.size or record.delay > LONGEST or np.isnan(y).mean(axis=0).max() > MOST_MISSING:
         return ""
     y, u = (x[:, moving] / np.nanstd(y) for x in (y, u))
     with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):  # numbers without noise decide nothing

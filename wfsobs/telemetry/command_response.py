@@ -113,10 +113,10 @@ def command_response(record: Record) -> CommandResponse | None:
     """Compare the sign and delay under which the disturbance of a closed loop is smooth.
 
     The record's own delay plays no part; its sign is that of u as it stands. Of the modes, the first two.
-    None for a record of fewer than 40 steps per block, or with commands that never move.
+    None for a record of fewer than 40 steps per block, or with measurements or commands that never move.
     """
     y, u = (hold_last(x[:MOST_STEPS, : len(TIP_TILT)]) for x in (record.y_lgs, record.u))
-    moving = np.ptp(u, axis=0) > 0
+    moving = (np.ptp(y, axis=0) > 0) & (np.ptp(u, axis=0) > 0)
     if len(y) - ORDER - SPAN < 40 * BLOCKS or not moving.any():
         return None
     y, u = (x[:, moving] - x[:, moving].mean(axis=0) for x in (y, u))
@@ -146,8 +146,10 @@ def command_response(record: Record) -> CommandResponse | None:
     )
 
 
-def saturation_lines(record: Record) -> list[str]:
+def saturation_lines(record: Record, rail: float | None = None) -> list[str]:
     """Return a line for each mode whose mirror does not follow commands beyond a level, or whose commands stay at their largest.
+
+    The latter only where no rail is stated, at which they were cut.
 
     A loop is linear but for that: measurements are predicted from their past and that of the commands, whole and cut at a level.
     """
@@ -164,7 +166,7 @@ def saturation_lines(record: Record) -> list[str]:
             levels = " and ".join(f"{1e3 * level:+.3g} nm" for level in (low, high) if np.isfinite(level))
             known = f"commands beyond about {levels}, {100.0 * beyond / len(y):.2g} % of all, do nothing"
             lines.append(f"{mode.name}: {known}: the mirror is at its limit there, and z is wrong without --rail")
-        elif count := max(_count_at_end(commands), _count_at_end(-commands)):
+        elif rail is None and (count := max(_count_at_end(commands), _count_at_end(-commands))):
             lines.append(f"{mode.name}: commands stay at their largest value in {count} frames, as at the limit of a mirror")
     return lines
 

@@ -243,7 +243,7 @@ def read_off(record: Record, contents: Contents, declaration: DeclaredFormat, sc
     response = command_response(replace(record, u=sign * record.u))
     excluded = contradiction_of(record, contents, declaration, scenario)
     stated = stated_delay(contents, declaration), declaration.command_gain
-    return Reading(sign, response, units, saturation_lines(record), excluded, *stated)
+    return Reading(sign, response, units, saturation_lines(record, declaration.rail), excluded, *stated)
 
 
 def safe_name(name: str) -> str:
