@@ -33,8 +33,11 @@ LARGEST = 2_000_000
 REPORT = "wfsobs-report.html"
 
 
-class Toolbar(HtmlComponent):
-    """The menus in the browser: texts down, messages {action, ...} up, files down as messages."""
+class Menus(HtmlComponent):
+    """The menus in the browser: texts down, messages {action, ...} up, files down as messages.
+
+    A component whose name ended in Toolbar would be styled as one of a figure, and the whole page laid out anew each time.
+    """
 
     query = param.String("", doc="What a link to the settings has after its ?.")
     view = param.String("", doc="What the address has beside the settings, of the view.")
@@ -71,7 +74,7 @@ class Actions:
         self.view: Final = view
         self.pages: Final = view.pages
         self._seeds = seeds
-        self.toolbar: Final = Toolbar(self.handle, labels=labels(), margin=0)
+        self.toolbar: Final = Menus(self.handle, labels=labels(), margin=0)
         self._tasks: dict[str, BackgroundTask] = {}
         self._under_way: dict[str, tuple[str, Callable[[Any], None]]] = {}
         store.param.watch(once(self._refresh, AFTERWARDS_MS), ["scenario", "preset", "source", "wanted_record"])

@@ -129,6 +129,7 @@ def new_figure(**options: Any) -> figure:
         active_drag="xbox_zoom",
         toolbar_location="above",
         toolbar_inner=True,
+        title=None,
         min_border_right=16,
         min_border_left=70,
         **options,
