@@ -21,6 +21,7 @@ UNITS = {"nm": "nm", "mas": "mas", "um": "µm"}
 
 IN_MOST = "where the error of an optimal observer lies in 95 % of records"
 OVER_SEEDS = "where the mean error over records lies, at 95 % confidence"
+FROM_RECORD = "from one record"
 
 AT_LIMIT = "at the limit"
 """Note on an observer whose error is, within its interval, the bound of what it measures."""

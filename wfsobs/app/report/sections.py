@@ -9,7 +9,7 @@ from datetime import datetime
 from itertools import groupby
 from typing import Any
 
-from wfsobs.app.display import AT_LIMIT, IN_MOST, OVER_SEEDS, label_of, score_columns
+from wfsobs.app.display import AT_LIMIT, FROM_RECORD, IN_MOST, OVER_SEEDS, label_of, score_columns
 from wfsobs.app.render import NOTHING, number
 from wfsobs.app.report.data import Report, State, window_of
 from wfsobs.app.style import BOUND_MARKS, TERM_COLOURS
@@ -68,7 +68,7 @@ def _bodies(rows: list[Row], dt: float, seeds: Mapping[str, Any]) -> list[dict[s
         for row in rows
         if above_bound(row["rms_um"], row["interval_um"], bounds.get(own_bound(row["observer"]) or "")) == 0.0
     }
-    over_seeds = f"{OVER_SEEDS}, {seeds.get('count', 1)} seeds"
+    over_seeds = f"{OVER_SEEDS}, {seeds['count']} seeds" if seeds else f"{OVER_SEEDS}, {FROM_RECORD}"
     words = {word for row in rows for word in row["needs"].split()}
     source = IDENTIFIED if IDENTIFIED in words else GIVEN if GIVEN in words else TRUE
     cells = {
@@ -79,7 +79,7 @@ def _bodies(rows: list[Row], dt: float, seeds: Mapping[str, Any]) -> list[dict[s
             "stretch": own_interval(row),
             "mark": marks.get(row["observer"]),
             "at_limit": row["observer"] in limits and AT_LIMIT,
-            "interval": row["interval_um"] if seeds or row["observer"] in BOUNDS else None,
+            "interval": row["interval_um"],
             "meaning": IN_MOST if row["observer"] in BOUNDS else over_seeds,
             "lag": None if row["lag_s"] is None else 1e3 * row["lag_s"],
             "time": row[TIME],

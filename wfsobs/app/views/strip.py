@@ -11,7 +11,7 @@ import param
 
 from wfsobs.app.budgets import Budgets
 from wfsobs.app.component import HtmlComponent
-from wfsobs.app.display import OVER_SEEDS, Display, per_micrometre
+from wfsobs.app.display import FROM_RECORD, OVER_SEEDS, Display, per_micrometre
 from wfsobs.app.glossary import RELATIVE, TERMS, sentence_on
 from wfsobs.app.jobs import DONE, RUNNING
 from wfsobs.app.render import NOTHING, change, number, render, with_decimals_of
@@ -92,9 +92,6 @@ def card_of(name: str, dark: bool, note: str, value: str = NOTHING, **fields: An
     known = {"name": name, "label": it.label, "colour": it.colour(dark), "dash": it.dash, "about": sentence_on(name)}
     empty = {"unit": "", "half": "", "change": "", "parts": (), "size": 0.0, "limit": 0.0, "compared": ()}
     return {**known, "note": note, "value": value, **empty, **fields}
-
-
-FROM_RECORD = "from one record"
 
 
 def error_fields(rms: float, interval: Sequence[float] | None, scale: float, of: str = FROM_RECORD) -> dict[str, str]:

@@ -9,7 +9,7 @@ from typing import Final
 from markupsafe import Markup
 
 from wfsobs.app.compared import ComparedRun
-from wfsobs.app.display import AT_LIMIT, IN_MOST, OVER_SEEDS, Display, per_micrometre, score_columns
+from wfsobs.app.display import AT_LIMIT, FROM_RECORD, IN_MOST, OVER_SEEDS, Display, per_micrometre, score_columns
 from wfsobs.app.glossary import BOUND as TERM_OF_BOUND
 from wfsobs.app.glossary import term
 from wfsobs.app.jobs import DONE
@@ -149,11 +149,12 @@ class Table:
         return dict.fromkeys(rank_observers(rivals)[:1], SMALLEST)
 
     def _interval(self, score: Score, scale: float) -> Markup:
-        """Write the interval of a bound, or of the mean error over several seeds, to stand before it."""
+        """Write the interval of a bound or a mean error, to stand before it."""
         evidence = self.seeds.evidence if self.seeds else None
-        if score.interval is None or not (evidence or score.observer in BOUNDS):
+        if score.interval is None:
             return Markup()
-        meaning = IN_MOST if score.observer in BOUNDS or not evidence else f"{OVER_SEEDS}, {evidence.n_seeds} seeds"
+        of = f"{evidence.n_seeds} seeds" if evidence else FROM_RECORD
+        meaning = IN_MOST if score.observer in BOUNDS else f"{OVER_SEEDS}, {of}"
         return macro("interval", *(number(x * scale) for x in score.interval), meaning)
 
     def _row(self, name: str, target: str, score: Score | None, mark: Markup, at_limit: bool) -> Row:
