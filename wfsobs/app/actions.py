@@ -53,7 +53,7 @@ class Menus(HtmlComponent):
     saves = param.List([], doc="What the page can save beside the data, as it is called in the menu.")
 
     _esm = script("listen", "patch", "markup", "save", "figures", "actions")
-    _stylesheets = sheets("base", "actions")
+    _stylesheets = sheets("base", "bare", "actions")
 
     def save(self, name: str, kind: str, content: bytes) -> None:
         """Have the browser save a file."""

@@ -116,7 +116,7 @@ class Help(HtmlComponent):
     """The button at the top, and what it opens."""
 
     _esm = script("listen", "help")
-    _stylesheets = sheets("base", "help")
+    _stylesheets = sheets("base", "bare", "help")
 
     def __init__(self, **params: Any):
         super().__init__(html=render("help.html", shortcuts=SHORTCUTS, terms=TERMS), width=36, margin=0, **params)

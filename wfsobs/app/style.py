@@ -141,6 +141,11 @@ def html(content: str = "", **params: Any) -> HtmlText:
     return HtmlText(html=content, **{**WIDE, "stylesheets": sheets("style"), **params})
 
 
+def bare(content: str = "", **params: Any) -> HtmlText:
+    """HTML in the page's style that is always visible and has no box of its own, so that it costs no layout where it grows."""
+    return html(content, **{"stylesheets": sheets("style", "bare"), **params})
+
+
 def run_swatch(letter: str, dark: bool) -> Markup:
     """Draw a short line in the dashes and the colour of a compared run, with its letter."""
     return _swatch(run_look(letter), dark, True) + Markup("<b>{}</b>").format(letter)

@@ -58,7 +58,7 @@ class Picker(HtmlComponent):
     part = param.Integer(PART, doc="How much is sent at a time [bytes].")
 
     _esm = script("listen", "patch", "markup", "upload")
-    _stylesheets = sheets("base", "upload")
+    _stylesheets = sheets("base", "bare", "upload")
 
     @param.depends("message", "source_title", "back", watch=True, on_init=True)
     def _draw(self) -> None:

@@ -22,7 +22,7 @@ async function send(model, file) {
 export function render({model, el}) {
   const draw = () => {
     setMarkup(el, model.html)
-    el.getRootNode().host.style.position = model.source_title || model.message ? "" : "absolute"
+    el.style.position = model.source_title || model.message ? "" : "absolute"
   }
   for (const name of ["html", "source_title", "message"]) model.on(name, draw)  // which come one after the other
   draw()

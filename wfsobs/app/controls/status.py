@@ -29,7 +29,7 @@ ON_BAR = {
 BAR = ":host { align-items: center; }"
 
 STATUS_ON_BAR = """
-:host { color: #fff; }
+:host { color: #fff; display: contents !important; }
 progress::-webkit-progress-value { background: #8fd3f0; }
 progress::-moz-progress-bar { background: #8fd3f0; }
 .line { white-space: nowrap; }

@@ -28,7 +28,7 @@ from wfsobs.app.pages.parts import (
 )
 from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
-from wfsobs.app.style import HtmlText, html, sheets
+from wfsobs.app.style import HtmlText, bare, sheets
 from wfsobs.app.views.main_lines import MainLines
 from wfsobs.app.views.plots import call
 from wfsobs.app.views.spectra import MODEL, PEAKS, SpectraFigures
@@ -144,7 +144,6 @@ class Explore(Page):
         figures = pn.Column(traces, self.rooms[target], **WIDE, stylesheets=[HALVES])
         window = [self._tick("window_spectra")] if target == TARGETS[0] else []
         below = pn.Row(self.stretches[target].pane, *window, **WIDE, stylesheets=[WRAPPED])
-        self.stretches[target].pane.styles = {"flex": "1 1 240px"}
         head = pn.Column(self.verdicts[target].pane, cards, **WIDE, stylesheets=[HEAD, BELOW_FIGURES])
         return pn.Column(head, figures, below, **WIDE, stylesheets=sheets("box"))
 
@@ -181,4 +180,4 @@ class Explore(Page):
 
 
 def _caption(text: str, marks: str = "") -> HtmlText:
-    return html(f'<div class="caption">{escape(text)}{marks}</div>', margin=(8, 0, 0, 0))
+    return bare(f'<div class="caption above">{escape(text)}{marks}</div>')

@@ -40,7 +40,7 @@ from wfsobs.app.service import IDLE, BackgroundTask
 from wfsobs.app.share import LIVE, CopiedTask
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
-from wfsobs.app.style import html, look
+from wfsobs.app.style import bare, look
 from wfsobs.app.views.spectrum_editor import Frames, SpectrumEditor
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.error_spectra import Theory
@@ -73,9 +73,9 @@ class LiveRoom:
         self.spectra: Final = RollingSpectra(painter)
         self.waterfall: Final = Waterfall()
         self.stars: Final = Stars(painter)
-        self.table, self.control_table, self.news, self.peaks = (html() for _ in range(4))
+        self.table, self.control_table, self.news, self.peaks = (bare() for _ in range(4))
         self.editor: SpectrumEditor | None = None
-        self.legend: Final = html()
+        self.legend: Final = bare()
         self._second = 0
         self._bounds: Bounds = {}
         self._spectra_room = figure_with_caption("Spectra", self.spectra.figure)
@@ -177,7 +177,7 @@ class LivePage(Page):
         self.buttons: Final = c.buttons
         self.link = c.link
         self.intro: Final = text(INTRO)
-        self.status: Final = html()
+        self.status: Final = bare()
         self.room: Final = boxes()
         self.room.visible = False
         self.pulse: Final = Pulse(width=0, height=0, margin=0)

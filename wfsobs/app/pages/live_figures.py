@@ -19,7 +19,7 @@ from bokeh.plotting import figure
 from wfsobs.app.component import Component
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.pages.parts import WIDE, grid_style
-from wfsobs.app.style import html, look, script
+from wfsobs.app.style import bare, look, script
 from wfsobs.app.views.plots import FigureLines, call, envelope, envelope_times, new_figure
 from wfsobs.app.views.traces import WINDOW_S
 from wfsobs.app.work import TRUTH
@@ -430,7 +430,7 @@ class Detector:
         self._line = self.figure.line("x", "y", source=self._trail, line_alpha=0.5).glyph
         self._core = self.figure.circle("x", "y", radius=1.0, source=self._spot, fill_alpha=0.6).glyph
         self._style: tuple[float, float, str] | None = None
-        caption = html(f'<div class="caption">{self.label}</div>', sizing_mode=None)
+        caption = bare(f'<div class="caption">{self.label}</div>')
         self.view: Final = pn.Column(caption, pn.pane.Bokeh(self.figure, sizing_mode=self.figure.sizing_mode, margin=0), **WIDE)
 
     def draw(self, points: Array, reach: float, radius: float, dark: bool) -> None:

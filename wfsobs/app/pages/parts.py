@@ -23,7 +23,7 @@ from wfsobs.app.render import render
 from wfsobs.app.service import IDLE, BackgroundTask
 from wfsobs.app.share import EXPLORED, CopiedTask
 from wfsobs.app.store import Store
-from wfsobs.app.style import HEARD, WIDE, HtmlText, html, sheets, swatch
+from wfsobs.app.style import HEARD, WIDE, HtmlText, bare, html, sheets, swatch
 from wfsobs.app.views.plots import call
 from wfsobs.app.work import RunResults
 from wfsobs.settings.errors import SettingError
@@ -311,7 +311,7 @@ BELOW_FIGURES = "@media (max-height: 560px) { :host { order: 1; } }"
 def heading(title: str, about: str = "") -> HtmlText:
     """Make the title of a box; about : beside it, what is in the box."""
     words = f'<span class="about">{escape(about)}</span>' if about else ""
-    return html(f'<h2 class="title">{escape(title)}</h2>{words}', sizing_mode=None)
+    return bare(f'<h2 class="title">{escape(title)}</h2>{words}', sizing_mode=None)
 
 
 def text(content: str) -> HtmlText:
@@ -408,7 +408,7 @@ def figure_with_caption(title: str, fig: figure, *, tall: bool = False) -> pn.Co
     call(fig, title)
     if tall:
         fig.sizing_mode = "stretch_both"
-    caption = html(f'<div class="caption">{escape(title)}</div>', sizing_mode=None, margin=(8, 0, 0, 0))
+    caption = bare(f'<div class="caption above">{escape(title)}</div>')
     return pn.Column(caption, pn.pane.Bokeh(fig, sizing_mode=fig.sizing_mode, margin=0), **(TALL if tall else WIDE))
 
 

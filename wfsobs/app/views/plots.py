@@ -16,7 +16,6 @@ from bokeh.models import (
     CustomJS,
     GlyphRenderer,
     HTMLLabelSet,
-    Legend,
     Line,
     LogAxis,
     Range1d,
@@ -135,8 +134,6 @@ def new_figure(**options: Any) -> figure:
         **options,
     )
     fig.outline_line_color = None  # of which a theme has its own idea, the dark one alone
-    # For the files of the figure alone: on the page there are cards.
-    fig.add_layout(Legend(visible=False, margin=0, spacing=0, border_line_color=None, label_text_font_size="12px"), "above")
     fig.toolbar.logo = None
     fig.toolbar.autohide = True
     return fig

@@ -51,7 +51,7 @@ class Cards(HtmlComponent):
     last_arrival = param.Integer(0, doc="Number of the last click that has arrived, and all before it.")
 
     _esm = script("patch", "strip")
-    _stylesheets = sheets("style", "strip")
+    _stylesheets = sheets("style", "strip", "bare")
 
     def __init__(self, kind: str = "observers"):
         """Make the table. kind : what the rows are of."""

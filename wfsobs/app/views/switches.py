@@ -15,7 +15,7 @@ from wfsobs.app.jobs import FAILED
 from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import BackgroundTask
-from wfsobs.app.style import HEARD, html, run_swatch
+from wfsobs.app.style import HEARD, bare, html, run_swatch
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import TIP_TILT, Mode
 
@@ -134,7 +134,7 @@ class SeedSwitch:
         self.field: Final = pmui.IntInput.from_param(
             seeds.param.count, size="small", width=90, margin=(0, 0, 4, 0), stylesheets=[NO_STEPPERS]
         )
-        self.line: Final = html(self.text(), sizing_mode=None)
+        self.line: Final = bare(self.text(), sizing_mode=None)
         seeds.param.watch(self._refresh, ["evidence", "count"])
         seeds.run.param.watch(self._refresh, ["state", "result"])
         seeds.task.param.watch(self._refresh, ["state", "message"])

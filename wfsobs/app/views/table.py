@@ -16,7 +16,7 @@ from wfsobs.app.jobs import DONE
 from wfsobs.app.render import Row, change, hundredths, macro, missing, number, table
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import BackgroundTask
-from wfsobs.app.style import html, observers_of, swatch
+from wfsobs.app.style import bare, observers_of, swatch
 from wfsobs.app.work import RunResults
 from wfsobs.evaluation.evidence import rank_observers
 from wfsobs.evaluation.known_lines import group_by_knowledge
@@ -62,7 +62,7 @@ class Table:
         self.run = run
         self.display = display
         self.seeds = seeds
-        self.pane: Final = html(self.html())
+        self.pane: Final = bare(self.html())
         run.param.watch(self._refresh, ["result", "state"])
         if seeds is not None:
             seeds.param.watch(self._refresh, "evidence")

@@ -15,10 +15,13 @@ from bokeh.plotting import figure
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.render import number
 from wfsobs.app.service import BackgroundTask
-from wfsobs.app.style import html, look, observers_of, swatch
+from wfsobs.app.style import bare, look, observers_of, sheets, swatch
 from wfsobs.app.views.plots import FigureLines, on_settle, zoom_of
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.error_spectra import band_rms
+
+FLEXIBLE = ":host > div { flex: 1 1 240px; width: auto !important; }"
+"""Style of what shares a row with a switch."""
 
 
 class Stretch:
@@ -39,7 +42,7 @@ class Stretch:
         self.times = times
         self.frequencies = frequencies
         self.chosen_window = chosen_window
-        self.pane: Final = html()
+        self.pane: Final = bare(stylesheets=[*sheets("style", "bare"), FLEXIBLE])
         run.param.watch(self._refresh, "result")
         display.param.watch(self._refresh, ["mode", "unit", "hidden_lines", "dark"])
         on_settle([times, frequencies], self._refresh)

@@ -14,7 +14,7 @@ from wfsobs.app.jobs import DONE, RUNNING
 from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import IDLE, BackgroundTask
-from wfsobs.app.style import html
+from wfsobs.app.style import bare
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.rows import target_title
 from wfsobs.evaluation.scores import PREDICTION
@@ -41,7 +41,7 @@ class VerdictLine:
         self.seeds = seeds
         self.budgets = budgets
         self._text: tuple[tuple[str, str], tuple[str, str]] = ("", ""), ("", "")
-        self.pane: Final = html(self.html())
+        self.pane: Final = bare(self.html())
         run.param.watch(self._refresh, ["result", "state"])
         if seeds is not None:
             seeds.param.watch(self._refresh, "evidence")
