@@ -18,8 +18,9 @@ from wfsobs.control.supervisor import SupervisedController, Supervision
 from wfsobs.control.true_plant import ActingPlant, TruePlant, drive
 from wfsobs.record import Measurements, Sampling
 from wfsobs.streams.attach_controller import ControllerAttachment
+from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.shared_image import SharedImage
-from wfsobs.streams.wiring import Wiring
+from wfsobs.streams.wiring import NgsWiring, Wiring
 
 pytestmark = pytest.mark.slow
 
@@ -59,7 +60,9 @@ class Loop:
 
     unit, gain = 1e-3, -2.0
 
-    def __init__(self, controller: SupervisedController, plant: TruePlant, start: ArrayLike = (0.0, 0.0)):
+    def __init__(
+        self, controller: SupervisedController, plant: TruePlant, start: ArrayLike = (0.0, 0.0), ngs: NgsStream | None = None
+    ):
         start = np.asarray(start)
         self.said: list[str] = []
         self.source, self.sink, self.acting = Frames(3), Frames(3), ActingPlant(plant)
@@ -70,7 +73,7 @@ class Loop:
         source: Any = self.source
         sink: Any = self.sink
         there = start / (self.unit * self.gain)
-        self.attachment = ControllerAttachment(source, sink, controller, self.gain, there, wiring, self.said.append)
+        self.attachment = ControllerAttachment(source, sink, controller, self.gain, there, wiring, self.said.append, ngs)
 
     def take(self, z: np.ndarray, seen: np.ndarray | None = None, lost: bool = False) -> np.ndarray:
         """Go on by a frame; a lost one is counted but never there. Returns the command that the mirror then has [um]."""
@@ -157,7 +160,50 @@ def test_a_counter_that_jumps_begins_anew_where_the_mirror_is() -> None:
     loop.source.count = 10
     y = MEASURED.z[1500] + loop.correction
     np.testing.assert_allclose(loop.take(MEASURED.z[1500]), u - 0.3 * y, rtol=0, atol=1e-12)
-    assert loop.said[-2:] == ["the counter went from 1500 to 11", "the counter went from 1500 to 11: the last command stays"]
+    assert loop.said[-2:] == ["the counter went from 1500 to 11", "the counter went from 1500 to 11: on from the last command"]
+
+
+@pytest.mark.parametrize("lag", [0, 1, 3])
+@pytest.mark.parametrize("name", ["lqg-multirate-multi", "lqg-multirate-adaptive"])
+def test_frames_of_an_ngs_count_from_their_own_frame_on(name: str, lag: int) -> None:
+    """As a controller that in each frame takes all frames anew, every NGS frame that is there in its place."""
+    ratio, n = PAPER.sensors.exposure_ratio, 700
+    sampling = Sampling(2, PAPER.dt, ratio)
+
+    def make() -> SupervisedController:
+        return SupervisedController(wfsobs.design(name, PAPER, sampling=sampling), Supervision(0.3, calm=200))
+
+    slow: Any = Frames(2)
+    ngs = NgsStream(slow, NgsWiring((0, 1), 1e-3, ratio, lag, ENOUGH), lambda _: None)
+    loop, own = Loop(make(), TruePlant(np.eye(2), 2.0), ngs=ngs), make()
+    first, there, start, states = 2, dict[int, np.ndarray](), None, dict[int, Any]()  # another place than from the first row on
+    corrections, seen, sent = [np.zeros(2)] * first, [np.zeros(2)] * first, [np.zeros(2)] * first
+    for k in range(first, n):
+        corrections.append(loop.correction)
+        seen.append(MEASURED.z[k] + loop.correction)
+        if k - lag > 0 and (k - lag) % ratio == 0:
+            there[k - lag] = MEASURED.z_ngs[k - lag] + np.mean(corrections[k - lag - ratio + 1 : k - lag + 1], axis=0)
+            slow.write(there[k - lag] * 1e3)
+        u = loop.take(MEASURED.z[k])
+        sent.append(u)
+        if start is None and ngs.phase is not None:  # from here on: at rest where the last command has put the mirror
+            start = k
+            for i in range(-ratio, k % ratio):
+                own.update(np.full(2, np.nan), there.get(k - k % ratio + i) if i >= 0 else None)
+                own.amend(sent[k - 1])
+            states[k - 1] = own.state_dict()
+        if start is None:
+            continue
+        known = max(k - ratio, start - 1)
+        own.load_state_dict(states[known])
+        for i in range(known + 1, k + 1):
+            command = own.update(seen[i], there.get(i))
+            own.amend(sent[i])
+            states[i] = own.state_dict()
+        np.testing.assert_allclose(u, command, rtol=0, atol=1e-9)
+    assert start is not None and start < 150 and not own.reason and len(there) > 100
+    residual = MEASURED.z[start + 400 : n] + np.array(corrections[start + 400 :])
+    assert residual.std(axis=0).max() < 0.2 * MEASURED.z.std(axis=0).min()
 
 
 def test_a_loop_in_shared_memory_is_closed_from_the_command_line(tmp_path: Path) -> None:

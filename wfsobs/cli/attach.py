@@ -33,7 +33,7 @@ from wfsobs.streams.watchdog import LIMIT, Fallback, Safety
 from wfsobs.streams.wiring import STUCK, Wiring
 from wfsobs.units import UNITS, micrometres_per
 
-OBSERVERS_ALONE = ("name", "shadow", "commands", "ngs", "ngs_modes", "ngs_lag", "delay", "fallback")
+OBSERVERS_ALONE = ("name", "shadow", "commands", "delay", "fallback")
 """Options that a controller does not take."""
 
 
@@ -156,8 +156,8 @@ def attach(
             observer = _design(name, scenario, len(elements), delay - 1, ngs is not None)
             attachment = Attachment(given, taken, observer, wiring, _say, second, third)
         else:
-            law = _supervise(controller, scenario, wiring, command_gain)
-            attachment = ControllerAttachment(given, taken, law, command_gain, _sent_last(taken, wiring), wiring, _say)
+            law = _supervise(controller, scenario, wiring, command_gain, ngs is not None)
+            attachment = ControllerAttachment(given, taken, law, command_gain, _sent_last(taken, wiring), wiring, _say, second)
         with _stop_signals() as stop:
             attachment.run(seconds or np.inf, report=_say, stop=stop)
     except (StreamError, StepError) as error:
@@ -201,18 +201,25 @@ def _check_options(context: click.Context) -> None:
             raise SettingError(f"{parameter.opts[0]}: is of an observer; leave it out beside --controller")
 
 
-def _supervise(name: str, scenario: Scenario, wiring: Wiring, gain: float) -> SupervisedController:
+def _check_ngs(name: str, has_ngs: bool, needs_ngs: bool) -> None:
+    if has_ngs != needs_ngs:
+        raise StepError(
+            f"{name}: takes no NGS; leave --ngs out" if has_ngs else f"{name}: takes an NGS; name its stream by --ngs"
+        )
+
+
+def _supervise(name: str, scenario: Scenario, wiring: Wiring, gain: float, has_ngs: bool) -> SupervisedController:
     """Return the controller; no command that it gives exceeds the limits of the scenario and of the wiring."""
     if name not in CONTROLLERS:
         raise SettingError(f"controller {name!r}: no such controller; there are {', '.join(CONTROLLERS)}")
-    if CONTROLLERS[name].ngs:
-        raise StepError(f"{name}: takes an NGS, which has no stream here: takes a controller of the LGS alone")
+    _check_ngs(name, has_ngs, CONTROLLERS[name].ngs)
     if not gain:
         raise SettingError("--command-gain 0: the mirror does nothing")
     largest = float(wiring.largest.min()) * (1.0 if wiring.safety.largest is None else abs(gain))
     stroke = min(scenario.control.stroke or np.inf, largest)
     told = scenario.replace({"control.stroke": stroke})
-    stepper = design(name, told, sampling=Sampling(len(wiring.elements), scenario.dt), gate=scenario.gate)
+    sampling = Sampling(len(wiring.elements), scenario.dt, scenario.sensors.exposure_ratio if has_ngs else None)
+    stepper = design(name, told, sampling=sampling, gate=scenario.gate)
     return SupervisedController(stepper, Supervision(scenario.control.fallback_gain, scenario.control.leak))
 
 
@@ -231,10 +238,7 @@ def _design(name: str, scenario: Scenario, n_modes: int, horizon: float, has_ngs
     if "y_stars" in declared.needs:
         raise StepError(f"{name}: takes every LGS by itself; the stream is of them together")
     sampling = Sampling(n_modes, scenario.dt, scenario.sensors.exposure_ratio if has_ngs else None)
-    if has_ngs != ("y_ngs" in declared.needs):
-        raise StepError(
-            f"{name}: takes no NGS; leave --ngs out" if has_ngs else f"{name}: takes an NGS; name its stream by --ngs"
-        )
+    _check_ngs(name, has_ngs, "y_ngs" in declared.needs)
     observer = design(name, scenario, sampling=sampling, horizon=horizon)
     if observer.estimator.needs_command:
         raise StepError(f"{name}: its windows hold commands, which the stream has not; set its inputs to z")

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from time import monotonic
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.step import StepObserver
-from wfsobs.record import Sampling
 from wfsobs.signal.gate import OutlierGate, frame_mean_of
 from wfsobs.streams.follower import LONGEST_GAP, StreamFollower
 from wfsobs.streams.ngs_frames import NgsStream
@@ -18,95 +17,6 @@ from wfsobs.streams.stream import FrameStream, SinkStream, SourceStream
 from wfsobs.streams.watchdog import Watchdog
 from wfsobs.streams.wiring import Wiring, check_elements
 from wfsobs.typing import Array
-
-
-class StateObserver(Protocol):
-    """What it takes of a `StepObserver`."""
-
-    @property
-    def frame(self) -> int: ...  # noqa: D102
-
-    @property
-    def sampling(self) -> Sampling: ...  # noqa: D102
-
-    def update(self, z: Array, ngs: Array | None = None, /) -> None: ...  # noqa: D102
-
-    def reset(self) -> None: ...  # noqa: D102
-
-    def state_dict(self) -> dict[str, Array]: ...  # noqa: D102
-
-    def load_state_dict(self, state: Mapping[str, Array], /) -> None: ...  # noqa: D102
-
-
-class GoingBack:
-    """Takes LGS frames as they come, and an NGS frame up to one NGS frame later than it is due.
-
-    The state before the last frame with an NGS measurement is kept, and what has come since; a late NGS frame goes to its place
-    and the LGS frames after it are taken again. From then on the observer is where it would be had the frame come in time.
-
-    Parameters
-    ----------
-    observer : StateObserver
-        Of a sampling with a ratio; without one there is nothing to go back for.
-    """
-
-    def __init__(self, observer: StateObserver):
-        self._observer, self._ratio = observer, observer.sampling.ratio
-        self._state: dict[str, Array] | None = None
-        self._since: list[Array] = []
-
-    def update(self, z: Array, ngs: Array | None = None, late: int = 0) -> None:
-        """Take a frame.
-
-        Parameters
-        ----------
-        z : Array
-            LGS measurement, (n_modes,) [um].
-        ngs : Array, optional
-            NGS measurement, (n_modes,) [um], of the frame `late` before this one; the first frame of an observer has none.
-        late : int
-            LGS frames, below the ratio.
-        """
-        observer = self._observer
-        if ngs is not None and late:
-            self._take_late(ngs, late)
-            ngs = None
-        if self._ratio is not None:
-            self.keep()
-            self._since.append(z)
-        observer.update(z, ngs if observer.frame else None)
-
-    def keep(self) -> None:
-        """Keep the state where the next frame is one with an NGS measurement; `update` does it otherwise."""
-        if self._ratio is not None and self._observer.frame % self._ratio == 0 and (self._since or self._state is None):
-            self._state, self._since = self._observer.state_dict(), []
-
-    def align(self, age: int) -> bool:
-        """Start the observer anew unless its last frame with an NGS measurement was so many frames before the next one.
-
-        age : 0 to ratio - 1, 0 where the next one has an NGS measurement
-        """
-        observer = self._observer
-        if self._ratio is None or observer.frame % self._ratio == age:
-            return False
-        observer.reset()
-        self.forget()
-        for _ in range(age):
-            self.update(np.full(observer.sampling.n_modes, np.nan))
-        return True
-
-    def forget(self) -> None:
-        """Start anew with an observer that does."""
-        self._state, self._since = None, []
-
-    def _take_late(self, ngs: Array, late: int) -> None:
-        first = self._observer.frame - late
-        if self._state is None or late != len(self._since) or first <= 0:
-            return
-        self._observer.load_state_dict(self._state)
-        for k, z in enumerate(self._since):
-            self._observer.update(z, ngs if k == 0 else None)
-
 
 FAR = 6.0
 """Rms of a measurement by the prior beyond the largest estimate that may be sent: what is farther is never taken."""
@@ -271,11 +181,11 @@ class Attachment(StreamFollower):
         ngs: NgsStream | None = None,
         commands: CommandStream | None = None,
     ):
-        super().__init__(source, sink, wiring, observer.sampling.dt, say)
+        super().__init__(source, sink, wiring, observer, say, ngs)
         self._observer, self._forecast = observer, self._missing
         self._watchdog = Watchdog(wiring.largest, wiring.safety, say, wiring.warm_up)
         self._gate, self._ngs_gate = SafeGate(wiring, 2 * ngs.ratio if ngs else 1), SafeGate(wiring)
-        self._ngs, self._commands, self._frames = ngs, commands, GoingBack(observer)
+        self._commands = commands
 
     @property
     def reason(self) -> str:
@@ -310,26 +220,6 @@ class Attachment(StreamFollower):
         self._frames.keep()
         self._expect()
 
-    def _look_for_ngs(self) -> tuple[Array | None, int]:
-        """Return the NGS measurement that is new, and how many frames ago it should have been there.
-
-        Where NGS frames have another place than the observer has been given them in, it starts anew.
-        """
-        if self._ngs is None:
-            return None, 0
-        write_time = self._source.write_time
-        if self._source.count != self._count:  # that of a newer frame: what the NGS has by now waits for it
-            return None, 0
-        found = self._ngs.look(self._count, write_time)
-        phase = self._ngs.phase
-        if phase is not None and self._frames.align((self._count - phase) % self._ngs.ratio):
-            self._restart_gates()
-            self._watchdog.fall_back("the NGS frames have found their place")
-        if found is None:
-            return None, 0
-        late, ngs = found
-        return ngs, late
-
     def _step(self, z: Array, ngs: Array | None, late: int) -> Array:
         self._frames.update(z, ngs, late)
         return sum(
@@ -347,24 +237,16 @@ class Attachment(StreamFollower):
         self._gate.restart()
         self._ngs_gate.restart()
 
-    def _begin(self) -> None:
-        if self._ngs is not None:
-            self._ngs.restart()
+    def _start_anew(self, count: int, reason: str) -> None:
         if self._commands is not None:
             self._commands.restart()
-        self._observer.reset()
-        self._frames.forget()
-        self._restart_gates()
+        super()._start_anew(count, reason)
 
     def _fall_back(self, reason: str) -> None:
         self._watchdog.fall_back(reason)
 
-    def _line(self) -> str:
-        line = super()._line()
-        return line if self._ngs is None else f"{line}; {self._ngs.line()}"
-
     def summary(self) -> dict[str, Any]:
         """Return counts, latencies [us] and errors [nm] so far, as JSON takes them."""
-        ngs = {} if self._ngs is None else {**self._ngs.summary(), "ngs_outliers": self._ngs_gate.outliers.tolist()}
-        ngs |= {} if self._commands is None else {"commands_missing": self._commands.missing}
-        return {**super().summary(), "outliers": self._gate.outliers.tolist(), **ngs, "fallbacks": self._watchdog.trips}
+        more = {} if self._ngs is None else {"ngs_outliers": self._ngs_gate.outliers.tolist()}
+        more |= {} if self._commands is None else {"commands_missing": self._commands.missing}
+        return {**super().summary(), "outliers": self._gate.outliers.tolist(), **more, "fallbacks": self._watchdog.trips}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from time import monotonic
 from typing import Any
@@ -10,11 +10,76 @@ from typing import Any
 import numpy as np
 
 from wfsobs.control.supervisor import SupervisedController
+from wfsobs.record import Sampling
 from wfsobs.streams.attach import SafeGate
 from wfsobs.streams.follower import StreamFollower
+from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.stream import SinkStream, SourceStream
 from wfsobs.streams.wiring import Wiring
 from wfsobs.typing import Array
+
+
+class SendingController:
+    """A controller that is told what the mirror was sent: in every frame the command before, unless `send` says another one.
+
+    A frame that is taken again, as `GoingBack` does, is so with what the mirror was sent after it.
+
+    Parameters
+    ----------
+    controller : SupervisedController
+        Before its first frame.
+    command : Array
+        What the mirror has, at rest, (n_modes,) [um].
+
+    Attributes
+    ----------
+    answer : Array
+        Command that the controller wants after the last frame, (n_modes,) [um].
+    command : Array
+        The last one that the mirror was sent, (n_modes,) [um].
+    """
+
+    def __init__(self, controller: SupervisedController, command: Array):
+        self.controller, self.command, self.answer = controller, command, command
+        self._commands: dict[int, Array] = {}
+        self.reset()
+
+    @property
+    def frame(self) -> int:
+        """Frames so far."""
+        return self.controller.frame
+
+    @property
+    def sampling(self) -> Sampling:
+        """Of the controller."""
+        return self.controller.controller.sampling
+
+    def update(self, y: Array, ngs: Array | None = None, /) -> None:
+        """Take the measurements of a frame, as `StepController.update`."""
+        self.answer = self.controller.update(y, ngs)
+        self.controller.amend(self._commands.setdefault(self.frame, self.command))
+        self._commands.pop(self.frame - (self.sampling.ratio or 1), None)
+
+    def send(self) -> None:
+        """Take the answer for sent."""
+        self.command = self._commands[self.frame] = self.answer
+        self.controller.amend(self.answer)
+
+    def reset(self) -> None:
+        """Begin anew with the mirror at rest where the last command has put it, and an NGS frame due next."""
+        self.controller.reset()
+        self._commands.clear()
+        ratio = self.sampling.ratio or 1
+        for _ in range(-(-self.controller.mirror.taps.size // ratio) * ratio):
+            self.update(np.full(self.sampling.n_modes, np.nan))
+
+    def state_dict(self) -> dict[str, Array]:
+        """Return a copy of the state of the controller."""
+        return self.controller.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Array], /) -> None:
+        """Go on from a state of `state_dict`."""
+        self.controller.load_state_dict(state)
 
 
 class ControllerAttachment(StreamFollower):
@@ -29,7 +94,7 @@ class ControllerAttachment(StreamFollower):
     sink : SinkStream
         Where the commands go.
     controller : SupervisedController
-        Of the LGS alone, before its first frame. No command exceeds the limits of its mirror.
+        Before its first frame. No command exceeds the limits of its mirror.
     gain : float
         What the mirror does of a command, with its sign.
     start : Array
@@ -38,6 +103,8 @@ class ControllerAttachment(StreamFollower):
         Modes, unit, when the stream is stuck, what no measurement can be; limits and gate are those of the controller.
     say : callable
         Receives one line about whatever happens.
+    ngs : NgsStream, optional
+        Residual measurements of an NGS, for a controller that takes them.
 
     Raises
     ------
@@ -54,13 +121,13 @@ class ControllerAttachment(StreamFollower):
         start: Array,
         wiring: Wiring,
         say: Callable[[str], None],
+        ngs: NgsStream | None = None,
     ):
-        super().__init__(source, sink, wiring, controller.controller.sampling.dt, say)
+        self._sender = SendingController(controller, np.nan_to_num(start) * wiring.unit * gain)
+        super().__init__(source, sink, wiring, self._sender, say, ngs)
         self._controller, self._gain = controller, gain
-        self._command: Array = np.nan_to_num(start) * wiring.unit * gain
         self._alarms: list[tuple[int, str]] = []
-        self._gate = SafeGate(replace(wiring, gate=None))
-        self._begin()
+        self._gate, self._ngs_gate = SafeGate(replace(wiring, gate=None)), SafeGate(replace(wiring, gate=None))
 
     @property
     def reason(self) -> str:
@@ -70,37 +137,32 @@ class ControllerAttachment(StreamFollower):
     @property
     def safe(self) -> Array:
         """What is left to the mirror, (n_modes,) [um]."""
-        return self._command / self._gain
+        return self._sender.command / self._gain
 
     def _fall_back(self, reason: str) -> None:
-        self._say(f"{reason}: the last command stays")
+        self._say(f"{reason}: on from the last command")
 
-    def _begin(self) -> None:
-        """Begin with the mirror at rest where the last command has put it."""
-        self._controller.reset()
-        for _ in self._controller.mirror.taps:
-            self._hold()
-
-    def _hold(self) -> None:
-        self._controller.update(self._missing)
-        self._controller.amend(self._command)
+    def _restart_gates(self) -> None:
+        for gate in (self._gate, self._ngs_gate):
+            gate.restart()
 
     def _answer(self, arrival: float, measurement: Array, missing: int) -> None:
-        before, known = self.reason, len(self._controller.alarms)
+        before, known, first = self.reason, len(self._controller.alarms), self._controller.frame
         for _ in range(missing):
-            self._hold()
+            self._frames.update(self._missing)
+        ngs, late = self._look_for_ngs()
         disturbance = measurement - self._controller.controller.correction
-        command = self._controller.update(self._gate.accept(measurement))
-        if self._send_in_time(command / self._gain):
-            self._command = command
-        else:
-            self._controller.amend(self._command)
+        self._frames.update(self._gate.accept(measurement), None if ngs is None else self._ngs_gate.accept(ngs), late)
+        if self._send_in_time(self._sender.answer / self._gain):
+            self._sender.send()
         self.tally.add(arrival, monotonic(), missing, disturbance, measurement)
+        self._frames.keep()
         if before and not self.reason:
             self._say("the controller closes the loop")
-        for _, reason in self._controller.alarms[known:]:
-            self._alarms.append((self._count, reason))
-            self._say(f"{reason}: an integrator closes the loop")
+        for frame, reason in self._controller.alarms[known:]:
+            if frame >= first:  # else one that is taken again
+                self._alarms.append((self._count, reason))
+                self._say(f"{reason}: an integrator closes the loop")
 
     def summary(self) -> dict[str, Any]:
         """Return counts, latencies [us], medians of measurement and disturbance [nm] so far, as JSON takes them."""

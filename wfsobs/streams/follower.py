@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from wfsobs.streams.going_back import GoingBack, StateObserver
 from wfsobs.streams.layout import Semaphore, StreamError
+from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.stream import SinkStream, SourceStream
 from wfsobs.streams.tally import Tally
 from wfsobs.streams.wiring import Wiring, check_elements
@@ -33,10 +35,12 @@ class StreamFollower(ABC):
         Where the answers go; None writes nothing.
     wiring : Wiring
         Modes, unit, limits.
-    dt : float
-        Time between two frames by the design of who answers [s].
+    observer : StateObserver
+        Who answers, before its first frame.
     say : callable
         Receives one line about whatever happens.
+    ngs : NgsStream, optional
+        The frames of an NGS.
 
     Raises
     ------
@@ -44,7 +48,15 @@ class StreamFollower(ABC):
         The streams have not the modes of the wiring.
     """
 
-    def __init__(self, source: SourceStream, sink: SinkStream | None, wiring: Wiring, dt: float, say: Callable[[str], None]):
+    def __init__(
+        self,
+        source: SourceStream,
+        sink: SinkStream | None,
+        wiring: Wiring,
+        observer: StateObserver,
+        say: Callable[[str], None],
+        ngs: NgsStream | None,
+    ):
         for stream in (source, sink):
             if stream is not None:
                 check_elements(stream, wiring.elements)
@@ -54,7 +66,9 @@ class StreamFollower(ABC):
         self._semaphore_number: int | None = None
         self._count, self._alive = source.first, 0.0
         self._is_stuck = self._is_overtaken = False
-        self.tally: Tally = Tally(dt)
+        self._ngs, self._frames = ngs, GoingBack(observer)
+        self._restart = observer.reset
+        self.tally: Tally = Tally(observer.sampling.dt)
 
     @property
     @abstractmethod
@@ -71,8 +85,8 @@ class StreamFollower(ABC):
         """Let what is safe go out for a while."""
 
     @abstractmethod
-    def _begin(self) -> None:
-        """Begin at a counter that has nothing to do with the one before."""
+    def _restart_gates(self) -> None:
+        """Begin anew with what guards who answers, which has done so."""
 
     @abstractmethod
     def _answer(self, arrival: float, measurement: Array, missing: int) -> None:
@@ -149,6 +163,26 @@ class StreamFollower(ABC):
             measurement = values[self._elements] * self._wiring.unit
         self._answer(arrival, measurement, lost)
 
+    def _look_for_ngs(self) -> tuple[Array | None, int]:
+        """Return the NGS measurement that is new, and how many frames ago it should have been there.
+
+        Where NGS frames have another place than the observer has been given them in, it starts anew.
+        """
+        if self._ngs is None:
+            return None, 0
+        write_time = self._source.write_time
+        if self._source.count != self._count:  # that of a newer frame: what the NGS has by now waits for it
+            return None, 0
+        found = self._ngs.look(self._count, write_time)
+        phase = self._ngs.phase
+        if phase is not None and self._frames.align((self._count - phase) % self._ngs.ratio):
+            self._restart_gates()
+            self._fall_back("the NGS frames have found their place")
+        if found is None:
+            return None, 0
+        late, ngs = found
+        return ngs, late
+
     def _send_in_time(self, answer: Array) -> bool:
         """Send it, unless a newer frame is there: the next answer follows at once, and who waits for it must not get this one."""
         self._is_overtaken = self._source.count != self._count and not self._is_overtaken
@@ -181,7 +215,11 @@ class StreamFollower(ABC):
 
     def _start_anew(self, count: int, reason: str) -> None:
         """Begin at a counter that has nothing to do with the one before, and say so."""
-        self._begin()
+        if self._ngs is not None:
+            self._ngs.restart()
+        self._restart()
+        self._frames.forget()
+        self._restart_gates()
         self._count = count
         self._say(reason)
         self._fall_back(reason)
@@ -191,8 +229,10 @@ class StreamFollower(ABC):
             self._sink.write(answer / self._wiring.unit, self._elements)
 
     def _line(self) -> str:
-        return self.tally.line(self.reason)
+        line = self.tally.line(self.reason)
+        return line if self._ngs is None else f"{line}; {self._ngs.line()}"
 
     def summary(self) -> dict[str, Any]:
         """Return counts, latencies [us] and errors [nm] so far, as JSON takes them."""
-        return {**self.tally.summary(), "output": self.reason or "on"}
+        ngs = {} if self._ngs is None else self._ngs.summary()
+        return {**self.tally.summary(), **ngs, "output": self.reason or "on"}
