@@ -190,8 +190,9 @@ class SupervisedController(StateArrays):
         seen = np.where(np.isfinite(seen), seen, np.nan)
         slow = None if ngs is None else np.where(np.isfinite(ngs), ngs, np.nan)
         command = self.controller.update(seen, slow, stars=stars)
-        error, plan = np.nan_to_num(seen), self.supervision
-        excess = not np.isnan(seen).any() and self._level.exceeds(error)  # a dropout is no small residual
+        is_missing, plan = np.isnan(seen), self.supervision
+        error = np.where(is_missing, 0.0, seen)
+        excess = not is_missing.any() and self._level.exceeds(error)  # a dropout is no small residual
         safe = self._within(plan.leak * self._command - plan.gain * error)
         if self._why:
             self._wait(command, safe, excess)
@@ -241,8 +242,11 @@ class SupervisedController(StateArrays):
 
     def _within(self, u: Array) -> Array:
         """Return the commands nearest to these within the limits of the mirror."""
-        near = np.clip(u, self._command - self.mirror.slew, self._command + self.mirror.slew)
-        return np.clip(near, -self.mirror.stroke, self.mirror.stroke)
+        mirror, last = self.mirror, self._command
+        if not mirror.has_limits:
+            return u
+        near = np.minimum(np.maximum(u, last - mirror.slew), last + mirror.slew)
+        return np.minimum(np.maximum(near, -mirror.stroke), mirror.stroke)
 
     def take_over(self, old: SupervisedController) -> None:
         """Go on where another design of the same controller is supervised. Raises StepError."""
