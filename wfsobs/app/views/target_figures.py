@@ -5,7 +5,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
-from typing import Final, Protocol
+from types import MappingProxyType
+from typing import Any, Final, Protocol
 
 import numpy as np
 import panel as pn
@@ -22,6 +23,19 @@ from wfsobs.evaluation.error_spectra import band_rms
 
 FLEXIBLE = ":host > div { flex: 1 1 240px; width: auto !important; }"
 """Style of what shares a row with a switch."""
+
+FONT = "Roboto, Helvetica, Arial, sans-serif"
+AXIS_TEXT: Mapping[str, Any] = MappingProxyType(
+    {
+        "major_label_text_font": FONT,
+        "major_label_text_font_size": "0.925em",
+        "axis_label_text_font": FONT,
+        "axis_label_text_font_size": "1em",
+        "axis_label_text_font_style": "normal",
+        "axis_label_standoff": 12,
+    }
+)
+"""Text of axes as the theme of the page sets it: where it sets another the page is laid out anew."""
 
 
 class Stretch:
@@ -114,8 +128,11 @@ class TargetFigures(ABC):
 
     def pane(self, target: str) -> pn.pane.Bokeh:
         """Return the figure of one target."""
-        self._drawings[target].figure.sizing_mode = "stretch_both"
-        return pn.pane.Bokeh(self._drawings[target].figure, sizing_mode="stretch_both", margin=0)
+        fig = self._drawings[target].figure
+        fig.sizing_mode = "stretch_both"
+        for axis in fig.axis:
+            axis.update(**AXIS_TEXT)
+        return pn.pane.Bokeh(fig, sizing_mode="stretch_both", margin=0)
 
     def show(self, visible: bool) -> None:
         """Draw what has come meanwhile, and go on while visible."""
