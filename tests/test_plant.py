@@ -17,8 +17,11 @@ from wfsobs.cli import main
 from wfsobs.control.true_plant import ActingPlant, TruePlant
 from wfsobs.identification.mirror_response import few_lags, second_order
 from wfsobs.identification.plant import GroupPlant, PlantNumber, identify_plant, plant_lines
+from wfsobs.identification.probe import design_probe
 from wfsobs.record import Record, RecordError
 from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.wiener import circle_mean
+from wfsobs.simulation.true_spectra import true_spectra
 from wfsobs.telemetry.records import save_record
 from wfsobs.typing import Array
 
@@ -228,6 +231,14 @@ def test_a_probe_costs_and_tells_what_its_design_says(tmp_path: Path) -> None:
     for (n, value), bound in zip(numbers, design["bound"].values(), strict=True):
         assert right(n, value) and n.sd is not None
         assert 0.3 * bound < n.sd < 1.1 * bound, "the loop's own motion tells as well, and both modes have one delay"
+
+
+def test_a_probe_of_a_mirror_at_rest_is_all_in_the_residual() -> None:
+    """Nothing answers it: every mode's variance grows by that of the probe."""
+    scenario = PRESETS["paper"]().replace({"loop.closed": False})
+    found = design_probe(scenario, 20.0, {"delay_frames": 0.03, "gain": 0.02, "rotation_deg": 1.0})
+    quietest = min(circle_mean(true_spectra(scenario, mode).total[0]) for mode in range(2))
+    assert (1.0 + found.cost) ** 2 - 1.0 == pytest.approx(found.rms**2 / quietest, rel=0.01), "to the bin at the lowest frequency"
 
 
 def test_text() -> None:

@@ -75,7 +75,8 @@ def design_probe(scenario: Scenario, seconds: float, accuracy: Mapping[str, floa
         for s in spectra:
             omega = np.pi * np.arange(s.measurement.size) / (s.measurement.size - 1)
             forgets = 1.0 - scenario.loop.leak * np.exp(-1j * omega)
-            sensitivity = forgets / (forgets + scenario.loop.gain * scenario.loop.closed * np.exp(-2j * omega))
+            acts = scenario.loop.gain * scenario.loop.closed * np.exp(-2j * omega)
+            sensitivity = np.divide(forgets, forgets + acts, out=np.ones_like(forgets), where=acts != 0.0)
             own = residual_density(1.0 - sensitivity, s.total[0], s.total[1], s.measurement)
             power = np.abs(sensitivity) ** 2 * np.where(omega >= 2.0 * np.pi * share, 0.5 / (0.5 - share), 0.0)
             excess.append(circle_mean(power) / circle_mean(own))
