@@ -199,6 +199,7 @@ def test_the_matrices_for_compass(tmp_path: Path, controller: str, whole: tuple)
         (("lqg-multirate-multi", "compass"), "repeats every 5 steps"),
         (("gpr-online", "specula"), "no such controller"),
         (("integrator+gpr-online", "c99"), "no linear form"),
+        (("lqg-kf-adaptive", "c99"), "there is no law to write, or none that stays as it is"),
         (("none", "npz"), "there is no law"),
         (("integrator", "npz", "--set", "control.stroke=1"), "limits of the mirror"),
         (("kf-lgs", "npz"), "no such controller"),

@@ -89,11 +89,10 @@ class LinearDesign:
 def linear_design(controller: StepController) -> LinearDesign:
     """Return a controller as matrices. Raises StepError with the reason where it is none."""
     law = controller.law
-    if law is None:
-        raise StepError(f"{controller.id}: there is no law to write")
     if controller.ahead is not None:
         raise StepError(f"{controller.id}: a prediction by Gaussian process regression has no linear form")
-    assert isinstance(law, (KalmanLaws, LinearLaws, Integrators))
+    if not isinstance(law, (KalmanLaws, LinearLaws, Integrators)):
+        raise StepError(f"{controller.id}: there is no law to write, or none that stays as it is")
     if isinstance(law, Integrators) and controller.plant.mirror.has_limits:
         raise StepError(f"{controller.id}: limits of the mirror stop an integrator, which no linear form does: leave them at 0")
     lgs, ngs = ({}, {}) if controller.bridges is None else (bridge.gains for bridge in controller.bridges)
