@@ -180,6 +180,8 @@ def run(
     if history:
         show_over_time(history, as_json)
         return
+    for name in sorted(set(budget_of) - {e.observer for e in results[0].estimates}):
+        click.echo(f"wfsobs: --budget-of {name}: it did not run", err=True)
     budgets = find_budgets(results[0], budget_of or None) if budget or budget_of else []
     all_rows = [row for it in results for row in score_rows(it.scores, it.scenario.run.seed)]
     show(add_budgets(all_rows, budgets), as_json)
