@@ -6,10 +6,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pandas
 import pytest
 
 from tests.records import ON_PAPER
-from wfsobs import PRESETS, Record, Scenario, SettingError, observe, run, simulate
+from wfsobs import PRESETS, Record, RecordError, Scenario, SettingError, observe, run, simulate
 from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.result import Failure
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, BOUNDS, COMMON_BOUNDS, LOOP, PREDICTION, RESIDUAL, SCORED
@@ -234,6 +235,45 @@ def test_the_record_overrides_the_scenario_where_it_states_something() -> None:
     assert as_stated(simulate(own), own) is own
     without_ngs = replace(made, y_ngs=None, ratio=None)
     assert as_stated(without_ngs, scenario()).sensors.exposure_ratio == scenario().sensors.exposure_ratio
+
+
+def test_a_record_of_more_modes_than_the_settings_have() -> None:
+    three = np.random.default_rng(1).standard_normal((1000, 3))
+    result = observe(Record(three, 0.0 * three, 1e-3), scenario(), observers="kf-lgs")
+    assert result.scenario.telescope.radial_order == 2 and {s.mode for s in result.scores} == {"tip", "tilt", "defocus"}
+    with pytest.raises(SettingError, match=r"telescope\.radial_order = 7: takes a whole number from 1 to 6"):
+        observe(Record(np.zeros((9, 28)), np.zeros((9, 28)), 1e-3), scenario())
+
+
+@pytest.mark.parametrize("kind", [list, "float32", pandas.DataFrame, np.asfortranarray])
+def test_a_record_of_numbers_of_any_kind(kind: Any) -> None:
+    y = np.random.default_rng(1).integers(-99, 99, (500, 2)).astype(float)
+    other = y.astype(kind) if isinstance(kind, str) else kind(y.tolist())
+    one, two = (observe(Record(x, x, 1e-3), scenario(), observers=["kf-lgs"]) for x in (y, other))
+    np.testing.assert_array_equal(one.estimates[0].values, two.estimates[0].values)
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"y_lgs": np.zeros(9)}, r"y_lgs has shape \(9,\); expected \(n_steps, n_modes\)"),
+        ({"u": np.zeros((8, 2))}, r"u has shape \(8, 2\); expected \(9, 2\), that of y_lgs"),
+        ({"turbulence": np.zeros((9, 1))}, r"turbulence has shape \(9, 1\); expected \(9, 2\), that of y_lgs"),
+        ({"y_lgs": [["a", "b"]]}, "y_lgs holds no numbers, or rows of unlike lengths"),
+        ({"y_lgs": [[1.0], [1.0, 2.0]]}, "y_lgs holds no numbers, or rows of unlike lengths"),
+        ({"u": np.full((9, 2), np.inf)}, "u holds infinite numbers; a missing sample is NaN"),
+        ({"dt": 0}, "dt takes a time step above 0 s, not 0"),
+        ({"dt": np.nan}, "dt takes a time step above 0 s, not nan"),
+        ({"dt": "1 ms"}, r"dt takes a time step \[s\], not '1 ms'"),
+        ({"delay": 1.5}, "delay takes a whole number of steps from 1, not 1.5"),
+        ({"delay": 0}, "delay takes a whole number of steps from 1, not 0"),
+    ],
+)
+def test_what_is_no_record_is_one_line(change: dict[str, Any], line: str) -> None:
+    good: dict[str, Any] = {"y_lgs": np.zeros((9, 2)), "u": np.zeros((9, 2)), "dt": np.array(1e-3)}
+    assert Record(**good).dt == 1e-3
+    with pytest.raises(RecordError, match=f"^{line}$"):
+        Record(**(good | change))
 
 
 def test_a_record_too_slow_for_the_settings_is_refused() -> None:

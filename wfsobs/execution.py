@@ -38,6 +38,7 @@ def each_estimate(
     memo       : estimates that are known by what they depend on; they come first, without a run
     """
     scenario = scenario.before_events  # no observer is told
+    observers = [observers] if isinstance(observers, str) else observers
     unknown = set(observers or ()) - set(OBSERVERS)
     if unknown:
         raise SettingError(f"observer {sorted(unknown)[0]!r}: no such observer; there are {', '.join(OBSERVERS)}")

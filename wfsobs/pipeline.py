@@ -22,6 +22,7 @@ from wfsobs.priors_from.training import trained_until, with_training
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
+from wfsobs.sensors.modes import HIGHEST_ORDER, order_of
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
 
@@ -82,7 +83,7 @@ def observe(
 ) -> Result:
     """Run observers on a record.
 
-    The time step and the exposure ratio of the record replace those of the scenario.
+    The time step and the exposure ratio of the record replace those of the scenario, as do its modes where they are more.
 
     Parameters
     ----------
@@ -154,7 +155,9 @@ def _from(estimate: Estimate, first: int) -> Estimate:
 
 
 def as_stated(record: Record, scenario: Scenario) -> Scenario:
-    """Return the scenario with the time step and exposure ratio of the record."""
+    """Return the scenario with the time step, the exposure ratio and at least the modes of the record. Raises SettingError."""
+    if record.n_modes > len(scenario.modes):
+        scenario = scenario.replace({"telescope.radial_order": order_of(record.n_modes) or HIGHEST_ORDER + 1})
     return as_sampled(scenario, record.sampling)
 
 

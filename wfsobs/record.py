@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from wfsobs.notebook import PlotAccessor, html_table, import_extra
 from wfsobs.signal.gate import GateSettings, OutlierGate, frame_mean_of, let_through
@@ -175,6 +176,22 @@ class Record(Signals):
     gate: GateSettings | None = field(default=None, kw_only=True)
     plot: ClassVar[PlotAccessor] = PlotAccessor()
 
+    def __post_init__(self) -> None:
+        """Take lists, tables and numbers of any kind. Raises RecordError where they are no record."""
+        for name in ("y_lgs", "u", "y_ngs", "open_loop_y", "turbulence", "vibration"):
+            if (values := getattr(self, name)) is not None:
+                object.__setattr__(self, name, _numbers(name, values))
+                if (shape := getattr(self, name).shape) != self.y_lgs.shape:
+                    raise RecordError(f"{name} has shape {shape}; expected {self.y_lgs.shape}, that of y_lgs")
+        try:
+            object.__setattr__(self, "dt", float(self.dt))
+        except (TypeError, ValueError):
+            raise RecordError(f"dt takes a time step [s], not {self.dt!r}") from None
+        if not 0.0 < self.dt < np.inf:
+            raise RecordError(f"dt takes a time step above 0 s, not {self.dt:g}")
+        if self.delay < 1 or self.delay % 1:
+            raise RecordError(f"delay takes a whole number of steps from 1, not {self.delay:g}")
+
     def __repr__(self) -> str:
         return f"Record({', '.join(f'{what} {value}' for what, value in self._summary())})"
 
@@ -278,6 +295,19 @@ class Record(Signals):
         if target == "total":
             return None if self.turbulence is None or self.vibration is None else self.turbulence + self.vibration
         return {"turbulence": self.turbulence, "vibration": self.vibration}[target]
+
+
+def _numbers(name: str, values: ArrayLike) -> Array:
+    """Return a signal as float64. Raises RecordError."""
+    try:
+        out = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise RecordError(f"{name} holds no numbers, or rows of unlike lengths") from None
+    if out.ndim != 2:
+        raise RecordError(f"{name} has shape {out.shape}; expected (n_steps, n_modes)")
+    if np.isinf(out).any():
+        raise RecordError(f"{name} holds infinite numbers; a missing sample is NaN")
+    return out
 
 
 def _copy(x: Array | None) -> Array | None:

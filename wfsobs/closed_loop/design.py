@@ -124,6 +124,7 @@ def design_mode(controller: str, scenario: Scenario, mode: int, spectra: Spectra
 
 def select_controllers(controllers: Sequence[str] | None) -> list[Controller]:
     """Return the controllers of these ids, in the order of the registry; all for None. Raises SettingError."""
+    controllers = [controllers] if isinstance(controllers, str) else controllers
     unknown = set(controllers or ()) - set(CONTROLLERS)
     if unknown:
         raise SettingError(f"controller {sorted(unknown)[0]!r}: no such controller; there are {', '.join(CONTROLLERS)}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.signal import get_window, welch
 
 from wfsobs.typing import Array
@@ -13,15 +14,15 @@ def rms(x: Array) -> float:
     return float(np.sqrt(np.mean(np.square(x)))) if x.size else 0.0
 
 
-def psd(x: Array, dt: float, *, resolution: float = 0.5) -> tuple[Array, Array]:
+def psd(x: ArrayLike, dt: float, *, resolution: float = 0.5) -> tuple[Array, Array]:
     """Estimate the power spectral density by Welch's method.
 
     Averages half-overlapping Hann windows of 1 / resolution seconds, or of the whole record if that is shorter.
 
     Parameters
     ----------
-    x : Array
-        Signals, (n, n_columns), without NaN.
+    x : array_like
+        Signals, (n,) or (n, n_columns), without NaN.
     dt : float
         Time step [s].
     resolution : float
@@ -34,7 +35,8 @@ def psd(x: Array, dt: float, *, resolution: float = 0.5) -> tuple[Array, Array]:
     density : Array
         One-sided density [unit^2/Hz], a column per signal.
     """
-    window = min(round(1.0 / (resolution * dt)), x.shape[0])
+    x = np.asarray(x, dtype=float)
+    window = min(round(1.0 / (resolution * dt)), len(x))
     frequency, density = welch(x, fs=1.0 / dt, nperseg=window, axis=0, detrend="constant")
     return frequency, density
 
