@@ -219,6 +219,16 @@ def test_bars_are_the_scores_and_their_intervals(result: wfsobs.Result) -> None:
     assert colours == [look(s.observer).light for s in scores]
 
 
+def test_bars_are_seen_where_an_interval_is_wide(result: wfsobs.Result) -> None:
+    """Of a second of turbulence the scatter is hardly known: it is up to thousands of times the rms."""
+    wide = [replace(s, interval=(0.01 * s.rms, 100.0 * s.rms)) for s in result.scores]
+    for scores, is_cut in ((wide, True), (result.scores, False)):
+        figure = replace(result, scores=scores).plot.errors(target="vibration")
+        longest = max(1e3 * s.rms for s in scores if (s.target, s.mode) == ("vibration", "tip"))
+        low, high = to_matplotlib(figure).axes[0].get_xlim()
+        assert (low, high) == ((0.0, 2.0 * longest) if is_cut else (low, high)) and longest < high <= 2.0 * longest
+
+
 def pixels(paper: Any) -> np.ndarray:
     """(height, width, 3) colours of a picture, from the bottom."""
     canvas = FigureCanvasAgg(paper)
@@ -361,6 +371,8 @@ def test_a_paper_figure_is_written_as_every_kind_of_file(name: str, suffix: str,
             save_figure(figure, path)
         return
     save_figure(figure, path)
+    with pytest.raises(wfsobs.SettingError, match=r"takes a width and a height from 20 to 1000 mm, not -5 and 0"):
+        save_figure(figure, path, width=-5.0)
     content = path.read_bytes()
     begins = {"pdf": b"%PDF", "svg": b"<?xml", "png": b"\x89PNG", "pgf": b"%% Creator", "html": b"<!DOCTYPE html>"}[suffix]
     assert content.startswith(begins)

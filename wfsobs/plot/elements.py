@@ -44,6 +44,9 @@ COLUMN, PAGE = 88.0, 180.0
 NARROW = 40.0
 """Least width of one plot in a file [mm], of bars with their names twice that; what does not fit into a row begins another."""
 
+LEAST, MOST = 20.0, 1000.0
+"""Least and largest width and height of a file [mm]."""
+
 HEIGHT, LINE = 40.0, 3.3
 """Height of one plot in a file, and of a line of its legend or a bar [mm]."""
 
@@ -201,12 +204,16 @@ def save_figure(figure: Any, path: str | Path, *, width: float = COLUMN, height:
     Raises
     ------
     SettingError
-        The suffix is another, or PGF is asked for without LaTeX, by which Matplotlib measures its text.
+        The suffix or the size is none of a figure, or PGF is asked for without LaTeX, by which Matplotlib measures its text.
     OSError
         The file cannot be written.
     """
     path = Path(path)
     check_suffix(path)
+    if not (LEAST <= width <= MOST and (height == 0.0 or LEAST <= height <= MOST)):
+        raise SettingError(
+            f"{path}: a figure takes a width and a height from {LEAST:g} to {MOST:g} mm, not {width:g} and {height:g}"
+        )
     if path.suffix == ".html":
         page = file_html(hv.renderer("bokeh").get_plot(figure).state, INLINE, path.stem)
         write_whole(path, lambda file: file.write(page.encode()))

@@ -47,6 +47,9 @@ from wfsobs.units import unit_text
 NM = 1e3
 """Nanometres in a micrometre."""
 
+WIDEST = 2.0
+"""End of the axis over the longest bar where an interval goes beyond: in short records it can be a hundred bars long."""
+
 SIGNALS = {
     "z": Look("Pseudo-open-loop LGS", "#8A8A8A"),
     "y_lgs": Look("Residual LGS", "#FF6600"),
@@ -150,6 +153,9 @@ class ResultPlots:
                 x = quantity(f"rms {of} {name}", "nm", f"rms error, {of}, {name}")
                 of_rows = [(row_label(s.observer), [NM * s.rms], [look(s.observer).light]) for s in rows]
                 ends = [None if s.interval is None else (NM * s.interval[0], NM * s.interval[1]) for s in rows]
+                most = WIDEST * NM * rows[-1].rms
+                if any(end is not None and end[1] > most for end in ends):
+                    x.range = (0.0, most)
                 figures.append(overlay([draw_bars(of_rows, x), draw_intervals(ends, x)], rows=len(rows)))
         return stack(_some(figures, f"error of {target or 'any target'}"))
 
