@@ -86,6 +86,8 @@ def design(
     settings = scenario or (prior if isinstance(prior, Scenario) else Scenario())
     sampling = sampling or _sampling(prior, settings)
     _check_sampling(name, sampling)
+    if not horizon >= 0.0:
+        raise StepError(f"{name}: horizon = {horizon:g}: takes 0 frames or more")
     if not isinstance(prior, (Prior, Scenario)) and len(prior.modes) < sampling.n_modes:
         raise StepError(f"{name}: the identification has {len(prior.modes)} modes, the loop has {sampling.n_modes}")
     settings = as_sampled(settings, sampling)

@@ -349,6 +349,8 @@ def test_a_horizon_that_cannot_be_is_refused() -> None:
         wfsobs.design("ridge-30", scenario, train=record.training, horizon=0.5)
     with refused("band-passes predict nothing"):
         wfsobs.design("butterworth-cl", scenario, horizon=1)
+    with refused("horizon = -1: takes 0 frames or more"):
+        wfsobs.design("kf-lgs", scenario, horizon=-1)
 
 
 @pytest.mark.parametrize(
