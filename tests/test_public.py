@@ -9,6 +9,7 @@ import sys
 import tomllib
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -162,6 +163,21 @@ def test_a_record_is_loaded_from_its_file(result: wfsobs.Result, tmp_path: Path)
     turned = wfsobs.load(tmp_path / "bare.npz", rate=1000.0, unit="nm", command_sign=-1)
     assert turned.dt == 1e-3
     np.testing.assert_allclose(turned.u, 1e-3 * result.record.u, rtol=1e-12)  # the rounding of one product
+    micron = wfsobs.load(tmp_path / "bare.npz", rate=1000.0, unit="micron", command_sign=-1)
+    np.testing.assert_array_equal(micron.u, result.record.u)
+
+
+@pytest.mark.parametrize(
+    ("stated", "line"),
+    [
+        ({"unit": "furlong"}, "unit = 'furlong': takes one of um, nm, mas, arcsec, rad"),
+        ({"rate": np.nan}, "rate = nan: takes a number above 0"),
+        ({"rail": -1.0}, "rail = -1: takes a number above 0"),
+    ],
+)
+def test_what_cannot_be_stated_of_a_file_is_one_line(stated: dict[str, Any], line: str) -> None:
+    with pytest.raises(wfsobs.RecordError, match=f"^{line}$"):
+        wfsobs.load("night.npz", **stated)
 
 
 def test_the_loop_is_closed_on_what_is_simulated() -> None:

@@ -31,7 +31,7 @@ from wfsobs.telemetry.formats.npz import write as write_npz
 from wfsobs.telemetry.intake import DeclaredFormat, to_record
 from wfsobs.telemetry.modal import LoopMatrix, matrix_of, split_source
 from wfsobs.typing import Array
-from wfsobs.units import UNITS, micrometres_per
+from wfsobs.units import UNITS, micrometres_per, parse_unit
 
 MOST_BYTES = 4_000_000_000
 """Maximum bytes of numbers in a file."""
@@ -205,6 +205,12 @@ def load(
     RecordError
         The file cannot be used; one line naming what, where and what is expected.
     """
+    if unit is not None and parse_unit(str(unit)) is None:
+        raise RecordError(f"unit = {unit!r}: takes one of {', '.join(UNITS)}")
+    for name, value in (("rate", rate), ("rail", rail)):
+        if value is not None and not value > 0:
+            raise RecordError(f"{name} = {value:g}: takes a number above 0")
+    unit = unit and parse_unit(unit)
     gain = None if command_gain is None else tuple(np.atleast_1d(command_gain).tolist())
     matrices = [read_loop_matrix(matrix) for matrix in (reconstructor, command_modes)]
     stated = DeclaredFormat(unit, command_sign, command_delay, rate, columns or {}, trust, gain, rail, open_loop, *matrices)
