@@ -16,7 +16,7 @@ from wfsobs.app.service import Service
 from wfsobs.app.work import compute
 from wfsobs.scenario import Scenario
 
-MODELS = 240
+MODELS = 200
 """The most that the first picture may be made of."""
 
 

@@ -89,7 +89,7 @@ PAGES = """
 """
 """The pages scroll where there is no room for all of them."""
 
-BODY = ":host { gap: 10px; max-height: none !important; }"
+BODY = ":host { gap: 10px; max-height: none !important; } .scroll-button { display: none; }"
 """As long as its contents: the toolkit's limit is the window, which all boxes inside take over, and longer ones overlap."""
 
 STALE = "These results are not those of the settings."
@@ -169,8 +169,6 @@ class Dashboard:
             self._switches(),
             self.upload.picker,
             self.upload.room,
-            self.alert,
-            self.stale,
             self.keyboard,
             self.pages.view,
             self.frame,
@@ -206,11 +204,14 @@ class Dashboard:
         return page
 
     def complete(self) -> None:
-        """Make what the first picture does not need: the settings, whose drawer has its width, and figures further down."""
+        """Make what the first picture does not need: the settings, whose drawer has its width, and what is further down."""
         if len(self.drawer):
             return
         with pn.io.hold():
             self.explore.complete()
+            self.pages.complete()
+            for it in (self.alert, self.stale):
+                self.body.insert(self.body.index(self.keyboard), it)
             self.drawer[:] = [self.controls.view()]
 
     def _stand(self) -> None:

@@ -44,7 +44,7 @@ from wfsobs.evaluation.error_spectra import Theory
 from wfsobs.observers.base import TARGETS, VIBRATION
 
 HEAD = grid_style("minmax(0, 2fr) minmax(0, 3fr)")
-GAP = ":host { gap: 10px; }"
+GAP = ":host { gap: 10px; } .scroll-button { display: none; }"
 WRAPPED = ":host { flex-wrap: wrap; gap: 8px; align-items: center; }"
 SWITCHES = """
 :host { gap: 8px; align-items: center; width: max-content !important; }
@@ -76,18 +76,13 @@ class Explore(Page):
         self.table: Final = Table(run, display, seeds)
         self.pinning: Final = Pinning(run, display, history)
         self.rooms: dict[str, pn.Column] = {}
-        self._later: list[tuple[pn.Column, pn.pane.Bokeh]] = []
         self.editors: dict[str, SpectrumEditor] = {}
+        self.sections: Final = pn.Column(self._section(TARGETS[0]), **WIDE, stylesheets=[GAP])
         display.param.watch(self._edit, "editing")
 
     def view(self) -> pn.Column:
-        """Return the contents of the page."""
-        return pn.Column(
-            *(self._section(target) for target in TARGETS),
-            box("RMS errors", self._above_table(), self.table.pane),
-            **WIDE,
-            stylesheets=[GAP],
-        )
+        """Return the contents of the page: what is seen first, until it is completed."""
+        return self.sections
 
     def show(self, visible: bool) -> None:
         """Draw what has come meanwhile, and go on while visible."""
@@ -134,31 +129,18 @@ class Explore(Page):
         cards.on_main = lambda: self.lines.reset(target)
         cards.on_all = self.budgets.ask_for_all
         marks = MARKS if target == VIBRATION else ""
-        traces, self.rooms[target] = (
-            self._room(target, *parts)
-            for parts in (
-                (_caption("Time trace"), self.traces.pane(target)),
-                (_caption("Spectrum", marks), self.spectra.pane(target)),
-            )
-        )
+        traces = pn.Column(_caption("Time trace"), self.traces.pane(target), **TALL)
+        self.rooms[target] = pn.Column(_caption("Spectrum", marks), self.spectra.pane(target), **TALL)
         figures = pn.Column(traces, self.rooms[target], **WIDE, stylesheets=[HALVES])
         window = [self._tick("window_spectra")] if target == TARGETS[0] else []
         below = pn.Row(self.stretches[target].pane, *window, **WIDE, stylesheets=[WRAPPED])
         head = pn.Column(self.verdicts[target].pane, cards, **WIDE, stylesheets=[HEAD, BELOW_FIGURES])
         return pn.Column(head, figures, below, **WIDE, stylesheets=sheets("box"))
 
-    def _room(self, target: str, caption: HtmlText, pane: pn.pane.Bokeh) -> pn.Column:
-        """Lay out a figure; those of the first target stand there at once, the others have their room."""
-        if target == TARGETS[0]:
-            return pn.Column(caption, pane, **TALL)
-        self._later.append((room := pn.Column(caption, **TALL), pane))
-        return room
-
     def complete(self) -> None:
-        """Put the figures further down into their rooms."""
-        for room, pane in self._later:
-            room.insert(1, pane)
-        self._later = []
+        """Put what is further down below the first target."""
+        if len(self.sections) == 1:
+            self.sections.extend([*map(self._section, TARGETS[1:]), box("RMS errors", self._above_table(), self.table.pane)])
 
     def _edit(self, *_: object) -> None:
         """Make the handles when they are first wanted, and room for what stands below them."""

@@ -91,7 +91,7 @@ class Pages(param.Parameterized):
         self.param["current"].objects = [*known.values()]
         self.by_name: dict[str, Page] = {EXPLORE: explore}
         self.rooms: Final = {
-            EXPLORE: pn.Column(self.suggestion.view, explore.view(), **WIDE),
+            EXPLORE: pn.Column(explore.view(), **WIDE),
             **{name: pn.Column(visible=False, sizing_mode="stretch_width", margin=0) for name in self._makers},
         }
         self.switch: Final = pmui.RadioButtonGroup.from_param(
@@ -104,6 +104,10 @@ class Pages(param.Parameterized):
     def page(self) -> Page:
         """The page that is shown."""
         return self.by_name[self.current]
+
+    def complete(self) -> None:
+        """Make what the first picture does not need."""
+        self.rooms[EXPLORE].insert(0, self.suggestion.view)
 
     def _identify_page(self) -> IdentifyPage:
         page = self._page_of(IDENTIFY)
