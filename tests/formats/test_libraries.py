@@ -432,6 +432,15 @@ def test_what_is_converted_is_what_it_was(tmp_path: Path, ending: str) -> None:
     }
 
 
+def test_what_is_missing_is_said_and_stays_missing(tmp_path: Path) -> None:
+    y = np.random.default_rng(1).standard_normal((300, 2))
+    y[7] = np.nan
+    wfsobs.save(tmp_path / "gap.npz", Record(y, np.zeros_like(y), 1e-3))
+    done = CliRunner().invoke(main, ["convert", str(tmp_path / "gap.npz"), str(tmp_path / "gap.csv")])
+    assert done.stderr == f"wfsobs: {tmp_path / 'gap.npz'}: 1 of 300 frames are missing\n"
+    np.testing.assert_array_equal(wfsobs.load(tmp_path / "gap.csv").y_lgs, y)
+
+
 def test_formats_that_are_only_read(tmp_path: Path) -> None:
     for ending in (".npy", ".sav"):
         with pytest.raises(RecordError, match="files of its ending are read, not written"):

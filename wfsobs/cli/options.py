@@ -235,11 +235,7 @@ def load_with_delay(
     if record.origin:
         click.echo(f"wfsobs: {record_file}: read as {record.origin}", err=True)
     if record.missing:
-        click.echo(
-            f"wfsobs: {record_file}: {record.missing} of {record.n_steps} frames are missing; they are filled by "
-            "prediction and count in no score of one",
-            err=True,
-        )
+        click.echo(f"wfsobs: {record_file}: {record.missing} of {record.n_steps} frames are missing", err=True)
     expected = erfc(record.gate.level / sqrt(2.0)) * record.n_steps * record.n_modes if record.gate else 0.0
     if record.gate and record.outliers > expected + 3.0 * sqrt(expected):
         what = "missing" if record.gate.action == "reject" else "clipped"
