@@ -179,8 +179,23 @@ def test_what_is_not_identifiable() -> None:
     record = closed_loop(1200, 2.0, np.eye(2))
     with pytest.raises(RecordError, match="has 900 frames, the plant needs 1000"):
         identify_plant(Record(record.y_lgs[:900], record.u[:900], DT))
-    with pytest.raises(RecordError, match="the commands of tip and tilt do not move"):
-        identify_plant(Record(record.y_lgs, 0.0 * record.u, DT))
+
+
+def test_signals_that_tell_nothing_of_a_plant_are_named() -> None:
+    record = closed_loop(2000, 2.0, np.eye(2))
+    y, u, tip, same = record.y_lgs, record.u, np.array([1.0, 0.0]), np.ones((2, 2)) * [[1.0], [0.0]]
+    gone, frozen = np.full_like(y, np.nan), np.where(np.arange(len(y))[:, None] < 1500, y, y[1500])
+    for measured, sent, reason in (
+        (y, 0.0 * u, "the commands of tip and tilt do not move"),
+        (y, u * tip, "the commands of tilt do not move"),
+        (0.0 * y + 0.1, u, "the measurements of tip and tilt do not move"),
+        (gone, u, "the measurements of tip and tilt do not move"),
+        (y * tip, u, "the measurements of tilt do not move"),
+        (y @ same, u, "the measurements of tip and tilt are the same"),
+        (frozen, u, "of tip and tilt stay the same for 500 frames from frame 1500 on: leave out what is not measured"),
+    ):
+        with pytest.raises(RecordError, match=reason):
+            identify_plant(Record(measured, sent, DT))
 
 
 @pytest.mark.slow

@@ -36,6 +36,9 @@ from wfsobs.typing import Array
 SHORTEST, MOST_STEPS = 1000, 100_000
 """Minimum frames of a record; frames that are looked at, its first."""
 
+FROZEN = 100
+"""Frames in a row with the same measurement that are taken for one that was not renewed."""
+
 STARTS, REFINED, SAME, REFINEMENTS = (1.25, 2.25, 3.25, 4.5), 2, 0.05, 3
 """Delays at which a search starts [frames]; how many of the likeliest maxima are then fitted with all peaks, and how often;
 distance below which two maxima are one."""
@@ -165,7 +168,7 @@ def identify_plant(record: Record, watch: Watch = QUIET) -> tuple[GroupPlant, ..
     Raises
     ------
     RecordError
-        The record is too short, or its commands do not move.
+        The record is too short, or its commands or measurements do not move.
     Cancelled
         `watch` asks to stop.
     """
@@ -177,11 +180,28 @@ def identify_plant(record: Record, watch: Watch = QUIET) -> tuple[GroupPlant, ..
     for i, columns in enumerate(groups):
         watch.check()
         names = tuple(modes_up_to(HIGHEST_ORDER)[c].name for c in columns)
-        if (np.ptp(u[:, columns], axis=0) == 0).any():
-            raise RecordError(f"the commands of {' and '.join(names)} do not move: there is no plant to identify")
+        _check_motion(names, y[:, columns], u[:, columns])
         out.append(_identify_group(names, y[:, columns], u[:, columns], record.dt))
         watch.step((i + 1) / len(groups))
     return tuple(out)
+
+
+def _check_motion(names: tuple[str, ...], y: Array, u: Array) -> None:
+    """Raise RecordError where commands or measurements of a group do not tell what the plant does."""
+    for signals, what in ((u, "commands"), (y, "measurements")):
+        moves = np.fmax.reduce(signals) > np.fmin.reduce(signals)
+        if still := [name for name, it_does in zip(names, moves, strict=True) if not it_does]:
+            raise RecordError(f"the {what} of {' and '.join(still)} do not move: there is no plant to identify")
+        if len(names) == 2 and np.array_equal(signals[:, 0], signals[:, 1], equal_nan=True):
+            raise RecordError(f"the {what} of {' and '.join(names)} are the same: there is no plant to identify")
+    changes = np.flatnonzero(np.append(True, (np.diff(y, axis=0) != 0).any(axis=1)))  # NaN is a change
+    length = np.diff(np.append(changes, len(y)))
+    longest = int(length.argmax())
+    if length[longest] > FROZEN:
+        raise RecordError(
+            f"the measurements of {' and '.join(names)} stay the same for {length[longest]} frames "
+            f"from frame {changes[longest]} on: leave out what is not measured"
+        )
 
 
 def plant_dict(groups: Sequence[GroupPlant]) -> dict[str, Any]:
