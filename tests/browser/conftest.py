@@ -238,13 +238,13 @@ DRAWN = """() => {
   const parse = (text) => new DOMParser().parseFromString(text, "text/html").body
   const table = (root) => {
     for (const it of root.querySelectorAll("*")) {
-      if (it.matches("table.rms") && it.querySelector("[data-observer], .target")) return it
+      if (it.matches("[aria-label='RMS errors'] table.rms") && it.querySelector("[data-observer], .target")) return it
       const below = it.shadowRoot && table(it.shadowRoot)
       if (below) return below
     }
   }
   const models = [...Bokeh.index.roots[0].model.document.all_models]
-  const said = models.map((m) => m.html).find((text) => typeof text === "string" && /table class="rms/.test(text))
+  const said = models.map((m) => m.html).find((text) => typeof text === "string" && /aria-label="RMS errors"/.test(text))
   return said && table(document)?.textContent === table(parse(said))?.textContent
 }"""
 """Whether the table stands on the page as its model has it: on a busy machine that takes a while."""
