@@ -39,6 +39,7 @@ class Frames:
     """A stream in memory: frames that the test gives, or those that have been written."""
 
     path, first, is_current, write_time = "memory", 0, True, 0
+    newer = 0  # frames that have come after the one that is read
 
     def __init__(self, n: int):
         self.count, self.values = 0, np.zeros(n)
@@ -48,7 +49,7 @@ class Frames:
         return self.values.size
 
     def read(self, patience: float = 0.0) -> tuple[int, np.ndarray] | None:
-        return self.count, self.values.copy()
+        return self.count - self.newer, self.values.copy()
 
     def write(self, values: np.ndarray, elements: np.ndarray | slice = slice(None)) -> None:
         self.values[elements] = values
@@ -101,6 +102,25 @@ def test_the_commands_are_those_of_the_same_loop_without_streams() -> None:
     summary = loop.attachment.summary()
     assert summary["output"] == "on" and summary["alarms"] == []
     assert summary["next_median_nm"] < 0.2 * summary["median_nm"], "the residual, of the disturbance"
+
+
+def test_a_command_that_a_newer_frame_has_overtaken_is_not_sent() -> None:
+    """Of two such in a row one goes out; the controller goes on from what was sent."""
+    plant, overtaken = TruePlant(np.eye(2), 2.0), {1500, 1700, 1701}
+    loop, own, acting, correction, u = Loop(supervised(), plant), supervised(), ActingPlant(plant), np.zeros(2), np.zeros(2)
+    for _ in range(3):  # as at rest
+        own.update(np.full(2, np.nan))
+    for k, row in enumerate(MEASURED.z):
+        loop.source.newer = int(k in overtaken)
+        loop.source.count += loop.source.newer
+        got = loop.take(row)
+        loop.source.count -= loop.source.newer
+        command = own.update(row + correction)
+        u = u if k in (1500, 1700) else command
+        own.amend(u)
+        np.testing.assert_allclose(got, u, rtol=0, atol=1e-9)
+        correction = acting.take(u)
+    assert loop.sink.count == len(MEASURED.z) - 2
 
 
 def test_missing_frames_are_those_in_which_the_command_stays() -> None:
@@ -245,8 +265,9 @@ def test_a_loop_in_shared_memory_is_closed_from_the_command_line(tmp_path: Path)
     [
         (["--controller", "lqg"], "controller 'lqg': no such controller"),
         (["--controller", "lqg-multirate"], "takes an NGS"),
-        (["--controller", "lqg-kf-lgs", "--shadow"], "--shadow: is of an observer"),
-        (["--controller", "lqg-kf-lgs", "--delay", "2"], "--delay: is of an observer"),
+        (["--controller", "integrator+gpr-offline"], "learns from a record beforehand"),
+        (["--controller", "lqg-kf-lgs", "--shadow"], "--shadow applies to observers"),
+        (["--controller", "lqg-kf-lgs", "--delay", "2"], "--delay applies to observers"),
         (["--controller", "lqg-kf-lgs", "--command-gain", "0"], "--command-gain 0"),
     ],
 )

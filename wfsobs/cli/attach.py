@@ -16,7 +16,8 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.supervisor import SupervisedController, Supervision
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.step import StepError, StepObserver
-from wfsobs.prior import LgsError, Lines, Model, Training
+from wfsobs.prior import LgsError, Lines, Model, Part, Training
+from wfsobs.priors_from.controllers import own_settings
 from wfsobs.priors_from.scenario import observer_settings
 from wfsobs.record import DELAY, Sampling
 from wfsobs.scenario import Scenario
@@ -181,7 +182,7 @@ def _open_sink(name: str, source: SharedImage | Subscription, *others: str | Non
     dtype = source.header.dtype.name if isinstance(source, SharedImage) else source.dtype
     if is_address(name):
         made = click.get_current_context().with_resource(closing(Publication(name, source.n, dtype)))
-        _say(f"{made.path}: estimates go out here")
+        _say(f"{made.path}: what is sent goes out here")
         return made
     path = stream_path(name)
     if path.resolve() in {stream_path(one).resolve() for one in (source.path, *others) if one is not None}:
@@ -194,14 +195,17 @@ def _open_sink(name: str, source: SharedImage | Subscription, *others: str | Non
 
 
 def _check_options(context: click.Context) -> None:
-    """Raise SettingError where an option beside --controller says something of observers."""
+    """Raise SettingError for an option beside --controller that applies to observers alone."""
     for parameter in context.command.params:
         is_given = context.get_parameter_source(parameter.name or "") is ParameterSource.COMMANDLINE
         if is_given and parameter.name in OBSERVERS_ALONE:
-            raise SettingError(f"{parameter.opts[0]}: is of an observer; leave it out beside --controller")
+            raise SettingError(f"{parameter.opts[0]} applies to observers; leave it out beside --controller")
 
 
-def _check_ngs(name: str, has_ngs: bool, needs_ngs: bool) -> None:
+def _check_kind(name: str, parts: tuple[Part, ...], has_ngs: bool, needs_ngs: bool) -> None:
+    """Raise StepError for what learns from a record, which a stream has not, and where the NGS is missing or not taken."""
+    if Training in parts:
+        raise StepError(f"{name}: learns from a record beforehand; takes one with a model, such as kf-multi or lqg-kf-multi")
     if has_ngs != needs_ngs:
         raise StepError(
             f"{name}: takes no NGS; leave --ngs out" if has_ngs else f"{name}: takes an NGS; name its stream by --ngs"
@@ -209,10 +213,11 @@ def _check_ngs(name: str, has_ngs: bool, needs_ngs: bool) -> None:
 
 
 def _supervise(name: str, scenario: Scenario, wiring: Wiring, gain: float, has_ngs: bool) -> SupervisedController:
-    """Return the controller; no command that it gives exceeds the limits of the scenario and of the wiring."""
+    """Return a supervised controller, whose commands are within the limits of the scenario and of the wiring."""
     if name not in CONTROLLERS:
         raise SettingError(f"controller {name!r}: no such controller; there are {', '.join(CONTROLLERS)}")
-    _check_ngs(name, has_ngs, CONTROLLERS[name].ngs)
+    declared = CONTROLLERS[name]
+    _check_kind(name, declared.parts(own_settings(declared, scenario)), has_ngs, declared.ngs)
     if not gain:
         raise SettingError("--command-gain 0: the mirror does nothing")
     largest = float(wiring.largest.min()) * (1.0 if wiring.safety.largest is None else abs(gain))
@@ -233,12 +238,10 @@ def _design(name: str, scenario: Scenario, n_modes: int, horizon: float, has_ngs
     if name not in OBSERVERS:
         raise SettingError(f"observer {name!r}: no such observer; there are {', '.join(OBSERVERS)}")
     declared = OBSERVERS[name]
-    if Training in declared.parts(observer_settings(declared, scenario)):
-        raise StepError(f"{name}: learns from a record beforehand; takes an observer with a model, such as kf-multi")
     if "y_stars" in declared.needs:
         raise StepError(f"{name}: takes every LGS by itself; the stream is of them together")
+    _check_kind(name, declared.parts(observer_settings(declared, scenario)), has_ngs, "y_ngs" in declared.needs)
     sampling = Sampling(n_modes, scenario.dt, scenario.sensors.exposure_ratio if has_ngs else None)
-    _check_ngs(name, has_ngs, "y_ngs" in declared.needs)
     observer = design(name, scenario, sampling=sampling, horizon=horizon)
     if observer.estimator.needs_command:
         raise StepError(f"{name}: its windows hold commands, which the stream has not; set its inputs to z")

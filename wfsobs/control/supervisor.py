@@ -208,7 +208,7 @@ class SupervisedController(StateArrays):
         return u
 
     def amend(self, command: Array) -> None:
-        """Take what the mirror was sent, (n_modes,) [um], where that is another command than the one of the last frame."""
+        """Replace the command of the last frame by that which the mirror was sent, (n_modes,) [um]."""
         self.controller.amend(command)
         self._command = command.copy()
 

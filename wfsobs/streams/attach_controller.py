@@ -20,23 +20,23 @@ from wfsobs.typing import Array
 
 
 class SendingController:
-    """A controller that is told what the mirror was sent: in every frame the command before, unless `send` says another one.
+    """A controller and the commands that were sent: in every frame the previous one, unless `send` confirms the new one.
 
-    A frame that is taken again, as `GoingBack` does, is so with what the mirror was sent after it.
+    `GoingBack` repeats frames; they are repeated with the commands that were sent.
 
     Parameters
     ----------
     controller : SupervisedController
         Before its first frame.
     command : Array
-        What the mirror has, at rest, (n_modes,) [um].
+        Command at which the mirror rests, (n_modes,) [um].
 
     Attributes
     ----------
     answer : Array
-        Command that the controller wants after the last frame, (n_modes,) [um].
+        Command of the controller after the last frame, (n_modes,) [um].
     command : Array
-        The last one that the mirror was sent, (n_modes,) [um].
+        Last command that was sent, (n_modes,) [um].
     """
 
     def __init__(self, controller: SupervisedController, command: Array):
@@ -51,22 +51,22 @@ class SendingController:
 
     @property
     def sampling(self) -> Sampling:
-        """Of the controller."""
+        """Sampling of the controller."""
         return self.controller.controller.sampling
 
     def update(self, y: Array, ngs: Array | None = None, /) -> None:
-        """Take the measurements of a frame, as `StepController.update`."""
+        """Take the measurements of a frame, (n_modes,) [um], as `StepController.update`."""
         self.answer = self.controller.update(y, ngs)
         self.controller.amend(self._commands.setdefault(self.frame, self.command))
         self._commands.pop(self.frame - (self.sampling.ratio or 1), None)
 
     def send(self) -> None:
-        """Take the answer for sent."""
+        """Record that the answer was sent."""
         self.command = self._commands[self.frame] = self.answer
         self.controller.amend(self.answer)
 
     def reset(self) -> None:
-        """Begin anew with the mirror at rest where the last command has put it, and an NGS frame due next."""
+        """Reset the controller with the mirror at rest at the last command; the next frame is one with an NGS measurement."""
         self.controller.reset()
         self._commands.clear()
         ratio = self.sampling.ratio or 1
@@ -85,7 +85,7 @@ class SendingController:
 class ControllerAttachment(StreamFollower):
     """Closes a loop through streams.
 
-    Where nothing comes in, and at the end, the last command stays; frames that are missing are taken as such.
+    The last command stays while no frame comes in, and at the end.
 
     Parameters
     ----------
@@ -96,11 +96,11 @@ class ControllerAttachment(StreamFollower):
     controller : SupervisedController
         Before its first frame. No command exceeds the limits of its mirror.
     gain : float
-        What the mirror does of a command, with its sign.
+        Correction per unit of command, with its sign.
     start : Array
-        Command that the mirror has, (n_modes,), in the unit of the stream.
+        Command of the mirror at the start, (n_modes,), in the unit of the stream.
     wiring : Wiring
-        Modes, unit, when the stream is stuck, what no measurement can be; limits and gate are those of the controller.
+        Modes, unit, time after which the stream is stuck, largest measurement; limits and gate are those of the controller.
     say : callable
         Receives one line about whatever happens.
     ngs : NgsStream, optional
@@ -136,7 +136,7 @@ class ControllerAttachment(StreamFollower):
 
     @property
     def safe(self) -> Array:
-        """What is left to the mirror, (n_modes,) [um]."""
+        """The last command, (n_modes,), as `_send` takes it [um]."""
         return self._sender.command / self._gain
 
     def _fall_back(self, reason: str) -> None:
@@ -160,7 +160,7 @@ class ControllerAttachment(StreamFollower):
         if before and not self.reason:
             self._say("the controller closes the loop")
         for frame, reason in self._controller.alarms[known:]:
-            if frame >= first:  # else one that is taken again
+            if frame >= first:  # not of a repeated frame
                 self._alarms.append((self._count, reason))
                 self._say(f"{reason}: an integrator closes the loop")
 

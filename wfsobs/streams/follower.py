@@ -25,7 +25,7 @@ LONGEST_GAP = 1000
 
 
 class StreamFollower(ABC):
-    """Answers each frame of a stream by one of another.
+    """Follows a stream and writes an answer to each of its frames to another one.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ class StreamFollower(ABC):
     wiring : Wiring
         Modes, unit, limits.
     observer : StateObserver
-        Who answers, before its first frame.
+        Observer or controller, before its first frame.
     say : callable
         Receives one line about whatever happens.
     ngs : NgsStream, optional
@@ -73,7 +73,7 @@ class StreamFollower(ABC):
     @property
     @abstractmethod
     def reason(self) -> str:
-        """Why what goes out is not what it should be; "" where it is."""
+        """Why a fallback is sent; "" while the answers of the observer or controller are."""
 
     @property
     @abstractmethod
@@ -82,15 +82,15 @@ class StreamFollower(ABC):
 
     @abstractmethod
     def _fall_back(self, reason: str) -> None:
-        """Let what is safe go out for a while."""
+        """Send the safe output for a while, and say why."""
 
     @abstractmethod
     def _restart_gates(self) -> None:
-        """Begin anew with what guards who answers, which has done so."""
+        """Reset the gates; the observer or controller has been reset."""
 
     @abstractmethod
     def _answer(self, arrival: float, measurement: Array, missing: int) -> None:
-        """Take the measurement of a frame, (n_modes,) [um], before which `missing` ones have not come, and send the answer."""
+        """Process the measurement of a frame, (n_modes,) [um], after `missing` frames that were lost, and send the answer."""
 
     def run(
         self, seconds: float, *, report: Callable[[str], None] = lambda _: None, stop: Callable[[], bool] = lambda: False
@@ -166,7 +166,7 @@ class StreamFollower(ABC):
     def _look_for_ngs(self) -> tuple[Array | None, int]:
         """Return the NGS measurement that is new, and how many frames ago it should have been there.
 
-        Where NGS frames have another place than the observer has been given them in, it starts anew.
+        Where the NGS frames belong to other LGS frames than assumed so far, the observer or controller starts anew.
         """
         if self._ngs is None:
             return None, 0
