@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.optimize import bisect
+from scipy.signal import freqs
 
 from tests.records import MATCHED
 from wfsobs.closed_loop.design import design
@@ -21,7 +22,7 @@ from wfsobs.control.margins import disk_margin, frequencies
 from wfsobs.control.mirror import Mirror
 from wfsobs.control.mismatch import draws_of, loops, margins_of, one_loop, radius, step_matrices
 from wfsobs.control.true_plant import ActingPlant, TruePlant, true_matrix
-from wfsobs.priors_from.controllers import true_plant_of
+from wfsobs.priors_from.controllers import full_plant_of, true_plant_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.errors import SettingError
@@ -54,6 +55,21 @@ def state_space(plant: TruePlant) -> tuple[np.ndarray, np.ndarray, np.ndarray, n
     rows[2, size] = 1.0
     rows[3:, 2:-2] = np.eye(n)
     return rows[:, :size], rows[:, size:], end[2:3, :size], end[2:3, size:]
+
+
+def test_mounts_have_the_dynamics_of_their_data_sheets():
+    def response(mount: str, f: np.ndarray) -> np.ndarray:
+        plant = full_plant_of(Scenario().replace({"plant.mount": mount, "plant.resonance": 77.0}))  # at 1 kHz
+        _, h = freqs([plant.resonance**2], [1.0, 2.0 * plant.damping * plant.resonance, plant.resonance**2], 2e-3 * np.pi * f)
+        return h
+
+    h = response("newport-fsm-300", np.linspace(1.0, 1000.0, 1000))
+    assert 20.0 * np.log10(np.abs(h).max()) == pytest.approx(3.0, abs=0.01)  # peaking
+    assert np.degrees(np.angle(h[399])) == pytest.approx(-60.0, abs=0.05)  # at 400 Hz
+    assert np.abs(h[691]) == pytest.approx(10**-0.15, abs=0.001)
+    h = response("est-m2", np.array([10.0, 150.0]))
+    assert np.abs(h) == pytest.approx([1.0, np.sqrt(0.5)], abs=1e-4)
+    assert true_plant_of(Scenario().replace({"plant.mount": "est-m2"})) is not None
 
 
 @settings(max_examples=25, deadline=None, derandomize=True)

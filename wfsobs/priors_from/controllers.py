@@ -35,8 +35,8 @@ def full_plant_of(scenario: Scenario, rotation: float = 0.0) -> TruePlant:
         matrix,
         scenario.control.delay + p.delay_error,
         p.delay_jitter,
-        2.0 * pi * p.resonance * dt,
-        p.damping,
+        2.0 * pi * p.dynamics.resonance * dt,
+        p.dynamics.damping,
         p.lost_commands,
         p.quantum,
         p.hysteresis,
@@ -50,7 +50,8 @@ def full_plant_of(scenario: Scenario, rotation: float = 0.0) -> TruePlant:
 
 def true_plant_of(scenario: Scenario) -> TruePlant | None:
     """Return the plant as it is; None where it is the one that the controllers are designed for."""
-    out, is_moved = full_plant_of(scenario), scenario.plant.delay_error or scenario.plant.resonance
+    out = full_plant_of(scenario)
+    is_moved = scenario.plant.delay_error or out.resonance
     is_perfect = replace(out, start=0).time_invariant and not is_moved and np.array_equal(out.matrix, np.eye(len(out.matrix)))
     return None if is_perfect else out
 

@@ -106,7 +106,7 @@ def _across(scenario: Scenario) -> Iterator[tuple[str, str]]:
             yield "sensors.lgs_angle", "Used only where LGS asterism, radius is above 0"
     if scenario.turbulence.source == "none":
         yield "sensors.tip_tilt_indetermination", "Used only where there is turbulence"
-    if not scenario.plant.resonance:
+    if scenario.plant.mount == "custom" and not scenario.plant.resonance:
         yield "plant.damping", "Used only where Resonance is above 0"
     if not scenario.plant.hysteresis:
         yield "plant.hysteresis_range", "Used only where Hysteresis is above 0"

@@ -2,8 +2,33 @@
 
 from __future__ import annotations
 
-from wfsobs.settings.group import Group
+from types import MappingProxyType
+from typing import ClassVar, NamedTuple
+
+import param
+
+from wfsobs.settings.group import Group, UsedWhen
 from wfsobs.settings.parameters import Real, Reals
+
+
+class Mount(NamedTuple):
+    """Dynamics of a tip-tilt mount, a second-order system of gain 1: natural frequency [Hz] and damping ratio."""
+
+    resonance: float
+    damping: float
+
+
+MOUNTS = MappingProxyType(
+    {
+        # FSM-CD300B manual, "Typical Specifications", at their limits: peaking of 3 dB, lag of 60 degrees at 400 Hz. Its
+        # amplitude is 3 dB down at 692 Hz then (specified: at 800 Hz or above), which no second order has with that lag.
+        "newport-fsm-300": Mount(498.2, 0.3832),
+        # Secondary mirror with fast drives, design study of the European Solar Telescope: 3 dB down at 150 Hz. No damping is
+        # published: that of the flattest response is assumed.
+        "est-m2": Mount(150.0, 0.7071),
+    }
+)
+"""Tip-tilt mounts by name, from their data sheets."""
 
 
 class PlantErrors(Group):
@@ -11,6 +36,8 @@ class PlantErrors(Group):
 
     The plant of the controllers is the mirror of `control`, of gain 1, and its delay.
     """
+
+    used_when: ClassVar[UsedWhen] = MappingProxyType({"resonance": ("mount", ("custom",)), "damping": ("mount", ("custom",))})
 
     start: Real = Real(
         0.0,
@@ -57,6 +84,12 @@ class PlantErrors(Group):
         step=0.01,
         label="Coupling",
         doc="Share of a command that also acts in the other mode of its pair, such as that of tip in tilt.",
+    )
+    mount: param.Selector[str] = param.Selector(
+        default="custom",
+        objects=["custom", *MOUNTS],
+        label="Mount",
+        doc="Tip-tilt mount whose data sheet gives the dynamics of the mirror; custom: Resonance and its damping do.",
     )
     resonance: Real = Real(
         0.0,
@@ -126,3 +159,8 @@ class PlantErrors(Group):
         label="Optical gain, time",
         doc="Correlation time of that change [s].",
     )
+
+    @property
+    def dynamics(self) -> Mount:
+        """Dynamics of the mirror, by its mount or by resonance and damping."""
+        return MOUNTS.get(self.mount) or Mount(self.resonance, self.damping)
