@@ -56,7 +56,8 @@ def test_where_it_would_diverge_the_integrator_takes_over(record: Record, wrong:
         assert one.alarms is not None and one.residual is not None and one.stable == (True, True)
         # poles outside the unit circle are noticed within some dozens of frames
         assert 1.0 <= one.alarms[0][0] < 1.2
-        np.testing.assert_allclose(one.residual[:1000], integrator.residual[:1000], rtol=0, atol=1e-9)
+        if one.controller == "lqg-kf-lgs":  # with the NGS the integrator does not follow the slow error of the LGS
+            np.testing.assert_allclose(one.residual[:1000], integrator.residual[:1000], rtol=0, atol=1e-9)
         # in the long run it is the integrator's, which forgets the outburst; the controller is back for some frames
         assert np.median(np.abs(one.residual[1500:])) < 1.5 * np.median(np.abs(integrator.residual[1500:]))
 

@@ -11,7 +11,7 @@ from scipy.stats import gamma
 import wfsobs
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.step_laws import KalmanLaws
-from wfsobs.control.supervisor import WINDOW, SupervisedController, Supervision, _Level
+from wfsobs.control.supervisor import STRICT, WINDOW, SupervisedController, Supervision, _Level
 from wfsobs.observers.step import StepError
 from wfsobs.typing import Array
 
@@ -60,6 +60,28 @@ def test_while_all_is_well_it_is_the_controller(name: str, record: wfsobs.Record
     )
 
 
+def test_the_integrator_leaves_the_slow_error_of_the_lgs_to_the_ngs(record: wfsobs.Record) -> None:
+    """The sum written out, with missing measurements; in a loop it leaves less than the LGS alone."""
+    rng, n = np.random.default_rng(5), 5
+    y, slow = rng.normal(0.3, 0.1, (200, 2)), rng.normal(0.0, 0.1, (200, 2))
+    y[47], slow[80, 1] = np.nan, np.nan
+    supervised = SupervisedController(wfsobs.design("lqg-multirate", SCENARIO), Supervision(gain=0.3, leak=0.99, calm=10**6))
+    u, error = np.zeros(2), np.zeros(2)
+    for k in range(200):
+        due = k and k % n == 0 and k != 60
+        given = supervised.update(y[k], slow[k] if due else None)
+        excess = y[k - n + 1 : k + 1].mean(axis=0) - slow[k] if due else np.full(2, np.nan)
+        error = np.where(np.isnan(excess), error, 0.8 * error + 0.2 * excess)
+        u = 0.99 * u - 0.3 * np.where(np.isnan(y[k]), 0.0, y[k] - error)
+        np.testing.assert_allclose(given, u, rtol=0, atol=1e-12)
+
+    def left(name: str) -> Array:
+        residual, _ = close(SupervisedController(wfsobs.design(name, SCENARIO), Supervision(calm=10**6)), record)
+        return np.asarray(residual[1000:].std(axis=0))
+
+    assert (left("lqg-multirate") < 0.75 * left("lqg-kf-lgs")).all()
+
+
 def test_an_unstable_loop_is_the_integrators_until_it_is_well_again(record: wfsobs.Record) -> None:
     when = slice(1200, 1400)
     supervised = SupervisedController(wfsobs.design("lqg-kf-lgs", SCENARIO), PLAN)
@@ -70,6 +92,38 @@ def test_an_unstable_loop_is_the_integrators_until_it_is_well_again(record: wfso
     alone, _ = close(SupervisedController(wfsobs.design("lqg-kf-lgs", SCENARIO), PLAN), record)
     # what happened is forgotten by the filter's poles and the blend
     np.testing.assert_allclose(residual[2700:], alone[2700:], rtol=0, atol=0.02 * alone.std())
+
+
+def test_a_loop_that_grows_slowly_is_no_more_usual_the_second_time() -> None:
+    """0.3 % a frame, after an alarm: the threshold does not follow it, so that it is left where it was left before."""
+    rng, level = np.random.default_rng(4), _Level(1, 1e-10)
+    for _ in range(3000):
+        level.exceeds(rng.standard_normal(1))
+    level.begin(np.inf, STRICT * level.limit)
+    grown = next(k for k in range(3000) if level.exceeds(1.003**k * rng.standard_normal(1)))
+    assert 1.003**grown < 3.0, "0.5 of a threshold of 5.2 is 1.6 of its deviation, and 16 samples vary"
+    free = _Level(1, 1e-10)
+    for _ in range(3000):
+        free.exceeds(rng.standard_normal(1))
+    free.begin(np.inf)
+    assert not any(free.exceeds(1.003**k * rng.standard_normal(1)) for k in range(3 * grown)), "without the cap it would be usual"
+
+
+def test_a_disturbance_that_stays_larger_becomes_usual() -> None:
+    """Three times as much from 3 s on is no fault of the controller, which has the loop again for good."""
+    calm = wfsobs.simulate(SCENARIO.replace({"run.duration": 20.0}))
+    factor = np.where(np.arange(calm.n_steps) < 3000, 1.0, 3.0)[:, None]
+    assert calm.turbulence is not None and calm.vibration is not None
+    record = replace(
+        calm,
+        y_lgs=factor * calm.y_lgs,
+        u=factor * calm.u,
+        turbulence=factor * calm.turbulence,
+        vibration=factor * calm.vibration,
+    )
+    supervised = SupervisedController(wfsobs.design("lqg-kf-lgs", SCENARIO), Supervision(calm=200))
+    close(supervised, record)
+    assert supervised.reason == "" and supervised.alarms[-1][0] < 17_000
 
 
 def test_one_that_limits_stop_and_one_that_is_not_finite_are_given_up(record: wfsobs.Record) -> None:

@@ -36,6 +36,15 @@ ANEW = 200
 REFRESH = 50
 """Frames between two thresholds: the distribution changes slowly."""
 
+STRICT = 0.5
+"""Cap of the threshold after the first alarm over the threshold before: a controller that comes back is on trial."""
+
+RELAX = 1.01
+"""By how much that cap rises in `REFRESH` frames: slow growth does not become usual, a larger disturbance does."""
+
+NGS_SHARE = 0.2
+"""Share of each NGS frame in the running mean of what the LGS have more than it, which the integrator does not follow."""
+
 REASONS = (
     "",
     "start",
@@ -81,16 +90,17 @@ class _Level(StateArrays):
     slow         : running mean of the measurement, (n_modes,) [um]
     squares      : of the last frames without it, (WINDOW, n_modes);  frames : their number so far
     weight       : frames that the distribution counts for
-    mean, spread : its mean and mean square, (n_modes,);  limit : threshold
+    mean, spread : its mean and mean square, (n_modes,);  limit : threshold, (n_modes,);  cap : which it may not exceed
     """
 
-    state_names: tuple[str, ...] = ("slow", "squares", "frames", "weight", "mean", "spread", "limit")
+    state_names: tuple[str, ...] = ("slow", "squares", "frames", "weight", "mean", "spread", "limit", "cap")
 
     def __init__(self, n_modes: int, alarm: float):
         self._alarm = alarm
         self.slow, self.squares = np.zeros(n_modes), np.zeros((WINDOW, n_modes))
         self.frames = self.weight = 0
         self.mean, self.spread, self.limit = np.zeros(n_modes), np.zeros(n_modes), np.full(n_modes, np.inf)
+        self.cap = self.limit
         self.mark_start()
 
     def exceeds(self, y: Array) -> bool:
@@ -105,8 +115,10 @@ class _Level(StateArrays):
         self.weight = min(self.weight + 1, MEMORY)
         self.mean += (usual - self.mean) / self.weight
         self.spread += (usual * usual - self.spread) / self.weight
-        if self.frames % REFRESH == 0 and self.weight > 3 * ANEW:
-            self.limit = self._limit()
+        if self.frames % REFRESH == 0:
+            self.cap = self.cap * (RELAX if self.weight < MEMORY else np.inf)
+            if self.weight > 3 * ANEW:
+                self.limit = np.minimum(self._limit(), self.cap)
         return bool((level > self.limit).any())
 
     def _limit(self) -> Array:
@@ -115,9 +127,10 @@ class _Level(StateArrays):
         shape = np.clip(self.mean**2 / np.maximum(variance, 1e-300), 1.0, WINDOW / 2)
         return np.asarray(self.mean * gammainccinv(shape, self._alarm) / shape)
 
-    def begin(self, limit: Array | float) -> None:
-        """Let what comes now count more than what was, with a threshold for the first 400 frames."""
-        self.weight, self.limit = min(self.weight, ANEW), np.broadcast_to(limit, self.mean.shape).copy()
+    def begin(self, limit: Array | float, cap: Array | float = np.inf) -> None:
+        """Let what comes now count more than what was, with a threshold for the first 400 frames and a cap for longer."""
+        self.cap = np.broadcast_to(cap, self.mean.shape).copy()
+        self.weight, self.limit = min(self.weight, ANEW), np.minimum(limit, self.cap)
 
 
 class SupervisedController(StateArrays):
@@ -152,6 +165,8 @@ class SupervisedController(StateArrays):
         "_calm",
         "_limit_share",
         "_since",
+        "_exposure",
+        "_slow_error",
     )
 
     def __init__(self, controller: StepController, supervision: Supervision = Supervision()):
@@ -163,10 +178,12 @@ class SupervisedController(StateArrays):
         self._level = _Level(n, supervision.alarm)
         self._command, self._offset = np.zeros(n), np.zeros(n)
         self._usual = np.full(n, np.inf)  # mean square of the measurement under the integrator
-        self._bound = np.full(n, np.inf)  # threshold of the controller over that mean square, when it last had the loop
+        self._bound = np.full(n, np.inf)  # cap of the threshold of the controller, when it lost the loop
         self._why = REASONS.index("start")
         self._left, self._calm = supervision.calm, supervision.calm  # frames of the integrator: still, and at the next alarm
         self._limit_share, self._since = 0.0, 0  # share of frames at a limit; frame of the last change of hands
+        self._exposure = np.zeros(n)  # sum of the measurements since the last NGS frame
+        self._slow_error = np.zeros(n)  # of the LGS
         self.mark_start()
 
     @property
@@ -193,7 +210,8 @@ class SupervisedController(StateArrays):
         is_missing, plan = np.isnan(seen), self.supervision
         error = np.where(is_missing, 0.0, seen)
         excess = not is_missing.any() and self._level.exceeds(error)  # a dropout is no small residual
-        safe = self._within(plan.leak * self._command - plan.gain * error)
+        self._follow_ngs(seen, slow)
+        safe = self._within(plan.leak * self._command - plan.gain * np.where(is_missing, 0.0, seen - self._slow_error))
         if self._why:
             self._wait(command, safe, excess)
         elif fault := self._fault(command, excess):
@@ -212,6 +230,18 @@ class SupervisedController(StateArrays):
         self.controller.amend(command)
         self._command = command.copy()
 
+    def _follow_ngs(self, y: Array, ngs: Array | None) -> None:
+        """Learn what the LGS have more than an NGS frame over its exposure, where none of it is missing."""
+        ratio = self.controller.sampling.ratio
+        if not (ratio and self.controller.uses_ngs):
+            return
+        self._exposure += y
+        if (self.frame - 1) % ratio == 0:
+            if ngs is not None:
+                error = self._exposure / ratio - ngs - self._slow_error
+                self._slow_error += NGS_SHARE * np.where(np.isnan(error), 0.0, error)
+            self._exposure = np.zeros_like(y)
+
     def _fault(self, command: Array, excess: bool) -> int:
         """Return why the controller may not go on, an index of `REASONS`; 0 where it may."""
         if not np.isfinite(command).all():
@@ -228,17 +258,19 @@ class SupervisedController(StateArrays):
         self.alarms.append((self.frame - 1, REASONS[why]))
         most = 64 * self.supervision.calm
         self._left = self._calm = self.supervision.calm if self.frame - self._since > most else min(2 * self._calm, most)
+        inherited = self.frame - self._since <= 2 * ANEW  # it may be the disturbance that is larger: ever more is allowed
+        self._bound = self._level.limit * (self.supervision.worse if inherited else STRICT)
         self._why, self._limit_share, self._since = why, 0.0, self.frame
-        self._bound = self._level.limit / self._usual
         self._level.begin(np.inf)
 
     def _wait(self, command: Array, safe: Array, excess: bool) -> None:
         """Let the integrator go on until all has been well for a while, then give the loop back."""
         self._left = max(self._left - 1, WINDOW if excess else 0)
         if not self._left and np.isfinite(command).all():
+            cap = self._bound * RELAX ** ((self.frame - self._since) / REFRESH)
             self._usual, self._why, self._since = self._level.mean.copy(), 0, self.frame
             self._offset = (safe - command) / BLEND
-            self._level.begin(np.minimum(self.supervision.worse**2 * self._level.limit, self._bound * self._usual))
+            self._level.begin(self.supervision.worse**2 * self._level.limit, cap)
 
     def _within(self, u: Array) -> Array:
         """Return the commands nearest to these within the limits of the mirror."""
