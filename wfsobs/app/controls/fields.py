@@ -26,9 +26,6 @@ from wfsobs.units import unit_text
 
 ROOM = {"sizing_mode": "stretch_width", "margin": (4, 0)}
 
-SOON = 5
-"""How long a change in the browser waits for the next to go with it [ms]: by default 50, a tenth of a redraw."""
-
 TAG = "setting:"
 """Stands before the path of its setting in the tag of a widget: the browser knows by it what was changed."""
 
@@ -46,8 +43,6 @@ class Field(ABC):
         self.idle: str = ""
         self._note_html = ""
         self.widgets: Final = self._widgets()
-        for widget in self.widgets:
-            widget._debounce = SOON
         self.view: Final = pn.Column(self._row(), sizing_mode="stretch_width", margin=0)
         self.refresh()
         store.param.watch(self.refresh, ["scenario", "errors"])
