@@ -13,7 +13,7 @@ import pytest
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.pages import model
 from wfsobs.app.pages.figures import Figures
-from wfsobs.app.pages.pages import EXPLORE, FIGURES, MODEL
+from wfsobs.app.pages.pages import AWAY, EXPLORE, FIGURES, MODEL
 from wfsobs.app.pages.parts import example
 from wfsobs.app.render import matrix, short, tex
 from wfsobs.app.style import look
@@ -57,7 +57,7 @@ def words(html: str) -> str:
 
 
 def seen(dashboard: Dashboard) -> list[str]:
-    return [name for name, room in dashboard.pages.rooms.items() if room.visible]
+    return [name for name, room in dashboard.pages.rooms.items() if room.styles != AWAY]
 
 
 class TestPages:

@@ -54,7 +54,7 @@ WRONG = """([looks, dark]) => {
     const [r, g, b] = context.getImageData(0, 0, 1, 1).data
     return r + g + b > 384
   }
-  const shown = [...Bokeh.index.query((it) => it.model.type === "Figure" && it.el.offsetParent !== null)].map((it) => it.model)
+  const shown = [...Bokeh.index.query((it) => it.model.type === "Figure" && it.el.checkVisibility())].map((it) => it.model)
   const lines = shown.flatMap((it) => it.renderers).filter((it) => looks[it.name] && it.glyph.type === "Line")
   const found = lines.filter((it) => it.glyph.line_color.value !== looks[it.name][dark ? 1 : 0]).map((it) => it.name)
   const axes = shown.filter((it) => text(it) && bright(text(it).value ?? text(it)) !== dark).map((it) => it.name)
@@ -63,7 +63,7 @@ WRONG = """([looks, dark]) => {
 }"""
 """Lines in the colours of the other theme, figures whose axes are written in them, and the page where its ground is of it."""
 
-FIGURES = """() => [...Bokeh.index.query((it) => it.model.type === "Figure" && it.el.offsetParent !== null)]
+FIGURES = """() => [...Bokeh.index.query((it) => it.model.type === "Figure" && it.el.checkVisibility())]
     .map((it) => it.model.id)"""
 TURNED = f"""([before, without]) => {{
   const now = ({FIGURES})()

@@ -22,7 +22,7 @@ from wfsobs.app.glossary import Help
 from wfsobs.app.history import History, HistorySheet
 from wfsobs.app.jobs import FAILED
 from wfsobs.app.pages.explore import Explore
-from wfsobs.app.pages.pages import EXPLORE, LIVE, Pages, ViewState
+from wfsobs.app.pages.pages import AWAY, EXPLORE, LIVE, SHOWN, Pages, ViewState
 from wfsobs.app.pages.parts import ON_ONE_LINE, WIDE, warning
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import Post, Session
@@ -250,7 +250,7 @@ class Dashboard:
     def _switches(self) -> pn.FlexBox:
         """Lay out the switches that all pages share, and those of the first."""
         first = self.explore.switches()
-        self.pages.param.watch(lambda event: setattr(first, "visible", event.new == EXPLORE), "current")
+        self.pages.param.watch(lambda event: setattr(first, "styles", SHOWN if event.new == EXPLORE else AWAY), "current")
         return pn.FlexBox(
             *self.modes.view(), *self.units.view(), first, gap="8px", align_items="center", **WIDE, stylesheets=[ON_ONE_LINE]
         )

@@ -3,7 +3,7 @@
 const ENTRY = 170 // of the legend [px]
 
 function figures() {
-  const views = [...Bokeh.index.query((it) => it.model.type === "Figure" && it.el.getBoundingClientRect().width > 0)]
+  const views = [...Bokeh.index.query((it) => it.model.type === "Figure" && it.el.checkVisibility())]
   return views.map((view) => {
     const axes = [view.model.left[0]?.axis_label, view.model.below[0]?.axis_label]
     return [view.model.name ?? axes.filter(Boolean).join(" over "), view]

@@ -64,6 +64,10 @@ TABS = {
 }
 """Pages on the dark bar at the top."""
 
+SHOWN = {"content-visibility": "visible", "height": "auto", "overflow": "visible"}
+AWAY = {"content-visibility": "hidden", "height": "0", "overflow": "hidden"}
+"""A page that is not shown stays as it was laid out: without `display` each of its figures would be laid out anew."""
+
 
 class Pages(param.Parameterized):
     """The first page, and others that are made when they are wanted."""
@@ -92,7 +96,7 @@ class Pages(param.Parameterized):
         self.by_name: dict[str, Page] = {EXPLORE: explore}
         self.rooms: Final = {
             EXPLORE: pn.Column(explore.view(), **WIDE),
-            **{name: pn.Column(visible=False, sizing_mode="stretch_width", margin=0) for name in self._makers},
+            **{name: pn.Column(sizing_mode="stretch_width", margin=0, styles=AWAY) for name in self._makers},
         }
         self.switch: Final = pmui.RadioButtonGroup.from_param(
             self.param.current, options=known, size="small", margin=0, css_classes=["tabs"], sx=TABS, stylesheets=[HEARD]
@@ -136,7 +140,7 @@ class Pages(param.Parameterized):
             for other, room in self.rooms.items():
                 if other in self.by_name:
                     self.by_name[other].show(other == name)
-                room.visible = other == name
+                room.styles = SHOWN if other == name else AWAY
 
 
 PREFIX = "view."
