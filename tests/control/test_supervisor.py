@@ -126,6 +126,17 @@ def test_a_disturbance_that_stays_larger_becomes_usual() -> None:
     assert supervised.reason == "" and supervised.alarms[-1][0] < 17_000
 
 
+def test_the_controller_has_the_loop_after_a_sensor_that_gave_zeros(record: wfsobs.Record) -> None:
+    """A mean square of zero is no threshold; nor is a wait of hours, during which commands were not finite, too long."""
+    supervised = SupervisedController(wfsobs.design("lqg-kf-lgs", SCENARIO), Supervision(calm=100))
+    for k in range(record.n_steps):
+        supervised.update(np.zeros(2) if k < 1000 else record.z[k] - record.z[k - 1])
+        if k == 1005:
+            assert supervised.reason, "the first that are not zero"
+            supervised._since -= 10_000_000
+    assert supervised.reason == ""
+
+
 def test_one_that_limits_stop_and_one_that_is_not_finite_are_given_up(record: wfsobs.Record) -> None:
     tight = SCENARIO.replace({"control.stroke": 0.05})
     supervised = SupervisedController(wfsobs.design("lqg-kf-lgs", tight), PLAN)

@@ -57,7 +57,7 @@ def state_space(plant: TruePlant) -> tuple[np.ndarray, np.ndarray, np.ndarray, n
     return rows[:, :size], rows[:, size:], end[2:3, :size], end[2:3, size:]
 
 
-def test_mounts_have_the_dynamics_of_their_data_sheets():
+def test_mounts_have_the_dynamics_of_their_data_sheets() -> None:
     def response(mount: str, f: np.ndarray) -> np.ndarray:
         plant = full_plant_of(Scenario().replace({"plant.mount": mount, "plant.resonance": 77.0}))  # at 1 kHz
         _, h = freqs([plant.resonance**2], [1.0, 2.0 * plant.damping * plant.resonance, plant.resonance**2], 2e-3 * np.pi * f)

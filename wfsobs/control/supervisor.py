@@ -129,7 +129,8 @@ class _Level(StateArrays):
 
     def begin(self, limit: Array | float, cap: Array | float = np.inf) -> None:
         """Let what comes now count more than what was, with a threshold for the first 400 frames and a cap for longer."""
-        self.cap = np.broadcast_to(cap, self.mean.shape).copy()
+        cap = np.broadcast_to(cap, self.mean.shape)
+        self.cap = np.where(cap > 0.0, cap, np.inf)  # measurements of zero alone say nothing of what is usual
         self.weight, self.limit = min(self.weight, ANEW), np.minimum(limit, self.cap)
 
 
@@ -267,7 +268,7 @@ class SupervisedController(StateArrays):
         """Let the integrator go on until all has been well for a while, then give the loop back."""
         self._left = max(self._left - 1, WINDOW if excess else 0)
         if not self._left and np.isfinite(command).all():
-            cap = self._bound * RELAX ** ((self.frame - self._since) / REFRESH)
+            cap = self._bound * RELAX ** (min(self.frame - self._since, MEMORY) / REFRESH)
             self._usual, self._why, self._since = self._level.mean.copy(), 0, self.frame
             self._offset = (safe - command) / BLEND
             self._level.begin(self.supervision.worse**2 * self._level.limit, cap)
