@@ -32,9 +32,8 @@ import psutil
 from wfsobs.campaign.plan import Campaign, parse_plan
 from wfsobs.campaign.pools import DaskCluster, Processes, Workers
 from wfsobs.campaign.report import write_report
-from wfsobs.campaign.run import AHEAD
+from wfsobs.campaign.run import AHEAD, Batch, run_rows, wfsobs_batch
 from wfsobs.campaign.store import open_folder, write_batch
-from wfsobs.campaign.work import Batch, run_rows, wfsobs_batch
 
 TINY = """
 name = "Tiny"

@@ -35,8 +35,8 @@ from usage import cpu_seconds, family, memory_mb
 
 from wfsobs import PRESETS
 from wfsobs.live.checks import observers_on
-from wfsobs.live.paced import SOURCE, go_first, prefer
 from wfsobs.live.simulated import SimulatedLoop
+from wfsobs.live.source import SOURCE, go_first, prefer
 from wfsobs.observers import OBSERVERS
 
 DT, LATE = 1e-3, 1e-3

@@ -25,9 +25,8 @@ from bench_campaign import Cluster, cpu_seconds
 
 from wfsobs.campaign.plan import Campaign, load_plan
 from wfsobs.campaign.pools import DaskCluster
-from wfsobs.campaign.run import AHEAD, BATCH, MOST_RUNS
+from wfsobs.campaign.run import AHEAD, BATCH, MOST_RUNS, Batch, Summary, run_rows, wfsobs_batch
 from wfsobs.campaign.store import ROWS, batch_files
-from wfsobs.campaign.work import Batch, Summary, run_rows, wfsobs_batch
 
 
 def skip_batch(batch: Batch) -> Summary:

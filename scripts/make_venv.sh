@@ -14,6 +14,7 @@ command -v "$python" >/dev/null || fail "$python is missing: $line"
     fail "Python 3.11 or later is needed, and $python is $("$python" --version 2>&1): make PYTHON=/path/to/python3.11"
 "$python" -c 'import venv, ensurepip' 2>/dev/null || fail "python3-venv is missing: $line"
 
+[ ! -L "$directory" ] || fail "$directory is a link to an environment, which would be emptied: remove the link"
 if ! output=$("$python" -m venv --clear "$directory" 2>&1); then
     rm -rf "$directory"
     case $output in

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import wfsobs
-from wfsobs.campaign.keys import PHYSICS_VERSION
+from wfsobs.campaign.store import PHYSICS_VERSION
 
 FILE = Path(__file__).parents[1] / "tests" / "campaign" / "physics.json"
 OBSERVERS = ["kf-lgs", "kf-multi", "multirate", "multirate-optimal", "ridge"]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from wfsobs import PRESETS, simulate
-from wfsobs.priors_from.selection import usual_observers
+from wfsobs.priors_from.scenario import usual_observers
 from wfsobs.record import Record, Training
 from wfsobs.scenario import Scenario
 from wfsobs.testing import QUICK

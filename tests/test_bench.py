@@ -17,8 +17,8 @@ from wfsobs.bench.measure import OURS, Row, max_error, measure_time, row, with_r
 from wfsobs.bench.tasks import Sizes
 from wfsobs.cli.bench import bench
 from wfsobs.observers.gpr.kernels import SquaredExponential
+from wfsobs.observers.gpr.offline import train
 from wfsobs.observers.gpr.online import predict_sliding
-from wfsobs.observers.gpr.trained import train
 
 pytestmark = pytest.mark.slow
 

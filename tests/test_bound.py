@@ -13,7 +13,7 @@ from wfsobs.evaluation.bound import INFORMATION, bound, least_errors
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.signal.welch import rms
+from wfsobs.signal.spectrum import rms
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import TrueSpectra, true_spectra
 from wfsobs.typing import Array

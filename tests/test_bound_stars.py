@@ -15,7 +15,7 @@ from wfsobs.simulation import layers as atmosphere
 from wfsobs.simulation.flow_spectra import star_basis, star_flow_spectra
 from wfsobs.simulation.guide_stars import stars_differ
 from wfsobs.simulation.loop import simulate
-from wfsobs.simulation.star_spectra import StarSpectra, star_spectra
+from wfsobs.simulation.mode_spectra import StarSpectra, star_spectra
 from wfsobs.simulation.turbulence import SOURCES
 from wfsobs.typing import Array
 

@@ -25,15 +25,15 @@ pytestmark = pytest.mark.slow
 
 SCENARIO = PRESETS["laser-dropout"]().replace(
     {
-        "run.duration": 5.7,
+        "run.duration": 2.8,
         "events": [
-            {"kind": "laser", "start": 2.0, "duration": 1.5, "lasers": 1},
-            {"kind": "laser", "start": 4.5, "duration": 1.0, "lasers": 2},
+            {"kind": "laser", "start": 0.6, "duration": 0.6, "lasers": 1},
+            {"kind": "laser", "start": 1.6, "duration": 1.0, "lasers": 2},
         ],
     }
 )
 """The preset's outages in a shorter record."""
-AFTER = slice(5500, 5700)
+AFTER = slice(2600, 2800)
 """The first 0.2 s with a laser again."""
 NAMES = ("kf-lgs", "kf-multi", "multirate", "multirate-optimal", "multirate-multi")
 

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.grid import parse_variation
-from wfsobs.scenario.groups.vibration import Peak
+from wfsobs.scenario.groups.atmosphere import Peak
 from wfsobs.scenario.presets import PRESETS, paper
 from wfsobs.settings.errors import SettingError
 

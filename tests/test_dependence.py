@@ -20,8 +20,7 @@ from wfsobs.evaluation.result import Failure
 from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.estimates import Estimate
-from wfsobs.priors_from.scenario import prior_and_settings
-from wfsobs.priors_from.selection import usual_observers
+from wfsobs.priors_from.scenario import prior_and_settings, usual_observers
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.idle import idle_settings, used_settings, why_idle_at

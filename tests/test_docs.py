@@ -166,7 +166,10 @@ def test_the_page_of_observers_lists_them() -> None:
 
 @pytest.mark.parametrize("page", COMMANDS, ids=lambda p: p.name)
 def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every line of a ```sh block that starts with wfsobs, in order, in one folder, on short records and with few observers."""
+    """Every line of a ```sh block that starts with wfsobs, in order, in one folder.
+
+    On short records and with few observers and controllers, evaluations and values.
+    """
     monkeypatch.chdir(tmp_path)
     shutil.copy(ROOT / "examples" / "wind.toml", tmp_path)
     monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path))
@@ -179,8 +182,14 @@ def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         words, out = (words[:-2], words[-1]) if ">" in words else (words, None)
         if "--seeds" in words:
             words[words.index("--seeds") + 1] = "2"
+        if "--vary" in words:  # the first and the last value of each
+            words = [re.sub(r"^([\w.]+=[^,]+,).*,", r"\1", word) for word in words]
         short = SHORT if words[1] in ("run", "observe", "tune", "loop", "export", "sweep") else ()
         short = ("--seconds", "0.1") if words[1] == "attach" else short
+        if words[1] == "tune":
+            short = (*short, "--evaluations", "3")
+        if words[1] == "loop" and "--controller" not in words:
+            short = (*short, "--controller", "integrator", "--controller", "lqg-kf-multi")
         if words[1] == "envelope":
             short = ("--points", "8", *(() if "--controller" in words else ("--controller", "lqg-kf-lgs")))
         if words[1] in ("run", "observe", "export", "sweep", "live") and "--observer" not in words:

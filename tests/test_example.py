@@ -101,7 +101,7 @@ from wfsobs.app.controls.names import setting_name
 from wfsobs.app.controls.panel import Controls
 from wfsobs.app.share import to_command, to_python
 from wfsobs.app.limits import NONE
-from wfsobs.app.report.export import make
+from wfsobs.app.report.page import make
 from wfsobs.app.service import Service
 from wfsobs.app.share import from_query, to_query
 from wfsobs.app.store import Store

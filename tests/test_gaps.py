@@ -15,12 +15,11 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.missing import fill_missing
 from wfsobs.prior import Lines, Model, Prior
-from wfsobs.priors_from.scenario import kalman_model, prior_of
-from wfsobs.priors_from.turbulence import measurement_noise
+from wfsobs.priors_from.scenario import kalman_model, measurement_noise, prior_of
 from wfsobs.record import Record, hold_last, pseudo_open_loop
 from wfsobs.scenario import Scenario
 from wfsobs.signal.riccati import steady_state
-from wfsobs.signal.welch import rms
+from wfsobs.signal.spectrum import rms
 
 
 def scenario() -> Scenario:

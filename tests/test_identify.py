@@ -25,7 +25,7 @@ from wfsobs.identification.report import (
     mode_rows,
     whiteness_lines,
 )
-from wfsobs.identification.whiteness import autocorrelation_test, cumulated_test, innovations
+from wfsobs.identification.result import autocorrelation_test, cumulated_test, innovations
 from wfsobs.pipeline import observe
 from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import Record, RecordError

@@ -10,8 +10,8 @@ import pytest
 from tests.records import recorded
 from wfsobs import PRESETS, observe
 from wfsobs.identification import Identification, identify
-from wfsobs.identification.both_sensors import FEWEST, read_difference, sensor_differences, without_error
 from wfsobs.identification.process import Number
+from wfsobs.identification.result import FEWEST, read_difference, sensor_differences, without_error
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2

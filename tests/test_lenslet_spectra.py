@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import welch
 
 from wfsobs.scenario import Scenario
-from wfsobs.sensors.aliasing import Aliasing
+from wfsobs.sensors.shack_hartmann import Aliasing
 from wfsobs.simulation import layers as atmosphere
 from wfsobs.simulation.flow_spectra import FlowSpectra, flow_spectra
 from wfsobs.simulation.lenslet_spectra import lenslet_flow_spectra, true_lenslet_spectra

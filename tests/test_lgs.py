@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from wfsobs.pipeline import observe
-from wfsobs.priors_from.turbulence import measurement_noise
+from wfsobs.priors_from.scenario import measurement_noise
 from wfsobs.record import delay_signal
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.disturbance import make_disturbance, vibration_variance

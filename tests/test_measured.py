@@ -7,7 +7,7 @@ import pytest
 
 from wfsobs.app.views.plots import marked_peaks
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.groups.vibration import Vibration
+from wfsobs.scenario.groups.atmosphere import Vibration
 from wfsobs.scenario.measured_spectra import ALL, LINES, PARTS, SPECTRA, measured_spectrum
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.disturbance import make_disturbance, vibration_variance

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from tests.records import ON_PAPER
 from wfsobs import PRESETS, SettingError
 from wfsobs.cli import main
-from wfsobs.cli.recovery_tables import OverTime
+from wfsobs.cli.show import OverTime
 from wfsobs.evaluation.recovery import PooledRms, recovery, running_rms, trailing_rms
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import VIBRATION

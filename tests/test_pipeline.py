@@ -20,7 +20,7 @@ from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import Estimate
 from wfsobs.pipeline import as_stated
 from wfsobs.progress import Cancelled, Watch
-from wfsobs.signal.welch import rms
+from wfsobs.signal.spectrum import rms
 
 
 def scenario(changes: dict[str, Any] | None = None) -> Scenario:

@@ -15,8 +15,8 @@ from scipy.signal import lfilter
 from wfsobs import PRESETS, simulate
 from wfsobs.cli import main
 from wfsobs.control.true_plant import ActingPlant, TruePlant
-from wfsobs.identification.mirror_response import few_lags, second_order
 from wfsobs.identification.plant import GroupPlant, PlantNumber, identify_plant, plant_lines
+from wfsobs.identification.plant_likelihood import few_lags, second_order
 from wfsobs.identification.probe import design_probe
 from wfsobs.record import Record, RecordError
 from wfsobs.signal.ar2 import Ar2
@@ -119,7 +119,7 @@ def test_both_sides_of_a_whole_number_of_frames_count(seed: int) -> None:
 def test_a_probe_makes_it_sharper() -> None:
     """And a rotation is found that the controller does not know of."""
     matrix = rotation(np.radians(8.0))
-    quiet, probed = (identify_plant(closed_loop(20_000, 1.3, matrix, probe=size, turned=np.eye(2)))[0] for size in (0.0, 0.01))
+    quiet, probed = (identify_plant(closed_loop(10_000, 1.3, matrix, probe=size, turned=np.eye(2)))[0] for size in (0.0, 0.01))
     for found in (quiet, probed):
         assert right(found.common_delay, 1.3) and found.rotation is not None and right(found.rotation, np.radians(8.0))
     assert quiet.common_gain.sd is not None and probed.common_gain.sd is not None
@@ -128,9 +128,9 @@ def test_a_probe_makes_it_sharper() -> None:
     assert quiet.chance == 1.0 and probed.chance > 1e-3
 
 
-def probed_mirrors(*plants: TruePlant) -> Record:
+def probed_mirrors(*plants: TruePlant, n: int = 20_000) -> Record:
     """The loop of a mirror, or of several whose motions add up, with a probe of 10 nm."""
-    rng, n = np.random.default_rng(3), 20_000
+    rng = np.random.default_rng(3)
     slow, line = Ar2(4.0 * pi, 0.9, 0.3, DT), Ar2(94.0 * pi, 0.01, 0.06, DT)
     seen = np.column_stack([slow.sample(n, rng) + line.sample(n, rng) for _ in range(2)])
     noise, probe = NOISE * rng.standard_normal((n, 2)), 0.01 * rng.standard_normal((n, 2))
@@ -159,7 +159,7 @@ def test_a_probe_tells_the_group_delay_of_a_mirror_with_dynamics(frequency: floa
 @pytest.mark.slow
 def test_what_no_mirror_of_second_order_does_is_not_identifiable() -> None:
     """An echo four frames later."""
-    (found,) = identify_plant(probed_mirrors(TruePlant(0.7 * np.eye(2), 2.0), TruePlant(0.3 * np.eye(2), 6.0)))
+    (found,) = identify_plant(probed_mirrors(TruePlant(0.7 * np.eye(2), 2.0), TruePlant(0.3 * np.eye(2), 6.0), n=6000))
     assert found.chance < 1e-6 and all(n.value is None for n in (*found.delay, *found.gain, found.common_delay))
     assert "than by any mirror of second order" in plant_lines([found])[1] and found.uncertainty == np.inf
 
@@ -200,10 +200,10 @@ def test_signals_that_tell_nothing_of_a_plant_are_named() -> None:
 
 @pytest.mark.slow
 def test_bad_samples_and_other_units_do_not_matter() -> None:
-    record = closed_loop(20_000, 2.4, np.eye(2))
+    record = closed_loop(10_000, 2.4, np.eye(2))
     y, rng = record.y_lgs.copy(), np.random.default_rng(3)
-    y[rng.choice(len(y), 200, replace=False)] += 0.8
-    y[rng.choice(len(y), 200, replace=False)] = np.nan
+    y[rng.choice(len(y), 100, replace=False)] += 0.8
+    y[rng.choice(len(y), 100, replace=False)] = np.nan
     (found,) = identify_plant(Record(y, 1e3 * record.u, DT))
     assert right(found.common_delay, 2.4) and right(found.common_gain, 1e-3)
 
@@ -212,7 +212,7 @@ def test_bad_samples_and_other_units_do_not_matter() -> None:
 def test_command(tmp_path: Path) -> None:
     """Delay and gain are those of the commands in the file, whatever is stated; it ends with what they rest on."""
     file = tmp_path / "r.npz"
-    save_record(file, closed_loop(12_000, 2.4, np.eye(2)))
+    save_record(file, closed_loop(4000, 2.4, np.eye(2)))
     plain = json.loads(CliRunner().invoke(main, ["plant", str(file), "--json"]).stdout)
     stated = ["plant", str(file), "--json", "--command-delay", "1.5", "--command-gain", "1.1", "--trust"]
     assert json.loads(CliRunner().invoke(main, stated).stdout) == plain

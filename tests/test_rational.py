@@ -9,8 +9,7 @@ from wfsobs import PRESETS
 from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.exact_errors import exact_errors
 from wfsobs.observers import OBSERVERS
-from wfsobs.priors_from.scenario import lines_of
-from wfsobs.priors_from.vibration import continuum_power
+from wfsobs.priors_from.scenario import continuum_power, lines_of
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.simulation.disturbance import vibration_power
 from wfsobs.spectral.rational import fit_processes

@@ -12,7 +12,7 @@ from wfsobs.evaluation.scores import lag, supervised_scores, unsupervised_scores
 from wfsobs.observers.estimates import TOTAL, Estimate
 from wfsobs.record import Record
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.welch import psd, rms
+from wfsobs.signal.spectrum import psd, rms
 
 NAMES = ["tip", "tilt"]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from wfsobs import simulate
-from wfsobs.priors_from.turbulence import measurement_noise
+from wfsobs.priors_from.scenario import measurement_noise
 from wfsobs.progress import QUIET
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS

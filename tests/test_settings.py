@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.groups.vibration import Peak
+from wfsobs.scenario.groups.atmosphere import Peak
 from wfsobs.settings.errors import SettingError
 from wfsobs.settings.group import Group
 from wfsobs.settings.parameters import Reals, allowed_values, unit_of
@@ -102,15 +102,18 @@ def test_the_walk_reaches_every_group() -> None:
 
 @pytest.mark.slow
 def test_every_setting_refuses_what_it_does_not_take(subtests: pytest.Subtests) -> None:
+    """One value by its whole path, and all of them at the group that owns the setting."""
     scenario = full()
     before = scenario.to_dict()
-    for path, p in ALL.items():
+    for path, owner, p in scenario.walk():
         with subtests.test(path):
             bad = list(refused(p))
             assert len(bad) >= 6
+            with pytest.raises(SettingError, match=rf"^{re.escape(path)} = "):
+                scenario.set(path, bad[0])
             for value in bad:
                 with pytest.raises(SettingError) as caught:
-                    scenario.set(path, value)
+                    owner.update({p.name: value}, path.removesuffix(p.name))
                 message = str(caught.value)
                 assert message.startswith(f"{path} = "), message
                 assert "\n" not in message and len(message) < 400
@@ -139,14 +142,17 @@ def bounds_of(p: param.Parameter) -> list[Any]:
 
 @pytest.mark.slow
 def test_every_setting_takes_its_own_bounds(subtests: pytest.Subtests) -> None:
+    """All at once: at their first bound, at their last, and at the choices that are left."""
     base = full()
-    for path, p in ALL.items():
-        with subtests.test(path):
-            is_real = isinstance(p, param.Number) and not isinstance(p, param.Integer)
-            for value in bounds_of(p):
-                found = _flat(_with(base, path, value))[path]
-                assert found == value
-                assert type(found) is (float if is_real else type(value))
+    bounds = {path: bounds_of(p) for path, p in ALL.items()}
+    for i in range(max(map(len, bounds.values()))):
+        values = {path: found[min(i, len(found) - 1)] for path, found in bounds.items()}
+        taken = _flat(base.replace(values))
+        for path, p in ALL.items():
+            with subtests.test(path, value=values[path]):
+                assert taken[path] == values[path]
+                is_real = isinstance(p, param.Number) and not isinstance(p, param.Integer)
+                assert type(taken[path]) is (float if is_real else type(values[path]))
 
 
 def test_every_number_states_its_unit_or_has_none(subtests: pytest.Subtests) -> None:
@@ -284,15 +290,20 @@ def types_in(value: Any) -> set[type]:
 def test_numbers_of_numpy_become_plain_on_every_way_in(subtests: pytest.Subtests) -> None:
     base = full()
     by_path, by_attribute = base.copy(), base.copy()
-    owners = {path: owner for path, owner, _ in by_attribute.walk()}
-    for path, p in ALL.items():
+    given = {path: of_numpy(p) for path, p in ALL.items()}
+    for path, owner, p in by_attribute.walk():
         with subtests.test(path):
-            for value in of_numpy(p):
+            for value in given[path]:
+                setattr(owner, p.name, value)
+                assert types_in(owner.to_dict()) <= {float, int, bool, str}
+    for i in range(2):
+        values = {path: found[i % len(found)] for path, found in given.items()}
+        for path, value in values.items():
+            if i < len(given[path]):
                 by_path.set(path, value)
-                setattr(owners[path], p.name, value)
-                for scenario in (by_path, by_attribute, base.replace({path: value})):
-                    assert scenario == base
-                    assert types_in(scenario.to_dict()) <= {float, int, bool, str}
+        for scenario in (by_path, by_attribute, base.replace(values)):
+            assert scenario == base
+            assert types_in(scenario.to_dict()) <= {float, int, bool, str}
 
 
 def test_numbers_of_numpy_in_peaks_and_events() -> None:

@@ -15,11 +15,8 @@ from wfsobs.atmosphere.frozen_flow import FrequencyGrid, View, frozen_flow, wave
 from wfsobs.atmosphere.plane_waves import Footprint, Wave
 from wfsobs.atmosphere.von_karman import TurbulenceLayer, von_karman_density
 from wfsobs.sensors import zernike
-from wfsobs.sensors.aliasing import Aliasing
-from wfsobs.sensors.lenslets import Lenslets
-from wfsobs.sensors.reconstructor import interaction, polynomials, reconstructor
-from wfsobs.sensors.shack_hartmann import ShackHartmann, TrigonometricSum, lagrange_weights
-from wfsobs.sensors.spots import ARCSEC, SpotModel
+from wfsobs.sensors.lenslets import Lenslets, interaction, polynomials, reconstructor
+from wfsobs.sensors.shack_hartmann import ARCSEC, Aliasing, ShackHartmann, SpotModel, TrigonometricSum, lagrange_weights
 from wfsobs.sensors.zernike import ZernikeProjection, up_to_order
 
 pytestmark = pytest.mark.slow

@@ -17,10 +17,12 @@ from wfsobs.observers.base import VIBRATION, Observer
 from wfsobs.prior import Prior
 from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import Measurements, Record
-from wfsobs.testing import CheckError, check_observer
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.testing import QUICK, CheckError, check_observer
 from wfsobs.testing.common import arrays_of, changed_after, steps_to_check
 
 CALLS: list[int] = []
+SHORTER = PRESETS["paper"]().replace({**QUICK, "run.duration": 0.8})
 
 
 def mean_of_three(measured: Measurements, _prior: Prior, _settings: Any, _watch: Watch) -> dict[str, np.ndarray]:
@@ -93,7 +95,7 @@ def observer(run: Any, **given: Any) -> Observer:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ON_PAPER)
 def test_ours_pass(name: str) -> None:
-    check_observer(OBSERVERS[name], alone=False)
+    check_observer(OBSERVERS[name], SHORTER, alone=False)
 
 
 @pytest.mark.slow

@@ -13,12 +13,12 @@ import pytest
 from wfsobs.control.base import Controller
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.integrator import integrator_law
-from wfsobs.control.law import Law
-from wfsobs.control.mirror import Plant
+from wfsobs.control.mirror import Law, Plant
 from wfsobs.prior import Bands, Prior
 from wfsobs.record import Measurements, Record
 from wfsobs.scenario import Scenario
-from wfsobs.testing import CheckError, check_controller
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.testing import QUICK, CheckError, check_controller
 
 CALLS: list[int] = []
 
@@ -98,7 +98,8 @@ def predicting(predict: Any) -> Controller:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_ours_pass(name: str) -> None:
-    check_controller(CONTROLLERS[name], alone=False)
+    shorter = PRESETS["paper"]().replace({**QUICK, "run.duration": 0.8})
+    check_controller(CONTROLLERS[name], shorter, alone=False)
 
 
 @pytest.mark.slow
@@ -119,7 +120,7 @@ def test_one_of_a_few_lines_passes() -> None:
         (unstable, "not within the unit circle"),
         (backwards, "looks ahead: measurements after step "),
         (partial(knows_the_scenario, Scenario()), "uses more than it is given: it reaches Run, Scenario"),
-        (lambda prior, mode, plant, settings: 0.5, "takes a wfsobs.control.law.Law, not a float"),
+        (lambda prior, mode, plant, settings: 0.5, "takes a wfsobs.control.mirror.Law, not a float"),
     ],
 )
 def test_a_law_that_breaks_a_rule_is_refused_with_the_reason(law: Any, reason: str) -> None:

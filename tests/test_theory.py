@@ -21,7 +21,7 @@ from wfsobs.priors_from.scenario import lines_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.welch import expected_psd
+from wfsobs.signal.spectrum import expected_psd
 
 RIGHT = Scenario().replace(
     {

@@ -10,8 +10,7 @@ from scipy.linalg import solve_toeplitz
 
 from wfsobs.evaluation.bound import bound_rms, least_errors
 from wfsobs.observers.base import TARGETS
-from wfsobs.priors_from.scenario import kalman_model
-from wfsobs.priors_from.turbulence import measurement_noise
+from wfsobs.priors_from.scenario import kalman_model, measurement_noise
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.ar2 import Ar2, turbulence_corner

@@ -16,7 +16,7 @@ from wfsobs.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from wfsobs.app.notebook_page import explore
-    from wfsobs.app.report.export import export
+    from wfsobs.app.report.page import export
     from wfsobs.closed_loop.envelope import plant_envelope
     from wfsobs.closed_loop.run import close_loop
     from wfsobs.evaluation.bound import bound
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from wfsobs.scenario.presets import PRESETS
     from wfsobs.scenario.scenario import register
     from wfsobs.settings.errors import SettingError
-    from wfsobs.signal.welch import psd
+    from wfsobs.signal.spectrum import psd
     from wfsobs.simulation.loop import simulate
     from wfsobs.stepping import design
     from wfsobs.telemetry.records import load, save
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "bound": "evaluation.bound",
     "explore": "app.notebook_page",
-    "export": "app.report.export",
+    "export": "app.report.page",
     "close_loop": "closed_loop.run",
     "plant_envelope": "closed_loop.envelope",
     "design": "stepping",
@@ -58,7 +58,7 @@ _HOMES = {
     "Scenario": "scenario",
     "PRESETS": "scenario.presets",
     "SettingError": "settings.errors",
-    "psd": "signal.welch",
+    "psd": "signal.spectrum",
     "simulate": "simulation.loop",
     "load": "telemetry.records",
     "save": "telemetry.records",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from time import perf_counter
 
 from wfsobs.dependence import RecordMemo
@@ -10,13 +11,11 @@ from wfsobs.evaluation.result import Failure
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
 from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimate, Estimates
-from wfsobs.priors_from.scenario import PriorParts, arguments, prior_and_settings
-from wfsobs.priors_from.selection import usual_observers
+from wfsobs.priors_from.scenario import PriorParts, arguments, prior_and_settings, usual_observers
 from wfsobs.progress import QUIET, Watch, detach_watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.idle import used_settings
-from wfsobs.settings.errors import SettingError
 from wfsobs.settings.tree import Plain
 from wfsobs.typing import Array
 
@@ -39,9 +38,7 @@ def each_estimate(
     """
     scenario = scenario.before_events  # no observer is told
     observers = [observers] if isinstance(observers, str) else observers
-    unknown = set(observers or ()) - set(OBSERVERS)
-    if unknown:
-        raise SettingError(f"observer {sorted(unknown)[0]!r}: no such observer; there are {', '.join(OBSERVERS)}")
+    OBSERVERS.check_ids(observers or ())
     names_of = usual_observers(scenario, record) if observers is None else dict.fromkeys(observers)
     chosen = [OBSERVERS[name] for name in names_of]
     names: dict[str, str] = {}
@@ -56,24 +53,21 @@ def each_estimate(
                 chosen.remove(observer)
             elif name:
                 names[observer.id] = name
-    weights = {o.id: o.weight for o in chosen}
-    total = sum(weights.values()) or 1.0
+    total = sum(o.weight for o in chosen) or 1.0
     done = 0.0
-    progress = _only_forward(watch.progress)
+    forward = replace(watch, progress=_only_forward(watch.progress))
     for observer in sorted(chosen, key=lambda o: o.weight):
-        base, share = done / total, weights[observer.id] / total
-        inner = Watch(
-            progress=lambda f, base=base, share=share: progress(base + share * f),
-            is_cancelled=watch.is_cancelled,
+        inner = replace(
+            forward.part(done / total, observer.weight / total),
             partial=lambda target, values, o=observer: on_partial(o.id, target, values) if on_partial else None,
         )
         for item in _one(observer, record, scenario, inner, parts):
             if memo is not None and isinstance(item, Estimate):
                 memo.note(names[observer.id], item)
             yield item
-        done += weights[observer.id]
+        done += observer.weight
         watch.check()
-        progress(done / total)
+        forward.progress(done / total)
 
 
 def _only_forward(tell: Callable[[float], None]) -> Callable[[float], None]:

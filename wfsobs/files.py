@@ -35,6 +35,11 @@ def write_whole(path: str | Path, write: Callable[[IO[bytes]], object]) -> None:
         raise OSError(error.errno, error.strerror or str(error), str(path)) from error
 
 
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text as `write_whole` writes a file. Raises OSError."""
+    write_whole(path, lambda file: file.write(text.encode()))
+
+
 def _is_device(path: str | Path) -> bool:
     """Return whether a path is that of a device or a pipe."""
     return os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path)

@@ -50,6 +50,15 @@ class Watch:
         if self.is_cancelled():
             raise Cancelled
 
+    def part(self, start: float, share: float) -> Watch:
+        """Return the watch of a part: its progress is `share` of this one's, from `start` on, and it stops with this one."""
+        return Watch(lambda fraction: self.progress(start + share * fraction), self.is_cancelled)
+
+    @property
+    def silent(self) -> Watch:
+        """A watch that stops with this one and reports nothing."""
+        return Watch(is_cancelled=self.is_cancelled)
+
     def step(self, fraction: float) -> None:
         """Report progress; raise `Cancelled` if the computation is to stop."""
         self.check()

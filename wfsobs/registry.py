@@ -15,6 +15,7 @@ from typing import Any, Protocol, TypeVar
 
 import param
 
+from wfsobs.settings.errors import SettingError
 from wfsobs.settings.group import Group, Section
 
 log: logging.Logger = logging.getLogger(__name__)
@@ -142,6 +143,11 @@ class Registry(MutableMapping[str, E]):
         if entry.label in (other.label for other in self._entries.values()):
             raise RegistrationError(f"{where}: the label {entry.label!r} is taken")
         _check_settings(entry, where)
+
+    def check_ids(self, ids: Iterable[str]) -> None:
+        """Raise SettingError for an id that is not there."""
+        if unknown := set(ids) - set(self):
+            raise SettingError(f"{self._word} {min(unknown)!r}: no such {self._word}; there are {', '.join(self)}")
 
     @property
     def _word(self) -> str:

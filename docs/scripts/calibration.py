@@ -11,7 +11,7 @@ from collections import defaultdict
 import numpy as np
 
 from wfsobs import PRESETS, run
-from wfsobs.evaluation.calibration import Calibration
+from wfsobs.evaluation.scores import Calibration
 from wfsobs.observers import OBSERVERS
 
 SEEDS = range(1, 6)

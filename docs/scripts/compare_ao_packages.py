@@ -21,10 +21,8 @@ import numpy as np
 
 from wfsobs.atmosphere.von_karman import von_karman_density
 from wfsobs.sensors import zernike
-from wfsobs.sensors.lenslets import Lenslets
-from wfsobs.sensors.reconstructor import reconstructor
-from wfsobs.sensors.shack_hartmann import ShackHartmann
-from wfsobs.sensors.spots import ARCSEC
+from wfsobs.sensors.lenslets import Lenslets, reconstructor
+from wfsobs.sensors.shack_hartmann import ARCSEC, ShackHartmann
 from wfsobs.typing import Array
 
 R0, L0 = 0.157, 25.0  # [m]

@@ -10,7 +10,7 @@ from itertools import groupby
 
 import numpy as np
 
-from wfsobs.cli.recovery_tables import OverTime, recovery_texts
+from wfsobs.cli.show import OverTime, recovery_texts
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.run import close_loop, closed_loop
 from wfsobs.control.controllers import CONTROLLERS

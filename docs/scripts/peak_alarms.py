@@ -17,8 +17,7 @@ from functools import partial
 import numpy as np
 
 import wfsobs
-from wfsobs.live.finding import Finding, identify_frames
-from wfsobs.live.peaks import CLOSE, peak_changes
+from wfsobs.live.finding import CLOSE, Finding, identify_frames, peak_changes
 from wfsobs.record import Record
 
 LINES = (0.0, 0.003, 0.005, 0.010, 0.030)

@@ -19,13 +19,12 @@ import wfsobs
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.observers.kalman.step import by_target
-from wfsobs.priors_from.scenario import modelled_processes
-from wfsobs.priors_from.turbulence import measurement_noise
+from wfsobs.priors_from.scenario import measurement_noise, modelled_processes
 from wfsobs.record import Record, Training
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.bandpass import bandpass_bank, filter_causal, filter_zero_phase
+from wfsobs.signal.spectrum import rms
 from wfsobs.signal.statespace import disturbance_model
-from wfsobs.signal.welch import rms
 
 SEEDS = range(1, 21)
 PRINTED = {"butterworth-ol": 7.66, "butterworth-cl": 13.4, "kf-lgs": 16.6, "gpr-offline": 12.4, "gpr-online": 13.3}

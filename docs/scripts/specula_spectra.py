@@ -14,7 +14,7 @@ import numpy as np
 from wfsobs.observers.base import Look
 from wfsobs.plot.elements import FREQUENCY, PAGE, draw_line, overlay, quantity, save_figure, stack
 from wfsobs.plot.looks import look
-from wfsobs.signal.welch import psd
+from wfsobs.signal.spectrum import psd
 
 RATE = 1000.0
 LOOPS = ("integrator", "lqg-kf-multi")

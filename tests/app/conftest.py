@@ -20,11 +20,13 @@ from wfsobs.app.service import Service, Session, run_key
 from wfsobs.app.sources import LoadedRecord, Source
 from wfsobs.app.store import Store
 from wfsobs.app.work import RunResults, compute
+from wfsobs.closed_loop.rows import Outcome
+from wfsobs.dependence import Memo
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 
-WAIT = 60.0
+WAIT = 200.0
 """How long a page is waited for [s]: a busy machine takes ten times as long as a quiet one."""
 
 SHORT = {
@@ -92,8 +94,8 @@ def enter() -> Iterator[Callable[..., Session]]:
     """A session of a server of its own, which keeps no results."""
     services: list[Service] = []
 
-    def enter(work: Any = compute, limits: Limits = NONE, workers: int = 2) -> Session:
-        services.append(Service(limits, workers, 0, work))
+    def enter(work: Any = compute, limits: Limits = NONE, workers: int = 2, memo: Memo | None = None) -> Session:
+        services.append(Service(limits, workers, 0, work, memo))
         return services[-1].enter()
 
     yield enter
@@ -128,10 +130,26 @@ def compute_once(scenario: Scenario, watch: Watch, tell: Tell, source: Source | 
     return shown
 
 
+class Outcomes(Memo):
+    """What controllers have done, held in memory: most of what a closed loop takes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.held: dict[str, Any] = {}
+
+    def put(self, name: str, value: Any) -> Any:
+        if isinstance(value, Outcome):
+            self.held[name] = value
+        return super().put(name, value)
+
+
+OUTCOMES = Outcomes()
+
+
 @pytest.fixture
 def dashboard(loop: Loop, short: Scenario, enter: Callable[..., Session]) -> Dashboard:
     """A dashboard whose first run is done."""
-    dashboard = Dashboard(loop.queue.put, enter(compute_once), short)
+    dashboard = Dashboard(loop.queue.put, enter(compute_once, memo=OUTCOMES), short)
     loop.closing.append(dashboard)
     dashboard.page()
     dashboard.start()

@@ -17,7 +17,7 @@ from wfsobs.app import downloads
 from wfsobs.app.actions import LARGEST, Actions
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.downloads import TooLarge, data_csv, data_npz
-from wfsobs.app.report.export import ReportError
+from wfsobs.app.report.page import ReportError
 from wfsobs.app.share import to_query
 from wfsobs.app.work import RunResults, compute
 from wfsobs.cli import main

@@ -7,19 +7,22 @@ from typing import Any
 import pytest
 
 from tests.app.conftest import compute_once
-from wfsobs.app.budgets import Budgets
 from wfsobs.app.display import Display
+from wfsobs.app.idle_work import Budgets
 from wfsobs.app.render import number
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.style import TERM_COLOURS
-from wfsobs.app.views.main_lines import MainLines
 from wfsobs.app.views.strip import Strip
-from wfsobs.app.views.verdict import VerdictLine
+from wfsobs.app.views.verdict import MainLines, VerdictLine
 from wfsobs.evaluation.budget import TERMS, Budget
 from wfsobs.evaluation.rows import own_bound
 from wfsobs.observers import OBSERVERS
+from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import simulate
+
+MAIN = ("multirate-multi", "gpr-online")
+"""One observer that is linear and one that is not."""
 
 
 class Page:
@@ -28,7 +31,7 @@ class Page:
     def __init__(self, store: Store):
         self.store, self.display = store, Display()
         self.lines = MainLines(store.run, self.display)
-        self.budgets = Budgets(store, self.lines.names)
+        self.budgets = Budgets(store, lambda _target: MAIN)
         self.strip = Strip("vibration", store.run, self.display, None, self.lines, self.budgets)
 
     def row(self, observer: str) -> dict[str, Any]:
@@ -38,6 +41,12 @@ class Page:
         budget = self.budgets.budget(observer, "vibration", mode)
         assert budget is not None
         return budget.terms
+
+
+@pytest.fixture
+def short(short: Scenario) -> Scenario:
+    """Each observer that is not linear runs sixteen times."""
+    return short.replace({"run.duration": 1.5})
 
 
 @pytest.fixture
@@ -89,8 +98,7 @@ def test_a_negative_term_has_no_piece_and_is_told(page: Page, loop: Any) -> None
 def test_those_that_are_not_linear_have_budgets_if_they_are_main_ones_or_all_are_asked_for(page: Page, loop: Any) -> None:
     page.store.start()
     loop.until(lambda: "gpr-online" in page.budgets.by_observer and page.budgets.task.state == "done")
-    main = {name for target in ("turbulence", "vibration") for name in page.lines.names(target)}
-    assert not {name for name in page.budgets.by_observer if not OBSERVERS[name].linear} - main
+    assert not {name for name in page.budgets.by_observer if not OBSERVERS[name].linear} - {*MAIN}
     before = dict(page.budgets.by_observer)
     page.budgets.ask_for_all()
     loop.until(lambda: "gpr-offline" in page.budgets.by_observer)
@@ -98,7 +106,7 @@ def test_those_that_are_not_linear_have_budgets_if_they_are_main_ones_or_all_are
 
 
 def test_observers_that_would_take_too_long_have_none(page: Page, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wfsobs.app.budgets.PATIENCE", 0.01)
+    monkeypatch.setattr("wfsobs.app.idle_work.BUDGET_PATIENCE", 0.01)
     page.budgets.ask_for_all()
     page.store.start()
     loop.until(lambda: page.budgets.task.state == "done")

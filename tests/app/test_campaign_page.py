@@ -24,8 +24,8 @@ from wfsobs.app.share import CopiedTask, to_command, to_python
 from wfsobs.campaign.compare import compare
 from wfsobs.campaign.follow import CampaignFolder
 from wfsobs.campaign.plan import Campaign, parse_plan
+from wfsobs.campaign.run import run_rows
 from wfsobs.campaign.store import batch_files, open_folder, read_results, write_batch
-from wfsobs.campaign.work import run_rows
 from wfsobs.cli import main
 from wfsobs.scenario import Scenario
 

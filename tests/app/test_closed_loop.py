@@ -18,13 +18,13 @@ from wfsobs.app.jobs import CANCELLED, DONE
 from wfsobs.app.pages.closed_loop import CURVES, ClosedLoopPage
 from wfsobs.app.pages.pages import EXPLORE, LOOP
 from wfsobs.app.style import look
-from wfsobs.app.views.plots import envelope
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.envelope import plant_envelope
 from wfsobs.closed_loop.rows import label, rows
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS
+from wfsobs.signal.envelope import envelope
 
 
 def opened(dashboard: Dashboard) -> ClosedLoopPage:
@@ -164,7 +164,7 @@ def test_it_comes_back_as_the_switches_are_by_then(page: ClosedLoopPage, dashboa
 
 
 def test_more_modes_than_tip_and_tilt(page: ClosedLoopPage, dashboard: Dashboard, loop: Any) -> None:
-    dashboard.store.change("telescope.radial_order", 2)
+    dashboard.store.load(dashboard.store.scenario.replace({"telescope.radial_order": 2, "run.duration": 1.0}))
     loop.finish(dashboard.store)
     done(page, loop)
     dashboard.display.mode = "defocus"

@@ -14,7 +14,7 @@ from panel.io.state import set_curdoc
 from panel.io.state import state as pn_state
 from tornado.ioloop import IOLoop
 
-from wfsobs.app.component import Component
+from wfsobs.app.style import Component
 
 
 class Setter(Component):

@@ -10,8 +10,7 @@ import pytest
 
 from wfsobs.app.controls.fields import SliderField, parse_number
 from wfsobs.app.controls.names import setting_name
-from wfsobs.app.controls.panel import AT_HAND, Controls
-from wfsobs.app.controls.status import status_of
+from wfsobs.app.controls.panel import AT_HAND, Controls, status_of
 from wfsobs.app.display import label_of
 from wfsobs.app.work import RunResults
 from wfsobs.evaluation.result import Result

@@ -12,11 +12,11 @@ import pytest
 from wfsobs.app.controls.panel import Controls
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.store import Store
-from wfsobs.app.views.plots import envelope
 from wfsobs.app.views.traces import BINS
 from wfsobs.evaluation.recovery import running_rms
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.events import OF_KIND, Event
+from wfsobs.signal.envelope import envelope
 
 EVENTS = [
     {"kind": "wind", "start": 1.6, "duration": 0.2, "wind_factor": 2.0},

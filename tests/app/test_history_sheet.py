@@ -14,7 +14,7 @@ from wfsobs.app import history as module
 from wfsobs.app.actions import Actions
 from wfsobs.app.display import Display
 from wfsobs.app.history import History, HistorySheet, Sheet
-from wfsobs.app.seeds import SeedRuns
+from wfsobs.app.idle_work import SeedRuns
 from wfsobs.app.session_file import SUFFIX, read_session
 from wfsobs.app.share import EXPLORED
 

@@ -31,13 +31,12 @@ from wfsobs.app.store import Store
 from wfsobs.app.style import look
 from wfsobs.app.views.plots import new_figure
 from wfsobs.live.board import NEXT
-from wfsobs.live.finding import Finding, MinuteSpectrum, PeakFinding
+from wfsobs.live.finding import Change, Finding, MinuteSpectrum, PeakFinding
 from wfsobs.live.loop import LiveLoop, LiveOrder
-from wfsobs.live.paced import ALARM, LiveEvent
-from wfsobs.live.peaks import Change
 from wfsobs.live.recording import Recorder
 from wfsobs.live.ring import Ring
 from wfsobs.live.simulated import SimulatedLoop
+from wfsobs.live.source import ALARM, LiveEvent
 from wfsobs.live.view import SHARED, SharedView
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
@@ -65,7 +64,7 @@ def is_running(pid: int) -> bool:
         return False
 
 
-def wait(condition: Any, seconds: float = 60.0) -> None:
+def wait(condition: Any, seconds: float = 200.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end

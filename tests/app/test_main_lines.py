@@ -15,13 +15,12 @@ from wfsobs.app.display import Display
 from wfsobs.app.jobs import DONE, RUNNING
 from wfsobs.app.render import number
 from wfsobs.app.style import look, observers_of
-from wfsobs.app.views.main_lines import REFERENCES, MainLines, main_observers
 from wfsobs.app.views.plots import GREY, MOST_COLOURED, ROOM_OF_NAME
 from wfsobs.app.views.traces import first_window
+from wfsobs.app.views.verdict import REFERENCES, MainLines, main_observers
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.evidence import gather_evidence, rank_observers
-from wfsobs.evaluation.known_lines import NOTHING, PEAKS, prior_knowledge
-from wfsobs.evaluation.rows import NO_ESTIMATE, is_non_causal
+from wfsobs.evaluation.rows import NO_ESTIMATE, NOTHING, PEAKS, is_non_causal, prior_knowledge
 from wfsobs.evaluation.scores import PREDICTION, Score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS

@@ -11,7 +11,7 @@ import panel as pn
 import pytest
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.pages import model
+from wfsobs.app.pages import figures as figures_page
 from wfsobs.app.pages.figures import Figures
 from wfsobs.app.pages.pages import AWAY, EXPLORE, FIGURES, MODEL
 from wfsobs.app.pages.parts import example
@@ -167,15 +167,15 @@ class TestModel:
             ),
             0,
         )
-        assert "is unstable" in words(model.model_html(told, dark=False))
+        assert "is unstable" in words(figures_page.model_html(told, dark=False))
 
     def test_nothing_is_fetched(self) -> None:
-        html = model.model_html(describe(Scenario(), 0), dark=True)
+        html = figures_page.model_html(describe(Scenario(), 0), dark=True)
         assert "http" not in html and "src=" not in html
 
     def test_no_font_for_mathematics_is_needed(self) -> None:
         """Without one no sign grows with what it encloses, roots are cut off and hats stand beside their letter."""
-        html = model.model_html(describe(Scenario(), 0), dark=False)
+        html = figures_page.model_html(describe(Scenario(), 0), dark=False)
         assert html.count("<math") > 20 and "<mi>x\u0302</mi>" in html and "<mi>φ\u0302</mi>" in html
         assert 'stretchy="true"' not in html and "<msqrt" not in html and "<mover" not in html
 

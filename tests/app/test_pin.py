@@ -13,11 +13,11 @@ from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.render import change, hundredths, number
 from wfsobs.app.style import observers_of
 from wfsobs.app.work import TRUTH
-from wfsobs.evaluation.known_lines import group_by_knowledge
+from wfsobs.evaluation.rows import group_by_knowledge
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.signal.welch import rms
+from wfsobs.signal.spectrum import rms
 
 
 def press(dashboard: Dashboard) -> None:

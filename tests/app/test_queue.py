@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from wfsobs.app import jobs as module
 from wfsobs.app.cache import Cache
-from wfsobs.app.controls.status import status_of
+from wfsobs.app.controls.panel import status_of
 from wfsobs.app.jobs import BATCH, CANCELLED, CLICK, DONE, FAILED, LONG, RUNNING, Job, JobQueue
 from wfsobs.app.limits import NONE
 from wfsobs.app.service import BackgroundTask, Service

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from wfsobs.app.controls.search import settings_found
+from wfsobs.app.controls.panel import settings_found
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.scenario import Scenario
 
@@ -46,10 +46,13 @@ class TestHeadings:
         dashboard.store.choose("paper")
         plain = titles(dashboard)
         assert plain == dashboard.controls.topics
+        written: list[object] = []
+        dashboard.controls.accordion.param.watch(written.append, "objects")
         dashboard.store.replace({"kalman.vibration_rms": 0.1, "kalman.turbulence_rms": 0.4, "run.seed": 5})
         assert titles(dashboard) == plain | {
             "kalman": f"{plain['kalman']} · 2 changed",
             "run": f"{plain['run']} · 1 changed",
         }
+        assert len(written) == 1, "all at once: for each the whole page is looked through"
         dashboard.store.undo()
         assert titles(dashboard) == plain

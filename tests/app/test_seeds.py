@@ -12,8 +12,8 @@ import pytest
 
 from wfsobs.app.cache import Cache
 from wfsobs.app.display import Display
+from wfsobs.app.idle_work import SeedRuns
 from wfsobs.app.jobs import BATCH, CLICK, DONE, IDLE_TIME, Job, JobQueue
-from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.store import Store
 from wfsobs.app.views.strip import Strip
 from wfsobs.app.views.switches import SeedSwitch
@@ -31,7 +31,7 @@ def queue() -> Iterator[JobQueue]:
 
 
 def wait(condition: Any) -> None:
-    end = monotonic() + 30.0
+    end = monotonic() + 200.0
     while not condition():
         assert monotonic() < end
         sleep(0.005)

@@ -19,8 +19,7 @@ from wfsobs.app import session_file as module
 from wfsobs.app.service import run_key
 from wfsobs.app.session_file import MOST, HistoryEntry, SessionContent, SessionError, make_entry, read_session, write_session
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, record_key
-from wfsobs.evaluation.calibration import Calibration
-from wfsobs.evaluation.scores import Score
+from wfsobs.evaluation.scores import Calibration, Score
 from wfsobs.record import Record, Training
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.telemetry.intake import DeclaredFormat

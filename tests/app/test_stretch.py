@@ -11,7 +11,7 @@ from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.render import number
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.error_spectra import band_rms, cumulative_rms
-from wfsobs.signal.welch import psd
+from wfsobs.signal.spectrum import psd
 
 
 def lines(dashboard: Dashboard, target: str = "vibration") -> list[str]:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.idle_work import SeedScores
 from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING, Job
 from wfsobs.app.limits import NONE, Limits
 from wfsobs.app.pages import sweep as sweep_work
@@ -20,7 +21,6 @@ from wfsobs.app.pages.pages import EXPLORE, SWEEP
 from wfsobs.app.pages.sweep import EVERY, SweepPage, SweepTask, sweep_settings
 from wfsobs.app.pages.sweep_views import FULL_MARGIN, GROUNDS, mix
 from wfsobs.app.render import number
-from wfsobs.app.seeds import SeedScores
 from wfsobs.app.service import Service
 from wfsobs.app.sources import SimulatedRecord
 from wfsobs.app.style import look
@@ -58,6 +58,7 @@ def cell(page: SweepPage, index: int, target: str) -> dict[str, Any]:
 
 def test_a_map_is_what_the_core_finds(page: SweepPage, dashboard: Dashboard, loop: Any) -> None:
     store = dashboard.store
+    store.change("run.duration", 1.0)
     page.values[0].value, page.values[1].value, page.seeds.value = "5,20", "5,10", "3"
     said = f'<p class="text" role="status">2 × 2 scenarios × 3 seeds = 12 runs, about {page.plan().seconds:.0f} s'
     assert page.estimate.html.startswith(said)
@@ -170,8 +171,9 @@ def test_settings_and_their_usual_values(page: SweepPage, dashboard: Dashboard) 
     for path in paths:
         axis = parse_axis(f"{path}={usual_values(scenario, path)}")
         assert len(axis.values) >= 2
+        group, _, name = path.rpartition(".")
         for value in axis.values:  # each is one that the setting takes
-            scenario.replace({path: value})
+            scenario.lookup(group).replace({name: value})
     assert usual_values(scenario, RATIO) == "1,6,10,15,20"
     page.settings[0].value = "gpr_online.length_scale"
     assert "gpr-online" in page.plan().observers and "kf-adaptive" not in page.plan().observers, "its own observer runs"

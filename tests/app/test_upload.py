@@ -79,7 +79,9 @@ def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: 
     assert np.isfinite(line["kf-lgs"]).all() and np.isnan(line["truth"]).all()
     spectrum = dashboard.explore.spectra.spectra["vibration"].sources["kf-lgs"].data
     assert len(spectrum["y"]) and np.isfinite(spectrum["y"]).all()
-    assert dashboard.explore.spectra.spectra["vibration"].peaks.data["x"] == []  # of the settings, not of the record
+    assert (
+        dashboard.explore.spectra.spectra["vibration"].marks["peaks"].data_source.data["x"] == []
+    )  # of the settings, not of the record
     cards = dashboard.explore.strips["vibration"].items()
     notes, values = ({card["name"]: card[key] for card in cards} for key in ("note", "value"))
     found = {s.observer: number(1e3 * s.rms) for s in expected.scores if s.mode == "tip"}

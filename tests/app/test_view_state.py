@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.seeds import SEEDS
+from wfsobs.app.idle_work import SEEDS
 
 
 def other(dashboard: Dashboard, query: str) -> list[str]:

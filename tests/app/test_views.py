@@ -18,7 +18,6 @@ from wfsobs.app.downloads import data_csv
 from wfsobs.app.render import number
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.style import look
-from wfsobs.app.views.plots import envelope, envelope_times
 from wfsobs.app.views.traces import BINS
 from wfsobs.app.work import TRUTH
 from wfsobs.control.controllers import CONTROLLERS
@@ -26,6 +25,7 @@ from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import PLAIN
 from wfsobs.scenario import Scenario
+from wfsobs.signal.envelope import envelope, envelope_times
 from wfsobs.simulation.loop import simulate
 
 
@@ -187,14 +187,14 @@ class TestSpectra:
     def test_peaks_are_marked(self, dashboard: Dashboard, loop: Any) -> None:
         view = dashboard.explore.spectra.spectra["vibration"]
         peaks = [p.frequency for p in dashboard.store.scenario.vibration.peaks]
-        assert view.peaks.data["x"] == peaks
-        assert view.model.data["x"] == [dashboard.store.scenario.kalman.frequency]
+        assert view.marks["peaks"].data_source.data["x"] == peaks
+        assert view.marks["model"].data_source.data["x"] == [dashboard.store.scenario.kalman.frequency]
         dashboard.store.change("vibration.cutoff", 20)
         loop.finish(dashboard.store)
-        assert view.peaks.data["x"] == [f for f in peaks if f <= 20]
+        assert view.marks["peaks"].data_source.data["x"] == [f for f in peaks if f <= 20]
         dashboard.store.change("vibration.source", "none")
         loop.finish(dashboard.store)
-        assert view.peaks.data["x"] == []
+        assert view.marks["peaks"].data_source.data["x"] == []
 
     def test_axes(self, dashboard: Dashboard) -> None:
         assert dashboard.explore.spectra.x_range.start == pytest.approx(0.667, abs=0.01)
@@ -316,7 +316,7 @@ class TestHigherModes:
         units.buttons.value = "mas"
         assert display.unit == "mas"
         switch.list.value = "defocus"
-        dashboard.explore.pinning._on_press(None)
+        dashboard.explore.pinning.button.param.trigger("clicks")
         store.change("telescope.radial_order", 1)
         loop.finish(store)
         assert display.mode == "tip" and switch.buttons.visible and not switch.list.visible

@@ -16,7 +16,7 @@ from wfsobs.dependence import Memo
 from wfsobs.evaluation.error_spectra import scored_samples
 from wfsobs.progress import QUIET, Cancelled, Watch
 from wfsobs.scenario import Scenario
-from wfsobs.signal.welch import psd
+from wfsobs.signal.spectrum import psd
 
 
 def keys(shown: RunResults) -> set[tuple[str, str]]:

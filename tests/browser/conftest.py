@@ -21,7 +21,7 @@ import pytest
 from playwright.sync_api import Browser, BrowserContext, JSHandle, Page, expect, sync_playwright
 
 from wfsobs.app.style import observers_of
-from wfsobs.priors_from.selection import usual_observers
+from wfsobs.priors_from.scenario import usual_observers
 from wfsobs.scenario.presets import PRESETS
 
 ROOT = Path(__file__).parents[2]
@@ -37,6 +37,17 @@ FLAGS = [
 SEEDS = "view.seeds="
 QUICK = "?run.duration=2&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.5"
 """Settings of a short record: what one test has had run, a server knows for the next."""
+PRESET = {"run.duration": 4.0, "run.warm_up": 1.0, "adaptive.window": 1.0}
+"""What the first preset has on the server of the tests: pages that open with it, and changes on them, take less than half."""
+SERVE = f"""
+import sys
+from panel.command import main
+from wfsobs.scenario.presets import PRESETS
+whole = PRESETS["paper"]
+PRESETS["paper"] = lambda: whole().replace({PRESET})
+sys.argv[0] = "panel"
+main()
+"""
 CLOSED_MID_UPDATE = (
     "WebSocketClosedError",
     "StreamClosedError",
@@ -84,7 +95,7 @@ class Server:
         }
         with log.open("w") as out:
             self.process = subprocess.Popen(
-                [sys.executable, *(part.format(port=port) for part in command)],
+                [sys.executable, *(part.replace("{port}", str(port)) for part in command)],
                 cwd=ROOT,
                 env=environment,
                 stdout=out,
@@ -116,8 +127,8 @@ class Server:
 @pytest.fixture(scope="session")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     log = tmp_path_factory.mktemp("server") / "log"
-    command = "-m panel serve app --port {port} --liveness --session-token-expiration 86400".split()
-    server = Server(command, log, "/app")
+    command = "serve app --port {port} --liveness --session-token-expiration 86400".split()
+    server = Server(["-c", SERVE, *command], log, "/app")
     yield server
     server.close()
 
@@ -263,13 +274,16 @@ ANSWERED = """() => {
 
 
 CHANGED = f"""() => [...new URLSearchParams(location.search).keys()]
-    .some((it) => !it.startsWith("view.") && !new URLSearchParams("{QUICK}").has(it))"""
-"""Whether the link has settings beside those of `QUICK`."""
+    .some((it) => !it.startsWith("view.") && it !== "preset" && !new URLSearchParams("{QUICK}").has(it))"""
+"""Whether the link has settings beside those of `QUICK`; a preset by its name has none."""
 
 
-def until(page: Page, holds: str, arg: object = None) -> JSHandle:
-    """Wait until a function holds on the page: asked with every picture, as is usual, it takes time from what it waits for."""
-    return page.wait_for_function(holds, arg=arg, polling=50)
+def until(page: Page, holds: str, arg: object = None, every: float = 50) -> JSHandle:
+    """Wait until a function holds on the page: asked with every picture, as is usual, it takes time from what it waits for.
+
+    every : time from one question to the next [ms]
+    """
+    return page.wait_for_function(holds, arg=arg, polling=every)
 
 
 def answered(page: Page) -> None:
@@ -287,6 +301,6 @@ def eventually(page: Page, holds: Callable[[], object], seconds: float = PATIENC
 
 def finished(page: Page) -> None:
     """Wait until the settings are there, the run is over and its results are drawn."""
-    until(page, SETTINGS)
-    until(page, DONE)
-    until(page, DRAWN)
+    until(page, SETTINGS, every=200)
+    until(page, DONE, every=200)
+    until(page, DRAWN, every=200)  # it looks through all of the page

@@ -11,8 +11,11 @@ from playwright.sync_api import Locator, Page, expect
 
 from tests.browser.conftest import DONE, QUICK, SETTINGS, eventually, finished, until
 
-LIVE = QUICK + "&view.page=live&view.live.observers=kf-multi,multirate-multi,gpr-online&view.live.controllers=integrator"
-"""Few beside the page: those whose lines are shown first."""
+LIVE = (
+    f"{QUICK}&sensors.lgs_rate=250&view.page=live"
+    "&view.live.observers=kf-multi,multirate-multi,gpr-online&view.live.controllers=integrator"
+)
+"""Few frames, and few beside the page: those whose lines are shown first."""
 
 
 def begin(page: Page) -> None:

@@ -22,6 +22,8 @@ RATE = 250
 """Frames a second: a thread of this process keeps that up beside the browser."""
 RUNNING = re.compile("^Running at 1 × real time")
 SETTINGS = {"sensors.lgs_rate": 250.0}
+OBSERVERS = ("kf-lgs", "kf-multi", "gp-lgs", "gpr-online")
+"""Three with errors of the next measurement, whose lines are shown, and the online GPR, which has none."""
 
 
 class Publisher:
@@ -62,6 +64,7 @@ def shadow(
     running = [Publisher(path, rows)]
     settings = [part for name, value in SETTINGS.items() for part in ("--set", f"{name}={value:g}")]
     stream = ["--in", str(path), "--modes", "0,1", *settings, "--log", str(tmp_path / "told.log")]
+    stream += [part for name in OBSERVERS for part in ("--observer", name)]
     server = make_server(["-m", "wfsobs", "live", "--port", "{port}", *stream], tmp_path / "log", "/")
     yield server, path, running
     for publisher in running:

@@ -186,7 +186,7 @@ def page(opened: Page) -> Iterator[Page]:
     opened.evaluate("() => { document.body.tabIndex = -1; document.body.focus(); scrollTo(0, 0) }")
     yield opened
     undo = opened.get_by_role("button", name="Undo", exact=True)
-    while undo.is_enabled() or opened.evaluate(CHANGED):
+    while opened.evaluate(CHANGED):  # and no further: before the link there was the preset
         undo.evaluate("it => it.click()")  # which does nothing where there is nothing to undo any more
         answered(opened)
 
@@ -219,7 +219,7 @@ def test_the_keyboard_does_it_all(page: Page) -> None:
     page.keyboard.press("ControlOrMeta+a")
     page.keyboard.type("7.5")
     assert focused(page)["name"] == "Peak 1: ξ", "Tab takes the value over and goes on"
-    expect(page.get_by_text(re.compile("2 changed: .*Peaks"))).to_be_visible()
+    expect(page.get_by_text(re.compile("changed: (?=.*Wind speed)(?=.*Peaks)"))).to_be_visible()
     expect(cell).to_have_value("7.5")
 
     card = page.get_by_role("button", name=re.compile("^LGS KF")).first  # always shown at first

@@ -15,8 +15,8 @@ from tests.browser.conftest import until
 from wfsobs.app.pages.pages import TITLES
 from wfsobs.app.style import labels, look
 from wfsobs.campaign.plan import parse_plan
+from wfsobs.campaign.run import run_rows
 from wfsobs.campaign.store import open_folder, write_batch
-from wfsobs.campaign.work import run_rows
 from wfsobs.evaluation.scores import BOUNDS
 
 SHORT = {"run.duration": 1.0, "run.warm_up": 0.2, "gpr_online.training_size": 40, "gpr_offline.training_size": 40}

@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 
 from wfsobs.campaign.compare import compare
-from wfsobs.campaign.errors import CampaignErrors
-from wfsobs.campaign.follow import CampaignFolder
+from wfsobs.campaign.follow import CampaignErrors, CampaignFolder
 from wfsobs.campaign.plan import parse_plan
+from wfsobs.campaign.run import run_rows
 from wfsobs.campaign.selection import MOST_VALUES, plan_axes
 from wfsobs.campaign.store import open_folder, read_results, write_batch
-from wfsobs.campaign.work import run_rows
 from wfsobs.settings.errors import SettingError
 
 PLAN = """

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from scripts.store_physics import FILE, numbers
-from wfsobs.campaign.keys import PHYSICS_VERSION
+from wfsobs.campaign.store import PHYSICS_VERSION
 
 pytestmark = pytest.mark.slow
 
@@ -17,5 +17,5 @@ def test_numbers_move_with_the_version():
     stored = json.loads(FILE.read_text(encoding="utf-8"))
     assert stored["version"] == PHYSICS_VERSION, "run scripts/store_physics.py"
     assert numbers() == pytest.approx(stored["rms_nm"], rel=TOLERANCE), (
-        "results have moved: raise PHYSICS_VERSION in wfsobs/campaign/keys.py and run scripts/store_physics.py"
+        "results have moved: raise PHYSICS_VERSION in wfsobs/campaign/store.py and run scripts/store_physics.py"
     )

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from wfsobs.campaign.plan import parse_plan
-from wfsobs.campaign.work import run_rows
+from wfsobs.campaign.run import run_rows
 from wfsobs.cli.campaign import rows_of_a_run
 from wfsobs.evaluation.scores import COMMON_BOUNDS
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from wfsobs.campaign.points import conditions, grid, product, sample
+from wfsobs.campaign.sweep import conditions, grid, product, sample
 from wfsobs.settings.errors import SettingError
 
 

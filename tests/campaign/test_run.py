@@ -12,8 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 import wfsobs
-from wfsobs.campaign.keys import row_key, scenario_digest
-from wfsobs.campaign.store import ROWS, batch_files, read_results, write_batch
+from wfsobs.campaign.store import ROWS, batch_files, read_results, row_key, scenario_digest, write_batch
 from wfsobs.cli import main
 
 pytestmark = pytest.mark.slow
@@ -176,7 +175,7 @@ def test_an_observer_that_ends_in_an_error_is_a_failure_of_its_own(monkeypatch):
     from dataclasses import replace
 
     from wfsobs.campaign.plan import parse_plan
-    from wfsobs.campaign.work import run_rows
+    from wfsobs.campaign.run import run_rows
     from wfsobs.observers import OBSERVERS
 
     def broken(*_):

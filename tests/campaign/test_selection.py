@@ -7,9 +7,9 @@ import pytest
 from click.testing import CliRunner
 
 from wfsobs.campaign.plan import parse_plan
+from wfsobs.campaign.run import run_rows
 from wfsobs.campaign.selection import cells_where, condition, plan_axes
 from wfsobs.campaign.store import open_folder, read_results, write_batch
-from wfsobs.campaign.work import run_rows
 from wfsobs.cli import main
 from wfsobs.settings.errors import SettingError
 

@@ -60,12 +60,12 @@ def test_an_empty_folder_has_an_empty_table(folder):
 
 def test_the_rows_as_text_are_those_of_the_table_in_chunks(monkeypatch, capsys, tmp_path):
     from wfsobs.campaign.plan import parse_plan
-    from wfsobs.cli import campaign_results
+    from wfsobs.cli import campaign
 
     plan = parse_plan('seeds = 1\nobservers = ["kf-lgs"]\n[grid]\nturbulence.wind_speed = [5, 10]\n', tmp_path)
     rows = [row(str(i), 0.1 + i, cell=i % 2, truth_rms_nm=None, start_s=0.0, apart=False, note="") for i in range(5)]
-    monkeypatch.setattr(campaign_results, "CHUNK", 2)
-    campaign_results.print_csv(plan, pa.Table.from_pylist(rows, schema=schema()))
+    monkeypatch.setattr(campaign, "CHUNK", 2)
+    campaign.print_csv(plan, pa.Table.from_pylist(rows, schema=schema()))
     head, *lines = (line.split(",") for line in capsys.readouterr().out.splitlines())
     assert head[-1] == "turbulence.wind_speed"
     assert [line[0] for line in lines] == ["0", "1", "2", "3", "4"]
@@ -74,12 +74,12 @@ def test_the_rows_as_text_are_those_of_the_table_in_chunks(monkeypatch, capsys, 
 
 
 def test_a_process_asks_for_its_kernel_once(monkeypatch):
-    from wfsobs.campaign import work
+    from wfsobs.campaign import run
 
     asked = []
-    monkeypatch.setattr(work, "threadpool_info", lambda: asked.append(1) or [{"user_api": "blas", "architecture": "Tape"}])
-    work.blas_kernel.cache_clear()
+    monkeypatch.setattr(run, "threadpool_info", lambda: asked.append(1) or [{"user_api": "blas", "architecture": "Tape"}])
+    run.blas_kernel.cache_clear()
     try:
-        assert [work.blas_kernel() for _ in range(3)] == ["Tape"] * 3 and len(asked) == 1
+        assert [run.blas_kernel() for _ in range(3)] == ["Tape"] * 3 and len(asked) == 1
     finally:
-        work.blas_kernel.cache_clear()
+        run.blas_kernel.cache_clear()

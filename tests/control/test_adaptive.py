@@ -15,7 +15,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.step import each_frame
 from wfsobs.record import Record
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.signal.welch import rms
+from wfsobs.signal.spectrum import rms
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
 

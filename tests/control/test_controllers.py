@@ -15,21 +15,20 @@ from wfsobs.closed_loop.rows import ClosedLoop, Outcome, residual_rms, strehl
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.integrator import best_gain, highest_stable_gain, integrator_law, limited_integrator
+from wfsobs.control.margins import residual_variance
 from wfsobs.control.mirror import Mirror
-from wfsobs.control.residual import residual_variance
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers.baselines import online_reference
 from wfsobs.priors_from.controllers import controller_arguments, own_settings
-from wfsobs.priors_from.scenario import bands_of, kalman_model, modelled_processes, spectra_of
-from wfsobs.priors_from.turbulence import measurement_noise
+from wfsobs.priors_from.scenario import bands_of, kalman_model, measurement_noise, modelled_processes, spectra_of
 from wfsobs.progress import QUIET
 from wfsobs.record import Record, RecordError, Training, delay_signal
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.errors import SettingError
 from wfsobs.signal.riccati import steady_state
+from wfsobs.signal.spectrum import psd
 from wfsobs.signal.statespace import paper_matrices
-from wfsobs.signal.welch import psd
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
 

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from wfsobs.closed_loop.design import design
 from wfsobs.control.integrator import highest_stable_gain, integrator_law
-from wfsobs.control.law import Law, transfer
 from wfsobs.control.margins import Margins, crossings, frequencies, margins
-from wfsobs.control.mirror import Mirror
+from wfsobs.control.mirror import Law, Mirror, transfer
 from wfsobs.scenario.presets import PRESETS
 
 DT = 1e-3

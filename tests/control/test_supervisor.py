@@ -10,7 +10,7 @@ from scipy.stats import gamma
 
 import wfsobs
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.control.step_laws import KalmanLaws
+from wfsobs.control.step import KalmanLaws
 from wfsobs.control.supervisor import STRICT, WINDOW, SupervisedController, Supervision, _Level
 from wfsobs.observers.step import StepError
 from wfsobs.typing import Array

@@ -12,9 +12,8 @@ from click.testing import CliRunner
 import wfsobs
 from wfsobs.cli.group import main
 from wfsobs.closed_loop.design import design
-from wfsobs.control.integrator import best_gain, highest_stable_gain
+from wfsobs.control.integrator import best_gain, gain_from_telemetry, highest_stable_gain
 from wfsobs.control.mirror import Mirror
-from wfsobs.control.telemetry_gain import gain_from_telemetry
 from wfsobs.prior import Spectra
 from wfsobs.record import delay_signal
 from wfsobs.signal.ar2 import Ar2

@@ -14,7 +14,7 @@ from tests.test_plant import closed_loop as loop_of_plant
 from tests.test_plant import rotation
 from wfsobs.cli import main
 from wfsobs.cli.options import load_declared
-from wfsobs.identification.stated_plant import contradiction
+from wfsobs.identification.plant import contradiction
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS

@@ -3,13 +3,12 @@
 import queue
 from types import SimpleNamespace
 
-from wfsobs.live.board import Board
-from wfsobs.live.crew import Site, trace_width
-from wfsobs.live.paced import LiveEvent
+from wfsobs.live.board import Board, trace_width
+from wfsobs.live.crew import Site
 from wfsobs.live.processes import made_crew
 from wfsobs.live.recording import Recorder
-from wfsobs.live.ring import Ring
-from wfsobs.live.rows import Rows
+from wfsobs.live.ring import Ring, Rows
+from wfsobs.live.source import LiveEvent
 from wfsobs.live.view import last_frames, read_view
 
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from tests.live.in_process import keep_lines
-from wfsobs.live.board import SLOTS
-from wfsobs.live.crew import slot_width, trace_width
+from wfsobs.live.board import SLOTS, slot_width, trace_width
 from wfsobs.live.loop import FEWEST, Alarms, noise_of
 from wfsobs.live.ring import LiveFrame
 from wfsobs.live.view import LiveView

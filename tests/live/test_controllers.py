@@ -12,7 +12,7 @@ from wfsobs.closed_loop.design import design as design_laws
 from wfsobs.closed_loop.rows import residual_rms
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.live.checks import make_design
-from wfsobs.live.control_crew import SEATS, ControlCrew, ControlView, row_width
+from wfsobs.live.crew import SEATS, ControlCrew, ControlView, row_width
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.ring import LiveFrame
 from wfsobs.live.simulated import SimulatedLoop

@@ -11,12 +11,12 @@ from scipy.signal import lfilter
 
 import wfsobs
 from wfsobs.cli import main
-from wfsobs.latencies import EDGES, Latencies
 from wfsobs.live.ring import CAPACITY, Ring
 from wfsobs.live.simulated import Integrator, endless_blocks
 from wfsobs.observers import OBSERVERS
 from wfsobs.prior import Training
 from wfsobs.scenario.presets import paper
+from wfsobs.streams.follower import EDGES, Latencies
 from wfsobs.telemetry.records import save_record
 
 pytestmark = pytest.mark.slow

@@ -18,15 +18,13 @@ import pytest
 
 import wfsobs
 from wfsobs.live import simulated
-from wfsobs.live.board import Board
-from wfsobs.live.crew import Site, trace_width
-from wfsobs.live.delivery import Delivery, merged_rows
+from wfsobs.live.board import Board, Delivery, trace_width
+from wfsobs.live.crew import Site
 from wfsobs.live.loop import TICK, LiveLoop, _keep
-from wfsobs.live.paced import Pace
 from wfsobs.live.processes import POLL, REST, Pause, made_crew
-from wfsobs.live.ring import LiveFrame, Ring
-from wfsobs.live.rows import Rows
+from wfsobs.live.ring import LiveFrame, Ring, Rows, merged_rows
 from wfsobs.live.simulated import FADE, GLANCE, Block, SimulatedFrames, SimulatedLoop
+from wfsobs.live.source import Pace
 from wfsobs.live.view import read_view
 from wfsobs.scenario.presets import paper
 from wfsobs.settings.group import SettingError
@@ -135,7 +133,7 @@ def test_lost_frames_hold_the_command():
 
 def test_play_pause_steps_and_speed(monkeypatch):
     now = 100.0
-    monkeypatch.setattr("wfsobs.live.paced.monotonic", lambda: now)
+    monkeypatch.setattr("wfsobs.live.source.monotonic", lambda: now)
     pace = Pace(0.001, 2.0)
     assert not pace.runs
     pace.take({"step": 2})
@@ -406,7 +404,7 @@ def is_running(pid):
 
 TURNS = """
 import os
-from wfsobs.live.paced import SOURCE, go_first
+from wfsobs.live.source import SOURCE, go_first
 
 def turn():
     return os.sched_getparam(0).sched_priority if hasattr(os, "sched_getparam") else 0

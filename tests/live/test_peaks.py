@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from tests.live.in_process import keep_lines
-from wfsobs.live.finding import Finding, MinuteSpectrum, PeakFinding, spectrum_of
+from wfsobs.live.finding import Change, Finding, MinuteSpectrum, PeakFinding, distinct_peaks, has_risen, peak_changes, spectrum_of
 from wfsobs.live.loop import Alarms
-from wfsobs.live.peaks import Change, distinct_peaks, has_risen, peak_changes
 
 STEP, NOISE, DT = 1.0 / 60.0, 0.02, 1e-3
 FREQUENCY = STEP * np.arange(1, 30_000)

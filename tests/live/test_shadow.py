@@ -13,7 +13,7 @@ from tests.live.in_process import LoopInProcess
 from tests.live.test_sources import Inbox
 from wfsobs.live.attached import StreamFrames, StreamSource
 from wfsobs.live.loop import Shadow, append_line
-from wfsobs.live.paced import Desk, LiveEvent
+from wfsobs.live.source import Desk, LiveEvent
 from wfsobs.scenario.presets import paper
 from wfsobs.streams.shared_image import SharedImage
 

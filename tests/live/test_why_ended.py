@@ -8,7 +8,7 @@ import pytest
 
 from wfsobs.live.follow import _drain
 from wfsobs.live.loop import LiveLoop
-from wfsobs.live.paced import FAILURE, LiveEvent
+from wfsobs.live.source import FAILURE, LiveEvent
 from wfsobs.settings.group import SettingError
 
 

@@ -11,25 +11,21 @@ import pytest
 
 import wfsobs
 from wfsobs.evaluation.bound import bound, bound_rms
-from wfsobs.evaluation.calibration import half_width
+from wfsobs.evaluation.scores import half_width
 from wfsobs.execution import run_observer
 from wfsobs.live.board import SLOTS
 from wfsobs.live.checks import check_slot
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.kalman.asterism_model import ALIKE, FRAME_MEANS, MEANS, AsterismModel
-from wfsobs.observers.kalman.joint import AsterismEstimator
+from wfsobs.observers.kalman.joint import ALIKE, FRAME_MEANS, MEANS, AsterismEstimator, AsterismModel
 from wfsobs.observers.step import StepError
 from wfsobs.prior import Asterism, Lines, Prior
-from wfsobs.priors_from.scenario import arguments, prior_of
-from wfsobs.priors_from.selection import usual_observers
+from wfsobs.priors_from.scenario import arguments, prior_of, usual_observers
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.filter_covariance import lyapunov
-from wfsobs.signal.frame_shares import frame_shares
-from wfsobs.signal.joint_states import StateFilter
-from wfsobs.signal.present_inputs import PresentInputs
+from wfsobs.signal.joint_states import PresentInputs, StateFilter, frame_shares
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.simulation.flow_spectra import star_basis
 from wfsobs.simulation.guide_stars import lgs_weights
@@ -37,7 +33,7 @@ from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.synthesis import line_width
 from wfsobs.telemetry.records import load_record, save_record
 from wfsobs.testing import check_observer
-from wfsobs.testing.steps import step_difference
+from wfsobs.testing.common import step_difference
 
 STARS = wfsobs.PRESETS["paper"]().replace(
     {

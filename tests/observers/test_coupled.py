@@ -12,10 +12,9 @@ from tests.test_mode_spectra import FLOW
 from wfsobs.campaign.plan import parse_plan
 from wfsobs.campaign.sweep import parse_axis, plan_sweep
 from wfsobs.evaluation.bound import bound, bound_rms
-from wfsobs.evaluation.calibration import half_width
 from wfsobs.evaluation.error_spectra import is_predicted
 from wfsobs.evaluation.exact_errors import exact_errors
-from wfsobs.evaluation.scores import BOUND, BOUND_MODES, SCORED
+from wfsobs.evaluation.scores import BOUND, BOUND_MODES, SCORED, half_width
 from wfsobs.evaluation.verdict import verdict
 from wfsobs.execution import run_observer
 from wfsobs.live.checks import observers_on
@@ -24,8 +23,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.kalman.coupled import INDEPENDENT, CoupledEstimator, CoupledModel
 from wfsobs.pipeline import observe, run
 from wfsobs.prior import Flow, Lines
-from wfsobs.priors_from.scenario import arguments, prior_of
-from wfsobs.priors_from.selection import has_prior, usual_observers
+from wfsobs.priors_from.scenario import arguments, has_prior, prior_of, usual_observers
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.mode_spectra import mode_spectra

@@ -10,15 +10,16 @@ from scipy.integrate import quad
 import wfsobs
 from tests.records import short
 from wfsobs import PRESETS, simulate
-from wfsobs.evaluation.calibration import calibration
+from wfsobs.evaluation.scores import calibration
 from wfsobs.execution import run_observer
-from wfsobs.observers.gpr.adaptive import schedule_of
-from wfsobs.observers.gpr.learning import (
+from wfsobs.observers.gpr.adaptive import (
     RATIOS,
     factor_of,
     fit_bands,
     learn,
     nothing_learnt,
+    schedule_of,
+    smoother,
     standing,
     weight_covariance,
     whitener_of,
@@ -29,7 +30,6 @@ from wfsobs.record import Record, RecordError, Sampling
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.riccati import steady_state
-from wfsobs.signal.smoother import smoother
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.spectral.model import Spectrum
 from wfsobs.spectral.search import expected_above_zero, missed_variance

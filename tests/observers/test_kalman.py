@@ -15,8 +15,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.kalman.single import between_frames, steady_filter
-from wfsobs.priors_from.scenario import arguments, kalman_model, modelled_processes
-from wfsobs.priors_from.turbulence import measurement_noise
+from wfsobs.priors_from.scenario import arguments, kalman_model, measurement_noise, modelled_processes
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS

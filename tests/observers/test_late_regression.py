@@ -8,12 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs.control.mirror import Mirror, Plant
-from wfsobs.control.prediction import VibrationPredictor, of_z
+from wfsobs.control.prediction import gpr_online_ahead, of_z
 from wfsobs.observers.baselines import online_reference
-from wfsobs.observers.gpr.inputs import Scale, window_signals
+from wfsobs.observers.gpr.inputs import scale_of, window_signals
 from wfsobs.observers.gpr.kernels import SquaredExponential
 from wfsobs.observers.gpr.sliding_regression import LateRegression
+from wfsobs.prior import Prior
 from wfsobs.priors_from.scenario import bands_of
+from wfsobs.progress import QUIET
+from wfsobs.record import Record, Training
 from wfsobs.scenario import Scenario
 from wfsobs.typing import Array
 
@@ -65,17 +68,21 @@ def test_the_vibration_is_predicted_for_the_time_that_the_command_acts(delay: fl
             "gpr_online.inputs_filter": inputs,
         }
     )
-    z = np.random.default_rng(5).standard_normal(n)
-    f = online_reference(bands_of(scenario), z[:, None], scenario.dt)[:, 0]
+    rng = np.random.default_rng(5)
+    z, nothing = rng.standard_normal((n, 2)), np.zeros((n, 2))
+    f = online_reference(bands_of(scenario), z, scenario.dt)
     taps = Mirror(delay).taps
     late = taps.size - 2
     targets = np.array([taps[1:] @ f[j + 1 : j + taps.size] for j in range(n - taps.size)])
-    scale = Scale(np.array([0.1]), np.array([0.7])) if inputs == "standardised" else None
-    predictor = VibrationPredictor(scenario.gpr_online, bands_of(scenario), Plant(Mirror(delay), scenario.dt, 5), scale)
-    nothing = np.zeros((n, 1))
-    seen = window_signals(of_z(scenario.gpr_online), nothing, nothing, z[:, None], 0, scenario.dt, scale)[:, 0]
-    values = [predictor.step(x) for x in z]
+    training = Training(0.1 + 0.7 * rng.standard_normal((n, 2)), nothing)
+    prior = Prior(bands=bands_of(scenario), training=training)
+    plant = Plant(Mirror(delay), scenario.dt, 5)
+    values = gpr_online_ahead(Record(z, nothing, scenario.dt).measurements(), prior, plant, scenario, QUIET)
     kernel = SquaredExponential(1.0, 3.0, scenario.gpr_online.noise_std)
-    for k in range(depth + m - 1, n - taps.size):
-        expected = plain_prediction(seen, targets, k, depth, m, late, kernel)
-        assert values[k] == pytest.approx(expected, rel=1e-8, abs=1e-9 * np.abs(targets).max())
+    for mode in range(2):
+        scale = scale_of(of_z(scenario.gpr_online), training, 2, mode)
+        seen = window_signals(of_z(scenario.gpr_online), nothing, nothing, z, mode, scenario.dt, scale)[:, 0]
+        assert np.isnan(values[: depth + m - 1, mode]).all()
+        for k in range(depth + m - 1, n - taps.size):
+            expected = plain_prediction(seen, targets[:, mode], k, depth, m, late, kernel)
+            assert values[k, mode] == pytest.approx(expected, rel=1e-8, abs=1e-9 * np.abs(targets).max())

@@ -11,13 +11,12 @@ from scipy.linalg import solve_discrete_lyapunov
 from wfsobs.evaluation.bound import bound_rms
 from wfsobs.execution import run_observer
 from wfsobs.observers.ridge import TAPS, fit, predict
-from wfsobs.priors_from.scenario import lines_of, modelled_processes, multi_model, predicted_rms
-from wfsobs.priors_from.turbulence import modelled_turbulence
+from wfsobs.priors_from.scenario import lines_of, modelled_processes, modelled_turbulence, multi_model, predicted_rms
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.ar3 import Ar3, fit_ar3
+from wfsobs.signal.ar3 import Ar3, Ar3Fits
 from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.statespace import disturbance_model, third_order_model
 from wfsobs.simulation.disturbance import vibration_lines
@@ -109,7 +108,7 @@ def test_a_model_may_mix_orders() -> None:
 def test_the_fit_finds_a_process_as_good_as_the_truth(truth: Ar3) -> None:
     frequency = np.fft.rfftfreq(2**16, 1e-3)
     S = truth.psd(frequency) / 2e-3
-    found = fit_ar3(S, 4e-4, Ar3(10.0, 0.8, 60.0, 0.3, 1e-3))
+    found = Ar3Fits().fit("", S, 4e-4, Ar3(10.0, 0.8, 60.0, 0.3, 1e-3))
     # What the innovations of a filter on the fitted model have more than white ones, after Whittle; zero is the truth's own.
     ratio = (S + 4e-4) / (found.psd(frequency) / 2e-3 + 4e-4)
     excess = ratio - np.log(ratio) - 1.0

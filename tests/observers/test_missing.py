@@ -12,7 +12,7 @@ import pytest
 import wfsobs
 from tests.observers.test_spread import RATIO, STEPS, WITH_MODEL, own_record, told
 from wfsobs import PRESETS
-from wfsobs.evaluation.calibration import half_width
+from wfsobs.evaluation.scores import half_width
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.gp.observers import kernels_of, measured_late, sampled_model
@@ -21,7 +21,7 @@ from wfsobs.priors_from.scenario import arguments, observer_settings, prior_of
 from wfsobs.record import Measurements, Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.riccati import Step
-from wfsobs.testing.steps import run_steps
+from wfsobs.testing.common import run_steps
 from wfsobs.typing import Array
 
 FILTERS = [name for name in WITH_MODEL if name != "kf-ngs"]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from wfsobs import PRESETS, simulate
-from wfsobs.evaluation.calibration import calibration
+from wfsobs.evaluation.scores import calibration
 from wfsobs.execution import run_observer
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import TOTAL

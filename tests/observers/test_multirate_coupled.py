@@ -11,22 +11,19 @@ import wfsobs
 from tests.observers.test_coupled import SHAKEN
 from tests.test_mode_spectra import FLOW
 from wfsobs.evaluation.bound import bound
-from wfsobs.evaluation.calibration import half_width
-from wfsobs.evaluation.scores import BOUND_BOTH, BOUND_BOTH_MODES
+from wfsobs.evaluation.scores import BOUND_BOTH, BOUND_BOTH_MODES, half_width
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.kalman.asterism_model import AsterismModel
 from wfsobs.observers.kalman.coupled import CoupledModel
-from wfsobs.observers.kalman.joint import INDEPENDENT, coupled_model
+from wfsobs.observers.kalman.joint import INDEPENDENT, AsterismModel, coupled_model
 from wfsobs.pipeline import observe, run
 from wfsobs.prior import Flow, FlowOfBoth, Lines
-from wfsobs.priors_from.scenario import arguments, prior_of
-from wfsobs.priors_from.selection import usual_observers
+from wfsobs.priors_from.scenario import arguments, prior_of, usual_observers
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.mode_spectra import combined_spectra
 from wfsobs.testing import check_observer
-from wfsobs.testing.steps import step_difference
+from wfsobs.testing.common import step_difference
 
 OBSERVER = OBSERVERS["multirate-coupled"]
 LONG = SHAKEN.replace({"telescope.radial_order": 1, "run.duration": 160.0})

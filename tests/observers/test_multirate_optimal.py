@@ -10,8 +10,7 @@ from scipy.stats import chi2
 from wfsobs.execution import run_observer
 from wfsobs.observers.kalman.multirate import optimal_cycle, optimal_filter, optimal_model
 from wfsobs.prior import LgsError, Model, Prior
-from wfsobs.priors_from.scenario import kalman_model, model_of, modelled_processes, prior_of
-from wfsobs.priors_from.turbulence import lgs_error_of
+from wfsobs.priors_from.scenario import kalman_model, lgs_error_of, model_of, modelled_processes, prior_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
 from wfsobs.signal.ar2 import Ar2

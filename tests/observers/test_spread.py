@@ -14,11 +14,11 @@ from scipy.special import ndtr
 
 import wfsobs
 from tests.records import ON_PAPER
-from wfsobs.evaluation.calibration import calibration, crps, half_width
+from wfsobs.evaluation.scores import calibration, crps, half_width
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.gpr.kernels import SquaredExponential
+from wfsobs.observers.gpr.offline import HELD, train
 from wfsobs.observers.gpr.online import predict_sliding
-from wfsobs.observers.gpr.trained import HELD, train
 from wfsobs.observers.kalman.single import MultiPeak
 from wfsobs.prior import LgsError, Noise, Prior
 from wfsobs.priors_from.scenario import observer_settings, prior_of

@@ -25,15 +25,13 @@ from wfsobs.observers.missing import fill_missing
 from wfsobs.observers.step import StepError
 from wfsobs.prior import Bands, Lines, Model, Prior, Training
 from wfsobs.priors_from.controllers import own_settings
-from wfsobs.priors_from.scenario import arguments, kalman_model, observer_settings, prior_of
-from wfsobs.priors_from.selection import has_prior
-from wfsobs.priors_from.turbulence import measurement_noise
+from wfsobs.priors_from.scenario import arguments, has_prior, kalman_model, measurement_noise, observer_settings, prior_of
 from wfsobs.progress import QUIET
 from wfsobs.record import Record, Sampling, hold_last, pseudo_open_loop
 from wfsobs.scenario import Scenario
 from wfsobs.signal.joint_states import RIDGE
 from wfsobs.signal.riccati import steady_state
-from wfsobs.testing.steps import run_steps, step_difference
+from wfsobs.testing.common import run_steps, step_difference
 
 STEPS = [name for name, observer in OBSERVERS.items() if observer.step is not None]
 

@@ -32,7 +32,7 @@ from wfsobs.plot.elements import BINS, save_figure, to_matplotlib
 from wfsobs.plot.figures import plots_of
 from wfsobs.plot.looks import look
 from wfsobs.plot.paper import NUMBERS, draw_paper_figure, observers_in, samples_of
-from wfsobs.signal.welch import psd
+from wfsobs.signal.spectrum import psd
 
 SHORT = {"run.duration": 3.0, "gpr_offline.training_size": 30, "gpr_online.training_size": 30}
 SCENARIO = wfsobs.PRESETS["paper"]().replace(SHORT)

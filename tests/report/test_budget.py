@@ -106,7 +106,7 @@ def test_errors_have_the_interval_over_seeds_and_the_best_is_significant(short: 
 
 @pytest.mark.parametrize("seeds", [1, 3])
 def test_export_runs_as_many_seeds_as_asked_for(seeds: int, short: Scenario, tmp_path: Any, parse: Any) -> None:
-    from wfsobs.app.report.export import export
+    from wfsobs.app.report.page import export
 
     path = tmp_path / "r.html"
     seen: list[int] = []

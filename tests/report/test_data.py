@@ -19,7 +19,7 @@ from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.rows import score_rows
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.grid import Variation
-from wfsobs.signal.welch import psd
+from wfsobs.signal.spectrum import psd
 
 
 @given(st.integers(2, 30_000), st.integers(10, 800), st.sampled_from([1e-2, 1e-3, 2e-4]))

@@ -13,8 +13,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from wfsobs import pipeline
-from wfsobs.app.report import export as report_export
-from wfsobs.app.report.export import ReportError
+from wfsobs.app.report import page as report_export
+from wfsobs.app.report.page import ReportError
 from wfsobs.app.work import RunResults
 from wfsobs.cli import main
 from wfsobs.evaluation.rows import TIME, score_rows

@@ -28,8 +28,7 @@ from wfsobs.streams.attach import Attachment
 from wfsobs.streams.layout import StreamError
 from wfsobs.streams.network import BURST, LARGEST, Publication, Subscription
 from wfsobs.streams.shared_image import SharedImage
-from wfsobs.streams.watchdog import Safety
-from wfsobs.streams.wiring import Wiring
+from wfsobs.streams.wiring import Safety, Wiring
 
 ANYWHERE = "tcp://127.0.0.1:*"
 

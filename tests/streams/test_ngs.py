@@ -19,8 +19,7 @@ from wfsobs.stepping import design
 from wfsobs.streams.attach import Attachment
 from wfsobs.streams.ngs_frames import SEARCH, NgsStream
 from wfsobs.streams.shared_image import SharedImage
-from wfsobs.streams.watchdog import Safety
-from wfsobs.streams.wiring import NgsWiring, Wiring
+from wfsobs.streams.wiring import NgsWiring, Safety, Wiring
 
 pytestmark = pytest.mark.slow
 

@@ -5,8 +5,7 @@ import pytest
 
 from wfsobs.signal.gate import RUN, GateSettings
 from wfsobs.streams.attach import SafeGate
-from wfsobs.streams.watchdog import Safety, Watchdog
-from wfsobs.streams.wiring import Wiring
+from wfsobs.streams.wiring import Safety, Watchdog, Wiring
 
 NONE = np.full(2, np.nan)
 ESTIMATE, Z = np.array([0.3, -0.2]), np.zeros(2)

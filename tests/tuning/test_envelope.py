@@ -19,9 +19,9 @@ from wfsobs.record import RecordError
 from wfsobs.scenario import configfile
 from wfsobs.settings.errors import SettingError
 from wfsobs.tuning import EnvelopeGoal, TuningResult, tune, tuned_envelope
-from wfsobs.tuning.envelope import HELD_OUT, SEARCHED
+from wfsobs.tuning.records import space
 from wfsobs.tuning.report import tuning_dict, tuning_toml
-from wfsobs.tuning.space import space
+from wfsobs.tuning.tuning import HELD_OUT, SEARCHED
 
 FAST = MATCHED.replace({"sensors.lgs_rate": 500.0})
 """Where the filter of the true model is fragile."""

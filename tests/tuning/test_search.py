@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.tuning.space import numbers, space
+from wfsobs.tuning.records import numbers, space
 from wfsobs.tuning.trials import NoEvaluationLeft, minimise
 
 pytestmark = pytest.mark.slow

@@ -17,8 +17,7 @@ from wfsobs.cli import main
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.pipeline import observe, run
-from wfsobs.priors_from.scenario import kalman_model
-from wfsobs.priors_from.turbulence import measurement_noise
+from wfsobs.priors_from.scenario import kalman_model, measurement_noise
 from wfsobs.progress import QUIET, Cancelled, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario, configfile
@@ -27,9 +26,8 @@ from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.sensor_noise import noise_covariance
 from wfsobs.tuning import Evaluation, tune
-from wfsobs.tuning.records import NEXT, REFERENCE, TRUTH, cut_record, piece, simulate_records, stream
+from wfsobs.tuning.records import NEXT, REFERENCE, TRUTH, cut_record, piece, simulate_records, space, stream
 from wfsobs.tuning.report import tuning_dict, tuning_toml
-from wfsobs.tuning.space import space
 
 pytestmark = pytest.mark.slow
 

@@ -9,20 +9,19 @@ from typing import Any, Final
 
 import param
 
-from wfsobs.app.component import HtmlComponent
 from wfsobs.app.downloads import Save, TooLarge, data_csv, data_npz
 from wfsobs.app.history import HistorySheet, session_save
+from wfsobs.app.idle_work import SeedRuns
 from wfsobs.app.jobs import DONE, FAILED, RUNNING, Job
 from wfsobs.app.pages.pages import ViewState
 from wfsobs.app.render import render
-from wfsobs.app.report.export import LIMIT, ReportError, make
-from wfsobs.app.seeds import SeedRuns
+from wfsobs.app.report.page import LIMIT, ReportError, make
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.session_file import SessionError, read_session
 from wfsobs.app.share import FILE, Link, from_file, from_query, name_record, to_command, to_file, to_python, to_query
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord
 from wfsobs.app.store import Store
-from wfsobs.app.style import labels, script, sheets
+from wfsobs.app.style import HtmlComponent, labels, script, sheets
 from wfsobs.app.views.plots import AFTERWARDS_MS, once
 from wfsobs.app.work import RunResults
 from wfsobs.settings.errors import SettingError
@@ -39,15 +38,15 @@ class Menus(HtmlComponent):
     A component whose name ended in Toolbar would be styled as one of a figure, and the whole page laid out anew each time.
     """
 
-    query = param.String("", doc="What a link to the settings has after its ?.")
-    view = param.String("", doc="What the address has beside the settings, of the view.")
-    has_link = param.Boolean(True, doc="Whether the settings are short enough for a link.")
-    record = param.String("", doc="The loaded record, where a link cannot name it.")
-    command = param.String("", doc="The settings as a command line.")
-    python = param.String("", doc="The settings as Python.")
-    ready = param.Boolean(False, doc="Whether there are results to save.")
-    reporting = param.Boolean(False, doc="Whether a report is being made.")
-    message = param.String("", doc="What was done, in one line.")
+    query: param.String[str] = param.String("", doc="What a link to the settings has after its ?.")
+    view: param.String[str] = param.String("", doc="What the address has beside the settings, of the view.")
+    has_link: param.Boolean[bool] = param.Boolean(True, doc="Whether the settings are short enough for a link.")
+    record: param.String[str] = param.String("", doc="The loaded record, where a link cannot name it.")
+    command: param.String[str] = param.String("", doc="The settings as a command line.")
+    python: param.String[str] = param.String("", doc="The settings as Python.")
+    ready: param.Boolean[bool] = param.Boolean(False, doc="Whether there are results to save.")
+    reporting: param.Boolean[bool] = param.Boolean(False, doc="Whether a report is being made.")
+    message: param.String[str] = param.String("", doc="What was done, in one line.")
     notes = param.List([], doc="What was refused, a line each.")
     labels = param.Dict({}, doc="Name of a line in the figures -> what it is called, for the legends of figures that are saved.")
     saves = param.List([], doc="What the page can save beside the data, as it is called in the menu.")
@@ -84,7 +83,7 @@ class Actions:
         view.param.watch(self._follow_view, "query", onlychanged=False)
         self._refresh()
 
-    def _follow_view(self, event: param.parameterized.Event) -> None:
+    def _follow_view(self, event: Any) -> None:
         """Keep the view in the address, behind settings that wait for theirs: an entry of the browser's history has both."""
         self._refresh()
         self.toolbar.view = event.new
@@ -107,7 +106,8 @@ class Actions:
             "session": lambda: self.save(session_save(self.sheet.history)),
             "unlinked": lambda: self._note("These settings are too long for a link: save the scenario and send the file."),
             "dismiss": lambda: self.toolbar.param.update(notes=[]),
-            "read": lambda: self._take_back(msg.get("text")),
+            # what has been read is unsaid, unless something else has been said meanwhile
+            "read": lambda: self.toolbar.message == msg.get("text") and self.toolbar.param.update(message=""),
             "view": lambda: self.open_view(str(msg.get("query", ""))),
             "report": self.make_report,
             "toml": self.save_scenario,
@@ -208,11 +208,6 @@ class Actions:
 
     def _note(self, line: str) -> None:
         self.toolbar.param.update(notes=[line], message="")
-
-    def _take_back(self, text: object) -> None:
-        """Unsay what has been read, unless something else has been said meanwhile."""
-        if self.toolbar.message == text:
-            self.toolbar.message = ""
 
     def _refresh(self, *_: object) -> None:
         scenario, preset, source = self.store.scenario, self.store.preset, self.store.source

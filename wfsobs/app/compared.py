@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from wfsobs.app.controls.names import preset_title, setting_name
 from wfsobs.app.render import NOTHING, change, number
-from wfsobs.app.sources import LoadedRecord, Source, Step, give_same_record
+from wfsobs.app.sources import LoadedRecord, Step, give_same_record
 from wfsobs.app.style import observers_of
-from wfsobs.app.views.plots import envelope, envelope_times
 from wfsobs.app.work import TRUTH, Key, RunResults, SignalAndError
 from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.rows import row_label, target_title
@@ -21,6 +20,8 @@ from wfsobs.evaluation.scores import Score
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings, reference_preset
+from wfsobs.signal.envelope import envelope, envelope_times
+from wfsobs.typing import Array
 from wfsobs.units import unit_text
 
 NAMED = 3
@@ -39,17 +40,12 @@ def name_of_change(before: Step | None, now: Step) -> str:
     else:
         base = before[0]
     if not give_same_record(source, before[2] if before else None):
-        words.append(_name_of_record(source))
+        named = f"Record {source.name}" if isinstance(source, LoadedRecord) else "Simulation kept"
+        words.append("Simulation of the settings" if source is None else named)
     if isinstance(source, LoadedRecord) and before is not None and words:  # it brings its rate and length with it
         return ", ".join(words)
     changed = differences(base, scenario)
     return ", ".join([*words, *([join_differences(changed)] if changed else [])]) or SAME
-
-
-def _name_of_record(source: Source | None) -> str:
-    if source is None:
-        return "Simulation of the settings"
-    return f"Record {source.name}" if isinstance(source, LoadedRecord) else "Simulation kept"
 
 
 def differences(before: Scenario, now: Scenario) -> list[str]:
@@ -122,8 +118,6 @@ def join_differences(words: Sequence[str]) -> str:
     more = f" and {len(words) - NAMED} more" if len(words) > NAMED else ""
     return ", ".join(words[:NAMED]) + more
 
-
-Array = NDArray[np.float64]
 
 KEPT = 10_000
 """Pairs of extremes kept of a line: every sample of a record of 20 s."""

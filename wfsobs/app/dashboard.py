@@ -13,24 +13,22 @@ import param
 from panel.util.parameters import edit_readonly
 
 from wfsobs.app.actions import Actions
-from wfsobs.app.component import Component
 from wfsobs.app.controls.names import name_settings
-from wfsobs.app.controls.panel import Controls
-from wfsobs.app.controls.status import waiting_text
+from wfsobs.app.controls.panel import Controls, waiting_text
 from wfsobs.app.display import Display
 from wfsobs.app.glossary import Help
 from wfsobs.app.history import History, HistorySheet
+from wfsobs.app.idle_work import SeedRuns
 from wfsobs.app.jobs import FAILED
 from wfsobs.app.pages.explore import Explore
 from wfsobs.app.pages.pages import AWAY, EXPLORE, LIVE, SHOWN, Pages, ViewState
 from wfsobs.app.pages.parts import ON_ONE_LINE, WIDE, warning
-from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import Post, Session
 from wfsobs.app.store import Store
-from wfsobs.app.style import labels, script, sheets, theme
+from wfsobs.app.style import Component, labels, script, sheets, theme
 from wfsobs.app.upload import Upload
-from wfsobs.app.views.main_lines import effect_line
 from wfsobs.app.views.switches import ModeSwitch, UnitSwitch
+from wfsobs.app.views.verdict import effect_line
 from wfsobs.scenario import Scenario
 
 MOST = 1000
@@ -103,6 +101,10 @@ BAR = {
     "@media (max-width: 600px)": {"& .header a:has(.title)": {"display": "none !important"}},
 }
 """The bar at the top, and the rooms under it that are as high; on a phone it has room for the run, not for the name."""
+
+
+UNSEEN = {"position": "absolute", "width": "1px", "height": "1px", "overflow": "hidden", "clip-path": "inset(50%)"}
+"""Of the page's heading: for screen readers."""
 
 
 class Frame(Component):
@@ -186,10 +188,7 @@ class Dashboard:
             theme_config=theme(),
             sx=BAR,
             favicon=None,
-            main=[
-                _title(),
-                self.body,
-            ],
+            main=[pn.pane.HTML("<h1>wfsobs: disturbance observers for adaptive optics</h1>", margin=0, styles=UNSEEN), self.body],
         )
         self.frame.on_message = lambda message: message.get("drawn") and self._post(self._stand)
         if pn.state.curdoc is None:  # nobody will say that it has been drawn
@@ -210,8 +209,8 @@ class Dashboard:
         with pn.io.hold():
             self.explore.complete()
             self.pages.complete()
-            for it in (self.alert, self.stale):
-                self.body.insert(self.body.index(self.keyboard), it)
+            there, at = self.body.objects, self.body.index(self.keyboard)
+            self.body.objects = [*there[:at], self.alert, self.stale, *there[at:]]
             self.drawer[:] = [self.controls.view()]
 
     def _stand(self) -> None:
@@ -232,7 +231,7 @@ class Dashboard:
         """Release what the session holds; called when it ends."""
         self.store.close()
 
-    def _on_theme(self, event: param.parameterized.Event) -> None:
+    def _on_theme(self, event: Any) -> None:
         self.display.dark = event.new
         if event.new != self.frame.wants_dark:
             self._theme_chosen = True
@@ -264,12 +263,3 @@ class Dashboard:
             texts.append(f"{waiting_text(self.store.waiting)}.")
         self.stale.param.update(object=" ".join(texts), visible=bool(texts) and run.state != "running")
         self.frame.stale = self.store.stale
-
-
-def _title() -> pn.pane.HTML:
-    """Make the page's heading for screen readers."""
-    return pn.pane.HTML(
-        "<h1>wfsobs: disturbance observers for adaptive optics</h1>",
-        margin=0,
-        styles={"position": "absolute", "width": "1px", "height": "1px", "overflow": "hidden", "clip-path": "inset(50%)"},
-    )

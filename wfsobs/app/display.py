@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any
 
 import param
 
 from wfsobs.app.compared import ComparedRun, DrawnLines
 from wfsobs.app.glossary import LAG, REAL_TIME, RELATIVE, RMS_ERROR, STATED, TERMS
+from wfsobs.evaluation.error_spectra import cumulative_rms
+from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import HIGHEST_ORDER, TIP_TILT, Mode, modes_up_to
 from wfsobs.settings.parameters import unit_of
+from wfsobs.typing import Array
 from wfsobs.units import micrometres_per, unit_text
 
 SIGNAL, ERROR, RUNNING_RMS = "signal", "error", "running rms"
@@ -48,7 +50,7 @@ def label_of(p: param.Parameter[Any]) -> str:
     return f"{p.label} [{unit}]" if unit else str(p.label)
 
 
-def score_columns(unit: str, base: str = "truth", compared_columns: Mapping[str, str] = MappingProxyType({})) -> dict[str, str]:
+def score_columns(unit: str, base: str = "truth", compared_columns: Mapping[str, str] = {}) -> dict[str, str]:
     """List the headings of a table of scores, and an explanation of each.
 
     base        : what an error is divided by: "truth", or "z" for a record without truth
@@ -141,3 +143,17 @@ class Display(param.Parameterized):
     def unit_label(self) -> str:
         """The unit as it is written."""
         return UNITS[self.unit]
+
+    def scale(self, scenario: Scenario) -> float:
+        """Return how many of the unit shown one micrometre is."""
+        return per_micrometre(self.unit, scenario.telescope.diameter)
+
+    def curve(self, frequency: Array, density: Array, scenario: Scenario) -> Array:
+        """Compute what is drawn of a density [um^2/Hz] above zero frequency: itself, or the rms from each frequency on."""
+        scale = self.scale(scenario)
+        return scale * cumulative_rms(frequency[1:], density[1:]) if self.cumulative else scale**2 * density[1:]
+
+    def curve_label(self, of: str) -> str:
+        """Write the axis of such curves. of : what they are of, with a space before it."""
+        what, unit = (f"cumulative rms{of}", self.unit_label) if self.cumulative else (f"PSD{of}", f"{self.unit_label}²/Hz")
+        return f"{what}, {self.mode_label} [{unit}]"

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from wfsobs.app.loop_work import LoopResults
 from wfsobs.app.work import RunResults
@@ -18,8 +17,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import to_toml
 from wfsobs.telemetry.formats import writer_of
 from wfsobs.telemetry.records import record_arrays
-
-Array = NDArray[np.float64]
+from wfsobs.typing import Array
 
 MOST = 4_000_000
 """Numbers in a download: about 100 s at 1 kHz."""

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any
 
 from markupsafe import Markup, escape
 
-from wfsobs.app.component import HtmlComponent
 from wfsobs.app.render import macro, render
-from wfsobs.app.style import script, sheets
+from wfsobs.app.style import HtmlComponent, script, sheets
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import target_title
 from wfsobs.observers import OBSERVERS
@@ -31,43 +29,40 @@ KF, GPR, LGS, NGS, BOUND, NEEDS, LAG, STREHL, RELATIVE, RMS_ERROR, REAL_TIME, ST
     "Predicted sigma",
 )
 
-TERMS: Mapping[str, str] = MappingProxyType(
-    {
-        target_title(TURBULENCE): "Atmospheric tip/tilt, estimated from the guide stars.",
-        target_title(VIBRATION): "Structural vibration, separated from turbulence.",
-        KF: (
-            "Kalman filter: estimates turbulence and vibration step by step from a state-space model of both. A multi-rate one "
-            "uses LGS and NGS, each at its own rate; an adaptive one identifies its model from the measurements."
-        ),
-        GPR: (
-            "Gaussian process regression: predicts the vibration from past measurements, without a model of its peaks. The "
-            "offline one is trained on an earlier record, the online one during the run."
-        ),
-        LGS: "Laser guide star: measured at the rate of the loop, with a slow error of its own in tip and tilt.",
-        NGS: "Natural guide star: measured once in several steps of the loop (exposure ratio n), without that slow error.",
-        RMS_ERROR: (
-            "Root mean square of estimate minus truth after the warm-up, over the samples that all observers have. "
-            "Smaller is better."
-        ),
-        RELATIVE: ("RMS error over the RMS of the truth. 0 is perfect, 1 is as good as an estimate of zero, above 1 is worse."),
-        BOUND: (
-            "Smallest RMS error that a causal linear observer of the mean LGS measurement, or of both sensors, can have, from "
-            "the true spectra (Wiener). Where each LGS passes different turbulence, a third row is for an observer that has each "
-            "of them separately. On a single record an observer may come out slightly below."
-        ),
-        NEEDS: ("What an observer must know beside measurements: a model, peak frequencies, frequency bands or training data."),
-        LAG: (
-            "Delay of the estimate: where its cross-correlation with the truth has its maximum. Negative if the estimate leads. "
-            "For an oscillation it is ambiguous by whole periods: the value nearest to zero is shown."
-        ),
-        REAL_TIME: "Computing time per step over the period of the loop. Below 1 the observer is fast enough.",
-        STATED: (
-            "Standard deviation that the observer's own model gives its estimates. Equal to the RMS error where that model is "
-            "true; far below it, the observer is overconfident. A line shown alone has its 95 % band."
-        ),
-        STREHL: "Peak intensity over that of an image without error, from the residual of the simulated modes; at most 1.",
-    }
-)
+TERMS: Mapping[str, str] = {
+    target_title(TURBULENCE): "Atmospheric tip/tilt, estimated from the guide stars.",
+    target_title(VIBRATION): "Structural vibration, separated from turbulence.",
+    KF: (
+        "Kalman filter: estimates turbulence and vibration step by step from a state-space model of both. A multi-rate one "
+        "uses LGS and NGS, each at its own rate; an adaptive one identifies its model from the measurements."
+    ),
+    GPR: (
+        "Gaussian process regression: predicts the vibration from past measurements, without a model of its peaks. The "
+        "offline one is trained on an earlier record, the online one during the run."
+    ),
+    LGS: "Laser guide star: measured at the rate of the loop, with a slow error of its own in tip and tilt.",
+    NGS: "Natural guide star: measured once in several steps of the loop (exposure ratio n), without that slow error.",
+    RMS_ERROR: (
+        "Root mean square of estimate minus truth after the warm-up, over the samples that all observers have. Smaller is better."
+    ),
+    RELATIVE: ("RMS error over the RMS of the truth. 0 is perfect, 1 is as good as an estimate of zero, above 1 is worse."),
+    BOUND: (
+        "Smallest RMS error that a causal linear observer of the mean LGS measurement, or of both sensors, can have, from "
+        "the true spectra (Wiener). Where each LGS passes different turbulence, a third row is for an observer that has each "
+        "of them separately. On a single record an observer may come out slightly below."
+    ),
+    NEEDS: ("What an observer must know beside measurements: a model, peak frequencies, frequency bands or training data."),
+    LAG: (
+        "Delay of the estimate: where its cross-correlation with the truth has its maximum. Negative if the estimate leads. "
+        "For an oscillation it is ambiguous by whole periods: the value nearest to zero is shown."
+    ),
+    REAL_TIME: "Computing time per step over the period of the loop. Below 1 the observer is fast enough.",
+    STATED: (
+        "Standard deviation that the observer's own model gives its estimates. Equal to the RMS error where that model is "
+        "true; far below it, the observer is overconfident. A line shown alone has its 95 % band."
+    ),
+    STREHL: "Peak intensity over that of an image without error, from the residual of the simulated modes; at most 1.",
+}
 
 
 def sentence_on(name: str) -> str:
@@ -95,20 +90,18 @@ def explain_first(text: str, word: str, name: str) -> Markup:
     return escape(before) + term(name, word) + escape(after) if found else escape(text)
 
 
-SHORTCUTS: Mapping[str, str] = MappingProxyType(
-    {
-        "?": "This help",
-        "/": "Find a setting",
-        "H": "The history: every result of the session",
-        "Ctrl+Z, Ctrl+Shift+Z": "Undo and redo a change of the settings",
-        "Enter or Space on a row beside the verdict": "Hide or show its line",
-        "S on such a row": "Its line alone, and those before again",
-        "Double click on a figure": "All of it again, after a zoom",
-        "Arrows, Page up and down on a handle": "Move it (Shift: further), change its damping; Escape gives up",
-        "Arrow keys": "Choose in a switch, go from line to line in a table",
-        "Tab": "The first stop of the page leads to the figures",
-    }
-)
+SHORTCUTS: Mapping[str, str] = {
+    "?": "This help",
+    "/": "Find a setting",
+    "H": "The history: every result of the session",
+    "Ctrl+Z, Ctrl+Shift+Z": "Undo and redo a change of the settings",
+    "Enter or Space on a row beside the verdict": "Hide or show its line",
+    "S on such a row": "Its line alone, and those before again",
+    "Double click on a figure": "All of it again, after a zoom",
+    "Arrows, Page up and down on a handle": "Move it (Shift: further), change its damping; Escape gives up",
+    "Arrow keys": "Choose in a switch, go from line to line in a table",
+    "Tab": "The first stop of the page leads to the figures",
+}
 """Key -> what it does."""
 
 

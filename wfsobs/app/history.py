@@ -13,9 +13,8 @@ from typing import Any, Final
 import param
 
 from wfsobs.app.compared import LETTERS, ComparedRun, name_of_change, thin_lines
-from wfsobs.app.component import HtmlComponent
 from wfsobs.app.controls.names import name_settings
-from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.display import Display
 from wfsobs.app.downloads import Save, TooLarge
 from wfsobs.app.jobs import DONE, FAILED
 from wfsobs.app.render import number, render
@@ -34,11 +33,11 @@ from wfsobs.app.session_file import (
 )
 from wfsobs.app.sources import Step
 from wfsobs.app.store import Store
-from wfsobs.app.style import look, script, sheets
+from wfsobs.app.style import HtmlComponent, look, script, sheets
 from wfsobs.app.work import RunResults
 from wfsobs.evaluation.evidence import rank_observers
 from wfsobs.evaluation.rows import can_be_best
-from wfsobs.evaluation.scores import PREDICTION, Score
+from wfsobs.evaluation.scores import PREDICTION
 from wfsobs.observers.base import TARGETS
 from wfsobs.settings.errors import SettingError
 
@@ -350,7 +349,7 @@ class HistorySheet:
         if sheet.open:
             runs = {run.key: run for run in self.display.compared_runs}
             self.rows = [self._row(entry, runs.get(entry.key)) for entry in self.history.entries]
-            html = render(
+            sheet.html = render(
                 "history.html",
                 rows=[row for row in self.rows if row["star"] or not self._stars_alone],
                 starred=self._stars_alone,
@@ -358,14 +357,10 @@ class HistorySheet:
                 undo=self.history.can_undelete,
                 message=self.message,
             )
-            sheet.html = html
 
     def _row(self, entry: HistoryEntry, run: ComparedRun | None) -> dict[str, Any]:
         return {
-            "key": entry.key,
-            "name": entry.name,
-            "time": entry.time,
-            "star": entry.star,
+            **{name: getattr(entry, name) for name in ("key", "name", "time", "star")},
             "letter": run.letter if run else "",
             "current": entry.key == self.history.current,
             "restorable": entry.is_restorable,
@@ -402,14 +397,11 @@ def session_save(history: History) -> Save:
 
 def best_scores(entry: HistoryEntry, display: Display) -> str:
     """Write the smallest error of each target in the mode shown, and whose it is."""
-    scale = per_micrometre(display.unit, entry.scenario.telescope.diameter)
+    scale = display.scale(entry.scenario)
     parts = []
     for target in (*TARGETS, PREDICTION):
-        scores: list[Score] = [
-            s for s in entry.scores if (s.target, s.mode) == (target, display.mode) and can_be_best(s.observer, s.apart)
-        ]
-        if scores:
-            errors = {s.observer: s.rms for s in scores}
+        own = [s for s in entry.scores if (s.target, s.mode) == (target, display.mode)]
+        if errors := {s.observer: s.rms for s in own if can_be_best(s.observer, s.apart)}:
             best = rank_observers(errors)[0]
             parts.append(f"{target.capitalize()} {number(errors[best] * scale)} {display.unit_label} ({look(best).label})")
     return ", ".join(parts)

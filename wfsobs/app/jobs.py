@@ -7,7 +7,6 @@ import ctypes
 import itertools
 import logging
 import math
-import os
 import sys
 import threading
 from collections.abc import Callable, Hashable, Mapping
@@ -290,7 +289,6 @@ class JobQueue:
         return not any(thread.is_alive() for thread in self._threads)
 
     def _work(self) -> None:
-        lower_priority()
         while (job := self._next()) is not None:
             again = False
             try:
@@ -360,9 +358,3 @@ def release_memory() -> None:
     if sys.platform == "linux":
         with contextlib.suppress(OSError, AttributeError):  # another C library
             ctypes.CDLL(None).malloc_trim(0)
-
-
-def lower_priority() -> None:
-    """Let the page's own thread, and a browser on the same machine, go first. On Linux priority is the thread's own."""
-    if sys.platform == "linux":
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)

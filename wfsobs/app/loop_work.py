@@ -13,12 +13,12 @@ from wfsobs.closed_loop.envelope import PlantEnvelope, plant_envelope
 from wfsobs.closed_loop.rows import ClosedLoop, Row, rows
 from wfsobs.closed_loop.run import each_outcome
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.control.curves import Curves, curves
+from wfsobs.control.margins import Curves, curves
 from wfsobs.dependence import Memo
 from wfsobs.priors_from.controllers import own_settings
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
-from wfsobs.signal.welch import psd
+from wfsobs.signal.spectrum import psd
 from wfsobs.typing import Array
 
 PATIENCE = 60.0

@@ -50,7 +50,7 @@ from wfsobs.app.share import LONGEST, has_settings
 from wfsobs.app.work import one_blas_thread
 from wfsobs.campaign.follow import CampaignFolder
 from wfsobs.live.loop import LiveOrder
-from wfsobs.live.paced import prefer
+from wfsobs.live.source import prefer
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.errors import SettingError
 

@@ -49,11 +49,12 @@ class Service:
 
     workers    : jobs at once
     most_bytes : of results kept
+    memo       : results by the digest of what they depend on; empty by default
     """
 
-    def __init__(self, limits: Limits, workers: int, most_bytes: int, work: Compute | None = None):
+    def __init__(self, limits: Limits, workers: int, most_bytes: int, work: Compute | None = None, memo: Memo | None = None):
         self.limits = limits
-        self.memo: Final = Memo()
+        self.memo: Final = Memo() if memo is None else memo
         self.cache: Cache[Any] = Cache(most_bytes)
         self.queue: Final = JobQueue(workers, self.cache)
         self.sessions: int = 0

@@ -22,8 +22,7 @@ from wfsobs.app.compared import DrawnLines
 from wfsobs.app.service import run_key
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, Step, record_key
 from wfsobs.app.work import RunResults
-from wfsobs.evaluation.calibration import Calibration
-from wfsobs.evaluation.scores import Score
+from wfsobs.evaluation.scores import Calibration, Score
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS

@@ -12,10 +12,9 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import reduce
-from types import MappingProxyType
 from typing import Any
 from urllib.parse import parse_qsl, quote
 
@@ -41,18 +40,16 @@ PREFIX, COLUMN = "record.", "column."
 DIGITS = 64
 """Of a SHA-256 in hexadecimal."""
 
-STATEMENTS: Mapping[str, tuple[str, str]] = MappingProxyType(
-    {
-        "unit": ("unit", f"takes one of {', '.join(UNITS)}"),
-        "sign": ("command_sign", "takes 1 or -1"),
-        "delay": ("command_delay", "takes a number of steps from 1"),
-        "gain": ("command_gain", "takes a number above 0, or one per mode"),
-        "rail": ("rail", "takes a number above 0"),
-        "open_loop": ("open_loop", "takes True"),
-        "rate": ("rate", "takes a rate above 0 Hz"),
-        "trust": ("trust", "takes True"),
-    }
-)
+STATEMENTS: Mapping[str, tuple[str, str]] = {
+    "unit": ("unit", f"takes one of {', '.join(UNITS)}"),
+    "sign": ("command_sign", "takes 1 or -1"),
+    "delay": ("command_delay", "takes a number of steps from 1"),
+    "gain": ("command_gain", "takes a number above 0, or one per mode"),
+    "rail": ("rail", "takes a number above 0"),
+    "open_loop": ("open_loop", "takes True"),
+    "rate": ("rate", "takes a rate above 0 Hz"),
+    "trust": ("trust", "takes True"),
+}
 """Field -> part of the declaration, what it takes."""
 
 FLAGS = {"True": True, "False": False}
@@ -384,7 +381,8 @@ def to_command(scenario: Scenario, preset: str, source: Source | None = None, ta
     if task.what == LIVE:
         return _live_command(scenario, preset, source, task.arguments["order"])
     given = given_options(scenario, preset, FILE)
-    more = [word for name, value in task.arguments.items() for one in _as_list(value) for word in (f"--{name}", str(one))]
+    given_lists = {name: value if isinstance(value, list) else [value] for name, value in task.arguments.items()}
+    more = [word for name, values in given_lists.items() for one in values for word in (f"--{name}", str(one))]
     if task.what == SWEEP:  # it simulates the settings, whatever is shown
         source = None
     if source is None and task.what != IDENTIFY:
@@ -397,10 +395,6 @@ def to_command(scenario: Scenario, preset: str, source: Source | None = None, ta
         return command
     simulation = given_options(source.simulation, preset, SIMULATION) if source else given
     return f"{shlex.join(['wfsobs', 'run', *simulation, '--save', RECORD])} &&\n{command}"
-
-
-def _as_list(value: Any) -> Sequence[Any]:
-    return value if isinstance(value, (list, tuple)) else [value]
 
 
 def _live_command(scenario: Scenario, preset: str, source: Source | None, order: LiveOrder) -> str:

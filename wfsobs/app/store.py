@@ -6,7 +6,7 @@ A `Scenario` in the store is replaced, never changed in place, so whoever holds 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import panel as pn
 import param
@@ -14,7 +14,16 @@ from param.parameterized import batch_call_watchers
 
 from wfsobs.app.jobs import DONE
 from wfsobs.app.service import IDLE, BackgroundTask, Post, Session
-from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, Step, fit_to_record, give_same_record, record_key
+from wfsobs.app.sources import (
+    LoadedRecord,
+    NamedRecord,
+    SimulatedRecord,
+    Source,
+    Step,
+    fit_to_record,
+    give_same_record,
+    record_key,
+)
 from wfsobs.cost import rerun_seconds, run_seconds
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings, reference_preset
@@ -22,9 +31,6 @@ from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.errors import SettingError
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.preview import Preview
-
-if TYPE_CHECKING:
-    from wfsobs.app.sources import NamedRecord
 
 AFTER_FIT = ("telescope.radial_order", "run.warm_up")
 """Settings that follow a record, and may be changed afterwards."""
@@ -158,7 +164,7 @@ class Store(param.Parameterized):
         Values refused before are tried again with it, so that settings that only go together can be given
         one by one. Returns whether the value was accepted.
         """
-        waiting = {p: v for p, v in self._refusals.items() if not _covers(path, p)}
+        waiting = {p: v for p, v in self._refusals.items() if not f"{p}.".startswith(f"{path}.")}  # without what it replaces
         reason = ""
         for changes in ({**waiting, path: value}, {path: value}) if waiting else ({path: value},):
             try:
@@ -250,13 +256,6 @@ class Store(param.Parameterized):
 
 def _of_one_file(steps: list[Step], source: Source | None) -> list[Step]:
     """Without those on another file than the one that is loaded: a session holds one."""
-
-    def other(step: Step) -> bool:
-        return isinstance(step[2], LoadedRecord) and isinstance(source, LoadedRecord) and not give_same_record(step[2], source)
-
-    return [step for step in steps if not other(step)]
-
-
-def _covers(path: str, other: str) -> bool:
-    """Whether setting `path` replaces what stands at `other`."""
-    return other == path or other.startswith(f"{path}.")
+    if not isinstance(source, LoadedRecord):
+        return steps
+    return [step for step in steps if not isinstance(step[2], LoadedRecord) or give_same_record(step[2], source)]

@@ -1,17 +1,22 @@
-"""Colours of the page, of runs compared and of marks; those of observers and controllers are `wfsobs.plot.looks`."""
+"""What the page is made of: its own components, whose parameters go down to the browser and messages up; texts, buttons, colours.
+
+Colours of observers and controllers are `wfsobs.plot.looks`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import cache
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, partial
 from importlib.resources import files
-from types import MappingProxyType
 from typing import Any
 
+import panel as pn
+import panel_material_ui as pmui
+import param
 from markupsafe import Markup
+from panel.custom import JSComponent
 
-from wfsobs.app.component import HtmlComponent
-from wfsobs.app.render import macro
+from wfsobs.app.render import Row, macro
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import NO_ESTIMATE
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH
@@ -22,23 +27,52 @@ from wfsobs.plot.looks import LOOKS as LOOKS
 from wfsobs.plot.looks import TERM_COLOURS as TERM_COLOURS
 from wfsobs.plot.looks import look as look
 
-RUNS: Mapping[str, Look] = MappingProxyType(
-    {
-        "A": Look("A", "#0072B2", "#6CB8E6", (6, 3)),
-        "B": Look("B", "#B84A00", "#FF9A57", (2, 2)),
-        "C": Look("C", "#007A58", "#4FD1AE", (10, 3, 2, 3)),
-        "D": Look("D", "#9C3F78", "#E79AC6", (12, 4)),
-        "E": Look("E", "#6B5B00", "#D9C64A", (4, 2, 1, 2)),
-    }
-)
+
+class Component(JSComponent):
+    """A component of the page in JavaScript.
+
+    on_message : gets the messages {name: value, ...} of the browser, and may change figures. Panel answers a message without the
+    lock of the document while a changed property is on its way; held changes need none. Until the page has been drawn Panel drops
+    held changes, so that messages wait.
+    """
+
+    __abstract = True
+
+    def __init__(self, on_message: Callable[[dict[str, Any]], object] | None = None, **params: Any):
+        self.on_message: Callable[[dict[str, Any]], object] = on_message or (lambda _message: None)
+        super().__init__(**params)
+
+    def _handle_msg(self, data: object) -> None:
+        if isinstance(data, dict):
+            answer = partial(self._answer, data)
+            answer() if pn.state.loaded else pn.state.onload(answer)
+
+    def _answer(self, message: dict[str, Any]) -> None:
+        with pn.io.hold():
+            self.on_message(message)
+
+
+class HtmlComponent(Component):
+    """A component whose contents are HTML that is made here."""
+
+    __abstract = True
+
+    html: param.String[str] = param.String("", doc="What is in it.")
+
+
+RUNS: Mapping[str, Look] = {
+    "A": Look("A", "#0072B2", "#6CB8E6", (6, 3)),
+    "B": Look("B", "#B84A00", "#FF9A57", (2, 2)),
+    "C": Look("C", "#007A58", "#4FD1AE", (10, 3, 2, 3)),
+    "D": Look("D", "#9C3F78", "#E79AC6", (12, 4)),
+    "E": Look("E", "#6B5B00", "#D9C64A", (4, 2, 1, 2)),
+}
 """Runs that are compared with the one shown, by their letters."""
 
-BOUND_MARKS: Mapping[str, tuple[str, str, str]] = MappingProxyType(
-    {
-        BOUND: ("#D64533", "dashed", "theoretical limit using LGS"),
-        BOUND_BOTH: ("#7A4FBF", "dotted", "theoretical limit using LGS and NGS"),
-    }
-)
+BOUND_MARKS: Mapping[str, tuple[str, str, str]] = {
+    BOUND: ("#D64533", "dashed", "theoretical limit using LGS"),
+    BOUND_BOTH: ("#7A4FBF", "dotted", "theoretical limit using LGS and NGS"),
+}
 """Bound -> its colour, its dash, and how it is called beside an error budget."""
 
 HEARD = ".MuiFormLabel-root { position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%); }"
@@ -93,11 +127,6 @@ def theme() -> dict[str, Any]:
     }
 
 
-def run_look(letter: str) -> Look:
-    """Return the look of a compared run."""
-    return RUNS[letter]
-
-
 def labels() -> dict[str, str]:
     """Every line's name in legends."""
     return {name: look(name).label for name in (*LOOKS, *OBSERVERS, *CONTROLLERS)}
@@ -127,7 +156,7 @@ def sheets(*names: str) -> list[str]:
     return [asset(f"{name}.css") for name in names]
 
 
-WIDE: Mapping[str, Any] = MappingProxyType({"sizing_mode": "stretch_width", "margin": 0})
+WIDE: Mapping[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
 
 
 class HtmlText(HtmlComponent):
@@ -146,14 +175,43 @@ def bare(content: str = "", **params: Any) -> HtmlText:
     return html(content, **{"stylesheets": sheets("style", "bare"), **params})
 
 
+def watch(act: Callable[..., object], *sources: tuple[Any, str | list[str]]) -> None:
+    """Call a function after every change of parameters: an object or None, and which of its parameters."""
+    for of, names in sources:
+        if of is not None:
+            of.param.watch(act, names)
+
+
+def follow_html(make: Callable[[], str], *sources: tuple[Any, str | list[str]], **params: Any) -> HtmlText:
+    """HTML as `bare`, made anew after every change of what `watch` takes."""
+    pane = bare(make(), **params)
+    watch(lambda *_: setattr(pane, "html", make()), *sources)
+    return pane
+
+
+def make_button(label: str, act: Callable[[], object], **options: Any) -> pmui.Button:
+    """Make a small button. act : called by a click."""
+    return pmui.Button(label=label, on_click=lambda _event: act(), **{"size": "small", "margin": 0, **options})
+
+
+def make_select(label: str, options: Any, value: Any, width: int | None, **more: Any) -> pmui.Select:
+    """Make a small list to choose from."""
+    return pmui.Select(label=label, options=options, value=value, width=width, **{"size": "small", "margin": 0, **more})
+
+
 def run_swatch(letter: str, dark: bool) -> Markup:
     """Draw a short line in the dashes and the colour of a compared run, with its letter."""
-    return _swatch(run_look(letter), dark, True) + Markup("<b>{}</b>").format(letter)
+    return _swatch(RUNS[letter], dark, True) + Markup("<b>{}</b>").format(letter)
 
 
 def swatch(name: str, dark: bool, with_dash: bool = True) -> Markup:
     """Draw a short line as in the figures, as SVG; solid if not to be dashed."""
     return _swatch(look(name), dark, with_dash)
+
+
+def named_row(name: str, label: str, dark: bool, cells: Sequence[str], kind: str = "name") -> Row:
+    """Make a row of a table of lines. kind : what scripts and tests find it by."""
+    return Row(swatch(name, dark) + label, cells, {kind: name})
 
 
 @cache

@@ -20,18 +20,17 @@ import param
 from bokeh.models import ColumnDataSource
 
 from wfsobs.app.actions import Actions
-from wfsobs.app.component import HtmlComponent
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs import CANCELLED, FAILED, RUNNING, Job
-from wfsobs.app.pages.parts import make_button, read_number
+from wfsobs.app.pages.parts import read_number
 from wfsobs.app.render import render
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.session_file import LARGEST, SUFFIX
 from wfsobs.app.sources import fit_to_record
 from wfsobs.app.store import RecordPlace, Store
-from wfsobs.app.style import html, script, sheets
-from wfsobs.app.views.plots import new_figure, send
+from wfsobs.app.style import HtmlComponent, html, make_button, make_select, script, sheets
+from wfsobs.app.views.plots import new_spectrum, send
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import TIP_TILT
@@ -123,10 +122,8 @@ class UploadFields:
         self.rate: Final = _text("Rate [Hz]")
         self.gain: Final = _text("Gain of commands")
         self.rail: Final = _text("Rail: largest command")
-        self.trust, self.open_loop = (
-            pmui.Checkbox(label=label, value=False, size="small", margin=(4, 0))
-            for label in ("Trust sign and delay as stated", "Open loop: the mirror was at rest")
-        )
+        said = "Trust sign and delay as stated", "Open loop: the mirror was at rest"
+        self.trust, self.open_loop = (pmui.Checkbox(label=label, size="small", margin=(4, 0)) for label in said)
         self.widgets: Final = (self.unit, self.sign, self.delay, self.rate, self.gain, self.rail, self.trust, self.open_loop)
         self._first: Final = [widget.value for widget in self.widgets]
         for widget in self.widgets:
@@ -154,11 +151,8 @@ class UploadFields:
 
 def differs_from_proposals(preview: Preview) -> bool:
     """Return whether the data propose another sign or delay than those with which the record was read."""
-    found = preview.reading.response
-    read = preview.reading.sign, preview.record.delay
-    return found is not None and any(
-        new is not None and new != old for new, old in zip((found.sign, found.delay), read, strict=True)
-    )
+    found, sign, delay = preview.reading.response, preview.reading.sign, preview.record.delay
+    return found is not None and (found.sign not in (None, sign) or found.delay not in (None, delay))
 
 
 def _number(field: Any, least: float) -> Any:
@@ -168,7 +162,7 @@ def _number(field: Any, least: float) -> Any:
 
 def _select(label: str, options: Any) -> pmui.Select:
     first = options[0] if isinstance(options, list) else next(iter(options.values()))
-    return pmui.Select(label=label, options=options, value=first, size="small", width=190, margin=(4, 0))
+    return make_select(label, options, first, 190, margin=(4, 0))
 
 
 def _text(label: str, width: int = 190) -> pmui.TextInput:
@@ -185,9 +179,8 @@ class PreviewView:
 
     def __init__(self) -> None:
         self.text: Final = html(margin=(4, 0), styles=TEXT)
-        self.figure: Final = new_figure(x_axis_type="log", y_axis_type="log")
+        self.figure: Final = new_spectrum(None, None)
         self.figure.name = "Spectrum of the record"
-        self.figure.xaxis.axis_label, self.figure.yaxis.axis_label = "frequency [Hz]", "PSD of z [µm²/Hz]"
         self.sources: Final = [ColumnDataSource({"x": [], "y": []}) for _ in TIP_TILT]
         for source, colour, mode in zip(self.sources, COLOURS, TIP_TILT, strict=True):
             self.figure.line("x", "y", source=source, color=colour, line_width=1.4, legend_label=mode.name)
@@ -257,7 +250,7 @@ class ColumnForm:
             choice.param.update(options=options, value=roles.get(role, ""))
         self._fills = False
 
-    def _choose(self, event: param.parameterized.Event) -> None:
+    def _choose(self, event: Any) -> None:
         """Take the column away from the role that had it."""
         if self._fills:
             return
@@ -293,14 +286,11 @@ class Upload:
         self.reading: Final = BackgroundTask(store.session)
         self.reading.param.watch(self._read, ["state", "place", "message"])
         self.fields: Final = UploadFields(self.look)
-        self._diameter = store.scenario.telescope.diameter
         store.param.watch(self._follow, "scenario")
         store.param.watch(self._entitle, ["source", "wanted_record"])
 
-    def _follow(self, _event: object) -> None:
-        diameter = self.store.scenario.telescope.diameter
-        if diameter != self._diameter:
-            self._diameter = diameter
+    def _follow(self, event: Any) -> None:
+        if event.new.telescope.diameter != event.old.telescope.diameter:
             self.look()
 
     def _entitle(self, *_: object) -> None:
@@ -382,10 +372,7 @@ class Upload:
             self._say(task.line() if task.place else f"Reading {self._name} …")
         elif self._content and task.state != CANCELLED:
             found = RecordError(task.message) if task.state == FAILED else task.result
-            if self._is_wanted:
-                self._use_wanted(found)
-            else:
-                self._show(found)
+            (self._use_wanted if self._is_wanted else self._show)(found)
 
     def _use_wanted(self, preview: AnyPreview | RecordError) -> None:
         """Use the file of a link at once; look at it as at any other where that cannot be."""

@@ -14,7 +14,6 @@ from functools import partial
 from time import perf_counter, sleep
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from wfsobs.app.jobs import INTERVAL, Tell
@@ -30,13 +29,13 @@ from wfsobs.observers.base import SLOW, TARGETS
 from wfsobs.observers.estimates import Estimate
 from wfsobs.pipeline import as_stated, collect, with_gate
 from wfsobs.prior import GIVEN, TRUE
-from wfsobs.priors_from.selection import usual_observers
+from wfsobs.priors_from.scenario import usual_observers
 from wfsobs.progress import Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import record_settings
+from wfsobs.typing import Array
 
-Array = NDArray[np.float64]
 Key = tuple[str, str]
 """(observer or TRUTH, target)."""
 

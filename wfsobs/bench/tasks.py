@@ -16,8 +16,23 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from wfsobs.bench import textbook
-from wfsobs.bench.measure import ENOUGH_FOR_P999, OURS, Row, max_error, measure_time, peak_memory_mb, row, with_ratios
-from wfsobs.bench.steps import RATE, Latency, back_to_back, reference_step, run_paced, set_aside, step_of
+from wfsobs.bench.measure import (
+    ENOUGH_FOR_P999,
+    OURS,
+    RATE,
+    Latency,
+    Row,
+    back_to_back,
+    max_error,
+    measure_time,
+    peak_memory_mb,
+    reference_step,
+    row,
+    run_paced,
+    set_aside,
+    step_of,
+    with_ratios,
+)
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
@@ -25,16 +40,14 @@ from wfsobs.observers.base import TARGETS, VIBRATION
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.gpr.inputs import window_signals
 from wfsobs.observers.gpr.kernels import SquaredExponential
-from wfsobs.observers.gpr.offline import training_targets
-from wfsobs.observers.gpr.online import OnlineGprStream, gpr_online, kernel_of
-from wfsobs.observers.gpr.trained import train
+from wfsobs.observers.gpr.offline import train, training_targets
+from wfsobs.observers.gpr.online import gpr_online, kernel_of, step_gpr_online
 from wfsobs.observers.kalman.adaptive import adapt
 from wfsobs.observers.kalman.multirate import multirate_filter, multirate_noise
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.pipeline import run
 from wfsobs.prior import Bands
-from wfsobs.priors_from.scenario import bands_of, model_of, modelled_processes, prior_of
-from wfsobs.priors_from.selection import usual_observers
+from wfsobs.priors_from.scenario import bands_of, model_of, modelled_processes, prior_of, usual_observers
 from wfsobs.progress import QUIET
 from wfsobs.record import Record, pseudo_open_loop
 from wfsobs.scenario import Scenario
@@ -321,13 +334,15 @@ def online_stream(sizes: Sizes) -> Iterator[Row]:
 
 def _stream(scenario: Scenario, record: Record) -> tuple[Array, Array]:
     """Estimates (n_steps,), and for every step that has one: sample to estimate, whole step [s]."""
-    stream = OnlineGprStream(scenario.gpr_online, bands_of(scenario), scenario.dt)
+    prior, sampling = prior_of(scenario, record, (Bands,)), record.sampling._replace(n_modes=1)
+    estimator = step_gpr_online(prior, scenario.gpr_online, sampling, 0.0)
     values, times = np.empty(record.n_steps), np.empty((record.n_steps, 2))
-    for k, (y, u) in enumerate(zip(record.y_lgs[:, 0].tolist(), record.u[:, 0].tolist(), strict=True)):
+    for k, (z, u) in enumerate(zip(record.z[:, :1], record.u[:, :1], strict=True)):
         start = perf_counter()
-        values[k] = stream.estimate(y, u)
+        estimator.advance(z, None, u)
+        values[k] = estimator.predict(0.0, VIBRATION)[0][0]
         ready = perf_counter()
-        stream.update()
+        estimator.settle()
         times[k] = ready - start, perf_counter() - start
     return values, times[~np.isnan(values)]
 

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from wfsobs.campaign.compare import LEVEL, Comparison, compare
-from wfsobs.campaign.points import Changes, conditions, grid, product, sample
+from wfsobs.campaign.sweep import Changes, conditions, grid, product, sample
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
-from wfsobs.priors_from.selection import common_observers
+from wfsobs.priors_from.scenario import common_observers
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import load_scenario, parse_toml, preset
 from wfsobs.settings.errors import SettingError

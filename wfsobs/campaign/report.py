@@ -23,7 +23,7 @@ from wfsobs.campaign.plan import Campaign
 from wfsobs.campaign.store import finished_runs, folder_plan, read_results
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import NOT_OBSERVERS
-from wfsobs.files import write_whole
+from wfsobs.files import write_text
 from wfsobs.observers import OBSERVERS
 from wfsobs.typing import Array
 
@@ -63,7 +63,7 @@ class Ranking:
     ties: tuple[tuple[int, int], ...] = ()
 
 
-def critical_difference(names: int, blocks: int, level: float = LEVEL) -> float:
+def critical_difference(names: int, blocks: int) -> float:
     """Return Nemenyi's critical difference of mean ranks.
 
     Parameters
@@ -72,8 +72,6 @@ def critical_difference(names: int, blocks: int, level: float = LEVEL) -> float:
         Number of what is compared.
     blocks : int
         Number of scenarios.
-    level : float
-        Level of the test.
 
     Returns
     -------
@@ -85,7 +83,7 @@ def critical_difference(names: int, blocks: int, level: float = LEVEL) -> float:
     >>> round(critical_difference(5, 6) / (5 * 6 / (6 * 6)) ** 0.5, 3)  # Demsar's table 5: 2.728
     2.728
     """
-    q = float(studentized_range.ppf(level, names, np.inf)) / np.sqrt(2.0)
+    q = float(studentized_range.ppf(LEVEL, names, np.inf)) / np.sqrt(2.0)
     return float(q * np.sqrt(names * (names + 1) / (6.0 * blocks)))
 
 
@@ -219,6 +217,7 @@ def write_report(folder: Path, path: Path) -> None:
 
     plan, table = folder_plan(folder), read_results(folder)
     comparisons = compare(table)
+    groups = _by_group(comparisons)
     stable = first_places(table, np.random.default_rng(0))
     environment = Environment(
         loader=PackageLoader("wfsobs.campaign"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -226,17 +225,21 @@ def write_report(folder: Path, path: Path) -> None:
     text = environment.get_template("report.html").render(
         plan=plan,
         done=int(finished_runs(plan, folder).sum()),
-        maps=[m for key in _keys(comparisons) for m in _maps(plan, [c for c in comparisons if (c.target, c.mode) == key])],
+        maps=[
+            m
+            for key in dict.fromkeys((c.target, c.mode) for c in comparisons)
+            for m in _maps(plan, [c for c in comparisons if (c.target, c.mode) == key])
+        ],
         rankings=[(r, _lines(r)) for r in rank(comparisons)],
-        groups=list(_by_group(comparisons).items())[:MOST_ROWS],
-        left_out=max(0, len(_by_group(comparisons)) - MOST_ROWS),
+        groups=list(groups.items())[:MOST_ROWS],
+        left_out=max(0, len(groups) - MOST_ROWS),
         stable=stable,
         label=name_label,
         colour=colour,
         settings=lambda cell: ", ".join(f"{path} = {_short(v)}" for path, v in plan.cells[cell].changes.items()),
         size=(WIDTH, HEIGHT, LEFT, TOP),
     )
-    write_whole(path, lambda file: file.write(text.encode()))
+    write_text(path, text)
 
 
 def name_label(name: str) -> str:
@@ -248,10 +251,6 @@ def colour(name: str) -> str:
     """Return the colour of an observer or a controller."""
     entry = OBSERVERS.get(name) or CONTROLLERS.get(name)
     return entry.look.light if entry is not None else "#555577"
-
-
-def _keys(comparisons: Sequence[Comparison]) -> list[tuple[str, str]]:
-    return list(dict.fromkeys((c.target, c.mode) for c in comparisons))
 
 
 def _by_group(comparisons: Sequence[Comparison]) -> dict[tuple[int, str, str], list[Comparison]]:

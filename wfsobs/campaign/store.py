@@ -1,23 +1,85 @@
-"""Results of a campaign: a folder with the plan and one Parquet file per batch."""
+"""Results of a campaign: a folder with the plan and one Parquet file per batch, by keys of all that a result depends on."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
+import sys
 import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wfsobs.campaign.keys import row_key, scenario_digest
 from wfsobs.campaign.plan import Campaign
-from wfsobs.files import write_whole
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.evaluation.rows import NOT_OBSERVERS
+from wfsobs.files import write_text, write_whole
+from wfsobs.observers import OBSERVERS
+from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 from wfsobs.typing import Array
+from wfsobs.version import __version__
+
+PHYSICS_VERSION = 6
+"""Number of the simulation and its numerics: rises with every change that moves results (tests/campaign/test_physics.py)."""
+
+
+def scenario_digest(scenario: Scenario) -> str:
+    """Return a digest of the settings but for the seed, and of the version of the physics."""
+    settings = scenario.to_dict()
+    settings["run"] = {k: v for k, v in settings["run"].items() if k != "seed"}
+    return hashlib.sha256(json.dumps([PHYSICS_VERSION, settings], sort_keys=True).encode()).hexdigest()
+
+
+def row_key(digest: str, seed: int, name: str) -> str:
+    """Return the key of the rows of one observer, controller or bound, on one record.
+
+    Parameters
+    ----------
+    digest : str
+        That of the scenario.
+    seed : int
+        Seed of the record.
+    name : str
+        Id of the observer or controller.
+
+    Returns
+    -------
+    str
+        SHA-256, in hexadecimal.
+    """
+    return hashlib.sha256(f"{digest} {seed} {name} {package_version(name)}".encode()).hexdigest()
+
+
+@cache
+def package_version(name: str) -> str:
+    """Return the package of an observer or a controller and its version; that of wfsobs for bounds.
+
+    >>> package_version("kf-lgs").split()[0]
+    'wfsobs'
+    """
+    if name in NOT_OBSERVERS:
+        return f"wfsobs {__version__}"
+    entry = OBSERVERS.get(name)
+    function = entry.run if entry is not None else CONTROLLERS[name].law or CONTROLLERS[name].step_law
+    home = getattr(function, "__module__", "wfsobs").partition(".")[0]
+    package = sys.modules.get(home)
+    return f"{home} {getattr(package, '__version__', None) or _distribution_version(home)}"
+
+
+def _distribution_version(home: str) -> str:
+    """Return the version of the installed distribution that has this module; "0" for a script."""
+    from importlib.metadata import packages_distributions, version
+
+    names = packages_distributions().get(home, [])
+    return version(names[0]) if names else "0"
+
 
 if TYPE_CHECKING:
     import pyarrow
@@ -224,7 +286,7 @@ def open_folder(plan: Campaign, folder: Path) -> None:
     known = folder / PLAN
     if known.exists() and folder_plan(folder).identity() != plan.identity():
         raise SettingError(f"{folder}: holds another campaign; the plan may differ in its number of seeds alone")
-    write_whole(known, lambda file: file.write(json.dumps(plan.to_dict()).encode()))
+    write_text(known, json.dumps(plan.to_dict()))
 
 
 def remove_leftovers(folder: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
@@ -11,7 +10,8 @@ import click
 import numpy as np
 from click.core import ParameterSource
 
-from wfsobs.cli.options import ngs_options, ngs_wiring, scenario_options, stream_elements, told_scenario
+from wfsobs.cli.options import json_option, ngs_options, ngs_wiring, scenario_options, stream_elements, told_scenario
+from wfsobs.cli.show import print_json, print_note
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.supervisor import SupervisedController, Supervision
 from wfsobs.observers import OBSERVERS
@@ -23,15 +23,13 @@ from wfsobs.record import DELAY, Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 from wfsobs.stepping import design, prior_in
-from wfsobs.streams.attach import Attachment, CommandStream
-from wfsobs.streams.attach_controller import ControllerAttachment
+from wfsobs.streams.attach import Attachment, CommandStream, ControllerAttachment
 from wfsobs.streams.follower import StreamFollower
 from wfsobs.streams.layout import StreamError
 from wfsobs.streams.network import Publication, Subscription, is_address
 from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.shared_image import SharedImage, stream_path
-from wfsobs.streams.watchdog import LIMIT, Fallback, Safety
-from wfsobs.streams.wiring import STUCK, Wiring
+from wfsobs.streams.wiring import LIMIT, STUCK, Fallback, Safety, Wiring
 from wfsobs.units import UNITS, micrometres_per
 
 OBSERVERS_ALONE = ("name", "shadow", "commands", "delay", "fallback")
@@ -101,7 +99,7 @@ OBSERVERS_ALONE = ("name", "shadow", "commands", "delay", "fallback")
     help="Wait for this one of the stream, or a free one; else the counter is watched.",
 )
 @click.option("--seconds", type=click.FloatRange(0, min_open=True), metavar="S", help="Duration; by default until Ctrl+C.")
-@click.option("--json", "as_json", is_flag=True, help="At the end print one JSON object.")
+@json_option("At the end print one JSON object.")
 def attach(
     scenario: Scenario,
     source: str,
@@ -165,11 +163,11 @@ def attach(
         raise SettingError(f"attach: {error}") from None
     if as_json:
         refused = {"refused": given.n_refused} if isinstance(given, Subscription) else {}
-        click.echo(json.dumps({**attachment.summary(), **refused}, allow_nan=False))
+        print_json({**attachment.summary(), **refused})
 
 
 def _say(line: str) -> None:
-    click.echo(f"wfsobs: attach: {line}", err=True)
+    print_note(f"attach: {line}")
 
 
 def _open_source(name: str) -> SharedImage | Subscription:
@@ -214,8 +212,7 @@ def _check_kind(name: str, parts: tuple[Part, ...], has_ngs: bool, needs_ngs: bo
 
 def _supervise(name: str, scenario: Scenario, wiring: Wiring, gain: float, has_ngs: bool) -> SupervisedController:
     """Return a supervised controller, whose commands are within the limits of the scenario and of the wiring."""
-    if name not in CONTROLLERS:
-        raise SettingError(f"controller {name!r}: no such controller; there are {', '.join(CONTROLLERS)}")
+    CONTROLLERS.check_ids([name])
     declared = CONTROLLERS[name]
     _check_kind(name, declared.parts(own_settings(declared, scenario)), has_ngs, declared.ngs)
     if not gain:
@@ -235,8 +232,7 @@ def _sent_last(sink: SharedImage | Publication | None, wiring: Wiring) -> np.nda
 
 
 def _design(name: str, scenario: Scenario, n_modes: int, horizon: float, has_ngs: bool) -> StepObserver:
-    if name not in OBSERVERS:
-        raise SettingError(f"observer {name!r}: no such observer; there are {', '.join(OBSERVERS)}")
+    OBSERVERS.check_ids([name])
     declared = OBSERVERS[name]
     if "y_stars" in declared.needs:
         raise StepError(f"{name}: takes every LGS by itself; the stream is of them together")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -13,7 +12,8 @@ from rich.table import Table
 
 from wfsobs.bench import tasks
 from wfsobs.bench.measure import Row, machine
-from wfsobs.cli.show import progress_bar
+from wfsobs.cli.options import json_option
+from wfsobs.cli.show import new_table, print_json, print_note, progress_bar
 
 HEADS = {
     "steps": "steps",
@@ -32,19 +32,16 @@ HEADS = {
 
 @click.command()
 @click.option("--full", is_flag=True, help="Include m up to 2048, d up to 1000 and a run of 60 s.")
-@click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
+@json_option("Print a list of rows instead of a table.")
 @click.pass_obj
 def bench(libraries: Mapping[str, tasks.Library] | None, full: bool, as_json: bool) -> None:
     """Time the observers beside textbook versions."""
     if libraries is None:
-        click.echo(
-            "wfsobs: bench: without scikit-learn, filterpy and statsmodels; python -m benchmarks, in the repository, has them",
-            err=True,
-        )
-    with progress_bar("benchmarks") as update:
-        measured = tasks.measure_all(replace(tasks.FULL if full else tasks.QUICK, libraries=libraries or {}), update)
+        print_note("bench: without scikit-learn, filterpy and statsmodels; python -m benchmarks, in the repository, has them")
+    with progress_bar("benchmarks") as watch:
+        measured = tasks.measure_all(replace(tasks.FULL if full else tasks.QUICK, libraries=libraries or {}), watch.progress)
     if as_json:
-        click.echo(json.dumps(measured, allow_nan=False))
+        print_json(measured)
         return
     console = Console()
     table = bench_table(measured, markdown=not console.is_terminal)
@@ -54,15 +51,12 @@ def bench(libraries: Mapping[str, tasks.Library] | None, full: bool, as_json: bo
 
 def bench_table(rows: Sequence[Row], markdown: bool = False) -> Table:
     """Return the table of the rows; `markdown` draws it as Markdown."""
-    table = Table(box=box.MARKDOWN if markdown else box.HEAVY_HEAD)
     fields = [name for name in HEADS if name != "peak_memory_mb" or any(r[name] is not None for r in rows)]
-    for head in ("Task", "Size", "Variant"):
-        table.add_column(head, no_wrap=True)
-    for name in fields:
-        table.add_column(HEADS[name], justify="right", no_wrap=True)
+    heads = [HEADS[name] for name in fields]
+    table = new_table(("Task", "Size", "Variant"), heads, box=box.MARKDOWN if markdown else box.HEAVY_HEAD)
     last = None
     for r in rows:
-        if not markdown and last not in (None, r["task"]):
+        if not markdown and last != r["task"]:
             table.add_section()
         last = r["task"]
         table.add_row(r["task"], r["size"], r["variant"], *(_cell(name, r[name]) for name in fields))

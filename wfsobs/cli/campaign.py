@@ -1,40 +1,123 @@
-"""`wfsobs campaign`: many scenarios and seeds, on many processes or machines."""
+"""`wfsobs campaign`: many scenarios and seeds, on many processes or machines, and their results in the terminal."""
 
 from __future__ import annotations
 
 import csv
-import json
 import math
 import re
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import astuple, fields
 from pathlib import Path
 from time import perf_counter
 from types import FrameType
+from typing import TYPE_CHECKING
 
 import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from wfsobs.campaign.compare import QUANTILES, compare
 from wfsobs.campaign.follow import CampaignFolder
 from wfsobs.campaign.plan import Campaign, load_plan
 from wfsobs.campaign.pools import DaskCluster, Processes, usable_processors
-from wfsobs.campaign.run import BATCH, run_campaign, run_cost
+from wfsobs.campaign.run import BATCH, run_campaign, run_cost, run_rows
 from wfsobs.campaign.run import Progress as State
+from wfsobs.campaign.selection import cells_where
 from wfsobs.campaign.standings import TogetherRow, standings
-from wfsobs.campaign.store import add_settings, finished_runs, folder_plan, need_pyarrow, read_results
-from wfsobs.campaign.work import run_rows
-from wfsobs.cli.campaign_results import cells_of, check_known, print_csv, select_rows, summary_table
-from wfsobs.cli.show import show_table
+from wfsobs.campaign.store import RESULTS, add_settings, finished_runs, folder_plan, need_pyarrow, read_results
+from wfsobs.cli.options import json_option
+from wfsobs.cli.show import new_table, print_json, print_note, show_table
 from wfsobs.evaluation.rows import NOT_OBSERVERS
 from wfsobs.evaluation.scores import COMMON_BOUNDS
 from wfsobs.observers import OBSERVERS
 from wfsobs.settings.errors import SettingError
 
-TEXTS = ("Target", "Mode", "Name")
+if TYPE_CHECKING:
+    import pyarrow
+
+SPREAD = f"{', '.join(f'{q * 100:g}' for q in QUANTILES)} % of seeds"
+"""Heading of the quantiles."""
+
+CHUNK = 10_000
+"""Rows that are Python objects at a time: these take far more memory than a table."""
+
+
+def select_rows(plan: Campaign, table: pyarrow.Table, only: Sequence[str], target: str | None, mode: str | None) -> pyarrow.Table:
+    """Return the rows of some scenarios, a target and a mode, and of runs without an estimate. Raises SettingError."""
+    import pyarrow.compute as pc
+
+    cells = cells_of(plan, only)
+    for option, wanted in (("target", target), ("mode", mode)):
+        known = sorted(filter(None, table[option].unique().to_pylist()))
+        if check_known(option, wanted, known):
+            table = table.filter((pc.field(option) == wanted) | (pc.field("target") == ""))
+    return table.filter(pc.field("cell").isin(cells)) if only else table
+
+
+def cells_of(plan: Campaign, only: Sequence[str]) -> list[int]:
+    """Return the scenarios of --only. Raises SettingError."""
+    try:
+        return cells_where(plan, only).tolist()
+    except SettingError as error:
+        raise SettingError(f"--only {error}") from None
+
+
+def check_known(option: str, text: str | None, names: Iterable[str]) -> bool:
+    """Return whether an option is given. Raises SettingError where it is none of what there are results of."""
+    if text is not None and text not in names:
+        listed = ", ".join(names)
+        raise SettingError(f"--{option} {text}: {f'takes one of {listed}' if listed else 'there are no results yet'}")
+    return text is not None
+
+
+def print_csv(plan: Campaign, table: pyarrow.Table) -> None:
+    """Print rows, with the settings of their scenarios; numbers with all their digits."""
+    out = csv.writer(sys.stdout, lineterminator="\n")
+    columns, axes = list(RESULTS), plan.axes
+    out.writerow([*columns, *axes])
+    for part in table.to_batches(max_chunksize=CHUNK):
+        for row in part.to_pylist():
+            changes = plan.cells[row["cell"]].changes if row["cell"] < len(plan.cells) else {}
+            out.writerow([_text(row[c]) for c in columns] + [_text(changes.get(path)) for path in axes])
+
+
+def _text(value: object) -> object:
+    return "" if value is None else repr(value) if isinstance(value, float) else value
+
+
+def summary_table(plan: Campaign, rows: object, title: str) -> Table:
+    """Return a table with one row per scenario, target, mode and observer."""
+    texts, numbers = ("Scenario", "Settings", "Target", "Mode", "Name"), ("rms, nm", SPREAD, "above the best, nm", "seeds")
+    caption = "+-: interval of 95 % of the paired difference from the best; ~: not significant"
+    out = new_table(texts, numbers, no_wrap=False, title=title, caption=caption)
+    before = None
+    for one in compare(rows):
+        key = (one.cell, one.target, one.mode)
+        settings = ", ".join(f"{path.split('.')[-1]} = {value}" for path, value in plan.cells[one.cell].changes.items())
+        new = key != before
+        above = (
+            ""
+            if one.difference is None
+            else f"{'~' if one.is_tie else ''}{one.difference:.2f}"
+            + (f" +- {one.half_width:.2f}" if one.half_width is not None else "")
+        )
+        label = NOT_OBSERVERS.get(one.name, one.name)
+        failed = f" ({one.failures} failed)" if one.failures else ""
+        out.add_row(
+            *((one.scenario, settings, one.target, one.mode) if new else ("",) * 4),
+            label,
+            f"{one.rms:.2f}",
+            " ".join(f"{q:.2f}" for q in one.quantiles),
+            above,
+            f"{one.seeds}{failed}",
+        )
+        before = key
+    return out
+
+
 NUMBERS = ("rms, nm", "rms / limit", "95 %", "above the best, %", "rank", "wins", "records", "failed")
 
 
@@ -56,9 +139,8 @@ def print_together(folder: Path, only: Sequence[str], target: str | None, mode: 
 
 
 def _table(rows: Sequence[TogetherRow], title: str) -> Table:
-    out = Table(title=title, caption="wins: scenarios with the smallest error, and how many of them are significant")
-    for name in (*TEXTS, *NUMBERS):
-        out.add_column(name, justify="right" if name in NUMBERS else "left")
+    caption = "wins: scenarios with the smallest error, and how many of them are significant"
+    out = new_table(("Target", "Mode", "Name"), NUMBERS, no_wrap=False, title=title, caption=caption)
     before = None
     for row in rows:
         key = row.target, row.mode
@@ -181,7 +263,7 @@ def rows_of_a_run(plan: Campaign) -> int:
     help="Run on a Dask cluster, such as tcp://head:8786; its workers see DIR under the same path.",
 )
 @click.option("--shard", metavar="K/N", help="Run the K-th of N shares, for job arrays.")
-@click.option("--json", "as_json", is_flag=True, help="Print what was done as JSON.")
+@json_option("Print what was done as JSON.")
 def run(plan_file: str, out: str, workers: int | None, scheduler: str | None, shard: str | None, as_json: bool) -> None:
     """Run what is missing of a campaign."""
     if workers and scheduler:
@@ -189,7 +271,7 @@ def run(plan_file: str, out: str, workers: int | None, scheduler: str | None, sh
     plan, share = load_plan(plan_file), _shard(shard)
     stop = _Stop()
     with _bar(plan.name) as bar:
-        place = DaskCluster(scheduler, _say) if scheduler else Processes(workers or usable_processors())
+        place = DaskCluster(scheduler, print_note) if scheduler else Processes(workers or usable_processors())
         task = bar.add_task("runs", total=None)
 
         def tell(state: State) -> None:
@@ -197,21 +279,15 @@ def run(plan_file: str, out: str, workers: int | None, scheduler: str | None, sh
 
         state = run_campaign(plan, Path(out), place, shard=share, report=tell, must_stop=stop)
     if as_json:
-        click.echo(
-            json.dumps(
-                {"total": state.total, "done": state.n_done, "before": state.before, "runs": state.runs, "breaks": state.breaks}
-            )
+        print_json(
+            {"total": state.total, "done": state.n_done, "before": state.before, "runs": state.runs, "breaks": state.breaks}
         )
     else:
         lost = f"; workers or their scheduler were lost {state.breaks} times, and their batches ran again" if state.breaks else ""
-        click.echo(f"wfsobs: {out}: {state.n_done} of {state.total} runs are done, {state.runs} of them now{lost}", err=True)
+        print_note(f"{out}: {state.n_done} of {state.total} runs are done, {state.runs} of them now{lost}")
     if stop():
-        click.echo("wfsobs: stopped; the same command resumes", err=True)
+        print_note("stopped; the same command resumes")
         sys.exit(STOPPED)
-
-
-def _say(line: str) -> None:
-    click.echo(f"wfsobs: {line}", err=True)
 
 
 class _Stop:
@@ -302,4 +378,4 @@ def report(folder: str, out: str | None) -> None:
 
     path = Path(out) if out else Path(folder) / "report.html"
     write_report(Path(folder), path)
-    click.echo(f"wfsobs: {path}: written", err=True)
+    print_note(f"{path}: written")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import click
 
 from wfsobs.cli.options import scenario_options, told_scenario
+from wfsobs.cli.show import print_note
 from wfsobs.handover.write import FORMATS, write_design
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
@@ -23,4 +24,4 @@ def design(scenario: Scenario, prior: str | None, name: str, form: str, out: str
         write_design(name, scenario, form, out)
     except ValueError as error:
         raise SettingError(f"design: {error}") from None
-    click.echo(f"wfsobs: design: {name} written to {out}", err=True)
+    print_note(f"design: {name} written to {out}")

@@ -1,16 +1,26 @@
-"""`wfsobs export`."""
+"""`wfsobs export` and `wfsobs figure`: results as files."""
 
 from __future__ import annotations
 
 import click
 
 from wfsobs.campaign.sweep import MOST_SEEDS
-from wfsobs.cli.options import observer_option, preset_of_command, scenario_options
+from wfsobs.cli.options import (
+    load_declared,
+    needing,
+    observer_option,
+    preset_of_command,
+    record_options,
+    scenario_options,
+    training,
+    training_options,
+)
 from wfsobs.cli.show import progress_bar, warn
-from wfsobs.progress import Watch
+from wfsobs.pipeline import observe, run
+from wfsobs.plot.paper import NUMBERS, draw_paper_figure, observers_in
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.grid import MOST, parse_variation
-from wfsobs.settings.errors import SettingError
+from wfsobs.telemetry.intake import DeclaredFormat
 
 
 @click.command()
@@ -39,11 +49,9 @@ def export(
 ) -> None:
     """Write a report: one HTML file with figures and numbers that opens without a network."""
     variations = [parse_variation(text) for text in vary]
-    try:
-        from wfsobs.app.report.export import export as write
-    except ModuleNotFoundError as error:
-        raise SettingError(f"export: a report needs {error.name}; install wfsobs with its extra: wfsobs[app]") from None
-    with progress_bar("runs") as update:
+    with needing("export: a report needs", "app"):
+        from wfsobs.app.report.page import export as write
+    with progress_bar("runs") as watch:
         write(
             out,
             scenario,
@@ -51,6 +59,45 @@ def export(
             vary=variations,
             seeds=seeds,
             preset=preset_of_command(),
-            watch=Watch(progress=update),
+            watch=watch,
             on_result=warn,
         )
+
+
+@click.command()
+@click.argument("name", type=click.Choice(tuple(NUMBERS)))
+@scenario_options
+@record_options
+@training_options
+@click.option("--out", required=True, metavar="FILE", help="File to write: .pdf, .svg, .pgf, .png or .html.")
+@click.option("--record", "record_file", metavar="RECORD", help="Draw from a record of your own, not from a simulation.")
+@click.option(
+    "--width", type=click.FloatRange(40, 400), default=88.0, show_default=True, metavar="MM", help="One column; 180 are two."
+)
+@click.option("--height", type=click.FloatRange(20, 1000), metavar="MM", help="By default 40 for each plot, and legends.")
+def figure(
+    name: str,
+    scenario: Scenario,
+    declaration: DeclaredFormat,
+    sha256: str | None,
+    train: str | None,
+    train_until: float | None,
+    out: str,
+    record_file: str | None,
+    width: float,
+    height: float | None,
+) -> None:
+    """Draw a figure of the paper as a file (docs/figures.md)."""
+    with needing("figure: needs", "plot"):
+        from wfsobs.plot.elements import check_suffix, save_figure
+    check_suffix(out)
+    names = observers_in(name)
+    record = load_declared(record_file, scenario, declaration, sha256) if record_file else None
+    with progress_bar() as watch:
+        if record is None:
+            result = run(scenario, observers=names, watch=watch)
+        else:
+            learnt = training(train, train_until, record, scenario, declaration)
+            result = observe(record, scenario, observers=names, train=learnt, watch=watch)
+    warn(result)
+    save_figure(draw_paper_figure(name, result), out, width=width, height=height or 0.0)

@@ -28,7 +28,7 @@ COMMANDS = {
     "design": Place("design", "Write a controller for a program elsewhere: C99 with a test, arrays, python-control."),
     "envelope": Place("simulate", "Compute what every linear controller leaves of the disturbance over an uncertain plant."),
     "export": Place("export", "Write a report: one HTML file with figures and numbers that opens without a network."),
-    "figure": Place("figure", "Draw a figure of the paper as a file."),
+    "figure": Place("export", "Draw a figure of the paper as a file."),
     "gain": Place("telemetry", "Find the integrator's optimal gain from closed-loop telemetry."),
     "identify": Place("telemetry", "Find noise, turbulence and vibration peaks in a record."),
     "live": Place("live", "Run a loop by the clock, every observer beside it, frame by frame, and show it on a page."),

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from os import cpu_count
 
 import click
 import numpy as np
-from rich.table import Table
 
 from wfsobs.cli.options import (
+    controller_option,
+    json_option,
     load_declared,
+    needing,
     ngs_options,
     ngs_wiring,
     observer_option,
@@ -20,11 +21,11 @@ from wfsobs.cli.options import (
     scenario_options,
     stream_elements,
 )
-from wfsobs.cli.show import progress_bar, show_table
+from wfsobs.cli.show import new_table, print_json, print_note, progress_bar, show_table
 from wfsobs.files import check_writable
 from wfsobs.live.attached import StreamSource
 from wfsobs.live.checks import can_control, check_slot, observers_on
-from wfsobs.live.control_crew import USUAL
+from wfsobs.live.crew import USUAL
 from wfsobs.live.follow import follow
 from wfsobs.live.programme import acts_of
 from wfsobs.live.recording import open_loop_record, record_of
@@ -54,13 +55,7 @@ from wfsobs.units import micrometres_per
 @ngs_options
 @record_options
 @observer_option
-@click.option(
-    "--controller",
-    "controllers",
-    multiple=True,
-    metavar="NAME",
-    help="Run this controller alone beside it; can be repeated.",
-)
+@controller_option("Run this controller alone beside it; can be repeated.")
 @click.option("--no-controllers", is_flag=True, help="Run no controller beside it.")
 @click.option("--speed", type=click.FloatRange(0.1, 20), default=1.0, metavar="X", help="1 is real time, the default.")
 @click.option("--record", "record_file", metavar="RECORD", help="Also save what was sent, in the format of its ending.")
@@ -71,7 +66,7 @@ from wfsobs.units import micrometres_per
 @click.option("--open", "open_browser", is_flag=True, help="Open a browser.")
 @click.option("--headless", is_flag=True, help="Run without a page, for --seconds, and print a table.")
 @click.option("--seconds", type=click.FloatRange(0.01, 86_400), default=10.0, metavar="N", help="Duration; by default 10.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of a table.")
+@json_option("Print one JSON object instead of a table.")
 def live(
     scenario: Scenario,
     replay_file: str | None,
@@ -116,11 +111,9 @@ def live(
     beside = () if no_controllers else controllers or usual
     for name in (*names, *beside):
         check_slot(name)
-    try:
+    with needing("live: the page needs", "app"):
         from wfsobs.app import serve as server
         from wfsobs.live.loop import LiveOrder
-    except ModuleNotFoundError as error:
-        raise SettingError(f"live: the page needs {error.name}; install wfsobs with its extra: wfsobs[app]") from None
     addresses = {
         "in": stream,
         "modes": modes,
@@ -176,7 +169,7 @@ def _place(stream: str) -> str:
 
 
 def _say(line: str) -> None:
-    click.echo(f"wfsobs: live: {line}", err=True)
+    print_note(f"live: {line}")
 
 
 def _run_headless(
@@ -194,7 +187,7 @@ def _run_headless(
     if isinstance(source, Replay):
         n_frames = min(n_frames, source.record.n_steps)
     try:
-        with progress_bar("frames") as update:
+        with progress_bar("frames") as watch:
             result = follow(
                 scenario,
                 n_frames,
@@ -202,7 +195,7 @@ def _run_headless(
                 source=source,
                 speed=speed,
                 keep=kept.append if record_file else None,
-                report=update,
+                report=watch.progress,
                 say=_say if isinstance(source, StreamSource) else lambda _: None,
                 log_file=log_file or "",
             )
@@ -213,11 +206,10 @@ def _run_headless(
             record = record_of(frames, scenario) if is_simulated else open_loop_record(frames, source.sampling)
             save_record(record_file, record, configfile.to_toml(scenario.before_events))
     if as_json:
-        click.echo(json.dumps(result, allow_nan=False))
+        print_json(result)
         return
-    table = Table(title=f"{result['frames']} frames, {result['lost']} lost, {result['late_share']:.2%} more than 1 ms late")
-    for name in ("Observer", "rms, nm", "step p50, us", "p99.9, us", "longer than a frame"):
-        table.add_column(name, justify="left" if name == "Observer" else "right")
+    title = f"{result['frames']} frames, {result['lost']} lost, {result['late_share']:.2%} more than 1 ms late"
+    table = new_table(("Observer",), ("rms, nm", "step p50, us", "p99.9, us", "longer than a frame"), no_wrap=False, title=title)
     for name, row in result["observers"].items():
         cells = (
             "-" if x is None else f"{x:.{digits}f}"

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import wraps
 from math import erfc, sqrt
 from typing import Any
 
 import click
 
+from wfsobs.cli.show import print_note
 from wfsobs.closed_loop.envelope import Uncertainty
 from wfsobs.priors_from.identification import told_by
 from wfsobs.priors_from.training import training_part
@@ -73,6 +75,25 @@ def uncertainty_options(command: Callable) -> Callable:
 observer_option = click.option(
     "--observer", "observers", multiple=True, metavar="NAME", help="Run this observer alone; can be repeated."
 )
+
+
+def json_option(text: str = "Print JSON instead of a table.") -> Callable:
+    """Return the option --json, received as `as_json`; text : its help."""
+    return click.option("--json", "as_json", is_flag=True, help=text)
+
+
+def controller_option(text: str = "Run this controller alone; can be repeated.") -> Callable:
+    """Return the option --controller, received as `controllers`; text : its help."""
+    return click.option("--controller", "controllers", multiple=True, metavar="NAME", help=text)
+
+
+@contextmanager
+def needing(what: str, extra: str) -> Iterator[None]:
+    """Turn a missing library into a SettingError: what needs it, and the extra of wfsobs that brings it."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise SettingError(f"{what} {error.name}; install wfsobs with its extra: wfsobs[{extra}]") from None
 
 
 def told_scenario(prior: str | None, scenario: Scenario) -> Scenario:
@@ -190,6 +211,16 @@ def record_options(command: Callable) -> Callable:
     )
 
 
+def record_command(command: Callable) -> click.Command:
+    """Return the command on a RECORD: its argument, and the options of its scenario and of what is stated of it."""
+    return click.command()(click.argument("record_file", metavar="RECORD")(scenario_options(record_options(command))))
+
+
+seeds_option = click.option(
+    "--seeds", type=click.IntRange(1, 100_000), default=1, metavar="N", help="Repeat with seeds run.seed ... run.seed + N - 1."
+)
+
+
 def training_options(command: Callable) -> Callable:
     """Add --train and --train-until."""
     return add_options(
@@ -212,12 +243,12 @@ def training(
         raise SettingError("--train and --train-until: give one of them")
     if train is not None:
         other = training_part(record, load_declared(train, scenario, declaration), scenario)
-        click.echo(f"wfsobs: training data: {train}, {other.n_steps * other.dt:g} s; no score is of it", err=True)
+        print_note(f"training data: {train}, {other.n_steps * other.dt:g} s; no score is of it")
         return other
     if train_until is not None:
         training_part(record, train_until, scenario)
         what = f"the first {train_until:g} s of {record.n_steps * record.dt:g} s"
-        click.echo(f"wfsobs: training data: {what}; estimates and scores begin after", err=True)
+        print_note(f"training data: {what}; estimates and scores begin after")
     return train_until
 
 
@@ -233,19 +264,18 @@ def load_with_delay(
     with open_record(record_file, sha256) as (file, name):
         record, delay = read_with_delay(file, name, scenario, declaration)
     if record.origin:
-        click.echo(f"wfsobs: {record_file}: read as {record.origin}", err=True)
+        print_note(f"{record_file}: read as {record.origin}")
     if record.missing:
-        click.echo(f"wfsobs: {record_file}: {record.missing} of {record.n_steps} frames are missing", err=True)
+        print_note(f"{record_file}: {record.missing} of {record.n_steps} frames are missing")
     expected = erfc(record.gate.level / sqrt(2.0)) * record.n_steps * record.n_modes if record.gate else 0.0
     if record.gate and record.outliers > expected + 3.0 * sqrt(expected):
         what = "missing" if record.gate.action == "reject" else "clipped"
-        click.echo(
-            f"wfsobs: {record_file}: {record.outliers} of {record.n_steps} frames have outliers, which are {what} to observers "
-            f"(sensors.gate); {expected:.1g} are expected of Gaussian noise",
-            err=True,
+        print_note(
+            f"{record_file}: {record.outliers} of {record.n_steps} frames have outliers, which are {what} to observers "
+            f"(sensors.gate); {expected:.1g} are expected of Gaussian noise"
         )
     for line in saturation_lines(record, declaration.rail):
-        click.echo(f"wfsobs: {record_file}: {line}", err=True)
+        print_note(f"{record_file}: {line}")
     return record, delay
 
 

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import json
-
 import click
 import numpy as np
 from rich import box
-from rich.table import Table
 from threadpoolctl import threadpool_limits
 
-from wfsobs.bench.measure import machine
-from wfsobs.bench.steps import SHARE, RealTime, measure_realtime
-from wfsobs.cli.options import scenario_options
-from wfsobs.cli.show import show_table
+from wfsobs.bench.measure import SHARE, RealTime, machine, measure_realtime
+from wfsobs.cli.options import json_option, scenario_options
+from wfsobs.cli.show import new_table, print_json, show_table
 from wfsobs.observers.step import StepError
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
@@ -23,7 +19,7 @@ from wfsobs.settings.group import SettingError
 @scenario_options
 @click.option("--observer", "name", default="kf-multi", show_default=True, metavar="ID", help="Observer or controller that runs.")
 @click.option("--seconds", type=click.FloatRange(0.01, 3600), default=5.0, show_default=True, metavar="S", help="Duration.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+@json_option()
 def rt_check(scenario: Scenario, name: str, seconds: float, as_json: bool) -> None:
     """Tell what this machine can hold: how late a loop at the LGS rate wakes, and what a step takes in it."""
     rate = scenario.sensors.lgs_rate
@@ -35,12 +31,9 @@ def rt_check(scenario: Scenario, name: str, seconds: float, as_json: bool) -> No
     rows = _rows(found)
     if as_json:
         summary = {"observer": name, "rate_hz": rate, "late_share": found.late_share, "highest_rate_hz": found.highest_rate}
-        click.echo(json.dumps({**summary, "microseconds": dict(rows)}, allow_nan=False))
+        print_json({**summary, "microseconds": dict(rows)})
         return
-    table = Table(box=box.HEAVY_HEAD)
-    table.add_column("us")
-    for head in ("p50", "p99", "p99.9", "max"):
-        table.add_column(head, justify="right")
+    table = new_table(("us",), ("p50", "p99", "p99.9", "max"), no_wrap=False, box=box.HEAVY_HEAD)
     for what, values in rows:
         table.add_row(what, *(f"{value:.1f}" for value in values))
     show_table(table)

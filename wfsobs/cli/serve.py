@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from wfsobs.settings.errors import SettingError
+from wfsobs.cli.options import needing
 
 ORIGIN = re.compile(r"https?://(\*\.)?[\w.-]+(:\d+|:\*)?|https?://\[[\da-f:]+\](:\d+)?", re.ASCII | re.IGNORECASE)
 
@@ -82,8 +82,6 @@ def _check_embedders(_context: click.Context, _option: click.Parameter, origins:
 @click.option("--log-requests", is_flag=True, help="Log every request, with address and query.")
 def serve(**options: Any) -> None:
     """Serve the dashboard (docs/serving.md)."""
-    try:
+    with needing("serve: the dashboard needs", "app"):
         from wfsobs.app import serve as server
-    except ModuleNotFoundError as error:
-        raise SettingError(f"serve: the dashboard needs {error.name}; install wfsobs with its extra: wfsobs[app]") from None
     server.serve(server.options(**options))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from statistics import mean, median
@@ -12,19 +11,25 @@ import numpy as np
 from rich.table import Table
 
 from wfsobs.cli.options import (
+    controller_option,
+    json_option,
     load_declared,
     observer_option,
     record_options,
     scenario_options,
+    seeds_option,
     training,
     training_options,
     uncertainty_options,
 )
-from wfsobs.cli.recovery_tables import OverTime
 from wfsobs.cli.show import (
+    OverTime,
     add_budgets,
     find_budgets,
     median_text,
+    new_table,
+    print_json,
+    print_note,
     progress_bar,
     show,
     show_budgets,
@@ -47,7 +52,6 @@ from wfsobs.pipeline import as_stated
 from wfsobs.pipeline import observe as observe_record
 from wfsobs.prior import GIVEN
 from wfsobs.priors_from.training import trained_until, with_training
-from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.loop import simulate
@@ -61,16 +65,17 @@ from wfsobs.units import UNITS
 def loop_table(rows: Sequence[Row]) -> Table:
     """Return the residual table, best controller first; residuals are means over seeds with intervals, all else medians."""
     several = len({r["seed"] for r in rows}) > 1
-    out = Table(title="Residual in closed loop after warm-up" + (", mean over seeds" if several else ""))
-    for name in ("Mode", "Controller", "Prior knowledge"):
-        out.add_column(name, no_wrap=True)
     spread = ("95 %, nm",) if several else ()
-    for name in ("rms, nm", *spread, "mas", "Strehl", "theory, nm", "gain", "margins", "delay, ms", "at limit, %"):
-        out.add_column(name, justify="right", no_wrap=True)
+    numbers = ("rms, nm", *spread, "mas", "Strehl", "theory, nm", "gain", "margins", "delay, ms", "at limit, %")
+    out = new_table(
+        ("Mode", "Controller", "Prior knowledge"),
+        numbers,
+        title="Residual in closed loop after warm-up" + (", mean over seeds" if several else ""),
+    )
     last = None
     for mode, controller in sorted({(r["mode"], r["controller"]) for r in rows}, key=_order(rows)):
         same = [r for r in rows if (r["mode"], r["controller"]) == (mode, controller)]
-        if last not in (None, mode):
+        if last != mode:
             out.add_section()
         last = mode
         stable = all(r["stable"] for r in same)
@@ -121,10 +126,8 @@ def _order(rows: Sequence[Row]):
 @click.command()
 @scenario_options
 @observer_option
-@click.option(
-    "--seeds", type=click.IntRange(1, 100_000), default=1, metavar="N", help="Repeat with seeds run.seed ... run.seed + N - 1."
-)
-@click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
+@seeds_option
+@json_option("Print a list of rows instead of a table.")
 @click.option("--save", metavar="RECORD", help="Also save the record of the (one) run, in the format of its ending.")
 @click.option("--vibration-psd", metavar="FILE", help="Vibration with the spectrum of a CSV or FITS file (docs/data.md).")
 @click.option(
@@ -164,13 +167,13 @@ def run(
         scenario = scenario.replace({"vibration.source": "psd", "vibration.psd": table})
     results: list[Result] = []
     history = OverTime(scenario, over_time) if over_time else None
-    with progress_bar() as update:
+    with progress_bar() as watch:
         for i in range(seeds):
             one = scenario.replace({"run.seed": scenario.run.seed + i})
             record = simulate(one)
             if save:
                 save_record(save, record, configfile.to_toml(one))
-            inner = Watch(progress=lambda f, i=i: update((i + f) / seeds))
+            inner = watch.part(i / seeds, 1.0 / seeds)
             result = observe_record(record, one, observers=observers or None, watch=inner, is_simulated=True)
             warn(result)
             if history:
@@ -181,7 +184,7 @@ def run(
         show_over_time(history, as_json)
         return
     for name in sorted(set(budget_of) - {e.observer for e in results[0].estimates}):
-        click.echo(f"wfsobs: --budget-of {name}: it did not run", err=True)
+        print_note(f"--budget-of {name}: it did not run")
     budgets = find_budgets(results[0], budget_of or None) if budget or budget_of else []
     all_rows = [row for it in results for row in score_rows(it.scores, it.scenario.run.seed)]
     show(add_budgets(all_rows, budgets), as_json)
@@ -192,15 +195,13 @@ def run(
 
 @click.command()
 @scenario_options
-@click.option("--controller", "controllers", multiple=True, metavar="NAME", help="Run this controller alone; can be repeated.")
-@click.option(
-    "--seeds", type=click.IntRange(1, 100_000), default=1, metavar="N", help="Repeat with seeds run.seed ... run.seed + N - 1."
-)
+@controller_option()
+@seeds_option
 @click.option("--record", "record_file", metavar="RECORD", help="Use the disturbance and noise of a record with truth.")
 @record_options
 @training_options
 @click.option("--envelope", "with_envelope", is_flag=True, help="Also print what an uncertain plant does (`wfsobs envelope`).")
-@click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
+@json_option("Print a list of rows instead of a table.")
 def loop(
     scenario: Scenario,
     controllers: tuple[str, ...],
@@ -227,31 +228,31 @@ def loop(
         learnt = training(train, train_until, record, scenario, declaration)
         record, start = record if learnt is None else with_training(record, learnt, scenario), trained_until(learnt)
     all_rows: list[Row] = []
-    with progress_bar("controllers") as update:
+    with progress_bar("controllers") as watch:
         plan = design(scenario, controllers or None, start)
         for i in range(seeds):
             one = scenario.replace({"run.seed": scenario.run.seed + i})
             given = simulate(one) if record is None else record
-            result = closed_loop(given, replace(plan, scenario=one), Watch(progress=lambda f, i=i: update((i + f) / seeds)))
+            result = closed_loop(given, replace(plan, scenario=one), watch.part(i / seeds, 1.0 / seeds))
             all_rows += loop_rows(result, one.run.seed) if record is None else loop_rows(result, None, source=GIVEN)
     if as_json:
-        click.echo(json.dumps(all_rows, allow_nan=False))
+        print_json(all_rows)
     else:
         show_table(loop_table(all_rows))
         for line in dict.fromkeys(f"{label(r['controller'])}: {r['note']}" for r in all_rows if r["note"] not in ("", LIMITED)):
             click.echo(line)
     if with_envelope:
-        with progress_bar("envelope") as update:
-            _show_envelope(plant_envelope(scenario, controllers=controllers or None, watch=Watch(progress=update)))
+        with progress_bar("envelope") as watch:
+            _show_envelope(plant_envelope(scenario, controllers=controllers or None, watch=watch))
 
 
 def envelope_table(result: PlantEnvelope) -> Table:
     """Return the table of an envelope, least nominal residual first in each mode."""
-    out = Table(title=f"Residual over {len(result.errors['delay'])} plants: {result.ranges}")
-    for name in ("Mode", "Controller"):
-        out.add_column(name, no_wrap=True)
-    for name in ("caution", "nominal, nm", "mean", "95 %", "worst", "unstable, %", "corners"):
-        out.add_column(name, justify="right", no_wrap=True)
+    out = new_table(
+        ("Mode", "Controller"),
+        ("caution", "nominal, nm", "mean", "95 %", "worst", "unstable, %", "corners"),
+        title=f"Residual over {len(result.errors['delay'])} plants: {result.ranges}",
+    )
     rows = result.rows()
     for mode in dict.fromkeys(r["mode"] for r in rows):
         out.add_section()
@@ -275,7 +276,7 @@ def envelope_table(result: PlantEnvelope) -> Table:
 
 @click.command()
 @scenario_options
-@click.option("--controller", "controllers", multiple=True, metavar="NAME", help="Of this controller alone; can be repeated.")
+@controller_option("Of this controller alone; can be repeated.")
 @click.option("--points", type=click.IntRange(1, 100_000), default=POINTS, show_default=True, metavar="N", help="Plants.")
 @click.option(
     "--simulate",
@@ -287,7 +288,7 @@ def envelope_table(result: PlantEnvelope) -> Table:
 )
 @uncertainty_options
 @click.option("--tune", "is_tuned", is_flag=True, help="Of each controller after `wfsobs tune --envelope`.")
-@click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
+@json_option("Print a list of rows instead of a table.")
 def envelope(
     scenario: Scenario,
     controllers: tuple[str, ...],
@@ -301,8 +302,8 @@ def envelope(
     names = controllers or None
     if simulation_points and is_tuned:
         raise SettingError("--simulate: not with --tune, which is by theory")
-    with progress_bar("controllers") as update:
-        watch = Watch(progress=update)
+    with progress_bar("controllers") as watch:
+        watch = watch
         if is_tuned:
             result = tuned_envelope(scenario, controllers=names, goal=EnvelopeGoal(uncertainty), points=points, watch=watch)
         else:
@@ -315,7 +316,7 @@ def envelope(
                 watch=watch,
             )
     if as_json:
-        click.echo(json.dumps(result.rows(), allow_nan=False))
+        print_json(result.rows())
         return
     _show_envelope(result)
 

@@ -12,11 +12,10 @@ from rich.table import Table
 
 from wfsobs.campaign.sweep import MOST_SEEDS, SweepResults, parse_axis, plan_sweep, run_sweep
 from wfsobs.cli.options import observer_option, scenario_options
-from wfsobs.cli.show import progress_bar, show_table
+from wfsobs.cli.show import new_table, print_note, progress_bar, show_table
 from wfsobs.evaluation.evidence import FEWEST
 from wfsobs.evaluation.rows import row_label
-from wfsobs.files import check_writable, write_whole
-from wfsobs.progress import Watch
+from wfsobs.files import check_writable, write_text
 from wfsobs.scenario import Scenario
 
 
@@ -51,15 +50,14 @@ def sweep(
     plan = plan_sweep(scenario, [parse_axis(text) for text in axes], seeds, observers or None)
     if csv_file:
         check_writable(csv_file)
-    click.echo(f"wfsobs: {len(plan.cells)} scenarios x {seeds} seeds = {plan.n_runs} runs, about {plan.seconds:.2g} s", err=True)
-    with progress_bar("runs") as update:
-        results = run_sweep(plan, Watch(progress=update))
+    print_note(f"{len(plan.cells)} scenarios x {seeds} seeds = {plan.n_runs} runs, about {plan.seconds:.2g} s")
+    with progress_bar("runs") as watch:
+        results = run_sweep(plan, watch)
     if csv_file:
-        text = _csv(results.rows())
-        write_whole(csv_file, lambda file: file.write(text.encode()))
+        write_text(csv_file, _csv(results.rows()))
     show_table(_winners(results))
     for cell, reason in results.failures.items():
-        click.echo(f"wfsobs: {_settings(results, cell)}: {reason}", err=True)
+        print_note(f"{_settings(results, cell)}: {reason}")
 
 
 def _csv(rows: Sequence[dict[str, Any]]) -> str:
@@ -77,9 +75,15 @@ def _settings(results: SweepResults, cell: int) -> str:
 
 def _winners(results: SweepResults) -> Table:
     """Return a table with one row per scenario, target and mode."""
-    out = Table(title="Best observers", caption=f"~: another is not significantly worse, or fewer than {FEWEST} seeds")
-    for name in ("Settings", "Target", "Mode", "Best", "mean rms, nm", "before the next, %", "Equal to"):
-        out.add_column(name, justify="right" if name in ("mean rms, nm", "before the next, %") else "left")
+    caption = f"~: another is not significantly worse, or fewer than {FEWEST} seeds"
+    out = new_table(
+        ("Settings", "Target", "Mode", "Best"),
+        ("mean rms, nm", "before the next, %"),
+        no_wrap=False,
+        title="Best observers",
+        caption=caption,
+    )
+    out.add_column("Equal to")
     groups = list(dict.fromkeys(key[1:] for key in results.known_keys()))
     for cell in range(len(results.sweep.cells)):
         for target, mode in groups:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from dataclasses import asdict, replace
 
@@ -12,9 +11,12 @@ from rich.table import Table
 from rich.text import Text
 
 from wfsobs.cli.options import (
+    controller_option,
+    json_option,
     load_declared,
     load_with_delay,
     observer_option,
+    record_command,
     record_options,
     scenario_options,
     scenario_words,
@@ -22,13 +24,13 @@ from wfsobs.cli.options import (
     training,
     training_options,
 )
-from wfsobs.cli.show import progress_bar, show, show_table, show_verdicts, warn
+from wfsobs.cli.show import new_table, print_json, print_note, progress_bar, show, show_table, show_verdicts, warn
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.promise import make_promise
 from wfsobs.closed_loop.rows import label
-from wfsobs.control.telemetry_gain import gain_from_telemetry
+from wfsobs.control.integrator import gain_from_telemetry
 from wfsobs.evaluation.rows import score_rows
-from wfsobs.files import check_writable, write_whole
+from wfsobs.files import check_writable, write_text
 from wfsobs.identification import identify as identify_record
 from wfsobs.identification import report as identified
 from wfsobs.identification.identification import LEVEL
@@ -40,7 +42,6 @@ from wfsobs.identification.result import Identification
 from wfsobs.pipeline import as_stated
 from wfsobs.pipeline import observe as observe_record
 from wfsobs.priors_from.controllers import plant_of
-from wfsobs.progress import Watch
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
@@ -65,17 +66,18 @@ def convert(record_file: str, out: str, scenario: Scenario, declaration: Declare
     record = load_declared(record_file, scenario, declaration, sha256)
     save_record(out, record)
     if lost := name_differences(record, load_record(out, scenario, DeclaredFormat(trust=True))):
-        click.echo(f"wfsobs: {out}: has no place for {', '.join(lost)}", err=True)
+        print_note(f"{out}: has no place for {', '.join(lost)}")
 
 
 def identification_table(result: Identification) -> Table:
     """Noise, turbulence and peaks of every mode."""
     title = f"Identified from {result.duration:.1f} s, with standard deviations"
-    out = Table(title=title, caption="rms of lines and resonances: within this record")
-    for name in ("Mode", "What"):
-        out.add_column(name, no_wrap=True)
-    for name in ("frequency, Hz", "damping", "rms, nm"):
-        out.add_column(name, justify="right", no_wrap=True)
+    out = new_table(
+        ("Mode", "What"),
+        ("frequency, Hz", "damping", "rms, nm"),
+        title=title,
+        caption="rms of lines and resonances: within this record",
+    )
     for m in result.modes:
         out.add_section()
         for what, frequency, damping, rms in mode_rows(m):
@@ -88,15 +90,12 @@ def _nm(n: Number) -> Number:
     return Number(n.value * 1e3, n.std * 1e3)
 
 
-@click.command()
-@click.argument("record_file", metavar="RECORD")
-@scenario_options
-@record_options
+@record_command
 @training_options
 @observer_option
 @click.option("--prior", metavar="FOUND.toml", help="Prior of the observers: the file of `wfsobs identify --out`.")
 @click.option("--out", metavar="ESTIMATES.npz", help="Save every estimate under the key observer/target.")
-@click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
+@json_option("Print a list of rows instead of a table.")
 def observe(
     record_file: str,
     scenario: Scenario,
@@ -115,26 +114,21 @@ def observe(
     scenario = told_scenario(prior, scenario)
     record = load_declared(record_file, scenario, declaration, sha256)
     learnt = training(train, train_until, record, scenario, declaration)
-    with progress_bar() as update:
+    with progress_bar() as watch:
         told = None if prior is None else scenario
-        result = observe_record(
-            record, scenario, observers=observers or None, prior=told, train=learnt, watch=Watch(progress=update)
-        )
+        result = observe_record(record, scenario, observers=observers or None, prior=told, train=learnt, watch=watch)
     warn(result)
     if out:
         save_arrays(out, {f"{e.observer}/{e.target}": e.values for e in result.estimates})
     if not result.scores and not as_json:
-        click.echo(f"wfsobs: {record_file}: {len(result.estimates)} estimates, no scores: nothing after the warm-up", err=True)
+        print_note(f"{record_file}: {len(result.estimates)} estimates, no scores: nothing after the warm-up")
         return
     show(score_rows(result.scores, None, source=result.prior_source), as_json)
     if not as_json:
         show_verdicts(result, is_simulated=False)
 
 
-@click.command()
-@click.argument("record_file", metavar="RECORD")
-@scenario_options
-@record_options
+@record_command
 @click.option(
     "--level",
     type=click.FloatRange(0, 0.5, min_open=True),
@@ -152,7 +146,7 @@ def observe(
     help="Minimum frequency of a peak.",
 )
 @click.option("--out", metavar="F.toml", help="Save the model as settings, on top of the preset.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+@json_option()
 def identify(
     record_file: str,
     scenario: Scenario,
@@ -167,35 +161,29 @@ def identify(
     record = load_declared(record_file, scenario, declaration, sha256)
     if out:
         check_writable(out)
-    with progress_bar("sweeps") as update:
-        result = identify_record(record, level=level, lowest=lowest, watch=Watch(progress=update))
+    with progress_bar("sweeps") as watch:
+        result = identify_record(record, level=level, lowest=lowest, watch=watch)
     if out:
-        text = identified.identification_toml(result, result.scenario(as_stated(record, scenario)))
-        write_whole(out, lambda file: file.write(text.encode()))
+        write_text(out, identified.identification_toml(result, result.scenario(as_stated(record, scenario))))
     if as_json:
-        click.echo(json.dumps(identified.identification_dict(result), allow_nan=False))
+        print_json(identified.identification_dict(result))
         return
     show_table(identification_table(result))
     for line in identified.whiteness_lines(result):
         click.echo(line)
 
 
-@click.command()
-@click.argument("record_file", metavar="RECORD")
-@scenario_options
-@record_options
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+@record_command
+@json_option()
 def plant(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None, as_json: bool) -> None:
     """Identify what the commands of a closed loop do: delay, gain and rotation."""
     record = load_declared(record_file, scenario, declaration.as_commanded, sha256)
-    with progress_bar("groups of modes") as update:
-        groups = identify_plant(record, Watch(progress=update))
+    with progress_bar("groups of modes") as watch:
+        groups = identify_plant(record, watch)
     if as_json:
-        click.echo(json.dumps(plant_dict(groups), allow_nan=False))
+        print_json(plant_dict(groups))
         return
-    table = Table(title="The plant, with standard deviations")
-    for column in ("Modes", "delay, frames", "gain", "rotation, degrees"):
-        table.add_column(column, no_wrap=True)
+    table = new_table(("Modes", "delay, frames", "gain", "rotation, degrees"), title="The plant, with standard deviations")
     for group in groups:
         for name, delay, gain in zip(group.modes, group.delay, group.gain, strict=True):
             table.add_row(name, delay.text(), gain.text(), "")
@@ -206,12 +194,9 @@ def plant(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha
         click.echo(line)
 
 
-@click.command()
-@click.argument("record_file", metavar="RECORD")
-@scenario_options
-@record_options
+@record_command
 @click.option("--prior", metavar="FOUND.toml", help="Also the gain by these spectra: the file of `wfsobs identify --out`.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+@json_option()
 def gain(
     record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None, prior: str | None, as_json: bool
 ) -> None:
@@ -228,11 +213,13 @@ def gain(
         law = laws[mode].law if laws else None
         rows.append({"mode": name, **asdict(found), "recorded_rms": left, "from_spectra": law.gain if law else None})
     if as_json:
-        click.echo(json.dumps(rows, allow_nan=False))
+        print_json(rows)
         return
-    table = Table(title=f"Gain of the integrator, delay {delay:g} frames", caption="rms: of the measurement, noise and all")
-    for column in ("Mode", "gain", "stable below", "rms, nm", "in the record, nm", *(["by the spectra"] if laws else [])):
-        table.add_column(column, no_wrap=True)
+    table = new_table(
+        ("Mode", "gain", "stable below", "rms, nm", "in the record, nm", *(["by the spectra"] if laws else [])),
+        title=f"Gain of the integrator, delay {delay:g} frames",
+        caption="rms: of the measurement, noise and all",
+    )
     for row in rows:
         best = format_number(Number(row["gain"], row["deviation"]))
         numbers = [best, f"{row['limit']:.3g}", *(f"{1e3 * row[name]:.3g}" for name in ("measured_rms", "recorded_rms"))]
@@ -240,13 +227,10 @@ def gain(
     show_table(table)
 
 
-@click.command()
-@click.argument("record_file", metavar="RECORD")
-@scenario_options
-@record_options
-@click.option("--controller", "controllers", multiple=True, metavar="NAME", help="Of this controller alone; can be repeated.")
+@record_command
+@controller_option("Of this controller alone; can be repeated.")
 @click.option("--after", metavar="NEXT", help="Compare with the record of the loop after one controller was switched on.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+@json_option()
 def promise(
     record_file: str,
     scenario: Scenario,
@@ -262,15 +246,17 @@ def promise(
         for name, sha in ((record_file, sha256), (after, None))
     )
     assert record is not None
-    with progress_bar("controllers") as update:
-        result = make_promise(record, scenario, controllers=controllers or None, watch=Watch(progress=update))
+    with progress_bar("controllers") as watch:
+        result = make_promise(record, scenario, controllers=controllers or None, watch=watch)
     found = None if later is None else result.left_in(later)
     if as_json:
-        click.echo(json.dumps(result.to_dict() | {"after": found}, allow_nan=False))
+        print_json(result.to_dict() | {"after": found})
         return
-    table = Table(title="Residual promised, with 95 % intervals", caption="better: than the integrator with its optimal gain")
-    for column in ("Controller", "mode", "rms, nm", "stable, %", "better, %", "Switch on?"):
-        table.add_column(column, no_wrap=True)
+    table = new_table(
+        ("Controller", "mode", "rms, nm", "stable, %", "better, %", "Switch on?"),
+        title="Residual promised, with 95 % intervals",
+        caption="better: than the integrator with its optimal gain",
+    )
     for one in result.residuals:
         table.add_section()
         shares = (f"{100.0 * share:.0f}" for share in (one.stable_share, one.better_share))
@@ -296,7 +282,7 @@ def promise(
 @click.option("--gain", type=click.FloatRange(1e-4, 1.0), default=0.02, show_default=True, help="Error of the gain.")
 @click.option("--rotation", type=click.FloatRange(1e-3, 90.0), default=1.0, show_default=True, help="Error of it, degrees.")
 @click.option("--out", metavar="PROBE.npz", help="Save its commands, `probe` (steps, modes) [um], with `dt` [s].")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a line.")
+@json_option("Print JSON instead of a line.")
 def probe(scenario: Scenario, seconds: float, delay: float, gain: float, rotation: float, out: str | None, as_json: bool) -> None:
     """Design a probe: commands by which delay, gain and rotation of a loop are known better (by default preset paper)."""
     if out:
@@ -307,7 +293,7 @@ def probe(scenario: Scenario, seconds: float, delay: float, gain: float, rotatio
         rng, n = np.random.default_rng(scenario.run.seed), round(seconds / scenario.dt)
         save_arrays(out, {"probe": found.commands(n, 2, scenario.dt, rng), "dt": np.array(scenario.dt)})
     if as_json:
-        click.echo(json.dumps(asdict(found), allow_nan=False))
+        print_json(asdict(found))
         return
     bound = found.bound
     click.echo(
@@ -321,11 +307,8 @@ def probe(scenario: Scenario, seconds: float, delay: float, gain: float, rotatio
 COLOURS = {"ok": "green", "note": "yellow", "undecided": "yellow", "excluded": "red"}
 
 
-@click.command()
-@click.argument("record_file", metavar="RECORD")
-@scenario_options
-@record_options
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+@record_command
+@json_option()
 def check(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None, as_json: bool) -> None:
     """Check a record: what was read, and what of it can be relied on."""
     with open_record(record_file, sha256) as (file, name):
@@ -335,8 +318,8 @@ def check(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha
         except RecordError as error:
             raise RecordError(f"{record_file}: {error}") from None
     reading = read_off(record, contents, declaration, scenario)
-    with progress_bar("sweeps") as update:
-        result = check_record(record, reading, raw, Watch(progress=update))
+    with progress_bar("sweeps") as watch:
+        result = check_record(record, reading, raw, watch)
     own = {"command-delay": "delay", "command-sign": "command_sign"}  # which the file states otherwise
     is_refused = bool(reading.contradiction) and not result.corrections  # there is no option for a rotation
     trust = declaration.trust or is_refused or any(own.get(name) in contents.arrays for name in result.corrections)
@@ -354,7 +337,7 @@ def check(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha
             "reliable": result.is_reliable,
             "next": command,
         }
-        click.echo(json.dumps(found, allow_nan=False))
+        print_json(found)
         return
     show_table(check_table(result, record_file))
     click.echo(f"{result.summary} {'It is refused as it is; all the same' if is_refused else 'Go on with'}:\n  {command}")

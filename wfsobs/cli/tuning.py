@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from typing import Literal
 
 import click
 import numpy as np
 from rich.table import Table
 
-from wfsobs.cli.options import load_declared, record_options, scenario_options, uncertainty_options
-from wfsobs.cli.show import progress_bar, show_table
+from wfsobs.cli.options import json_option, load_declared, record_options, scenario_options, uncertainty_options
+from wfsobs.cli.show import new_table, print_json, progress_bar, show_table
 from wfsobs.closed_loop.envelope import Uncertainty
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.scores import PREDICTION
-from wfsobs.files import check_writable, write_whole
+from wfsobs.files import check_writable, write_text
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
-from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 from wfsobs.telemetry.intake import DeclaredFormat
@@ -29,10 +27,7 @@ from wfsobs.tuning.tuning import EVALUATIONS, TuningResult
 
 def settings_table(result: TuningResult) -> Table:
     """Return the table of searched settings, and of those set by hand for the search, before and after."""
-    out = Table(title=f"{result.label}: settings after {len(result.history)} evaluations")
-    out.add_column("Setting", no_wrap=True)
-    for name in ("before", "after"):
-        out.add_column(name, justify="right", no_wrap=True)
+    out = new_table(("Setting",), ("before", "after"), title=f"{result.label}: settings after {len(result.history)} evaluations")
     for path, before, after in settings(result):
         out.add_row(path, before, after)
     return out
@@ -40,10 +35,11 @@ def settings_table(result: TuningResult) -> Table:
 
 def errors_table(result: TuningResult) -> Table:
     """Errors, or what takes their place, on validation and test record, mode by mode and together."""
-    out = Table(title=f"{result.measure}{'' if result.target == PREDICTION else f' in {result.target}'}, nm")
-    out.add_column("", no_wrap=True)
-    for name in ("validation, before", "after", "test, before", "after"):
-        out.add_column(name, justify="right", no_wrap=True)
+    out = new_table(
+        ("",),
+        ("validation, before", "after", "test, before", "after"),
+        title=f"{result.measure}{'' if result.target == PREDICTION else f' in {result.target}'}, nm",
+    )
     stages = (result.before, result.after)
     cells = [s.validation for s in stages] + [s.test for s in stages]
     for mode in next(e for e in cells if e).modes:
@@ -57,10 +53,7 @@ def errors_table(result: TuningResult) -> Table:
 
 def spreads_table(result: TuningResult) -> Table:
     """Residual of a controller over the plants of the search and over others, modes together."""
-    out = Table(title="Residual, rms over modes, nm")
-    out.add_column("", no_wrap=True)
-    for name in ("search, before", "after", "other plants, before", "after"):
-        out.add_column(name, justify="right", no_wrap=True)
+    out = new_table(("",), ("search, before", "after", "other plants, before", "after"), title="Residual, rms over modes, nm")
     stages = [s.spreads for s in (result.before, result.after) if s.spreads]
     spreads = [one for both in zip(*stages, strict=True) for one in both]
     for name, key in (("nominal", "nominal"), ("95 %", "p95"), ("worst", "worst")):
@@ -121,7 +114,7 @@ LINEAR = [c.id for c in CONTROLLERS.values() if c.tunable.usual]
 @click.option("--record", "record_file", metavar="RECORD", help="Tune on telemetry, cut in three, instead of simulated records.")
 @record_options
 @click.option("--out", metavar="F.toml", help="Save all settings, the tuned ones with a comment.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
+@json_option("Print JSON instead of tables.")
 def tune(
     observer: str | None,
     controller: str | None,
@@ -153,7 +146,7 @@ def tune(
         record = load_declared(record_file, scenario, declaration, sha256)
     if out:
         check_writable(out)
-    with progress_bar("evaluations") as update:
+    with progress_bar("evaluations") as watch:
         tuned = search(
             scenario,
             name,
@@ -163,13 +156,12 @@ def tune(
             target=target,
             validation=validation,
             envelope=goal if on_envelope else None,
-            watch=Watch(progress=update),
+            watch=watch,
         )
     if out:
-        text = report.tuning_toml(tuned)
-        write_whole(out, lambda file: file.write(text.encode()))
+        write_text(out, report.tuning_toml(tuned))
     if as_json:
-        click.echo(json.dumps(report.tuning_dict(tuned), allow_nan=False))
+        print_json(report.tuning_dict(tuned))
         return
     show_table(settings_table(tuned))
     show_table(errors_table(tuned) if tuned.after.spreads is None else spreads_table(tuned))

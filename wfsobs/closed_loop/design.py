@@ -9,11 +9,9 @@ import numpy as np
 
 from wfsobs.control.base import Controller, Settings
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.control.law import Law
-from wfsobs.control.margins import Margins, Response, frequencies, margins
-from wfsobs.control.mirror import Mirror, Plant
+from wfsobs.control.margins import Margins, Response, frequencies, margins, residual_variance
+from wfsobs.control.mirror import Law, Mirror, Plant
 from wfsobs.control.mismatch import SensorSpectra, loops, margins_of, one_loop, pairs, radius, weigh
-from wfsobs.control.residual import residual_variance
 from wfsobs.control.true_plant import TruePlant
 from wfsobs.evaluation.bound import INFORMATION, least_residual
 from wfsobs.observers.kalman.multirate import UnstableCycle
@@ -21,7 +19,6 @@ from wfsobs.prior import Prior, Spectra
 from wfsobs.priors_from.controllers import own_settings, plant_of, prior_for, supervision_of, true_plant_of
 from wfsobs.priors_from.scenario import told_spectra
 from wfsobs.scenario import Scenario
-from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, true_spectra
 
 
@@ -125,9 +122,7 @@ def design_mode(controller: str, scenario: Scenario, mode: int, spectra: Spectra
 def select_controllers(controllers: Sequence[str] | None) -> list[Controller]:
     """Return the controllers of these ids, in the order of the registry; all for None. Raises SettingError."""
     controllers = [controllers] if isinstance(controllers, str) else controllers
-    unknown = set(controllers or ()) - set(CONTROLLERS)
-    if unknown:
-        raise SettingError(f"controller {sorted(unknown)[0]!r}: no such controller; there are {', '.join(CONTROLLERS)}")
+    CONTROLLERS.check_ids(controllers or ())
     return [c for c in CONTROLLERS.values() if controllers is None or c.id in controllers]
 
 

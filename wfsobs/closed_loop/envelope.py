@@ -21,8 +21,7 @@ from scipy.stats.qmc import Sobol
 from wfsobs.closed_loop.design import design, loop_spectra, select_controllers
 from wfsobs.closed_loop.run import each_outcome
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.control.law import Law
-from wfsobs.control.mirror import Mirror
+from wfsobs.control.mirror import Law, Mirror
 from wfsobs.control.mismatch import loops, pairs, radius, stack_weights, weigh
 from wfsobs.control.true_plant import TruePlant
 from wfsobs.evaluation.rows import Row
@@ -303,15 +302,14 @@ def plant_envelope(
     errors, corners, plants = uncertain_plants(scenario, of, points)
     spectra = known_spectra(scenario)
     names = [c.id for c in select_controllers(controllers) if not c.is_idle] if simulation_points else with_laws(controllers)
-    names.sort(key=lambda name: not is_linear(name))
+    names.sort(key=lambda name: not CONTROLLERS[name].is_linear)
     spreads, notes = dict[str, Spread](), dict[str, str]()
     first = replace(plants, points=plants.points[:simulation_points])
     for i, name in enumerate(names):
         watch.check()
         try:
-            if simulation_points and not is_linear(name):
-                inner = Watch(lambda share, i=i: watch.progress((i + share) / len(names)), watch.is_cancelled)
-                for spread in simulated_spreads(name, scenario, first, inner):
+            if simulation_points and not CONTROLLERS[name].is_linear:
+                for spread in simulated_spreads(name, scenario, first, watch.part(i / len(names), 1.0 / len(names))):
                     spreads[name] = spread
                     if on_spread:
                         on_spread(PlantEnvelope(scenario, of, errors, corners, tuple(spreads.values()), dict(notes)))
@@ -323,11 +321,6 @@ def plant_envelope(
         if on_spread:
             on_spread(PlantEnvelope(scenario, of, errors, corners, tuple(spreads.values()), dict(notes)))
     return PlantEnvelope(scenario, of, errors, corners, tuple(spreads.values()), notes)
-
-
-def is_linear(name: str) -> bool:
-    """Whether a controller has a linear law alone."""
-    return CONTROLLERS[name].law is not None and CONTROLLERS[name].predict is None
 
 
 def with_laws(controllers: Sequence[str] | None) -> list[str]:
@@ -380,12 +373,11 @@ def spread_of(name: str, scenario: Scenario, plants: Plants, spectra: Sequence[T
 def simulated_spreads(name: str, scenario: Scenario, plants: Plants, watch: Watch = QUIET) -> Iterator[Spread]:
     """Yield what a controller leaves of these plants in one record, the points one by one. Raises ValueError, Cancelled."""
     believed = scenario.replace({f"plant.{key}": value for key, value in type(scenario)().plant.to_dict().items()})
-    plan, record = design(believed, [name]), simulate(believed, watch=Watch(is_cancelled=watch.is_cancelled))
+    plan, record = design(believed, [name]), simulate(believed, watch=watch.silent)
     total = 1 + len(plants.corners) + len(plants.points)
 
     def left(plant: TruePlant, number: int) -> Array:
-        inner = Watch(lambda share: watch.progress((number + share) / total), watch.is_cancelled)
-        (outcome,) = each_outcome(record, replace(plan, true=plant), inner, [name])
+        (outcome,) = each_outcome(record, replace(plan, true=plant), watch.part(number / total, 1.0 / total), [name])
         if outcome.residual is None:
             if None in outcome.stable:
                 raise ValueError(outcome.note)

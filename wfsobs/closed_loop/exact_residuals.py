@@ -9,8 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from wfsobs.closed_loop.design import design
-from wfsobs.control.law import Law
-from wfsobs.control.mirror import Mirror
+from wfsobs.control.mirror import Law, Mirror
 from wfsobs.evaluation.bound import PeriodicError
 from wfsobs.evaluation.exact_errors import variance_of
 from wfsobs.observers.estimates import TOTAL

@@ -23,10 +23,9 @@ from wfsobs.closed_loop.run import each_outcome
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.true_plant import TruePlant
 from wfsobs.identification.identification import identify
-from wfsobs.identification.mirror_response import LAGS
 from wfsobs.identification.plant import GroupPlant, identify_plant
-from wfsobs.identification.plant_likelihood import LONGEST
-from wfsobs.identification.result import Identification
+from wfsobs.identification.plant_likelihood import LAGS, LONGEST
+from wfsobs.identification.result import Identification, base_scenario
 from wfsobs.pipeline import as_stated
 from wfsobs.prior import Line, Lines
 from wfsobs.progress import QUIET, Watch
@@ -163,18 +162,20 @@ def make_promise(
     SettingError
         A controller is unknown.
     """
-    groups = identify_plant(record, Watch(is_cancelled=watch.is_cancelled))
+    groups = identify_plant(record, watch.silent)
     rng = np.random.default_rng(seed)
     likeliest, *others = draw_plants(groups, record.n_modes, rng)
     corrected = as_seen(record, likeliest)
-    found = identify(corrected, watch=Watch(is_cancelled=watch.is_cancelled))
+    found = identify(corrected, watch=watch.silent)
     known = {
         "control.delay": likeliest.group_delay,
         **{f"plant.{name}": value for name, value in Scenario().plant.to_dict().items()},
     }
 
+    stated = base_scenario(record.n_modes, record.dt, as_stated(corrected, scenario)).replace(known)
+
     def of(identification: Identification) -> Scenario:
-        out = identification.scenario(as_stated(corrected, scenario)).replace(known)
+        out = identification.scenario(stated)
         return out.replace({"vibration.source": "ar2"}) if out.vibration.source == "peaks" else out  # no cut-off
 
     told = of(found)

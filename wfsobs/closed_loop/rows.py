@@ -12,8 +12,7 @@ import numpy as np
 from wfsobs.closed_loop.design import Design
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.evidence import means_differ
-from wfsobs.evaluation.known_lines import SPECTRA, knowledge_of
-from wfsobs.evaluation.rows import NOT_OBSERVERS, Row
+from wfsobs.evaluation.rows import NOT_OBSERVERS, TRUE_SPECTRA, Row, knowledge_of
 from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS, batch_means, rms_interval
 from wfsobs.evaluation.verdict import Contender, Verdict
 from wfsobs.notebook import PlotAccessor, import_extra
@@ -21,7 +20,7 @@ from wfsobs.prior import TRUE, PriorSource, Spectra, words_for
 from wfsobs.priors_from.controllers import own_settings
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.signal.welch import rms
+from wfsobs.signal.spectrum import rms
 from wfsobs.typing import Array
 from wfsobs.units import micrometres_per
 
@@ -38,6 +37,9 @@ LEARNT = "an integrator closes its loop until its first window is full, at {:.2f
 """What the residual of a controller that learns is of."""
 
 NOT_APPLICABLE = "n/a"
+
+THEORY = ("predicted_rms_nm", "gain", "gain_margin_db", "phase_margin_deg", "delay_margin_ms", "disk_margin")
+"""Keys of a row without a value for a bound, beside `limited` and `alarms`."""
 
 
 @dataclass(frozen=True)
@@ -104,19 +106,6 @@ def rows(result: ClosedLoop, seed: int | None, *, source: PriorSource = TRUE) ->
     wavelength = result.scenario.control.wavelength
 
     def row(controller: str, needs: str, mode: int, stable: bool | None, left: Sequence[float] | None, **more: Any) -> Row:
-        known = {
-            name: more.get(name)
-            for name in (
-                "predicted_rms_nm",
-                "gain",
-                "gain_margin_db",
-                "phase_margin_deg",
-                "delay_margin_ms",
-                "disk_margin",
-                "limited",
-                "alarms",
-            )
-        }
         return {
             "controller": controller,
             "mode": modes[mode].name,
@@ -125,9 +114,10 @@ def rows(result: ClosedLoop, seed: int | None, *, source: PriorSource = TRUE) ->
             "residual_rms_nm": None if left is None else left[mode] * 1e3,
             "residual_rms_mas": None if left is None or modes[mode].radial_order > 1 else left[mode] / mas,
             "strehl": None if left is None else strehl(left, wavelength),
-            **known,
-            "ranked": more.get("ranked", True),
-            "note": more.get("note", ""),
+            **dict.fromkeys((*THEORY, "limited", "alarms")),
+            "ranked": True,
+            "note": "",
+            **more,
             "seed": seed,
         }
 
@@ -194,7 +184,7 @@ def loop_verdict(result: ClosedLoop, mode: str) -> Verdict | None:
             float(errors[i]),
             rms_interval(float(errors[i]), squares[:, i : i + 1]),
             not worse[i],
-            SPECTRA if "spectra" in controller_needs(name, result.scenario) else knowledge_of(CONTROLLERS[name].prior),
+            TRUE_SPECTRA if "spectra" in controller_needs(name, result.scenario) else knowledge_of(CONTROLLERS[name].prior),
             0,
             limit,
             label(name),

@@ -18,7 +18,7 @@ from wfsobs.closed_loop.rows import ClosedLoop, Outcome
 from wfsobs.control.base import Controller
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.supervisor import SupervisedController
-from wfsobs.control.true_plant import TruePlant, drive
+from wfsobs.control.true_plant import drive
 from wfsobs.dependence import Memo, digest, record_digest
 from wfsobs.pipeline import as_stated
 from wfsobs.priors_from.controllers import controller_arguments, full_plant_of, own_settings, supervision_of
@@ -59,7 +59,7 @@ def close_loop(scenario: Scenario, *, controllers: Sequence[str] | None = None, 
     wfsobs.run : Run observers, which do not act on the loop.
     """
     plan = design(scenario, controllers)
-    return closed_loop(simulate(scenario, watch=Watch(is_cancelled=watch.is_cancelled)), plan, watch)
+    return closed_loop(simulate(scenario, watch=watch.silent), plan, watch)
 
 
 def closed_loop(record: Record, plan: Design, watch: Watch = QUIET) -> ClosedLoop:
@@ -69,9 +69,9 @@ def closed_loop(record: Record, plan: Design, watch: Watch = QUIET) -> ClosedLoo
     """
     total = sum(CONTROLLERS[name].weight for name in plan.laws)
     outcomes, done = [], 0.0
-    for name, weight in ((name, CONTROLLERS[name].weight) for name in plan.laws):
-        inner = Watch(lambda f, at=done, w=weight: watch.progress((at + f * w) / total), watch.is_cancelled)
-        outcomes += each_outcome(record, plan, inner, [name])
+    for name in plan.laws:
+        weight = CONTROLLERS[name].weight
+        outcomes += each_outcome(record, plan, watch.part(done / total, weight / total), [name])
         done += weight
     return ClosedLoop(plan, record, tuple(outcomes))
 
@@ -107,19 +107,17 @@ def truth(record: Record) -> Array:
 def _name(controller: Controller, designs: Sequence[LawDesign], record: Record, plan: Design) -> str:
     """Return the name of an outcome: what it depends on; empty where a law or a prior has no value to compare."""
     used, settings = used_settings(plan.scenario), own_settings(controller, plan.scenario)
-    own = [used.get(name) for name in controller.groups] if controller.counts is None else controller.counts(settings)
+    own = controller.counts(settings) if controller.counts else None
+    if own is None and not controller.is_linear:
+        own = [used.get(name) for name in controller.groups]
     laws = [(d.law, d.stable, d.note) for d in designs]
     try:
         _, prior = controller_arguments(controller, record, settings, plan.priors[controller.id])
-        which, acting = supervision_of(controller, plan.scenario), _plant_of(plan)
+        acting = () if plan.true is None else (plan.true, plan.scenario.run.seed)
+        which = supervision_of(controller, plan.scenario)
         return digest("outcome", controller.id, laws, own, record_digest(record), prior, plan.plant, plan.start, which, *acting)
     except (TypeError, ValueError):
         return ""
-
-
-def _plant_of(plan: Design) -> tuple[TruePlant, int] | tuple[()]:
-    """Return the plant as it is and the seed of its random numbers; nothing where it is the one of the controllers."""
-    return () if plan.true is None else (plan.true, plan.scenario.run.seed)
 
 
 def _outcome(

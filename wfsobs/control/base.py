@@ -20,10 +20,8 @@ from typing import Any
 import numpy as np
 
 from wfsobs.control.integrator import limited_integrator
-from wfsobs.control.law import Law
-from wfsobs.control.mirror import Plant
-from wfsobs.control.step import StepController
-from wfsobs.control.step_laws import KalmanLaws, MakeStepLaw, StepPredict, VibrationAhead, step_law, take_missing
+from wfsobs.control.mirror import Law, Plant
+from wfsobs.control.step import KalmanLaws, MakeStepLaw, StepController, StepPredict, VibrationAhead, step_law, take_missing
 from wfsobs.observers.base import NOT_TUNED, NOTHING, PLAIN, Look, Tunable
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
@@ -77,7 +75,8 @@ class Controller:
     step_predict : callable or None
         (prior, plant, settings, sampling) -> its prediction, one frame at a time; None without one.
     counts : callable or None
-        Settings -> what of them its commands depend on beside its laws, as plain values; None for all that have an effect.
+        Settings -> what of them its commands depend on beside its laws, as plain values; None for none where it is
+        linear, else for all that have an effect.
     tunable : Tunable
         Settings that its laws can be tuned by on an uncertain plant.
     step_law : callable or None
@@ -113,6 +112,11 @@ class Controller:
     def __post_init__(self) -> None:
         if self.predict is not None and not asks_for(Bands, self.prior):
             raise ValueError(f"controller {self.id!r}: with a prediction it needs Bands in its prior")
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether it has a linear law alone."""
+        return self.law is not None and self.predict is None
 
     @property
     def is_idle(self) -> bool:

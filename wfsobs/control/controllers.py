@@ -8,7 +8,6 @@ from wfsobs import registry
 from wfsobs.control.base import Controller
 from wfsobs.control.h2 import h2_fir
 from wfsobs.control.integrator import best_gain, integrator_law
-from wfsobs.control.law import Law
 from wfsobs.control.lqg import (
     lqg_kf_adaptive,
     lqg_kf_lgs,
@@ -18,7 +17,7 @@ from wfsobs.control.lqg import (
     lqg_multirate_multi,
     lqg_multirate_optimal,
 )
-from wfsobs.control.mirror import Plant
+from wfsobs.control.mirror import Law, Plant
 from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead, of_z, step_gpr_offline_ahead, step_gpr_online_ahead
 from wfsobs.observers.base import Look, Tunable
 from wfsobs.observers.kalman.adaptive import KF_ADAPTIVE, MULTIRATE_ADAPTIVE
@@ -65,10 +64,6 @@ def _gain_and_scale(settings: Any) -> tuple[Part, ...]:
 def _matched_noise(settings: Any) -> tuple[Part, ...]:
     """Return the noise of both sensors, where it is not that of the settings."""
     return matched_noise(settings.multirate)
-
-
-def _nothing_more(_settings: Any) -> None:
-    """Return what counts of the settings beside the laws that were made of them."""
 
 
 def _offline_used(settings: Any) -> Plain:
@@ -118,7 +113,6 @@ CONTROLLERS = Registry(
             settings=("control",),
             asks=_gain,
             tunable=Tunable(_CAUTION, ("control.gain", "control.leak")),
-            counts=_nothing_more,
             look=Look("Integrator", "#003DE6", "#7AA2FF"),
         ),
         Controller(
@@ -129,7 +123,6 @@ CONTROLLERS = Registry(
             prior=(LgsModel, LgsStars),
             settings=("control",),
             tunable=Tunable(_CAUTION, (*MODEL, "kalman.lgs_noise")),
-            counts=_nothing_more,
             look=Look("LQG LGS KF", "#FF6600", "#FF8533"),
         ),
         Controller(
@@ -140,7 +133,6 @@ CONTROLLERS = Registry(
             prior=(Lines, LgsStars),
             settings=("control", "multipeak"),
             tunable=Tunable(_CAUTION, ("multipeak.line_width", "kalman.lgs_noise", "kalman.turbulence_rms")),
-            counts=_nothing_more,
             look=Look("LQG multi-peak", "#AE7D40", "#BA6A26", (14, 3)),
         ),
         Controller(
@@ -150,7 +142,6 @@ CONTROLLERS = Registry(
             help="64 taps of least residual that bear half a frame, 20 % and 10 degrees",
             prior=(Spectra,),
             settings=("control",),
-            counts=_nothing_more,
             tunable=Tunable(_CAUTION),
             look=Look("H2, robust", "#A3004F", "#FF7AB0", (5, 2, 1, 2)),
         ),
@@ -164,7 +155,6 @@ CONTROLLERS = Registry(
             settings=("control", "multirate"),
             ngs=True,
             tunable=_BOTH_SENSORS,
-            counts=_nothing_more,
             look=Look("LQG multi-rate", "#E31FFF", "#7E75C8", (10, 2, 2, 2)),
         ),
         Controller(
@@ -177,7 +167,6 @@ CONTROLLERS = Registry(
             settings=("control", "multirate"),
             ngs=True,
             tunable=_BOTH_SENSORS,
-            counts=_nothing_more,
             look=Look("LQG opt. multi-rate", "#5718C1", "#B848F9", (3, 2)),
         ),
         Controller(
@@ -190,7 +179,6 @@ CONTROLLERS = Registry(
             settings=("control", "multirate", "multipeak"),
             ngs=True,
             tunable=Tunable(_CAUTION, ("multipeak.line_width", *TUNABLE.usual, "kalman.turbulence_rms")),
-            counts=_nothing_more,
             look=Look("LQG multi-rate multi-peak", "#AB64CF", "#F26FF3", (8, 3)),
         ),
         Controller(

@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import toeplitz
 
-from wfsobs.control.law import Law, steady_law
-from wfsobs.control.mirror import Mirror, Plant
+from wfsobs.control.mirror import Law, Mirror, Plant, steady_law
 from wfsobs.observers.stepping import Gain, GainCycle
 from wfsobs.prior import Prior, Spectra
 from wfsobs.typing import Array
@@ -57,16 +56,18 @@ def taps_of(spectra: Spectra, mirror: Mirror, caution: float) -> Array:
     """Return the taps of Q (TAPS,), of commands over measurements; spectra : on equidistant frequencies up to half the rate."""
     n = spectra.measurement.size
     P = mirror.response(pi * np.arange(n) / (n - 1))
-    power = toeplitz(np.fft.irfft(np.abs(P) ** 2 * spectra.measurement)[:TAPS])
+    power = np.fft.irfft(np.abs(P) ** 2 * spectra.measurement)[:TAPS]
     target = np.fft.irfft(spectra.cross * np.conj(P))[:TAPS]
-    E = mirror.response(GRID)[:, None] * np.exp(-1j * GRID[:, None] * np.arange(TAPS))
+    response, lags = mirror.response(GRID), np.arange(TAPS)
+    E = response[:, None] * np.exp(-1j * GRID[:, None] * lags)
+    of_limits = np.abs(response) ** 2 * np.cos(lags[:, None] * GRID)  # E* w E is Toeplitz, its first column of_limits w
     most = ROBUST / caution / uncertainty(mirror, GRID)
-    scale = power[0, 0]
+    scale = power[0]
+    power[0] += 1e-12 * scale
     peak, roll_off = np.full((2, GRID.size), 1e-9 * scale)
     q = np.zeros(TAPS)
     for _ in range(ROUNDS):
-        H = power + (E.conj().T @ ((peak + roll_off)[:, None] * E)).real
-        q = np.linalg.solve(H + 1e-12 * scale * np.eye(TAPS), target + (E.conj().T @ peak).real)
+        q = np.linalg.solve(toeplitz(power + of_limits @ (peak + roll_off)), target + E.real.T @ peak)
         T = E @ q
         peak = np.maximum(peak * (np.abs(1.0 - T) / PEAK) ** 1.5, 1e-14 * scale)
         roll_off = np.maximum(roll_off * (np.abs(T) / most) ** 1.5, 1e-14 * scale)

@@ -19,9 +19,8 @@ from typing import Any
 import numpy as np
 
 from wfsobs.control.integrator import integrator_law
-from wfsobs.control.law import Law, steady_law
-from wfsobs.control.mirror import Mirror, Plant
-from wfsobs.control.step_laws import Integrators, PredictionLaws
+from wfsobs.control.mirror import Law, Mirror, Plant, steady_law
+from wfsobs.control.step import Integrators, PredictionLaws
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.adaptive import AdaptiveEstimator, kf_adaptive, multirate_adaptive
 from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean

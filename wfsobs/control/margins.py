@@ -1,6 +1,10 @@
-"""How far a linear loop is from instability: gain, phase, delay and disk margin.
+"""What a time-invariant loop does at every frequency, what it leaves, and how far it is from instability.
 
-With T = P F = L / (1 + L) (`law`), nothing needs to be divided by what may vanish:
+    rejection       E = 1 / (1 + L) = 1 - P F       from the disturbance to the residual
+    noise transfer  N = P F = L / (1 + L)           from the measurement's noise to the residual, its sign and delay aside
+    loop gain       L = P F / (1 - P F)
+
+With T = P F = L / (1 + L) (`mirror.Law`), nothing needs to be divided by what may vanish:
 
     L real      where Im T = 0; the gain can be multiplied by kappa = 1 - 1 / T before 1 + kappa L = 0
     |L| = 1     where Re T = 1/2; L can be turned by its angle from -1
@@ -10,10 +14,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
+from wfsobs.control.mirror import Law, Mirror
+from wfsobs.prior import Spectra
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
 
@@ -103,3 +111,57 @@ def frequencies(poles: Complex, n: int = 400, near_pole: int = 24) -> Array:
     near = (angle[:, None] + width[:, None] * np.concatenate([-spread, spread])).ravel()
     points = np.concatenate([np.geomspace(1e-5 * np.pi, np.pi, n), np.linspace(0.0, np.pi, n), near])
     return np.unique(points[(points >= 0.0) & (points <= np.pi)])
+
+
+@dataclass(frozen=True)
+class Curves:
+    """frequency (n,) [Hz], above zero, closer where the loop changes faster; noise (n,) = P F."""
+
+    frequency: Array
+    noise: Complex
+
+    @property
+    def rejection(self) -> Complex:
+        """E (n,)."""
+        return 1.0 - self.noise
+
+    @property
+    def loop_gain(self) -> Complex:
+        """L (n,); infinite where nothing is left of a disturbance."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return self.noise / self.rejection
+
+
+def curves(T: Response, poles: Complex, dt: float) -> Curves:
+    """Of a time-invariant loop of T = L / (1 + L) whose law has these poles, with a step `dt` [s]."""
+    omega = frequencies(poles)[1:]
+    return Curves(omega / (2.0 * np.pi * dt), T(omega))
+
+
+AT_A_TIME = 2**17
+"""Frequencies; slow winds have millions of them."""
+
+
+def residual_density(T: Any, target: Array, cross: Any, measurement: Array) -> Array:
+    """Spectrum of the residual phi_dist + phi_corr where T = P F: what is not rejected, and the noise let in.
+
+    target : of phi_dist; cross : between phi_dist[k] and z[k + 1]; measurement : of z
+    """
+    return target + np.abs(T) ** 2 * measurement - 2.0 * np.real(np.conj(cross) * T)
+
+
+def residual_variance(law: Law, spectra: Spectra, mirror: Mirror) -> float:
+    """Variance [um^2] of the residual that a stable time-invariant law leaves.
+
+    T is smooth between the points that `frequencies` takes, close together near the poles of the law, whatever the number
+    of frequencies of the spectra.
+    """
+    points = frequencies(law.poles)
+    T = CubicSpline(points, mirror.response(points) * law.response(points))
+    n, total = spectra.measurement.size, 0.0
+    for start in range(0, n, AT_A_TIME):
+        part = slice(start, min(start + AT_A_TIME, n))
+        omega = np.pi * np.arange(part.start, part.stop) / (n - 1)
+        density = residual_density(T(omega), spectra.disturbance[part], spectra.cross[part], spectra.measurement[part])
+        total += 2.0 * float(density.sum()) - float(density[0]) * (start == 0) - float(density[-1]) * (part.stop == n)
+    return total / (2 * (n - 1))

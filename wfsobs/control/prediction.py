@@ -12,16 +12,15 @@ from typing import Any, TypeVar
 import numpy as np
 
 from wfsobs.control.mirror import Mirror, Plant
-from wfsobs.observers.gpr.inputs import Scale, StreamingInputs, Windows, scale_of, scales_of, training_signals, window_signals
-from wfsobs.observers.gpr.offline import OfflineEstimator, OfflineGpr, training_targets
+from wfsobs.observers.base import VIBRATION
+from wfsobs.observers.gpr.inputs import Windows, scale_of, scales_of, training_signals, window_signals
+from wfsobs.observers.gpr.offline import OfflineEstimator, OfflineGpr, TrainedGpr, train, training_targets
 from wfsobs.observers.gpr.online import OnlineEstimator, OnlineGpr, kernel_of
-from wfsobs.observers.gpr.sliding_regression import LateRegression
-from wfsobs.observers.gpr.trained import TrainedGpr, train
 from wfsobs.observers.per_mode import over_modes
-from wfsobs.prior import Bands, Prior
+from wfsobs.observers.step import run_frames
+from wfsobs.prior import Prior
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, Sampling
-from wfsobs.signal.bandpass import StreamingBank, bandpass_bank
 from wfsobs.typing import Array
 
 G = TypeVar("G", OfflineGpr, OnlineGpr)
@@ -92,48 +91,11 @@ def _ahead(x: Array, mirror: Mirror) -> Array:
     return out
 
 
-class VibrationPredictor:
-    """The online GPR of one mode as a control loop calls it: one sample in, one prediction out, then an update.
-
-    At step k it has learnt from the windows whose target is known by then: those up to k - mirror.taps.size + 1.
-    """
-
-    def __init__(self, settings: OnlineGpr, bands: Bands, plant: Plant, scale: Scale | None = None):
-        """Scale: of standardised inputs, from `inputs.scale_of`."""
-        g = of_z(settings)
-        self._inputs = StreamingInputs(g, plant.dt, scale)
-        self._taps = plant.mirror.taps
-        self._bank = StreamingBank(bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, plant.dt))
-        self._regression = LateRegression(g.depth, g.training_size, 1, kernel_of(g), late=self._taps.size - 2)
-        self._band_signal = np.zeros(self._taps.size - 1)  # newest first; of step k it tells phi_vib[k-1]
-
-    def step(self, z: float) -> float:
-        """Prediction [um] of the vibration while the command of this step acts; NaN until the training set is full."""
-        self._band_signal = np.roll(self._band_signal, 1)
-        self._band_signal[0] = self._bank.push(z)
-        # of the window that ended as many steps ago as there are taps after the first
-        target = self._taps[1:] @ self._band_signal[::-1]
-        value = float(self._regression.predict(self._inputs.step(np.array([z]))[None], target[None])[0])
-        self._regression.update()
-        self._bank.settle()
-        return value
-
-
 def gpr_online_ahead(measurements: Measurements, prior: Prior, plant: Plant, settings: Any, watch: Watch) -> Array:
-    """As `gpr_offline_ahead`, by `VibrationPredictor`."""
-    g, bands = settings.gpr_online, prior.bands
-    assert bands is not None
-    done = np.zeros(measurements.n_modes)
+    """Predict the vibration while u[k] acts, (n_steps, n_modes) [um], NaN before the training set is full.
 
-    def one(mode: int, watch: Watch) -> Array:
-        scale = scale_of(of_z(g), prior.training, measurements.delay, mode)
-        predictor, z = VibrationPredictor(g, bands, plant, scale), measurements.z[:, mode].tolist()
-        out = np.empty(measurements.n_steps)
-        for k, sample in enumerate(z):
-            if k % 256 == 0:
-                done[mode] = k / measurements.n_steps
-                watch.step(float(done.mean()))
-            out[k] = predictor.step(sample)
-        return out
-
-    return over_modes(measurements.n_modes, one, watch)
+    The GPR is trained anew at every step (paper, Algorithm 3), at step k on the last windows whose target is known by then: those
+    up to k - mirror.taps.size + 1.
+    """
+    estimator = step_gpr_online_ahead(prior, plant, settings, measurements.sampling)
+    return run_frames(estimator, (VIBRATION,), measurements, watch)[VIBRATION]

@@ -6,16 +6,242 @@ prediction of the vibration beside it. Over a frame it does what `Controller.com
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wfsobs.control.mirror import Plant
-from wfsobs.control.step_laws import StepLaw, VibrationAhead, push_row
+from wfsobs.control.mirror import Law, Mirror, Plant
+from wfsobs.observers.base import TARGETS
+from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.observers.missing import Bridge
-from wfsobs.observers.step import StepBase, StepError
-from wfsobs.record import Sampling
+from wfsobs.observers.step import Estimator, StepBase, StepError, each_frame
+from wfsobs.observers.stepping import FilterBank, StateArrays, Stateful
+from wfsobs.prior import Bands, Prior
+from wfsobs.progress import Watch
+from wfsobs.record import Measurements, Sampling
+from wfsobs.signal.bandpass import bandpass_bank, bank_recursion
 from wfsobs.signal.gate import GateSettings
+from wfsobs.signal.periodic import Recursion
 from wfsobs.typing import Array
+
+StepPredict = Callable[[Prior, Plant, Any, Sampling], Estimator]
+"""(prior, plant, settings, sampling) -> predictor of the vibration while the command of the frame acts."""
+
+MakeStepLaw = Callable[[Prior, Plant, Any, Sampling], "StepLaw"]
+"""(prior, plant, settings, sampling) -> laws of all modes. Raises ValueError saying why there are none."""
+
+
+DECIMALS = 9
+"""Of z [um] where a model is identified from it: it is then the same in whichever order commands were added."""
+
+
+class StepLaw(Stateful, Protocol):
+    """The laws of all modes, one frame at a time."""
+
+    def see_stars(self, count: int | None) -> None:
+        """Take the LGS measurement of the next frame for the mean over so many stars; None for all."""
+        ...
+
+    def command(self, z: Array, ngs: Array | None, forward: Array) -> Array:
+        """Return the commands (n_modes,) [um] that the laws want, `forward` included."""
+        ...
+
+    def tell(self, command: Array, forward: Array) -> None:
+        """Tell what the mirror took of them."""
+        ...
+
+    def amend(self, difference: Array) -> None:
+        """Go on from a command that differs by this from the one told last."""
+        ...
+
+    def take_over(self, old: Any) -> None:
+        """Go on from the state of other laws. Raises StepError."""
+        ...
+
+
+class _Laws(StateArrays):
+    """Laws of one gain, for which the commands sent do not matter."""
+
+    def see_stars(self, count: int | None) -> None:
+        """Ignored: constant gain."""
+
+    def tell(self, command: Array, forward: Array) -> None:
+        """Ignored: z holds none of the commands."""
+
+    def amend(self, difference: Array) -> None:
+        """Ignored, as what is told."""
+
+
+class LinearLaws(_Laws):
+    """Laws as filters of z."""
+
+    state_names: tuple[str, ...] = ("bank",)
+
+    def __init__(self, laws: Sequence[Law]):
+        self.laws: tuple[Law, ...] = tuple(laws)
+        self.bank: FilterBank = FilterBank([Recursion(law.cycle.steps, law.first) for law in laws])
+        self._v = np.zeros((len(laws), laws[0].cycle.steps[0][1].shape[1]))
+        self.mark_start()
+
+    def command(self, z: Array, ngs: Array | None, forward: Array) -> Array:
+        """Return what the filters give."""
+        v = self._v
+        v[:, 0] = z
+        if v.shape[1] > 1:
+            v[:, 1] = 0.0 if ngs is None else ngs
+        return self.bank.step(v)[:, 0] + forward
+
+    def take_over(self, old: Any) -> None:
+        """Go on from a state of the same size."""
+        if not isinstance(old, LinearLaws) or len(old.bank.maps) != len(self.bank.maps):
+            raise StepError("the laws are of another kind")
+        if old.bank.x.shape != self.bank.x.shape:
+            raise StepError("the laws have states of another size")
+        self.bank.load(old.bank.save())
+
+
+class KalmanLaws(_Laws):
+    """Laws as rows of what Kalman filters estimate; a measurement that is missing, NaN, is none to them."""
+
+    laws: tuple[Law, ...]
+
+    state_names: tuple[str, ...] = ("filters",)
+
+    def __init__(self, laws: Sequence[Law]):
+        self.laws, known = tuple(laws), [law for law in laws if law.filter is not None and law.row is not None]
+        self.filters: KalmanEstimator = KalmanEstimator([law.filter for law in known if law.filter is not None])
+        self._rows = np.zeros_like(self.filters.bank.x)
+        for row, law in zip(self._rows, known, strict=True):
+            assert law.row is not None
+            row[: len(law.row)] = law.row
+        self.mark_start()
+
+    def see_stars(self, count: int | None) -> None:
+        """Take the LGS measurement of the next frame for the mean over so many stars; None for all."""
+        self.filters.see_stars(count)
+
+    def command(self, z: Array, ngs: Array | None, forward: Array) -> Array:
+        """Return the commands of the estimates."""
+        self.filters.advance(z, ngs, None)
+        return np.sum(self._rows * self.filters.bank.x, axis=1) + forward
+
+    def run(self, measurements: Measurements, watch: Watch) -> Array:
+        """Return the commands over a record with gaps, (n_steps, n_modes) [um]. Raises Cancelled."""
+        none = np.zeros(len(self.laws))
+        return np.array([self.command(z, ngs, none) for z, ngs, _ in each_frame(self.filters, measurements, watch)])
+
+    def take_over(self, old: Any) -> None:
+        """Go on where the disturbance is in the old filters' states."""
+        if not isinstance(old, KalmanLaws) or len(old.filters.bank.maps) != len(self.filters.bank.maps):
+            raise StepError("the laws are of another kind")
+        self.filters.take_over(old.filters)
+
+
+class Integrators(_Laws):
+    """Integrators whose state are their own commands, so that a limit of the mirror stops them (anti-windup)."""
+
+    state_names: tuple[str, ...] = ("_own",)
+
+    def __init__(self, laws: Sequence[Law], mirror: Mirror):
+        self.laws: tuple[Law, ...] = tuple(laws)
+        self._gain = np.array([law.gain for law in laws])
+        self._leak = np.array([law.leak for law in laws])
+        self._taps = mirror.taps[1:]
+        self._own = np.zeros((len(self._taps), len(laws)))  # newest first
+        self.mark_start()
+
+    def command(self, z: Array, ngs: Array | None, forward: Array) -> Array:
+        """Return leak u - g y, y the measurement with the integrator's own commands alone; none where it is missing."""
+        return self._leak * self._own[0] - self._gain * np.nan_to_num(z + self._taps @ self._own) + forward
+
+    def tell(self, command: Array, forward: Array) -> None:
+        """Go on from what the mirror took."""
+        push_row(self._own, command - forward)
+
+    def amend(self, difference: Array) -> None:
+        """Go on from a command that differs by this from the one told last."""
+        self._own[0] += difference
+
+    def take_over(self, old: Any) -> None:
+        """Go on from the last commands."""
+        if not isinstance(old, Integrators) or old._own.shape != self._own.shape:
+            raise StepError("the laws are of another kind")
+        self._own[...] = old._own
+
+
+class PredictionLaws(_Laws):
+    """Minus what an observer predicts that needs time until it does; until then integrators."""
+
+    state_names: tuple[str, ...] = ("estimator", "integrators")
+
+    def __init__(self, estimator: Estimator, integrators: Integrators, mirror: Mirror):
+        self.estimator, self.integrators = estimator, integrators
+        self._taps = [(steps, tap) for steps, tap in enumerate(mirror.taps[1:].tolist()) if tap]
+        self.mark_start()
+
+    def command(self, z: Array, ngs: Array | None, forward: Array) -> Array:
+        """Return minus the mean of the prediction while the command acts."""
+        self.estimator.advance(np.round(z, DECIMALS), None if ngs is None else np.round(ngs, DECIMALS), None)
+        ahead = sum((tap * self.estimator.predict(k, target)[0] for k, tap in self._taps for target in TARGETS), -forward)
+        return np.where(np.isnan(ahead), self.integrators.command(z, ngs, forward), -ahead)
+
+    def tell(self, command: Array, forward: Array) -> None:
+        """Have the integrators go on from what the mirror took."""
+        self.integrators.tell(command, forward)
+
+    def amend(self, difference: Array) -> None:
+        """Go on from a command that differs by this from the one told last."""
+        self.integrators.amend(difference)
+
+    def take_over(self, old: Any) -> None:
+        """Go on from what the old observer knows."""
+        if not isinstance(old, PredictionLaws):
+            raise StepError("the laws are of another kind")
+        self.estimator.take_over(old.estimator)
+        self.integrators.take_over(old.integrators)
+
+
+def take_missing(laws: Sequence[Law]) -> bool:
+    """Return whether a measurement that is missing can be none to all these laws."""
+    return bool(laws) and all(law.filter is not None and law.row is not None for law in laws)
+
+
+def step_law(laws: Sequence[Law], mirror: Mirror) -> StepLaw | None:
+    """Return the laws of all modes, one frame at a time; None for no laws."""
+    if take_missing(laws):
+        return KalmanLaws(laws)
+    if any(one.gain is None for one in laws):
+        return LinearLaws(laws)
+    return Integrators(laws, mirror) if laws else None
+
+
+class VibrationAhead:
+    """What the vibration will be while the command of a frame acts, and the part of z that this corrects (`control.base`)."""
+
+    def __init__(self, estimator: Estimator, bands: Bands, sampling: Sampling):
+        self.estimator = estimator
+        self.bank: FilterBank = FilterBank(
+            [bank_recursion(bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, sampling.dt))]
+            * sampling.n_modes
+        )
+        self.parts: dict[str, Stateful] = {"estimator": estimator, "bank": self.bank}
+
+    def split(self, z: Array) -> tuple[Array, Array]:
+        """Return z without the vibration, and the command against the vibration, both (n_modes,) [um]."""
+        self.estimator.advance(z, None, None)
+        horizon = self.estimator.horizon
+        ahead, _ = self.estimator.predict(0.0 if horizon is None else horizon, "vibration")
+        known = ~np.isnan(ahead)
+        now = self.bank.step(z[:, None])[:, 0]
+        return z - np.where(known, now, 0.0), -np.where(known, ahead, 0.0)
+
+
+def push_row(last: Array, newest: Array) -> None:
+    """Put the newest row in front; the oldest one goes."""
+    last[1:] = last[:-1].copy()
+    last[0] = newest
 
 
 class StepController(StepBase):

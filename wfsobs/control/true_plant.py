@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.signal import lfilter
 
-from wfsobs.control.step import StepController
-from wfsobs.control.step_laws import push_row
+from wfsobs.control.step import StepController, push_row
 from wfsobs.control.supervisor import SupervisedController
 from wfsobs.observers.step import EVERY
 from wfsobs.progress import QUIET, Watch

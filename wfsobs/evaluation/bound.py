@@ -7,7 +7,7 @@ periodic (`synthesis`).
 - *lgs*: all measurements of the mean of the LGS in one mode, or of what `sensors.lgs_combination` makes of them: the error of the
   Wiener filter (`wiener`). Undamped lines are then known. A record is neither infinitely long nor the mean of all:
   `PeriodicError.interval` is the range of the rms of an optimal observer of all samples since the start, in 95 % of records.
-- *both*: the NGS frames, too (`slow_sensor`). The error is periodic: least when an NGS frame has just been read.
+- *both*: the NGS frames, too (`sensor_array`). The error is periodic: least when an NGS frame has just been read.
 - *stars*: every LGS by itself, and the NGS (`sensor_array`). Where all stars see the same turbulence, but for independent errors,
   their mean has all the information that they have, and the bound is that of both.
 - *modes*, *both-modes*, *asterism*: the same from all modes together. Their error is what the best weights of very many means
@@ -57,21 +57,18 @@ from wfsobs.evaluation.scores import (
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, TURBULENCE
 from wfsobs.observers.estimates import TOTAL
-from wfsobs.observers.kalman.asterism_model import AsterismModel
 from wfsobs.observers.kalman.coupled import CoupledModel
+from wfsobs.observers.kalman.joint import AsterismModel
 from wfsobs.prior import Asterism, Flow, FlowOfBoth, Lines
-from wfsobs.priors_from.scenario import prior_of
-from wfsobs.priors_from.selection import has_prior
+from wfsobs.priors_from.scenario import has_prior, prior_of
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.joint_states import running_means
-from wfsobs.signal.sensor_array import FastSensors, variance_from_sensors
-from wfsobs.signal.slow_sensor import SlowSensor, SlowTarget, variance_from_frames
-from wfsobs.signal.welch import rms
+from wfsobs.signal.sensor_array import FastSensors, SlowSensor, SlowTarget, variance_from_frames, variance_from_sensors
+from wfsobs.signal.spectrum import rms
 from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean, degrees_of_freedom, explained_variance
 from wfsobs.simulation.guide_stars import MEAN, stars_differ
-from wfsobs.simulation.mode_spectra import are_coupled
-from wfsobs.simulation.star_spectra import StarSpectra, star_spectra
+from wfsobs.simulation.mode_spectra import StarSpectra, are_coupled, star_spectra
 from wfsobs.simulation.synthesis import line_width
 from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, true_spectra
 from wfsobs.typing import Array

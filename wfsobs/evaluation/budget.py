@@ -32,8 +32,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from wfsobs.evaluation.bound import TRUE_MODEL
-from wfsobs.evaluation.known_lines import given_lines, is_near
-from wfsobs.evaluation.rows import NO_ESTIMATE, own_bound
+from wfsobs.evaluation.rows import NO_ESTIMATE, given_lines, is_near, own_bound
 from wfsobs.evaluation.scores import Score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Observer
@@ -42,9 +41,7 @@ from wfsobs.observers.kalman.multirate import beam_model, estimated_cycle, optim
 from wfsobs.observers.kalman.single import MIN_NOISE, steady_filter
 from wfsobs.observers.step import Estimator
 from wfsobs.prior import Beams, Line, Lines
-from wfsobs.priors_from.scenario import observer_settings, prior_of
-from wfsobs.priors_from.turbulence import beams_of, modelled_turbulence
-from wfsobs.priors_from.vibration import vibration_continuum
+from wfsobs.priors_from.scenario import beams_of, modelled_turbulence, observer_settings, prior_of, vibration_continuum
 from wfsobs.progress import QUIET, Watch, detach_watch
 from wfsobs.record import Measurements, Record, delay_signal, frame_mean
 from wfsobs.scenario import Scenario

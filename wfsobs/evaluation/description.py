@@ -14,8 +14,7 @@ import numpy as np
 from wfsobs.observers.kalman.multirate import multirate_filter, multirate_noise, optimal_filter, optimal_model
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.prior import Prior
-from wfsobs.priors_from.scenario import model_of
-from wfsobs.priors_from.turbulence import lgs_error_of
+from wfsobs.priors_from.scenario import lgs_error_of, model_of
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.periodic import PeriodicFilter

@@ -32,12 +32,11 @@ from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
 from wfsobs.prior import Beams, LgsError, LgsStars, Lines, Prior
-from wfsobs.priors_from.scenario import lines_of, observer_settings, prior_of
-from wfsobs.priors_from.turbulence import beams_of, lgs_error_of, lines_turbulence
+from wfsobs.priors_from.scenario import beams_of, lgs_error_of, lines_of, lines_turbulence, observer_settings, prior_of
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar3 import Ar3Fits
-from wfsobs.signal.welch import expected_psd, psd
+from wfsobs.signal.spectrum import expected_psd, psd
 from wfsobs.signal.wiener import circle_mean
 from wfsobs.simulation.guide_stars import MEAN
 from wfsobs.simulation.true_spectra import MOST, TrueSpectra, has_known_spectra, n_frequencies, true_spectra

@@ -150,6 +150,19 @@ def rank_observers(errors: Mapping[str, float]) -> list[str]:
     return [*same[:1], *(name for name in ranked if name not in same[:1])]
 
 
+def marks_of(errors: Mapping[str, tuple[float, bool]], leaders: Sequence[str]) -> dict[str, str]:
+    """Mark the best, which differs significantly from all others over the seeds, or those tied; of one record the smallest.
+
+    errors : observer -> error [um], and whether it stands apart, on samples of its own
+    leaders : from `Evidence.leaders`; empty for one record
+    Returns observer -> "best", "tied" or "smallest".
+    """
+    if leaders:
+        return dict.fromkeys(leaders, "tied" if len(leaders) > 1 else "best")
+    rivals = {name: rms for name, (rms, apart) in errors.items() if can_be_best(name, apart)}
+    return dict.fromkeys(rank_observers(rivals)[:1], "smallest")
+
+
 def gather_evidence(seeds: Sequence[Iterable[Score]]) -> Evidence:
     """Gather the scores of several seeds, one sequence each: of rows that all of them have and that can be compared."""
     known = [{(s.observer, s.target, s.mode): s for s in scores if not s.apart and s.observer not in BOUNDS} for scores in seeds]

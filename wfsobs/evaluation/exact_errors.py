@@ -5,7 +5,7 @@ coefficients h_p and g_p of its estimates p steps after a frame,
 
     s_hat[k] = sum_j h_p[j] z[k-j] + sum_j g_p[j] y[k-j].
 
-With their transforms H_p and G_p, and y = x + v as in `slow_sensor`, the error s - s_hat has the variance
+With their transforms H_p and G_p, and y = x + v as in `sensor_array`, the error s - s_hat has the variance
 
     mean(S_s + |H_p|^2 S_z + |G_p|^2 S_y + 2 Re(G_p S_yz H_p*) - 2 Re(S_sz H_p* + S_sy G_p*))
 
@@ -37,7 +37,7 @@ from wfsobs.priors_from.scenario import observer_settings, prior_of
 from wfsobs.progress import QUIET
 from wfsobs.record import Measurements
 from wfsobs.scenario import Scenario
-from wfsobs.signal.slow_sensor import SlowSensor
+from wfsobs.signal.sensor_array import SlowSensor
 from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean, square
 from wfsobs.simulation.true_spectra import TrueSpectra, true_spectra
 from wfsobs.typing import Array

@@ -11,18 +11,22 @@ import numpy as np
 
 from wfsobs.evaluation.budget import NOISE, TERMS, Budget, error_budget
 from wfsobs.evaluation.evidence import Evidence, gather_evidence
-from wfsobs.evaluation.known_lines import (
+from wfsobs.evaluation.rows import (
     BANDS,
+    JOINT_BOUNDS,
     NOTHING,
     ONE_PEAK,
     PEAKS,
-    SPECTRA,
     TRAINED,
+    TRUE_SPECTRA,
+    above_bound,
     given_lines,
     is_near,
     prior_knowledge,
+    row_label,
+    target_title,
+    uncertainty_text,
 )
-from wfsobs.evaluation.rows import JOINT_BOUNDS, above_bound, row_label, target_title, uncertainty_text
 from wfsobs.evaluation.scores import (
     BOUND_ASTERISM,
     BOUND_BOTH,
@@ -37,7 +41,7 @@ from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import Estimate
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.signal.welch import psd
+from wfsobs.signal.spectrum import psd
 from wfsobs.simulation.disturbance import vibration_lines
 from wfsobs.typing import Array
 
@@ -50,7 +54,7 @@ HEADINGS = {
     ONE_PEAK: "With one known peak",
     TRAINED: "With training data",
     BANDS: "With known frequency bands",
-    SPECTRA: "With known spectra",
+    TRUE_SPECTRA: "With known spectra",
 }
 """Kinds of prior knowledge, as the beginning of a sentence."""
 
@@ -124,7 +128,7 @@ class Contender:
             ONE_PEAK: f"{model} {'one' if n else 'none'}{of} peak{'s' * bool(of)}",
             TRAINED: f"{they} {have} training data",
             BANDS: f"{they} {know} the frequency bands",
-            SPECTRA: f"{they} {know} the spectra",
+            TRUE_SPECTRA: f"{they} {know} the spectra",
             NOTHING: f"{they} {have} no prior knowledge",
         }[self.knowledge]
 

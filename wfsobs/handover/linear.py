@@ -13,8 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from wfsobs.control.step import StepController
-from wfsobs.control.step_laws import Integrators, KalmanLaws, LinearLaws
+from wfsobs.control.step import Integrators, KalmanLaws, LinearLaws, StepController
 from wfsobs.observers.step import StepError
 from wfsobs.observers.stepping import GainCycle
 from wfsobs.signal.gap_gains import ONE, GapGains

@@ -9,10 +9,17 @@ from itertools import pairwise
 import numpy as np
 from scipy.stats import chi2, gamma
 
-from wfsobs.identification.both_sensors import read_difference, sensor_differences
 from wfsobs.identification.one_mode import OneMode
-from wfsobs.identification.result import Identification, read_mode
-from wfsobs.identification.whiteness import Whiteness, autocorrelation_test, cumulated_test, innovations
+from wfsobs.identification.result import (
+    Identification,
+    Whiteness,
+    autocorrelation_test,
+    cumulated_test,
+    innovations,
+    read_difference,
+    read_mode,
+    sensor_differences,
+)
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to

@@ -15,10 +15,9 @@ import numpy as np
 from scipy.optimize import minimize
 
 from wfsobs.identification.process import Number
-from wfsobs.identification.settings import MATCHED, base_scenario, model_settings
+from wfsobs.identification.result import MATCHED, base_scenario, model_settings
 from wfsobs.notebook import import_extra
-from wfsobs.observers.gp.kernels import Kernel, Matern, Sho, SquaredExponentialInTime, Sum
-from wfsobs.observers.gp.likelihood import log_likelihood
+from wfsobs.observers.gp.kernels import Kernel, Matern, Sho, SquaredExponentialInTime, Sum, log_likelihood
 from wfsobs.prior import Line, Lines
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError

@@ -9,7 +9,7 @@ from math import sqrt
 import numpy as np
 from scipy.fft import irfft, rfft
 
-from wfsobs.control.residual import residual_density
+from wfsobs.control.margins import residual_density
 from wfsobs.scenario import Scenario
 from wfsobs.signal.wiener import circle_mean
 from wfsobs.simulation.true_spectra import true_spectra

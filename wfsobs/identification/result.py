@@ -1,13 +1,24 @@
-"""Result of an identification, every number with its standard deviation, and the scenario of it."""
+"""Result of an identification, every number with its standard deviation, and the scenario of it.
+
+Two sensors differ by the noise of the NGS, and by what the LGS alone see. With x the mean of phi over a frame, the NGS gives x
++ v, and the mean of z over the same steps x + e + w / sqrt(n). Their difference holds the slow error e of the LGS and both
+noises, but no vibration. Its spectrum is fitted as that of a mode without peaks. e is taken for independent of phi.
+
+The residual of each mode is tested for whiteness twice, each test of level LEVEL.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import nan, pi, sqrt
+from math import hypot, nan, pi, sqrt
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from wfsobs.identification.both_sensors import SensorDifference, error_of_a_star, without_error
-from wfsobs.identification.one_mode import BROAD, OneMode, is_continuum
+import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
+from scipy.stats import chi2, kstwobign
+
+from wfsobs.identification.one_mode import BROAD, SETTLED, OneMode, is_continuum
 from wfsobs.identification.process import (
     IdentifiedPeak,
     IdentifiedProcess,
@@ -21,17 +32,264 @@ from wfsobs.identification.process import (
     scale_number,
     with_reliable_std,
 )
-from wfsobs.identification.settings import MATCHED, base_scenario, model_settings
-from wfsobs.identification.whiteness import Whiteness
 from wfsobs.notebook import PlotAccessor, html_table, import_extra
+from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.prior import Line, Lines
+from wfsobs.record import Record, hold_last, pseudo_open_loop
 from wfsobs.scenario import Scenario
+from wfsobs.sensors.modes import order_of
 from wfsobs.signal.ar2 import Ar2, turbulence_corner
+from wfsobs.signal.ar3 import Ar3
+from wfsobs.signal.statespace import disturbance_model
 from wfsobs.simulation.layers import relative_cone_error, relative_rms
+from wfsobs.spectral.missing import find_outlying
 from wfsobs.spectral.model import Spectrum
+from wfsobs.spectral.periodogram import fast_length, inflation
+from wfsobs.typing import Array
 
 if TYPE_CHECKING:
     import pandas
+
+
+HIGHEST, LARGEST_RMS, LEAST_DAMPING = 50_000.0, 1e4, 1e-6
+"""Limits of a scenario's settings: frequency of a peak [Hz], rms [um], minimum damping of a process."""
+MATCHED: dict[str, Any] = {
+    "sensors.noise_from": "nm",
+    "sensors.lgs_combination": "mean",
+    "sensors.tip_tilt_indetermination": False,
+    "kalman.process_noise": "matched",
+    "kalman.measurement_noise": "matched",
+    "kalman.peak": "matched",
+}
+"""Settings by which filters take the models as they are told."""
+WIDTHS = ("bandwidth_offline", "bandwidth_online")
+
+
+def base_scenario(n_modes: int, dt: float, base: Scenario | None) -> Scenario:
+    """Return a scenario for telemetry of so many modes at steps of dt [s], without events, which name peaks by their number."""
+    changes = {"telescope.radial_order": order_of(n_modes), "sensors.lgs_rate": 1.0 / dt}
+    out = _with((base or Scenario()).before_events, changes)
+    return _with(out, band_settings(out, 0.5 / dt))
+
+
+def _with(scenario: Scenario, changes: Mapping[str, Any]) -> Scenario:
+    """Return a scenario with settings changed; itself where it has these values, since a copy takes its time."""
+    return scenario if all(scenario.lookup(path) == value for path, value in changes.items()) else scenario.replace(changes)
+
+
+def model_settings(priors: Sequence[Lines], scenario: Scenario) -> dict[str, Any]:
+    """Return dotted path -> value of the settings that give the filters these models, one per mode.
+
+    For sensors as in the scenario. No two modes share a process or a peak: they stay as different as their numbers are.
+    """
+    modes = len(priors)
+    smooth = [_process(p, _alone(p.rms, i, modes)) for i, prior in enumerate(priors) for p in prior.turbulence]
+    lines = sorted((line, i) for i, prior in enumerate(priors) for line in prior.lines)
+    peaks = [{"frequency": line.frequency, "damping": line.damping, "rms": _alone(line.rms, i, modes)} for line, i in lines]
+    changes: dict[str, Any] = {
+        "turbulence.source": "processes" if smooth else "none",
+        "turbulence.processes": smooth,
+        "vibration.source": "peaks" if peaks else "none",
+        "vibration.peaks": peaks,
+        "sensors.lgs_noise_per_mode": [min(p.noise * sqrt(scenario.sensors.lgs_count), LARGEST_RMS) for p in priors],
+    }
+    if lines:
+        strongest, highest = max((line for line, _ in lines), key=lambda line: line.rms), lines[-1][0].frequency
+        changes |= {
+            "vibration.cutoff": min(max(scenario.vibration.cutoff, 1.2 * highest), HIGHEST),
+            "kalman.frequency": strongest.frequency,
+            "kalman.damping": strongest.damping,
+        }
+    return changes
+
+
+def band_settings(scenario: Scenario, nyquist: float) -> dict[str, Any]:
+    """Return dotted path -> value of the settings of bands, without those above half the rate [Hz].
+
+    Where none remains there is one in the middle.
+    """
+    b = scenario.butterworth
+    widest = 0.5 * max(b.bandwidth_offline, b.bandwidth_online)
+    inside = [f for f in b.frequencies if widest < f < nyquist - widest]
+    changes: dict[str, Any] = {} if inside == b.frequencies else {"butterworth.frequencies": inside or [0.5 * nyquist]}
+    if not inside:
+        changes |= {f"butterworth.{name}": min(getattr(b, name), 0.5 * nyquist) for name in WIDTHS}
+    if scenario.kalman.frequency >= nyquist:
+        changes["kalman.frequency"] = 0.5 * nyquist
+    return changes
+
+
+def _process(p: Ar2 | Ar3, rms: list[float]) -> dict[str, Any]:
+    return {
+        "frequency": p.omega / (2 * pi),
+        "damping": max(p.damping, LEAST_DAMPING),
+        "rms": rms,
+        "third_corner": p.corner / p.omega if isinstance(p, Ar3) else 0.0,
+    }
+
+
+def _alone(rms: float, mode: int, modes: int) -> list[float]:
+    """Return the strength per mode of a process of one mode."""
+    return [min(rms, LARGEST_RMS) if i == mode else 0.0 for i in range(modes)]
+
+
+LEVEL = 0.01
+LAGS = 100
+"""Lags of the autocorrelation, beside one for every parameter of the model."""
+MIN_NOISE = 1e-6
+"""Minimum noise of the filter, over the rms of z."""
+
+
+@dataclass(frozen=True)
+class Whiteness:
+    """Tests of the residual of one mode; p-values are probabilities that white noise would look less white.
+
+    Attributes
+    ----------
+    periodogram : float
+        p-value of the largest distance between the cumulative I / S and a straight line (Bartlett, with Kolmogorov's law).
+    innovations : float
+        p-value of the autocorrelation of the Kalman filter's innovations (Ljung and Box, Biometrika 65, 297, 1978).
+    left : int
+        Candidates that the search still finds and no peak explains.
+    remarks : tuple of str
+        Differences, one clause each, where it is not white.
+    """
+
+    periodogram: float
+    innovations: float
+    left: int
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def white(self) -> bool:
+        """Whether both tests pass at LEVEL and no candidate is left."""
+        return min(self.periodogram, self.innovations) >= LEVEL and not self.left
+
+
+def cumulated_test(ratio: Array, n: int) -> float:
+    """Return the p-value of I / S, (bins,), of a record of n samples."""
+    count = len(ratio)
+    distance = np.cumsum(ratio) / ratio.sum() - np.arange(1, count + 1) / count
+    return float(kstwobign.sf(np.max(np.abs(distance)) * np.sqrt(count / inflation(n))))
+
+
+def innovations(z: Array, spectrum: Spectrum) -> Array:
+    """Return the innovations of the steady-state Kalman filter of the spectrum on z (n,), without the start.
+
+    One second or a tenth of the record is left out; the rest is white where the spectrum is that of z.
+    """
+    settle = min(len(z) // 10, round(1.0 / spectrum.dt))
+    if not spectrum.processes:
+        return z[settle:]
+    model = disturbance_model(list(spectrum.processes[:1]), list(spectrum.processes[1:]))
+    kalman, _ = steady_filter(model, max(spectrum.noise, MIN_NOISE * float(np.std(z))), (model.C @ model.A)[None])
+    predicted = kalman.run(z[:, None, None])[:, 0, 0]  # C A x_hat[k], what z[k+1] should be
+    return (z[1:] - predicted[:-1])[settle:]
+
+
+def autocorrelation_test(e: Array, numbers: int) -> float:
+    """Return the p-value of Ljung and Box's statistic of e (n,); numbers : parameters of the model that made it."""
+    n, lags = len(e), LAGS + numbers
+    e = e - e.mean()
+    power = np.abs(rfft(e, next_fast_len(2 * n, real=True))) ** 2
+    r = irfft(power)[: lags + 1]
+    rho = r[1:] / r[0]
+    statistic = n * (n + 2) * np.sum(rho**2 / (n - np.arange(1, lags + 1)))
+    return float(chi2.sf(statistic, LAGS))
+
+
+FEWEST, SHARE = 200, 0.5
+"""Minimum NGS frames, and minimum share of them that is measured."""
+LEAST = 0.1
+"""Minimum share of the NGS in the noise of the difference."""
+LEFT = 0.01
+"""Minimum share of the variance of z's turbulence that is not the error of the LGS."""
+
+
+@dataclass(frozen=True)
+class SensorDifference:
+    """What the sensors of one mode differ by.
+
+    Attributes
+    ----------
+    noise : Number
+        Rms of the noise of an NGS frame [um].
+    error : IdentifiedProcess or None
+        Slow error of the combined LGS.
+    process : Ar2 or None
+        The same, as an observer receives it.
+    outlying : int
+        Frames far from what those around them predict, taken for missing.
+    """
+
+    noise: Number
+    error: IdentifiedProcess | None = None
+    process: Ar2 | None = None
+    outlying: int = 0
+
+
+def sensor_differences(record: Record) -> Array | None:
+    """Return the mean of z over each NGS frame minus the frame, (frames, n_modes) [um]; None without enough frames.
+
+    NaN where a sample is missing.
+    """
+    if record.y_ngs is None or record.ratio is None:
+        return None
+    ratio, u = record.ratio, hold_last(record.u)
+    z = pseudo_open_loop(record.y_lgs, u, record.delay)
+    first = ratio * -(-(record.delay + ratio) // ratio)  # what the mirror did before the record is not known
+    frames = replace(record, u=u).z_ngs[first::ratio]
+    whole = fast_length(len(frames))
+    if whole < FEWEST:
+        return None
+    start = first - ratio + 1
+    out = z[start : start + whole * ratio].reshape(whole, ratio, -1).mean(axis=1) - frames[:whole]
+    return out if (np.isfinite(out).mean(axis=0) >= SHARE).all() else None
+
+
+def read_difference(difference: Array, dt: float, ratio: int, lgs_noise: Number) -> SensorDifference:
+    """Identify one mode.
+
+    Parameters
+    ----------
+    difference : Array
+        Of the sensors, (frames,) [um]; NaN is a missing one.
+    dt, ratio : float, int
+        Time step of z [s], and steps of a frame.
+    lgs_noise : Number
+        Rms of the noise of z [um].
+
+    Returns
+    -------
+    SensorDifference
+        The numbers.
+    """
+    outlying = find_outlying(difference)
+    mode = OneMode(np.where(outlying, np.nan, difference), dt * ratio)
+    for _ in range(mode.missing.rounds(SETTLED)):
+        mode.refit()
+    std, spectrum = mode.errors(), mode.spectrum
+    whole, of_lgs = spectrum.noise**2, lgs_noise.value**2 / ratio
+    rms = sqrt(max(whole - of_lgs, LEAST * whole))
+    noise = with_reliable_std(Number(rms, hypot(whole * float(std[0]), lgs_noise.value * lgs_noise.std / ratio) / rms))
+    if not isinstance(slow := spectrum.turbulence, Ar2):
+        return SensorDifference(noise, outlying=int(outlying.sum()))
+    return SensorDifference(noise, read_process(slow, std[spectrum.starts[0] :]), slow.at(dt), int(outlying.sum()))
+
+
+def without_error(turbulence: tuple[Ar2 | Ar3, ...], error: Ar2 | None) -> tuple[Ar2 | Ar3, ...]:
+    """Return the processes of z's turbulence, the first without the variance of the LGS error."""
+    if error is None or not turbulence:
+        return turbulence
+    first, *others = turbulence
+    return replace(first, rms=sqrt(max(first.rms**2 - error.rms**2, LEFT * first.rms**2))), *others
+
+
+def error_of_a_star(difference: SensorDifference, stars: int) -> Number:
+    """Return the rms of the slow error of one of so many LGS [um], 0 where none was found."""
+    return Number(0.0, nan) if difference.error is None else scale_number(difference.error.rms, sqrt(stars))
+
 
 SLOWEST = 10.0
 """Minimum periods of turbulence in a record for a standard deviation of its corner: a slower one is not resolved."""

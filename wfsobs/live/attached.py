@@ -12,9 +12,8 @@ from time import monotonic, sleep
 
 import numpy as np
 
-from wfsobs.live.paced import SOURCE, Desk, Staff, enter_process
 from wfsobs.live.ring import Ring
-from wfsobs.live.source import STREAM
+from wfsobs.live.source import SOURCE, STREAM, Desk, Staff, enter_process, receive
 from wfsobs.record import Sampling
 from wfsobs.signal.gate import GateSettings, OutlierGate, frame_mean_of
 from wfsobs.streams.follower import LONGEST_GAP
@@ -261,7 +260,7 @@ class StreamFrames:
 
     def _follow_commands(self) -> None:
         while self._desk.inbox.poll():
-            command = self._desk.inbox.recv()
+            command = receive(self._desk.inbox)
             was_playing = self._is_playing
             self._is_playing = command.get("play", self._is_playing)
             self._steps += command.get("step", 0)

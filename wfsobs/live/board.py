@@ -1,19 +1,21 @@
-"""What is counted of every observer, in shared memory: errors since the start, latencies, frames."""
+"""What is counted of every observer, in shared memory: errors since the start, latencies, frames taken, lost and late."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from multiprocessing.shared_memory import SharedMemory
+from threading import Lock
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wfsobs.latencies import EDGES, Latencies
+from wfsobs.live.ring import LATE, Ring, Rows, merged_rows
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import TOTAL
+from wfsobs.streams.follower import EDGES, Latencies
 from wfsobs.typing import Array
 
 NEXT = "next"
@@ -35,6 +37,16 @@ Integers = NDArray[np.int64]
 def crew_of(observer: str) -> int:
     """Return the place in CREWS of the process in which an observer follows."""
     return CREWS.index("long" if observer in LONG_STEPS else "linear" if OBSERVERS[observer].linear else "learning")
+
+
+def trace_width(n_modes: int) -> int:
+    """Return the width of a row of estimates: number of the frame, its delay [s], and what each observer has."""
+    return 2 + len(SLOTS) * slot_width(n_modes)
+
+
+def slot_width(n_modes: int) -> int:
+    """Return the width of what one observer has in a row: the time of its step [s], and an estimate of every target [um]."""
+    return 1 + len(TARGETS) * n_modes
 
 
 class Counts(NamedTuple):
@@ -149,3 +161,60 @@ class Board:
         if self._owner:
             with suppress(FileNotFoundError):  # as in `Rows.release`
                 self._memory.unlink()
+
+
+class Delivery:
+    """Counts the frames of a loop.
+
+    A frame is taken once every observer has an estimate of it that is counted, and late where it has it more than 1 ms after the
+    frame was due.
+
+    Parameters
+    ----------
+    ring : Ring
+        The frames.
+    board : Board
+        Where the crews count what they lose.
+    traces : callable
+        Returns the rows of the crews that take part.
+    count : callable
+        Returns the number of the first frame that one of them has not counted.
+    """
+
+    def __init__(self, ring: Ring, board: Board, traces: Callable[[], list[Rows]], count: Callable[[], int]):
+        self._ring, self._board, self._traces, self._count, self._lock = ring, board, traces, count, Lock()
+        self._next = self._n_delays = self._n_late = 0
+
+    @property
+    def count(self) -> int:
+        """Frames that every observer has taken, or lost."""
+        return self._count()
+
+    @property
+    def losses(self) -> int:
+        """Frames that an observer has lost."""
+        return int(self._board.losses.max())
+
+    @property
+    def frames(self) -> int:
+        """Frames that every observer has taken."""
+        return self.count - self.losses
+
+    @property
+    def late_share(self) -> float:
+        """Share of the frames of which an estimate came more than 1 ms after they were due."""
+        return self._n_late / max(self._n_delays, 1)
+
+    @property
+    def late_share_sent(self) -> float:
+        """Share of the frames that the source sent more than 1 ms after they were due."""
+        return self._ring.late / max(self._ring.count, 1)
+
+    def collect(self) -> None:
+        """Count what has come since the last call; rows that have been overwritten meanwhile are not known."""
+        with self._lock:
+            stop = self.count
+            delays = merged_rows(self._traces(), self._next, stop, 2)[:, 1]
+            self._next = stop
+            self._n_delays += int((~np.isnan(delays)).sum())
+            self._n_late += int((delays > LATE).sum())

@@ -9,17 +9,15 @@ import numpy as np
 
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.step import StepController
-from wfsobs.live.beside import Beside
 from wfsobs.live.board import ADAPTIVE, LONG_STEPS, SLOTS
-from wfsobs.live.control_crew import SEATS
+from wfsobs.live.crew import SEATS, Beside
 from wfsobs.live.source import STREAM, LiveSource
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, Observer
 from wfsobs.observers.step import StepObserver
 from wfsobs.prior import Training
 from wfsobs.priors_from.controllers import full_plant_of, supervision_of
-from wfsobs.priors_from.scenario import observer_settings
-from wfsobs.priors_from.selection import has_prior
+from wfsobs.priors_from.scenario import has_prior, observer_settings
 from wfsobs.record import Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError

@@ -1,20 +1,26 @@
-"""What the last minute of a live loop says of itself: noise, turbulence, peaks."""
+"""Identification of the last minute of a live loop: noise, turbulence, peaks; and changes of the peaks between minutes.
+
+An identification finds a weak peak in one minute and not in the next, though nothing has changed. A peak is new where the power
+of its band has risen, and gone where that has fallen; what is found or not without either is neither.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import hypot, isnan, sqrt
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from wfsobs.evaluation.bound import INFORMATION, bound
 from wfsobs.identification import identify
 from wfsobs.priors_from.identification import told_by
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.signal.welch import psd
+from wfsobs.signal.spectrum import psd
 from wfsobs.simulation.true_spectra import has_known_spectra
 from wfsobs.spectral.periodogram import periodogram
 from wfsobs.typing import Array
@@ -175,3 +181,170 @@ def second_spectrum(x: Array, dt: float) -> Array:
     power = np.concatenate([[0.0], np.cumsum(density[:, 0] * 2.0 * half)])
     below = np.interp(edges, np.concatenate([[-half], frequency + half]), power)
     return np.diff(below) / np.diff(edges)
+
+
+SIGMAS = 5.0
+"""A peak has moved if its frequencies differ by more than so many standard deviations, and is another beyond REACH."""
+REACH = 0.1
+"""Part of its frequency within which a peak of its size is looked for again."""
+CLOSE = 0.02
+"""Part of their frequency within which peaks are one: of two modes, or a line that has been found in pieces."""
+SIZE = 2.0
+"""Factor within which a line that has moved keeps its rms: what is left of it in a minute in which it jumps may be nearer."""
+RESOLUTION = 1.0 / 60.0
+"""Standard deviation of a frequency at least [Hz]: a minute resolves no more, and a real line wanders."""
+FAINT = 0.1
+"""A peak weaker than this part of the noise of a frame is none."""
+CHANGE, MOST = 4.0, 30.0
+"""Factor by which the power of a band rises with a peak that is new, at least; at most where a narrow one varies by itself."""
+CHANCE = 1e-5
+"""Probability of such a rise where nothing has changed."""
+WIDTHS = 3.0
+"""Half width of the band of a peak, in its own half widths or standard deviations of its frequency; CLOSE at most."""
+
+
+class Change:
+    """What has become of the peaks from one minute to the next.
+
+    Parameters
+    ----------
+    findings : sequence of Finding
+        The last three minutes, or fewer: a peak that one of them lacks is known from the one before.
+
+    Attributes
+    ----------
+    peaks : tuple of PeakFinding
+        Those of the last minute.
+    same : dict
+        Those of them that were known -> as they were.
+    drifts : dict
+        Those of the same that have been elsewhere -> as they were.
+    new, losses : list of PeakFinding
+        Those that were not known and have risen; those known that are not found and have fallen.
+    """
+
+    def __init__(self, findings: Sequence[Finding]):
+        before, now = findings[-2:][0], findings[-1]
+        known: list[PeakFinding] = []
+        for minute in findings[-2::-1]:
+            known += [peak for peak in distinct_peaks(minute) if not any(is_close(peak, one) for one in known)]
+        self.peaks: tuple[PeakFinding, ...] = distinct_peaks(now)
+        self.same: dict[PeakFinding, PeakFinding] = paired_peaks(known, self.peaks)
+        self.drifts: dict[PeakFinding, PeakFinding] = {
+            peak: one for peak, one in self.same.items() if _has_drifted(peak, one, before, now)
+        }
+        self.new: list[PeakFinding] = [peak for peak in self.peaks if peak not in self.same and has_risen(peak, before, now)]
+        was = self.same.values()
+        self.losses: list[PeakFinding] = [peak for peak in known if peak not in was and has_risen(peak, now, before)]
+
+
+def peak_changes(findings: Sequence[Finding]) -> list[tuple[str, str]]:
+    """Say which peaks are new, have moved or are gone in the last of up to four minutes, and a detail of each.
+
+    A line that moves in the midst of a minute is two peaks in that minute: one is new. In the next one the other is gone, and has
+    moved to it.
+    """
+    last, before = Change(findings[-3:]), Change(findings[-4:-1]) if len(findings) > 1 else None
+    moves = moves_of(last, before)
+    lines = []
+    for peak in last.peaks:
+        if (origin := moves.get(peak, last.drifts.get(peak))) is not None:
+            was = origin if before is None else before.same.get(origin, origin)
+            origin = min(origin, was, key=lambda one: one.frequency_std)  # the rest of a line that has jumped is known less well
+            lines.append((f"peak moved from {origin.frequency:.2f} to {peak.frequency:.2f} Hz", ""))
+        elif peak in last.new:
+            lines.append((f"new peak at {peak.frequency:.2f} Hz", f", {1e3 * peak.rms:.1f} nm"))
+    lost = [peak for peak in last.losses if peak not in moves.values()]
+    return [*lines, *((f"peak at {peak.frequency:.2f} Hz is gone", "") for peak in lost)]
+
+
+def moves_of(last: Change, before: Change | None = None) -> dict[PeakFinding, PeakFinding]:
+    """Return peak -> the one that has moved there: gone, within REACH, of its size in one of the last two minutes.
+
+    A peak that was new the minute `before` is a place to have moved to as well.
+    """
+    just_new = [] if before is None else [peak for peak, one in last.same.items() if one in before.new]
+    pairs = [(abs(one.frequency - peak.frequency), peak, one) for peak in (*last.new, *just_new) for one in last.losses]
+    moves: dict[PeakFinding, PeakFinding] = {}
+    for _, peak, one in sorted(pairs, key=lambda pair: pair[0]):
+        was = one if before is None else before.same.get(one, one)
+        is_it = _is_near(one, peak, REACH) and (_are_alike(one, peak) or _are_alike(was, peak))
+        if is_it and peak not in moves and one not in moves.values():
+            moves[peak] = one
+    return moves
+
+
+def _has_drifted(peak: PeakFinding, was: PeakFinding, before: Finding, now: Finding) -> bool:
+    """Return whether a peak is elsewhere: in its band by its frequency alone, beyond it the power has moved as well."""
+    std = hypot(*(max(each.frequency_std, RESOLUTION) for each in (was, peak)))
+    by = abs(was.frequency - peak.frequency)
+    if isnan(std) or by <= SIGMAS * std:
+        return False
+    return by <= _half_width(peak) or has_risen(peak, before, now) or has_risen(was, now, before)
+
+
+def _half_width(peak: PeakFinding) -> float:
+    """Return the half width of the band of a peak [Hz]."""
+    std = 0.0 if isnan(peak.frequency_std) else peak.frequency_std
+    return min(WIDTHS * max(peak.damping * peak.frequency, std), CLOSE * peak.frequency)
+
+
+def has_risen(peak: PeakFinding, before: Finding, now: Finding) -> bool:
+    """Return whether the power of a peak's band has risen, more than what is around it, in one mode at least.
+
+    A band that was weaker than what is around it counts as that: of many bands some are, and a peak is found where one is strong.
+    Power of n independent bins over that of n others is F-distributed, 2n to 2n.
+    """
+    if before.spectrum is None or now.spectrum is None:
+        return False
+    half = _half_width(peak)
+    was, level_was, bins_were = before.spectrum.band(peak.frequency, half)
+    power, level, bins = now.spectrum.band(peak.frequency, half)
+    freedom = 2.0 * np.maximum(np.minimum(bins, bins_were), 1.0)
+    least = np.clip(stats.f.isf(CHANCE, freedom, freedom), CHANGE, MOST)
+    return bool(np.any(power * level_was > least * np.maximum(was, level_was) * np.maximum(level, level_was)))
+
+
+def distinct_peaks(finding: Finding) -> tuple[PeakFinding, ...]:
+    """Return the peaks that are not faint; CLOSE ones are one, in the middle by their power, as strong as the strongest."""
+    groups: list[list[PeakFinding]] = []
+    for peak in sorted(finding.peaks, key=lambda one: one.frequency):
+        if groups and peak.frequency - groups[-1][-1].frequency < CLOSE * peak.frequency:
+            groups[-1].append(peak)
+        else:
+            groups.append([peak])
+    return tuple(peak for peak in map(_joint_peak, groups) if peak.rms >= FAINT * max(finding.noise, default=0.0))
+
+
+def _joint_peak(peaks: Sequence[PeakFinding]) -> PeakFinding:
+    """Return peaks as one; its standard deviation has their distances in it."""
+    share = np.square([peak.rms for peak in peaks])
+    share = share / share.sum() if share.any() else np.full(len(peaks), 1.0 / len(peaks))
+    frequencies = np.array([peak.frequency for peak in peaks])
+    middle = float(share @ frequencies)
+    variances = np.square([peak.frequency_std for peak in peaks]) + (frequencies - middle) ** 2
+    strongest = max(peaks, key=lambda one: one.rms)
+    return replace(strongest, frequency=middle, frequency_std=sqrt(float(share @ variances)))
+
+
+def paired_peaks(before: Sequence[PeakFinding], now: Sequence[PeakFinding]) -> dict[PeakFinding, PeakFinding]:
+    """Return peak -> the one before in its place, the nearest ones first."""
+    near = [(abs(one.frequency - peak.frequency), peak, one) for peak in now for one in before if is_close(one, peak)]
+    pairs: dict[PeakFinding, PeakFinding] = {}
+    for _, peak, one in sorted(near, key=lambda pair: pair[0]):
+        if peak not in pairs and one not in pairs.values():
+            pairs[peak] = one
+    return pairs
+
+
+def is_close(one: PeakFinding, other: PeakFinding) -> bool:
+    """Return whether two peaks are in one place."""
+    return _is_near(one, other, CLOSE)
+
+
+def _is_near(one: PeakFinding, other: PeakFinding, share: float) -> bool:
+    return abs(one.frequency - other.frequency) <= share * other.frequency
+
+
+def _are_alike(one: PeakFinding, other: PeakFinding) -> bool:
+    return other.rms <= SIZE * one.rms and one.rms <= SIZE * other.rms

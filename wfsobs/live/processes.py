@@ -14,14 +14,23 @@ from threading import Event, Lock, RLock
 from time import monotonic, sleep
 from typing import Any, Final
 
-from wfsobs.live.board import CREWS, Board, crew_of
-from wfsobs.live.control_crew import ControlView, control_frames, row_width
-from wfsobs.live.crew import ROOM, ObserverCrew, Site, trace_width, warm_up_of
-from wfsobs.live.delivery import Delivery, merged_rows
-from wfsobs.live.paced import FAILURE, SOURCE, Command, LiveEvent, enter_process, go_first
-from wfsobs.live.ring import LiveFrame, Ring
-from wfsobs.live.rows import Rows, Tracker
-from wfsobs.live.source import LiveSource, SourceProcess, end_process, send_command, take_all
+from wfsobs.live.board import CREWS, Board, Delivery, crew_of, trace_width
+from wfsobs.live.crew import ROOM, ControlView, ObserverCrew, Site, control_frames, row_width, warm_up_of
+from wfsobs.live.ring import LiveFrame, Ring, Rows, Tracker, merged_rows
+from wfsobs.live.source import (
+    FAILURE,
+    SOURCE,
+    Command,
+    LiveEvent,
+    LiveSource,
+    SourceProcess,
+    end_process,
+    enter_process,
+    go_first,
+    receive,
+    send_command,
+    take_all,
+)
 from wfsobs.live.view import LiveView, last_frames, read_view
 from wfsobs.scenario import Scenario
 from wfsobs.stepping import design
@@ -79,7 +88,7 @@ def observe_frames(
                 go_first(0)
             crew.count()
             while inbox.poll():
-                crew.follow(inbox.recv(), number)
+                crew.follow(receive(inbox), number)
         if ring.count <= number:
             pause.rest()
             continue
@@ -384,7 +393,7 @@ def compute(pipe: Connection) -> None:
     """Answer (function, arguments) with the result, or the exception, until the process is ended."""
     enter_process(10)
     while True:
-        function, arguments = pipe.recv()
+        function, arguments = receive(pipe)
         try:
             answer = function(*arguments)
         except Exception as error:

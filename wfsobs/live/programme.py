@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from wfsobs.live.paced import Command
-from wfsobs.live.source import SIMULATION, LiveSource
+from wfsobs.live.source import SIMULATION, Command, LiveSource
 from wfsobs.priors_from.scenario import as_sampled
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.events import FRAMES, LASER, PEAK, WIND, Event, during, shift, strength, wind

@@ -7,8 +7,7 @@ from multiprocessing.context import SpawnContext
 
 import numpy as np
 
-from wfsobs.live.paced import SOURCE, Command, Desk, Staff, enter_process, send_frames
-from wfsobs.live.source import RECORD
+from wfsobs.live.source import RECORD, SOURCE, Command, Desk, Staff, enter_process, send_frames
 from wfsobs.record import Record, Sampling
 from wfsobs.typing import Array
 

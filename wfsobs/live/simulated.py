@@ -21,8 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from wfsobs.live.paced import SOURCE, Command, Desk, Staff, enter_process, may_go_first, send_frames
-from wfsobs.live.source import SIMULATION
+from wfsobs.live.source import SIMULATION, SOURCE, Command, Desk, Staff, enter_process, may_go_first, receive, send_frames
 from wfsobs.record import Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.disturbance import make_disturbance
@@ -172,7 +171,7 @@ def _make(settings: dict[str, Any], inbox: Connection, ready: Queue[Piece]) -> N
                 break
         is_first = False
         while inbox.poll():  # only the newest settings are simulated
-            changed, generation, is_first = inbox.recv()["settings"], generation + 1, True
+            changed, generation, is_first = receive(inbox)["settings"], generation + 1, True
         if changed is not None:
             blocks = endless_blocks(Scenario.from_dict(changed), rng)
 

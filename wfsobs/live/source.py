@@ -1,20 +1,265 @@
-"""Sources of frames, in processes of their own: a simulation, a record, a stream."""
+"""Sources of frames, in processes of their own, by the clock: a simulation, a record, a stream; and the events they tell."""
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import os
+import signal
+from collections.abc import Mapping
 from contextlib import suppress
-from multiprocessing import get_context
+from dataclasses import dataclass
+from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext
 from multiprocessing.process import BaseProcess
 from multiprocessing.queues import Queue
 from queue import Empty
-from typing import Protocol
+from threading import Thread
+from time import monotonic, sleep
+from typing import Any, NamedTuple, Protocol
 
-from wfsobs.live.paced import Command, Desk, LiveEvent, Staff
+import numpy as np
+
 from wfsobs.live.ring import Ring
 from wfsobs.record import Sampling
+from wfsobs.typing import Array
+
+IDLE = 0.05
+"""Pause between two looks at the commands while nothing is sent [s]."""
+LOOK = 0.01
+"""Pause between two looks at the commands while frames are sent [s]."""
+STALL = 1.0
+"""Delay beyond which the frames in between are given up, and the clock starts anew [s]."""
+
+SOURCE = 4
+"""Turn of the source: what takes least goes first, and delays the others least; those of the crews follow, the last is 1."""
+
+Command = Mapping[str, Any]
+"""What a process of a live loop is told: one word and what belongs to it."""
+
+ALARM, FAILURE = "ALARM", "failure"
+"""Kinds of events: something is not as it was; observers cannot follow."""
+
+
+class LiveEvent(NamedTuple):
+    """An event of a live loop.
+
+    Attributes
+    ----------
+    frame : int
+        Number of the first frame of it.
+    what : str
+        What has happened, in a few words; "{}" stands for `about`.
+    about : str
+        Id of the observer or controller that it is about.
+    detail : str
+        Numbers that follow, with the punctuation before them.
+    origin : str
+        Path or address of the stream that it is of.
+    kind : str
+        ALARM, FAILURE or "".
+    """
+
+    frame: int
+    what: str
+    about: str = ""
+    detail: str = ""
+    origin: str = ""
+    kind: str = ""
+
+    def words(self, name: str) -> str:
+        """Return what has happened, with a name for `about`."""
+        words = self.what.replace("{}", name) if self.about else self.what
+        return f"{ALARM} {words}" if self.kind == ALARM else words
+
+    def text(self, name: str) -> str:
+        """Return all of it in one line, with a name for `about`."""
+        return f"{self.origin}: {self.words(name)}{self.detail}" if self.origin else self.words(name) + self.detail
+
+    @property
+    def line(self) -> str:
+        """All of it in one line."""
+        return self.text(self.about)
+
+
+@dataclass(frozen=True)
+class Desk:
+    """Where a process of a source finds its work, and says what happens.
+
+    ring_name, n_modes : of the ring that it writes
+    inbox : commands
+    news  : events
+    speed : at the start, 1 is real time
+    n_frames : after which it ends; None for no end
+    """
+
+    ring_name: str
+    n_modes: int
+    inbox: Connection
+    news: Queue[LiveEvent]
+    speed: float
+    n_frames: int | None
+
+    def say(self, number: int, what: str, origin: str = "") -> None:
+        """Tell what happens from a frame on."""
+        self.news.put(LiveEvent(number, what, origin=origin))
+
+
+class Staff(NamedTuple):
+    """The processes of a source.
+
+    sender   : writes the ring
+    others   : work for it
+    outboxes : by which the others are told of new settings
+    queue    : between them; its locks live as long as it is kept
+    """
+
+    sender: BaseProcess
+    others: list[BaseProcess]
+    outboxes: list[Connection]
+    queue: object = None
+
+
+class PacedFrames(Protocol):
+    """Frames of a source that has no clock of its own."""
+
+    def next_row(self, number: int) -> Array | None:
+        """Return z, ngs, u, turbulence and vibration of the next frame, (5 n_modes,) [um]; None after the last one."""
+        ...
+
+    def take(self, command: Command, number: int, /) -> str:
+        """Follow a command about the frames, from this number on; return a line for the list of events, or ""."""
+        ...
+
+
+class Pace:
+    """The clock of a source.
+
+    Parameters
+    ----------
+    dt : float
+        Time between two frames at the speed 1 [s].
+    speed : float
+        1 is real time.
+    """
+
+    def __init__(self, dt: float, speed: float):
+        self._dt, self._speed, self._steps, self._due = dt, speed, 0, 0.0
+        self.is_playing = False
+
+    @property
+    def runs(self) -> bool:
+        """Whether a frame is to be sent."""
+        return self.is_playing or self._steps > 0
+
+    def take(self, command: Command) -> None:
+        """Follow a command about the clock: "play", "step", "speed"."""
+        was_running = self.runs
+        self.is_playing: Any = command.get("play", self.is_playing)
+        self._steps += command.get("step", 0)
+        self._speed = command.get("speed", self._speed)
+        if self.runs and not was_running:
+            self._due = monotonic() + self._dt / self._speed
+
+    def due(self) -> float:
+        """Return when the next frame is due, on the monotonic clock [s]."""
+        now = monotonic()
+        if now - self._due > STALL:
+            self._due = now
+        return self._due
+
+    def advance(self) -> None:
+        """Count a frame."""
+        self._due += self._dt / self._speed
+        self._steps = max(0, self._steps - 1)
+
+
+def send_frames(desk: Desk, frames: PacedFrames, dt: float) -> None:
+    """Write frames to the ring when they are due, until there are no more."""
+    ring, pace, number = Ring(desk.n_modes, desk.ring_name), Pace(dt, desk.speed), 0
+    row, rest = np.empty(1 + 5 * desk.n_modes), frames.next_row(0)
+    gc.collect()
+    gc.freeze()
+    look = 0.0
+    while number != desk.n_frames and rest is not None:
+        if not pace.runs or monotonic() >= look:
+            while desk.inbox.poll(0 if pace.runs else IDLE):
+                command = receive(desk.inbox)
+                pace.take(command)
+                if line := frames.take(command, number):
+                    desk.say(number, line)
+            look = monotonic() + LOOK
+        if not pace.runs:
+            continue
+        row[0] = due = pace.due()
+        row[1:] = rest
+        if (wait := due - monotonic()) > 0:
+            sleep(wait)
+        ring.send(row)
+        number += 1
+        pace.advance()
+        rest = frames.next_row(number)
+    if rest is None:
+        desk.say(number, "the record has ended")
+    ring.close_writer()
+
+
+def enter_process(niceness: int = 0, *, turn: int = 0) -> None:
+    """Set up a process of a live loop: it ends with the one that started it, to which alone Ctrl+C goes.
+
+    niceness : of one that may wait;  turn : as in `go_first`, of one that keeps time
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    prefer(niceness)
+    if turn:
+        go_first(turn)
+    parent = parent_process()
+    assert parent is not None
+
+    def end() -> None:
+        parent.join()
+        os._exit(1)
+
+    Thread(target=end, daemon=True).start()
+
+
+def receive(pipe: Connection) -> Any:
+    """Return what comes by a pipe from the process that started this one; without that process, end."""
+    try:
+        return pipe.recv()
+    except (EOFError, OSError):
+        raise SystemExit(1) from None
+
+
+def prefer(niceness: int) -> None:
+    """Give the calling thread, and what it starts, a niceness, where the system lets it: below 0 it runs before others that wait.
+
+    Only root, and who has CAP_SYS_NICE, may lower it.
+    """
+    with contextlib.suppress(AttributeError, OSError):  # another system, or no right to it
+        os.setpriority(os.PRIO_PROCESS, 0, niceness)
+
+
+def go_first(turn: int) -> bool:
+    """Have this process run as soon as it has something to do, before all of a lower turn; return whether the system lets it.
+
+    Turns are those of the real-time policy of Linux, which root may take, who has CAP_SYS_NICE, and others as far as
+    RLIMIT_RTPRIO says; 0 is the usual policy.
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR if turn else os.SCHED_OTHER, os.sched_param(turn))
+    except (AttributeError, OSError):  # another system, or no right to it
+        return False
+    return True
+
+
+def may_go_first() -> bool:
+    """Return whether the system lets processes like this one go first; its own turn is the usual one afterwards."""
+    may = go_first(SOURCE)
+    go_first(0)
+    return may
+
 
 SIMULATION, RECORD, STREAM = "simulation", "record", "stream"
 """Names of sources."""

@@ -9,11 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from wfsobs.live.board import NEXT, SLOTS
-from wfsobs.live.crew import slot_width
-from wfsobs.live.delivery import merged_rows
-from wfsobs.live.ring import LiveFrame, Ring
-from wfsobs.live.rows import Rows
+from wfsobs.live.board import NEXT, SLOTS, slot_width
+from wfsobs.live.ring import LiveFrame, Ring, Rows, merged_rows
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import TOTAL
 from wfsobs.typing import Array

@@ -7,6 +7,8 @@ causal, so its estimate of step k is what the filter gives at step k.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Look, Observer, Tunable
@@ -94,14 +96,9 @@ def step_butterworth_cl(prior: Prior, _settings: None, sampling: Sampling, horiz
     return BankEstimator(prior.bands, sampling)
 
 
-def step_persistence(_prior: Prior, _settings: None, sampling: Sampling, _horizon: float) -> LastValue:
-    """Return `persistence`, one frame at a time."""
-    return LastValue(sampling, 1.0)
-
-
-def step_zero(_prior: Prior, _settings: None, sampling: Sampling, _horizon: float) -> LastValue:
-    """Return `zero`, one frame at a time."""
-    return LastValue(sampling, 0.0)
+def step_last_value(factor: float, _prior: Prior, _settings: None, sampling: Sampling, _horizon: float) -> LastValue:
+    """Return z times a factor, one frame at a time: `persistence` or `zero`."""
+    return LastValue(sampling, factor)
 
 
 BUTTERWORTH_OL = Observer(
@@ -140,7 +137,7 @@ PERSISTENCE = Observer(
     linear=True,
     weight=0.1,
     look=Look("Persistence", "#8F8F63", "#A37F9E", (1, 3)),
-    step=step_persistence,
+    step=partial(step_last_value, 1.0),
 )
 
 ZERO = Observer(
@@ -152,5 +149,5 @@ ZERO = Observer(
     linear=True,
     weight=0.1,
     look=Look("Zero", "#8A8A8A", "#9A9A9A", (2, 4)),
-    step=step_zero,
+    step=partial(step_last_value, 0.0),
 )

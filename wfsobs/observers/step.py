@@ -68,7 +68,17 @@ class Estimator(Stateful, Protocol):
         ...
 
 
-class HeldEstimate(StateArrays):
+class PromptEstimator(StateArrays):
+    """An estimator of z and NGS frames that predicts any horizon and defers no work."""
+
+    horizon: float | None = None
+    needs_command = False
+
+    def settle(self) -> None:
+        """No deferred work."""
+
+
+class HeldEstimate(PromptEstimator):
     """An estimator that makes its estimate in `advance`, for one horizon.
 
     Parameters
@@ -82,7 +92,6 @@ class HeldEstimate(StateArrays):
     """
 
     state_names: tuple[str, ...] = ("_mean",)
-    needs_command = False
 
     def __init__(self, n_modes: int, horizon: float | None, before: float = np.nan):
         self.horizon = horizon
@@ -91,9 +100,6 @@ class HeldEstimate(StateArrays):
     def predict(self, frames: float, target: str) -> tuple[Array, Array]:
         """Return mean and standard deviation of the last frame."""
         return self._mean, self._sd
-
-    def settle(self) -> None:
-        """No deferred work."""
 
     def take_over(self, old: Any) -> None:
         """Go on from another design with a state of the same shapes. Raises StepError."""
@@ -106,8 +112,8 @@ class HeldEstimate(StateArrays):
 MakeEstimator = Callable[[Prior, Any, Sampling, float], Estimator]
 """(prior, settings, sampling, horizon) -> estimator. Raises ValueError with the reason where there is none."""
 
-EVERY = 1000
-"""Frames between two looks at whether to stop."""
+EVERY = 200
+"""Frames between two looks at whether to stop: the largest training set of a GPR takes 10 ms a frame."""
 
 
 def each_frame(estimator: Any, measurements: Measurements, watch: Watch) -> Iterator[tuple[Array, Array | None, Array]]:

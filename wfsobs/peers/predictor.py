@@ -23,9 +23,8 @@ from wfsobs.priors_from.identification import told_by
 from wfsobs.record import Record, Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.stepping import design
-from wfsobs.streams.going_back import GoingBack
 from wfsobs.streams.layout import StreamError
-from wfsobs.streams.ngs_frames import NgsStream
+from wfsobs.streams.ngs_frames import GoingBack, NgsStream
 from wfsobs.streams.wiring import STUCK, NgsWiring
 from wfsobs.typing import Array
 

@@ -19,7 +19,7 @@ import numpy as np
 from bokeh.embed import file_html
 from bokeh.resources import INLINE
 
-from wfsobs.files import check_writable, write_whole
+from wfsobs.files import check_writable, write_text, write_whole
 from wfsobs.observers.base import Look
 from wfsobs.plot.looks import look
 from wfsobs.settings.errors import SettingError
@@ -216,7 +216,7 @@ def save_figure(figure: Any, path: str | Path, *, width: float = COLUMN, height:
         )
     if path.suffix == ".html":
         page = file_html(hv.renderer("bokeh").get_plot(figure).state, INLINE, path.stem)
-        write_whole(path, lambda file: file.write(page.encode()))
+        write_text(path, page)
         return
     drawn = to_matplotlib(figure, width, height)
     with mpl.rc_context(PAPER):

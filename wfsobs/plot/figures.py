@@ -16,7 +16,7 @@ import numpy as np
 from wfsobs.campaign.sweep import SweepResults
 from wfsobs.closed_loop.envelope import PlantEnvelope
 from wfsobs.closed_loop.rows import ClosedLoop, residual_rms
-from wfsobs.control.curves import Curves, curves
+from wfsobs.control.margins import Curves, curves
 from wfsobs.evaluation.budget import TERMS, error_budget
 from wfsobs.evaluation.error_spectra import FEWEST, TRUTH, cumulative_rms
 from wfsobs.evaluation.result import Result
@@ -40,7 +40,7 @@ from wfsobs.plot.looks import TERM_COLOURS, look
 from wfsobs.record import Record, hold_last
 from wfsobs.scenario.grid import Variation
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
-from wfsobs.signal.welch import psd
+from wfsobs.signal.spectrum import psd
 from wfsobs.typing import Array
 from wfsobs.units import unit_text
 

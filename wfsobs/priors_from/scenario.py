@@ -1,17 +1,26 @@
-"""What observers and controllers are told of a scenario: matched to it, or wrong on purpose where its settings say so."""
+"""Priors of a scenario for observers and controllers: matched to it, or in error where its settings ask for that.
+
+The part of the vibration that is no line is a few processes; the turbulence is the scenario's own process, or one that is
+fitted to its true spectra.
+
+Without a choice of observers, those run that the scenario has an input for. An observer of the correlation of modes, or of
+guide stars, equals a simpler one where there is none: it is left out then, and refuses to run if chosen.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from math import sqrt
 from types import MappingProxyType
 from typing import TypeVar
 
 import numpy as np
 
+from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
-from wfsobs.observers.kalman.single import steady_filter
+from wfsobs.observers.kalman.single import MIN_NOISE, steady_filter
 from wfsobs.prior import (
     Asterism,
     Bands,
@@ -34,18 +43,282 @@ from wfsobs.prior import (
     Spectra,
     Training,
 )
-from wfsobs.priors_from.flow import asterism_of, flow_of, flow_of_both
 from wfsobs.priors_from.training import training_of
-from wfsobs.priors_from.turbulence import beams_of, lgs_error_of, lines_turbulence, measurement_noise, one_process, stars_of
-from wfsobs.priors_from.vibration import vibration_continuum
 from wfsobs.record import Measurements, Record, Sampling
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.measured_spectra import ALL, LINES
 from wfsobs.settings.group import Group
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.ar3 import Ar3
+from wfsobs.signal.ar3 import Ar3, Ar3Fits, SharedProcess, fit_shared_process
 from wfsobs.signal.statespace import MIN_MODEL_DAMPING, DisturbanceModel
-from wfsobs.simulation.disturbance import vibration_lines, vibration_variance
-from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, true_spectra
+from wfsobs.simulation.disturbance import vibration_lines, vibration_power, vibration_variance
+from wfsobs.simulation.flow_spectra import star_basis
+from wfsobs.simulation.guide_stars import lgs_error_process, lgs_error_variance, lgs_noise_rms, lgs_weights, stars_differ
+from wfsobs.simulation.layers import relative_rms
+from wfsobs.simulation.mode_spectra import ModeSpectra, are_coupled, beam_spectra, combined_spectra, frequency_rule, mode_spectra
+from wfsobs.simulation.sensor_noise import noise_rms
+from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, lgs_turbulence_spectrum, n_frequencies, true_spectra
+from wfsobs.simulation.turbulence import processes, turbulence_process, turbulence_rms
+from wfsobs.simulation.turbulence_spectra import TurbulenceSpectra, turbulence_spectra
+from wfsobs.spectral.rational import fit_processes
+from wfsobs.typing import Array
+
+Of = TypeVar("Of", bound=Asterism)
+
+
+def flow_of(scenario: Scenario, n_modes: int, dt: float | None = None) -> Flow | None:
+    """Return the turbulence of the first modes together; None where they tell nothing of one another.
+
+    dt : [s], by default that of the scenario. Where the strength of the model is set by hand the flow has that.
+    """
+    if not are_coupled(scenario) or n_modes < 2:
+        return None
+    return _flow(scenario, dt or scenario.dt).first(n_modes)
+
+
+def asterism_of(scenario: Scenario, n_modes: int, dt: float | None = None) -> Asterism | None:
+    """Return the turbulence of the first modes in every beam; None where all LGS see the same. dt, strength : as in `flow_of`."""
+    if not has_stars_apart(scenario):
+        return None
+    return _make_asterism(scenario, dt or scenario.dt).first(n_modes)
+
+
+def flow_of_both(scenario: Scenario, n_modes: int, dt: float | None = None) -> FlowOfBoth | None:
+    """Return that in what is made of all LGS, and in the NGS; None as in `flow_of`, which has dt and strength."""
+    if not are_coupled(scenario) or n_modes < 2:
+        return None
+    return _flow_of_both(scenario, dt or scenario.dt).first(n_modes)
+
+
+def has_stars_apart(scenario: Scenario) -> bool:
+    """Return whether every LGS tells something that their mean does not."""
+    return any(stars_differ(scenario, mode) for mode in range(len(scenario.modes)))
+
+
+@lru_cache(maxsize=4)
+def _flow(scenario: Scenario, dt: float) -> Flow:
+    """Return that of all modes, which takes a while."""
+    frequency, weight = frequency_rule(scenario)
+    found, strength = mode_spectra(scenario, frequency), _strength(scenario, dt)
+    by_pair = weight * np.outer(strength, strength)[:, :, None]
+    return Flow(
+        omega=2.0 * np.pi * frequency * dt,
+        own=found.own * weight * strength[:, None] ** 2,
+        measurement=found.measurement * by_pair,
+        cross=found.cross * by_pair,
+        line_gain=_line_gain(scenario),
+    )
+
+
+@lru_cache(maxsize=2)
+def _make_asterism(scenario: Scenario, dt: float) -> Asterism:
+    """Return that of all modes, which takes a while."""
+    every, m = lgs_weights(scenario), range(len(scenario.modes))
+    alone = np.sqrt(np.sum(every[m, :, m] ** 2, axis=1))  # noise of their combination, over that of one
+    return _of_beams(Asterism, scenario, dt, beam_spectra, star_basis(len(every[0])), alone, every, np.ones(len(m)))
+
+
+@lru_cache(maxsize=2)
+def _flow_of_both(scenario: Scenario, dt: float) -> FlowOfBoth:
+    """Return that of all modes, which takes a while."""
+    m = len(scenario.modes)
+    itself = np.eye(m)[:, None]
+    return _of_beams(FlowOfBoth, scenario, dt, combined_spectra, np.eye(1), np.ones(m), itself, _line_gain(scenario))
+
+
+def _of_beams(
+    kind: type[Of],
+    scenario: Scenario,
+    dt: float,
+    spectra: Callable[[Scenario, Array], ModeSpectra],
+    basis: Array,
+    noise_gain: Array,
+    combination: Array,
+    line_gain: Array,
+) -> Of:
+    """Return the turbulence in the beams of the LGS and in the NGS.
+
+    noise_gain : noise of all LGS together, over that of one, (n_modes,);  the others as in `Asterism`
+    """
+    frequency, weight = frequency_rule(scenario)
+    found, strength, beams = spectra(scenario, frequency), _strength(scenario, dt), len(basis) + 1
+    m = len(strength)
+    by_pair = weight * np.outer(strength, strength)[:, :, None]
+    noise, ngs_noise = np.array([measurement_noise(scenario, mode) for mode in range(m)]).T
+    return kind(
+        omega=2.0 * np.pi * frequency * dt,
+        own=found.own * weight * strength[:, None] ** 2,
+        measurement=found.measurement.reshape(beams, m, beams, m, -1) * by_pair[:, None],
+        cross=found.cross.reshape(m, beams, m, -1) * by_pair[:, None],
+        basis=basis,
+        noise=noise / noise_gain,
+        ngs_noise=ngs_noise,
+        combination=combination,
+        line_gain=line_gain,
+        ratio=scenario.sensors.exposure_ratio,
+    )
+
+
+def _line_gain(scenario: Scenario) -> Array:
+    """Return the gain of the combined LGS for the vibration of each mode, (n_modes,)."""
+    modes = range(len(scenario.modes))
+    return lgs_weights(scenario)[modes, :, modes].sum(axis=1)
+
+
+def _strength(scenario: Scenario, dt: float) -> Array:
+    """Return the strength of the model over that of the turbulence, (n_modes,)."""
+    modes = range(len(scenario.modes))
+    own = [turbulence_process(scenario, mode, dt).rms for mode in modes]
+    return np.divide([one_process(scenario, mode, dt).rms for mode in modes], own)
+
+
+def lgs_error_of(scenario: Scenario, mode: int, dt: float | None = None) -> LgsError:
+    """Return the slow error of the combined LGS in one mode."""
+    return LgsError(lgs_error_process(scenario, mode, dt or scenario.dt))
+
+
+def stars_of(scenario: Scenario, mode: int, dt: float | None = None) -> LgsStars:
+    """Return what the LGS together are in one mode where some are out; dt [s]: by default that of the scenario.
+
+    What the variance of the error grows by where one is out is a slow error of its own.
+    """
+    count, process = scenario.sensors.lgs_count, lgs_error_process(scenario, mode, dt or scenario.dt)
+    noises = np.array([max(lgs_noise_rms(scenario, mode, stars), MIN_NOISE) for stars in range(1, count + 1)])
+    growth = -np.diff([lgs_error_variance(scenario, mode, stars) for stars in range(1, count + 1)])
+    slow = tuple(replace(process, rms=float(np.sqrt(max(variance, 0.0)))) for variance in growth)
+    return LgsStars(tuple((noises / noises[-1]).tolist()), slow)
+
+
+def one_process(scenario: Scenario, mode: int, dt: float) -> Ar2:
+    """Return the turbulence of the model with one peak."""
+    turbulence = turbulence_process(scenario, mode, dt)
+    if scenario.kalman.process_noise == "manual":
+        return replace(turbulence, rms=scenario.kalman.turbulence_rms * relative_rms(scenario, mode))
+    return turbulence
+
+
+def measurement_noise(scenario: Scenario, mode: int) -> tuple[float, float]:
+    """Return the rms of the modelled noise [um] of the combined LGS and of an NGS frame in one mode."""
+    k = scenario.kalman
+    if k.measurement_noise == "manual":
+        return k.lgs_noise, k.ngs_noise
+    return max(lgs_noise_rms(scenario, mode), MIN_NOISE), max(float(noise_rms(scenario, "ngs")[mode]), MIN_NOISE)
+
+
+def lines_turbulence(
+    scenario: Scenario, mode: int, dt: float, spectrum: Array | None = None, fits: Ar3Fits | None = None
+) -> tuple[Ar2 | Ar3, ...]:
+    """Return a scenario's own processes, in the strength of the model; else one process, as `modelled_turbulence`."""
+    found = processes(scenario, mode, dt) if scenario.turbulence.source == "processes" else []
+    if not found:
+        return (modelled_turbulence(scenario, mode, dt, spectrum, fits),)
+    if scenario.kalman.process_noise == "matched":
+        return tuple(found)
+    factor = one_process(scenario, mode, dt).rms / turbulence_rms(scenario, mode)
+    return tuple(replace(p, rms=factor * p.rms) for p in found)
+
+
+def modelled_turbulence(
+    scenario: Scenario, mode: int, dt: float, spectrum: Array | None = None, fits: Ar3Fits | None = None
+) -> Ar2 | Ar3:
+    """Return the turbulence of the model: that of one peak, or of third order and nearest to the true spectrum of the LGS.
+
+    spectrum : that of the turbulence in the LGS (`lgs_turbulence_spectrum`), where already computed
+    fits : those of similar scenarios, to start from
+    """
+    process = one_process(scenario, mode, dt)
+    if not _is_third_order(scenario, process):
+        return process
+    return _fit_seen(scenario, mode, dt) if spectrum is None else _fit_third_order(scenario, mode, dt, spectrum, fits)
+
+
+@lru_cache(maxsize=32)
+def _fit_seen(scenario: Scenario, mode: int, dt: float) -> Ar3:
+    """Return the fit to the spectrum that the LGS measure; kept, since every observer with several lines needs the same one."""
+    return _fit_third_order(scenario, mode, dt, lgs_turbulence_spectrum(scenario, mode))
+
+
+def _fit_third_order(scenario: Scenario, mode: int, dt: float, spectrum: Array, fits: Ar3Fits | None = None) -> Ar3:
+    noise, _ = measurement_noise(scenario, mode)
+    return (fits or Ar3Fits()).fit("LGS", spectrum, noise**2, _third_order(one_process(scenario, mode, dt)))
+
+
+def beams_of(
+    scenario: Scenario,
+    mode: int,
+    dt: float | None = None,
+    spectra: TurbulenceSpectra | None = None,
+    fits: Ar3Fits | None = None,
+) -> Beams:
+    """Return turbulence as the target has it and as the LGS see it in one mode; dt [s]: by default that of the scenario.
+
+    Of third order it is fitted to the true spectra of both and to their cross spectrum, else it is the AR(2) and the slow error.
+
+    spectra : the true ones, where already computed
+    fits : those of similar scenarios, to start from
+    """
+    dt = dt or scenario.dt
+    line_gain = float(lgs_weights(scenario)[mode, :, mode].sum())
+    process = one_process(scenario, mode, dt)
+    if scenario.turbulence.source == "processes" or not _is_third_order(scenario, process):
+        return Beams(lines_turbulence(scenario, mode, dt), lgs=(lgs_error_of(scenario, mode, dt).process,), line_gain=line_gain)
+    found = _shared_turbulence(scenario, mode, dt) if spectra is None else _fit_shared(scenario, mode, dt, spectra, fits)
+    factor = process.rms / turbulence_process(scenario, mode, dt).rms  # where the strength is set by hand
+    common, target, lgs = (tuple(replace(p, rms=factor * p.rms) for p in part) for part in found[1:])
+    return Beams(common, target, lgs, found.gain, line_gain)
+
+
+@lru_cache(maxsize=32)
+def _shared_turbulence(scenario: Scenario, mode: int, dt: float) -> SharedProcess:
+    """Return the fit to the spectra, which takes a while."""
+    return _fit_shared(scenario, mode, dt, turbulence_spectra(scenario, mode, n_frequencies(scenario, mode)))
+
+
+def _fit_shared(
+    scenario: Scenario, mode: int, dt: float, spectra: TurbulenceSpectra, fits: Ar3Fits | None = None
+) -> SharedProcess:
+    noise, _ = measurement_noise(scenario, mode)
+    start = _third_order(turbulence_process(scenario, mode, dt))
+    return fit_shared_process(spectra.own, spectra.measurement, np.real(spectra.cross), noise**2, start, fits)
+
+
+def _is_third_order(scenario: Scenario, process: Ar2) -> bool:
+    return scenario.multipeak.turbulence_order == 3 and process.rms > 0
+
+
+def _third_order(process: Ar2) -> Ar3:
+    """Return a first guess for fits."""
+    return Ar3(process.omega, process.damping, 5.0 * process.omega, process.rms, process.dt)
+
+
+PROCESSES = 8
+"""Processes of a continuum. With five, `multirate-multi` is up to 1.27 times the bound on `ut4-floor`, with eight 1.23."""
+
+
+@lru_cache(maxsize=32)
+def vibration_continuum(scenario: Scenario, mode: int) -> tuple[Ar2, ...]:
+    """Return processes whose sum has the spectrum of what is no line in a mode's vibration; none where all of it is lines.
+
+    Fitted beside turbulence and noise of the LGS, at the step of the scenario.
+    """
+    n = n_frequencies(scenario, mode)
+    power = continuum_power(scenario, mode, n)
+    if not power.any():
+        return ()
+    beside = measurement_noise(scenario, mode)[0] ** 2 + lgs_turbulence_spectrum(scenario, mode)
+    return fit_processes(0.5 * n * power, beside, scenario.dt, PROCESSES)
+
+
+def continuum_power(scenario: Scenario, mode: int, n: int) -> Array:
+    """Return the variance [um^2] of what is no line in a mode's vibration, in each DFT bin of `n` steps, even, (n // 2 + 1,)."""
+    v = scenario.vibration
+    if v.source == "psd":
+        return vibration_power(scenario, mode, n)
+    if v.source != "measured" or v.part != ALL:
+        return np.zeros(n // 2 + 1)
+    lines = vibration_power(scenario.replace({"vibration.part": LINES}), mode, n)
+    return np.maximum(vibration_power(scenario, mode, n) - lines, 0.0)
+
 
 T = TypeVar("T", Model, Bands)
 
@@ -238,3 +511,38 @@ def as_sampled(scenario: Scenario, sampling: Sampling) -> Scenario:
     if sampling.ratio is not None and sampling.ratio != scenario.sensors.exposure_ratio:
         changes["sensors.exposure_ratio"] = sampling.ratio
     return scenario.replace(changes) if changes else scenario
+
+
+def has_prior(observer: Observer, scenario: Scenario, n_modes: int | None = None) -> bool:
+    """Return whether a scenario has what an observer is told; n_modes : of the record, by default those of the scenario."""
+    n = len(scenario.modes) if n_modes is None else n_modes
+    is_alone = Asterism in observer.prior and not has_stars_apart(scenario)
+    is_joint = not {Flow, FlowOfBoth}.isdisjoint(observer.prior)
+    return not is_alone and (not is_joint or (are_coupled(scenario) and n > 1))
+
+
+def is_usual(observer: Observer, scenario: Scenario, record: Record | None = None) -> bool:
+    """Return whether an observer runs on a record of a scenario, or on its own, though it is not named."""
+    is_without_stars = record is not None and record.y_stars is None and "y_stars" in observer.needs
+    return not is_without_stars and has_prior(observer, scenario, None if record is None else record.n_modes)
+
+
+def usual_observers(scenario: Scenario, record: Record | None = None) -> list[str]:
+    """Return the ids of the observers that run where none is named."""
+    return [o.id for o in OBSERVERS.values() if is_usual(o, scenario, record)]
+
+
+def common_observers(scenarios: Iterable[Scenario]) -> tuple[str, ...]:
+    """Return the ids of the observers that every scenario has something for."""
+    found = list(OBSERVERS)
+    for scenario in scenarios:
+        found = [name for name in found if has_prior(OBSERVERS[name], scenario)]
+    return tuple(found)
+
+
+def quick_observers(scenario: Scenario, groups: Container[str | None] = ()) -> list[str]:
+    """Return the ids of `usual_observers` but for those that learn during the run.
+
+    groups : of settings; those that learn and have one of them as their own stay
+    """
+    return [name for name in usual_observers(scenario) if not (o := OBSERVERS[name]).slow or o.group in groups]

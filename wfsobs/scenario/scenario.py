@@ -16,13 +16,10 @@ import numpy as np
 import param
 
 from wfsobs import registry
-from wfsobs.scenario.groups.atmosphere import PsdTable, Telescope, Turbulence
+from wfsobs.scenario.groups.atmosphere import PsdTable, Telescope, Turbulence, Vibration
 from wfsobs.scenario.groups.events import FRAMES, LASER, PEAK, WIND, Event, shift, turbulence_time
-from wfsobs.scenario.groups.plant import PlantErrors
-from wfsobs.scenario.groups.run import Control, Loop, Run
-from wfsobs.scenario.groups.sensors import Sensors
-from wfsobs.scenario.groups.vibration import Vibration
-from wfsobs.scenario.lenslet_fit import fit_lenslets
+from wfsobs.scenario.groups.plant import Control, Loop, PlantErrors, Run
+from wfsobs.scenario.groups.sensors import Sensors, fit_lenslets
 from wfsobs.sensors.modes import Mode, modes_up_to
 from wfsobs.settings.errors import SettingError
 from wfsobs.settings.group import Group, Section, section

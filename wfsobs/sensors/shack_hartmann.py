@@ -11,17 +11,19 @@ Slopes and fit are linear, so an output is one sum over the cells of the pupil, 
 with w the weights of the cells of side h. No slope is computed: the cost is that of the output modes,
 whatever the number of subapertures.
 
-Non-uniform FFT of a square grid, and Lagrange interpolation.
-
 A sum of exponentials is one Fourier transform onto a grid of twice the resolution, and five points of that grid along each
 axis for every point, with a Kaiser-Bessel window whose own transform is divided out beforehand: the non-uniform fast
 Fourier transform of type 2 (J. A. Fessler and B. P. Sutton, IEEE Trans. Signal Process. 51, 560, 2003).
+
+The noise is that of the spots and of their centre of gravity. Aliasing is an error term of its own: the sensor's output minus
+the Zernike coefficients of the phase in the same beam. The fitted modes do not contribute; the rest of the turbulence drives
+it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -30,11 +32,56 @@ from scipy.sparse import csr_array
 from scipy.special import i0
 
 from wfsobs.atmosphere.plane_waves import Footprint, Wave
-from wfsobs.sensors.lenslets import Lenslets
-from wfsobs.sensors.reconstructor import reconstructor
-from wfsobs.sensors.spots import SpotModel
+from wfsobs.atmosphere.von_karman import von_karman_density
+from wfsobs.sensors import zernike
+from wfsobs.sensors.lenslets import Lenslets, reconstructor
 from wfsobs.sensors.zernike import noll
 from wfsobs.typing import Array
+
+ARCSEC = np.pi / 180.0 / 3600.0
+"""One arcsecond [rad]."""
+
+
+@dataclass(frozen=True)
+class SpotModel:
+    """The spots of a sensor and their detector. Spots are round: the elongation of a laser's spot is not modelled.
+
+    Attributes
+    ----------
+    photons : float
+        Detected per frame by a fully lit subaperture [e-].
+    read_noise : float
+        Rms per pixel and frame [e-].
+    fwhm : float
+        Full width at half maximum of a spot [arcsec].
+    pixel_scale : float
+        Angle of a pixel [arcsec].
+    pixels : int
+        Side of the window of the centre of gravity.
+    """
+
+    photons: float
+    read_noise: float
+    fwhm: float
+    pixel_scale: float
+    pixels: int
+
+    def slope_variance(self, lit: Array) -> Array:
+        """Return the variance of a slope [um^2/m^2] of subapertures with the lit fraction `lit`.
+
+        For a Gaussian spot in photon noise, and read noise on every pixel of the window (G. Rousset in F. Roddier (ed.),
+        "Adaptive optics in astronomy", 1999; S. Thomas et al., Mon. Not. R. Astron. Soc. 371, 323, 2006):
+
+            fwhm^2 / (8 ln 2 photons) + pixel_scale^2 (read_noise / photons)^2 N^2 (N^2 - 1) / 12,
+
+        where N^2 (N^2 - 1) / 12 is the sum of the squares of the pixels' positions along an axis.
+        """
+        photons = self.photons * lit
+        photon_noise = self.fwhm**2 / (8.0 * np.log(2.0) * photons)
+        places = self.pixels**2 * (self.pixels**2 - 1) / 12.0
+        read_noise = (self.pixel_scale * self.read_noise / photons) ** 2 * places
+        return (photon_noise + read_noise) * (1e6 * ARCSEC) ** 2
+
 
 WIDTH = 5
 SHAPE = np.pi * WIDTH * 0.75  # of the window, for a grid twice as fine
@@ -205,3 +252,47 @@ class ShackHartmann:
             known = wave, scale, np.moveaxis(made, 2, 0).astype(np.complex64, order="C")
             self._memory = known
         return known[2]
+
+
+RINGS, SPOKES = 800, 40
+RADII = np.geomspace(0.005, 2000.0, RINGS)
+"""k D / 2 at which the plane is sampled."""
+GOLDEN = (np.arange(RINGS) * 0.5 * (np.sqrt(5.0) - 1.0)) % 1.0
+ANGLES = (np.arange(SPOKES) + GOLDEN[:, None]) * (np.pi / SPOKES)
+"""Points of the rings (RINGS, SPOKES), every ring rotated against the last for even coverage of all directions.
+
+A half-plane is enough: the transforms at k and -k are conjugate.
+"""
+
+
+class Aliasing:
+    """The aliasing error of one sensor, for any layer and beam."""
+
+    def __init__(self, sensor: ShackHartmann) -> None:
+        self.sensor = sensor
+        self._radius = sensor.lenslets.diameter / 2.0
+        kx, ky = RADII[:, None] * np.cos(ANGLES), RADII[:, None] * np.sin(ANGLES)
+        wrong = sensor.transform(kx / self._radius, ky / self._radius)
+        wrong -= [zernike.transform(j, kx, ky) for j in sensor.nolls]
+        self._power = np.einsum("ikt,jkt->kij", wrong, wrong.conj()).real / SPOKES
+
+    def covariance(self, strength: float, outer_scale: float, scale: float = 1.0) -> Array:
+        """Return the covariance of the error in a layer.
+
+        Parameters
+        ----------
+        strength : float
+            r0^(-5/3), r0 at 500 nm [m^(-5/3)].
+        outer_scale : float
+            L0 [m].
+        scale : float
+            Scale of the beam, see `Footprint`.
+
+        Returns
+        -------
+        Array
+            (n_outputs, n_outputs) [um^2].
+        """
+        k = RADII / (self._radius * scale)
+        ring = 2.0 * np.pi * k**2 * np.log(RADII[1] / RADII[0])
+        return np.tensordot(von_karman_density(k**2, strength, outer_scale) * ring, self._power, 1)

@@ -2,18 +2,31 @@
 
 Frozen flow falls as f^-17/3 there (Conan, Rousset and Madec, JOSA A 12, 1559, 1995), an AR(2) as f^-4: a filter
 with the AR(2) model takes too much of the noise for turbulence.
+
+Two views of one process as a sum of independent processes, fitted to their spectra.
+
+The views are s and m, with real cross spectrum. With a gain g,
+
+    s = c + d,    m = g c + e,
+
+c is what both see, d and e what one sees alone. Then S_c = S_sm / g, S_d = S_s - S_sm / g and S_e = S_m - g S_sm, which at every
+frequency are positive for some g. Here it is the regression of m on s, so that what is strong is common; where others came out
+negative they are taken as zero. Each is a third-order process (`ar3`) in the white noise beside which it has to be known.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import cos, exp, expm1, sin, sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, logit
 
 from wfsobs.signal.whittle import negative_log_likelihood, whittle_fit
+from wfsobs.signal.wiener import circle_mean
 from wfsobs.typing import Array
 
 SLOWEST = 3e-3
@@ -64,9 +77,15 @@ class Ar3:
         The product of 1 - p_i p_j over i <= j, divided by 1 + e_2 - e_1 e_3 - e_3^2 with e_i the elementary symmetric polynomials
         of the poles: one over the sum of squares of the impulse response. Grouped so that nothing cancels when it is slow.
         """
-        a, total = self.decays, self.decays.sum()
-        pairs = np.prod(-np.expm1(-(a[:, None] + a))[np.triu_indices(3)])
-        return float((pairs / (-np.expm1(-2.0 * total) - (np.exp(a - total) * np.expm1(-2.0 * a)).sum())).real)
+        x, y, z = self.damping * self.omega * self.dt, sqrt(1.0 - self.damping**2) * self.omega * self.dt, self.corner * self.dt
+        pairs = expm1(-2.0 * x) * expm1(-2.0 * z) * _distance(2.0 * x, 2.0 * y) * _distance(x + z, y)
+        total = 2.0 * x + z
+        return -pairs / (expm1(-2.0 * total) + 2.0 * cos(y) * exp(x - total) * expm1(-2.0 * x) + exp(z - total) * expm1(-2.0 * z))
+
+    @property
+    def drive_variance(self) -> float:
+        """Variance of the drive for which the process has the variance rms^2."""
+        return self.rms**2 * self.unit_drive_variance
 
     @property
     def reflections(self) -> Array:
@@ -81,7 +100,7 @@ class Ar3:
     def psd(self, frequency: Array) -> Array:
         """Return the one-sided power spectral density [unit^2/Hz] at `frequency` [Hz]."""
         half = np.pi * np.asarray(frequency) * self.dt
-        out = np.full(half.shape, 2.0 * self.dt * self.rms**2 * self.unit_drive_variance)
+        out = np.full(half.shape, 2.0 * self.dt * self.drive_variance)
         for a in self.decays:  # |1 - p q|^2 without cancellation, and without complex exponentials, which take five times as long
             within = -np.expm1(-a.real)
             out /= within**2 + 4.0 * (1.0 - within) * np.sin(half + 0.5 * a.imag) ** 2
@@ -91,51 +110,61 @@ class Ar3:
         """Return the derivatives of log `psd` by log omega, logit damping, log corner and log rms, (4, n)."""
         a, xi = self.decays, self.damping
         turn = 2j * np.pi * np.asarray(frequency) * self.dt
-        pairs = 1.0 / np.expm1(a[:, None] + a)
+        pairs = _inverse_expm1(a[:, None] + a)
         drive = pairs.sum(axis=1) + np.diag(pairs) + 1.0
-        drive -= (np.cosh(a.sum()) + np.cosh(a)) / (np.sinh(a.sum()) + np.sinh(a).sum())
-        by_decay = drive[:, None] - 2.0 / np.expm1(a[:, None] + turn)
+        total, share = a.sum(), np.exp(a - a.sum())
+        drive -= (1.0 + np.exp(-2.0 * total) + share * (1.0 + np.exp(-2.0 * a))) / (
+            -np.expm1(-2.0 * total) - (share * np.expm1(-2.0 * a)).sum()
+        )
+        by_decay = drive[:, None] - 2.0 * _inverse_expm1(a[:, None] + turn)
         damped = self.omega * self.dt * complex(xi * (1.0 - xi), -(xi**2) * np.sqrt((1.0 - xi) / (1.0 + xi)))
         moves = np.array([[a[0], a[1], 0.0], [damped, damped.conjugate(), 0.0], [0.0, 0.0, a[2]]])
         return np.vstack([(moves @ by_decay).real, np.full(by_decay.shape[1], 2.0)])
 
 
-def fit_ar3(spectrum: Array, noise: float, start: Ar3) -> Ar3:
-    """Fit a third-order process in white noise to a spectrum.
+def _inverse_expm1(s: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Return 1 / (exp(s) - 1), finite for a large real part."""
+    lost: NDArray[np.complex128] = np.expm1(-s)
+    return -(1.0 + lost) / lost
 
-    The fit makes the innovations of the filter built on it as white and as small as possible: it minimises the mean of
-    log S + S_true / S (`whittle`). Frequencies are thinned to a fixed number per octave, each with the weight of those it
-    replaces. There can be two minima, with the pair below or above the real pole: the fit starts from `start` and from the
-    same with the two exchanged, and keeps the lower minimum.
 
-    Parameters
-    ----------
-    spectrum : Array
-        Two-sided spectrum per sample, on the frequencies of `wiener`, (n // 2 + 1,).
-    noise : float
-        Variance of the white noise, the same in spectrum and fit.
-    start : Ar3
-        First guess.
-
-    Returns
-    -------
-    Ar3
-        The process whose spectrum is nearest.
-    """
-    return Ar3Fits().fit("", spectrum, noise, start)
+def _distance(decay: float, angle: float) -> float:
+    """Return the square of |1 - exp(-decay + i angle)| without cancellation."""
+    return expm1(-decay) ** 2 + 4.0 * exp(-decay) * sin(0.5 * angle) ** 2
 
 
 class Ar3Fits:
-    """Fits as `fit_ar3`, of spectra that change little by little: each starts where the two before it ended.
+    """Fits of third-order processes in white noise to spectra, each from where the last one of its name ended.
 
-    That takes a quarter of the steps. A minimum that comes up while both are at another one is not found.
+    A fit makes the innovations of the filter built on it as white and as small as possible: it minimises the mean of
+    log S + S_true / S (`whittle`). Frequencies are thinned to a fixed number per octave, each with the weight of those it
+    replaces. There can be two minima, with the pair below or above the real pole: the first fit starts from `start` and from the
+    same with the two exchanged, and keeps the lower minimum. A later one starts where the two before it ended, which takes a
+    quarter of the steps. A minimum that comes up while both are at another one is not found.
     """
 
     def __init__(self) -> None:
         self._minima: dict[str, list[Ar3]] = {}
 
     def fit(self, name: str, spectrum: Array, noise: float, start: Ar3) -> Ar3:
-        """Fit the spectrum of that name, which starts at `start` only where there is none before it."""
+        """Fit a spectrum.
+
+        Parameters
+        ----------
+        name : str
+            Of the spectrum: its fit starts where the last one of this name ended.
+        spectrum : Array
+            Two-sided spectrum per sample, on the frequencies of `wiener`, (n // 2 + 1,) [um^2].
+        noise : float
+            Variance of the white noise, the same in spectrum and fit [um^2].
+        start : Ar3
+            First guess where there is no fit of this name.
+
+        Returns
+        -------
+        Ar3
+            The process whose spectrum is nearest.
+        """
         exchanged = replace(start, omega=start.corner, corner=start.omega)
         found = self._minima[name] = _minima(spectrum, noise, self._minima.get(name, [start, exchanged]))
         return found[0]
@@ -165,3 +194,59 @@ def _minima(spectrum: Array, noise: float, starts: Sequence[Ar3]) -> list[Ar3]:
         first = np.array([np.log(start.omega), logit(min(start.damping, 0.999)), np.log(start.corner), np.log(start.rms)])
         found.append(whittle_fit(density, log_slopes, first, bounds, mean, count, TOLERANCE, STEPS))
     return [process(x) for x in sorted(found, key=lambda x: negative_log_likelihood(density(x), mean, count))]
+
+
+NOTHING = 1e-6
+"""Variance over that of the noise below which a process is left out."""
+
+FLOOR = 1e-12
+"""Minimum of a spectrum, over the noise: where others would be negative."""
+
+
+class SharedProcess(NamedTuple):
+    """Processes common to both views, of s alone and of m alone; gain : of m for those in common."""
+
+    gain: float
+    common: tuple[Ar3, ...]
+    first: tuple[Ar3, ...]
+    second: tuple[Ar3, ...]
+
+
+def fit_shared_process(
+    first: Array, second: Array, cross: Array, noise: float, start: Ar3, fits: Ar3Fits | None = None
+) -> SharedProcess:
+    """Fit the processes of two views.
+
+    Parameters
+    ----------
+    first, second : Array
+        Spectra of s and m per sample, on the frequencies of `wiener`, (n // 2 + 1,).
+    cross : Array
+        Real part of their cross spectrum, (n // 2 + 1,).
+    noise : float
+        Variance of the white noise of a measurement.
+    start : Ar3
+        First guess of shape; each starts with its own rms.
+    fits : Ar3Fits, optional
+        Those of similar spectra, to start from.
+
+    Returns
+    -------
+    SharedProcess
+        Gain and processes.
+    """
+    fits = fits or Ar3Fits()
+
+    def fit(name: str, spectrum: Array) -> tuple[Ar3, ...]:
+        positive = np.maximum(spectrum, FLOOR * noise)
+        variance = circle_mean(positive)
+        if variance <= NOTHING * noise:
+            return ()
+        return (fits.fit(name, positive, noise, replace(start, rms=float(np.sqrt(variance)))),)
+
+    strength, together = circle_mean(first), circle_mean(cross)
+    gain = together / strength if strength > 0 else 0.0
+    if gain <= 0.0:
+        return SharedProcess(0.0, (), fit("first", first), fit("second", second))
+    common = cross / gain
+    return SharedProcess(gain, fit("common", common), fit("first", first - common), fit("second", second - gain * cross))

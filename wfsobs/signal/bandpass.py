@@ -59,33 +59,6 @@ def filter_zero_phase(bank: Sequence[Array], x: Array) -> Array:
     return out
 
 
-class StreamingBank:
-    """The causal bank, one sample at a time, as one state-space system.
-
-    The output needs only a product; the state is updated afterwards, in `settle`.
-    """
-
-    def __init__(self, bank: Sequence[Array]):
-        systems = [sos2ss(sos) for sos in bank]
-        self._A = block_diag(*(A for A, *_ in systems))
-        self._b = np.concatenate([b for _, b, *_ in systems])
-        self._c = np.concatenate([c for *_, c, _ in systems])
-        self._d = sum(d for *_, d in systems)
-        self._x = np.zeros(self._b.size)
-        self._z = 0.0
-        self._ahead = 0.0
-
-    def push(self, z: float) -> float:
-        """Return the filtered value at this sample."""
-        self._z = z
-        return self._ahead + self._d * z
-
-    def settle(self) -> None:
-        """Update the state with the last sample."""
-        self._x = self._A @ self._x + self._b * self._z
-        self._ahead = float(self._c @ self._x)
-
-
 def bank_recursion(bank: Sequence[Array]) -> Recursion:
     """Return `filter_causal` of one signal as a recursion."""
     systems = [sos2ss(sos) for sos in bank]

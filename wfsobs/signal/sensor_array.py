@@ -1,6 +1,6 @@
 """What several fast sensors and a slow one add to a fast one: the minimum error of any causal linear observer of all.
 
-As in `slow_sensor`, e are the innovations of the one sensor z, and what is to be gained by the others is the regression of the
+As below, e are the innovations of the one sensor z, and what is to be gained by the others is the regression of the
 rest of the target on the rests of their measurements, those of age a = 0, 1, ...,
 
     r_i[a] = y_i'[k - a] + sum_{t > 0} C_i[t + a] e[k+t],
@@ -12,6 +12,26 @@ S_ij - S_iz S_zj / S_z. With every one of them whitened by a causal factor of it
 
 in which E, the shares that sensors have in common, and K, the innovations that are still to come, are Toeplitz and Hankel
 matrices, multiplied by the FFT. No matrix spectrum is factorised. Measurements older than LONGEST steps are left out.
+
+With a slow sensor alone beside the fast one: the fast sensor gives z[k] at every step, the slow one a frame y[k] = x[k] + v[k]
+at every n-th, v white. Signals are stationary, the two sensors together are so only from one cycle of n steps to the next. With
+e the innovations of z, of variance one (`wiener`),
+
+    y[k] = sum_j c[j] e[k-j] + y'[k],
+
+over all j, past and future, where y' is what all of z leaves of the frames: it has the spectrum S_x - |S_xz|^2 / S_z, aliased,
+plus that of v. At a step k the last frame is p steps old, p = 0 ... n - 1, and innovations after k are not known. Of the frame of
+age p + n i remains
+
+    r_i = y'[k - p - n i] + sum_{t > 0} C[t + p + n i] e[k+t],    C[j] = c[-j],
+
+and of the target likewise s' + sum G[t] e[k+t]. What is to be gained by the frames is the regression of this rest on all r_i. A
+causal factor of the spectrum of y' turns it into white noise, in which a Hankel matrix K_ti = C'[t + p + n i] remains:
+
+    gain = b' (I + K' K)^-1 b,    b_i = E s' y'_i + sum_t G[t] K_ti.
+
+I + K' K has few eigenvalues that are not one, so that conjugate gradients need few steps, and no matrix spectrum has to be
+factorised.
 """
 
 from __future__ import annotations
@@ -20,17 +40,146 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from itertools import combinations, permutations
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from wfsobs.signal.slow_sensor import SlowSensor, SlowTarget
 from wfsobs.signal.wiener import Complex, Whitener, factorise, innovations_to_come, square
 from wfsobs.typing import Array
 
+KEPT = 0.875
+"""Share of the frames that half the DFT holds that is used: the oldest are whitened without those before them."""
+
+FRAMES_TOLERANCE = 1e-4
+"""Residual of a solution over its right-hand side; the gain is wrong by its square at most, since I + K' K is no less than I."""
+
+
+@dataclass(frozen=True)
+class SlowSensor:
+    """A slow sensor beside a fast one.
+
+    Attributes
+    ----------
+    spectrum : Array
+        Spectrum of x, what a frame measures, at every fast step, (n // 2 + 1,).
+    cross : Array
+        S_xz, the transform over n of E x[k] z[k-n], (n // 2 + 1,).
+    noise : float
+        Variance of v, above zero.
+    ratio : int
+        Fast steps from frame to frame.
+    """
+
+    spectrum: Array
+    cross: Complex
+    noise: float
+    ratio: int
+
+
+class SlowTarget(NamedTuple):
+    """What z and the slow sensor tell of a target, all (n // 2 + 1,).
+
+    of_z    : S_sz, the transform over n of E s[k] z[k-n]
+    to_come : `wiener.innovations_to_come` of it
+    of_x    : S_sx, the transform over n of E s[k] x[k-n]
+    """
+
+    of_z: Complex
+    to_come: Complex
+    of_x: Complex
+
+
+def variance_from_frames(targets: Sequence[SlowTarget], whitener: Whitener, slow: SlowSensor) -> Array:
+    """Return how much the frames lower the variance of the minimum error of z alone.
+
+    Parameters
+    ----------
+    targets : sequence of SlowTarget
+        The targets.
+    whitener : Whitener
+        Factor of the spectrum of z.
+    slow : SlowSensor
+        The other sensor.
+
+    Returns
+    -------
+    Array
+        Explained covariance of the targets, (ratio, n_targets, n_targets), p steps after a frame.
+    """
+    n, ratio = whitener.n, slow.ratio
+    half = n // 2
+    frames = fft.next_fast_len(half // ratio, real=True)  # those beyond half the DFT are not kept
+    of_z = slow.cross.conj() * (1.0 / whitener.spectrum)
+    noise = _frame_whitener(fft.irfft(slow.spectrum - (of_z * slow.cross).real, n)[: frames * ratio + 1 : ratio], slow.noise)
+
+    def by_age(spectrum: Complex) -> Array:
+        """Return the coefficients of e[k], e[k+1], ..., or E s' y'[k], E s' y'[k-1], ..., with the frames whitened."""
+        found = fft.irfft(spectrum, n)
+        found[half:] = 0.0
+        return _whiten_frames(found, noise, ratio)
+
+    ahead = by_age((slow.cross * whitener.backwards).conj())  # C'
+    of_frame = fft.rfft(ahead.ravel(), n)
+    rests = []
+    for target in targets:
+        known = fft.irfft(of_frame * target.to_come.conj(), n)[: frames * ratio]
+        rests.append(by_age(target.of_x - target.of_z * of_z) + known.reshape(ahead.shape))
+    kept = max(round(KEPT * (half // ratio)), 1)
+    return _gains_of_frames(ahead[:kept], np.array(rests)[:, :kept])
+
+
+def _frame_whitener(covariance: Array, noise: float) -> Whitener:
+    """Return the factor of the spectrum of y', from its autocovariance without noise at the lags of frames."""
+    circle = np.concatenate([covariance, covariance[-2:0:-1]])
+    return factorise(np.maximum(fft.rfft(circle).real, 0.0) + noise)
+
+
+def _whiten_frames(x: Array, noise: Whitener, ratio: int) -> Array:
+    """Return F^-1 x for every age up to `ratio`, (frames, ratio), where F is the factor of the covariance of y' by age."""
+    frames = noise.n // 2
+    by_age = x[: frames * ratio].reshape(frames, ratio)
+    return fft.irfft(fft.rfft(by_age, noise.n, axis=0) * noise.backwards[:, None], noise.n, axis=0)[:frames]
+
+
+def _gains_of_frames(ahead: Array, rest: Array) -> Array:
+    """Return b' (I + K' K)^-1 b of all pairs of targets at every age.
+
+    ahead : C', (frames, ratio);  rest : b, (n_targets, frames, ratio)
+    """
+    length = min(len(ahead), LONGEST)
+    near = rest[:, :length].transpose(2, 0, 1)
+    out = near @ _solve_frames(ahead.astype(np.float32), near, length).transpose(0, 2, 1)
+    out += np.einsum("aip,bip->pab", rest[:, length:], rest[:, length:])
+    return 0.5 * (out + out.transpose(0, 2, 1))
+
+
+def _solve_frames(ahead: NDArray[np.float32], rest: Array, length: int) -> Array:
+    """Solve (I + K' K) x = rest for every age, (ratio, n_targets, length), by conjugate gradients in single precision."""
+    scale = np.sqrt(np.sum(rest**2, axis=-1, keepdims=True))
+    b = (rest / np.where(scale > 0.0, scale, 1.0)).astype(np.float32)
+    ratio = ahead.shape[1]
+    size = fft.next_fast_len(2 * length, real=True)
+    common = fft.rfft(ahead[1 : 2 * length + 1].T, size)
+    # Of the innovations in the present cycle, those after the step are not known.
+    first = ahead[:length].T * (np.arange(ratio)[:, None, None] < np.arange(ratio)[:, None])  # (age, step, frame)
+
+    def apply(x: NDArray[np.float32]) -> NDArray[np.float32]:
+        reversed_x = fft.rfft(x, size).conj()
+        # Not by BLAS: as fast here, and one of its products once told of an invalid value where there was none.
+        out = x + np.einsum("asp,apf->asf", np.einsum("asf,apf->asp", x, first), first)
+        total = np.zeros_like(reversed_x)
+        for hankel in common:
+            known = fft.irfft(hankel * reversed_x, size)[..., :length]
+            total += hankel * fft.rfft(known, size).conj()
+        return out + fft.irfft(total, size)[..., :length]
+
+    return scale * _conjugate_gradients(apply, b, axis=-1, tolerance=FRAMES_TOLERANCE)
+
+
 LONGEST = 8192
-"""Maximum age of a measurement beside z [steps]."""
+"""Maximum age of a measurement beside z [steps], and, of a slow sensor alone, number of frames of which K' K is not left out."""
 
 TOLERANCE = 2e-4
 """Residual of a solution over its right-hand side."""
@@ -174,22 +323,39 @@ def _gains(regression: _Regression, rest: Array) -> Array:
     rest : b of each target, (n_targets, n_sensors, n_ages)
     """
     b, single = regression.mask * rest[:, :, None], regression.single()
-    x = [_solve(single, one.astype(np.float32)).astype(np.float64) for one in b]
+    x = [_conjugate_gradients(single.apply, one.astype(np.float32), (0, 2), TOLERANCE).astype(np.float64) for one in b]
     # Wrong by the square of the error of x, rounding and all.
     out = np.einsum("tipa,uipa->ptu", x, [2.0 * one - regression.apply(of) for one, of in zip(b, x, strict=True)])
     return 0.5 * (out + out.transpose(0, 2, 1))
 
 
-def _solve(regression: _Regression, b: Array) -> Array:
-    """Solve (I + E + K' K) x = b for every age, by conjugate gradients."""
+def _conjugate_gradients(apply: Callable[[Array], Array], b: Array, axis: int | tuple[int, ...], tolerance: float) -> Array:
+    """Solve M x = b, M symmetric and positive, for all right-hand sides at once.
+
+    Parameters
+    ----------
+    apply : callable
+        x -> M x.
+    b : Array
+        Right-hand sides.
+    axis : int or tuple of int
+        Axes of b of one right-hand side; along the others each is another.
+    tolerance : float
+        Residual of every solution over its right-hand side.
+
+    Returns
+    -------
+    Array
+        x, as b.
+    """
     x, residual, direction = np.zeros_like(b), b.copy(), b.copy()
-    power = np.sum(b**2, axis=(0, 2), keepdims=True)
-    enough, smallest = TOLERANCE**2 * power, np.finfo(b.dtype).tiny
+    power = np.sum(b**2, axis=axis, keepdims=True)
+    enough, smallest = tolerance**2 * power, np.finfo(b.dtype).tiny
     while (power > enough).any():
-        moved = regression.apply(direction)
-        step = power / np.maximum(np.sum(direction * moved, axis=(0, 2), keepdims=True), smallest)
+        moved = apply(direction)
+        step = power / np.maximum(np.sum(direction * moved, axis=axis, keepdims=True), smallest)
         x += step * direction
         residual -= step * moved
-        before, power = power, np.sum(residual**2, axis=(0, 2), keepdims=True)
+        before, power = power, np.sum(residual**2, axis=axis, keepdims=True)
         direction = residual + (power / np.maximum(before, smallest)) * direction
     return x

@@ -14,8 +14,8 @@ import numpy as np
 
 from wfsobs.progress import QUIET, Watch
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.groups.atmosphere import Peak
 from wfsobs.scenario.groups.events import PEAK, phase_turns, strength
-from wfsobs.scenario.groups.vibration import Peak
 from wfsobs.scenario.measured_spectra import measured_spectrum
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.spectrum import bin_edges, bin_frequencies, gaussian_signal, random_phase_signal, resonance_power, table_power

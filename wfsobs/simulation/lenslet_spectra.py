@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from wfsobs.atmosphere.plane_waves import Footprint
 from wfsobs.atmosphere.von_karman import TurbulenceLayer
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.lenslet_fit import Kind
+from wfsobs.scenario.groups.sensors import Kind
 from wfsobs.simulation import layers as atmosphere
 from wfsobs.simulation.flow_integral import PlaneWaves, spectra_between
 from wfsobs.simulation.flow_spectra import FlowSpectra, ideal_mode, of_stars

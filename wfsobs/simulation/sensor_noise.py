@@ -8,11 +8,9 @@ import numpy as np
 
 from wfsobs.atmosphere.plane_waves import Sensor
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.lenslet_fit import Kind, fit_lenslets
-from wfsobs.sensors.aliasing import Aliasing
+from wfsobs.scenario.groups.sensors import Kind, fit_lenslets
 from wfsobs.sensors.lenslets import Lenslets
-from wfsobs.sensors.shack_hartmann import ShackHartmann
-from wfsobs.sensors.spots import SpotModel
+from wfsobs.sensors.shack_hartmann import Aliasing, ShackHartmann, SpotModel
 from wfsobs.simulation import layers as atmosphere
 from wfsobs.typing import Array
 

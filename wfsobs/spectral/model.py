@@ -170,10 +170,10 @@ def _any_of(p: Ar2 | Ar3, start: int, indices: Sequence[int]) -> bool:
 
 def _slopes_of_third_order(p: Ar3, f: Array) -> Array:
     """Return the derivatives of the density by the parameters of a process, (4, len(f)) [um^2/Hz]."""
-    at, rows = _vector(p), []
+    at, rows, frequencies = _vector(p), [], _Frequencies(f, p.dt)
     for i in range(len(at)):
         move = STEP * (p.damping if i == 0 else 1.0) * np.eye(len(at))[i]
-        up, down = (_process(at + sign * move, p.dt).psd(f) for sign in (1.0, -1.0))
+        up, down = (frequencies.density(_process(at + sign * move, p.dt)) for sign in (1.0, -1.0))
         rows.append((up - down) / (2.0 * move[i]))
     return np.array(rows)
 
@@ -182,17 +182,19 @@ class _Frequencies:
     """Frequencies for the densities of many processes: they share sine and cosine, most of the work of `Ar2.psd`."""
 
     def __init__(self, f: Array, dt: float):
-        self.f, self.sine, self.cosine = f, np.sin(np.pi * f * dt), np.cos(np.pi * f * dt)
+        self.sine, self.cosine = np.sin(np.pi * f * dt), np.cos(np.pi * f * dt)
 
     def density(self, p: Ar2 | Ar3) -> Array:
         """Return the one-sided power spectral density [um^2/Hz] of a process."""
-        if isinstance(p, Ar3):
-            return p.psd(self.f)
         damped, half = p.damping * p.omega * p.dt, 0.5 * p.omega * np.sqrt(1.0 - p.damping**2) * p.dt
         # |1 - exp(-damped + 2i x)|^2 = (1 - exp(-damped))^2 + 4 exp(-damped) sin^2 x at both x = pi f dt -+ half
         a, b = self.sine * np.cos(half), self.cosine * np.sin(half)
         flat, turning = np.expm1(-damped) ** 2, 4.0 * np.exp(-damped)
-        return 2.0 * p.dt * p.drive_variance / ((flat + turning * (a - b) ** 2) * (flat + turning * (a + b) ** 2))
+        out = 2.0 * p.dt * p.drive_variance / ((flat + turning * (a - b) ** 2) * (flat + turning * (a + b) ** 2))
+        if isinstance(p, Ar3):
+            decay = p.corner * p.dt
+            out /= np.expm1(-decay) ** 2 + 4.0 * np.exp(-decay) * self.sine**2
+        return out
 
 
 def _vector(p: Ar2 | Ar3) -> Array:
@@ -201,7 +203,7 @@ def _vector(p: Ar2 | Ar3) -> Array:
 
 
 def _process(v: Array, dt: float) -> Ar2 | Ar3:
-    omega, damping, rms = float(np.exp(v[0])), float(np.clip(expit(v[1]), 1e-9, HIGHEST)), float(np.exp(v[2]))
+    omega, damping, rms = float(np.exp(v[0])), min(max(float(expit(v[1])), 1e-9), HIGHEST), float(np.exp(v[2]))
     if len(v) == 3:
         return Ar2(omega, damping, rms, dt)
     omega = min(max(omega, SLOW / dt), FAST / dt)

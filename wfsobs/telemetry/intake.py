@@ -18,8 +18,8 @@ from wfsobs.record import DELAY, Record, RecordError, Training
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import order_of
 from wfsobs.telemetry.bridged import without_bridged
+from wfsobs.telemetry.columns import LoopMatrix, apply_matrices
 from wfsobs.telemetry.formats.contents import APART, FAST, FRAME, LARGEST, NGS, SIGNALS, STARS, TIME, TRAINING, Contents
-from wfsobs.telemetry.modal import LoopMatrix, apply_matrices
 from wfsobs.typing import Array
 from wfsobs.units import ANGLES, SECONDS, micrometres_per, parse_unit
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from wfsobs.record import DELAY, Record, RecordError, hold_last
 from wfsobs.scenario import Scenario
-from wfsobs.signal.welch import psd, rms
+from wfsobs.signal.spectrum import psd, rms
 from wfsobs.telemetry.columns import describe_values, suggest_clock, suggest_roles
 from wfsobs.telemetry.command_response import CommandResponse, command_response, saturation_lines
 from wfsobs.telemetry.formats.contents import TIME, Contents

@@ -16,20 +16,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from wfsobs.files import write_whole
-from wfsobs.identification.stated_plant import contradiction
+from wfsobs.identification.plant import contradiction
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import DELAY, Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
 from wfsobs.simulation.loop import simulate
-from wfsobs.telemetry.columns import join_clock, to_contents
+from wfsobs.telemetry.columns import LoopMatrix, join_clock, matrix_of, split_source, to_contents
 from wfsobs.telemetry.formats import format_of, from_gzip, writer_of
 from wfsobs.telemetry.formats.aot import TRANSLATED, translate
 from wfsobs.telemetry.formats.contents import Contents, FileColumns
 from wfsobs.telemetry.formats.csv import write
 from wfsobs.telemetry.formats.npz import write as write_npz
 from wfsobs.telemetry.intake import DeclaredFormat, to_record
-from wfsobs.telemetry.modal import LoopMatrix, matrix_of, split_source
 from wfsobs.typing import Array
 from wfsobs.units import UNITS, micrometres_per, parse_unit
 

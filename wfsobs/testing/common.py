@@ -1,8 +1,8 @@
-"""What the checks of observers and of controllers share."""
+"""What the checks of observers and of controllers share, and an observer frame by frame against its run over a record."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -11,7 +11,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from wfsobs.progress import Watch
+from wfsobs.control.step import StepController
+from wfsobs.observers.base import Observer
+from wfsobs.observers.step import StepObserver
+from wfsobs.prior import Prior
+from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, hold_last
 from wfsobs.typing import Array
 
@@ -114,3 +118,102 @@ def in_a_fresh_process(name: str, watch: Watch, run: Callable[..., R], *argument
         ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool,
     ):
         return pool.submit(run, *arguments).result()
+
+
+Estimates = dict[str, Array]
+
+STEPS = "cannot run frame by frame"
+
+
+def run_steps(observer: StepObserver, measurements: Measurements, steps: Iterable[int] | None = None) -> Estimates:
+    """Return `predict(0)` after every frame of measurements, target -> (n_steps, n_modes) [um]; steps : those to take.
+
+    A lost command is held, as the mirror holds its position; NGS frames are given where they are due, NaN where they are lost.
+    """
+    measurements = replace(measurements, u=hold_last(measurements.u))
+    z, u, n = measurements.z, measurements.u, measurements.ratio
+    z_ngs = None if n is None or measurements.y_ngs is None else measurements.z_ngs
+    z_stars = None if measurements.y_stars is None else measurements.z_stars
+    out = {target: np.full_like(z, np.nan) for target in observer.targets}
+    for k in range(measurements.n_steps) if steps is None else steps:
+        due = z_ngs is not None and n is not None and k > 0 and k % n == 0
+        stars = None if measurements.lgs_stars is None else int(measurements.lgs_stars[k])
+        each = None if z_stars is None else z_stars[k]
+        observer.update(z[k], z_ngs[k] if z_ngs is not None and due else None, u=u[k], stars=stars, each=each)
+        for target, values in out.items():
+            values[k] = observer.predict(0, target)[0]
+    return out
+
+
+def run_loop(controller: StepController, measurements: Measurements) -> Array:
+    """Return the commands (n_steps, n_modes) [um] in a loop with the mirror and these pseudo-open-loop measurements."""
+    measurements = replace(measurements, u=hold_last(measurements.u))
+    z, n, mirror = measurements.z, measurements.ratio, controller.plant.mirror
+    z_ngs = None if n is None or measurements.y_ngs is None else measurements.z_ngs
+    u, seen = np.zeros_like(z), np.zeros_like(z)
+    back = np.arange(1, mirror.taps.size)
+    for k in range(len(z)):
+        past = back[back <= k]
+        seen[k] = mirror.taps[past] @ u[k - past]
+        ngs = None
+        if z_ngs is not None and n is not None and k > 0 and k % n == 0:
+            ngs = z_ngs[k] + seen[k + 1 - n : k + 1].mean(axis=0)
+        stars = None if measurements.lgs_stars is None else int(measurements.lgs_stars[k])
+        u[k] = controller.update(z[k] + seen[k], ngs, stars=stars)
+    return u
+
+
+def step_difference(observer: Observer, measurements: Measurements, prior: Prior, settings: Any) -> float:
+    """Return the largest difference between steps and batch over the standard deviation of the estimate; inf where NaN differ."""
+    batch = observer.estimate(measurements, prior, settings)
+    got = run_steps(observer.design(prior, settings, measurements.sampling), measurements)
+    worst = 0.0
+    for target in observer.targets:
+        a, b = got[target], batch[target]
+        if not np.array_equal(np.isnan(a), np.isnan(b)):
+            return float("inf")
+        if not np.isnan(b).all():
+            worst = max(worst, float(np.nanmax(np.abs(a - b))) / (float(np.nanstd(b)) or 1.0))
+    return worst
+
+
+def check_steps(observer: Observer, measurements: Measurements, prior: Prior, settings: Any, watch: Watch = QUIET) -> None:
+    """Check an observer that can run frame by frame.
+
+    After every frame its estimate is that of its run over the record, without gaps and with. It goes on from a saved state as if
+    there had been no break, and a reset takes it back to the start.
+
+    Raises
+    ------
+    CheckError
+        With the rule that it does not keep.
+    """
+    if observer.step is None:
+        return
+    y, half = measurements.y_lgs.copy(), measurements.n_steps // 2
+    y[half : half + 7] = np.nan
+    with_gap = replace(measurements, y_lgs=y)
+    with report_errors(observer.id, watch, STEPS):
+        differences = [step_difference(observer, seen, prior, settings) for seen in (measurements, with_gap)]
+    measurements = with_gap
+    if not max(differences) <= SAME:
+        raise CheckError(f"{observer.id}: frame by frame its estimate is not that of its run over the record")
+    with report_errors(observer.id, watch, STEPS):
+        ours, other = (observer.design(prior, settings, measurements.sampling) for _ in range(2))
+        base = run_steps(ours, measurements)
+    with report_errors(observer.id, watch, STEPS):
+        run_steps(other, measurements, range(half))
+        ours.reset()
+        ours.load_state_dict(other.state_dict())
+        got = run_steps(ours, measurements, range(half, measurements.n_steps))
+    _compare(observer, got, base, half, "from a saved state it goes on elsewhere")
+    with report_errors(observer.id, watch, STEPS):
+        ours.reset()
+        got = run_steps(ours, measurements)
+    _compare(observer, got, base, 0, "after a reset it is not what it was at the start")
+
+
+def _compare(observer: Observer, got: Estimates, base: Estimates, start: int, what: str) -> None:
+    for target in observer.targets:
+        if not np.array_equal(got[target][start:], base[target][start:], equal_nan=True):
+            raise CheckError(f"{observer.id}: {what} ({target})")

@@ -17,27 +17,27 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from wfsobs.control.base import Controller, Settings
-from wfsobs.control.law import Law
-from wfsobs.control.mirror import Plant
+from wfsobs.control.mirror import Law, Plant
 from wfsobs.prior import Prior
 from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, Record
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.groups.run import Run
+from wfsobs.scenario.groups.plant import Run
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
 from wfsobs.testing.common import (
     QUICK,
     SAME,
+    STEPS,
     CheckError,
     changed_after,
     check_numbers,
     in_a_fresh_process,
     report_errors,
+    run_loop,
     steps_to_check,
 )
-from wfsobs.testing.steps import STEPS, run_loop
 from wfsobs.typing import Array
 
 SEED = 918_273_645
@@ -109,7 +109,7 @@ class ControllerRuns(NamedTuple):
             laws = _laws(self.controller, inputs)
             for law in laws:
                 if not isinstance(law, Law):
-                    raise CheckError(f"{id_}: law takes a wfsobs.control.law.Law, not a {type(law).__name__}")
+                    raise CheckError(f"{id_}: law takes a wfsobs.control.mirror.Law, not a {type(law).__name__}")
                 if not law.stable:
                     raise CheckError(f"{id_}: a pole of its closed loop is not within the unit circle")
         return laws

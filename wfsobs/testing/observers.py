@@ -24,14 +24,15 @@ from wfsobs.testing.common import (
     QUICK,
     SAME,
     CheckError,
+    Estimates,
     arrays_of,
     changed_after,
     check_numbers,
+    check_steps,
     in_a_fresh_process,
     report_errors,
     steps_to_check,
 )
-from wfsobs.testing.steps import Estimates, check_steps
 
 
 class ObserverRuns(NamedTuple):

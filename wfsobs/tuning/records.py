@@ -1,30 +1,222 @@
-"""The records of a tuning: training, validation and test, which share nothing.
+"""The records and the search space of a tuning.
 
-From a scenario they are simulated. Training and test are what `wfsobs run` has, from `run.seed`; the validation record has a
-stream of its own, SeedSequence([run.seed, 1]), from which nothing else is drawn. From telemetry they are pieces of the
-record in the order of time, with a gap between.
+Training, validation and test records share nothing. From a scenario they are simulated. Training and test are what `wfsobs run`
+has, from `run.seed`; the validation record has a stream of its own, SeedSequence([run.seed, 1]), from which nothing else is
+drawn. From telemetry they are pieces of the record in the order of time, with a gap between.
+
+The search space has the tuned settings of an observer or controller, their ranges and scales. The world (turbulence, vibration,
+sensors, loop) is not tuned.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
+from typing import Any
 
 import numpy as np
+import param
 
+from wfsobs.control.base import Controller
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.control.integrator import best_gain
 from wfsobs.evaluation.scores import PREDICTION
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import TARGETS, VIBRATION
+from wfsobs.observers.base import TARGETS, VIBRATION, Observer, Tunable
 from wfsobs.observers.baselines import open_loop_reference
 from wfsobs.observers.missing import fill_missing
 from wfsobs.prior import Model
-from wfsobs.priors_from.scenario import bands_of, observer_settings, prior_of
+from wfsobs.priors_from.controllers import plant_of
+from wfsobs.priors_from.scenario import bands_of, measurement_noise, observer_settings, prior_of, told_spectra
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError, Training, delay_signal, frame_mean
 from wfsobs.scenario import Scenario
+from wfsobs.settings.errors import SettingError
+from wfsobs.simulation.disturbance import vibration_lines, vibration_variance
+from wfsobs.simulation.layers import relative_rms
 from wfsobs.simulation.loop import TRAINING_MARGIN, simulate
-from wfsobs.tuning.space import Space
+from wfsobs.simulation.true_spectra import true_spectra
+from wfsobs.simulation.turbulence import turbulence_process
 from wfsobs.typing import Array
+
+FROM_ZERO = 1e-3
+"""A range that begins at 0 is searched from this part of its end."""
+DIGITS = 6
+"""Digits of a number that is tried, more than matter."""
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One setting that is tuned: its dotted path, its range, and whether it takes whole numbers.
+
+    A range above 0 is searched by the logarithm, one of whole numbers from 0 evenly; 0 and 1 are its ends.
+    """
+
+    path: str
+    low: float
+    high: float
+    whole: bool
+
+    def value(self, x: float) -> float:
+        """Return the number at x, from 0 to 1."""
+        low, high = self._to_scale(self.low), self._to_scale(self.high)
+        value = low + (high - low) * x
+        value = float(f"{np.exp(value) if self.low > 0 else value:.{DIGITS}g}")
+        return min(max(round(value) if self.whole else value, self.low), self.high)
+
+    def place(self, value: float) -> float:
+        """Where a number is, from 0 to 1; what lies outside is at an end."""
+        low, high = self._to_scale(self.low), self._to_scale(self.high)
+        inside = self._to_scale(min(max(value, self.low), self.high))
+        return (inside - low) / (high - low) if high > low else 0.0
+
+    def _to_scale(self, value: float) -> float:
+        return float(np.log(value)) if self.low > 0 else value
+
+
+@dataclass(frozen=True)
+class Space:
+    """The axes, and the settings that go with them: what has to be set by hand so that they count, numbers as they were."""
+
+    axes: tuple[Axis, ...]
+    by_hand: dict[str, Any]
+
+    def changes(self, point: Array) -> dict[str, Any]:
+        """Return the settings (dotted path -> value) at a point (len(axes),) of the unit cube."""
+        return {**self.by_hand, **{a.path: a.value(float(x)) for a, x in zip(self.axes, point, strict=True)}}
+
+    def values(self, scenario: Scenario) -> dict[str, float]:
+        """Dotted path -> number that a scenario has for every axis."""
+        now = {**numbers(scenario), **self.by_hand}
+        return {a.path: now[a.path] for a in self.axes}
+
+    def start(self, scenario: Scenario) -> Array:
+        """Where a scenario is in the unit cube."""
+        now = self.values(scenario)
+        return np.array([a.place(now[a.path]) for a in self.axes])
+
+
+def numbers(scenario: Scenario) -> dict[str, float]:
+    """Dotted path -> value of every setting that is one number."""
+    return {path: _value(scenario, path) for path, _, p in scenario.walk() if isinstance(p, param.Number)}
+
+
+def space(
+    scenario: Scenario, name: str, names: Sequence[str] | None = None, of: Mapping[str, Observer | Controller] = OBSERVERS
+) -> Space:
+    """Return the search space of an observer, or of a controller: its usual settings, or those named.
+
+    A range is that of the sliders (soft bounds), wide enough for the scenario's own number.
+    Raises SettingError for a name that is no setting, is not one number, or is not used by the observer.
+    """
+    kind = "controller" if of is CONTROLLERS else "observer"
+    if name not in of:
+        raise SettingError(f"{kind} {name!r}: no such {kind}; there are {', '.join(of)}")
+    known = of[name].tunable
+    if not known.usual:
+        raise SettingError(f"{kind} {name!r}: has no settings to tune")
+    chosen = tuple(known.usual if names is None else names)
+    if not chosen:
+        raise SettingError("names: takes one setting or more")
+    for i, path in enumerate(chosen):
+        _check(scenario, name, known, path)
+        if path in chosen[:i]:
+            raise SettingError(f"{path}: is given twice")
+    by_hand = {}
+    for switch, (paths, matched) in BY_HAND.items():
+        if set(paths) & set(chosen) and _value(scenario, switch) != "manual":
+            by_hand |= {
+                switch: "manual",
+                **{p: _clip_to_limits(scenario, p, v) for p, v in zip(paths, matched(scenario), strict=True)},
+            }
+    gain_from = by_hand.get("control.integrator", scenario.control.integrator)
+    if name == "integrator" and "control.caution" in chosen and gain_from == "manual":
+        raise SettingError("control.caution: has no effect on an integrator while control.integrator = manual")
+    values = {**numbers(scenario), **by_hand}
+    return Space(tuple(_axis(scenario, path, values[path]) for path in chosen), by_hand)
+
+
+def _check(scenario: Scenario, of: str, tunable: Tunable, path: str) -> None:
+    usual, others = tunable
+    settings = {name: p for name, _, p in scenario.walk()}
+    if path not in settings:
+        raise SettingError(f"{path}: no such setting")
+    if not isinstance(settings[path], param.Number):
+        raise SettingError(f"{path}: cannot be tuned, it is not a single number")
+    if path not in (*usual, *others):
+        raise SettingError(f"{path}: not a setting of {of} that can be tuned; there are {', '.join((*usual, *others))}")
+    group, _, name = path.rpartition(".")
+    if name == "highpass" and (way := _value(scenario, f"{group}.inputs_filter")) != "high-pass":
+        raise SettingError(f"{path}: has no effect while {group}.inputs_filter = {way}")
+
+
+def _value(group: Any, path: str) -> Any:
+    """Return the value of a setting, or of an item of a list, by its dotted path."""
+    return reduce(lambda node, key: node[int(key)] if isinstance(node, list) else getattr(node, key), path.split("."), group)
+
+
+def _parameter(scenario: Scenario, path: str) -> Any:
+    return next(p for known, _, p in scenario.walk() if known == path)
+
+
+def _limits(bounds: tuple[Any, Any] | None) -> tuple[float, float]:
+    """Bounds as numbers: every setting that is one has both."""
+    assert bounds is not None
+    return float(bounds[0]), float(bounds[1])
+
+
+def _clip_to_limits(scenario: Scenario, path: str, value: float) -> float:
+    low, high = _limits(_parameter(scenario, path).bounds)
+    return min(max(float(f"{value:.{DIGITS}g}"), low), high)
+
+
+def _axis(scenario: Scenario, path: str, start: float) -> Axis:
+    p = _parameter(scenario, path)
+    low, high = _limits(p.get_soft_bounds())
+    if low == 0 and not isinstance(p, param.Integer):
+        low = FROM_ZERO * high
+    return Axis(path, min(low, start) if start > 0 else low, max(high, start), isinstance(p, param.Integer))
+
+
+def _process(scenario: Scenario) -> tuple[float, float]:
+    """Strength of turbulence and of vibration in tip and tilt that "matched" gives, rms [um]."""
+    tip_tilt = [i for i, mode in enumerate(scenario.modes) if mode.radial_order == 1]
+    variance = np.mean([vibration_variance(scenario, mode) for mode in tip_tilt])
+    return turbulence_process(scenario, 0, scenario.dt).rms / relative_rms(scenario, 0), float(np.sqrt(variance))
+
+
+def _peak(scenario: Scenario) -> tuple[float, float]:
+    """Frequency and damping of the line that is the strongest of all modes: set by hand it is one for all of them."""
+    lines = [line for mode in range(len(scenario.modes)) for line in vibration_lines(scenario, mode)]
+    default = (scenario.kalman.frequency, scenario.kalman.damping, 0.0)
+    frequency, damping, _ = max(lines, key=lambda line: line[2], default=default)
+    return frequency, damping
+
+
+def _noise(scenario: Scenario) -> tuple[float, float]:
+    """Noise of LGS and NGS that "matched" gives, rms over the modes [um]: set by hand it is one number for all of them."""
+    each = np.array([measurement_noise(scenario, mode) for mode in range(len(scenario.modes))])
+    lgs, ngs = np.sqrt(np.mean(each**2, axis=0)).tolist()
+    return lgs, ngs
+
+
+def _gain(scenario: Scenario) -> tuple[float]:
+    """Optimal gain of the integrator, less its caution, mean over the modes: set by hand it is one for all of them."""
+    mirror, c = plant_of(scenario).mirror, scenario.control
+    spectra = (told_spectra(true_spectra(scenario, mode)) for mode in range(len(scenario.modes)))
+    return (float(np.mean([best_gain(one, mirror, c.leak) for one in spectra])) / c.caution,)
+
+
+BY_HAND: dict[str, tuple[tuple[str, ...], Callable[[Scenario], tuple[float, ...]]]] = {
+    "control.integrator": (("control.gain",), _gain),
+    "kalman.peak": (("kalman.frequency", "kalman.damping"), _peak),
+    "kalman.process_noise": (("kalman.turbulence_rms", "kalman.vibration_rms"), _process),
+    "kalman.measurement_noise": (("kalman.lgs_noise", "kalman.ngs_noise"), _noise),
+    "multirate.measurement_noise": (("multirate.lgs_noise", "multirate.ngs_noise"), _noise),
+}
+"""Settings that say "matched" or "optimised", the numbers that count once they say "manual", and what those are until then."""
+
 
 VALIDATION, DESIGN = 1, 2
 """Beside `run.seed`, the streams of the validation record and of the search."""

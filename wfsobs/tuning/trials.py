@@ -31,9 +31,8 @@ from wfsobs.observers.base import TARGETS, VIBRATION
 from wfsobs.observers.estimates import Estimate
 from wfsobs.observers.gpr.inputs import scale_of, window_signals
 from wfsobs.observers.gpr.kernels import SquaredExponential
-from wfsobs.observers.gpr.offline import training_targets
+from wfsobs.observers.gpr.offline import eliminated_covariance, training_targets
 from wfsobs.observers.gpr.online import kernel_of, online_targets
-from wfsobs.observers.gpr.trained import eliminated_covariance
 from wfsobs.observers.missing import fill_missing
 from wfsobs.prior import Bands
 from wfsobs.priors_from.scenario import bands_of, prior_of
@@ -41,8 +40,7 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError, pseudo_open_loop
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
-from wfsobs.tuning.records import Records
-from wfsobs.tuning.space import Space
+from wfsobs.tuning.records import Records, Space
 from wfsobs.typing import Array
 
 

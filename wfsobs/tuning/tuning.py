@@ -1,14 +1,30 @@
-"""Tuning: the settings of an observer, or of a controller, that are best on what it is not scored on in the end."""
+"""Tuning: the settings of an observer, or of a controller, that are best on what it is not scored on in the end.
+
+On an uncertain plant a controller is tuned for the least residual at the worst of its plants, or below which 95 % of them are.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from math import isfinite, nan
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, replace
+from math import inf, isfinite, nan
+from typing import TYPE_CHECKING, Literal
 
-from wfsobs.closed_loop.envelope import POINTS, PlantEnvelope, plant_envelope, with_laws
+import numpy as np
+
+from wfsobs.closed_loop.envelope import (
+    POINTS,
+    PlantEnvelope,
+    Plants,
+    Spread,
+    Uncertainty,
+    known_spectra,
+    plant_envelope,
+    spread_of,
+    uncertain_plants,
+    with_laws,
+)
 from wfsobs.closed_loop.rows import label
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import row_label
@@ -18,13 +34,13 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
-from wfsobs.tuning.envelope import EnvelopeGoal, EnvelopeTrials
-from wfsobs.tuning.records import DESIGN, MEASURES, P95, WORST, cut_record, simulate_records, stream
-from wfsobs.tuning.space import space
-from wfsobs.tuning.trials import Evaluation, Judge, RecordTrials, Stage, Trials, minimise, target_of
+from wfsobs.simulation.true_spectra import TrueSpectra
+from wfsobs.tuning.records import DESIGN, MEASURES, P95, WORST, cut_record, simulate_records, space, stream
+from wfsobs.tuning.trials import Errors, Evaluation, Judge, RecordTrials, Stage, Trials, minimise, target_of
 
 if TYPE_CHECKING:
     import pandas
+
 
 EVALUATIONS = 40
 
@@ -205,3 +221,76 @@ def tuned_envelope(
         watch.step((i + 1) / len(names))
     spreads, notes = sum((part.spreads for part in parts), ()), {k: x for part in parts for k, x in part.notes.items()}
     return replace(parts[0], scenario=scenario, spreads=spreads, notes=notes)
+
+
+SEARCHED, HELD_OUT = 64, 256
+"""Points of the envelope that the search sees, beside all corners, and others that the result is scored on."""
+
+
+@dataclass(frozen=True)
+class EnvelopeGoal:
+    """What a controller is tuned for on an uncertain plant.
+
+    Attributes
+    ----------
+    uncertainty : Uncertainty
+        Largest errors of the plant.
+    by : {"worst", "p95"}
+        Residual that is made small: at the worst of points and corners, or the 95 % quantile of the points.
+    loss : float
+        How much more the controller may leave at the nominal plant than with the settings before.
+    """
+
+    uncertainty: Uncertainty = field(default_factory=Uncertainty)
+    by: Literal["worst", "p95"] = "worst"
+    loss: float = 0.1
+
+
+@dataclass
+class EnvelopeTrials(Trials):
+    """What a controller leaves of some plants with trial settings."""
+
+    controller: str
+    goal: EnvelopeGoal
+    most_nominal: float = field(default=inf, init=False)
+    spectra: list[TrueSpectra] = field(init=False)
+    search_plants: Plants = field(init=False)
+    other_plants: Plants = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.spectra = known_spectra(self.scenario)
+        _, _, plants = uncertain_plants(self.scenario, self.goal.uncertainty, SEARCHED + HELD_OUT)
+        self.search_plants = replace(plants, points=plants.points[:SEARCHED])
+        self.other_plants = replace(plants, points=plants.points[SEARCHED:], corners=())
+
+    def errors_of(self, scenario: Scenario) -> Errors:
+        """Return the residuals that count, of the plants of the search."""
+        spread = self._spread(scenario, self.search_plants)
+        nominal = float(np.sqrt(np.mean(spread.nominal**2)))
+        if not self.history:
+            self.most_nominal = (1.0 + self.goal.loss) * nominal
+        if nominal > self.most_nominal or not isfinite(nominal):
+            raise ValueError(f"{1e3 * nominal:.2f} nm at the nominal plant, above {1e3 * self.most_nominal:.2f}")
+        errors = self._errors(spread)
+        if not isfinite(errors.rms):
+            raise ValueError("not stable at every plant")
+        return errors
+
+    def stage(self, evaluation: Evaluation) -> Stage:
+        """Return the controller on plants that the search has not seen."""
+        scenario = self.scenario.replace(evaluation.changes)
+        seen, held_out = (self._spread(scenario, plants) for plants in (self.search_plants, self.other_plants))
+        errors = self._errors(held_out)
+        return Stage(scenario, evaluation.errors, errors if isfinite(errors.rms) else None, spreads=(seen, held_out))
+
+    def _spread(self, scenario: Scenario, plants: Plants) -> Spread:
+        scenario.validate()
+        watch = self.inner()
+        watch.check()
+        spread = spread_of(self.controller, scenario, plants, self.spectra, watch)
+        watch.step(1.0)
+        return spread
+
+    def _errors(self, spread: Spread) -> Errors:
+        left = spread.worst if self.goal.by == "worst" else spread.p95
+        return Errors({mode.name: float(x) for mode, x in zip(self.scenario.modes, left, strict=True)})

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from wfsobs.campaign.keys import PHYSICS_VERSION
+from wfsobs.campaign.store import PHYSICS_VERSION
 from wfsobs.closed_loop.design import design
 from wfsobs.evaluation.bound import bound
 from wfsobs.observers.base import Observer

@@ -13,7 +13,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from wfsobs import __version__
-from wfsobs.campaign.keys import PHYSICS_VERSION
+from wfsobs.campaign.store import PHYSICS_VERSION
 from wfsobs.files import write_whole
 from wfsobs.observers.base import Observer
 from wfsobs.prior import IDENTIFIED, TRUE

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from wfsobs.control.base import Controller
-from wfsobs.evaluation.calibration import calibration
+from wfsobs.evaluation.scores import calibration
 from wfsobs.observers.base import Observer
 from wfsobs.observers.estimates import NEXT_Z, TOTAL
 from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for

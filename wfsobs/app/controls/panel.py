@@ -1,4 +1,4 @@
-"""The drawer: preset, run, progress, and every setting by topic."""
+"""The drawer: preset, every setting by topic, and a box that finds them; and on the bar at the top the run and its progress."""
 
 from __future__ import annotations
 
@@ -6,21 +6,18 @@ import contextlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
-from types import MappingProxyType
 from typing import Any, Final
 
 import panel as pn
 import panel_material_ui as pmui
 import param
 
-from wfsobs.app.controls.fields import ROOM, TAG, Field, idle_html, make_field
+from wfsobs.app.controls.fields import ROOM, TAG, Field, RowEditor, idle_html, make_field
 from wfsobs.app.controls.names import preset_line, preset_title, setting_name
-from wfsobs.app.controls.rows import RowEditor
-from wfsobs.app.controls.search import Search
-from wfsobs.app.controls.status import BAR, ON_BAR, STATUS_ON_BAR, Status, status_of
-from wfsobs.app.jobs import DONE, RUNNING
+from wfsobs.app.display import label_of
+from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.store import Store
-from wfsobs.app.style import PRIMARY, HtmlText, html
+from wfsobs.app.style import PRIMARY, Component, HtmlText, html, make_button, script, sheets
 from wfsobs.app.views.plots import AFTERWARDS_MS, once
 from wfsobs.app.work import RunResults
 from wfsobs.scenario import Scenario
@@ -29,13 +26,115 @@ from wfsobs.scenario.idle import idle_settings
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.group import Group
 
-FIRST: Mapping[str, Sequence[str]] = MappingProxyType(
-    {
-        "": ("turbulence.wind_speed", "sensors.exposure_ratio"),
-        "Online GPR": ("gpr_online.length_scale", "gpr_online.signal_std", "gpr_online.training_size"),
-        "Vibration": ("vibration.peaks",),
-    }
-)
+ON_BAR = {
+    "color": "#fff",
+    "borderColor": "#fff",
+    "&.Mui-disabled": {"color": "#ffffff80", "borderColor": "#ffffff60"},
+    "&:hover": {"backgroundColor": "#ffffff30", "borderColor": "#fff", "color": "#fff"},
+    "@media (max-width: 600px)": {
+        "fontSize": 0,
+        "minWidth": "40px",
+        "height": "34px",
+        "padding": 0,
+        "& .MuiButton-startIcon": {"margin": 0, "fontSize": "22px"},
+    },
+}
+"""Buttons on the bar at the top, which is dark in either mode; on a phone their icons alone are seen."""
+
+BAR = ":host { align-items: center; }"
+
+STATUS_ON_BAR = """
+:host { color: #fff; display: contents !important; }
+progress::-webkit-progress-value { background: #8fd3f0; }
+progress::-moz-progress-bar { background: #8fd3f0; }
+.line { white-space: nowrap; }
+.note { color: #ffc9c2; height: auto; }
+"""
+
+
+class Status(Component):
+    """The state of the run in the browser."""
+
+    progress: param.Number[float] = param.Number(0.0, doc="Fraction done.")
+    text: param.String[str] = param.String("", doc="The state, in words.")
+    note: param.String[str] = param.String("", doc="What was refused.")
+    label: param.String[str] = param.String("Progress of the run", doc="What the bar is the progress of.")
+
+    _esm = script("status")
+    _stylesheets = sheets("base", "status")
+
+
+def status_of(store: Store) -> tuple[float, str, str]:
+    """Return how much of the run is done, its state in one line, and what was refused in another.
+
+    Work that goes on after it takes its place.
+    """
+    run, progress = store.run, store.run.progress
+    seconds = f" in {run.result.seconds:.2f} s{_share(run.result)}" if run.result and run.state == DONE else ""
+    text = {
+        RUNNING: run.line(),
+        DONE: f"Done{seconds}",
+        CANCELLED: "Cancelled",
+        FAILED: "The run failed",
+    }.get(run.state, "")
+    if store.waiting:
+        text = waiting_text(store.waiting)
+    elif run.state != RUNNING and store.session.doing:
+        progress, text = next(reversed(store.session.doing.values()))
+    note = f"Not accepted: {', '.join(map(setting_name, store.errors))}" if store.errors else ""
+    return progress, text, note
+
+
+def _share(run: RunResults) -> str:
+    """Say how many observers ran where not all did."""
+    every = {item.observer for item in (*run.result.estimates, *run.result.failures)}
+    return f", {len(run.ran)} of {len(every)} ran" if run.ran is not None and len(run.ran) < len(every) else ""
+
+
+def waiting_text(seconds: float) -> str:
+    """How long a run takes that waits to be asked for.
+
+    >>> waiting_text(12.3), waiting_text(1000.0)
+    ('About 12 s: press Run', 'About 17 min: press Run')
+    """
+    length = f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
+    return f"About {length}: press Run"
+
+
+class Search(Component):
+    """The box in the browser; it gets the settings when it is first used, and says which one has been chosen."""
+
+    items = param.List([], doc="{path, name} of every setting.")
+
+    _esm = script("listen", "search")
+    _stylesheets = sheets("base", "search")
+
+    def __init__(self, reveal: Callable[[str], None], **params: Any):
+        """Make the box. reveal : opens the topic of the setting of a path."""
+        self._reveal = reveal
+        super().__init__(self._take, **params)
+
+    def _take(self, data: dict[str, Any]) -> None:
+        if data.get("open"):
+            self.items = settings_found()
+        elif (path := str(data.get("path", ""))) in {item["path"] for item in self.items}:
+            self._reveal(path)
+
+
+def settings_found() -> list[dict[str, str]]:
+    """List every setting and every list of settings, by its name and its topic."""
+    scenario, topics = Scenario(), Scenario.settings()
+    lists = dict(scenario.lists())
+    inner = tuple(f"{path}." for path in lists)
+    known = [*lists.items(), *((path, p) for path, _, p in scenario.walk() if not path.startswith(inner))]
+    return [{"path": path, "name": f"{label_of(p)} · {topics[path.split('.')[0]].label}"} for path, p in known]
+
+
+FIRST: Mapping[str, Sequence[str]] = {
+    "": ("turbulence.wind_speed", "sensors.exposure_ratio"),
+    "Online GPR": ("gpr_online.length_scale", "gpr_online.signal_std", "gpr_online.training_size"),
+    "Vibration": ("vibration.peaks",),
+}
 """Settings that stand above the topics, under a heading."""
 
 AT_HAND = tuple(path for paths in FIRST.values() for path in paths)
@@ -87,15 +186,15 @@ class Controls:
             stylesheets=[TWO_LINES],
             **ROOM,
         )
-        self.reset: Final = pmui.Button(label="Reset", variant="text", size="small", margin=(4, 0))
+        self.reset: Final = make_button("Reset", lambda: store.choose(store.preset), variant="text", margin=(4, 0))
         self.undo, self.redo = (
-            pmui.Button(label=name, variant="text", size="small", margin=(4, 4, 4, 0), disabled=True) for name in ("Undo", "Redo")
+            make_button(name, act, variant="text", margin=(4, 4, 4, 0), disabled=True)
+            for name, act in (("Undo", store.undo), ("Redo", store.redo))
         )
-        self.run: Final = pmui.Button(
-            label="Run", icon="play_arrow", size="small", margin=0, sx=ON_BAR | {"backgroundColor": "#fff", "color": PRIMARY}
-        )
-        self.cancel: Final = pmui.Button(
-            label="Cancel", icon="stop", variant="outlined", size="small", margin=(0, 10, 0, 6), sx=ON_BAR
+        white = ON_BAR | {"backgroundColor": "#fff", "color": PRIMARY}
+        self.run: Final = make_button("Run", store.start, icon="play_arrow", sx=white)
+        self.cancel: Final = make_button(
+            "Cancel", store.run.cancel, icon="stop", variant="outlined", margin=(0, 10, 0, 6), sx=ON_BAR
         )
         self.status: Final = Status(sizing_mode="stretch_width", max_width=200, margin=0, stylesheets=[STATUS_ON_BAR])
         self.search: Final = Search(self.open_setting, sizing_mode="stretch_width", margin=(8, 0, 4, 0))
@@ -175,12 +274,9 @@ class Controls:
                 elif isinstance(message, dict):
                     part.handle(message)
 
-    def _idle(self) -> dict[str, str]:
-        return idle_settings(self.store.scenario, is_simulated=self.store.source is None)
-
     def _refresh_parts(self, *_: object) -> None:
         """Grey what has no effect for the settings as they are, and say why; of groups and tables only the name is left."""
-        idle = self._idle()
+        idle = idle_settings(self.store.scenario, is_simulated=self.store.source is None)
         with pn.io.hold():
             for path, view in self.parts:
                 view.visible = not any(path.startswith(f"{group}.") for group in idle if group != topic_of(group))
@@ -224,11 +320,6 @@ class Controls:
 
     def _watch(self) -> None:
         self.preset.param.watch(self._on_choice, "value")
-        self.reset.on_click(lambda _event: self.store.choose(self.store.preset))
-        self.undo.on_click(lambda _event: self.store.undo())
-        self.redo.on_click(lambda _event: self.store.redo())
-        self.run.on_click(lambda _event: self.store.start())
-        self.cancel.on_click(lambda _event: self.store.run.cancel())
         self.accordion.param.watch(self._on_open, "active")
         self.store.param.watch(self._refresh_preset, ["preset", "can_undo", "can_redo"])
         self.store.param.watch(once(self._count_changes, AFTERWARDS_MS), ["scenario", "preset"])
@@ -239,11 +330,11 @@ class Controls:
         # Last, so that "Done" is said of what has been drawn.
         self.store.run.param.watch(self._refresh_run, ["state", "progress", "place", "message"], precedence=2)
 
-    def _on_choice(self, event: param.parameterized.Event) -> None:
+    def _on_choice(self, event: Any) -> None:
         if event.new != self.store.preset:
             self.store.choose(event.new)
 
-    def _on_open(self, event: param.parameterized.Event) -> None:
+    def _on_open(self, event: Any) -> None:
         names = list(self.topics)
         for index in event.new:
             self.open_topic(names[index])
@@ -262,11 +353,10 @@ class Controls:
         titles = {name: title + (f" · {count[name]} changed" if count[name] else "") for name, title in self.topics.items()}
         if titles != self.titles:
             self.titles = titles
-            for i, (name, title) in enumerate(titles.items()):
-                self.accordion[i] = (title, self.rooms[name])
-            self.accordion.param.trigger("objects")  # which are the same
+            # All at once: Bokeh looks through the whole page for each.
+            self.accordion[:] = [(title, self.rooms[name]) for name, title in titles.items()]
 
-    def _show_effect(self, event: param.parameterized.Event) -> None:
+    def _show_effect(self, event: Any) -> None:
         """Say below the one setting that changed what came of it."""
         now = self.store.run.result
         if event.new != DONE or now is None or now is self._before:

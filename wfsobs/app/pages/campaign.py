@@ -11,20 +11,19 @@ import numpy as np
 import panel as pn
 import panel_material_ui as pmui
 
-from wfsobs.app.controls.status import Status
-from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.controls.panel import Status
+from wfsobs.app.display import Display
 from wfsobs.app.jobs import BATCH, FAILED, RUNNING, Job, Work
 from wfsobs.app.pages.parts import WIDE, LinkedFields, Page, box, boxes, html, line, text
 from wfsobs.app.pages.sweep import ErrorLines, SweepMap, line_of
 from wfsobs.app.pages.sweep_views import DECIDED, LEFT_OUT, OPEN, WAITING, axis_title, map_square, verdict_text
-from wfsobs.app.render import NOTHING, Row, number, table
+from wfsobs.app.render import NOTHING, number, table
 from wfsobs.app.report.sections import value_of
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.share import CAMPAIGN, EXPLORED, CopiedTask
 from wfsobs.app.store import Store
-from wfsobs.app.style import look, swatch
-from wfsobs.campaign.errors import CampaignErrors
-from wfsobs.campaign.follow import CampaignState, progress_text
+from wfsobs.app.style import look, make_select, named_row
+from wfsobs.campaign.follow import CampaignErrors, CampaignState, progress_text
 from wfsobs.campaign.report import name_label
 from wfsobs.campaign.selection import SCENARIO, PlanAxis, condition, plan_axes
 from wfsobs.campaign.standings import UNTESTED, TogetherRow, standings
@@ -48,7 +47,7 @@ class CampaignView:
 
     def scale(self, display: Display) -> float:
         """Return how many units of the display one nanometre is."""
-        return 1e-3 * per_micrometre(display.unit, self.base.telescope.diameter)
+        return 1e-3 * display.scale(self.base)
 
 
 def axis_name(axis: PlanAxis, base: Scenario) -> str:
@@ -79,22 +78,19 @@ def standings_html(view: CampaignView, display: Display) -> str:
     }
     rows = []
     for s in standings(view.state, view.target, view.mode, view.cells):
+        low, high = s.over_bound_low, s.over_bound_high
         cells_of = [
             number(scale * s.rms_nm),
             number(s.over_bound),
-            _interval(s.over_bound_low, s.over_bound_high),
+            f"{number(float(low))} – {number(float(high))}" if np.isfinite(low) and np.isfinite(high) else NOTHING,
             _above(s),
             NOTHING if s.rank == UNTESTED else s.rank,
             NOTHING if s.wins is None else f"{s.wins} ({s.decided_wins})",
             str(s.records),
             NOTHING if s.failures is None else str(s.failures),
         ]
-        rows.append(Row(swatch(s.name, display.dark) + name_label(s.name), cells_of, {"name": s.name}))
+        rows.append(named_row(s.name, name_label(s.name), display.dark, cells_of))
     return table("Observers of the campaign", columns, rows)
-
-
-def _interval(low: float, high: float) -> str:
-    return f"{number(float(low))} – {number(float(high))}" if np.isfinite(low) and np.isfinite(high) else NOTHING
 
 
 def _above(s: TogetherRow) -> str:
@@ -274,11 +270,11 @@ class CampaignPage(Page):
 
     def _say(self, *_: object) -> None:
         """Describe how far the campaign is."""
-        state = self.state
-        if state is None:
-            self.status.param.update(text=self.work.line("Reading"), progress=self.work.progress)
-            return
-        self.status.param.update(text=progress_text(state), progress=state.n_done / state.plan.n_runs)
+        state, work = self.state, self.work
+        text, progress = work.line("Reading"), work.progress
+        if state is not None:
+            text, progress = progress_text(state), state.n_done / state.plan.n_runs
+        self.status.param.update(text=text, progress=progress)
 
     def _make(self, state: CampaignState) -> None:
         """Make the fields when the first results are there, and anew where there are errors of something else."""
@@ -290,21 +286,13 @@ class CampaignPage(Page):
         self.base: Scenario = base
         self.axes = {axis.path: axis for axis in plan_axes(state.plan)}
         names = {axis_name(axis, base): path for path, axis in self.axes.items()}
-        style = {"size": "small", "margin": 0, "width": 300}
-        paths = [*self.axes]
-        self.target = pmui.Select(label="Errors of", options={target_title(t): t for t in targets}, value=targets[0], **style)
-        self.across = pmui.Select(label="Across", options=names, value=paths[0] if paths else None, **style)
-        self.down = pmui.Select(
-            label="Down", options={"no second condition": NONE, **names}, value=paths[1] if len(paths) > 1 else NONE, **style
-        )
+        first, second, *_ = [*self.axes, None, None]
+        self.target = make_select("Errors of", {target_title(t): t for t in targets}, targets[0], 300)
+        self.across = make_select("Across", names, first, 300)
+        self.down = make_select("Down", {"no second condition": NONE, **names}, second or NONE, 300)
         self.filters = {
-            path: pmui.Select(
-                label=f"Only {axis_name(axis, base)}",
-                options={"all": ALL, **{name: name for name in value_names(axis)}},
-                value=ALL,
-                **style,
-            )
-            for path, axis in self.axes.items()
+            path: make_select(f"Only {name}", {"all": ALL} | {of: of for of in value_names(self.axes[path])}, ALL, 300)
+            for name, path in names.items()
         }
         ranked = [s.name for s in next(iter(state.errors.values())).standings(range(len(state.plan.cells)))]
         known = [*state.plan.observers, *state.plan.controllers]
@@ -322,12 +310,8 @@ class CampaignPage(Page):
         fields = [line(self.target, self.across, self.down), line(*self.filters.values())] if self.axes else [line(self.target)]
         self.room[:] = [box("Conditions", *fields), box("Observers", self.table)]
         if self.axes:
-            self.room.extend(
-                [
-                    box("Best observers", self.map, text(SHADES)),
-                    box("Errors over one condition", self.lines, self.slice.view),
-                ]
-            )
+            self.room.append(box("Best observers", self.map, text(SHADES)))
+            self.room.append(box("Errors over one condition", self.lines, self.slice.view))
 
     def view_of(self, state: CampaignState) -> CampaignView | None:
         """Return what is shown by the fields and the mode of the page; None where there is nothing."""

@@ -1,4 +1,4 @@
-"""What every controller leaves of the disturbance of the results shown, and how far each is from instability."""
+"""What every controller leaves of the disturbance shown, and of that of an uncertain plant; how far each is from instability."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ from typing import Any, Final
 
 import numpy as np
 import panel as pn
-import panel_material_ui as pmui
-from bokeh.models import ColumnDataSource, Range1d
+from bokeh.models import ColumnDataSource, DataRange1d, Range1d
 from markupsafe import Markup
 
-from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.display import Display
 from wfsobs.app.downloads import residuals_csv, table_csv
 from wfsobs.app.glossary import NEEDS, STREHL, TERMS
-from wfsobs.app.jobs import CANCELLED, FAILED, RUNNING, Job
-from wfsobs.app.loop_work import LoopResults, compute, cost, seconds
+from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING, Job
+from wfsobs.app.loop_work import LoopResults, compute, cost, seconds, uncertain, uncertain_seconds
 from wfsobs.app.pages.parts import (
     EDITED,
     HALVES,
@@ -26,40 +25,137 @@ from wfsobs.app.pages.parts import (
     WIDE,
     LinkedLines,
     Page,
+    Starter,
     box,
     boxes,
     figure_with_caption,
     html,
+    line,
     text,
+    tick,
     zoom_buttons,
 )
-from wfsobs.app.pages.uncertain_plant import UNSTABLE, UncertainPlant, uncertain_cells, uncertain_columns
 from wfsobs.app.render import NOTHING, Row, macro, number, table
-from wfsobs.app.service import BackgroundTask
+from wfsobs.app.service import IDLE, BackgroundTask
 from wfsobs.app.share import LOOP, CopiedTask
+from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
-from wfsobs.app.style import look, swatch
+from wfsobs.app.style import look, named_row
 from wfsobs.app.views.gain_editor import GainEditor, plane
 from wfsobs.app.views.plots import (
     LoopLines,
     PairedLines,
-    envelope,
-    envelope_times,
     in_view,
     new_figure,
+    new_spectrum,
     on_settle,
     set_ends,
 )
 from wfsobs.app.views.strip import Cards, card_of, error_fields
-from wfsobs.app.views.table import SMALLEST
-from wfsobs.closed_loop.envelope import PlantEnvelope
+from wfsobs.closed_loop.envelope import POINTS, PlantEnvelope, Uncertainty
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label, loop_verdict, no_theory
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import Row as Score
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.evaluation.verdict import Verdict
+from wfsobs.settings.errors import SettingError
+from wfsobs.signal.envelope import envelope, envelope_times
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
+
+UNSTABLE = macro("tag", "above", "unstable")
+
+LINEAR = tuple(c.id for c in CONTROLLERS.values() if c.law and not c.predict)
+
+PLANT_INTRO = (
+    f"What the linear controllers, designed for the plant as it is set, leave over {POINTS} others, by theory: with errors of "
+    f"delay (±{Uncertainty.delay:g} frame), gain (±{100.0 * Uncertainty.gain:g} %), rotation (±{Uncertainty.rotation:g}°) and, "
+    f"where the mirror has one, resonance (±{100.0 * Uncertainty.resonance:g} %), of which they know nothing."
+)
+PLANT_ABOUT = "The worst plant bold, the mean faint, against the error of the delay; all other errors as they come."
+
+
+def uncertain_columns(unit: str) -> dict[str, str]:
+    """Return the columns of a table of controllers that an envelope adds: heading -> explanation."""
+    return {
+        f"95 % [{unit}]": "of the stable ones of the uncertain plants are below, by theory",
+        f"Worst [{unit}]": "of the uncertain plants and of the corners of their range",
+        "Unstable [%]": "of the uncertain plants",
+    }
+
+
+def uncertain_cells(envelope: PlantEnvelope, column: int, scale: float) -> dict[str, list[str]]:
+    """Return the cells of these columns by controller; scale : of [um]."""
+    out = {}
+    for spread in envelope.spreads:
+        (_, most), worst = spread.summary(column), spread.worst[column]
+        cells = [UNSTABLE if x is None or np.isinf(x) else number(scale * x) for x in (most, worst)]
+        out[spread.controller] = [*cells, number(100.0 * spread.unstable / len(spread.points), 2)]
+    return out
+
+
+class DelayFigure(PairedLines):
+    """The residual against the error of the delay: the worst plant, and the mean."""
+
+    def __init__(self) -> None:
+        fig = new_figure((-1.0, 1.0), DataRange1d(only_visible=True), "error of the delay [frames]", "y")
+        super().__init__(fig, LINEAR)
+
+    def draw(self, envelope: PlantEnvelope, display: Display) -> None:
+        """Send every line."""
+        scale = display.scale(envelope.scenario)
+        of = envelope.curves("delay", display.column)
+        end = envelope.uncertainty.delay
+        self.figure.x_range.update(start=-end, end=end)
+        self.put_both({name: (x, scale * most, scale * mean) for name, (x, mean, most) in of.items()})
+        self.figure.yaxis.axis_label = f"residual {display.mode_label} [{display.unit_label}]"
+
+
+class UncertainPlant:
+    """The box: a button, the figure, and what the page adds to its table and verdict."""
+
+    def __init__(self, store: Store, display: Display):
+        self.store, self.display = store, display
+        self.work = BackgroundTask(store.session, title="Uncertain plant")
+        self.starter = Starter(self.work, self._start, "Compute", "Progress of the uncertain plant")
+        self.figure = DelayFigure()
+        drawn = figure_with_caption("Residual against delay error", self.figure.figure)
+        self.room = pn.Column(drawn, text(PLANT_ABOUT), **WIDE, visible=False)
+
+    def view(self) -> pn.Column:
+        """Return the box."""
+        return box("Uncertain plant", text(PLANT_INTRO), line(*self.starter.view()), self.starter.status, self.room)
+
+    @property
+    def finding(self) -> PlantEnvelope | None:
+        """What there is so far."""
+        return self.work.result
+
+    @property
+    def complete(self) -> bool:
+        """Whether all controllers are in it."""
+        return self.work.state == DONE and self.finding is not None
+
+    def _start(self) -> None:
+        of = self.store.run.result
+        if of is None or isinstance(of.source, LoadedRecord):
+            raise SettingError("An envelope takes the true spectra, which only a simulation has.")
+        work, cost = partial(uncertain, of.scenario), uncertain_seconds(of.scenario)
+        self.work.start(self.store.limits.job("envelope", "uncertain plant", work, cost))
+
+    def forget(self) -> None:
+        """Forget what is of other results."""
+        self.work.close()
+        self.work.param.update(state=IDLE, result=None)
+
+    def draw(self, hidden_names: list[str]) -> None:
+        """Draw what there is."""
+        envelope = self.finding
+        self.room.visible = envelope is not None
+        if envelope is not None:
+            self.figure.draw(envelope, self.display)
+            self.figure.restyle(self.display.dark, hidden_names)
+
 
 BINS = 600
 DECADES = 7
@@ -76,14 +172,10 @@ class Trace(LoopLines):
 
     def __init__(self, seconds: float):
         self.x_range: Final = Range1d(start=0.0, end=1.0)
-        super().__init__(
-            new_figure(x_range=self.x_range, y_range=Range1d(start=-1.0, end=1.0)),
-            tuple(name for name in CONTROLLERS if name != NONE),
-        )
+        super().__init__(new_figure(self.x_range, (-1.0, 1.0), "time [s]"), [name for name in CONTROLLERS if name != NONE])
         self.seconds = seconds
         self._of: tuple[LoopResults, Display] | None = None
         self._invisible_names: list[str] = []
-        self.figure.xaxis.axis_label = "time [s]"
         on_settle([self.x_range], self._send)
 
     def draw(self, results: LoopResults, display: Display) -> None:
@@ -113,7 +205,7 @@ class Trace(LoopLines):
         start, end = in_view(self.x_range)
         first = min(max(int(start / record.dt), 0), record.n_steps - 2)
         last = min(max(int(np.ceil(end / record.dt)) + 1, first + 2), record.n_steps)
-        scale = per_micrometre(display.unit, results.result.scenario.telescope.diameter)
+        scale = display.scale(results.result.scenario)
         times = envelope_times(first, last, BINS, record.dt)
         with pn.io.hold():
             self.put(
@@ -136,17 +228,11 @@ class LoopSpectrum(LoopLines):
     """The power spectral density of every residual."""
 
     def __init__(self) -> None:
-        super().__init__(
-            new_figure(
-                x_range=Range1d(start=0.5, end=500.0), y_range=Range1d(start=1e-6, end=1.0), x_axis_type="log", y_axis_type="log"
-            ),
-            tuple(CONTROLLERS),
-        )
-        self.figure.xaxis.axis_label = "frequency [Hz]"
+        super().__init__(new_spectrum(), CONTROLLERS)
 
     def draw(self, results: LoopResults, display: Display) -> None:
         """Send every line."""
-        scale = per_micrometre(display.unit, results.result.scenario.telescope.diameter) ** 2
+        scale = display.scale(results.result.scenario) ** 2
         lines = {name: (f[1:], scale * density[1:, display.column]) for name, (f, density) in results.spectra.items()}
         self.put(lines)
         for frequency, _ in lines.values():
@@ -163,9 +249,8 @@ class Response(PairedLines):
     """Rejection and noise transfer of the loops that have them."""
 
     def __init__(self) -> None:
-        fig = new_figure(x_range=Range1d(start=0.5, end=500.0), y_range=Range1d(start=-50.0, end=15.0), x_axis_type="log")
+        fig = new_figure((0.5, 500.0), (-50.0, 15.0), "frequency [Hz]", "x", y_axis_label="amplitude [dB]")
         super().__init__(fig, CURVES)
-        fig.xaxis.axis_label, fig.yaxis.axis_label = "frequency [Hz]", "amplitude [dB]"
 
     def draw(self, results: LoopResults, display: Display) -> None:
         """Send every line."""
@@ -183,7 +268,7 @@ class Nyquist(LoopLines):
     """The loop gain in the complex plane, the unit circle, and where the margins are measured."""
 
     def __init__(self) -> None:
-        fig = new_figure(x_range=Range1d(start=-NYQUIST, end=NYQUIST), y_range=Range1d(start=-NYQUIST, end=NYQUIST))
+        fig = new_figure((-NYQUIST, NYQUIST), (-NYQUIST, NYQUIST), "real part", y_axis_label="imaginary part")
         fig.update(height=None, aspect_ratio=1.0, max_width=480)
         turn = np.linspace(0.0, 2.0 * np.pi, 181)
         fig.line(np.cos(turn), np.sin(turn), line_color="#888888", line_dash=[4, 3])
@@ -191,7 +276,6 @@ class Nyquist(LoopLines):
         super().__init__(fig, CURVES)
         self.marks: Final = ColumnDataSource({"x": [], "y": [], "colour": [], "marker": []})
         fig.scatter("x", "y", source=self.marks, marker="marker", line_color="colour", fill_alpha=0.0, size=9, line_width=2)
-        fig.xaxis.axis_label, fig.yaxis.axis_label = "real part", "imaginary part"
         self._at: dict[str, list[tuple[complex, str]]] = {}
 
     def draw(self, results: LoopResults, display: Display) -> None:
@@ -211,18 +295,13 @@ class Nyquist(LoopLines):
     def restyle(self, dark: bool, hidden_names: list[str]) -> None:
         """Restyle the marks too."""
         super().restyle(dark, hidden_names)
-        shown = [
-            (point, marker, look(name).colour(dark))
+        rows = [
+            (point.real, point.imag, look(name).colour(dark), marker)
             for name, at in self._at.items()
             if name not in hidden_names
             for point, marker in at
         ]
-        self.marks.data = {
-            "x": [p.real for p, *_ in shown],
-            "y": [p.imag for p, *_ in shown],
-            "colour": [c for *_, c in shown],
-            "marker": [m for _, m, _ in shown],
-        }
+        self.marks.data = {name: [row[i] for row in rows] for i, name in enumerate(("x", "y", "colour", "marker"))}
 
 
 def of_mode(results: LoopResults, display: Display) -> list[Score]:
@@ -248,7 +327,7 @@ def loop_html(results: LoopResults, display: Display, envelope: PlantEnvelope | 
     rows = of_mode(results, display)
     ranked = (r["controller"] for r in rows if r["controller"] not in BOUNDS and r["residual_rms_nm"] is not None and r["ranked"])
     smallest = next(ranked, None)
-    scale = 1e-3 * per_micrometre(display.unit, results.result.scenario.telescope.diameter)
+    scale = 1e-3 * display.scale(results.result.scenario)
     more = uncertain_cells(envelope, display.column, 1e3 * scale) if envelope is not None else {}
     empty = [NOTHING] * len(added)
     body = [_row(r, display, scale, r["controller"] == smallest, more.get(r["controller"], empty)) for r in rows]
@@ -256,14 +335,15 @@ def loop_html(results: LoopResults, display: Display, envelope: PlantEnvelope | 
     kinds = [("text", [r for r in noted if r["residual_rms_nm"] is not None])]
     kinds += [("failure", [r for r in noted if r["residual_rms_nm"] is None])]
     notes = "".join(macro("texts", kind, [f"{label(r['controller'])}: {r['note']}" for r in some]) for kind, some in kinds)
-    return f"{table('Controllers', columns, body)}{limits_note(rows)}{notes}"
+    said = no_theory(rows)
+    return table("Controllers", columns, body) + (f"<p>{said}</p>" if said else "") + notes
 
 
 def loop_verdict_html(
     results: LoopResults, verdict: Verdict | None, display: Display, envelope: PlantEnvelope | None = None
 ) -> str:
     """Write the controllers with the smallest residual by prior knowledge, and the limit; and the best over an envelope."""
-    scale = per_micrometre(display.unit, results.result.scenario.telescope.diameter)
+    scale = display.scale(results.result.scenario)
     said = [*verdict.sentences(scale, display.unit_label)] if verdict else []
     if envelope is not None:
         lines = envelope.sentences(scale, display.unit_label, display.column)
@@ -271,25 +351,15 @@ def loop_verdict_html(
     return f'<p class="verdict">{escape(" ".join(said))}</p>' if said else ""
 
 
-def limits_note(rows: Sequence[Score]) -> str:
-    """Why some of the rows have no theory and no margins; nothing where all have them."""
-    said = no_theory(rows)
-    return f"<p>{said}</p>" if said else ""
-
-
-def linear_text(row: Score, value: str) -> str:
-    """Write a result of the linear loop: not applicable where a limit of the mirror acts."""
-    return Markup('<span title="{}">{}</span>').format(LIMITED, NOT_APPLICABLE) if row["limited"] else value
-
-
 def _row(row: Score, display: Display, scale: float, smallest: bool, more: Sequence[str]) -> Row:
     def scaled(key: str) -> str:
         return number(row[key] and row[key] * scale)
 
     residual = UNSTABLE if row["stable"] is False else scaled("residual_rms_nm")
+    why_none = Markup('<span title="{}">{}</span>').format(LIMITED, NOT_APPLICABLE)
     cells = [
-        (SMALLEST if smallest else "") + residual,
-        linear_text(row, scaled("predicted_rms_nm")),
+        (macro("tag", "smallest", "smallest") if smallest else "") + residual,
+        why_none if row["limited"] else scaled("predicted_rms_nm"),
         *more,
         NOTHING if row["strehl"] is None else f"{row['strehl']:.4f}",
         number(row["gain"]),
@@ -314,7 +384,7 @@ def margins_html(results: LoopResults, display: Display) -> str:
 
 def _line(row: Score, display: Display, cells: list[str]) -> Row:
     name = row["controller"]
-    return Row(swatch(name, display.dark) + label(name), cells, {"controller": name})
+    return named_row(name, label(name), display.dark, cells, "controller")
 
 
 FIRST_S, ZOOM_S = 2.0, 0.5
@@ -383,33 +453,17 @@ class ClosedLoopPage(Page):
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""
-        figures = pn.Column(
-            *(
-                figure_with_caption(title, drawn.figure, tall=True)
-                for title, drawn in (
-                    ("Residual", self.trace),
-                    ("Spectrum of the residual", self.spectrum),
-                    ("Residual, zoomed", self.zoom),
-                )
-            ),
-            self.room,
-            **WIDE,
-            stylesheets=[HALVES],
-        )
-        stability = pn.Column(
-            self.stability,
-            pn.Column(text(ABOUT), self.margins, **WIDE),
-            **WIDE,
-            stylesheets=[HALVES],
-        )
-        parts = (self._switch(), figures, box("Controllers", self.table), self.uncertain.view(), box("Stability", stability))
+        named = {"Residual": self.trace, "Spectrum of the residual": self.spectrum, "Residual, zoomed": self.zoom}
+        rooms = [figure_with_caption(title, drawn.figure, tall=True) for title, drawn in named.items()]
+        figures = pn.Column(*rooms, self.room, **WIDE, stylesheets=[HALVES])
+        margins = pn.Column(text(ABOUT), self.margins, **WIDE)
+        stability = pn.Column(self.stability, margins, **WIDE, stylesheets=[HALVES])
+        edit = tick(self.display, "editing", stylesheets=[SMALL_LABEL])
+        switch = pn.FlexBox(*zoom_buttons(self.trace.zoom, {"All": None, f"{FIRST_S:g} s": FIRST_S}), edit, **WIDE)
+        parts = (switch, figures, box("Controllers", self.table), self.uncertain.view(), box("Stability", stability))
         self._rooms = [pn.Column(part, **WIDE) for part in parts]  # a grid by its own style is shown even where it is not visible
         residual = box("Residual in closed loop", text(INTRO), self.note, self.verdict, self.cards, *self._rooms[:2])
         return boxes(residual, *self._rooms[2:])
-
-    def _switch(self) -> pn.FlexBox:
-        edit = pmui.Checkbox.from_param(self.display.param.editing, size="small", margin=0, stylesheets=[SMALL_LABEL])
-        return pn.FlexBox(*zoom_buttons(self.trace.zoom, {"All": None, f"{FIRST_S:g} s": FIRST_S}), edit, **WIDE)
 
     def _edit(self, *_: object) -> None:
         """Make the handle when it is first wanted, and room for what stands below the figure."""
@@ -439,14 +493,11 @@ class ClosedLoopPage(Page):
         self.work.start(Job("loop", partial(compute, of, memo=self.store.session.service.memo), cost=cost(of.scenario)))
 
     @property
-    def finding(self) -> LoopResults | None:
-        """What can be saved."""
-        return self.results
-
-    @property
     def results(self) -> LoopResults | None:
         """What the loop has given so far, or the one before; None where there cannot be one."""
         return None if self.work.state == FAILED else self.work.result
+
+    finding = results
 
     def _say(self, *_: object) -> None:
         work = self.work
@@ -506,7 +557,7 @@ class ClosedLoopPage(Page):
 
     def _items(self, results: LoopResults) -> list[dict[str, Any]]:
         """Describe a card per controller."""
-        scale = per_micrometre(self.display.unit, results.result.scenario.telescope.diameter)
+        scale = self.display.scale(results.result.scenario)
         left = {r["controller"]: r for r in results.rows if r["mode"] == self.display.mode}
         intervals = {place.observer: place.interval for place in self._verdict.places} if self._verdict else {}
         out = []

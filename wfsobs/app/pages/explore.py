@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from html import escape
-from types import MappingProxyType
 from typing import Final
 
 import panel as pn
 import panel_material_ui as pmui
 
-from wfsobs.app.budgets import Budgets
 from wfsobs.app.display import SIGNAL
 from wfsobs.app.history import History
+from wfsobs.app.idle_work import Budgets, SeedRuns
 from wfsobs.app.pages.parts import (
     BELOW_FIGURES,
     EDITED,
@@ -22,23 +20,23 @@ from wfsobs.app.pages.parts import (
     WIDE,
     Page,
     box,
+    caption,
     grid_style,
     group,
+    tick,
     zoom_buttons,
 )
 from wfsobs.app.render import macro
-from wfsobs.app.seeds import SeedRuns
-from wfsobs.app.style import HtmlText, bare, sheets
-from wfsobs.app.views.main_lines import MainLines
-from wfsobs.app.views.plots import call
-from wfsobs.app.views.spectra import MODEL, PEAKS, SpectraFigures
+from wfsobs.app.style import sheets
+from wfsobs.app.views.plots import MODEL, PEAKS, call
+from wfsobs.app.views.spectra import SpectraFigures
 from wfsobs.app.views.spectrum_editor import Frames, SpectrumEditor
 from wfsobs.app.views.strip import Strip
 from wfsobs.app.views.switches import Pinning, SeedSwitch
 from wfsobs.app.views.table import Table
 from wfsobs.app.views.target_figures import Stretch
 from wfsobs.app.views.traces import Traces
-from wfsobs.app.views.verdict import VerdictLine
+from wfsobs.app.views.verdict import MainLines, VerdictLine
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.error_spectra import Theory
 from wfsobs.observers.base import TARGETS, VIBRATION
@@ -50,7 +48,7 @@ SWITCHES = """
 :host { gap: 8px; align-items: center; width: max-content !important; }
 @media (min-width: 600.05px) and (min-height: 560.05px) { :host { flex-wrap: wrap; max-width: 100%; } }
 """
-ZOOMS: Mapping[str, float | None] = MappingProxyType({"All": None, "2 s": 2.0, "0.2 s": 0.2})
+ZOOMS: Mapping[str, float | None] = {"All": None, "2 s": 2.0, "0.2 s": 0.2}
 MARKS = macro("marks", PEAKS, MODEL)
 
 
@@ -113,12 +111,7 @@ class Explore(Page):
                 self._wanted_show, self.display.show = self.display.show, SIGNAL
 
     def _tick(self, switch: str) -> pmui.Checkbox:
-        return pmui.Checkbox.from_param(
-            self.display.param[switch], size="small", margin=0, align="center", stylesheets=[SMALL_LABEL]
-        )
-
-    def _above_table(self) -> pn.FlexBox:
-        return pn.FlexBox(*SeedSwitch(self.seeds).view(), gap="4px 16px", align_items="center", **WIDE)
+        return tick(self.display, switch, align="center", stylesheets=[SMALL_LABEL])
 
     def _section(self, target: str) -> pn.Column:
         """Lay out the strip and the two figures of one target."""
@@ -129,8 +122,8 @@ class Explore(Page):
         cards.on_main = lambda: self.lines.reset(target)
         cards.on_all = self.budgets.ask_for_all
         marks = MARKS if target == VIBRATION else ""
-        traces = pn.Column(_caption("Time trace"), self.traces.pane(target), **TALL)
-        self.rooms[target] = pn.Column(_caption("Spectrum", marks), self.spectra.pane(target), **TALL)
+        traces = pn.Column(caption("Time trace"), self.traces.pane(target), **TALL)
+        self.rooms[target] = pn.Column(caption("Spectrum", marks), self.spectra.pane(target), **TALL)
         figures = pn.Column(traces, self.rooms[target], **WIDE, stylesheets=[HALVES])
         window = [self._tick("window_spectra")] if target == TARGETS[0] else []
         below = pn.Row(self.stretches[target].pane, *window, **WIDE, stylesheets=[WRAPPED])
@@ -140,7 +133,8 @@ class Explore(Page):
     def complete(self) -> None:
         """Put what is further down below the first target."""
         if len(self.sections) == 1:
-            self.sections.extend([*map(self._section, TARGETS[1:]), box("RMS errors", self._above_table(), self.table.pane)])
+            seeds = pn.FlexBox(*SeedSwitch(self.seeds).view(), gap="4px 16px", align_items="center", **WIDE)
+            self.sections.extend([*map(self._section, TARGETS[1:]), box("RMS errors", seeds, self.table.pane)])
 
     def _edit(self, *_: object) -> None:
         """Make the handles when they are first wanted, and room for what stands below them."""
@@ -159,7 +153,3 @@ class Explore(Page):
     def _hide(self, target: str, names: list[str]) -> None:
         if names != self.display.hidden_lines.get(target, []):
             self.lines.choose(target, names)
-
-
-def _caption(text: str, marks: str = "") -> HtmlText:
-    return bare(f'<div class="caption above">{escape(text)}{marks}</div>')

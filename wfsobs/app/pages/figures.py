@@ -1,4 +1,4 @@
-"""The paper's figures, drawn from the results shown."""
+"""Pages that explain: the paper's figures of the results shown, and the equations with the numbers of the settings."""
 
 from __future__ import annotations
 
@@ -6,18 +6,21 @@ from html import escape
 from typing import Final
 
 import panel as pn
-from bokeh.models import BoxAnnotation, DataRange1d, Range1d
+from bokeh.models import BoxAnnotation
 
-from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.pages.parts import WIDE, Page, boxes, html
-from wfsobs.app.render import number
+from wfsobs.app.display import Display
+from wfsobs.app.pages.parts import WIDE, Page, boxes
+from wfsobs.app.render import number, render, short
 from wfsobs.app.store import Store
-from wfsobs.app.style import look, sheets, swatch
+from wfsobs.app.style import HtmlText, html, look, sheets, swatch
 from wfsobs.app.views.plots import LoopLines, call, new_figure, set_ends
 from wfsobs.app.views.table import find
 from wfsobs.app.work import TRUTH, RunResults
+from wfsobs.evaluation.description import Description, describe
+from wfsobs.observers import OBSERVERS
 from wfsobs.plot.paper import DECADES, FIGURES, WHOLE, ZOOMED, PaperFigure, Plot, drawn_lines, is_dashed, samples_of
 from wfsobs.sensors.modes import TIP_TILT
+from wfsobs.typing import Array
 
 
 class Figures(Page):
@@ -67,7 +70,7 @@ class _Sheet:
 
     def _errors(self, results: RunResults, display: Display) -> str:
         """List the RMS errors of the lines, mode by mode."""
-        scale, parts = per_micrometre(display.unit, results.scenario.telescope.diameter), []
+        scale, parts = display.scale(results.scenario), []
         for column in sorted({plot.column for plot in self.figure.plots}):
             mode = TIP_TILT[column].name
             scores = {name: find(results, name, self.figure.target, mode) for name in self.figure.observers}
@@ -87,10 +90,8 @@ class _PlotLines(LoopLines):
 
     def __init__(self, plot: Plot, names: tuple[str, ...], of: PaperFigure):
         self.plot, self.of = plot, of
-        y_range = Range1d(start=1e-3, end=1.0) if plot.is_spectrum else DataRange1d()
-        kind = "log" if plot.is_spectrum else "linear"
-        fig = new_figure(x_range=Range1d(start=0.0, end=1.0), y_range=y_range, y_axis_type=kind)
-        fig.xaxis.axis_label = "frequency [Hz]" if plot.is_spectrum else "time [s]"
+        y, label, log = ((1e-3, 1.0), "frequency [Hz]", "y") if plot.is_spectrum else (None, "time [s]", "")
+        fig = new_figure((0.0, 1.0), y, label, log)
         call(fig, f"{of.title}, {TIP_TILT[plot.column].name}, {plot.what}")
         super().__init__(fig, names)
         for name, line in self.lines.items():
@@ -103,7 +104,7 @@ class _PlotLines(LoopLines):
         """Send every line in the colours of the paper."""
         record, warm_up = results.result.record, results.scenario.run.warm_up
         shown = drawn_lines(self.of, self.plot, record, warm_up, results.values)
-        scale = per_micrometre(display.unit, results.scenario.telescope.diameter) ** (1 + self.plot.is_spectrum)
+        scale = display.scale(results.scenario) ** (1 + self.plot.is_spectrum)
         self.put({name: (x, scale * y) for name, (x, y) in shown.lines.items()})
         self.restyle(display.dark, [])
         self.figure.yaxis.axis_label = f"{self.plot.label} [{self.plot.unit(display.unit_label)}]"
@@ -117,3 +118,42 @@ class _PlotLines(LoopLines):
 
 def _label(name: str) -> str:
     return "Reference" if name == TRUTH else look(name).label
+
+
+class ModelPage(Page):
+    """The page; follows the settings and the mode while it is visible."""
+
+    def __init__(self, store: Store, display: Display):
+        super().__init__(store, display, "mode", "dark")
+        self.pane: Final = html(stylesheets=sheets("style", "model"))
+        store.param.watch(self.redraw, "scenario")
+
+    def view(self) -> HtmlText:
+        """Return the contents of the page."""
+        return self.pane
+
+    def draw(self) -> None:
+        """Write the equations."""
+        scenario = self.store.scenario
+        mode = min(self.display.column, len(scenario.modes) - 1)
+        self.pane.html = model_html(describe(scenario, mode), self.display.dark)
+
+
+def model_html(it: Description, dark: bool) -> str:
+    """Write the whole page."""
+    return render(
+        "model.html",
+        it=it,
+        swatch=lambda name: swatch(name, dark),
+        label=lambda name: OBSERVERS[name].label,
+        poles=poles,
+    )
+
+
+def poles(poles: Array) -> list[str]:
+    """Write poles, a conjugate pair once; count those that are zero to rounding."""
+    zero = abs(poles) < 1e-9
+    words = [
+        short(p.real) if abs(p.imag) < 1e-9 else f"{short(p.real)} ± {short(p.imag)} i" for p in poles[~zero] if p.imag > -1e-9
+    ]
+    return [*words, *([f"{zero.sum()} at 0"] if zero.any() else [])]

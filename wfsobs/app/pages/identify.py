@@ -9,10 +9,10 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 import panel as pn
-from bokeh.models import ColumnDataSource, HoverTool, Range1d
+from bokeh.models import ColumnDataSource, HoverTool
 
 from wfsobs.app.controls.fields import parse_number
-from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.display import Display
 from wfsobs.app.jobs import DONE, FAILED, RUNNING, Job, Tell
 from wfsobs.app.pages.parts import (
     WIDE,
@@ -24,7 +24,6 @@ from wfsobs.app.pages.parts import (
     html,
     legend,
     line,
-    make_button,
     number_field,
     read_number,
     text,
@@ -35,15 +34,22 @@ from wfsobs.app.service import BackgroundTask
 from wfsobs.app.share import IDENTIFY, CopiedTask
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, record_key
 from wfsobs.app.store import Store
-from wfsobs.app.style import look
-from wfsobs.app.views.plots import call, new_figure, set_ends
+from wfsobs.app.style import look, make_button
+from wfsobs.app.views.plots import call, new_spectrum, set_ends
 from wfsobs.app.work import RunResults
 from wfsobs.identification import Identification, identify
 from wfsobs.identification.identification import LEVEL
 from wfsobs.identification.process import Number
-from wfsobs.identification.report import format_number, identification_toml, mode_rows, whiteness_lines
+from wfsobs.identification.report import (
+    Fit,
+    bin_periodogram,
+    fitted_spectrum,
+    format_number,
+    identification_toml,
+    mode_rows,
+    whiteness_lines,
+)
 from wfsobs.identification.result import IdentifiedMode
-from wfsobs.identification.spectrum import Fit, bin_periodogram, fitted_spectrum
 from wfsobs.observers.missing import fill_missing
 from wfsobs.pipeline import as_stated
 from wfsobs.prior import Model
@@ -104,12 +110,9 @@ class SpectrumFigure:
     """What was measured, mean and highest value of every bin; over it the model, its parts, and a mark on every peak."""
 
     def __init__(self) -> None:
-        self.figure: Final = new_figure(
-            x_range=Range1d(start=0.1, end=500.0), y_range=Range1d(start=1e-6, end=1.0), x_axis_type="log", y_axis_type="log"
-        )
+        self.figure: Final = new_spectrum((0.1, 500.0))
         self.figure.height = HEIGHT
         call(self.figure, "Spectrum of z and its model")
-        self.figure.xaxis.axis_label = "frequency [Hz]"
         self.measurement: Final = ColumnDataSource({"x": [], "mean": [], "highest": []})
         self.total: Final = ColumnDataSource({"x": [], "y": []})
         self.parts: Final = ColumnDataSource({"xs": [], "ys": []})
@@ -126,9 +129,9 @@ class SpectrumFigure:
         ]
         fig.add_tools(HoverTool(renderers=[self._glyphs[-1][1]], tooltips="@text"))
 
-    def draw_measured(self, of: RecordSpectrum, display: Display, diameter: float) -> None:
-        """Send what was measured, and have the axes hold it."""
-        scale, column = per_micrometre(display.unit, diameter) ** 2, display.column
+    def draw_measured(self, of: RecordSpectrum, display: Display, scale: float) -> None:
+        """Send what was measured, and have the axes hold it. scale : of densities."""
+        column = display.column
         mean, highest = scale * of.mean[:, column], scale * of.highest[:, column]
         self.measurement.data = {"x": of.frequency, "mean": mean, "highest": highest}
         positive = mean[mean > 0]
@@ -137,13 +140,12 @@ class SpectrumFigure:
         set_ends(self.figure.x_range, float(of.frequency[0]), float(of.frequency[-1]))
         self.figure.yaxis.axis_label = f"PSD of z, {display.mode_label} [{display.unit_label}²/Hz]"
 
-    def draw_fit(self, mode: IdentifiedMode | None, of: Fit | None, display: Display, diameter: float) -> None:
+    def draw_fit(self, mode: IdentifiedMode | None, of: Fit | None, scale: float) -> None:
         """Send the model of the mode shown, or nothing."""
         if mode is None or of is None:
             for source in (self.total, self.parts, self.spikes, self.peaks):
                 source.data = {str(name): [] for name in source.data}
             return
-        scale = per_micrometre(display.unit, diameter) ** 2
         self.total.data = {"x": of.frequency, "y": scale * of.total}
         self.parts.data = {"xs": [of.frequency] * len(of.parts), "ys": [scale * part for part in of.parts]}
         self.spikes.data = {
@@ -170,9 +172,8 @@ class SpectrumFigure:
 WHITE, COLOURED = macro("tag", "best", "white"), macro("tag", "above", "not white")
 
 
-def identification_html(mode: IdentifiedMode, display: Display, diameter: float) -> str:
-    """Noise, turbulence and peaks of a mode, each number with its standard deviation."""
-    scale = per_micrometre(display.unit, diameter)
+def identification_html(mode: IdentifiedMode, display: Display, scale: float) -> str:
+    """Noise, turbulence and peaks of a mode, each number with its standard deviation. scale : of micrometres."""
     columns = {
         "What": "by frequency",
         "Frequency [Hz]": "natural frequency; of turbulence the corner",
@@ -296,9 +297,7 @@ class IdentifyPage(Page):
     @property
     def task(self) -> CopiedTask:
         """To identify the record."""
-        return CopiedTask(
-            IDENTIFY, {"level": parse_number(str(self.level.value)), "lowest": parse_number(str(self.lowest.value))}
-        )
+        return CopiedTask(IDENTIFY, {name: parse_number(str(getattr(self, name).value)) for name in ("level", "lowest")})
 
     @property
     def finding(self) -> tuple[Identification, Record, Scenario] | None:
@@ -334,16 +333,16 @@ class IdentifyPage(Page):
         of, shown = self.of, self.run.result
         if of is None or shown is None or self.display.column >= of.mean.shape[1]:
             return
-        diameter, column = shown.scenario.telescope.diameter, self.display.column
+        scale, column = self.display.scale(shown.scenario), self.display.column
         result, record = self.work.result or NEITHER
         mode = result.modes[column] if result and column < len(result.modes) else None
         self.legend.html = legend(NAMES, self.display.dark)
-        self.figure.draw_measured(of, self.display, diameter)
-        self.figure.draw_fit(mode, fitted_spectrum(mode, result) if mode and result else None, self.display, diameter)
+        self.figure.draw_measured(of, self.display, scale**2)
+        self.figure.draw_fit(mode, fitted_spectrum(mode, result) if mode and result else None, scale**2)
         self.figure.restyle(self.display.dark)
         if result and record:
             self.verdict.html = verdict_html(result)
-            self.table.html = identification_html(mode, self.display, diameter) if mode else ""
+            self.table.html = identification_html(mode, self.display, scale) if mode else ""
             replaced = self.store.source is None and self._scenario == self.store.scenario
             self.stale.param.update(object=REPLACED if replaced else EARLIER, visible=not same_content(record, of.record))
 

@@ -6,14 +6,12 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from html import escape
 from time import monotonic
-from typing import Final
+from typing import Any, Final
 
 import panel as pn
-import panel_material_ui as pmui
-import param
 
 from wfsobs.app.compared import name_of_difference
-from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.display import Display
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs import FAILED, RUNNING
 from wfsobs.app.live_work import live_job, record_saves
@@ -35,7 +33,7 @@ from wfsobs.app.pages.live_figures import (
     Stars,
     Waterfall,
 )
-from wfsobs.app.pages.parts import HALVES, WIDE, Page, box, boxes, example, figure_with_caption, group, legend, line, text
+from wfsobs.app.pages.parts import HALVES, WIDE, Page, box, boxes, example, figure_with_caption, group, legend, line, text, tick
 from wfsobs.app.service import IDLE, BackgroundTask
 from wfsobs.app.share import LIVE, CopiedTask
 from wfsobs.app.sources import LoadedRecord
@@ -83,19 +81,13 @@ class LiveRoom:
     def view(self) -> list[pn.Column]:
         """Return the boxes."""
         c = self.controls
-        figures = [
-            figure_with_caption("The last seconds", self.traces.figure),
-            self._spectra_room,
-            pn.Column(figure_with_caption("Waterfall", self.waterfall.figure), **WIDE, styles={"grid-column": "1 / -1"}),
-        ]
-        switches = line(
-            c.window,
-            c.target,
-            group(self.display, "show"),
-            group(self.display, "spectrum"),
-            c.waterfall,
-            pmui.Checkbox.from_param(self.display.param.editing, size="small", margin=0),
+        seconds, waterfall = (
+            figure_with_caption(title, of.figure)
+            for title, of in (("The last seconds", self.traces), ("Waterfall", self.waterfall))
         )
+        figures = [seconds, self._spectra_room, pn.Column(waterfall, **WIDE, styles={"grid-column": "1 / -1"})]
+        shown = [group(self.display, name) for name in ("show", "spectrum")]
+        switches = line(c.window, c.target, *shown, c.waterfall, tick(self.display, "editing"))
         return [
             box("Now", switches, c.lines, self.legend, pn.Column(*figures, **WIDE, stylesheets=[HALVES])),
             box("Observers", self.table, self.peaks),
@@ -107,14 +99,14 @@ class LiveRoom:
         """Send the present."""
         display, dark = self.display, self.display.dark
         target = self._target(loop)
-        scale = per_micrometre(display.unit, loop.scenario.telescope.diameter)
+        scale = display.scale(loop.scenario)
         active = loop.board.active()
         names = [name for name in active if name in self.controls.lines.value]
         run_in = RollingTraces.run_in(display)
         longer = view.n * view.dt + run_in
         before = loop.readings.look(loop.view, longer, anew=not loop.is_playing) if run_in else view
         self.traces.draw(before, view.n, target, names, display, scale, list(loop.events), self._bounds)
-        self.spectra.draw(view, target, names, display, scale)
+        self.spectra.draw(view, target, names, display, loop.scenario)
         what = self.controls.waterfall.value
         self.waterfall.draw(view, what if what in active else MEASUREMENT, target, display, scale)
         running = [name for name in self.controls.controllers.value if name in loop.controllers]
@@ -318,18 +310,18 @@ class LivePage(Page):
                 loop.say(str(error))
             self.draw()
 
-    def _switch(self, act: Callable[[LiveLoop, str, bool], None], event: param.parameterized.Event) -> None:
+    def _switch(self, act: Callable[[LiveLoop, str, bool], None], event: Any) -> None:
         runs = set() if self.loop is None else set(self.loop.running_ids())
         for names, on in ((set(event.new) - set(event.old) - runs, True), (set(event.old) - set(event.new), False)):
             for name in names:
                 self._do(lambda loop, name=name, on=on: act(loop, name, on))
 
-    def _follow(self, event: param.parameterized.Event) -> None:
+    def _follow(self, event: Any) -> None:
         """Change the loop as the settings in the drawer have changed."""
 
         def become(loop: LiveLoop) -> None:
-            if (wanted := event.new) != (before := loop.programme.scenario):
-                loop.become(wanted, name_of_difference(before, wanted))
+            if event.new != loop.programme.scenario:
+                loop.become(event.new, name_of_difference(loop.programme.scenario, event.new))
 
         self._do(become)
 

@@ -15,17 +15,15 @@ from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.pages.live_figures import MEASUREMENT
 from wfsobs.app.pages.parts import WIDE, LinkedFields, line
 from wfsobs.app.render import NOTHING, Row, number, table
-from wfsobs.app.style import look, swatch
+from wfsobs.app.style import look, make_select, named_row
 from wfsobs.closed_loop.rows import strehl
 from wfsobs.evaluation.rows import row_label, target_title
 from wfsobs.live.board import ADAPTIVE, NEXT, SCORED, SLOTS
 from wfsobs.live.checks import has_error, speed_of
-from wfsobs.live.control_crew import SEATS, USUAL
-from wfsobs.live.finding import Bounds, PeakFinding
+from wfsobs.live.crew import SEATS, USUAL
+from wfsobs.live.finding import Bounds, Change, PeakFinding, moves_of
 from wfsobs.live.loop import LiveLoop
-from wfsobs.live.paced import ALARM, LiveEvent
-from wfsobs.live.peaks import Change, moves_of
-from wfsobs.live.source import SIMULATION, STREAM, LiveSource
+from wfsobs.live.source import ALARM, SIMULATION, STREAM, LiveEvent, LiveSource
 from wfsobs.live.view import LiveView
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
@@ -63,10 +61,7 @@ def live_html(loop: LiveLoop, view: LiveView, target: str, display: Display, sca
         _row(loop, name, rms, target, display, scale, least)
         for name, rms in ranking(view, loop.board.active(), target, display.column)
     ]
-    rows += [
-        Row(swatch(name, display.dark) + row_label(name), [number(scale * rms), *[NOTHING] * 5], {"name": name})
-        for name, rms in of.items()
-    ]
+    rows += [named_row(name, row_label(name), display.dark, [number(scale * rms), *[NOTHING] * 5]) for name, rms in of.items()]
     return table("Live", columns, rows)
 
 
@@ -81,7 +76,7 @@ def _row(loop: LiveLoop, name: str, rms: float, target: str, display: Display, s
         *(number(1e6 * counts.latencies.quantile(share)) for share in (0.5, 0.999)),
         str(int(counts.late[0])),
     ]
-    return Row(swatch(name, display.dark) + look(name).label, cells, {"name": name})
+    return named_row(name, look(name).label, display.dark, cells)
 
 
 def control_html(loop: LiveLoop, seconds: float, display: Display) -> str:
@@ -107,7 +102,7 @@ def control_html(loop: LiveLoop, seconds: float, display: Display) -> str:
         return [*map(number, (1e3 * now[column], mas * now[column], 1e3 * whole[column])), *ratios]
 
     order = sorted(found, key=lambda name: inf if isnan(found[name][0][column]) else found[name][0][column])
-    rows = [Row(swatch(name, display.dark) + look(name).label, cells(*found[name]), {"controller": name}) for name in order]
+    rows = [named_row(name, look(name).label, display.dark, cells(*found[name]), "controller") for name in order]
     return table("Controllers of the live loop", columns, rows)
 
 
@@ -202,25 +197,23 @@ class LiveControls:
             name: pmui.Button(label=name, icon=icon, color="primary" if name == "Start" else "default", size="small", margin=0)
             for name, icon in BUTTONS.items()
         }
-        select = {"size": "small", "margin": 0}
-        self.speed: Final = pmui.Select(label="Speed", options=SPEEDS, value=1.0, width=100, **select)
-        self.window: Final = pmui.Select(label="Window", options=WINDOWS, value=5.0, width=100, **select)
-        self.target: Final = pmui.Select(label="Errors of", options=QUANTITIES, value=TARGETS[0], width=300, **select)
-        self.lasers: Final = pmui.Checkbox(label="Lasers", value=True, **select)
-        self.ngs: Final = pmui.Checkbox(label="NGS", value=True, **select)
-        self.losses: Final = pmui.Select(label="Frame loss", options=LOSSES, value=0.0, width=160, **select)
+        self.speed: Final = make_select("Speed", SPEEDS, 1.0, 100)
+        self.window: Final = make_select("Window", WINDOWS, 5.0, 100)
+        self.target: Final = make_select("Errors of", QUANTITIES, TARGETS[0], 300)
+        self.lasers, self.ngs = (pmui.Checkbox(label=name, value=True, size="small", margin=0) for name in ("Lasers", "NGS"))
+        self.losses: Final = make_select("Frame loss", LOSSES, 0.0, 160)
         self.running: Final = pmui.MultiChoice(
             label="Observers", options={look(name).label: name for name in SLOTS}, value=list(FIRST), **APART
         )
         self.controllers: Final = pmui.MultiChoice(
             label="Controllers", options={look(name).label: name for name in SEATS}, value=list(USUAL), **APART
         )
-        self.whose: Final = pmui.Select(label="Redesign", options={"All that run": ALL}, value=ALL, width=230, **select)
+        self.whose: Final = make_select("Redesign", {"All that run": ALL}, ALL, 230)
         for field in (self.running, self.controllers):
             field.param.watch(self._offer, "value")
         self._offer()
         waterfall = {"the measurement": MEASUREMENT} | {f"error of {label}": name for label, name in self.running.options.items()}
-        self.waterfall: Final = pmui.Select(label="Waterfall of", options=waterfall, value=MEASUREMENT, width=260, **select)
+        self.waterfall: Final = make_select("Waterfall of", waterfall, MEASUREMENT, 260)
         self.lines: Final = pmui.MultiChoice(label="Lines", options=self.running.options, value=list(MAIN), **APART)
 
         linked = {"errors": self.target, "window": self.window}
@@ -248,8 +241,7 @@ class LiveControls:
     def _offer(self, *_: object) -> None:
         """Have those at hand that run, for a new design."""
         names = [*self.running.value, *self.controllers.value]
-        if self.whose.value not in names:
-            self.whose.value = ALL
+        self.whose.value = self.whose.value if self.whose.value in names else ALL
         self.whose.options = {"All that run": ALL} | {look(name).label: name for name in names}
 
     def _allow(self, source: LiveSource) -> None:

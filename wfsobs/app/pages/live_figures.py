@@ -16,24 +16,23 @@ from bokeh.models import BasicTicker, ColorBar, ColumnDataSource, Image, LogColo
 from bokeh.palettes import Viridis256
 from bokeh.plotting import figure
 
-from wfsobs.app.component import Component
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.pages.parts import WIDE, grid_style
-from wfsobs.app.style import bare, look, script
-from wfsobs.app.views.plots import FigureLines, call, envelope, envelope_times, new_figure
+from wfsobs.app.style import Component, bare, look, script
+from wfsobs.app.views.plots import FigureLines, call, new_figure, new_spectrum
 from wfsobs.app.views.traces import WINDOW_S
 from wfsobs.app.work import TRUTH
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.evaluation.error_spectra import cumulative_rms
 from wfsobs.evaluation.recovery import trailing_rms
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.live.board import SLOTS
-from wfsobs.live.control_crew import ControlView
+from wfsobs.live.crew import ControlView
 from wfsobs.live.finding import LENGTH, LOWEST, ROWS, Bounds, bridge_missing, second_spectrum
-from wfsobs.live.paced import LiveEvent
+from wfsobs.live.source import LiveEvent
 from wfsobs.live.view import LiveView
 from wfsobs.scenario import Scenario
-from wfsobs.signal.welch import psd
+from wfsobs.signal.envelope import envelope, envelope_times
+from wfsobs.signal.spectrum import psd
 from wfsobs.typing import Array
 
 PATIENCE = 10.0
@@ -195,8 +194,7 @@ class RollingTraces(LiveFigure):
     """The last seconds of errors, or of estimates and truth."""
 
     def __init__(self, painter: Painter) -> None:
-        super().__init__(new_figure(x_range=Range1d(start=0.0, end=1.0), y_range=Range1d(start=-1.0, end=1.0)), painter)
-        self.figure.xaxis.axis_label = "time of the loop [s]"
+        super().__init__(new_figure((0.0, 1.0), (-1.0, 1.0), "time of the loop [s]"), painter)
         self._marks = LiveMarks(self.figure)
 
     @staticmethod
@@ -246,21 +244,12 @@ class RollingSpectra(LiveFigure):
     """Spectra of the errors, averaged over time with weights that fade."""
 
     def __init__(self, painter: Painter) -> None:
-        super().__init__(
-            new_figure(
-                x_range=Range1d(start=1.0, end=500.0),
-                y_range=Range1d(start=1e-6, end=1.0),
-                x_axis_type="log",
-                y_axis_type="log",
-            ),
-            painter,
-        )
-        self.figure.xaxis.axis_label = "frequency [Hz]"
+        super().__init__(new_spectrum((1.0, 500.0)), painter)
         self._sums: dict[str, Array] = {}
         self._of: tuple[object, ...] = ()
         self._last = 0
 
-    def draw(self, view: LiveView, target: str, names: Sequence[str], display: Display, scale: float) -> None:
+    def draw(self, view: LiveView, target: str, names: Sequence[str], display: Display, scenario: Scenario) -> None:
         """Take what is new into the average, and send it."""
         of, last = (target, display.column, display.error), view.first + view.n
         if of != self._of or last < self._last:
@@ -279,15 +268,12 @@ class RollingSpectra(LiveFigure):
             density: Array = found[1]
             before = self._sums.get(name, density)
             now = self._sums[name] = before + share * (density - before) if before.shape == density.shape else density
-            of_errors = scale * cumulative_rms(frequency[1:], now[1:]) if display.cumulative else scale**2 * now[1:]
-            data[name] = frequency[1:], of_errors
+            data[name] = frequency[1:], display.curve(frequency, now, scenario)
         self.put(data, display.dark)
         top = 3.0 * max((float(y.max()) for _, y in data.values()), default=1.0) or 1.0
         self.figure.x_range.update(start=1.0, end=0.5 / view.dt)
         self.figure.y_range.update(start=top * 10.0 ** -(DECADES / 2 if display.cumulative else DECADES), end=top)
-        of, unit = " of error" if display.error else "", display.unit_label
-        what = (f"cumulative rms{of}", unit) if display.cumulative else (f"PSD{of}", f"{unit}²/Hz")
-        self.figure.yaxis.axis_label = f"{what[0]}, {display.mode_label} [{what[1]}]"
+        self.figure.yaxis.axis_label = display.curve_label(" of error" if display.error else "")
 
 
 def shown_signal(view: LiveView, name: str, target: str, display: Display) -> Array:
@@ -327,16 +313,15 @@ class Waterfall:
     """
 
     def __init__(self) -> None:
-        self.figure: Final = new_figure(
-            x_range=Range1d(start=0.0, end=1.0), y_range=Range1d(start=LOWEST, end=500.0), y_axis_type="log"
-        )
-        self.figure.xaxis.axis_label, self.figure.yaxis.axis_label = "time of the loop [s]", "frequency [Hz]"
+        self.figure: Final = new_figure((0.0, 1.0), (LOWEST, 500.0), "time of the loop [s]", "y", y_axis_label="frequency [Hz]")
         self.figure.grid.visible = False
         self._colours = LogColorMapper(palette=Viridis256, low=1e-6, high=1.0, nan_color="rgba(0, 0, 0, 0)")
         self._source = ColumnDataSource({"image": [], "x": [], "y": [], "dw": [], "dh": []})
         glyph = Image(image="image", x="x", y="y", dw="dw", dh="dh", color_mapper=self._colours)
         self.figure.add_glyph(self._source, glyph, level="image")
-        self._bar = ColorBar(color_mapper=self._colours, width=8, padding=4, title_text_font_style="normal")
+        self._bar = ColorBar(
+            color_mapper=self._colours, width=8, padding=4, title_text_font_style="normal", background_fill_alpha=0.0
+        )
         self.figure.add_layout(self._bar, "right")
         self.columns: Final = np.full((ROWS, COLUMNS), np.nan)
         self._of: tuple[str, str, int] = ("", "", 0)
@@ -383,12 +368,8 @@ class Waterfall:
             return
         high = float(np.nanmax(image))
         self._colours.update(low=min(float(np.nanquantile(image, FLOOR)), high * 10.0**-SPAN), high=high)
-        self._bar.update(
-            title=f"{display.unit_label}²/Hz",
-            background_fill_alpha=0.0,
-            title_text_color="#C8C8C8" if display.dark else "#404040",
-            major_label_text_color="#C8C8C8" if display.dark else "#404040",
-        )
+        ink = "#C8C8C8" if display.dark else "#404040"
+        self._bar.update(title=f"{display.unit_label}²/Hz", title_text_color=ink, major_label_text_color=ink)
         # An image is drawn between its corners, in equal steps of the axis: of a logarithmic one, of the logarithm.
         self._source.data = {"image": [image], "x": [left], "y": [LOWEST], "dw": [end - left], "dh": [top - LOWEST]}
         self.figure.x_range.update(start=max(left, 0.0), end=end)  # before the loop there was nothing
@@ -418,15 +399,14 @@ class Detector:
         self.painter = painter
         self.name = name
         self.label: Final = look("none" if name == TRUTH else name).label
-        ranges = {"x_range": Range1d(start=-1.0, end=1.0), "y_range": Range1d(start=-1.0, end=1.0)}
-        self.figure: figure = new_figure(**ranges)
+        self.figure: figure = new_figure((-1.0, 1.0), (-1.0, 1.0), "mas")
         self.figure.update(height=None, aspect_ratio=1.0, min_width=SIDE, min_border_left=36, toolbar_location=None)
         for axis in self.figure.axis:
             ticker = BasicTicker(desired_num_ticks=3)
             axis.update(major_label_text_font_size="10px", minor_tick_line_color=None, ticker=ticker)
-        self.figure.xaxis.update(axis_label="mas", axis_label_text_font_size="10px", axis_label_standoff=2)
+        self.figure.xaxis.update(axis_label_text_font_size="10px", axis_label_standoff=2)
         call(self.figure, f"Star: {self.label}")
-        self._trail, self._spot = ColumnDataSource({"x": [], "y": []}), ColumnDataSource({"x": [], "y": []})
+        self._trail, self._spot = (ColumnDataSource({"x": [], "y": []}) for _ in range(2))
         self._line = self.figure.line("x", "y", source=self._trail, line_alpha=0.5).glyph
         self._core = self.figure.circle("x", "y", radius=1.0, source=self._spot, fill_alpha=0.6).glyph
         self._style: tuple[float, float, str] | None = None

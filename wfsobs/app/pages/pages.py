@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
-from types import MappingProxyType
 from typing import Any, Final
 from urllib.parse import parse_qsl, quote
 
@@ -14,18 +13,17 @@ import param
 
 from wfsobs.app.compared import comparison_of
 from wfsobs.app.display import Display
+from wfsobs.app.idle_work import SeedRuns
 from wfsobs.app.pages.campaign import CampaignPage
 from wfsobs.app.pages.closed_loop import ClosedLoopPage
 from wfsobs.app.pages.explore import Explore
-from wfsobs.app.pages.figures import Figures
+from wfsobs.app.pages.figures import Figures, ModelPage
 from wfsobs.app.pages.identify import IdentifyPage, Suggestion
 from wfsobs.app.pages.live import LivePage
-from wfsobs.app.pages.model import ModelPage
 from wfsobs.app.pages.parts import WIDE, LinkedFields, LinkedLines, LinkPart, Page, not_known
 from wfsobs.app.pages.sweep import SweepPage
 from wfsobs.app.pages.sweep_views import report_part
 from wfsobs.app.pages.tune import TunePage
-from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.store import Store
 from wfsobs.app.style import HEARD, PRIMARY, observers_of
 from wfsobs.app.views.plots import on_settle
@@ -35,19 +33,17 @@ from wfsobs.observers.base import TARGETS
 
 EXPLORE, IDENTIFY, TUNE, SWEEP, LOOP, LIVE = "explore", "identify", "tune", "sweep", "loop", "live"
 CAMPAIGN, FIGURES, MODEL = "campaign", "figures", "model"
-TITLES: Mapping[str, str] = MappingProxyType(
-    {
-        "Explore": EXPLORE,
-        "Identify": IDENTIFY,
-        "Tune": TUNE,
-        "Sweep": SWEEP,
-        "Closed loop": LOOP,
-        "Live": LIVE,
-        "Campaign": CAMPAIGN,
-        "Paper figures": FIGURES,
-        "Model": MODEL,
-    }
-)
+TITLES: Mapping[str, str] = {
+    "Explore": EXPLORE,
+    "Identify": IDENTIFY,
+    "Tune": TUNE,
+    "Sweep": SWEEP,
+    "Closed loop": LOOP,
+    "Live": LIVE,
+    "Campaign": CAMPAIGN,
+    "Paper figures": FIGURES,
+    "Model": MODEL,
+}
 
 TABS = {
     "& .MuiToggleButton-root": {

@@ -6,7 +6,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import partial
 from html import escape
-from types import MappingProxyType
 from typing import Any, Final, Protocol
 
 import panel as pn
@@ -15,7 +14,7 @@ from bokeh.plotting import figure
 
 from wfsobs.app.controls.fields import parse_number
 from wfsobs.app.controls.names import name_settings
-from wfsobs.app.controls.status import Status
+from wfsobs.app.controls.panel import Status
 from wfsobs.app.display import Display
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs import CANCELLED, DONE, RUNNING
@@ -23,7 +22,7 @@ from wfsobs.app.render import render
 from wfsobs.app.service import IDLE, BackgroundTask
 from wfsobs.app.share import EXPLORED, CopiedTask
 from wfsobs.app.store import Store
-from wfsobs.app.style import HEARD, WIDE, HtmlText, bare, html, sheets, swatch
+from wfsobs.app.style import HEARD, WIDE, HtmlText, bare, html, make_button, sheets, swatch
 from wfsobs.app.views.plots import call
 from wfsobs.app.work import RunResults
 from wfsobs.settings.errors import SettingError
@@ -59,7 +58,7 @@ class LinkedFields:
         Name -> a function that has a field offer a text, if there is such a choice. Raises SettingError.
     """
 
-    def __init__(self, fields: Mapping[str, Any] | None, offers: Mapping[str, Callable[[str], object]] = MappingProxyType({})):
+    def __init__(self, fields: Mapping[str, Any] | None, offers: Mapping[str, Callable[[str], object]] = {}):
         self._offers = offers
         self._acts: list[Callable[..., object]] = []
         self._waiting: Mapping[str, str] = {}
@@ -208,7 +207,7 @@ class Page(ABC):
     """
 
     link: LinkPart = LinkedFields({})
-    files: Mapping[str, tuple[str, Callable[[Any], bytes]]] = MappingProxyType({})
+    files: Mapping[str, tuple[str, Callable[[Any], bytes]]] = {}
     visible: bool = False
     _repetition: Any = None
 
@@ -260,7 +259,7 @@ class Page(ABC):
             self.store.session.post(self._set_pace)
 
     def _set_pace(self) -> None:
-        if self._repetition is not None and self.goes_on != self._repetition.running:
+        if self.goes_on != self._repetition.running:
             (self._repetition.start if self.goes_on else self._repetition.stop)()
 
     @property
@@ -308,12 +307,6 @@ BELOW_FIGURES = "@media (max-height: 560px) { :host { order: 1; } }"
 """Style of what stands above the figures of its box where there is height for both."""
 
 
-def heading(title: str, about: str = "") -> HtmlText:
-    """Make the title of a box; about : beside it, what is in the box."""
-    words = f'<span class="about">{escape(about)}</span>' if about else ""
-    return bare(f'<h2 class="title">{escape(title)}</h2>{words}', sizing_mode=None)
-
-
 def text(content: str) -> HtmlText:
     """Make a paragraph."""
     return html(f'<p class="text">{escape(content)}</p>')
@@ -325,17 +318,6 @@ def example(name: str, results: Any) -> HtmlText:
     pane.visible = not results.visible
     results.param.watch(lambda event: setattr(pane, "visible", not event.new), "visible")
     return pane
-
-
-def make_button(label: str, act: Callable[[], object], **options: Any) -> pmui.Button:
-    """Make a small button. act : called by a click."""
-
-    def do(_event: object) -> None:
-        act()
-
-    button = pmui.Button(label=label, **{"size": "small", "margin": 0, **options})
-    button.on_click(do)
-    return button
 
 
 def warning(words: str) -> pmui.Alert:
@@ -351,9 +333,10 @@ def zoom_buttons(zoom: Callable[[float | None], None], stretches: Mapping[str, f
     ]
 
 
-def box(title: str, *content: Any, about: str = "") -> pn.Column:
-    """Lay out a part of a page under its title; about : what is in it, in a few words."""
-    return pn.Column(heading(title, about), *content, **WIDE, stylesheets=sheets("box"))
+def box(title: str, *content: Any) -> pn.Column:
+    """Lay out a part of a page under its title."""
+    heading = bare(f'<h2 class="title">{escape(title)}</h2>', sizing_mode=None)
+    return pn.Column(heading, *content, **WIDE, stylesheets=sheets("box"))
 
 
 def boxes(*parts: Any) -> pn.Column:
@@ -387,16 +370,14 @@ SMALL_LABEL = ".MuiFormControlLabel-label.MuiTypography-root { font-size: 0.8125
 HEIGHT = "clamp(230px, min(100vh - 330px, 64vh), 640px)"
 """Of a figure: what a window has room for below what stands above the first one."""
 
-TALL: Mapping[str, Any] = MappingProxyType(
-    {
-        **WIDE,
-        "height": 230,
-        "stylesheets": [
-            f":host {{ height: {HEIGHT} !important; flex-basis: auto !important; }}"
-            "@media (max-width: 1000px) { :host { height: clamp(230px, 42vh, 560px) !important; } }"
-        ],
-    }
-)
+TALL: Mapping[str, Any] = {
+    **WIDE,
+    "height": 230,
+    "stylesheets": [
+        f":host {{ height: {HEIGHT} !important; flex-basis: auto !important; }}"
+        "@media (max-width: 1000px) { :host { height: clamp(230px, 42vh, 560px) !important; } }"
+    ],
+}
 """A figure as high as the window has room for."""
 
 EDITED = f":host {{ height: calc({HEIGHT} + 120px) !important; }}"
@@ -408,8 +389,7 @@ def figure_with_caption(title: str, fig: figure, *, tall: bool = False) -> pn.Co
     call(fig, title)
     if tall:
         fig.sizing_mode = "stretch_both"
-    caption = bare(f'<div class="caption above">{escape(title)}</div>')
-    return pn.Column(caption, pn.pane.Bokeh(fig, sizing_mode=fig.sizing_mode, margin=0), **(TALL if tall else WIDE))
+    return pn.Column(caption(title), pn.pane.Bokeh(fig, sizing_mode=fig.sizing_mode, margin=0), **(TALL if tall else WIDE))
 
 
 def grid_style(columns: str, narrow: str = "minmax(0, 1fr)") -> str:
@@ -423,6 +403,16 @@ def grid_style(columns: str, narrow: str = "minmax(0, 1fr)") -> str:
 
 HALVES = grid_style("minmax(0, 1fr) minmax(0, 1fr)")
 """Two figures beside each other."""
+
+
+def caption(words: str, marks: str = "") -> HtmlText:
+    """Make what stands above a figure. marks : HTML behind it."""
+    return bare(f'<div class="caption above">{escape(words)}{marks}</div>')
+
+
+def tick(display: Display, name: str, **options: Any) -> pmui.Checkbox:
+    """Make the box of one switch of the display."""
+    return pmui.Checkbox.from_param(display.param[name], size="small", margin=0, **options)
 
 
 def group(display: Display, name: str) -> pmui.RadioButtonGroup:
@@ -446,7 +436,7 @@ class Starter:
         start: str,
         label: str,
         detail: Callable[[], str] = str,
-        uses: Mapping[str, Callable[[], object]] = MappingProxyType({}),
+        uses: Mapping[str, Callable[[], object]] = {},
     ):
         """Make the buttons.
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from html import escape
 from time import monotonic
-from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -14,10 +14,10 @@ import panel_material_ui as pmui
 import param
 
 from wfsobs.app.cache import key_of
-from wfsobs.app.component import HtmlComponent
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.display import Display
 from wfsobs.app.downloads import table_csv
+from wfsobs.app.idle_work import SeedScores
 from wfsobs.app.jobs import BATCH, CANCELLED, DONE, FAILED, RUNNING, Job, Tell
 from wfsobs.app.limits import Limits
 from wfsobs.app.pages.parts import (
@@ -46,16 +46,15 @@ from wfsobs.app.pages.sweep_views import (
     verdict_of_sweep,
 )
 from wfsobs.app.render import render
-from wfsobs.app.seeds import SeedScores
 from wfsobs.app.service import BackgroundTask, Session
 from wfsobs.app.share import SWEEP, CopiedTask
 from wfsobs.app.store import Store
-from wfsobs.app.style import look, script, sheets
+from wfsobs.app.style import HtmlComponent, look, make_select, script, sheets
 from wfsobs.campaign.sweep import MOST_SEEDS, SEED, Sweep, SweepResults, parse_axis, plan_sweep, run_cell
 from wfsobs.campaign.usual_values import usual_values
 from wfsobs.evaluation.rows import target_title
 from wfsobs.evaluation.scores import SCORED
-from wfsobs.priors_from.selection import quick_observers
+from wfsobs.priors_from.scenario import quick_observers
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.grid import Variation
@@ -104,19 +103,18 @@ class SweepTask(BackgroundTask):
         if following is None:
             self.param.update(state=DONE, progress=1.0)
             return
-        self._cell = following[0]
-        self._one.start(self._job(results.sweep, *following))
-
-    def _job(self, sweep: Sweep, cell: int, number: int) -> Job:
-        limits = self.session.service.limits
-        return Job(
-            "sweep",
-            lambda watch, tell: compute(sweep, cell, number, limits, watch, tell),
-            key=f"{number} of {sorted(sweep.cells[cell].items())} by {sweep.observers} of {self._base_key}",
-            cost=sweep.seconds / sweep.n_runs,
-            priority=BATCH,
-            time_limit=limits.seconds,
-            refusal=SettingError,
+        self._cell, number = following
+        sweep, limits = results.sweep, self.session.service.limits
+        self._one.start(
+            Job(
+                "sweep",
+                partial(compute, sweep, self._cell, number, limits),
+                key=f"{number} of {sorted(sweep.cells[self._cell].items())} by {sweep.observers} of {self._base_key}",
+                cost=sweep.seconds / sweep.n_runs,
+                priority=BATCH,
+                time_limit=limits.seconds,
+                refusal=SettingError,
+            )
         )
 
     def _take(self, *_: object) -> None:
@@ -164,7 +162,7 @@ def sweep_settings(scenario: Scenario) -> dict[str, str]:
 NONE = ""
 """No setting."""
 
-LONG: Mapping[str, Any] = MappingProxyType({"sizing_mode": "stretch_width", "max_width": 440, "margin": 0})
+LONG: Mapping[str, Any] = {"sizing_mode": "stretch_width", "max_width": 440, "margin": 0}
 """As wide as the longest words, or as a phone."""
 
 
@@ -174,7 +172,7 @@ class AxisFields:
     def __init__(self, store: Store, labels: tuple[str, str], options: dict[str, str], path: str, values: str):
         """Make the fields. labels : of the setting and of its values; options : name -> path of those to choose from."""
         self.store = store
-        self.select: Final = pmui.Select(label=labels[0], options=options, value=path, size="small", searchable=True, **LONG)
+        self.select: Final = make_select(labels[0], options, path, None, searchable=True, **LONG)
         self.values: Final = pmui.TextInput(label=labels[1], value=values, size="small", width=150, margin=0)
         self.select.param.watch(self._suggest, "value")
 
@@ -189,7 +187,7 @@ class AxisFields:
             self.select.options = {**self.select.options, axis_title(self.store.scenario, path): path}
         return path in self.select.options.values()
 
-    def _suggest(self, event: param.parameterized.Event) -> None:
+    def _suggest(self, event: Any) -> None:
         if event.new != NONE:
             self.values.value = usual_values(self.store.scenario, event.new)
         self.values.disabled = event.new == NONE
@@ -265,28 +263,20 @@ class SweepPage(Page):
         self.work: Final = SweepTask(store.session)
         self.starter: Final = Starter(self.work, self._start, "Run the sweep", "Progress of the sweep", self._so_far)
         names = sweep_settings(store.scenario)
-        (first, values), (second, more) = FIRST
+        several = {"no second setting": NONE, **names}
         self.axes: Final = (
-            AxisFields(store, ("Error over", "Values"), names, first, values),
-            AxisFields(store, ("and over", "Values of the second"), {"no second setting": NONE, **names}, second, more),
+            AxisFields(store, ("Error over", "Values"), names, *FIRST[0]),
+            AxisFields(store, ("and over", "Values of the second"), several, *FIRST[1]),
         )
         self.settings: Final = [axis.select for axis in self.axes]
         self.values: Final = [axis.values for axis in self.axes]
         self.seeds: Final = number_field("Seeds of each", SEEDS, 120)
-        self.observers: Final = pmui.Select(
-            label="Observers", options=OBSERVERS_OF, value=QUICK, size="small", width=290, margin=0
-        )
-        first_axis, second_axis = self.axes
-        linked = {
-            "over": first_axis.select,
-            "values": first_axis.values,
-            "second": second_axis.select,
-            "second_values": second_axis.values,
-            "seeds": self.seeds,
-            "observers": self.observers,
-        }
+        self.observers: Final = make_select("Observers", OBSERVERS_OF, QUICK, 290)
+        first, second = self.axes
+        linked = {"over": first.select, "values": first.values, "second": second.select, "second_values": second.values}
+        linked |= {"seeds": self.seeds, "observers": self.observers}
         # a setting of a list is not among the choices until it is asked for
-        self.link = LinkedFields(linked, {"over": first_axis.offer, "second": second_axis.offer})
+        self.link = LinkedFields(linked, {"over": first.offer, "second": second.offer})
         self.estimate: Final = html()
         self.maps: Final = {target: SweepMap(self.load, **WIDE) for target in SCORED}
         self.lines: Final = {target: ErrorLines() for target in SCORED}
@@ -299,13 +289,10 @@ class SweepPage(Page):
         self._draw_time = 0.0
         for part in (*self.boxes, self.shades):
             part.visible = False
-        self._watch()
-
-    def _watch(self) -> None:
         self.link.watch(self.follow)
         self.work.param.watch(self._take, ["state", "result"])
-        self.store.param.watch(self._compare, ["scenario", "source"])
-        self.store.param.watch(self.follow, ["scenario", "source"])
+        for act in (self._compare, self.follow):
+            store.param.watch(act, ["scenario", "source"])
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 from bokeh.colors import RGB
-from bokeh.models import ColumnDataSource, FixedTicker, Range1d
+from bokeh.models import ColumnDataSource, FixedTicker
 from bokeh.plotting import figure
 
 from wfsobs.app.controls.names import setting_name
@@ -47,12 +47,7 @@ class SweepLines:
         room = 0.03 * (high - low) + 0.5 * APART * float(np.diff(x).min())
         ratio = 1.1 * float(np.exp(0.5 * APART * np.diff(np.log(x)).min())) if logarithmic else 1.0
         ends = (low / ratio, high * ratio) if logarithmic else (low - room, high + room)
-        self.figure: figure = new_figure(
-            x_range=Range1d(start=ends[0], end=ends[1]),
-            y_range=Range1d(start=0.0, end=1.0),
-            x_axis_type="log" if logarithmic else "linear",
-        )
-        self.figure.xaxis.axis_label = part["across"]
+        self.figure: figure = new_figure(ends, (0.0, 1.0), part["across"], "x" * logarithmic)
         if texts is not None:
             self.figure.xaxis.ticker = FixedTicker(ticks=x.tolist())
             self.figure.xaxis.major_label_overrides = dict(zip(x.tolist(), texts, strict=True))

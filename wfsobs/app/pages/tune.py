@@ -11,7 +11,6 @@ from typing import Any, Final
 
 import numpy as np
 import panel as pn
-import panel_material_ui as pmui
 from bokeh.models import ColumnDataSource, DataRange1d
 from markupsafe import Markup
 
@@ -40,7 +39,7 @@ from wfsobs.app.render import NOTHING, Row, change, macro, number, table
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.share import TUNE, CopiedTask
 from wfsobs.app.store import Store
-from wfsobs.app.style import look
+from wfsobs.app.style import look, make_select
 from wfsobs.app.views.plots import call, new_figure
 from wfsobs.app.work import RunResults
 from wfsobs.cost import part_seconds
@@ -87,11 +86,6 @@ def seconds(of: RunResults, scenario: Scenario, observer: str, evaluations: int)
     return (evaluations + 2) * each * share * record.n_steps * record.n_modes + simulation
 
 
-def minimised_measure(of: RunResults, observer: str, target: str) -> str:
-    """Say what a tuning minimises. Raises RecordError where a loaded record has nothing to judge by."""
-    return MEASURES[judged_by(of.result.record, observer, target)[1] if of.is_recorded else TRUTH]
-
-
 def compute(
     of: RunResults, scenario: Scenario, observer: str, target: str, evaluations: int, watch: Watch, tell: Tell
 ) -> TuningResult:
@@ -130,9 +124,8 @@ class HistoryFigure:
     """The error, or what takes its place, on the validation record of every evaluation, and the least so far."""
 
     def __init__(self) -> None:
-        self.figure: Final = new_figure(x_range=DataRange1d(range_padding=0.02), y_range=DataRange1d())
+        self.figure: Final = new_figure(DataRange1d(range_padding=0.02), label="evaluation")
         call(self.figure, "History of the tuning")
-        self.figure.xaxis.axis_label = "evaluation"
         self.source: Final = ColumnDataSource({"x": [], "tried": [], "best": []})
         self._trials = self.figure.scatter("x", "tried", source=self.source, size=6, fill_alpha=0.7)
         self._best = self.figure.step("x", "best", source=self.source, mode="after", line_width=2.0)
@@ -177,15 +170,10 @@ def tuning_html(result: TuningResult, display: Display, diameter: float) -> str:
 
 def _row(section: str, name: str, before: float | str | None, after: float | str | None, scale: float) -> Row:
     error, name = section in (VALIDATION, TEST, OTHER), setting_name(name) if section == SETTING else name
-    cells = [_cell(x, scale if error else 1.0) for x in (before, after)]
+    scale = scale if error else 1.0
+    cells = [x if isinstance(x, str) else NOTHING if x is None else number(x * scale, 4) for x in (before, after)]
     cells.append(change(before, after) if error and isinstance(before, float) and isinstance(after, float) else "")
     return Row(Markup("<b>{}</b>").format(name) if name == TOGETHER else name, cells, {"section": section})
-
-
-def _cell(value: float | str | None, scale: float) -> str:
-    if isinstance(value, str):
-        return value
-    return NOTHING if value is None else number(value * scale, 4)
 
 
 INTRO = (
@@ -220,8 +208,8 @@ class TunePage(Page):
         self.starter: Final = Starter(
             self.work, self._start, "Start tuning", "Progress of the tuning", self._so_far, {"Use it": self.use}
         )
-        self.observer: Final = pmui.Select(label="Observer", options=choices(), value=START, size="small", width=250, margin=0)
-        self.target: Final = pmui.Select(label="Error of", options=[], size="small", width=130, margin=0)
+        self.observer: Final = make_select("Observer", choices(), START, 250)
+        self.target: Final = make_select("Error of", [], None, 130)
         self.evaluations: Final = number_field("Evaluations", EVALUATIONS, 110)
         self.figure: Final = HistoryFigure()
         self.measure = MEASURES[TRUTH]
@@ -249,7 +237,7 @@ class TunePage(Page):
         evaluations = read_number(self.evaluations, 1, MOST, whole=True)
         cost = seconds(of, scenario, observer, evaluations)
         job = self.store.limits.job("tune", "tuning", partial(compute, of, scenario, observer, target, evaluations), cost)
-        self.measure = minimised_measure(of, observer, target)
+        self.measure = MEASURES[judged_by(of.result.record, observer, target)[1] if of.is_recorded else TRUTH]
         self.work.start(job)
 
     def use(self) -> None:
@@ -278,9 +266,7 @@ class TunePage(Page):
 
     def _history(self) -> tuple[Evaluation, ...]:
         """Of the tuning under way, or of the last one."""
-        if self.work.state == RUNNING:
-            return self.work.latest or ()
-        tuned = self.finding
+        tuned = None if self.work.state == RUNNING else self.finding
         return tuned.history if tuned else self.work.latest or ()
 
     def _scale(self) -> tuple[str, float]:

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wfsobs.app.style import observers_of
-from wfsobs.app.views.main_lines import main_observers
-from wfsobs.app.views.plots import envelope, envelope_times
+from wfsobs.app.views.verdict import main_observers
 from wfsobs.app.work import TRUTH
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import rows as controller_rows
@@ -26,15 +25,15 @@ from wfsobs.evaluation.evidence import Evidence
 from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.rows import Row, score_rows
 from wfsobs.evaluation.scores import SCORED
-from wfsobs.evaluation.verdict import Verdict, verdict
+from wfsobs.evaluation.verdict import verdict
 from wfsobs.observers.base import TARGETS
-from wfsobs.priors_from.selection import usual_observers
+from wfsobs.priors_from.scenario import usual_observers
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import from_toml, to_toml
 from wfsobs.scenario.grid import Variation
-
-Array = NDArray[np.float64]
+from wfsobs.signal.envelope import envelope, envelope_times
+from wfsobs.typing import Array
 
 Floats = NDArray[np.float32]
 
@@ -199,7 +198,8 @@ def state_of(
                     lines[f"psd{suffix}/{where}"], lines[f"cumulative{suffix}/{where}"] = _spectra(found[0], density[:, i])
     scores = [evidence.over_seeds(score) for score in result.scores] if evidence else result.scores
     rows = score_rows(scores, scenario.run.seed, source=result.prior_source)
-    budgets = list_budgets(result) if is_simulated else []
+    budgets, simulation = (list_budgets(result), scenario) if is_simulated else ([], None)
+    of = scenario, record, result.estimates, result.scores
     return State(
         scenario,
         rows,
@@ -207,23 +207,16 @@ def state_of(
         grid,
         lines,
         loop_rows(result),
-        budget_rows(budgets),
+        [{"observer": it.observer, "target": it.target, "mode": it.mode, **budget_row(it)} for it in budgets],
         seeds_of(evidence) if evidence else {},
         [
             (target, mode, found.sentences())
             for target in TARGETS
             for mode in names
-            if (found := _verdict(result, target, mode, scenario if is_simulated else None, evidence, budgets)) is not None
+            if (found := verdict(*of, target, mode, simulation=simulation, evidence=evidence, budgets=budgets)) is not None
         ],
         {target: main_observers(result.scores, target, names[0], evidence) for target in TARGETS},
     )
-
-
-def _verdict(
-    result: Result, target: str, mode: str, simulation: Scenario | None, evidence: Evidence | None, budgets: Sequence[Budget]
-) -> Verdict | None:
-    of = result.scenario, result.record, result.estimates, result.scores
-    return verdict(*of, target, mode, simulation=simulation, evidence=evidence, budgets=budgets)
 
 
 def list_budgets(result: Result) -> list[Budget]:
@@ -233,11 +226,6 @@ def list_budgets(result: Result) -> list[Budget]:
     except ValueError:
         return []
     return sorted(found, key=lambda it: (SCORED.index(it.target), [m.name for m in result.scenario.modes].index(it.mode)))
-
-
-def budget_rows(budgets: Sequence[Budget]) -> list[Row]:
-    """List error budgets as plain values."""
-    return [{"observer": it.observer, "target": it.target, "mode": it.mode, **budget_row(it)} for it in budgets]
 
 
 def seeds_of(evidence: Evidence) -> dict[str, Any]:
@@ -304,6 +292,10 @@ def window_of(states: Sequence[State]) -> tuple[float, float] | None:
 # -------------------------------------------------------------------------------------------- to another process
 
 
+LATER = ("loop", "budgets", "seeds", "verdicts", "main")
+"""Fields of a state after its lines."""
+
+
 def pack(report: Report) -> bytes:
     """Write a report as a file of plain arrays and text."""
     words = {
@@ -317,14 +309,8 @@ def pack(report: Report) -> bytes:
         "states": [
             {
                 "toml": to_toml(s.scenario),
-                "rows": s.rows,
-                "reasons": s.reasons,
                 "grid": [s.grid.n, s.grid.dt, s.grid.bins],
-                "loop": list(s.loop),
-                "budgets": list(s.budgets),
-                "seeds": s.seeds,
-                "verdicts": list(s.verdicts),
-                "main": s.main,
+                **{name: getattr(s, name) for name in ("rows", "reasons", *LATER)},
             }
             for s in report.states
         ],
@@ -351,7 +337,7 @@ def unpack(content: bytes) -> Report:
             tuple(s["reasons"]),
             Grid(*s["grid"]),
             of,
-            *(s[name] for name in ("loop", "budgets", "seeds", "verdicts", "main")),
+            *(s[name] for name in LATER),
         )
         for s, of in zip(words["states"], lines, strict=True)
     )

@@ -7,11 +7,15 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import logging
 import os
+import subprocess
 import sys
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
+from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -21,8 +25,6 @@ from bokeh.models import (
     ColumnDataSource,
     CrosshairTool,
     DataRange1d,
-    DataRenderer,
-    HoverTool,
     Range1d,
     Span,
     VSpan,
@@ -36,7 +38,7 @@ from wfsobs.app.display import NO_ANGLE, UNITS, per_micrometre
 from wfsobs.app.glossary import sentence_on
 from wfsobs.app.pages.sweep_views import SweepLines
 from wfsobs.app.render import render
-from wfsobs.app.report.data import Report, State, unpack, window_of
+from wfsobs.app.report.data import Report, State, pack, state_of, unpack, window_of
 from wfsobs.app.report.sections import (
     budget_key,
     budget_state_table,
@@ -51,13 +53,20 @@ from wfsobs.app.report.sections import (
     value_of,
 )
 from wfsobs.app.style import PRIMARY, asset, look, observers_of
-from wfsobs.app.views.plots import MODEL, PEAKS, add_line, marked_peaks, new_figure
-from wfsobs.app.work import TRUTH
+from wfsobs.app.views.plots import MODEL, PEAKS, add_line, add_marks, model_mark, new_figure, new_spectrum, peak_marks
+from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE
 from wfsobs.evaluation.budget import TERMS
+from wfsobs.evaluation.evidence import Evidence, gather_evidence
+from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.scores import BOUNDS
+from wfsobs.files import check_writable, write_whole
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, VIBRATION
+from wfsobs.pipeline import run
+from wfsobs.progress import QUIET, Watch
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.grid import Variation, scenarios
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.version import __version__
 
@@ -71,6 +80,8 @@ def page(report: Report, date: datetime) -> str:
     scripts = {"start": START, "bokeh": bokeh, "page": asset("report.js")}
     names = [state_name(report, state, i) or "All modes" for i, state in enumerate(report.states)]
     states = list(zip(report.states, names, strict=True))
+    # what varies, and the rows of `wfsobs run --json` with the computing time
+    rows = [{"state": state_name(report, state, i), "rows": state.rows} for i, state in enumerate(report.states)]
     return render(
         "report/page.html",
         version=__version__,
@@ -90,16 +101,14 @@ def page(report: Report, date: datetime) -> str:
         modes={name: name[0].upper() + name[1:] for name in _modes(report)},
         units=UNITS,
         sweeps={i: setting_label(report.base, report.variations[i].path) for i in _sweeps(report)},
-        errors=[state_table(state, name) for state, name in states],
-        loops=[loop_state_table(state, name) for state, name in states] if any(state.loop for state in report.states) else [],
-        budgets=[budget_state_table(state, name) for state, name in states]
-        if any(state.budgets for state in report.states)
-        else [],
+        errors=[state_table(*of) for of in states],
+        loops=[loop_state_table(*of) for of in states] if any(state.loop for state in report.states) else [],
+        budgets=[budget_state_table(*of) for of in states] if any(state.budgets for state in report.states) else [],
         budget_key=budget_key(),
         terms=TERMS,
         not_applicable=NOT_APPLICABLE,
         limited=LIMITED,
-        embedded={"rows": _rows(report), "data": _data(report), "figures": _figures(report)},
+        embedded={"rows": rows, "data": _data(report), "figures": _figures(report)},
         **scenario_values(report),
         **meaning_values(report),
         **origin_values(report, date),
@@ -122,11 +131,9 @@ def _modes(report: Report) -> list[str]:
 
 def _sweeps(report: Report) -> list[int]:
     """Which variations are of several numbers."""
-    return [i for i, v in enumerate(report.variations) if len(v.values) > 1 and all(map(_is_number, v.values))]
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+    return [
+        i for i, v in enumerate(report.variations) if len(v.values) > 1 and all(type(value) in (int, float) for value in v.values)
+    ]
 
 
 def _line_names() -> list[str]:
@@ -149,11 +156,6 @@ def _figures(report: Report) -> dict[str, Any]:
     for fig in all_figures(_lines(report), bool(_sweeps(report)), parts).values():
         document.add_root(fig)
     return {"document": document.to_json(deferred=False), "roots": {root.id: str(root.name) for root in document.roots}}
-
-
-def _rows(report: Report) -> list[dict[str, Any]]:
-    """Collect what varies and the rows of every state: those of `wfsobs run --json`, with the computing time."""
-    return [{"state": state_name(report, state, i), "rows": state.rows} for i, state in enumerate(report.states)]
 
 
 def _data(report: Report) -> dict[str, Any]:
@@ -193,9 +195,9 @@ def _state(state: State, pool: Pool) -> dict[str, Any]:
         "warm_up": scenario.run.warm_up,
         "lines": lines,
         "axes": {name: pool.add(axis.astype("<f4").tobytes()) for name, axis in axes.items()},
-        "peaks": [[p.frequency, f"peak {p.frequency:.5g} Hz, damping {p.damping:.3g}"] for p in marked_peaks(scenario)],
+        "peaks": peak_marks(scenario),
         "intervals": state.seeds.get("intervals", {}),
-        "model": [[scenario.kalman.frequency, f"model of the Kalman filters {scenario.kalman.frequency:.5g} Hz"]],
+        "model": [model_mark(scenario)],
     }
 
 
@@ -231,8 +233,7 @@ def all_figures(lines: Mapping[str, Sequence[str]], sweeps: bool, parts: Sequenc
 
 def _trace(names: Sequence[str], times: Range1d, crosshair: CrosshairTool) -> figure:
     """Time traces of the truth and the estimates; warm-up and the stretch of every sample shaded."""
-    fig = new_figure(x_range=times, y_range=Range1d(start=-1.0, end=1.0))
-    fig.xaxis.axis_label = "time [s]"
+    fig = new_figure(times, (-1.0, 1.0), "time [s]")
     fig.add_tools(crosshair)
     for name, colour in SHADES.items():
         fig.add_layout(
@@ -244,24 +245,16 @@ def _trace(names: Sequence[str], times: Range1d, crosshair: CrosshairTool) -> fi
 
 def _spectrum(target: str, names: Sequence[str], frequencies: Range1d) -> figure:
     """Spectra, log-log, the peaks of the vibration and of the Kalman filters' model marked."""
-    fig = new_figure(x_range=frequencies, y_range=Range1d(start=1e-6, end=1.0), x_axis_type="log", y_axis_type="log")
-    fig.xaxis.axis_label = "frequency [Hz]"
+    fig = new_spectrum(frequencies)
     if target == VIBRATION:
-        marks: list[DataRenderer] = [
-            fig.add_glyph(ColumnDataSource({"x": [], "text": []}), VSpan(x="x", **look), name=name)
-            for name, look in (
-                ("peaks", {"line_color": PEAKS, "line_alpha": 0.4, "line_width": 1.5}),
-                ("model", {"line_color": MODEL, "line_dash": [4, 3], "line_width": 1.5}),
-            )
-        ]
-        fig.add_tools(HoverTool(renderers=marks, tooltips="@text"))
+        add_marks(fig)
     _add_lines(fig, names)
     return fig
 
 
 def _sweep(names: Sequence[str], values: DataRange1d) -> figure:
     """RMS errors over the values of a setting, a dot for every run; the present one marked."""
-    fig = new_figure(x_range=values, y_range=DataRange1d(start=0.0, only_visible=True))
+    fig = new_figure(values, DataRange1d(start=0.0, only_visible=True))
     fig.add_glyph(ColumnDataSource({"x": []}), VSpan(x="x", line_color=PEAKS, line_alpha=0.6, line_width=1.5), name=NOW)
     errors = [name for name in names if name != TRUTH]
     source = _add_lines(fig, errors, (0.0, 1.0))
@@ -329,6 +322,131 @@ def encode(line: ArrayLike, pool: Pool, logarithmic: bool = False) -> list[float
     changes = np.diff(levels, prepend=np.uint16(0)).view(np.int16)
     folded = ((changes << 1) ^ (changes >> 15)).astype("<i2").view(np.uint8).reshape(-1, 2)
     return [pool.add(folded.T.tobytes()), low, step]
+
+
+def export(
+    path: str | Path,
+    scenario: Scenario,
+    *,
+    observers: Sequence[str] | None = None,
+    vary: Sequence[Variation] = (),
+    preset: str = "paper",
+    seeds: int = 1,
+    watch: Watch = QUIET,
+    on_result: Callable[[Result], None] | None = None,
+) -> None:
+    """Run a scenario and write a report: one HTML file with figures and numbers that opens without a network.
+
+    Parameters
+    ----------
+    path : str or Path
+        File to write.
+    scenario : Scenario
+        Settings of the run.
+    observers : sequence of str, optional
+        Ids of the observers; by default all that the scenario has something for.
+    vary : sequence of Variation, optional
+        Settings and their values (`wfsobs.scenario.grid.parse_variation`); every combination is run.
+    preset : str
+        Preset that the report compares the settings with.
+    seeds : int
+        Number of seeds of every state, `run.seed` and those after it; figures and budgets are of the first, errors have
+        intervals over all.
+    watch : Watch, optional
+        Receives the progress, and is asked at every block of work whether to stop.
+    on_result : callable, optional
+        Receives every result.
+
+    Raises
+    ------
+    SettingError
+        Two settings exclude each other.
+    OSError
+        The file cannot be written.
+    Cancelled
+        `watch` asks to stop.
+    """
+    chosen = scenarios(scenario, vary)
+    check_writable(path)
+    kept = []
+    for i, one in enumerate(chosen):
+        of = []
+        for number in range(seeds):
+            done, scenario_of_seed = i + number / seeds, one.replace({"run.seed": one.run.seed + number}) if number else one
+            inner = Watch(lambda f, done=done: watch.progress((done + f / seeds) / len(chosen)), watch.is_cancelled)
+            of.append(run(scenario_of_seed, observers=observers, watch=inner))
+        if on_result is not None:
+            on_result(of[0])
+        evidence = gather_evidence([result.scores for result in of]) if seeds > 1 else None
+        kept.append(state_of(of[0], len(chosen), evidence=evidence, observers=observers))
+    content = page(Report(preset, scenario, tuple(vary), tuple(kept)), datetime.now().astimezone()).encode()
+    write_whole(path, lambda file: file.write(content))
+
+
+# ---------------------------------------------------------------------------------------------- of the dashboard
+
+
+log = logging.getLogger(__name__)
+
+LIMIT = 240.0
+"""The most that waiting for others, and then the making, may take [s]; long enough for a machine that is busy otherwise."""
+
+POLL = 0.1
+"""How often it is looked whether anybody still wants it [s]."""
+
+
+class ReportError(Exception):
+    """Why there is no report, in one line."""
+
+
+def make(
+    results: RunResults,
+    preset: str,
+    watch: Watch,
+    _tell: object = None,
+    command: str = "",
+    sweep: Mapping[str, Any] | None = None,
+    evidence: Evidence | None = None,
+    comparison: Mapping[str, Any] | None = None,
+) -> bytes:
+    """Make the file of the results shown; blocks, so call it in a job. Raises ReportError, Cancelled.
+
+    command : what makes the estimates again, of a record that is not the simulation of the settings; sweep, comparison : what
+    `Report` has of a sweep and of compared runs; evidence : what further seeds say
+    """
+    state = state_of(results.result, is_simulated=not results.is_recorded, evidence=evidence)
+    content = pack(Report(preset, results.scenario, (), (state,), results.is_recorded, command, sweep, comparison))
+    root = str(Path(__file__).parents[3])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))}
+    # A file, not a pipe: what a pipe has not taken when `communicate` times out is never sent.
+    with TemporaryFile() as packet:
+        packet.write(content)
+        packet.seek(0)
+        with subprocess.Popen(
+            [sys.executable, "-m", "wfsobs.app.report.page"],
+            env=environment,
+            stdin=packet,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        ) as process:
+            made, said = _output(process, watch)
+    if process.returncode:
+        log.error("the report could not be made:\n%s", said.decode(errors="replace"))
+        raise ReportError("it could not be made; the server's log has the details")
+    return made
+
+
+def _output(process: subprocess.Popen[bytes], watch: Watch) -> tuple[bytes, bytes]:
+    """Wait for a process and return its standard output and error; kill it where the report is no longer wanted."""
+    try:
+        while True:
+            try:
+                return process.communicate(timeout=POLL)
+            except subprocess.TimeoutExpired:
+                watch.check()
+    except BaseException:
+        process.kill()
+        raise
 
 
 # ---------------------------------------------------------------------- `python -m wfsobs.app.report.page`

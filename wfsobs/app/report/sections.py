@@ -6,7 +6,7 @@ import base64
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
-from itertools import groupby
+from itertools import groupby, product
 from typing import Any
 
 from wfsobs.app.display import AT_LIMIT, FROM_RECORD, IN_MOST, OVER_SEEDS, label_of, score_columns
@@ -16,13 +16,12 @@ from wfsobs.app.style import BOUND_MARKS, TERM_COLOURS
 from wfsobs.bench.measure import machine
 from wfsobs.closed_loop.rows import NOT_APPLICABLE, label
 from wfsobs.evaluation.budget import TERMS
-from wfsobs.evaluation.evidence import rank_observers
-from wfsobs.evaluation.known_lines import group_by_knowledge
+from wfsobs.evaluation.evidence import marks_of
 from wfsobs.evaluation.rows import (
     TIME,
     Row,
     above_bound,
-    can_be_best,
+    group_by_knowledge,
     is_non_causal,
     own_bound,
     own_interval,
@@ -39,7 +38,9 @@ from wfsobs.version import __version__
 
 def state_table(state: State, name: str) -> dict[str, Any]:
     """Collect what the table of a state shows: groups by target, mode and prior knowledge, best first, and what is missing."""
-    groups = [list(rows) for _, rows in groupby(sorted(state.rows, key=_order(state.rows)), _group)]
+    order = [*dict.fromkeys(map(_group, state.rows))]  # as they come; in each best first, those that stand apart last
+    ordered = sorted(state.rows, key=lambda row: (order.index(_group(row)), row["apart"], row["rms_um"]))
+    groups = [list(rows) for _, rows in groupby(ordered, _group)]
     return {
         "name": name,
         "columns": score_columns("nm", "z" if any(row["target"] == RESIDUAL for row in state.rows) else "truth"),
@@ -52,16 +53,11 @@ def _group(row: Row) -> tuple[str, str]:
     return row["target"], row["mode"]
 
 
-def _order(rows: list[Row]):
-    """Targets and modes as they come, best first, those that stand apart last."""
-    groups = list(dict.fromkeys(map(_group, rows)))
-    return lambda row: (groups.index(_group(row)), row["apart"], row["rms_um"])
-
-
 def _bodies(rows: list[Row], dt: float, seeds: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Collect a target and mode: its title, and the rows of every kind of prior knowledge."""
     target, mode = _group(rows[0])
-    marks = _marks(rows, seeds.get("leaders", {}).get(f"{target}/{mode}", []))
+    leaders = seeds.get("leaders", {}).get(f"{target}/{mode}", [])
+    marks = marks_of({row["observer"]: (row["rms_um"], row["apart"]) for row in rows}, leaders)
     bounds = {row["observer"]: row["rms_um"] for row in rows if row["observer"] in BOUNDS}
     limits = {
         row["observer"]
@@ -99,14 +95,6 @@ def _bodies(rows: list[Row], dt: float, seeds: Mapping[str, Any]) -> list[dict[s
     ]
 
 
-def _marks(rows: list[Row], leaders: Sequence[str]) -> dict[str, str]:
-    """Mark the best, which differs significantly from all others over the seeds, or those tied; of one record the smallest."""
-    if leaders:
-        return dict.fromkeys(leaders, "tied" if len(leaders) > 1 else "best")
-    rivals = {row["observer"]: row["rms_um"] for row in rows if can_be_best(row["observer"], row["apart"])}
-    return dict.fromkeys(rank_observers(rivals)[:1], "smallest")
-
-
 # ------------------------------------------------------------------------------------------------- error budgets
 
 
@@ -126,7 +114,7 @@ def budget_key() -> dict[str, list[tuple[str, str]]]:
 
 def budget_state_table(state: State, name: str) -> dict[str, Any]:
     """Collect what the table of a state shows: a group per target and mode, least error first."""
-    groups = groupby(state.budgets, key=lambda row: (row["target"], row["mode"]))
+    groups = groupby(state.budgets, _group)
     return {"name": name, "groups": [_budget_group(state, target, mode, list(rows)) for (target, mode), rows in groups]}
 
 
@@ -134,10 +122,12 @@ def _budget_group(state: State, target: str, mode: str, rows: list[Row]) -> dict
     bounds = {
         row["observer"]: row["rms_um"] ** 2
         for row in state.rows
-        if (row["target"], row["mode"]) == (target, mode) and row["observer"] in BOUND_MARKS
+        if _group(row) == (target, mode) and row["observer"] in BOUND_MARKS
     }
-    ends = [(sum(min(x, 0.0) for x in terms.values()), sum(max(x, 0.0) for x in terms.values())) for terms in _all_terms(rows)]
-    low, high = min(low for low, _ in ends), max([*(high for _, high in ends), *bounds.values()])
+    low, high = (
+        limit([*bounds.values(), *(sum(limit(x, 0.0) for x in row["terms_um2"].values()) for row in rows)])
+        for limit in (min, max)
+    )
     span = high - low or 1.0
     marks = [(*BOUND_MARKS[name][:2], f"{100.0 * (at - low) / span:.1f}") for name, at in bounds.items()]
     return {
@@ -147,10 +137,6 @@ def _budget_group(state: State, target: str, mode: str, rows: list[Row]) -> dict
         "marks": marks,
         "rows": [_budget_row(row, low, span) for row in sorted(rows, key=lambda row: row["total_um2"])],
     }
-
-
-def _all_terms(rows: list[Row]) -> list[Mapping[str, float]]:
-    return [row["terms_um2"] for row in rows]
 
 
 def _budget_row(row: Row, low: float, span: float) -> dict[str, Any]:
@@ -182,9 +168,9 @@ def loop_state_table(state: State, name: str) -> dict[str, Any]:
     """Collect what the table of a state shows: a group per mode, least residual first."""
     modes = list(dict.fromkeys(row["mode"] for row in state.loop))
 
-    def order(row: Row) -> tuple[int, float]:
+    def order(row: Row) -> tuple[int, bool, float]:
         residual = row["residual_rms_nm"]
-        return modes.index(row["mode"]), float("inf") if residual is None else residual
+        return modes.index(row["mode"]), residual is None, residual or 0.0
 
     return {
         "name": name,
@@ -277,11 +263,7 @@ def state_name(report: Report, state: State, index: int) -> str:
 
 def values_of(report: Report, index: int) -> list[Any]:
     """List the value of every variation in a state."""
-    out = []
-    for variation in reversed(report.variations):
-        index, at = divmod(index, len(variation.values))
-        out.append(variation.values[at])
-    return out[::-1]
+    return list([*product(*(variation.values for variation in report.variations))][index])
 
 
 # ---------------------------------------------------------------------- sections

@@ -13,7 +13,7 @@ import panel as pn
 from bokeh.plotting import figure
 from numpy.typing import ArrayLike
 
-from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.display import Display
 from wfsobs.app.loop_work import LoopResults
 from wfsobs.app.render import number
 from wfsobs.app.store import Store
@@ -21,8 +21,8 @@ from wfsobs.app.style import look
 from wfsobs.app.views.plots import ExtraLines
 from wfsobs.app.views.spectrum_editor import Frames, HandleLayer, positive
 from wfsobs.closed_loop.design import LawDesign, design_mode, nominal_loop
-from wfsobs.control.curves import Curves, curves
 from wfsobs.control.integrator import highest_stable_gain
+from wfsobs.control.margins import Curves, curves
 from wfsobs.evaluation.error_spectra import Theory
 from wfsobs.priors_from.controllers import plant_of
 from wfsobs.priors_from.scenario import told_spectra
@@ -248,14 +248,14 @@ class GainEditor:
 
     def _numbers(self, gain: float, design: LawDesign) -> list[dict[str, Any]]:
         """Describe the residual by theory and the margins."""
-        scale = per_micrometre(self.display.unit, self.store.scenario.telescope.diameter)
-        values = [("gain", "gain", f"{gain:.3g}", "")]
+        scale = self.display.scale(self.store.scenario)
+        margins, values = design.margins, [("gain", "gain", f"{gain:.3g}", "")]
         if design.predicted_rms is not None:
             values.append((INTEGRATOR, "residual", number(design.predicted_rms * scale), self.display.unit_label))
-        if design.margins is not None and design.margins.gain:
-            values.append(("gain-margin", "gain margin", f"{20.0 * np.log10(design.margins.gain):.1f}", "dB"))
-        if design.margins is not None and design.margins.phase is not None:
-            values.append(("phase-margin", "phase margin", f"{degrees(design.margins.phase):.0f}", "°"))
+        if margins and margins.gain:
+            values.append(("gain-margin", "gain margin", f"{20.0 * np.log10(margins.gain):.1f}", "dB"))
+        if margins and margins.phase is not None:
+            values.append(("phase-margin", "phase margin", f"{degrees(margins.phase):.0f}", "°"))
         colour = look(INTEGRATOR).colour(self.display.dark)
         return [
             {"name": name, "label": label, "colour": colour, "value": value, "unit": unit, "was": ""}

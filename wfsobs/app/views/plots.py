@@ -14,23 +14,24 @@ from bokeh.models import (
     CDSView,
     ColumnDataSource,
     CustomJS,
+    DataRange1d,
     GlyphRenderer,
+    HoverTool,
     HTMLLabelSet,
     Line,
     LogAxis,
     Range1d,
+    VSpan,
 )
 from bokeh.plotting import figure
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from wfsobs.app.style import look, run_look
+from wfsobs.app.style import RUNS, look
 from wfsobs.app.work import TRUTH
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.groups.vibration import Peak
+from wfsobs.scenario.groups.atmosphere import Peak
 from wfsobs.scenario.measured_spectra import measured_spectrum
-from wfsobs.signal.envelope import band_envelope as band_envelope
-from wfsobs.signal.envelope import envelope as envelope
-from wfsobs.signal.envelope import envelope_times as envelope_times
+from wfsobs.typing import Array
 
 SETTLE_MS = 60
 """A zoom is answered when the window has not moved for this long."""
@@ -95,8 +96,6 @@ def later(function: Any, milliseconds: int) -> None:
         doc.add_timeout_callback(function, milliseconds)
 
 
-Array = NDArray[np.float64]
-
 HEIGHT = 230
 
 PEAKS, MODEL = "#888888", "#FF6600"
@@ -118,9 +117,17 @@ MARKED_LINE = 0.004
 """Lines of a measured spectrum get a mark above this rms in either axis [um]."""
 
 
-def new_figure(**options: Any) -> figure:
-    """Make an empty figure as wide as its room, the scroll wheel left to the page until chosen."""
+def new_figure(x: Any = None, y: Any = None, label: str = "", log: str = "", **options: Any) -> figure:
+    """Make an empty figure as wide as its room, the scroll wheel left to the page until chosen.
+
+    x, y : both ends of the axes, ranges of Bokeh, or None for what fits itself; label : of x; log : which of "xy" are logarithmic
+    """
     fig = figure(
+        x_range=x or DataRange1d(),
+        y_range=y or DataRange1d(),
+        x_axis_label=label,
+        x_axis_type="log" if "x" in log else "linear",
+        y_axis_type="log" if "y" in log else "linear",
         height=HEIGHT,
         sizing_mode="stretch_width",
         min_width=240,
@@ -139,6 +146,11 @@ def new_figure(**options: Any) -> figure:
     return fig
 
 
+def new_spectrum(x: Any = (0.5, 500.0), y: Any = (1e-6, 1.0)) -> figure:
+    """Make an empty figure of densities over the frequency."""
+    return new_figure(x, y, "frequency [Hz]", "xy")
+
+
 def call(fig: figure, name: str) -> None:
     """Name a figure, for its file and for those who hear the page."""
     fig.update(name=name, html_attributes={"role": "figure", "aria-label": name})
@@ -151,9 +163,10 @@ def make_line(name: str, source: ColumnDataSource, y: str = "y", **options: Any)
     return GlyphRenderer(data_source=source, glyph=glyph, name=name, **options)
 
 
-def add_line(fig: figure, name: str, source: ColumnDataSource, y: str = "y") -> GlyphRenderer[Any]:
-    """Draw a line in the look of an observer or of the truth."""
+def add_line(fig: figure, name: str, source: ColumnDataSource, y: str = "y", **style: Any) -> GlyphRenderer[Any]:
+    """Draw a line in the look of an observer or of the truth, but for what the style has."""
     renderer = make_line(name, source, y)
+    renderer.glyph.update(**style)
     fig.renderers.append(renderer)
     return renderer
 
@@ -161,14 +174,16 @@ def add_line(fig: figure, name: str, source: ColumnDataSource, y: str = "y") -> 
 class LoopLines:
     """A figure with a line per name, of controllers or observers."""
 
-    def __init__(self, fig: figure, names: tuple[str, ...]):
+    def __init__(self, fig: figure, names: Iterable[str], **style: Any):
         self.figure = fig
         self.sources: Final = {name: ColumnDataSource({"x": [], "y": []}) for name in names}
-        self.lines: Final = {name: add_line(fig, name, source) for name, source in self.sources.items()}
+        self.lines: Final = {name: add_line(fig, name, source, **style) for name, source in self.sources.items()}
 
     def put(self, lines: Mapping[str, tuple[Array, Array]]) -> None:
         """Show these lines (name -> x, y), and nothing of the others."""
-        _put(self.sources, lines)
+        for name, source in self.sources.items():
+            x, y = lines.get(name, (np.empty(0), np.empty(0)))
+            source.data = {"x": x, "y": y.astype(np.float32)}
 
     def highest(self, hidden_names: Sequence[str], without: float) -> float:
         """Return the largest magnitude of the visible lines, or `without` where there are none."""
@@ -177,36 +192,49 @@ class LoopLines:
 
     def restyle(self, dark: bool, hidden_names: list[str]) -> None:
         """Set the colours of light or dark mode, and hide lines."""
-        restyle(self.lines, dark, hidden_names)
+        for name, line in self.lines.items():
+            line.glyph.line_color = look(name).colour(dark)
+            line.visible = name not in hidden_names
 
 
 class PairedLines(LoopLines):
     """A figure with a strong and a faint line per controller."""
 
-    def __init__(self, fig: figure, names: tuple[str, ...]):
-        super().__init__(fig, names)
-        self.faint_sources: Final = {name: ColumnDataSource({"x": [], "y": []}) for name in names}
-        self.faint: Final = {name: add_line(fig, name, source) for name, source in self.faint_sources.items()}
-        for drawn in self.lines.values():
-            drawn.glyph.line_width = 2.2
-        for drawn in self.faint.values():
-            drawn.glyph.update(line_alpha=0.45, line_width=1.2)
+    def __init__(self, fig: figure, names: Iterable[str]):
+        super().__init__(fig, names, line_width=2.2)
+        self.faint: Final = LoopLines(fig, names, line_alpha=0.45, line_width=1.2)
 
     def put_both(self, lines: Mapping[str, tuple[Array, Array, Array]]) -> None:
         """Show these lines (name -> x, strong y, faint y), and nothing of the others."""
         self.put({name: (x, y) for name, (x, y, _) in lines.items()})
-        _put(self.faint_sources, {name: (x, y) for name, (x, _, y) in lines.items()})
+        self.faint.put({name: (x, y) for name, (x, _, y) in lines.items()})
 
     def restyle(self, dark: bool, hidden_names: list[str]) -> None:
         """Set the colours of light or dark mode, and hide lines."""
         super().restyle(dark, hidden_names)
-        restyle(self.faint, dark, hidden_names)
+        self.faint.restyle(dark, hidden_names)
 
 
-def _put(sources: Mapping[str, ColumnDataSource], lines: Mapping[str, tuple[Array, Array]]) -> None:
-    for name, source in sources.items():
-        x, y = lines.get(name, (np.empty(0), np.empty(0)))
-        source.data = {"x": x, "y": y.astype(np.float32)}
+def add_marks(fig: figure) -> dict[str, GlyphRenderer[Any]]:
+    """Add vertical lines that say what they are: the scenario's peaks, and the one that the Kalman filters model."""
+    looks = {"peaks": {"line_color": PEAKS, "line_alpha": 0.4}, "model": {"line_color": MODEL, "line_dash": [4, 3]}}
+    marks: dict[str, Any] = {
+        name: fig.add_glyph(ColumnDataSource({"x": [], "text": []}), VSpan(x="x", line_width=1.5, **style), name=name)
+        for name, style in looks.items()
+    }
+    fig.add_tools(HoverTool(renderers=[*marks.values()], tooltips="@text"))
+    return marks
+
+
+def peak_marks(scenario: Scenario) -> list[tuple[float, str]]:
+    """List the frequencies of the marked peaks, with what they say."""
+    return [(p.frequency, f"peak {p.frequency:.5g} Hz, damping {p.damping:.3g}") for p in marked_peaks(scenario)]
+
+
+def model_mark(scenario: Scenario) -> tuple[float, str]:
+    """Return the frequency that the Kalman filters model, with what its mark says."""
+    frequency = scenario.kalman.frequency
+    return frequency, f"model of the Kalman filters {frequency:.5g} Hz"
 
 
 def marked_peaks(scenario: Scenario) -> list[Peak]:
@@ -221,9 +249,9 @@ def marked_peaks(scenario: Scenario) -> list[Peak]:
     return [p for p in peaks if p.frequency <= vibration.cutoff]
 
 
-def send(source: ColumnDataSource, data: dict[str, Any]) -> None:
+def send(source: Any, data: dict[str, Any]) -> None:
     """Give a source the columns that it does not have already: each time that one is sent its figure is drawn anew."""
-    old: Any = source.data
+    old = source.data
     if data.keys() != old.keys() or any(len(old[name]) != len(column) for name, column in data.items()):
         source.data = data
     elif changed := {name: column for name, column in data.items() if not _same(old[name], column)}:
@@ -234,13 +262,6 @@ def _same(a: Any, b: Any) -> bool:
     if len(a) != len(b):
         return False
     return np.array_equal(a, b, equal_nan=True) if isinstance(b, np.ndarray) else list(a) == list(b)
-
-
-def restyle(lines: dict[str, GlyphRenderer[Any]], dark: bool, hidden_names: list[str]) -> None:
-    """Give every line the colour of the mode, and hide those that are to be hidden."""
-    for name, line in lines.items():
-        line.glyph.line_color = look(name).colour(dark)
-        line.visible = name not in hidden_names
 
 
 def show_all_on_double_click(fig: figure) -> None:
@@ -284,7 +305,7 @@ class ComparedLines(ExtraLines):
     def draw_runs(self, lines: Sequence[tuple[str, str, ArrayLike, ArrayLike]], dark: bool) -> None:
         """Show lines (letter of the run, name, x, y); they have the runs' colours where one name is shown alone."""
         alone = len({name for _, name, _, _ in lines}) == 1
-        looks = [run_look(letter) for letter, _, _, _ in lines]
+        looks = [RUNS[letter] for letter, _, _, _ in lines]
         self._send(
             [(x, y, (run if alone else look(name)).colour(dark)) for run, (_, name, x, y) in zip(looks, lines, strict=True)],
             dash=[" ".join(map(str, run.dash)) for run in looks],

@@ -6,28 +6,31 @@ from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
-from bokeh.models import ColumnDataSource, HoverTool, Range1d, UnionRenderers, VSpan
+from bokeh.models import ColumnDataSource, Range1d, UnionRenderers
 
-from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.display import Display
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.plots import (
-    MODEL,
-    PEAKS,
     ComparedLines,
     EndLabels,
     FigureLines,
-    marked_peaks,
-    new_figure,
+    add_marks,
+    model_mark,
+    new_spectrum,
     on_settle,
+    peak_marks,
     send,
+    set_ends,
     show_all_on_double_click,
     zoom_of,
 )
 from wfsobs.app.views.target_figures import TargetFigures, shows_error
-from wfsobs.app.work import TRUTH, Array, Key, RunResults, SignalAndError
-from wfsobs.evaluation.error_spectra import cumulative_rms, spectra
+from wfsobs.app.work import TRUTH, Key, RunResults, SignalAndError
+from wfsobs.evaluation.error_spectra import spectra
 from wfsobs.observers.base import TARGETS, VIBRATION
+from wfsobs.scenario import Scenario
+from wfsobs.typing import Array
 
 DECADES = 8
 """The most that an axis of densities spans; one of amplitudes spans half of it."""
@@ -51,9 +54,9 @@ class SpectraFigures(TargetFigures):
             spectrum.draw(results, spectra, self.display)
         frequencies = next((s.frequency for s in results.spectra.values()), None)
         if frequencies is not None:
-            limits = {"start": float(frequencies[1]), "end": float(frequencies[-1])}
-            if self.x_range.reset_start != limits["start"] or self.x_range.reset_end != limits["end"]:
-                self.x_range.update(**limits, reset_start=limits["start"], reset_end=limits["end"])
+            ends = float(frequencies[1]), float(frequencies[-1])
+            if ends != (self.x_range.reset_start, self.x_range.reset_end):
+                set_ends(self.x_range, *ends)
 
 
 class _Spectrum:
@@ -61,15 +64,8 @@ class _Spectrum:
 
     def __init__(self, target: str, x_range: Range1d):
         self.target = target
-        self.figure = new_figure(
-            x_range=x_range,
-            y_range=Range1d(start=1e-6, end=1.0),
-            x_axis_type="log",
-            y_axis_type="log",
-        )
-        self.figure.xaxis.axis_label = "frequency [Hz]"
-        if target == VIBRATION:
-            self._add_marks()
+        self.figure = new_spectrum(x_range)
+        self.marks = add_marks(self.figure) if target == VIBRATION else {}
         show_all_on_double_click(self.figure)
         policy = UnionRenderers()
         self.sources = {
@@ -79,34 +75,22 @@ class _Spectrum:
         self.faint = ComparedLines(self.figure)
         self.names_at_end = EndLabels(self.figure)
 
-    def _add_marks(self) -> None:
-        """Vertical lines at the scenario's peaks and at the one that the Kalman filters model."""
-        self.peaks = ColumnDataSource({"x": [], "text": []})
-        self.model = ColumnDataSource({"x": [], "text": []})
-        peaks = self.figure.add_glyph(self.peaks, VSpan(x="x", line_color=PEAKS, line_alpha=0.4, line_width=1.5))
-        model = self.figure.add_glyph(self.model, VSpan(x="x", line_color=MODEL, line_dash=[4, 3], line_width=1.5))
-        self.figure.add_tools(HoverTool(renderers=[peaks, model], tooltips="@text"))
-
     def draw(self, results: RunResults, spectra: Mapping[Key, SignalAndError], display: Display) -> None:
         """Send every line, its axis and the marks."""
-        diameter, error = results.scenario.telescope.diameter, shows_error(results, self.target, display)
+        error = shows_error(results, self.target, display)
         drawn: dict[str, tuple[Array, Array]] = {}
         for name, source in self.sources.items():
             spectrum = spectra.get((name, self.target)) if self.lines[name].visible else None
             if spectrum is None:  # what is hidden is sent when it is shown
                 send(source, {"x": [], "y": []})
                 continue
-            y = _curve(spectrum, error and name != TRUTH, display, diameter)
+            y = _curve(spectrum, error and name != TRUTH, display, results.scenario)
             send(source, {"x": spectrum.frequency[1:], "y": y})
             drawn[name] = spectrum.frequency[1:], y
         self._fit([*(y for _, y in drawn.values()), *self._draw_compared(display, error)], display.cumulative)
         self.names_at_end.draw({name: line for name, line in drawn.items() if not self.lines[name].recedes}, display.dark)
-        of = " of error" if error else ""
-        what, unit = (
-            (f"cumulative rms{of}", display.unit_label) if display.cumulative else (f"PSD{of}", f"{display.unit_label}²/Hz")
-        )
-        self.figure.yaxis.axis_label = f"{what}, {display.mode_label} [{unit}]"
-        if self.target == VIBRATION:
+        self.figure.yaxis.axis_label = display.curve_label(" of error" if error else "")
+        if self.marks:
             self._draw_marks(results)
 
     def _draw_compared(self, display: Display, error: bool) -> list[Array]:
@@ -117,7 +101,7 @@ class _Spectrum:
                 spectrum = kept.spectra.get((name, self.target))
                 of_error = error and name != TRUTH
                 if line.visible and spectrum is not None and (not of_error or np.isfinite(spectrum.error).all()):
-                    y = _curve(spectrum, of_error, display, run.scenario.telescope.diameter)
+                    y = _curve(spectrum, of_error, display, run.scenario)
                     lines.append((run.letter, name, spectrum.frequency[1:], y))
         self.faint.draw_runs(lines, display.dark)
         return [y for *_, y in lines]
@@ -132,21 +116,9 @@ class _Spectrum:
 
     def _draw_marks(self, results: RunResults) -> None:
         simulated = results.result.record.vibration is not None  # peaks of the settings are not those of a record
-        drawn, kalman = marked_peaks(results.scenario) if simulated else [], results.scenario.kalman
-        send(
-            self.peaks,
-            {
-                "x": [p.frequency for p in drawn],
-                "text": [f"peak {p.frequency:.5g} Hz, damping {p.damping:.3g}" for p in drawn],
-            },
-        )
-        send(
-            self.model,
-            {
-                "x": [kalman.frequency],
-                "text": [f"model of the Kalman filters {kalman.frequency:.5g} Hz"],
-            },
-        )
+        found = {"peaks": peak_marks(results.scenario) if simulated else [], "model": [model_mark(results.scenario)]}
+        for name, marks in found.items():
+            send(self.marks[name].data_source, {"x": [x for x, _ in marks], "text": [text for _, text in marks]})
 
 
 def window_spectra(results: RunResults, start: float, end: float) -> dict[Key, SignalAndError]:
@@ -162,14 +134,12 @@ def window_spectra(results: RunResults, start: float, end: float) -> dict[Key, S
         inside[cut] = values[cut]
         if (found := spectra(record, target, inside, start)) is not None:
             frequency, signal, error = found
-            out[name, target] = SignalAndError(
-                frequency, signal, error if np.isfinite(whole.error).all() else np.full_like(error, np.nan)
-            )
+            known = np.isfinite(whole.error).all()
+            out[name, target] = SignalAndError(frequency, signal, error if known else np.full_like(error, np.nan))
     return out
 
 
-def _curve(spectrum: SignalAndError, error: bool, display: Display, diameter: float) -> Array:
-    """Compute what is drawn of a spectrum above zero frequency. In error plots the truth stays: the error of answering zero."""
-    scale = per_micrometre(display.unit, diameter)
-    density = (spectrum.error if error else spectrum.signal)[1:, display.column]
-    return scale * cumulative_rms(spectrum.frequency[1:], density) if display.cumulative else scale**2 * density
+def _curve(spectrum: SignalAndError, error: bool, display: Display, scenario: Scenario) -> Array:
+    """Compute what is drawn of a spectrum. In error plots the truth stays: the error of answering zero."""
+    density = (spectrum.error if error else spectrum.signal)[:, display.column]
+    return display.curve(spectrum.frequency, density, scenario)

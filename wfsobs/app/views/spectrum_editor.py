@@ -14,21 +14,20 @@ import panel as pn
 import param
 from bokeh.plotting import figure
 
-from wfsobs.app.component import HtmlComponent
-from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.display import Display
 from wfsobs.app.jobs import CANCELLED, CLICK, DONE, FAILED, Job
 from wfsobs.app.render import number, render
 from wfsobs.app.service import Session
 from wfsobs.app.store import Store
-from wfsobs.app.style import look, observers_of, script, sheets
+from wfsobs.app.style import HtmlComponent, look, observers_of, script, sheets
 from wfsobs.app.views.plots import AFTERWARDS_MS, ExtraLines, once
-from wfsobs.evaluation.error_spectra import TRUTH, Prediction, Theory, cumulative_rms, is_predicted
+from wfsobs.evaluation.error_spectra import TRUTH, Prediction, Theory, is_predicted
 from wfsobs.evaluation.exact_errors import SETTLED
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TURBULENCE, VIBRATION
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.groups.vibration import Peak
+from wfsobs.scenario.groups.atmosphere import Peak
 from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.turbulence import turbulence_process
 from wfsobs.typing import Array
@@ -415,7 +414,7 @@ class SpectrumEditor:
         }
 
     def _number_of(self, p: Prediction) -> dict[str, Any]:
-        scale, it, was = self._scale(self.trial), look(p.observer), self._was.get(p.observer, p.rms)
+        scale, it, was = self.display.scale(self.trial), look(p.observer), self._was.get(p.observer, p.rms)
         return {
             "name": p.observer,
             "label": it.label,
@@ -426,14 +425,9 @@ class SpectrumEditor:
             "waits": p.observer in self._left,
         }
 
-    def _scale(self, scenario: Scenario) -> float:
-        return per_micrometre(self.display.unit, scenario.telescope.diameter)
-
     def _curve(self, p: Prediction) -> tuple[Array, Array]:
         """Return what is drawn: frequencies and densities above zero frequency, or the rms from each on."""
-        scale, frequency = self._scale(self.trial), p.frequency[1:]
-        density = p.density[1:]
-        return frequency, scale * cumulative_rms(frequency, density) if self.display.cumulative else scale**2 * density
+        return p.frequency[1:], self.display.curve(p.frequency, p.density, self.trial)
 
 
 def positive(x: object) -> float:

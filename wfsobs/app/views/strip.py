@@ -9,23 +9,21 @@ from typing import Any, Final
 
 import param
 
-from wfsobs.app.budgets import Budgets
-from wfsobs.app.component import HtmlComponent
-from wfsobs.app.display import FROM_RECORD, OVER_SEEDS, Display, per_micrometre
+from wfsobs.app.display import FROM_RECORD, OVER_SEEDS, Display
 from wfsobs.app.glossary import RELATIVE, TERMS, sentence_on
+from wfsobs.app.idle_work import Budgets, SeedRuns
 from wfsobs.app.jobs import DONE, RUNNING
 from wfsobs.app.render import NOTHING, change, number, render, with_decimals_of
-from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import BackgroundTask
-from wfsobs.app.style import TERM_COLOURS, look, observers_of, script, sheets
-from wfsobs.app.views.main_lines import REFERENCES, MainLines
+from wfsobs.app.style import TERM_COLOURS, HtmlComponent, look, observers_of, script, sheets, watch
 from wfsobs.app.views.table import find
+from wfsobs.app.views.verdict import REFERENCES, MainLines
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.budget import TERMS as BUDGET_TERMS
 from wfsobs.evaluation.evidence import Evidence, gather_evidence
 from wfsobs.evaluation.rows import NOT_OBSERVERS, own_interval, score_rows, uncertainty_text
 from wfsobs.evaluation.scores import LOOP, PREDICTION, RESIDUAL, Score
-from wfsobs.priors_from.selection import usual_observers
+from wfsobs.priors_from.scenario import usual_observers
 
 HEADS = {"note": RELATIVE, "change": "Change", "bar": "Error budget"}
 """Headings beside that of the errors."""
@@ -126,18 +124,14 @@ class Strip:
         self._now = self._before = RunErrors()
         self.cards: Final = Cards()
         self._refresh()
-        run.param.watch(self._follow, ["result", "state"])
-        if seeds is not None:
-            seeds.param.watch(self._follow, "evidence")
-        if budgets is not None:
-            budgets.param.watch(self._refresh, "by_observer")
-        display.param.watch(self._refresh, ["mode", "unit", "dark", "compared_runs"])
+        watch(self._follow, (run, ["result", "state"]), (seeds, "evidence"))
+        watch(self._refresh, (budgets, "by_observer"), (display, ["mode", "unit", "dark", "compared_runs"]))
         display.param.watch(self._hide, "hidden_lines")
 
     def _follow(self, *_: object) -> None:
         """Keep what was shown before, so that the change from there can be shown."""
         if (results := self.run.result) is not None and self.run.state == DONE:
-            known = (self.seeds and self.seeds.evidence) or gather_evidence([results.result.scores])
+            known = self._evidence or gather_evidence([results.result.scores])
             if results is not self._now.results:
                 self._before = self._now
             elif known.n_seeds < self._now.errors.n_seeds:  # gone with the settings, which have changed
@@ -179,9 +173,9 @@ class Strip:
         rows = []
         for run in self.display.compared_runs:
             before = self._rms(run.scores, name, has_truth)
-            scale = per_micrometre(self.display.unit, run.scenario.telescope.diameter)
-            value = number(None if before is None else before * scale)
-            rows.append([run.letter, value, "" if before is None else f"{change(before, now)} %"])
+            known = before is not None
+            value = number(before * self.display.scale(run.scenario) if known else None)
+            rows.append([run.letter, value, f"{change(before, now)} %" if known else ""])
         return rows
 
     def _rms(self, scores: Sequence[Score], name: str, has_truth: bool) -> float | None:
@@ -198,21 +192,23 @@ class Strip:
     def _observer(self, name: str, results: RunResults | None) -> dict[str, Any]:
         score = find(results, name, self.target, self.display.mode) if results else None
         if results is None or score is None:
-            if results is not None and results.result.estimate(name, self.target) is not None:
-                return self._without_truth(name, results)
-            waiting = self.run.state == RUNNING
-            return self._card(name, None, "computing …" if waiting else "no result")
+            if results is not None and results.result.estimate(name, self.target) is not None:  # by how it predicts, if it does
+                score = find(results, name, PREDICTION, self.display.mode)
+                return self._score_fields(name, score, results) if score else self._card(name, None, "no truth")
+            return self._card(name, None, "computing …" if self.run.state == RUNNING else "no result")
         return self._score_fields(name, score, results) | self._budget_fields(score, results)
+
+    @property
+    def _evidence(self) -> Evidence | None:
+        return self.seeds.evidence if self.seeds else None
 
     def _mean(self, score: Score) -> Score:
         """Return a score with its mean over the seeds, where there are several."""
-        evidence = self.seeds.evidence if self.seeds else None
-        return evidence.over_seeds(score) if evidence else score
+        return self._evidence.over_seeds(score) if self._evidence else score
 
     def _score_fields(self, name: str, score: Score, results: RunResults) -> dict[str, Any]:
         mean, own = self._mean(score), own_interval(score_rows([score], None)[0])
-        evidence = self.seeds.evidence if self.seeds else None
-        of = f"{evidence.n_seeds} seeds" if evidence else FROM_RECORD
+        of = f"{self._evidence.n_seeds} seeds" if self._evidence else FROM_RECORD
         fields = self._card(name, None, own or number(mean.normalised_rms, 2))
         fields |= error_fields(mean.rms, mean.interval, self._in_unit(1.0, results), of)
         change = self._change(score)
@@ -245,25 +241,19 @@ class Strip:
         n = min(before.size, now.size)
         return float((now[:n] - before[:n]).mean())
 
-    def _without_truth(self, name: str, results: RunResults) -> dict[str, Any]:
-        """How well the next measurement is predicted, by whoever says what it will be."""
-        score = find(results, name, PREDICTION, self.display.mode)
-        return self._score_fields(name, score, results) if score else self._card(name, None, "no truth")
-
     def _truth(self, results: RunResults | None) -> dict[str, Any]:
         of = (self.target, self.display.mode)
         scores = [s for s in results.result.scores if (s.target, s.mode) == of and not s.apart] if results else []
         if results is None or not scores:
             left = find(results, LOOP, RESIDUAL, self.display.mode) if results else None
-            return self._loop(left, results) if results and left else self._card(TRUTH, None, "")
+            if results is None or left is None:
+                return self._card(TRUTH, None, "")
+            # the recorded loop's residual, in the place of the truth, which has no line either
+            return self._score_fields(TRUTH, left, results) | {"label": NOT_OBSERVERS[LOOP], "colour": "transparent"}
         return self._card(TRUTH, self._in_unit(self._mean(scores[0]).truth_rms, results), "rms")
 
-    def _loop(self, left: Score, results: RunResults) -> dict[str, Any]:
-        """Describe the recorded loop's residual, in the place of the truth, which has no line either."""
-        return self._score_fields(TRUTH, left, results) | {"label": NOT_OBSERVERS[LOOP], "colour": "transparent"}
-
     def _in_unit(self, value: float, results: RunResults) -> float:
-        return value * per_micrometre(self.display.unit, results.scenario.telescope.diameter)
+        return value * self.display.scale(results.scenario)
 
     def _card(self, name: str, value: float | None, note: str) -> dict[str, Any]:
         return card_of(name, self.display.dark, note, NOTHING if value is None else number(value))

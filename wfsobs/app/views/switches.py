@@ -11,13 +11,19 @@ from markupsafe import Markup
 from wfsobs.app.compared import ComparedRun, name_of_difference
 from wfsobs.app.display import UNITS, Display, short_name
 from wfsobs.app.history import History
+from wfsobs.app.idle_work import SeedRuns
 from wfsobs.app.jobs import FAILED
 from wfsobs.app.render import macro
-from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import BackgroundTask
-from wfsobs.app.style import HEARD, bare, html, run_swatch
+from wfsobs.app.style import HEARD, follow_html, html, make_button, make_select, run_swatch, watch
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import TIP_TILT, Mode
+
+
+def make_buttons(label: str, options: dict[str, str], value: str) -> pmui.RadioButtonGroup:
+    """Make the buttons of a switch."""
+    style: dict[str, Any] = {"size": "small", "margin": 0, "variant": "outlined", "stylesheets": [HEARD]}
+    return pmui.RadioButtonGroup(label=label, options=options, value=value, **style)
 
 
 class ModeSwitch:
@@ -30,12 +36,8 @@ class ModeSwitch:
         self.run = run
         self.display = display
         options = {_title(mode): mode.name for mode in TIP_TILT}
-        self.buttons: Final = pmui.RadioButtonGroup(
-            label="Mode", options=options, value=display.mode, size="small", margin=0, variant="outlined", stylesheets=[HEARD]
-        )
-        self.list: Final = pmui.Select(
-            label="Mode", options=options, value=display.mode, size="small", margin=0, width=190, visible=False
-        )
+        self.buttons: Final = make_buttons("Mode", options, display.mode)
+        self.list: Final = make_select("Mode", options, display.mode, 190, visible=False)
         for widget in (self.buttons, self.list):
             widget.param.watch(self._on_choice, "value")
         run.param.watch(self._fit, "result")
@@ -46,9 +48,7 @@ class ModeSwitch:
         return [self.buttons, self.list]
 
     def _on_choice(self, event: Any) -> None:
-        value = event.new
-        if value is not None:
-            self.display.mode = value
+        self.display.mode = event.new or self.display.mode
 
     def _fit(self, *_: object) -> None:
         """Offer the modes of the run shown."""
@@ -81,15 +81,7 @@ class UnitSwitch:
 
     def __init__(self, display: Display):
         self.display = display
-        self.buttons: Final = pmui.RadioButtonGroup(
-            label="Unit",
-            options=self._options(),
-            value=display.unit,
-            size="small",
-            margin=0,
-            variant="outlined",
-            stylesheets=[HEARD],
-        )
+        self.buttons: Final = make_buttons("Unit", self._options(), display.unit)
         self.note: Final = html(NO_MAS, visible=False, margin=0)
         self.buttons.param.watch(self._on_choice, "value")
         display.param.watch(self._follow, ["mode", "unit"])
@@ -102,9 +94,8 @@ class UnitSwitch:
         return {UNITS[unit]: unit for unit in self.display.units}
 
     def _on_choice(self, event: Any) -> None:
-        value = event.new
-        if value in self.display.units:
-            self.display.unit = value
+        if event.new in self.display.units:
+            self.display.unit = event.new
 
     def _follow(self, *_: object) -> None:
         options = self._options()
@@ -134,10 +125,8 @@ class SeedSwitch:
         self.field: Final = pmui.IntInput.from_param(
             seeds.param.count, size="small", width=90, margin=(0, 0, 4, 0), stylesheets=[NO_STEPPERS]
         )
-        self.line: Final = bare(self.text(), sizing_mode=None)
-        seeds.param.watch(self._refresh, ["evidence", "count"])
-        seeds.run.param.watch(self._refresh, ["state", "result"])
-        seeds.task.param.watch(self._refresh, ["state", "message"])
+        sources = (seeds, ["evidence", "count"]), (seeds.run, ["state", "result"]), (seeds.task, ["state", "message"])
+        self.line: Final = follow_html(self.text, *sources, sizing_mode=None)
 
     def view(self) -> list[Any]:
         """Return the field and what is said beside it."""
@@ -160,9 +149,6 @@ class SeedSwitch:
             said = f"over {seeds.n_known} seeds"
         return f'<span class="caption seeds">{said}</span>'
 
-    def _refresh(self, *_: object) -> None:
-        self.line.html = self.text()
-
 
 PIN, UNPIN = "Pin this run to compare others with it", "Unpin: compare with no other run"
 
@@ -174,20 +160,15 @@ class Pinning:
         self.run = run
         self.display = display
         self.history = history
-        self.button: Final = pmui.Button(
-            label="Pin", icon="push_pin", size="small", variant="outlined", margin=0, disabled=True, description=PIN
-        )
+        self.button: Final = make_button("Pin", self._press, icon="push_pin", variant="outlined", disabled=True, description=PIN)
         self.note: Final = html(sizing_mode=None, visible=False)
-        self.button.on_click(self._on_press)
-        run.param.watch(self._refresh, "result")
-        history.param.watch(self._refresh, "current")
-        display.param.watch(self._refresh, ["compared_runs", "dark"])
+        watch(self._refresh, (run, "result"), (history, "current"), (display, ["compared_runs", "dark"]))
 
     def view(self) -> list[object]:
         """Return the button and the legend."""
         return [self.button, self.note]
 
-    def _on_press(self, _event: object) -> None:
+    def _press(self) -> None:
         if self.display.compared_runs:
             self.history.compare_none()
         else:

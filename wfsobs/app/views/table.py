@@ -3,28 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 from markupsafe import Markup
 
 from wfsobs.app.compared import ComparedRun
-from wfsobs.app.display import AT_LIMIT, FROM_RECORD, IN_MOST, OVER_SEEDS, Display, per_micrometre, score_columns
+from wfsobs.app.display import AT_LIMIT, FROM_RECORD, IN_MOST, OVER_SEEDS, Display, score_columns
 from wfsobs.app.glossary import BOUND as TERM_OF_BOUND
 from wfsobs.app.glossary import term
+from wfsobs.app.idle_work import SeedRuns
 from wfsobs.app.jobs import DONE
 from wfsobs.app.render import Row, change, hundredths, macro, missing, number, table
-from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import BackgroundTask
-from wfsobs.app.style import bare, observers_of, swatch
+from wfsobs.app.style import follow_html, observers_of, swatch
 from wfsobs.app.work import RunResults
-from wfsobs.evaluation.evidence import rank_observers
-from wfsobs.evaluation.known_lines import group_by_knowledge
+from wfsobs.evaluation.evidence import Evidence, marks_of
 from wfsobs.evaluation.result import Failure
 from wfsobs.evaluation.rows import (
     NOT_OBSERVERS,
     at_bound,
-    can_be_best,
+    group_by_knowledge,
     is_non_causal,
     own_interval,
     row_label,
@@ -35,11 +34,9 @@ from wfsobs.evaluation.rows import (
 from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS, LOOP, PREDICTION, RESIDUAL, SCORED, Score
 from wfsobs.observers import OBSERVERS
 from wfsobs.prior import TRUE
-from wfsobs.priors_from.selection import is_usual
+from wfsobs.priors_from.scenario import is_usual
 
-BEST, TIED, ABOVE = macro("tag", "best", "best"), macro("tag", "tied", "tied"), macro("tag", "above", "worse than zero")
-SMALLEST = macro("tag", "smallest", "smallest")
-"""Error of one record, which does not tell who is best."""
+ABOVE = macro("tag", "above", "worse than zero")
 
 
 def find(results: RunResults, observer: str, target: str, mode: str) -> Score | None:
@@ -62,14 +59,12 @@ class Table:
         self.run = run
         self.display = display
         self.seeds = seeds
-        self.pane: Final = bare(self.html())
-        run.param.watch(self._refresh, ["result", "state"])
-        if seeds is not None:
-            seeds.param.watch(self._refresh, "evidence")
-        display.param.watch(self._refresh, ["mode", "unit", "dark", "compared_runs"])
+        switches = ["mode", "unit", "dark", "compared_runs"]
+        self.pane: Final = follow_html(self.html, (run, ["result", "state"]), (seeds, "evidence"), (display, switches))
 
-    def _refresh(self, *_: object) -> None:
-        self.pane.html = self.html()
+    @property
+    def _evidence(self) -> Evidence | None:
+        return self.seeds.evidence if self.seeds else None
 
     def html(self) -> str:
         """Write the table."""
@@ -110,11 +105,13 @@ class Table:
             if not scores.get(name):
                 scores.pop(name, None)
         known = [s for s in scores.values() if s]
-        marks, limits = self._marks(target, scores), {key[0] for key in at_bound(known)}
+        leaders = self._evidence.leaders(target, self.display.mode) if self._evidence else ()
+        marks = marks_of({s.observer: (s.rms, s.apart) for s in known}, leaders)
+        limits = {key[0] for key in at_bound(known)}
         order = sorted(scores, key=lambda name: (it.apart, it.rms) if (it := scores[name]) else (True, math.inf))
         groups = group_by_knowledge(order, shown.result.prior_source if shown else TRUE)
         rows = {
-            title: [self._row(name, target, scores[name], marks.get(name, Markup()), name in limits) for name in of]
+            title: [self._row(name, target, scores[name], marks.get(name), name in limits) for name in of]
             for title, of in groups.items()
         }
         return [(self._title(target, known), []), *rows.items()]
@@ -127,7 +124,7 @@ class Table:
             parts = [{PREDICTION: "Next measurement z", RESIDUAL: "Residual"}[target], self.display.mode, title]
         own = [s for s in scores if not s.apart]
         if shown and own:
-            scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
+            scale = self.display.scale(shown.scenario)
             of = "truth" if target in SCORED else "z"
             parts += [
                 scored_interval(score_rows(own, None)),
@@ -138,36 +135,28 @@ class Table:
     def _score(self, name: str, target: str) -> Score | None:
         """Find a score, with the mean over the seeds where there are several."""
         score = find(self.run.result, name, target, self.display.mode) if self.run.result else None
-        return self.seeds.evidence.over_seeds(score) if score and self.seeds and self.seeds.evidence else score
-
-    def _marks(self, target: str, scores: Mapping[str, Score | None]) -> dict[str, Markup]:
-        """Mark the best, which differs significantly from all others over seeds, or those tied; of one record the smallest."""
-        evidence = self.seeds.evidence if self.seeds else None
-        if evidence and (leaders := evidence.leaders(target, self.display.mode)):
-            return dict.fromkeys(leaders, TIED if len(leaders) > 1 else BEST)
-        rivals = {n: s.rms for n, s in scores.items() if s and can_be_best(n, s.apart)}
-        return dict.fromkeys(rank_observers(rivals)[:1], SMALLEST)
+        return self._evidence.over_seeds(score) if score and self._evidence else score
 
     def _interval(self, score: Score, scale: float) -> Markup:
         """Write the interval of a bound or a mean error, to stand before it."""
-        evidence = self.seeds.evidence if self.seeds else None
         if score.interval is None:
             return Markup()
-        of = f"{evidence.n_seeds} seeds" if evidence else FROM_RECORD
+        of = f"{self._evidence.n_seeds} seeds" if self._evidence else FROM_RECORD
         meaning = IN_MOST if score.observer in BOUNDS else f"{OVER_SEEDS}, {of}"
         return macro("interval", *(number(x * scale) for x in score.interval), meaning)
 
-    def _row(self, name: str, target: str, score: Score | None, mark: Markup, at_limit: bool) -> Row:
+    def _row(self, name: str, target: str, score: Score | None, mark: str | None, at_limit: bool) -> Row:
         shown = self.run.result
-        compared = self._compared_cells(name, target, find(shown, name, target, self.display.mode) if shown else None)
+        now = find(shown, name, target, self.display.mode) if shown else None
+        compared = [self._compared_cell(run, name, target, now) for run in self.display.compared_runs]
         if shown is None or score is None:
             why = "no error: it has no estimate" if shown and self.run.state == DONE else "not computed yet"
             cells = [missing(why), *compared, *[missing(why)] * 5]
         else:
-            scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
+            scale = self.display.scale(shown.scenario)
             cells = [
                 # The number last, so that numbers stand below each other.
-                self._interval(score, scale) + " " + mark + number(score.rms * scale),
+                self._interval(score, scale) + " " + (macro("tag", mark, mark) if mark else "") + number(score.rms * scale),
                 *compared,
                 (ABOVE if target in SCORED and (score.normalised_rms or 0.0) > 1.0 else "")
                 + _or_why(score.normalised_rms, "z is 0"),
@@ -181,21 +170,16 @@ class Table:
 
     def _head(self, name: str) -> Markup:
         label = row_label(name)
-        return (
-            Markup() + label
-            if name == LOOP
-            else swatch(name, self.display.dark) + (term(TERM_OF_BOUND, label) if name in BOUNDS else label)
-        )
-
-    def _compared_cells(self, name: str, target: str, score: Score | None) -> list[str]:
-        """Write the error in every compared run, and the change from there."""
-        return [self._compared_cell(run, name, target, score) for run in self.display.compared_runs]
+        if name == LOOP:
+            return Markup() + label
+        return swatch(name, self.display.dark) + (term(TERM_OF_BOUND, label) if name in BOUNDS else label)
 
     def _compared_cell(self, run: ComparedRun, name: str, target: str, score: Score | None) -> str:
+        """Write the error in a compared run, and the change from there."""
         before = run.score(name, target, self.display.mode)
         if before is None:
             return missing(f"{run.name} does not have it")
-        scale = per_micrometre(self.display.unit, run.scenario.telescope.diameter)
+        scale = self.display.scale(run.scenario)
         return macro("change", change(before.rms, score.rms if score else None)) + number(before.rms * scale)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
-from types import MappingProxyType
 from typing import Any, Final, Protocol
 
 import numpy as np
@@ -13,10 +12,10 @@ import panel as pn
 from bokeh.models import Range1d
 from bokeh.plotting import figure
 
-from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.display import Display
 from wfsobs.app.render import number
 from wfsobs.app.service import BackgroundTask
-from wfsobs.app.style import bare, look, observers_of, sheets, swatch
+from wfsobs.app.style import follow_html, look, observers_of, sheets, swatch
 from wfsobs.app.views.plots import FigureLines, on_settle, zoom_of
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.error_spectra import band_rms
@@ -25,16 +24,14 @@ FLEXIBLE = ":host > div { flex: 1 1 240px; width: auto !important; }"
 """Style of what shares a row with a switch."""
 
 FONT = "Roboto, Helvetica, Arial, sans-serif"
-AXIS_TEXT: Mapping[str, Any] = MappingProxyType(
-    {
-        "major_label_text_font": FONT,
-        "major_label_text_font_size": "0.925em",
-        "axis_label_text_font": FONT,
-        "axis_label_text_font_size": "1em",
-        "axis_label_text_font_style": "normal",
-        "axis_label_standoff": 12,
-    }
-)
+AXIS_TEXT: Mapping[str, Any] = {
+    "major_label_text_font": FONT,
+    "major_label_text_font_size": "0.925em",
+    "axis_label_text_font": FONT,
+    "axis_label_text_font_size": "1em",
+    "axis_label_text_font_style": "normal",
+    "axis_label_standoff": 12,
+}
 """Text of axes as the theme of the page sets it: where it sets another the page is laid out anew."""
 
 
@@ -56,13 +53,9 @@ class Stretch:
         self.times = times
         self.frequencies = frequencies
         self.chosen_window = chosen_window
-        self.pane: Final = bare(stylesheets=[*sheets("style", "bare"), FLEXIBLE])
-        run.param.watch(self._refresh, "result")
-        display.param.watch(self._refresh, ["mode", "unit", "hidden_lines", "dark"])
-        on_settle([times, frequencies], self._refresh)
-
-    def _refresh(self, *_: object) -> None:
-        self.pane.html = self.html()
+        sources = (run, "result"), (display, ["mode", "unit", "hidden_lines", "dark"])
+        self.pane: Final = follow_html(self.html, *sources, stylesheets=[*sheets("style", "bare"), FLEXIBLE])
+        on_settle([times, frequencies], lambda: setattr(self.pane, "html", self.html()))
 
     def html(self) -> str:
         """Write the errors; nothing where there is no truth or nothing is zoomed."""
@@ -83,8 +76,8 @@ class Stretch:
         record, truth = results.result.record, results.values(TRUTH, self.target)
         assert truth is not None
         cut = slice(max(round(start / record.dt), 0), round(end / record.dt) + 1), self.display.column
-        found = {name: values[cut] for name in names if (values := results.values(name, self.target)) is not None}
-        found = {name: values for name, values in found.items() if np.isfinite(values).any()}
+        known = {name: values[cut] for name in names if (values := results.values(name, self.target)) is not None}
+        found = {name: values for name, values in known.items() if np.isfinite(values).any()}
         if not found:
             return {}
         errors = np.column_stack([*found.values()]) - truth[cut][:, None]
@@ -97,7 +90,7 @@ class Stretch:
         return {name: band_rms(s.frequency, s.error[:, self.display.column], low, high) for name, s in spectra.items()}
 
     def _line(self, where: str, errors: dict[str, float], results: RunResults) -> str:
-        scale = per_micrometre(self.display.unit, results.scenario.telescope.diameter)
+        scale = self.display.scale(results.scenario)
         entries = [
             f'<span class="mark">{swatch(name, self.display.dark)}{escape(look(name).label)} '
             f"<b>{number(error * scale)}</b> {self.display.unit_label}</span>"

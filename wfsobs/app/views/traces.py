@@ -9,18 +9,14 @@ from typing import Any, Final
 import numpy as np
 from bokeh.models import BoxAnnotation, ColumnDataSource, CrosshairTool, GlyphRenderer, Label, Range1d, Span, Text, VSpan, VStrip
 from bokeh.plotting import figure
-from numpy.typing import NDArray
 
-from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.display import Display
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.style import look, observers_of
 from wfsobs.app.views.plots import (
     ComparedLines,
     EndLabels,
     FigureLines,
-    band_envelope,
-    envelope,
-    envelope_times,
     in_view,
     new_figure,
     on_settle,
@@ -30,11 +26,13 @@ from wfsobs.app.views.plots import (
 )
 from wfsobs.app.views.target_figures import TargetFigures, shows_error
 from wfsobs.app.work import TRUTH, RunResults
-from wfsobs.evaluation.calibration import half_width
 from wfsobs.evaluation.recovery import trailing_rms
+from wfsobs.evaluation.scores import half_width
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.events import LASER, PEAK, WIND, Event
+from wfsobs.signal.envelope import band_envelope, envelope, envelope_times
+from wfsobs.typing import Array
 
 COLOURS = {False: "#7A1FA2", True: "#E0B3FF"}
 """In light and dark mode."""
@@ -129,8 +127,6 @@ class EventMarks:
         """Set the colour of light or dark mode."""
         self._line.line_color = self._strip.fill_color = self._text.text_color = COLOURS[dark]
 
-
-Array = NDArray[np.float64]
 
 BINS = 500
 """Pairs of extremes per figure, about one per pixel."""
@@ -233,8 +229,7 @@ class _Trace:
         self.target = target
         self.names = [TRUTH, *observers_of(target)]
         self.source = ColumnDataSource({"x": [], **{name: [] for name in self.names}})
-        self.figure = new_figure(x_range=x_range, y_range=Range1d(start=-1.0, end=1.0))
-        self.figure.xaxis.axis_label = "time [s]"
+        self.figure = new_figure(x_range, (-1.0, 1.0), "time [s]")
         self.figure.add_tools(crosshair)
         show_all_on_double_click(self.figure)
         self.warm_up = BoxAnnotation(left=0, right=0, fill_color="#808080", fill_alpha=0.10, line_width=0, level="underlay")
@@ -247,7 +242,7 @@ class _Trace:
 
     def draw(self, results: RunResults, display: Display, first: int, last: int) -> None:
         """Send the samples first ... last - 1 of every line."""
-        scale = per_micrometre(display.unit, results.scenario.telescope.diameter)
+        scale = display.scale(results.scenario)
         data: dict[str, Any] = {"x": envelope_times(first, last, BINS, results.result.record.dt)}
         nothing = np.full(len(data["x"]), np.nan, np.float32)
         for name, line in self.lines.items():  # what is hidden is sent when it is shown
@@ -273,7 +268,7 @@ class _Trace:
         if sd is None:
             self.band.hide()
             return []
-        scale, cut = per_micrometre(display.unit, results.scenario.telescope.diameter), slice(first, last)
+        scale, cut = display.scale(results.scenario), slice(first, last)
         half = half_width(0.95) * sd[cut, display.column]
         values = None if shows_error(results, self.target, display) else results.values(shown[0], self.target)
         middle = 0.0 if values is None else values[cut, display.column]
@@ -288,7 +283,7 @@ class _Trace:
             first, last = np.searchsorted(kept.times, [times[0], times[-1]])
             cut = slice(first, last + 1)
             x = _times_of_envelope(kept.times[cut])
-            scale = per_micrometre(display.unit, run.scenario.telescope.diameter)
+            scale = display.scale(run.scenario)
             for name, line in self.lines.items():
                 values = (kept.errors if error else kept.signals).get((name, self.target))
                 if line.visible and values is not None:

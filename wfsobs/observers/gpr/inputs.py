@@ -147,7 +147,7 @@ class StreamingInputs(StateArrays):
 
     state_names: tuple[str, ...] = ("_filter", "_is_started")
 
-    def __init__(self, settings: Gpr, dt: float, scale: Scale | None = None, channels: int = 1):
+    def __init__(self, settings: Gpr, dt: float, scale: Scale | None, channels: int):
         if settings.inputs_filter == "standardised" and scale is None:
             raise ValueError("standardised inputs need their scale")
         self._scale, self._is_started = scale, False

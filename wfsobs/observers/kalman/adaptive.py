@@ -37,8 +37,8 @@ from wfsobs.observers.kalman.window_model import (
     unpack_spectrum,
     window_lengths,
 )
-from wfsobs.observers.step import StepError, run_frames
-from wfsobs.observers.stepping import SampleHistory, Saved, StateArrays
+from wfsobs.observers.step import PromptEstimator, StepError, run_frames
+from wfsobs.observers.stepping import SampleHistory, Saved
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, RecordError, Sampling
@@ -259,7 +259,7 @@ class ModeWindow:
             kalman.bank.load({"x": state["states"][None, :n], **own})
 
 
-class AdaptiveEstimator(StateArrays):
+class AdaptiveEstimator(PromptEstimator):
     """The adaptive filter of one sensor, or of both where the sampling has NGS frames that it uses.
 
     It identifies in `advance`, each mode when its window is due. Over a record without gaps it runs a filter over all steps to
@@ -273,14 +273,11 @@ class AdaptiveEstimator(StateArrays):
         Of the loop; its ratio is None for the LGS alone.
     """
 
-    horizon: None
-    needs_command: bool
     settings: Adaptive
     sampling: Sampling
     lengths: Lengths
     count: int
 
-    horizon, needs_command = None, False
     state_names: tuple[str, ...] = ("_samples", "count")
 
     def __init__(self, settings: Adaptive, sampling: Sampling):
@@ -342,9 +339,6 @@ class AdaptiveEstimator(StateArrays):
         """Return the estimates of the last frame, (2, n_modes), and deviations of these and of both together, (3, n_modes)."""
         values, sd = zip(*(window.estimate() for window in self.windows), strict=True)
         return np.stack(values, axis=1), np.stack(sd, axis=1)
-
-    def settle(self) -> None:
-        """No deferred work."""
 
     def save(self) -> Saved:
         """Return a copy of the state: the samples, what was found in them, and the states of the filters."""

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
-from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Look, Observer, Tunable
+from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Look, Observer
 from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimates, by_name
 from wfsobs.observers.kalman.mode_filter import ModeFilter
-from wfsobs.observers.kalman.single import PEAKS, MultiPeak, independent_filters, vibration_used
+from wfsobs.observers.kalman.single import PEAKS, TUNABLE_PEAKS, MultiPeak, independent_filters, vibration_used
 from wfsobs.observers.kalman.step import KalmanEstimator, matrix_power
-from wfsobs.observers.stepping import StateArrays
+from wfsobs.observers.step import PromptEstimator
 from wfsobs.prior import Flow, Lines, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
@@ -29,7 +29,7 @@ from wfsobs.signal import joint_states as joint
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.joint_states import LeastVariance, StateFilter, real_product, running_means, shared_covariance
 from wfsobs.signal.periodic import PeriodicFilter
-from wfsobs.signal.statespace import disturbance_model
+from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
 from wfsobs.typing import Array
 
 MEANS = running_means((0.0, 3.0, 9.0, 27.0, 81.0, 243.0))
@@ -74,10 +74,9 @@ class CoupledModel:
             raise ValueError(INDEPENDENT)
         self.means = means
         self.filters, self._flow = independent_filters(prior, settings), prior.flow
-        silent = Ar2(1.0, 1.0, 0.0, prior.lines[0].dt)
-        self._peaks = [disturbance_model((), one.vibration(settings.line_width) or [silent]) for one in prior.lines]
+        self._peaks = line_models(prior, settings)
         self._noise = np.array([one.noise for one in prior.lines])
-        states = [_with_means(one, means) for one in self.filters]
+        states = [with_means(one, means) for one in self.filters]
         known = zip(states, self._peaks, self._flow.line_gain, self._noise, strict=True)
         own = joint.in_two_threads(lambda parts: joint.own_share(*parts), known)
         self._responses = joint.responses(states, means, self._flow.omega)
@@ -139,14 +138,20 @@ class CoupledModel:
         return np.sqrt(np.maximum(variance, 0.0))
 
 
-def _with_means(one: ModeFilter, means: StateFilter) -> StateFilter:
+def line_models(prior: Prior, settings: MultiPeak) -> list[DisturbanceModel]:
+    """Return the models of the lines of each mode; of a mode without any, of a line that is zero."""
+    silent = Ar2(1.0, 1.0, 0.0, prior.lines[0].dt)
+    return [disturbance_model((), one.vibration(settings.line_width) or [silent]) for one in prior.lines]
+
+
+def with_means(one: ModeFilter, means: StateFilter) -> StateFilter:
     """Return an independent filter and the means of its measurement, as one filter."""
     step = one.gains.steps[0]
     reduced = (np.eye(len(step.A)) - step.L @ step.C) @ step.A
     return StateFilter(block_diag(reduced, means.F), np.concatenate([step.L[:, 0], means.G]))
 
 
-class CoupledEstimator(StateArrays):
+class CoupledEstimator(PromptEstimator):
     """The filter one frame at a time: the independent filters, the means, and the weights of both.
 
     Attributes
@@ -161,8 +166,6 @@ class CoupledEstimator(StateArrays):
     kalman: KalmanEstimator
     means: Array
 
-    horizon: float | None = None
-    needs_command = False
     state_names: tuple[str, ...] = ("kalman", "means", "_is_first")
 
     def __init__(self, model: CoupledModel):
@@ -205,9 +208,6 @@ class CoupledEstimator(StateArrays):
         values = by_name(out.reshape(len(z), 2, -1))
         return Estimates(values, {name: np.broadcast_to(spread, z.shape) for name, spread in sd.items()})
 
-    def settle(self) -> None:
-        """No deferred work."""
-
     def take_over(self, old: Any) -> None:
         """Go on from another design."""
         self.kalman.take_over(old.kalman)
@@ -229,7 +229,7 @@ KF_COUPLED = Observer(
     linear=True,
     couples_modes=True,
     weight=2.0,
-    tunable=Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
+    tunable=TUNABLE_PEAKS,
     look=Look("Coupled", "#D35312", "#D48F4D", (10, 2, 2, 2)),
     step=kf_coupled,
     counts=vibration_used,

@@ -4,7 +4,7 @@
 something that their mean does not. The prior `Asterism` has the spectra between the target, all modes in every beam and the NGS.
 The LGS are taken as their mean and orthonormal differences, whose noise is independent; vibration is in the mean and in the NGS
 alone. The states of the independent filters of `kf-multi` on the mean, running means of every measurement, and running means of
-the NGS frames are put together by the weights of least variance (`signal.joint_states`, `signal.frame_shares`); they repeat with
+the NGS frames are put together by the weights of least variance (`signal.joint_states`); they repeat with
 the NGS frames.
 
 `multirate-coupled` has the mean of the LGS, or what `sensors.lgs_combination` makes of them, in the place of a single star: for
@@ -15,28 +15,295 @@ The weights are those of the LGS that are there, of the NGS alone where none is,
 are made when a set of LGS first occurs. The states of one that is out go on with the measurements that the others predict for it,
 so that it can come back at any time. One of which a mode is missing is out. While an NGS frame is lost the weights are those of
 the frames before it; when the next comes, or after several, the filter of the frames takes for it what all states told of it.
+
+The states of the asterism's filter are those of the independent filter of a mode and running means, of the mean of the LGS in
+all modes, then of each difference; and those of the filter and the means of the NGS frames, mode after mode. Where LGS are out,
+the weights are of the states of the others alone (`signal.joint_states`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
-from typing import Any
+from dataclasses import replace
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 
-from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
+from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Look, Observer
 from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimates, by_name
-from wfsobs.observers.kalman.asterism_model import AsterismModel, Beginning
-from wfsobs.observers.kalman.single import NGS, PEAKS, MultiPeak, vibration_used
-from wfsobs.observers.step import StepError, run_frames
-from wfsobs.observers.stepping import StateArrays
+from wfsobs.observers.kalman.coupled import MEANS, line_models, with_means
+from wfsobs.observers.kalman.mode_filter import ModeFilter
+from wfsobs.observers.kalman.single import NGS, PEAKS, TUNABLE_PEAKS, MultiPeak, independent_filters, steady_mode, vibration_used
+from wfsobs.observers.kalman.step import matrix_power
+from wfsobs.observers.step import PromptEstimator, StepError, run_frames
 from wfsobs.prior import Asterism, FlowOfBoth, Lines, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
+from wfsobs.signal.filter_covariance import lyapunov
+from wfsobs.signal.joint_states import (
+    Present,
+    PresentInputs,
+    StateFilter,
+    frame_mean_response,
+    frame_shares,
+    in_two_threads,
+    real_product,
+    responses,
+    running_means,
+    shared_covariance,
+)
 from wfsobs.signal.periodic import PeriodicFilter
-from wfsobs.signal.present_inputs import Present
+from wfsobs.signal.statespace import disturbance_model
+from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
+
+FRAME_MEANS = running_means((0.0, 1.0, 3.0, 9.0, 27.0, 81.0))
+"""Of the NGS: over these frames."""
+
+ALIKE = "all LGS see the same: `multirate-multi` takes their mean and the NGS"
+"""Why there is no filter of the asterism."""
+
+
+class AsterismModel:
+    """Covariances of states and targets, and weights.
+
+    Attributes
+    ----------
+    fast, slow : list of Beginning
+        Of every LGS measurement in each mode, and of the NGS frames.
+    basis : Array
+        Weights of the LGS in their mean and their differences, (n_lgs, n_lgs).
+
+    Parameters
+    ----------
+    prior : Prior
+        With lines and asterism.
+    settings : MultiPeak
+        Of the independent filters.
+    ratio : int or None
+        Steps per NGS frame.
+    means, frame_means : StateFilter
+        Running means of every LGS measurement, and of every NGS frame.
+    age : int
+        Steps between the last NGS frame and the first for which there are weights: so many frames, which are lost.
+
+    Raises
+    ------
+    ValueError
+        The prior has no asterism, or another ratio.
+    """
+
+    basis: Array
+    ratio: int
+    n_states: int
+
+    def __init__(
+        self,
+        prior: Prior,
+        settings: MultiPeak,
+        ratio: int | None,
+        means: StateFilter = MEANS,
+        frame_means: StateFilter = FRAME_MEANS,
+        *,
+        age: int = 0,
+    ):
+        asterism = prior.asterism
+        if asterism is None:
+            raise ValueError(ALIKE)
+        if ratio != asterism.ratio:
+            raise ValueError(f"the prior has an NGS frame every {asterism.ratio} steps, the loop every {ratio}")
+        self._again = partial(AsterismModel, prior, settings, ratio, means, frame_means)
+        self.basis, self.ratio, self._asterism = asterism.basis, asterism.ratio, asterism
+        self._age, self._steps = age, range(age, age + asterism.ratio)
+        self.fast: list[Beginning] = [begin_with_means(one, means) for one in independent_filters(prior, settings)]
+        self.slow: list[Beginning] = [begin_with_means(one, frame_means) for one in frame_filters(prior, settings, asterism)]
+        self._peaks = line_models(prior, settings)
+        omega = asterism.omega
+        self._responses = responses([one.filter for one in self.fast], means, omega) * self.n_stars
+        of_frames = responses([one.filter for one in self.slow], frame_means, asterism.ratio * omega)
+        self._of_frames = [one * frame_mean_response(asterism.ratio, omega) for one in of_frames]
+        n_inputs = (self.n_stars + 1) * len(self._peaks)
+        self._powers = asterism.measurement.reshape(n_inputs, n_inputs, -1)
+        self._estimates = self._add_states()
+
+    @property
+    def n_stars(self) -> int:
+        """Number of LGS."""
+        return len(self.basis)
+
+    def late(self, n_lost: int) -> AsterismModel:
+        """Return the model of the same states while the last so many NGS frames are lost."""
+        return self._again(age=n_lost * self.ratio)
+
+    def plan(self, frames: float, target: str, present: Present | None = None) -> tuple[Array, Array]:
+        """Return weights and standard deviations of a target, or TOTAL, so many frames ahead.
+
+        present : LGS that are there, by default all; with none, the weights are of the NGS alone
+
+        Returns
+        -------
+        weights : Array
+            0, 1, ... steps after an NGS frame was due, and at last before the first, (ratio + 1, n_modes, n_states).
+        sd : Array
+            (ratio + 1, n_modes) [um].
+        """
+        found = self._target(frames, target)
+        return self._estimates.estimate([*found, found[-1]], present or (True,) * self.n_stars)
+
+    def stand_ins(self, present: Present) -> Array:
+        """Return weights that predict the next measurement of every LGS, in all modes, (ratio + 1, n_lgs, n_modes, n_states)."""
+        variance = np.diag(self._measurement_covariance())
+        found = [(cross, variance) for cross in self._next_measurement()]
+        weights = self._estimates.estimate([*found, found[-1]], present)[0]
+        stars = weights.reshape(self.ratio + 1, self.n_stars, -1)
+        return (np.linalg.inv(self.basis) @ stars).reshape(self.ratio + 1, self.n_stars, len(self._peaks), -1)
+
+    def frame(self, present: Present) -> Array:
+        """Return weights that tell the NGS frame that is due in the first of the steps, and lost, (n_modes, n_states)."""
+        n = self.n_stars * len(self._peaks)
+        cross = self._with_states(self._powers[n:] * frame_mean_response(self.ratio, self._asterism.omega))[0]
+        for row, places, exposure in zip(cross, self._places, self._exposures, strict=True):
+            row[places] += exposure
+        found = (cross, np.zeros(len(cross)))
+        return self._estimates.estimate([found], present)[0][0]
+
+    def next_z_sd(self, present: Present) -> Array:
+        """Return the standard deviations of the next z less the sum of both estimates, (ratio + 1, n_modes) [um].
+
+        present : as in `plan`; z is the mean of those that are there, or of all where none is
+        """
+        combination, noise = self._combination(present), self._asterism.noise
+        rows = np.einsum("isk,sb->ibk", combination, np.linalg.inv(self.basis)).reshape(len(noise), -1)
+        seen = np.sum((rows @ self._measurement_covariance()) * rows, axis=1) + np.sum((combination * noise) ** 2, axis=(1, 2))
+        weights, sd = self.plan(0.0, TOTAL, present)
+        ahead = [rows @ cross for cross in self._next_measurement()]
+        told = self._target(0.0, TOTAL)[0][1] - sd**2  # the variance of the estimate
+        variance = seen + told - 2.0 * np.sum(weights * np.array([*ahead, ahead[-1]]), axis=2)
+        return np.sqrt(np.maximum(variance, 0.0))
+
+    def _add_states(self) -> PresentInputs:
+        """Compute covariances of the lines and the states in every phase, and return estimates from the latter."""
+        asterism, m, stars = self._asterism, len(self._peaks), self.n_stars
+        powers, n = self._powers, stars * m
+        fast, slow = shared_covariance(powers[:n, :n], self._responses), shared_covariance(powers[n:, n:], self._of_frames)
+        n_fast, self.n_states = len(fast), len(fast) + len(slow)
+        sizes = [*(one.filter.G.size for one in self.fast)] * stars + [one.filter.G.size for one in self.slow]
+        starts = np.cumsum([0, *sizes])
+        self._places = [np.r_[starts[i] : starts[i + 1], starts[n + i] : starts[n + i + 1]] for i in range(m)]
+        own = zip(asterism.noise / np.sqrt(stars), asterism.ngs_noise, asterism.line_gain, strict=True)
+        known = zip(self.fast, self.slow, self._peaks, own, strict=True)
+        shares = in_two_threads(
+            lambda of: frame_shares(of[0].filter, of[1].filter, self.ratio, of[2], *of[3], age=self._age), known
+        )
+        self._of_lines = [[share.disturbance for share in one] for one in shares]
+        self._exposures = [one[0].exposure for one in shares]
+        of_noise = [
+            lyapunov(one.filter.F, np.outer(one.filter.G, noise**2 * one.filter.G))
+            for one, noise in zip(self.fast, asterism.noise, strict=True)
+        ]
+        first = starts[m]
+        fast[first:, first:] += block_diag(*of_noise * (stars - 1))
+        covariances = []
+        for phase, between in enumerate(self._between(powers[:n, n:])):
+            covariance = np.block([[fast, between], [between.T, slow]])
+            for places, one in zip(self._places, shares, strict=True):
+                covariance[np.ix_(places, places)] += one[phase].states
+            covariances.append(covariance)
+        return PresentInputs(covariances, self.basis, n_fast)
+
+    def _between(self, powers: Complex) -> list[Array]:
+        """Return the covariances of the states of the LGS and of the NGS in every step after a frame."""
+        late = [np.concatenate(parts) for parts in zip(*(self._late(phase) for phase in self._steps), strict=True)]
+
+        def row(i: int) -> list[Array]:
+            found = [real_product(self._responses[i] * powers[i, j], each) for j, each in enumerate(late)]
+            return [np.hstack(parts) for parts in zip(*(np.split(one, self.ratio, axis=1) for one in found), strict=True)]
+
+        return [np.vstack(parts) for parts in zip(*in_two_threads(row, range(len(powers))), strict=True)]
+
+    def _late(self, phase: int) -> list[Complex]:
+        """Return the responses of the states of the NGS so many steps after a frame."""
+        return [one * np.exp(-1j * phase * self._asterism.omega) for one in self._of_frames]
+
+    def _target(self, frames: float, target: str) -> list[tuple[Array, Array]]:
+        """Return covariances of the target and the states, and its variance, in every step after a frame."""
+        if target == TOTAL:
+            parts = zip(*(self._target(frames, part) for part in TARGETS), strict=True)
+            return [(one + other, own + more) for (one, own), (other, more) in parts]
+        return self._of_turbulence(frames) if target == TURBULENCE else self._of_vibration(frames)
+
+    def _of_turbulence(self, frames: float) -> list[tuple[Array, Array]]:
+        asterism, m = self._asterism, len(self._peaks)
+        ahead = (asterism.cross * np.exp(1j * asterism.omega * (1.0 + frames))).reshape(m, (self.n_stars + 1) * m, -1)
+        return [(cross, asterism.own.sum(axis=1)) for cross in self._with_states(ahead)]
+
+    def _next_measurement(self) -> list[Array]:
+        """Return those of the next measurement and the states: of the mean of the LGS, then each difference, in all modes."""
+        n = self.n_stars * len(self._peaks)
+        found = self._with_states(self._powers[:n] * np.exp(1j * self._asterism.omega))
+        for i, (model, of_lines) in enumerate(zip(self._peaks, self._of_lines, strict=True)):
+            for cross, seen in zip(found, of_lines, strict=True):
+                cross[i, self._places[i]] += self._asterism.line_gain[i] * np.ravel(model.C @ model.A @ seen)
+        return found
+
+    def _measurement_covariance(self) -> Array:
+        """Return that of the measurements of `_next_measurement`, without noise, (n_lgs * n_modes, n_lgs * n_modes)."""
+        n = self.n_stars * len(self._peaks)
+        lines = self._asterism.line_gain**2 * [(model.C @ model.C.T).item() for model in self._peaks]
+        return np.real(self._powers[:n, :n].sum(axis=2)) + np.diag(np.pad(lines, (0, n - len(lines))))
+
+    def _combination(self, present: Present) -> Array:
+        """Return the weights of the LGS in z, of these alone where it is their mean; NaN where a z of some is not known."""
+        there, own = np.array(present), self._asterism.combination
+        if there.all() or not there.any():
+            return own
+        is_mean = np.allclose(own, np.eye(len(own))[:, None] / self.n_stars)
+        return own * (there * self.n_stars / there.sum())[:, None] if is_mean else np.full_like(own, np.nan)
+
+    def _with_states(self, powers: Complex) -> list[Array]:
+        """Return covariances of signals and the states in every step, from the cross powers of the signals and all inputs."""
+        n = len(self._responses)
+        fast = [real_product(powers[:, i], one) for i, one in enumerate(self._responses)]
+        late = [[real_product(powers[:, i], one) for i, one in enumerate(self._late(phase), n)] for phase in self._steps]
+        return [np.hstack([*fast, *slow]) for slow in late]
+
+    def _of_vibration(self, frames: float) -> list[tuple[Array, Array]]:
+        found = []
+        for phase in range(self.ratio):
+            out, variances = np.zeros((len(self._peaks), self.n_states)), []
+            for i, (model, cross) in enumerate(zip(self._peaks, self._of_lines, strict=True)):
+                now = model.outputs[VIBRATION]
+                out[i, self._places[i]] = now @ matrix_power(model.A, frames) @ cross[phase]
+                variances.append(now @ now)  # the states have unit variance
+            found.append((out, np.array(variances)))
+        return found
+
+
+class Beginning(NamedTuple):
+    """A filter, and its state where the first measurement is 1: (n,)."""
+
+    filter: StateFilter
+    first: Array
+
+
+def frame_filters(prior: Prior, settings: MultiPeak, asterism: Asterism) -> list[ModeFilter]:
+    """Return a filter of the NGS frames of each mode, with its lines, as if frames were samples."""
+    found = []
+    for one, noise in zip(prior.lines, asterism.ngs_noise, strict=True):
+        step = asterism.ratio * one.dt
+        peaks = [peak.at(step) for peak in one.vibration(settings.line_width)]
+        turbulence = [replace(process, dt=step) for process in one.turbulence]
+        found.append(steady_mode(disturbance_model(turbulence, peaks), float(noise)))
+    return found
+
+
+def begin_with_means(one: ModeFilter, means: StateFilter) -> Beginning:
+    """Return a filter and means of the same measurement, of which the means begin as if it had always been what it is first."""
+    at_rest = np.linalg.solve(np.eye(len(means.F)) - means.F, means.G)
+    return Beginning(with_means(one, means), np.concatenate([np.zeros(len(one.gains.steps[0].A)), at_rest]))
+
 
 INDEPENDENT = "the modes tell nothing of one another: `multirate-multi` estimates each by itself"
 """Why there is no coupled filter."""
@@ -72,7 +339,7 @@ class _Bank:
         return (self.F @ x[..., None])[..., 0] + self.G * y[..., None]
 
 
-class JointEstimator(StateArrays):
+class JointEstimator(PromptEstimator):
     """The filter one frame at a time.
 
     Attributes
@@ -93,8 +360,6 @@ class JointEstimator(StateArrays):
     stand_in_frames: Array
     phase: int
 
-    horizon: float | None = None
-    needs_command = False
     state_names: tuple[str, ...] = ("x", "frames", "stand_in_frames", "phase", "present")
 
     def __init__(self, model: AsterismModel):
@@ -194,9 +459,6 @@ class JointEstimator(StateArrays):
         """Return all states in the order of the weights, (n_states,)."""
         return np.concatenate([self.x[:, self._fast.is_state].ravel(), self.frames[self._slow.is_state]])
 
-    def settle(self) -> None:
-        """No deferred work."""
-
     def take_over(self, old: Any) -> None:
         """Go on from another design. Raises StepError where that has other states."""
         if old.x.shape != self.x.shape or old.frames.shape != self.frames.shape:
@@ -293,7 +555,7 @@ KF_ASTERISM = Observer(
     couples_modes=True,
     sensors=("lgs", "ngs"),
     weight=5.0,
-    tunable=Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
+    tunable=TUNABLE_PEAKS,
     look=Look("Asterism", "#923222", "#F5B022", (8, 2, 2, 2)),
     step=kf_asterism,
     counts=vibration_used,
@@ -312,7 +574,7 @@ MULTIRATE_COUPLED = Observer(
     takes_missing=True,
     sensors=("lgs", "ngs"),
     weight=3.0,
-    tunable=Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
+    tunable=TUNABLE_PEAKS,
     look=Look("Coupled, both", "#3806FF", "#2C49F5", (10, 2, 4, 2)),
     step=multirate_coupled,
     counts=vibration_used,

@@ -40,6 +40,9 @@ NGS = ("y_ngs", "ratio")
 MODEL = ("kalman.frequency", "kalman.damping", "kalman.turbulence_rms", "kalman.vibration_rms")
 """Settings of the model with one peak."""
 
+TUNABLE_PEAKS = Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms"))
+"""Of filters with every line in their model."""
+
 MIN_NOISE = 1e-6
 """Floor of a modelled measurement noise [um]: a filter for perfect measurements has no Riccati solution."""
 
@@ -204,7 +207,7 @@ KF_MULTI = Observer(
     settings=PEAKS,
     linear=True,
     takes_missing=True,
-    tunable=Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
+    tunable=TUNABLE_PEAKS,
     look=Look("Multi-peak", "#AE7D40", "#BA6A26", (14, 3)),
     step=kf_multi,
     counts=vibration_used,

@@ -18,8 +18,8 @@ from scipy.linalg import block_diag, fractional_matrix_power
 
 from wfsobs.observers.estimates import TARGETS, Estimates, by_name
 from wfsobs.observers.kalman.mode_filter import ModeFilter, StatedErrors
-from wfsobs.observers.step import StepError, run_frames, whole_frames
-from wfsobs.observers.stepping import FilterBank, Gain, GainCycle, Saved, StateArrays
+from wfsobs.observers.step import PromptEstimator, StepError, run_frames, whole_frames
+from wfsobs.observers.stepping import FilterBank, Gain, GainCycle, Saved
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements
 from wfsobs.signal.filter_covariance import lyapunov
@@ -162,11 +162,9 @@ def plan(rows: Sequence[Array], n: int, sd: Array) -> Plan:
     return Plan(padded, np.zeros(len(rows)), sd)
 
 
-class LinearEstimator(StateArrays):
+class LinearEstimator(PromptEstimator):
     """What Kalman filters share: a bank of filters in the state after the measurement, and rows of it per prediction."""
 
-    horizon: float | None = None
-    needs_command = False
     state_names: tuple[str, ...] = ("bank",)
 
     def __init__(self, modes: Sequence[ModeFilter]):
@@ -183,9 +181,6 @@ class LinearEstimator(StateArrays):
         """Return the gains near gaps of a mode; modes of equal models share them."""
         model = self.modes[mode].digest()
         return self._of_equal.setdefault(model, self._of_equal.get(model) or self.modes[mode].gaps())
-
-    def settle(self) -> None:
-        """No deferred work."""
 
     def take_over(self, old: Any) -> None:
         """Go on from another design."""

@@ -1,12 +1,14 @@
-"""Settings of the wavefront sensors."""
+"""Settings of the wavefront sensors, and the lenslets and number of modes that those of a Shack-Hartmann sensor resolve."""
 
 from __future__ import annotations
 
 from types import MappingProxyType
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import param
 
+from wfsobs.sensors.lenslets import Lenslets, highest_order
+from wfsobs.settings.errors import SettingError
 from wfsobs.settings.group import Group, UsedWhen, section
 from wfsobs.settings.parameters import Real, Reals, Whole
 
@@ -244,3 +246,47 @@ class Sensors(Group):
         LensletArrays, "Shack-Hartmann", "Lenslets of the Shack-Hartmann sensors, and the fit to their slopes."
     )
     spots: Spots = section(Spots, "Spots", "Light and detectors of the Shack-Hartmann sensors, for noise from photons.")
+
+
+Kind = Literal["lgs", "ngs"]
+
+
+def fit_lenslets(settings: LensletArrays, kind: Kind, diameter: float, min_order: int) -> tuple[Lenslets, int]:
+    """Return the lenslets on an LGS or on the NGS, and the radial order fitted to their slopes.
+
+    Parameters
+    ----------
+    settings : LensletArrays
+        Settings of the sensors.
+    kind : {"lgs", "ngs"}
+        Which sensor.
+    diameter : float
+        Aperture diameter [m].
+    min_order : int
+        Minimum radial order.
+
+    Returns
+    -------
+    lenslets : Lenslets
+        Geometry.
+    order : int
+        Radial order of the fit.
+
+    Raises
+    ------
+    SettingError
+        The slopes determine fewer orders than `min_order`.
+    """
+    across = settings.lgs_subapertures if kind == "lgs" else settings.ngs_subapertures
+    lenslets = Lenslets(diameter, across, settings.illumination, settings.obscuration)
+    name = f"sensors.lenslets.{kind}_subapertures = {across}"
+    try:
+        order = highest_order(lenslets, settings.fitted_order)
+    except ValueError as error:
+        raise SettingError(f"{name}: {error}") from None
+    if order < min_order:
+        raise SettingError(
+            f"{name}: with sensors.lenslets.fitted_order = {settings.fitted_order} these fit modes up to radial "
+            f"order {order}, fewer than telescope.radial_order = {min_order}"
+        )
+    return lenslets, order

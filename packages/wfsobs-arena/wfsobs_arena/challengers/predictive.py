@@ -20,7 +20,7 @@ import numpy as np
 
 from wfsobs.control.base import Controller, Settings
 from wfsobs.control.mirror import Mirror, Plant
-from wfsobs.control.step_laws import StepLaw, push_row
+from wfsobs.control.step import StepLaw, push_row
 from wfsobs.observers.step import StepError
 from wfsobs.observers.stepping import Saved
 from wfsobs.prior import Prior

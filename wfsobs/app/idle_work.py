@@ -1,9 +1,10 @@
-"""Further seeds of the scenario shown, run in idle time: what they say of the errors."""
+"""What idle time is spent on: further seeds of the scenario shown, and why every observer has the error that it has."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -14,12 +15,16 @@ from wfsobs.app.jobs import DONE, IDLE_TIME, Job, Tell
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source
 from wfsobs.app.store import Store
+from wfsobs.app.style import watch
 from wfsobs.app.work import RunResults
-from wfsobs.cost import run_seconds
+from wfsobs.cost import part_seconds, run_seconds
 from wfsobs.dependence import Memo, RecordMemo, simulate_once
+from wfsobs.evaluation.budget import Budget, error_budget
 from wfsobs.evaluation.evidence import FEWEST, Evidence, gather_evidence
 from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.scores import Score
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import TARGETS
 from wfsobs.pipeline import observe
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
@@ -133,12 +138,101 @@ class SeedRuns(param.Parameterized):
         return simulated.run.seed + number
 
     def _job(self, of: RunResults, number: int) -> Job:
-        source, seed = of.source, self._seed(of, number)
+        service, args = self.task.session.service, (of.scenario, of.source, self._seed(of, number))
         return Job(
             "seed",
-            lambda watch, tell: run_seed(of.scenario, source, seed, watch, tell, self.task.session.service.memo),
-            key=self.task.session.service.seed_key(of.scenario, source, seed),
+            partial(run_seed, *args, memo=service.memo),
+            key=service.seed_key(*args),
             cost=run_seconds(of.scenario),
             priority=IDLE_TIME,
             refusal=SettingError,
         )
+
+
+RUNS = 16
+"""How often an observer that is not linear runs for a budget: on every combination of sources."""
+
+BUDGET_PATIENCE = 60.0
+"""An observer whose runs take longer has no budget [s]."""
+
+UNKNOWN = 0.05
+"""About how long an observer takes whose time is not estimated [s]."""
+
+ByObserver = dict[str, Sequence[Budget]]
+"""Observer -> budgets of its targets and modes."""
+
+
+class Budgets(param.Parameterized):
+    """The budgets of linear observers and of the main ones; of all others too once they are asked for.
+
+    main  : returns the main observers of a target
+    seeds : which change the main ones; where one record is enough, nothing else runs in idle time
+    """
+
+    by_observer: param.Parameter[ByObserver] = param.Parameter(
+        {}, doc="Observer -> its budgets (a sequence of Budget), as far as they are known."
+    )
+    every: param.Boolean[bool] = param.Boolean(
+        False, doc="Whether observers that are not linear have theirs too, though they are not main ones."
+    )
+
+    def __init__(self, store: Store, main: Callable[[str], Collection[str]], seeds: SeedRuns | None = None):
+        super().__init__()
+        self.store = store
+        self.run: Final = store.run
+        self.main = main
+        self.seeds = seeds
+        self.task: Final = BackgroundTask(store.session)
+        self._of: RunResults | None = None
+        self._budgets: ByObserver = {}
+        self._names: list[str] = []
+        watch(self._follow, (self.run, ["state", "result"]), (self, "every"), (seeds, ["evidence", "count"]))
+        self.task.param.watch(self._take, ["latest", "state"])
+
+    def budget(self, observer: str, target: str, mode: str) -> Budget | None:
+        """Find a budget; None where it is not known."""
+        return next((b for b in self.by_observer.get(observer, ()) if (b.target, b.mode) == (target, mode)), None)
+
+    def ask_for_all(self) -> None:
+        """Compute the budgets of observers that are not linear and no main ones too."""
+        self.every = True
+
+    @property
+    def possible(self) -> bool:
+        """Whether what is shown has budgets: of other records the sources are not known."""
+        shown = self.run.result
+        return shown is not None and not shown.is_recorded and shown.scenario.vibration.source != "psd"
+
+    def _follow(self, *_: object) -> None:
+        """Begin anew with what is shown, once it is complete."""
+        shown = self.run.result if self.run.state == DONE and self.possible else None
+        if shown is not self._of:
+            self._of, self._budgets, self._names, self.by_observer = shown, {}, [], {}
+        if shown is None:
+            self.task.close()
+        elif not set(wanted := self._order(shown)) <= set(self._names):
+            self._names = wanted
+            work = partial(compute_budgets, shown, wanted, self._budgets)
+            self.task.start(Job("budgets", work, cost=run_seconds(shown.scenario), priority=IDLE_TIME))
+
+    def _order(self, results: RunResults) -> list[str]:
+        """List the observers that are to have a budget, the main ones and the quick ones first."""
+        ran, each = {e.observer for e in results.result.estimates}, part_seconds(results.scenario)
+        is_one_record = self.seeds is not None and self.seeds.count == 1
+        main = {name for target in TARGETS for name in self.main(target) if not is_one_record}
+        seconds = {o.id: 0.0 if o.linear else RUNS * each.get(o.id, UNKNOWN) for o in OBSERVERS.values() if o.id in ran}
+        most = min(BUDGET_PATIENCE, self.store.limits.seconds)
+        wanted = [name for name, of in seconds.items() if of == 0.0 or (of <= most and (self.every or name in main))]
+        return sorted(wanted, key=lambda name: (seconds[name] > 0.0, name not in main, seconds[name]))
+
+    def _take(self, *_: object) -> None:
+        if self._of is not None and self.task.latest is not None:
+            self.by_observer = self.task.latest
+
+
+def compute_budgets(results: RunResults, names: Sequence[str], budgets: ByObserver, watch: Watch, tell: Tell) -> None:
+    """Compute the budgets of observers; budgets : those there are already, to which it adds."""
+    for name in names:
+        if name not in budgets:
+            budgets[name] = error_budget(results.result, observers=[name], watch=Watch(is_cancelled=watch.is_cancelled))
+            tell(latest=dict(budgets))
