@@ -30,7 +30,7 @@ from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import TOTAL
 from wfsobs.typing import Array
 
-SHOWN_EVENTS = 8
+SHOWN_EVENTS = 40
 FAR_BEHIND = 2.0
 """Beyond this the observers do not catch up by themselves [s]."""
 QUANTITIES = {"Next measurement" if target == NEXT else target_title(target): target for target in (*TARGETS, TOTAL, NEXT)}
@@ -155,7 +155,7 @@ def events_html(events: Iterable[LiveEvent], dt: float) -> str:
     """List the latest events, by time, the last one first."""
     latest = sorted(list(events)[-SHOWN_EVENTS:], key=lambda event: event.frame)[::-1]  # some are told late
     lines = [f"<li>{event.frame * dt:.2f} s: {_event_html(event)}</li>" for event in latest]
-    return f'<ul class="text" aria-label="Events">{"".join(lines)}</ul>' if lines else ""
+    return f'<ul class="text" tabindex="0" aria-label="Events">{"".join(lines)}</ul>' if lines else ""
 
 
 def _event_html(event: LiveEvent) -> str:
