@@ -138,13 +138,23 @@ ALERTS = """() => {
 """Keeps what alerts have said: on a busy machine one that goes by itself is gone before somebody looks."""
 
 
+LOST = """() => {
+  const send = WebSocket.prototype.send
+  WebSocket.prototype.send = function (text) {
+    if (typeof text !== "string" || !text.includes('"drawn"')) return send.call(this, text)
+    WebSocket.prototype.send = send
+  }
+}"""
+"""Loses the message by which the page first says that its picture stands: it is said again."""
+
+
 @pytest.fixture(scope="module")
 def opened(contexts: Any, cable: Cable, host: Host) -> Iterator[Page]:
     """The page at the end of the cable, its first run over."""
     page = contexts().new_page()
     page.set_viewport_size({"width": 1400, "height": 1000})
     page.set_default_timeout(PATIENCE)
-    page.add_init_script(f"({ALERTS})()")
+    page.add_init_script(f"({ALERTS})(), ({LOST})()")
     page.goto(with_seeds(f"http://localhost:{cable.port}/{QUICK}", 1))
     finished(page)
     yield page

@@ -116,6 +116,7 @@ class Frame(Component):
     )
     stale = param.Boolean(False, doc="Whether to fade the results.")
     dark = param.Boolean(False, doc="Whether the page is dark.")
+    complete = param.Boolean(False, doc="Whether what the first picture does not need is there.")
 
     _esm = script("frame")
 
@@ -204,9 +205,10 @@ class Dashboard:
 
     def complete(self) -> None:
         """Make what the first picture does not need: the settings, whose drawer has its width, and what is further down."""
-        if len(self.drawer):
+        if self.frame.complete:
             return
         with pn.io.hold():
+            self.frame.complete = True
             self.explore.complete()
             self.pages.complete()
             there, at = self.body.objects, self.body.index(self.keyboard)
@@ -214,9 +216,10 @@ class Dashboard:
             self.drawer[:] = [self.controls.view()]
 
     def _stand(self) -> None:
-        """Complete a page that has been drawn."""
-        self.complete()
-        self.store.session.service.keep_page()
+        """Complete a page that has been drawn, which it says until it is heard."""
+        if not self.frame.complete:
+            self.complete()
+            self.store.session.service.keep_page()
 
     def start(self) -> None:
         """Start the first run, unless settings from a link have brought one or would take long, or the page opens on Live."""

@@ -190,8 +190,12 @@ class Link {
     this.connection = this.model = null // until it is drawn
   }
 
+  // As soon as the server answers.
   async again() {
-    if (!await reachable()) return this.draw(SAID.gone + " It does not answer yet.", "gone")
+    if (!await reachable()) {
+      this.draw(SAID.gone + " It does not answer yet.", "gone")
+      return setTimeout(() => this.again(), LONGEST)
+    }
     this.keep()
     location.reload()
   }

@@ -58,15 +58,21 @@ function ignoreAllEchoes() {
 }
 ignoreAllEchoes()
 
-// What the first picture does not need is made when it stands: when its figures have been painted, or a page has none.
-const PATIENCE = 1500, STEP = 30
+// What the first picture does not need is made when it stands: when its figures have been painted, or a page has none. It is told
+// until it has come: what is told while a connection breaks is lost.
+const PATIENCE = 1500, STEP = 30, AGAIN = 3000
 function tellDrawn(model) {
   const end = performance.now() + PATIENCE
+  const tell = () => {
+    if (model.complete) return
+    model.send_msg({drawn: true})
+    setTimeout(tell, AGAIN)
+  }
   const idle = window.requestIdleCallback ?? ((act) => setTimeout(act, STEP))
   const look = () => {
     const figures = [...Bokeh.index.query((it) => it.model.type === "Figure")]
     const drawn = figures.length > 0 && figures.every((it) => it.has_finished())
-    if (drawn || performance.now() > end) idle(() => model.send_msg({drawn: true}), {timeout: PATIENCE})
+    if (drawn || performance.now() > end) idle(tell, {timeout: PATIENCE})
     else setTimeout(look, STEP)
   }
   look()
