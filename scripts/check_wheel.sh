@@ -45,7 +45,7 @@ def fetch(path):
     with urllib.request.urlopen(base + path, timeout=30) as answer:
         return answer.read().decode()
 
-for attempt in range(120):
+for attempt in range(480):
     try:
         fetch("/liveness")
         break
@@ -54,7 +54,7 @@ for attempt in range(120):
     except OSError:
         time.sleep(0.5)
 else:
-    sys.exit("no answer in a minute")
+    sys.exit("no answer in four minutes")
 page = fetch("/")
 assert "bokeh" in page and "<html" in page, page[:500]
 print("served", len(page), "characters, and /liveness")

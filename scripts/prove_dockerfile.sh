@@ -68,7 +68,7 @@ done < <(sed -E '/^\s*#/d; /^\s*$/d' Dockerfile | sed -E ':a; /\\$/N; s/\s*\\\n\
 echo "CMD ${command[*]} --port $port"
 (empty_env "${command[@]}" --port "$port") >"$root/tmp/log" 2>&1 &
 server=$!
-for _ in $(seq 60); do
+for _ in $(seq 240); do
     if (empty_env bash -euc "$health") 2>/dev/null; then healthy=yes; break; fi
     sleep 0.5
 done
