@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from concurrent.futures import wait as wait_for
+from multiprocessing import Pipe, get_context
 
 import numpy as np
 import psutil
@@ -17,6 +18,7 @@ import wfsobs
 from wfsobs.live.board import Board
 from wfsobs.live.follow import _row
 from wfsobs.live.loop import LiveLoop
+from wfsobs.live.processes import compute
 from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.scenario.presets import paper
 from wfsobs.streams.shared_image import SharedImage
@@ -144,3 +146,15 @@ def test_numbers_that_are_not_known_are_null_in_json():
         json.dumps(row, allow_nan=False)
     finally:
         board.release()
+
+
+def test_who_waits_for_work_ends_without_a_traceback_once_nobody_is_left(capfd):
+    here, there = Pipe()
+    process = get_context("spawn").Process(target=compute, args=(there,))
+    process.start()
+    there.close()
+    here.send((divmod, (7, 3)))
+    assert here.recv() == (2, 1)
+    here.close()
+    process.join()
+    assert (process.exitcode, capfd.readouterr().err) == (1, "")
