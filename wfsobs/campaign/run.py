@@ -12,12 +12,13 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from time import perf_counter, sleep, time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from wfsobs.campaign.plan import Campaign, Cell, wanted_seeds
+from wfsobs.campaign.compare import compare, comparison_groups
+from wfsobs.campaign.plan import Campaign, Cell, Stop
 from wfsobs.campaign.pools import Workers
 from wfsobs.campaign.store import BatchIndex, finished_runs, open_folder, remove_leftovers, row_key, scenario_digest, write_batch
 from wfsobs.closed_loop.design import Design, design
@@ -35,6 +36,9 @@ from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
+
+if TYPE_CHECKING:
+    import pyarrow
 
 Row = dict[str, Any]
 
@@ -228,6 +232,10 @@ BREAKS = 20
 """How often in a row an executor may break with no batch finished in between."""
 
 
+HELD = 20_000
+"""Rows that are held at a time, but for a scenario that has more."""
+
+
 @dataclass
 class Progress:
     """State of a campaign.
@@ -314,13 +322,52 @@ def _wanted_runs(plan: Campaign, folder: Path, shard: tuple[int, int]) -> tuple[
     finished = finished_runs(plan, folder)
     seeds = wanted_seeds(plan, finished, BatchIndex(folder)) if plan.stop else np.full(len(plan.cells), len(plan.seeds))
     wanted = np.arange(len(plan.seeds)) < seeds[:, None]
-    return wanted.ravel() & _share(plan, shard), finished.ravel()
-
-
-def _share(plan: Campaign, shard: tuple[int, int]) -> Array:
-    """Return the runs of a share, bool (n_runs,): of every scenario some seeds, so that shares take equally long."""
     k, n = shard
-    return np.arange(plan.n_runs) % n == k - 1
+    share = np.arange(plan.n_runs) % n == k - 1  # of every scenario some seeds, so that shares take equally long
+    return wanted.ravel() & share, finished.ravel()
+
+
+def wanted_seeds(plan: Campaign, complete: Array, rows: BatchIndex) -> Array:
+    """Return how many seeds each scenario is to have by what is known, (n_cells,).
+
+    At each look the first seeds alone count, so that the order of arrival does not matter. Some scenarios are decided at a time,
+    so that as many rows are held whatever the number of scenarios.
+
+    Parameters
+    ----------
+    plan : Campaign
+        The campaign.
+    complete : Array
+        Runs that are finished, bool (n_cells, n_seeds).
+    rows : BatchIndex
+        Their rows.
+    """
+    assert plan.stop is not None
+    wanted = np.full(len(plan.cells), plan.stop.looks[0])
+    size = max(1, int(HELD / max(1.0, rows.n_rows / max(1, complete.sum()) * complete.sum(axis=1).max())))
+    for start in range(0, len(wanted), size):
+        cells = range(start, min(start + size, len(wanted)))
+        if complete[cells, : plan.stop.looks[0]].all(axis=1).any():
+            wanted[cells] = _wanted_of(plan, plan.stop, cells, complete[cells], rows.read(cells))
+    return wanted
+
+
+def _wanted_of(plan: Campaign, stop: Stop, cells: range, complete: Array, table: pyarrow.Table) -> Array:
+    """Return how many seeds some scenarios are to have, (n,); complete : (n, n_seeds)."""
+    import pyarrow as pa
+
+    wanted, undecided = np.full(len(cells), stop.looks[0]), np.ones(len(cells), dtype=bool)
+    for count in stop.looks:
+        wanted[undecided] = count
+        undecided &= complete[:, :count].all(axis=1)  # the others wait for their seeds
+        if not undecided.any():
+            break
+        table = table.filter(pa.array(undecided[table["cell"].to_numpy() - cells.start]))
+        first = table.filter(pa.array(table["seed"].to_numpy() < plan.seeds.start + count))
+        groups = comparison_groups(compare(first, stop.level))
+        open_cells = {key[0] for key, compared in groups.items() if not stop.is_decided(compared)}
+        undecided &= np.isin(cells, list(open_cells))
+    return wanted
 
 
 class _Batches:

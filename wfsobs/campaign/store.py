@@ -26,6 +26,9 @@ from wfsobs.settings.errors import SettingError
 from wfsobs.typing import Array
 from wfsobs.version import __version__
 
+if TYPE_CHECKING:
+    import pyarrow
+
 PHYSICS_VERSION = 6
 """Number of the simulation and its numerics: rises with every change that moves results (tests/campaign/test_physics.py)."""
 
@@ -80,11 +83,6 @@ def _distribution_version(home: str) -> str:
     names = packages_distributions().get(home, [])
     return version(names[0]) if names else "0"
 
-
-if TYPE_CHECKING:
-    import pyarrow
-
-    from wfsobs.campaign.plan import Campaign
 
 PLAN = "plan.json"
 ROWS = "rows"
@@ -193,7 +191,6 @@ def read_results(folder: Path, provenance: bool = False) -> pyarrow.Table:
 
 def _each_once(tables: Sequence[pyarrow.Table], columns: Sequence[str]) -> pyarrow.Table:
     """Return the rows of tables, each once, sorted."""
-    import numpy as np
     import pyarrow as pa
 
     if not tables:
