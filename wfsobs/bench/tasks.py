@@ -188,7 +188,7 @@ class OnlineProblem:
         return max_error(estimates[some], exact, std)
 
 
-def timed(
+def time_row(
     task: str,
     size: str,
     variant: str,
@@ -256,7 +256,7 @@ def _filters(
         return max(max_error(values[: len(exact), i], exact[:, i]) for i in range(len(TARGETS)))
 
     for variant, work in ({OURS: ours} | states).items():
-        yield timed(task, f"{n} steps, 6 states", variant, work, sizes.repeats, n, error)
+        yield time_row(task, f"{n} steps, 6 states", variant, work, sizes.repeats, n, error)
 
 
 def paper_model(scenario: Scenario, dt: float) -> tuple[Array, Array, Array, Array]:
@@ -276,14 +276,14 @@ def adaptive_record(sizes: Sizes) -> Iterator[Row]:
     scenario = sizes.scenario(sizes.filter_duration)
     z, a = simulate(scenario).z[:, 0], scenario.adaptive
     size = f"{len(z)} steps, {a.window:g} s every {a.interval:g} s"
-    yield timed("adaptive-record", size, OURS, lambda: adapt(z, scenario.dt, a, lambda _fraction: None), sizes.repeats, len(z))
+    yield time_row("adaptive-record", size, OURS, lambda: adapt(z, scenario.dt, a, lambda _fraction: None), sizes.repeats, len(z))
 
 
-def online_problem(record: Record, scenario: Scenario, mode: int, count: int) -> OnlineProblem:
-    """Return the problem of one mode, with `count` rows for the others."""
+def online_problem(record: Record, scenario: Scenario, count: int) -> OnlineProblem:
+    """Return the problem of the first mode, with `count` rows for the others."""
     g = scenario.gpr_online
-    X = textbook.windows(window_signals(g, record.y_lgs, record.u, record.z, mode, record.dt), g.depth)
-    f = np.append(online_reference(bands_of(scenario), record.z, record.dt)[g.depth :, mode], 0.0)
+    X = textbook.windows(window_signals(g, record.y_lgs, record.u, record.z, 0, record.dt), g.depth)
+    f = np.append(online_reference(bands_of(scenario), record.z, record.dt)[g.depth :, 0], 0.0)
     rows = np.unique(np.linspace(g.training_size, len(X) - 1, count).astype(int))
     return OnlineProblem(X, f, g.training_size, g.depth, kernel_of(g), rows)
 
@@ -316,7 +316,7 @@ def _online_record(record: Record, scenario: Scenario, sizes: Sizes, count: int,
         given = part.measurements(), prior_of(scenario, part, (Bands,)), g
         seconds, result = measure_time(lambda given=given: gpr_online(*given, QUIET)[VIBRATION], sizes.repeats)
         ours.append((variant, seconds, result[:, 0]))
-    problem = online_problem(record, scenario, 0, count)  # only now: much memory held slows down the allocation of more
+    problem = online_problem(record, scenario, count)  # only now: much memory held slows down the allocation of more
     std = float(np.nanstd(ours[0][2]))
     for variant, seconds, values in ours:
         error = problem.error(values[problem.rows + g.depth - 1], std, sizes.exact_steps)
@@ -327,7 +327,7 @@ def _online_record(record: Record, scenario: Scenario, sizes: Sizes, count: int,
     for variant, predict, n in others:
         p = replace(problem, rows=problem.rows[:: -(-len(problem.rows) // n)])
         error = partial(p.error, std=std, count=sizes.exact_steps)
-        yield timed(task, size, variant, partial(predict, p), sizes.repeats, len(p.rows), error)
+        yield time_row(task, size, variant, partial(predict, p), sizes.repeats, len(p.rows), error)
 
 
 def online_stream(sizes: Sizes) -> Iterator[Row]:
@@ -338,7 +338,7 @@ def online_stream(sizes: Sizes) -> Iterator[Row]:
     record = cut_windows(simulate(scenario), scenario.n_steps, 1)
     runs = [_stream(scenario, record) for _ in range(sizes.repeats)]
     values = runs[-1][0]
-    problem = online_problem(record, scenario, 0, sizes.textbook_steps)
+    problem = online_problem(record, scenario, sizes.textbook_steps)
     error = partial(problem.error, std=float(np.nanstd(values)), count=sizes.exact_steps)
     yield _stream_row(task, size, OURS, [times for _, times in runs], error(values[problem.rows + g.depth - 1]))
 
@@ -496,7 +496,7 @@ def whole_run(sizes: Sizes) -> Iterator[Row]:
     learning = tuple(name for name, observer in OBSERVERS.items() if observer.slow)
     for variant, left_out in ((OURS, ()), ("without-online-gpr", ("gpr-online",)), ("without-learning", learning)):
         names = [name for name in usual_observers(scenario) if name not in left_out]
-        yield timed("whole-run", size, variant, partial(run, scenario, observers=names), sizes.repeats, scenario.n_steps)
+        yield time_row("whole-run", size, variant, partial(run, scenario, observers=names), sizes.repeats, scenario.n_steps)
 
 
 def each_observer(sizes: Sizes) -> Iterator[Row]:
@@ -506,7 +506,7 @@ def each_observer(sizes: Sizes) -> Iterator[Row]:
     for name in OBSERVERS:
         try:
             work = partial(run_observer, name, record, scenario)
-            found = timed("observer", f"{name}, {size}", OURS, work, sizes.repeats, record.n_steps)
+            found = time_row("observer", f"{name}, {size}", OURS, work, sizes.repeats, record.n_steps)
         except ValueError:
             continue
         yield found
@@ -532,13 +532,12 @@ TASKS: dict[Callable[[Sizes], Iterator[Row]], float] = {
 """Task -> its share of the time."""
 
 
-def measure_all(sizes: Sizes, progress: Callable[[float], None] | None = None) -> list[Row]:
+def measure_all(sizes: Sizes, progress: Callable[[float], None]) -> list[Row]:
     """Return every row. progress: receives the fraction done."""
     done, found = 0.0, list[list[Row]]()
     with threadpool_limits(1, user_api="blas"), set_aside():
         for task, weight in TASKS.items():
             found.append(with_ratios(list(task(sizes))))
             done += weight
-            if progress:
-                progress(done / sum(TASKS.values()))
+            progress(done / sum(TASKS.values()))
     return [r for rows in [*found[1:], found[0]] for r in rows]

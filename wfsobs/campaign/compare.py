@@ -177,7 +177,7 @@ class CampaignErrors:
             with np.errstate(divide="ignore"):
                 samples = np.where(rms > 0, np.log(rms), np.nan)
             mean, eligible = np.exp(mean_interval(samples)[0]), np.all(self.eligible[cells] | np.isnan(rms), axis=0)
-        best, difference, half, tie, untested = differences(samples, mean, eligible)
+        best, difference, half, tie, untested = compare_columns(samples, mean, eligible)
         parts = difference, difference - half, difference + half
         above, low, high = (part / mean[best] if len(cells) == 1 else np.expm1(part) for part in parts)
         numbers = [column.tolist() for column in (mean, above, low, high, np.arange(len(mean)) == best, tie, untested)]
@@ -210,7 +210,7 @@ def can_win(name: str, target: str) -> bool:
     return name not in (*OBSERVERS, *NOT_OBSERVERS) or can_be_best(name, apart=False)
 
 
-def differences(samples: Array, mean: Array, eligible: Array, level: float = LEVEL) -> tuple[int, Array, Array, Array, Array]:
+def compare_columns(samples: Array, mean: Array, eligible: Array, level: float = LEVEL) -> tuple[int, Array, Array, Array, Array]:
     """Find the best: the smallest mean of those with a result in most samples, and compare all that can be the best with it.
 
     Parameters
@@ -321,7 +321,7 @@ def compare(table: pyarrow.Table, level: float = LEVEL) -> list[Comparison]:
     out = []
     for where, errors in each_group(table):
         values, rms, count, eligible = errors.values[0], errors.rms[0], errors.count[0], errors.eligible[0]
-        best, difference, half, tie, untested = differences(values, rms, eligible, level)
+        best, difference, half, tie, untested = compare_columns(values, rms, eligible, level)
         for i in np.argsort(rms):
             if not count[i] and not eligible[i]:
                 continue

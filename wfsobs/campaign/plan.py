@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from wfsobs.campaign.compare import LEVEL, Comparison
-from wfsobs.campaign.sweep import Changes, conditions, grid, product, sample
+from wfsobs.campaign.sweep import Changes, check_keys, conditions, grid, product, sample
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.priors_from.scenario import common_observers
@@ -62,9 +62,7 @@ def parse_stop(table: Mapping[str, Any], seeds: int) -> Stop | None:
     """Return the rule of a plan, None for an empty table. Raises SettingError."""
     if not table:
         return None
-    for key in table:
-        if key not in ("half_width", "first"):
-            raise SettingError(f"stop.{key}: takes half_width, first")
+    check_keys(table, "stop", "half_width", "first")
     width, first = table.get("half_width", 0.05), table.get("first", 10)
     if not isinstance(width, (int, float)) or not 0 < width < 1:
         raise SettingError(f"stop.half_width = {width!r}: takes a number between 0 and 1, in units of the best rms")
@@ -276,9 +274,7 @@ def _scenarios(values: Mapping[str, Any], folder: Path) -> list[tuple[str, Mappi
     out: dict[str, Mapping[str, Any]] = {}
     for i, entry in enumerate(entries):
         where = f"scenario.{i}"
-        for key in entry:
-            if key not in ("name", "preset", "config", "settings"):
-                raise SettingError(f"{where}.{key}: takes name, preset, config, settings")
+        check_keys(entry, where, "name", "preset", "config", "settings")
         name = str(entry.get("name", entry.get("preset", entry.get("config", f"scenario {i}"))))
         if name in out:
             raise SettingError(f"{where}.name = {name!r}: there are two")

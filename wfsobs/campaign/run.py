@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 import os
 import socket
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from time import perf_counter, sleep, time
 from typing import TYPE_CHECKING, Any
@@ -66,24 +65,10 @@ class Batch:
     folder: str
 
 
-@dataclass(frozen=True)
-class Summary:
-    """Summary of a batch.
+def wfsobs_batch(batch: Batch) -> float:
+    """Do the runs of a batch, write their rows to a file, and return the time that they took [s].
 
-    Attributes
-    ----------
-    runs : int
-        Number of runs.
-    seconds : float
-        Time that they took [s].
-    """
-
-    runs: int
-    seconds: float
-
-
-def wfsobs_batch(batch: Batch) -> Summary:
-    """Do the runs of a batch and write their rows to a file. Raises OSError where it cannot be written.
+    Raises OSError where the file cannot be written.
 
     The name is what dashboards of schedulers show.
     """
@@ -92,7 +77,7 @@ def wfsobs_batch(batch: Batch) -> Summary:
         rows = [row for cell, seed in batch.runs for row in run_rows(cell, seed, batch.observers, batch.controllers)]
     seconds = perf_counter() - start
     write_batch(Path(batch.folder), rows, {"host": socket.gethostname(), "process": os.getpid(), "written": time()})
-    return Summary(len(batch.runs), seconds)
+    return seconds
 
 
 @dataclass
@@ -105,19 +90,11 @@ class _Ready:
     bounds: list[Bound] | None = None
 
 
-_READY: OrderedDict[str, _Ready] = OrderedDict()
-"""The last scenarios of this process: the seeds of a cell follow each other."""
-
-
-def _ready(cell: Cell) -> _Ready:
-    """Return the scenario of a cell, made once for all seeds. Raises SettingError."""
-    key = json.dumps([cell.base, cell.changes], sort_keys=True)
-    if key not in _READY:
-        scenario = cell.scenario()
-        _READY[key] = _Ready(scenario, scenario_digest(scenario))
-        while len(_READY) > READY:
-            _READY.popitem(last=False)
-    return _READY[key]
+@lru_cache(READY)
+def _ready(settings: str) -> _Ready:
+    """Return the scenario of a cell's `base` and `changes` in JSON, made once for all its seeds. Raises SettingError."""
+    scenario = Cell(0, "", *json.loads(settings)).scenario()
+    return _Ready(scenario, scenario_digest(scenario))
 
 
 def run_rows(cell: Cell, seed: int, observers: Sequence[str], controllers: Sequence[str]) -> list[Row]:
@@ -139,7 +116,7 @@ def run_rows(cell: Cell, seed: int, observers: Sequence[str], controllers: Seque
     """
     same = {"cell": cell.index, "scenario": cell.name, "seed": seed}
     try:
-        ready = _ready(cell)
+        ready = _ready(json.dumps([cell.base, cell.changes]))
         ready.scenario.run.seed = seed  # in place: a copy takes longer than a short record
         record = simulate(ready.scenario)
     except ValueError as error:  # settings that exclude each other, met in this cell alone
@@ -264,9 +241,9 @@ def run_campaign(
     folder: Path,
     workers: Workers,
     *,
-    shard: tuple[int, int] = (1, 1),
-    report: Callable[[Progress], None] = lambda _: None,
-    must_stop: Callable[[], bool] = lambda: False,
+    shard: tuple[int, int],
+    report: Callable[[Progress], None],
+    must_stop: Callable[[], bool],
 ) -> Progress:
     """Run what is missing of a campaign; call it again to resume.
 
@@ -378,7 +355,7 @@ class _Batches:
         self.position = 0
         self.again: list[Batch] = []
         self.actual_seconds, self.expected_seconds = 0.0, 0.0
-        self._cost: dict[int, float] = {}
+        self.cost = lru_cache(MOST_RUNS)(partial(run_cost, plan))
 
     def __iter__(self) -> Iterator[Batch]:
         return self
@@ -398,18 +375,10 @@ class _Batches:
             self.position += 1
         return Batch(tuple(runs), self.plan.observers, self.plan.controllers, self.folder)
 
-    def learn(self, batch: Batch, summary: Summary) -> None:
-        """Correct the expected times by that of a batch."""
-        self.actual_seconds += summary.seconds
+    def learn(self, batch: Batch, seconds: float) -> None:
+        """Correct the expected times by that of a batch [s]."""
+        self.actual_seconds += seconds
         self.expected_seconds += sum(self.cost(cell.index) for cell, _ in batch.runs)
-
-    def cost(self, cell: int) -> float:
-        """Return the expected time of a run [s]."""
-        if cell not in self._cost:
-            if len(self._cost) > MOST_RUNS:
-                self._cost.clear()
-            self._cost[cell] = run_cost(self.plan, cell)
-        return self._cost[cell]
 
 
 def run_cost(plan: Campaign, cell: int) -> float:
@@ -425,7 +394,7 @@ def _drive(
     batches: _Batches, workers: Workers, progress: Progress, report: Callable[[Progress], None], must_stop: Callable[[], bool]
 ) -> None:
     """Keep the executor busy until all batches are done."""
-    executor, running, in_a_row = workers.executor(), dict[Future[Summary], Batch](), 0
+    executor, running, in_a_row = workers.executor(), dict[Future[float], Batch](), 0
     while True:
         if not (count := workers.count()):
             if must_stop():  # nothing would end what waits
@@ -444,16 +413,15 @@ def _drive(
         for future in wait(running, timeout=LOOK, return_when=FIRST_COMPLETED).done:
             batch = running.pop(future)
             try:
-                summary = future.result()
+                batches.learn(batch, future.result())
             except Exception as error:
                 if not _is_loss(error):
                     raise
                 broken = True
                 batches.again.append(batch)
                 continue
-            batches.learn(batch, summary)
-            progress.n_done += summary.runs
-            progress.runs += summary.runs
+            progress.n_done += len(batch.runs)
+            progress.runs += len(batch.runs)
             in_a_row = 0
             report(progress)
         if broken:

@@ -158,35 +158,20 @@ def read_batch(path: Path, columns: Iterable[str]) -> pyarrow.Table | None:
         return None
 
 
-def read_batches(folder: Path, columns: Iterable[str], unreadable: list[Path] | None = None) -> Iterator[pyarrow.Table]:
-    """Yield the rows of one file after the other; one that cannot be read is left out, and appended to `unreadable`."""
+def read_batches(folder: Path, columns: Iterable[str]) -> Iterator[pyarrow.Table]:
+    """Yield the rows of one file after the other; one that cannot be read is left out."""
     columns = list(columns)
     for path in batch_files(folder):
         if (table := read_batch(path, columns)) is not None:
             yield table
-        elif unreadable is not None:
-            unreadable.append(path)
 
 
-def read_results(folder: Path, provenance: bool = False) -> pyarrow.Table:
-    """Return all rows, each once, sorted by key, target and mode.
+def read_results(folder: Path) -> pyarrow.Table:
+    """Return all rows without PROVENANCE, each once, sorted by key, target and mode.
 
     Rows that were computed twice (by a worker that was taken for dead) have one key, and the first counts.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the campaign.
-    provenance : bool
-        Whether to return the columns of PROVENANCE, too.
-
-    Returns
-    -------
-    pyarrow.Table
-        The rows.
     """
-    columns = [*RESULTS, *(PROVENANCE if provenance else ())]
-    return _each_once(list(read_batches(folder, columns)), columns)
+    return _each_once(list(read_batches(folder, RESULTS)), list(RESULTS))
 
 
 def _each_once(tables: Sequence[pyarrow.Table], columns: Sequence[str]) -> pyarrow.Table:
