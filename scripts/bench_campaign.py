@@ -248,8 +248,8 @@ class Bench:
 def do_batch(batch: Batch) -> tuple[float, float, float]:
     """Do a batch; return the time of its runs, that of all of it [s], and the processor time of the thread that did it [s]."""
     start, cpu = time.perf_counter(), time.thread_time()
-    summary = wfsobs_batch(batch)
-    return summary.seconds, time.perf_counter() - start, time.thread_time() - cpu
+    seconds = wfsobs_batch(batch)
+    return seconds, time.perf_counter() - start, time.thread_time() - cpu
 
 
 def measure_cost(workers: Workers, batches: Sequence[Batch], family: Callable[[], dict[str, psutil.Process]]) -> dict[str, Any]:

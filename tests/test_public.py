@@ -115,10 +115,10 @@ def test_help_and_presets_import_no_large_library(arguments: list[str]) -> None:
 
 
 def test_the_list_of_commands_says_what_each_says_of_itself() -> None:
-    for name, place in COMMANDS.items():
+    for name, (_, text) in COMMANDS.items():
         command = main.get_command(None, name)  # type: ignore[arg-type]
         assert command is not None and command.name == name and command.help
-        assert re.sub(r" \([^)]*\)", "", command.help.splitlines()[0]) == place.help
+        assert re.sub(r" \([^)]*\)", "", command.help.splitlines()[0]) == text
 
 
 def test_every_library_is_imported_before_the_limit_of_threads_is_set() -> None:

@@ -37,7 +37,7 @@ def pages() -> dict[str, str]:
 def commands() -> str:
     """Every command with its arguments and options, as `--help` has them."""
     out = ["# Command line\n\n[The command line](../command-line.md) is an introduction with examples.\n"]
-    whole = click.Context(main, info_name="wfsobs")
+    whole = click.Context(main, info_name="wfsobs", **main.context_settings)
     for name, command, parent in every_command(main, whole):
         context = click.Context(command, info_name=name.split()[-1], parent=parent)
         records = (p.get_help_record(context) for p in command.get_params(context))

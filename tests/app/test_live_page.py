@@ -107,7 +107,7 @@ def test_a_loop_from_start_to_the_end_of_the_session(page: LivePage, dashboard: 
     # the page is left, the loop goes on; the session ends, nothing is left
     page.show(False)
     assert not page.draw() and page.work.state == RUNNING
-    pids = live._processes.pids
+    pids = [process.pid for process in live._processes.processes]
     assert len(pids) == 5 and all(map(is_running, pids))
     dashboard.store.session.leave()
     wait(lambda: not any(map(is_running, pids)))

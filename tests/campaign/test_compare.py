@@ -8,8 +8,9 @@ import pyarrow as pa
 import pytest
 from scipy.stats import binom, ttest_rel
 
-from wfsobs.campaign.compare import LEVEL, Comparison, compare, paired_difference
-from wfsobs.campaign.plan import Stop, looks, parse_plan, wanted_seeds
+from wfsobs.campaign.compare import LEVEL, Comparison, compare, mean_interval
+from wfsobs.campaign.plan import Stop, looks, parse_plan
+from wfsobs.campaign.run import wanted_seeds
 from wfsobs.campaign.store import ROWS, BatchIndex, schema, write_batch
 from wfsobs.evaluation.rows import can_be_best
 from wfsobs.observers import OBSERVERS
@@ -34,7 +35,7 @@ def rows(values, name, cell=0):
 def test_differences_are_those_of_the_paired_t_test():
     rng = np.random.default_rng(5)
     a, b = rng.normal(10, 1, (2, 12))
-    mean, half = paired_difference(a, b)
+    ((mean,), (half,)) = mean_interval((a - b)[:, None])
     expected = ttest_rel(a, b).confidence_interval(LEVEL)
     assert mean == pytest.approx((expected.low + expected.high) / 2, rel=1e-12)
     assert half == pytest.approx((expected.high - expected.low) / 2, rel=1e-12)
@@ -75,7 +76,7 @@ def test_quantiles_are_those_of_the_seeds_with_a_result():
 
 
 def covers(differences, truth, level):
-    mean, half = paired_difference(differences, np.zeros(len(differences)), level)
+    ((mean,), (half,)) = mean_interval(differences[:, None], level)
     return abs(mean - truth) <= half
 
 
@@ -94,7 +95,7 @@ def test_intervals_where_it_is_stopped_cover_at_least_94_per_cent():
     for _ in range(4000):
         d = rng.normal(0.0, 1.0, 80)
         for count in stop.looks:
-            mean, half = paired_difference(d[:count], np.zeros(count), stop.level)
+            ((mean,), (half,)) = mean_interval(d[:count, None], stop.level)
             rival = Comparison(0, "s", "t", "m", "rival", count, 0, 10.0 + mean, mean, half, is_tie=abs(mean) <= half)
             best = Comparison(0, "s", "t", "m", "best", count, 0, 10.0, is_best=True)
             if stop.is_decided([best, rival]):
@@ -153,7 +154,7 @@ class Counted:
 def test_as_many_rows_are_held_whatever_the_number_of_scenarios(tmp_path, monkeypatch):
     """Counted, and by tracemalloc, which sees numpy and Python; the memory of a process has libraries and freed pages in it."""
     seeds, held, peaks = 16, [], []
-    monkeypatch.setattr("wfsobs.campaign.plan.HELD", 10 * 2 * seeds)  # ten scenarios of two observers
+    monkeypatch.setattr("wfsobs.campaign.run.HELD", 10 * 2 * seeds)  # ten scenarios of two observers
     for n_cells in (20, 80):
         winds = ", ".join(str(5 + i / 10) for i in range(n_cells))
         text = f'observers = ["kf-lgs", "kf-multi"]\n[grid]\nturbulence.wind_speed = [{winds}]\n[stop]\nfirst = 4\n'
@@ -170,11 +171,11 @@ def test_as_many_rows_are_held_whatever_the_number_of_scenarios(tmp_path, monkey
         everything = np.ones((n_cells, seeds), dtype=bool)
         found, peak = traced(plan, everything, index)
         held.append(max(index.held))
-        monkeypatch.setattr("wfsobs.campaign.plan.HELD", 10**9)
+        monkeypatch.setattr("wfsobs.campaign.run.HELD", 10**9)
         expected, at_once = traced(plan, everything, index)
         assert np.array_equal(found, expected)
         peaks.append((peak, at_once))
-        monkeypatch.setattr("wfsobs.campaign.plan.HELD", 10 * 2 * seeds)
+        monkeypatch.setattr("wfsobs.campaign.run.HELD", 10 * 2 * seeds)
     assert held == [10 * 2 * seeds] * 2
     # What is kept of a scenario, its masks and places, is a few hundred bytes; its rows are several thousand.
     (few, few_at_once), (many, many_at_once) = peaks

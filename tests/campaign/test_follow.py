@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from wfsobs.campaign.compare import compare
-from wfsobs.campaign.follow import CampaignErrors, CampaignFolder
+from wfsobs.campaign.compare import CampaignErrors, compare
+from wfsobs.campaign.follow import CampaignFolder
 from wfsobs.campaign.plan import parse_plan
 from wfsobs.campaign.run import run_rows
 from wfsobs.campaign.selection import MOST_VALUES, plan_axes

@@ -146,7 +146,7 @@ def test_controllers_beside_a_loop_that_runs():
         # without control the residual is the disturbance
         np.testing.assert_array_equal(seen.residual("none")[:n][on], total[on])
         assert (seen.rms("integrator") < 0.5 * seen.rms("none")).all()
-        assert loop.controllers == {"integrator", "none"} and len(loop._processes.pids) == 5
+        assert loop.controllers == {"integrator", "none"} and len(loop._processes.processes) == 5
         loop.control("none", False)
         wait(lambda: "none off" in [event.line for event in loop.events])
     finally:

@@ -106,8 +106,8 @@ def test_every_process_that_is_killed_is_named():
     loop = LiveLoop(SimulatedLoop(scenario), scenario, ["kf-lgs", "gpr-online", "gpr-adaptive"])
     try:
         loop.control("none", True)
-        wait(lambda: loop.is_ready and len(loop._processes.pids) == 7)
-        workshop, pids = loop._processes.workshop, loop._processes.pids
+        wait(lambda: loop.is_ready and len(loop._processes.processes) == 7)
+        workshop, pids = loop._processes.workshop, [p.pid for p in loop._processes.processes]
         assert workshop.submit(abs, -3).result(60) == 3
         with pytest.raises(ZeroDivisionError):
             workshop.submit(divmod, 1, 0).result(60)
@@ -119,7 +119,7 @@ def test_every_process_that_is_killed_is_named():
         wait(loop.failure)
         assert loop.failure() == f"live: the process of {first} ({process[first].pid}) was ended by signal 9 (SIGKILL)"
         for _ in range(100):  # no more than a pipe holds waits for the one that is gone
-            loop._processes.tell_controllers({"id": "none", "design": bytes(4096)})
+            loop._processes.tell({"id": "none", "design": bytes(4096)})
         for name in others:
             os.kill(process[name].pid, signal.SIGKILL)
         wait(lambda: loop.failure().count("SIGKILL") == len(pids))

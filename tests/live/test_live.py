@@ -27,8 +27,8 @@ def frames(n, length, seed=1, **changes):
     out = []
     for block in endless_blocks(scenario, np.random.default_rng(seed), length):
         out.append(block)
-        if sum(len(b.z) for b in out) >= n:
-            return {name: np.vstack([getattr(b, name) for b in out])[:n] for name in vars(block)}
+        if sum(map(len, out)) >= n:
+            return dict(zip(("z", "ngs", "turbulence", "vibration"), np.hsplit(np.vstack(out)[:n], 4), strict=True))
 
 
 def test_covariances_across_joints_are_those_of_a_record():

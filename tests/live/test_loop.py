@@ -23,7 +23,7 @@ from wfsobs.live.crew import Site
 from wfsobs.live.loop import TICK, LiveLoop, _keep
 from wfsobs.live.processes import POLL, REST, Pause, made_crew
 from wfsobs.live.ring import LiveFrame, Ring, Rows, merged_rows
-from wfsobs.live.simulated import FADE, GLANCE, Block, SimulatedFrames, SimulatedLoop
+from wfsobs.live.simulated import FADE, GLANCE, SimulatedFrames, SimulatedLoop
 from wfsobs.live.source import Pace
 from wfsobs.live.view import read_view
 from wfsobs.scenario.presets import paper
@@ -35,11 +35,11 @@ def put(ready, generation, value, n, count, first=False):
     ngs = np.full((n, 2), np.nan)
     ngs[::5] = value
     for number in range(count):
-        block = Block(np.full((n, 2), value), ngs.copy(), np.full((n, 2), value), np.full((n, 2), value))
+        block = np.hstack([np.full((n, 2), value), ngs, np.full((n, 4), value)])
         if first and number == 0:
-            block.ngs[0] = np.nan
-        for rows in block.pieces(315):  # whole NGS frames, no whole number of them in a block
-            ready.put((generation, rows))
+            block[0, 2:4] = np.nan
+        for at in range(0, n, 315):  # whole NGS frames, no whole number of them in a block
+            ready.put((generation, block[at : at + 315]))
 
 
 def test_new_settings_fade_in_without_a_seam():
@@ -286,7 +286,7 @@ def test_a_live_loop_from_start_to_stop():
         assert (loop.delivery.frames, loop.delivery.losses) == (sent, 0) and 0 <= loop.delivery.late_share <= 1
         names = [loop._processes.feed.ring.name, *(rows.name for rows in loop._processes.traces()), loop.board.name]
         assert len(names) == 4, "those that learn have a process of their own"
-        record, pids = loop.recorder.stop(scenario), loop._processes.pids
+        record, pids = loop.recorder.stop(scenario), [p.pid for p in loop._processes.processes]
         assert record.n_steps == sent == loop.newest
         for score in wfsobs.observe(record, scenario, observers=["kf-multi", "gp-both"]).scores:
             if score.observer in ("kf-multi", "gp-both"):
@@ -376,7 +376,7 @@ def test_nothing_is_left_of_a_loop_whose_owner_is_killed():
         "s = PRESETS['paper']()\n"
         "loop = LiveLoop(SimulatedLoop(s), s, ['zero'])\n"
         "p = loop._processes\n"
-        "print(*p.pids, p.feed.ring.name, p.traces()[0].name, loop.board.name, flush=True)\n"
+        "print(*(one.pid for one in p.processes), p.feed.ring.name, p.traces()[0].name, loop.board.name, flush=True)\n"
         "time.sleep(100)\n"
     )
     owner = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)

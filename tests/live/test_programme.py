@@ -129,7 +129,7 @@ class Maker:
         return command
 
     def get(self):
-        return self.generation, next(self.blocks).pieces(1 << 20)[0]
+        return self.generation, next(self.blocks)
 
     get_nowait = get
 

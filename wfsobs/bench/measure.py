@@ -23,7 +23,6 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
@@ -46,6 +45,9 @@ peak_memory_mb      : most memory the process has held until then [MB]
 
 What does not apply is None.
 """
+
+BESIDE = ("p99_us", "p999_us", "max_us", "ready_us", "ratio_to_ours", "max_error_over_std", "peak_memory_mb")
+"""Keys of a row without a value where they do not apply."""
 
 OURS = "ours"
 ENOUGH = 0.25
@@ -73,33 +75,12 @@ def row(
     variant: str,
     seconds: float,
     steps: int | None = None,
-    *,
-    per_step_us: float | None = None,
-    p99_us: float | None = None,
-    p999_us: float | None = None,
-    max_us: float | None = None,
-    ready_us: float | None = None,
-    error: float | None = None,
-    peak_memory_mb: float | None = None,
+    **more: float | None,
 ) -> Row:
-    """Return a measurement, without its ratio."""
-    if per_step_us is None and steps is not None:
-        per_step_us = seconds / steps * 1e6
-    return {
-        "task": task,
-        "size": size,
-        "variant": variant,
-        "steps": steps,
-        "median_s": seconds,
-        "per_step_us": per_step_us,
-        "p99_us": p99_us,
-        "p999_us": p999_us,
-        "max_us": max_us,
-        "ready_us": ready_us,
-        "ratio_to_ours": None,
-        "max_error_over_std": error,
-        "peak_memory_mb": peak_memory_mb,
-    }
+    """Return a measurement, without its ratio; more : what else of it is known."""
+    per_step = None if steps is None else seconds / steps * 1e6
+    known = {"task": task, "size": size, "variant": variant, "steps": steps, "median_s": seconds, "per_step_us": per_step}
+    return {**known, **dict.fromkeys(BESIDE), **more}
 
 
 def with_ratios(rows: Sequence[Row]) -> list[Row]:
@@ -257,29 +238,22 @@ def step_of(name: str, scenario: Scenario, record: Record) -> Step:
     n = record.ratio or record.n_steps + 1
     length = record.n_steps // n * n  # so that NGS frames come when they are due, however often the record is repeated
     z, u, y = record.z, record.u, record.y_lgs
-    slow = record.y_ngs if name in CONTROLLERS else record.z_ngs if record.y_ngs is not None else None
+    observer = OBSERVERS.get(name)
+    slow = record.y_ngs if observer is None else record.z_ngs if "y_ngs" in observer.needs else None
     frames = [slow[k or length - n] if slow is not None and k % n == 0 else None for k in range(length)]
     taken = 0
-    if name in CONTROLLERS:
 
-        def control(k: int) -> object:
-            nonlocal taken
-            taken += 1
-            i = (taken - 1) % length
-            return one.update(y[i], frames[i] if taken > 1 else None)
-
-        return control
-    target = OBSERVERS[name].targets[-1]
-    needs_ngs = "y_ngs" in OBSERVERS[name].needs
-
-    def observe(k: int) -> object:
+    def step(k: int) -> object:
         nonlocal taken
+        i = taken % length
+        ngs = frames[i] if taken else None
         taken += 1
-        i = (taken - 1) % length
-        one.update(z[i], frames[i] if needs_ngs and taken > 1 else None, u[i])
-        return one.predict(0, target)
+        if observer is None:
+            return one.update(y[i], ngs)
+        one.update(z[i], ngs, u[i])
+        return one.predict(0, observer.targets[-1])
 
-    return observe
+    return step
 
 
 @dataclass(frozen=True)

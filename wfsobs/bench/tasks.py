@@ -188,6 +188,20 @@ class OnlineProblem:
         return max_error(estimates[some], exact, std)
 
 
+def time_row(
+    task: str,
+    size: str,
+    variant: str,
+    work: Callable[[], Any],
+    repeats: int,
+    steps: int | None = None,
+    error: Callable[[Any], float] | None = None,
+) -> Row:
+    """Return the measurement of some work; error : of what it returns."""
+    seconds, values = measure_time(work, repeats)
+    return row(task, size, variant, seconds, steps, max_error_over_std=error and error(values))
+
+
 def kalman_record(sizes: Sizes) -> Iterator[Row]:
     """Time the steady-state Kalman filter on LGS, one mode over a long record."""
     scenario = sizes.scenario(sizes.filter_duration)
@@ -237,10 +251,12 @@ def _filters(
     n = len(arguments[-1])
     works = {"numpy-loop": lambda: loop(*arguments)} | {k: partial(v, problem) for k, v in sizes.others(task).items()}
     states = {name: lambda work=work: work()[:, PHI] for name, work in works.items()}
+
+    def error(values: Array) -> float:
+        return max(max_error(values[: len(exact), i], exact[:, i]) for i in range(len(TARGETS)))
+
     for variant, work in ({OURS: ours} | states).items():
-        seconds, values = measure_time(work, sizes.repeats)
-        error = max(max_error(values[: len(exact), i], exact[:, i]) for i in range(len(TARGETS)))
-        yield row(task, f"{n} steps, 6 states", variant, seconds, n, error=error)
+        yield time_row(task, f"{n} steps, 6 states", variant, work, sizes.repeats, n, error)
 
 
 def paper_model(scenario: Scenario, dt: float) -> tuple[Array, Array, Array, Array]:
@@ -259,15 +275,15 @@ def adaptive_record(sizes: Sizes) -> Iterator[Row]:
     """Time the adaptive Kalman filter, one mode over a long record: identification and filter of every window."""
     scenario = sizes.scenario(sizes.filter_duration)
     z, a = simulate(scenario).z[:, 0], scenario.adaptive
-    seconds, _ = measure_time(lambda: adapt(z, scenario.dt, a, lambda _fraction: None), sizes.repeats)
-    yield row("adaptive-record", f"{len(z)} steps, {a.window:g} s every {a.interval:g} s", OURS, seconds, len(z))
+    size = f"{len(z)} steps, {a.window:g} s every {a.interval:g} s"
+    yield time_row("adaptive-record", size, OURS, lambda: adapt(z, scenario.dt, a, lambda _fraction: None), sizes.repeats, len(z))
 
 
-def online_problem(record: Record, scenario: Scenario, mode: int, count: int) -> OnlineProblem:
-    """Return the problem of one mode, with `count` rows for the others."""
+def online_problem(record: Record, scenario: Scenario, count: int) -> OnlineProblem:
+    """Return the problem of the first mode, with `count` rows for the others."""
     g = scenario.gpr_online
-    X = textbook.windows(window_signals(g, record.y_lgs, record.u, record.z, mode, record.dt), g.depth)
-    f = np.append(online_reference(bands_of(scenario), record.z, record.dt)[g.depth :, mode], 0.0)
+    X = textbook.windows(window_signals(g, record.y_lgs, record.u, record.z, 0, record.dt), g.depth)
+    f = np.append(online_reference(bands_of(scenario), record.z, record.dt)[g.depth :, 0], 0.0)
     rows = np.unique(np.linspace(g.training_size, len(X) - 1, count).astype(int))
     return OnlineProblem(X, f, g.training_size, g.depth, kernel_of(g), rows)
 
@@ -300,18 +316,18 @@ def _online_record(record: Record, scenario: Scenario, sizes: Sizes, count: int,
         given = part.measurements(), prior_of(scenario, part, (Bands,)), g
         seconds, result = measure_time(lambda given=given: gpr_online(*given, QUIET)[VIBRATION], sizes.repeats)
         ours.append((variant, seconds, result[:, 0]))
-    problem = online_problem(record, scenario, 0, count)  # only now: much memory held slows down the allocation of more
+    problem = online_problem(record, scenario, count)  # only now: much memory held slows down the allocation of more
     std = float(np.nanstd(ours[0][2]))
     for variant, seconds, values in ours:
         error = problem.error(values[problem.rows + g.depth - 1], std, sizes.exact_steps)
-        yield row(task, size, variant, seconds, steps, error=error)
+        yield row(task, size, variant, seconds, steps, max_error_over_std=error)
     others = [("gemm-cholesky", lambda p: textbook.predict_online(p.X, p.f, p.rows, p.m, p.kernel), count)]
     if both:
         others += [(name, predict, sizes.library_steps) for name, predict in sizes.others(task).items()]
     for variant, predict, n in others:
         p = replace(problem, rows=problem.rows[:: -(-len(problem.rows) // n)])
-        seconds, values = measure_time(lambda p=p, predict=predict: predict(p), sizes.repeats)
-        yield row(task, size, variant, seconds, len(p.rows), error=p.error(values, std, sizes.exact_steps))
+        error = partial(p.error, std=std, count=sizes.exact_steps)
+        yield time_row(task, size, variant, partial(predict, p), sizes.repeats, len(p.rows), error)
 
 
 def online_stream(sizes: Sizes) -> Iterator[Row]:
@@ -322,14 +338,12 @@ def online_stream(sizes: Sizes) -> Iterator[Row]:
     record = cut_windows(simulate(scenario), scenario.n_steps, 1)
     runs = [_stream(scenario, record) for _ in range(sizes.repeats)]
     values = runs[-1][0]
-    problem = online_problem(record, scenario, 0, sizes.textbook_steps)
-    std = float(np.nanstd(values))
-    error = problem.error(values[problem.rows + g.depth - 1], std, sizes.exact_steps)
-    yield _stream_row(task, size, OURS, [times for _, times in runs], error)
+    problem = online_problem(record, scenario, sizes.textbook_steps)
+    error = partial(problem.error, std=float(np.nanstd(values)), count=sizes.exact_steps)
+    yield _stream_row(task, size, OURS, [times for _, times in runs], error(values[problem.rows + g.depth - 1]))
 
     runs = [_textbook_stream(problem) for _ in range(sizes.repeats)]
-    error = problem.error(runs[-1][0], std, sizes.exact_steps)
-    yield _stream_row(task, size, "gemm-cholesky", [times for _, times in runs], error)
+    yield _stream_row(task, size, "gemm-cholesky", [times for _, times in runs], error(runs[-1][0]))
 
 
 def _stream(scenario: Scenario, record: Record) -> tuple[Array, Array]:
@@ -370,7 +384,7 @@ def _stream_row(task: str, size: str, variant: str, runs: list[Array], error: fl
         variant,
         median(times[:, 1].sum() for times in runs),
         len(runs[0]),
-        error=error,
+        max_error_over_std=error,
         per_step_us=float(np.median(whole)),
         p999_us=p999,
         ready_us=float(np.median(ready)),
@@ -392,24 +406,23 @@ def offline(sizes: Sizes) -> Iterator[Row]:
     some = slice(None, None, -(-len(T) // (50 * sizes.library_steps)))
     exact_mean = textbook.exact_predict(T[some], X, exact, constant, kernel)
 
-    seconds, model = measure_time(lambda: train(learn, targets, d, m, kernel), sizes.repeats)
-    yield row(task, size, OURS, seconds, error=max_error(model.weights, exact))
-    seconds, weights = measure_time(lambda: textbook.train_textbook(X, f, kernel), sizes.repeats)
-    yield row(task, size, "gemm-cholesky", seconds, error=max_error(weights, exact))
-    means = {}
-    for name, fit in sizes.others("offline-gpr").items():
-        seconds, (fitted_weights, means[name]) = measure_time(lambda fit=fit: fit(X, f, kernel), sizes.repeats)
-        yield row(task, size, name, seconds, error=max_error(fitted_weights, exact))
+    def fit_textbook() -> tuple[Array, Callable[[Array], Array]]:
+        weights = textbook.train_textbook(X, f, kernel)
+        return weights, lambda windows: textbook.predict_textbook(windows, X, weights, kernel)
 
-    task = "offline-gpr-predict"
-    seconds, values = measure_time(lambda: model.predict(signals)[d - 1 :], sizes.repeats)
-    yield row(task, size, OURS, seconds, len(T), error=max_error(values[some], exact_mean))
-    seconds, values = measure_time(lambda: textbook.predict_textbook(T, X, weights, kernel), sizes.repeats)
-    yield row(task, size, "gemm-stored-weights", seconds, len(T), error=max_error(values[some], exact_mean))
-    part = T[some]
-    for name, mean in means.items():
-        seconds, values = measure_time(lambda mean=mean: mean(part), sizes.repeats)
-        yield row(task, size, name, seconds, len(part), error=max_error(values, exact_mean))
+    seconds, model = measure_time(lambda: train(learn, targets, d, m, kernel), sizes.repeats)
+    yield row(task, size, OURS, seconds, max_error_over_std=max_error(model.weights, exact))
+    means = {}
+    libraries = {name: partial(fit, X, f, kernel) for name, fit in sizes.others("offline-gpr").items()}
+    for name, fit in ({"gemm-cholesky": fit_textbook} | libraries).items():
+        seconds, (weights, means[name]) = measure_time(fit, sizes.repeats)
+        yield row(task, size, name, seconds, max_error_over_std=max_error(weights, exact))
+
+    whole = {OURS: lambda: model.predict(signals)[d - 1 :], "gemm-stored-weights": partial(means.pop("gemm-cholesky"), T)}
+    for name, predict in (whole | {name: partial(mean, T[some]) for name, mean in means.items()}).items():
+        seconds, values = measure_time(predict, sizes.repeats)
+        error = max_error(values[some] if name in whole else values, exact_mean)
+        yield row("offline-gpr-predict", size, name, seconds, len(values), max_error_over_std=error)
 
 
 ONE_LAYER: dict[str, Any] = {"turbulence.source": "frozen-flow"}
@@ -434,19 +447,13 @@ def frozen(sizes: Sizes) -> Iterator[Row]:
     """Few modes in one layer and many in ten, through Shack-Hartmann sensors and through ideal ones."""
     for changes, repeats in ((ONE_LAYER, sizes.repeats), (many_layers(sizes), 1)):
         scenario = sizes.scenario(sizes.duration, changes)
+        layers = len(scenario.turbulence.layers)
+        size = f"{sizes.duration:g} s, {len(scenario.modes)} modes, {layers} layer{'s' if layers > 1 else ''}"
         for variant, kind in ((OURS, "shack-hartmann"), ("ideal-sensors", "zernike")):
             made = scenario.replace({"sensors.kind": kind})
-            seconds, _ = measure_time(lambda made=made: _make_frozen(made), repeats)
-            yield row("frozen-flow", _layers(scenario), variant, seconds, scenario.n_steps, peak_memory_mb=peak_memory_mb())
-
-
-def _make_frozen(scenario: Scenario) -> None:
-    SOURCES["frozen-flow"](scenario, scenario.n_steps, np.random.default_rng(1), QUIET)
-
-
-def _layers(scenario: Scenario) -> str:
-    layers = len(scenario.turbulence.layers)
-    return f"{scenario.run.duration:g} s, {len(scenario.modes)} modes, {layers} layer{'s' if layers > 1 else ''}"
+            make = partial(SOURCES["frozen-flow"], made, made.n_steps)
+            seconds, _ = measure_time(lambda make=make: make(np.random.default_rng(1), QUIET), repeats)
+            yield row("frozen-flow", size, variant, seconds, scenario.n_steps, peak_memory_mb=peak_memory_mb())
 
 
 def steps(sizes: Sizes) -> Iterator[Row]:
@@ -486,13 +493,10 @@ def longest_run(sizes: Sizes) -> Iterator[Row]:
 def whole_run(sizes: Sizes) -> Iterator[Row]:
     """Time simulation, every observer on two modes, and scores."""
     scenario, size = sizes.scenario(sizes.duration), _length(sizes.duration)
-    seconds, _ = measure_time(lambda: run(scenario), sizes.repeats)
-    yield row("whole-run", size, OURS, seconds, scenario.n_steps)
     learning = tuple(name for name, observer in OBSERVERS.items() if observer.slow)
-    for variant, left_out in (("without-online-gpr", ("gpr-online",)), ("without-learning", learning)):
-        quick = [name for name in usual_observers(scenario) if name not in left_out]
-        seconds, _ = measure_time(lambda quick=quick: run(scenario, observers=quick), sizes.repeats)
-        yield row("whole-run", size, variant, seconds, scenario.n_steps)
+    for variant, left_out in ((OURS, ()), ("without-online-gpr", ("gpr-online",)), ("without-learning", learning)):
+        names = [name for name in usual_observers(scenario) if name not in left_out]
+        yield time_row("whole-run", size, variant, partial(run, scenario, observers=names), sizes.repeats, scenario.n_steps)
 
 
 def each_observer(sizes: Sizes) -> Iterator[Row]:
@@ -501,10 +505,11 @@ def each_observer(sizes: Sizes) -> Iterator[Row]:
     record = simulate(scenario)
     for name in OBSERVERS:
         try:
-            seconds, _ = measure_time(lambda name=name: run_observer(name, record, scenario), sizes.repeats)
+            work = partial(run_observer, name, record, scenario)
+            found = time_row("observer", f"{name}, {size}", OURS, work, sizes.repeats, record.n_steps)
         except ValueError:
             continue
-        yield row("observer", f"{name}, {size}", OURS, seconds, record.n_steps)
+        yield found
 
 
 def _length(duration: float) -> str:
@@ -527,13 +532,12 @@ TASKS: dict[Callable[[Sizes], Iterator[Row]], float] = {
 """Task -> its share of the time."""
 
 
-def measure_all(sizes: Sizes, progress: Callable[[float], None] | None = None) -> list[Row]:
+def measure_all(sizes: Sizes, progress: Callable[[float], None]) -> list[Row]:
     """Return every row. progress: receives the fraction done."""
     done, found = 0.0, list[list[Row]]()
     with threadpool_limits(1, user_api="blas"), set_aside():
         for task, weight in TASKS.items():
             found.append(with_ratios(list(task(sizes))))
             done += weight
-            if progress:
-                progress(done / sum(TASKS.values()))
+            progress(done / sum(TASKS.values()))
     return [r for rows in [*found[1:], found[0]] for r in rows]

@@ -1,18 +1,19 @@
-"""Compare what ran on the same records: rms over seeds, paired differences and their intervals."""
+"""Compare what ran on the same records: errors as arrays, paired differences and their intervals, what is best."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import TYPE_CHECKING
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
 
 from wfsobs.evaluation.evidence import columns_differ
-from wfsobs.evaluation.rows import can_be_best
-from wfsobs.evaluation.scores import BOUNDS
+from wfsobs.evaluation.rows import NOT_OBSERVERS, can_be_best
+from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS
+from wfsobs.observers import OBSERVERS
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:
@@ -68,34 +69,238 @@ class Comparison:
     quantiles: tuple[float, ...] = ()
 
 
-def paired_difference(a: Array, b: Array, level: float = LEVEL) -> tuple[float, float | None]:
-    """Return the mean of a - b, and the half-width of its interval by Student's t.
+class CampaignPlace(NamedTuple):
+    """One observer, controller or bound over some scenarios.
+
+    Attributes
+    ----------
+    name : str
+        Id.
+    rms : float
+        Root mean square over the seeds, of several scenarios the geometric mean [nm].
+    above : float
+        Mean of its rms over that of the best, less 1; NaN where it is not compared.
+    low, high : float
+        Interval of `above`; NaN where there is none.
+    is_best, is_tie, is_untested : bool
+        Whether it is the best; whether a test of all pairs together finds no difference from the best; whether it is compared
+        with too little to test.
+    """
+
+    name: str
+    rms: float
+    above: float
+    low: float
+    high: float
+    is_best: bool
+    is_tie: bool
+    is_untested: bool
+
+    @property
+    def is_rival(self) -> bool:
+        """Whether it is compared with the best."""
+        return self.is_tie or self.is_untested or not np.isnan(self.above)
+
+
+class CampaignWinner(NamedTuple):
+    """The best over some scenarios.
+
+    margin : how much worse the next is, NaN without one;  ties : what does not differ by a test
+    is_decided : whether it differs significantly from all others
+    """
+
+    best: CampaignPlace
+    margin: float
+    ties: tuple[str, ...]
+    is_decided: bool
+
+
+@dataclass(frozen=True)
+class CampaignErrors:
+    """Errors of a campaign, for one target and mode.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Ids of observers or controllers, and of bounds.
+    values : Array
+        rms [nm], (n_cells, n_seeds, n_names), NaN without a result.
+    eligible : Array
+        Whether a name ran in a scenario and can be the best there, bool (n_cells, n_names).
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    eligible: Array
+
+    @cached_property
+    def count(self) -> Array:
+        """Records with a result, (n_cells, n_names)."""
+        return (~np.isnan(self.values)).sum(axis=1)
+
+    @cached_property
+    def rms(self) -> Array:
+        """Root mean square over the seeds [nm], (n_cells, n_names)."""
+        squares = np.nansum(self.values**2, axis=1)
+        return np.sqrt(np.divide(squares, self.count, out=np.full(squares.shape, np.nan), where=self.count > 0))
+
+    @cached_property
+    def bound(self) -> Array:
+        """The smallest bound of what all observers are given, of every scenario [nm], (n_cells,); NaN where none is known."""
+        of = [i for i, name in enumerate(self.names) if name in COMMON_BOUNDS]
+        known = self.rms[:, of] if of else np.full((len(self.rms), 1), np.nan)
+        return np.fmin.reduce(known, axis=1)
+
+    def over_bound(self, cells: Sequence[int] | Array) -> tuple[Array, Array, Array]:
+        """Return the geometric mean over scenarios of rms over bound, and its interval, each (n_names,)."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            logs = np.log(self.rms[cells] / self.bound[cells, None])
+        mean, half = mean_interval(np.where(np.isfinite(logs), logs, np.nan))
+        return np.exp(mean), np.exp(mean - half), np.exp(mean + half)
+
+    def known_cells(self, cells: Sequence[int] | Array) -> Array:
+        """Return those of some scenarios that have results."""
+        cells = np.asarray(cells, dtype=int)
+        return cells[self.count[cells].any(axis=1)]
+
+    def standings(self, cells: Sequence[int] | Array) -> list[CampaignPlace]:
+        """Compare all names over some scenarios: over the seeds if a single one has results, else over the scenarios.
+
+        Seeds of one scenario are no independent evidence about others, so that of several each counts once, by the logarithm of
+        its rms. The best is the one with the smallest mean of those with a result in most records or scenarios.
+        """
+        cells = self.known_cells(cells)
+        if len(cells) == 1:
+            samples, mean, eligible = self.values[cells[0]], self.rms[cells[0]], self.eligible[cells[0]]
+        else:
+            rms = self.rms[cells]
+            with np.errstate(divide="ignore"):
+                samples = np.where(rms > 0, np.log(rms), np.nan)
+            mean, eligible = np.exp(mean_interval(samples)[0]), np.all(self.eligible[cells] | np.isnan(rms), axis=0)
+        best, difference, half, tie, untested = compare_columns(samples, mean, eligible)
+        parts = difference, difference - half, difference + half
+        above, low, high = (part / mean[best] if len(cells) == 1 else np.expm1(part) for part in parts)
+        numbers = [column.tolist() for column in (mean, above, low, high, np.arange(len(mean)) == best, tie, untested)]
+        known = np.any(~np.isnan(samples), axis=0)
+        return [CampaignPlace(self.names[i], *(column[i] for column in numbers)) for i in np.argsort(mean) if known[i]]
+
+    def verdict(self, cells: Sequence[int] | Array) -> CampaignWinner | None:
+        """Return the best over some scenarios; None where nothing is known."""
+        standings = self.standings(cells)
+        best = next((s for s in standings if s.is_best), None)
+        if best is None:
+            return None
+        rivals = [s for s in standings if s.is_rival]
+        decided = bool(rivals) and not any(s.is_tie or s.is_untested for s in rivals)
+        margin = min((s.rms for s in rivals), default=np.nan) / best.rms - 1.0 if best.rms > 0 else np.nan
+        return CampaignWinner(best, float(margin), tuple(s.name for s in standings if s.is_tie), decided)
+
+    @cached_property
+    def winners(self) -> dict[int, CampaignWinner]:
+        """The best of every scenario that has results."""
+        known = np.flatnonzero((self.count * self.eligible).any(axis=1)).tolist()
+        found = {cell: self.verdict([cell]) for cell in known}
+        return {cell: verdict for cell, verdict in found.items() if verdict is not None}
+
+
+def can_win(name: str, target: str) -> bool:
+    """Return whether an observer or a controller is one that can be the best."""
+    if target == "residual":
+        return name not in BOUNDS
+    return name not in (*OBSERVERS, *NOT_OBSERVERS) or can_be_best(name, apart=False)
+
+
+def compare_columns(samples: Array, mean: Array, eligible: Array, level: float = LEVEL) -> tuple[int, Array, Array, Array, Array]:
+    """Find the best: the smallest mean of those with a result in most samples, and compare all that can be the best with it.
 
     Parameters
     ----------
-    a, b : Array
-        Results on the same records, (n,); pairs with NaN are left out.
+    samples : Array
+        Errors or their logarithms, (n, n_names), NaN without a result.
+    mean : Array
+        By which is ranked, (n_names,).
+    eligible : Array
+        Whether a name can be the best, bool (n_names,).
     level : float
-        Level of the interval.
+        Level of the intervals.
 
     Returns
     -------
-    float
-        Mean.
-    float or None
-        Half-width; None for fewer than two pairs.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> mean, half = paired_difference(np.array([2.0, 4.0]), np.array([1.0, 1.0]))
-    >>> round(mean, 3), round(half, 3)  # t(0.975, 1 degree of freedom) = 12.706
-    (2.0, 12.706)
+    int
+        Column of the best; -1 where nothing is known.
+    Array
+        Means of the differences from it, (n_names,), NaN where they are not compared.
+    Array
+        Half-widths of their intervals, NaN where these are not known.
+    Array
+        Whether a test of all pairs together finds no difference from the best, bool (n_names,).
+    Array
+        Whether there is too little to test, bool (n_names,).
     """
-    d = (a - b)[~np.isnan(a - b)]
-    if len(d) < 2:
-        return (float(d.mean()) if len(d) else float("nan")), None
-    return float(d.mean()), float(stdtrit(len(d) - 1, (1 + level) / 2) * d.std(ddof=1) / np.sqrt(len(d)))
+    known = (~np.isnan(samples)).sum(axis=0)
+    candidates = eligible & (known > 0)
+    ranked = [i for i in np.argsort(mean) if candidates[i] and known[i] == known[candidates].max()]
+    if not ranked:
+        nothing, none = np.full(len(mean), np.nan), np.zeros(len(mean), dtype=bool)
+        return -1, nothing, nothing, none, none
+    best = int(ranked[0])
+    rivals = candidates & (np.arange(len(mean)) != best)
+    difference, half = (np.where(rivals, part, np.nan) for part in mean_interval(samples - samples[:, [best]], level))
+    untested, tie, compared = rivals & np.isnan(half), np.zeros(len(mean), dtype=bool), np.flatnonzero(candidates)
+    tie[compared] = ~columns_differ(samples[:, compared], 1.0 - level)[compared == best][0]
+    return best, difference, half, tie & rivals & ~untested, untested
+
+
+def mean_interval(samples: Array, level: float = LEVEL) -> tuple[Array, Array]:
+    """Return mean and half-width of its interval by Student's t along the first axis; NaN with fewer than one and two samples."""
+    known = ~np.isnan(samples)
+    n = known.sum(axis=0)
+    some = np.maximum(n, 1)
+    mean = np.where(known, samples, 0.0).sum(axis=0) / some
+    spread = np.sqrt((np.where(known, samples - mean, 0.0) ** 2).sum(axis=0) / np.maximum(n - 1, 1))
+    half = stdtrit(np.maximum(n - 1, 1), (1 + level) / 2) * spread / np.sqrt(some)
+    return np.where(n > 0, mean, np.nan), np.where(n > 1, half, np.nan)
+
+
+ROW = np.dtype(
+    [("cell", "i4"), ("seed", "i8"), ("name", "i4"), ("target", "i4"), ("mode", "i4"), ("rms_nm", "f8"), ("apart", "?")]
+)
+"""One row, its texts as numbers."""
+
+
+def coded_rows(table: pyarrow.Table, codes: dict[str, int]) -> Array:
+    """Return rows of a campaign as an array of ROW; codes : text -> its number, to which new ones are added."""
+    rows = np.zeros(table.num_rows, dtype=ROW)
+    for column in ("cell", "seed", "rms_nm"):
+        rows[column] = table[column].to_numpy()
+    rows["apart"] = table["apart"].fill_null(False).to_numpy()
+    for column in ("name", "target", "mode"):
+        encoded = table[column].combine_chunks().dictionary_encode()
+        known = np.array([codes.setdefault(text, len(codes)) for text in encoded.dictionary.to_pylist()], dtype=int)
+        rows[column] = known[encoded.indices.to_numpy()] if len(known) else 0
+    return rows
+
+
+def gather_errors(rows: Array, codes: Mapping[str, int], shape: tuple[int, int]) -> dict[tuple[str, str], CampaignErrors]:
+    """Return (target, mode) -> errors of rows, whose cells and seeds are places in an array of this shape."""
+    texts, out = list(codes), {}
+    for target, mode in np.unique(rows[["target", "mode"]]).tolist():
+        if texts[target]:
+            part = rows[(rows["target"] == target) & (rows["mode"] == mode)]
+            out[texts[target], texts[mode]] = _errors_of(part, texts, texts[target], shape)
+    return out
+
+
+def _errors_of(rows: Array, texts: list[str], target: str, shape: tuple[int, int]) -> CampaignErrors:
+    """Return the errors of the rows of one target and mode."""
+    codes, place = np.unique(rows["name"], return_inverse=True)
+    known, order = np.unique([texts[code] for code in codes], return_inverse=True)
+    names, column = known.tolist(), order[place]
+    values, eligible = np.full((*shape, len(names)), np.nan), np.zeros((shape[0], len(names)), dtype=bool)
+    values[rows["cell"], rows["seed"], column] = rows["rms_nm"]
+    eligible[rows["cell"], column] = np.array([can_win(name, target) for name in names])[column]
+    eligible[rows["cell"][rows["apart"]], column[rows["apart"]]] = False
+    return CampaignErrors(tuple(names), values, eligible)
 
 
 def compare(table: pyarrow.Table, level: float = LEVEL) -> list[Comparison]:
@@ -113,100 +318,42 @@ def compare(table: pyarrow.Table, level: float = LEVEL) -> list[Comparison]:
     list of Comparison
         By scenario, target and mode, the smallest error first.
     """
-    return [one for group in each_group(table) for one in _compare_one(group, level)]
-
-
-@dataclass(frozen=True)
-class Samples:
-    """What ran in one scenario, for one target and mode.
-
-    Attributes
-    ----------
-    cell : int
-        Number of the scenario.
-    scenario, target, mode : str
-        What was compared.
-    names : list of str
-        Ids.
-    values : Array
-        rms [nm], (n_seeds, n_names), NaN without a result.
-    eligible : Array
-        Whether a name can be the best, bool (n_names,).
-    """
-
-    cell: int
-    scenario: str
-    target: str
-    mode: str
-    names: list[str]
-    values: Array
-    eligible: Array
-
-
-def each_group(table: pyarrow.Table) -> Iterator[Samples]:
-    """Yield what ran in each scenario, for each target and mode."""
-    if not len(table):
-        return
-    table = table.sort_by([(c, "ascending") for c in ("cell", "target", "mode", "name", "seed")])
-    cell, seed, rms = (table[c].to_numpy() for c in ("cell", "seed", "rms_nm"))
-    apart = table["apart"].fill_null(False).to_numpy()
-    (target, targets), (mode, modes), (name, names) = (_codes(table[c]) for c in ("target", "mode", "name"))
-    changes = np.any(np.diff([cell, target, mode], axis=1) != 0, axis=0)
-    edges = np.concatenate([[0], np.flatnonzero(changes) + 1, [len(table)]])
-    failed_cells, failed_seeds = cell[target == targets.get("", -1)], seed[target == targets.get("", -1)]
-    of_target, of_mode, of_name = (list(texts) for texts in (targets, modes, names))
-    for start, stop in pairwise(edges):
-        what, part = of_target[target[start]], slice(start, stop)
-        if not what:
-            continue
-        ran, column = np.unique(name[part], return_inverse=True)
-        found = [of_name[code] for code in ran]
-        missing = failed_seeds[slice(*np.searchsorted(failed_cells, [cell[start], cell[start] + 1]))]
-        seeds = np.unique(np.concatenate([seed[part], missing]))
-        values = np.full((len(seeds), len(found)), np.nan)
-        values[np.searchsorted(seeds, seed[part]), column] = rms[part]
-        is_apart = np.bincount(column, weights=apart[part], minlength=len(found)) > 0
-        is_residual = what == "residual"
-        eligible = np.array(
-            [
-                (is_residual and one not in BOUNDS) or can_be_best(one, bool(beside))
-                for one, beside in zip(found, is_apart, strict=True)
-            ]
-        )
-        scenario = table["scenario"][int(start)].as_py()
-        yield Samples(int(cell[start]), scenario, what, of_mode[mode[start]], found, values, eligible)
-
-
-def _codes(column: pyarrow.ChunkedArray) -> tuple[Array, dict[str, int]]:
-    """Return texts as numbers, (n,), and the number of each text, in alphabetical order."""
-    encoded = column.combine_chunks().dictionary_encode()
-    texts = encoded.dictionary.to_pylist()
-    order = {text: i for i, text in enumerate(sorted(texts))}
-    return np.array([order[text] for text in texts])[encoded.indices.to_numpy()], order
-
-
-def _compare_one(group: Samples, level: float) -> list[Comparison]:
-    """Return the rows of a group, the smallest error first."""
-    names, values, eligible = group.names, group.values, group.eligible
-    known = ~np.isnan(values)
-    count = known.sum(axis=0)
-    with np.errstate(invalid="ignore"):
-        rms = np.sqrt((np.where(known, values, 0.0) ** 2).sum(axis=0) / count)
-    ranked = [i for i in np.argsort(rms) if eligible[i] and count[i] == count[eligible].max(initial=0)]
     out = []
-    rivals = np.flatnonzero(eligible)
-    differs = (
-        dict(zip(rivals, columns_differ(values[:, rivals], 1.0 - level)[rivals == ranked[0]][0], strict=True)) if ranked else {}
-    )
-    for i in np.argsort(rms):
-        difference, half, is_tie = None, None, False
-        if ranked and eligible[i] and i != ranked[0]:
-            difference, half = paired_difference(values[:, i], values[:, ranked[0]], level)
-            is_tie = not differs[i]
-        failures, is_best = len(values) - int(count[i]), bool(ranked) and bool(i == ranked[0])
-        where = group.cell, group.scenario, group.target, group.mode
-        spread = tuple(np.quantile(values[known[:, i], i], QUANTILES).tolist()) if count[i] else ()
-        out.append(
-            Comparison(*where, names[i], int(count[i]), failures, float(rms[i]), difference, half, is_best, is_tie, spread)
-        )
+    for where, errors in each_group(table):
+        values, rms, count, eligible = errors.values[0], errors.rms[0], errors.count[0], errors.eligible[0]
+        best, difference, half, tie, untested = compare_columns(values, rms, eligible, level)
+        for i in np.argsort(rms):
+            if not count[i] and not eligible[i]:
+                continue
+            by, reach = (None if np.isnan(x[i]) else float(x[i]) for x in (difference, half))
+            known = values[~np.isnan(values[:, i]), i]
+            spread = tuple(np.quantile(known, QUANTILES).tolist()) if count[i] else ()
+            counts = int(count[i]), len(values) - int(count[i])
+            is_tie = bool(tie[i] or untested[i])
+            out.append(Comparison(*where, errors.names[i], *counts, float(rms[i]), by, reach, bool(i == best), is_tie, spread))
+    return out
+
+
+def each_group(table: pyarrow.Table) -> Iterator[tuple[tuple[int, str, str, str], CampaignErrors]]:
+    """Yield the errors of each scenario, for each target and mode, after its number, its name, target and mode."""
+    codes: dict[str, int] = {}
+    rows = coded_rows(table, codes)
+    cells, first, rows["cell"] = np.unique(rows["cell"], return_index=True, return_inverse=True)
+    seeds, rows["seed"] = np.unique(rows["seed"], return_inverse=True)
+    ran = np.zeros((len(cells), len(seeds)), dtype=bool)
+    ran[rows["cell"], rows["seed"]] = True
+    found = sorted(gather_errors(rows, codes, ran.shape).items())
+    for i, cell in enumerate(cells.tolist()):
+        scenario = table["scenario"][int(first[i])].as_py()
+        for key, errors in found:
+            own = CampaignErrors(errors.names, errors.values[[i]][:, ran[i]], errors.eligible[[i]])
+            if own.count.any() or own.eligible.any():
+                yield (cell, scenario, *key), own
+
+
+def comparison_groups(comparisons: Sequence[Comparison]) -> dict[tuple[int, str, str], list[Comparison]]:
+    """Return (number of the scenario, target, mode) -> what was compared there."""
+    out: dict[tuple[int, str, str], list[Comparison]] = {}
+    for c in comparisons:
+        out.setdefault((c.cell, c.target, c.mode), []).append(c)
     return out

@@ -7,10 +7,10 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any
 
-from wfsobs.campaign.compare import LEVEL, Comparison, compare
-from wfsobs.campaign.sweep import Changes, conditions, grid, product, sample
+from wfsobs.campaign.compare import LEVEL, Comparison
+from wfsobs.campaign.sweep import Changes, check_keys, conditions, grid, product, sample
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.priors_from.scenario import common_observers
@@ -18,27 +18,6 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import load_scenario, parse_toml, preset
 from wfsobs.settings.errors import SettingError
 from wfsobs.settings.tree import leaves
-
-if TYPE_CHECKING:
-    import pyarrow
-
-    from wfsobs.typing import Array
-
-HELD = 20_000
-"""Rows that are held at a time, but for a scenario that has more."""
-
-
-class CampaignRows(Protocol):
-    """Rows of a campaign, such as `wfsobs.campaign.store.BatchIndex`."""
-
-    @property
-    def n_rows(self) -> int:
-        """Number of rows."""
-        ...
-
-    def read(self, cells: range) -> pyarrow.Table:
-        """Return the rows of some scenarios."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -83,9 +62,7 @@ def parse_stop(table: Mapping[str, Any], seeds: int) -> Stop | None:
     """Return the rule of a plan, None for an empty table. Raises SettingError."""
     if not table:
         return None
-    for key in table:
-        if key not in ("half_width", "first"):
-            raise SettingError(f"stop.{key}: takes half_width, first")
+    check_keys(table, "stop", "half_width", "first")
     width, first = table.get("half_width", 0.05), table.get("first", 10)
     if not isinstance(width, (int, float)) or not 0 < width < 1:
         raise SettingError(f"stop.half_width = {width!r}: takes a number between 0 and 1, in units of the best rms")
@@ -104,55 +81,6 @@ def looks(first: int, last: int) -> tuple[int, ...]:
     while out[-1] < last:
         out.append(min(2 * out[-1], last))
     return tuple(out)
-
-
-def wanted_seeds(plan: Campaign, complete: Array, rows: CampaignRows) -> Array:
-    """Return how many seeds each scenario is to have by what is known, (n_cells,).
-
-    At each look the first seeds alone count, so that the order of arrival does not matter. Some scenarios are decided at a time,
-    so that as many rows are held whatever the number of scenarios.
-
-    Parameters
-    ----------
-    plan : Campaign
-        The campaign.
-    complete : Array
-        Runs that are finished, bool (n_cells, n_seeds).
-    rows : CampaignRows
-        Their rows.
-    """
-    import numpy as np
-
-    if plan.stop is None:
-        return np.full(len(plan.cells), len(plan.seeds))
-    wanted = np.full(len(plan.cells), plan.stop.looks[0])
-    size = max(1, int(HELD / max(1.0, rows.n_rows / max(1, complete.sum()) * complete.sum(axis=1).max())))
-    for start in range(0, len(wanted), size):
-        cells = range(start, min(start + size, len(wanted)))
-        if complete[cells, : plan.stop.looks[0]].all(axis=1).any():
-            wanted[cells] = _wanted_of(plan, plan.stop, cells, complete[cells], rows.read(cells))
-    return wanted
-
-
-def _wanted_of(plan: Campaign, stop: Stop, cells: range, complete: Array, table: pyarrow.Table) -> Array:
-    """Return how many seeds some scenarios are to have, (n,); complete : (n, n_seeds)."""
-    import numpy as np
-    import pyarrow as pa
-
-    wanted, undecided = np.full(len(cells), stop.looks[0]), np.ones(len(cells), dtype=bool)
-    for count in stop.looks:
-        wanted[undecided] = count
-        undecided &= complete[:, :count].all(axis=1)  # the others wait for their seeds
-        if not undecided.any():
-            break
-        table = table.filter(pa.array(undecided[table["cell"].to_numpy() - cells.start]))
-        first = table.filter(pa.array(table["seed"].to_numpy() < plan.seeds.start + count))
-        groups: dict[tuple[int, str, str], list[Comparison]] = {}
-        for one in compare(first, stop.level):
-            groups.setdefault((one.cell, one.target, one.mode), []).append(one)
-        open_cells = {key[0] for key, compared in groups.items() if not stop.is_decided(compared)}
-        undecided &= np.isin(cells, list(open_cells))
-    return wanted
 
 
 KEYS = (
@@ -346,9 +274,7 @@ def _scenarios(values: Mapping[str, Any], folder: Path) -> list[tuple[str, Mappi
     out: dict[str, Mapping[str, Any]] = {}
     for i, entry in enumerate(entries):
         where = f"scenario.{i}"
-        for key in entry:
-            if key not in ("name", "preset", "config", "settings"):
-                raise SettingError(f"{where}.{key}: takes name, preset, config, settings")
+        check_keys(entry, where, "name", "preset", "config", "settings")
         name = str(entry.get("name", entry.get("preset", entry.get("config", f"scenario {i}"))))
         if name in out:
             raise SettingError(f"{where}.name = {name!r}: there are two")

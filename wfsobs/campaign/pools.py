@@ -11,7 +11,7 @@ from concurrent.futures import Executor, ProcessPoolExecutor
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait
 from time import monotonic
-from typing import Any, Protocol
+from typing import Any
 
 from wfsobs.settings.errors import SettingError
 
@@ -23,22 +23,6 @@ PATIENCE = 5.0
 
 DASK_RETRIES = 10
 """How often a scheduler starts a batch again whose worker died."""
-
-
-class Workers(Protocol):
-    """Makes executors: a fresh one after the last one broke."""
-
-    def count(self) -> int:
-        """Return how many batches run side by side; zero where none can for now."""
-        ...
-
-    def executor(self) -> Executor:
-        """Return a fresh executor."""
-        ...
-
-    def close(self) -> None:
-        """End the workers."""
-        ...
 
 
 def usable_processors() -> int:
@@ -161,3 +145,7 @@ class DaskCluster:
         if self._client is not None:
             self._client.close(timeout=5)
             self._client = None
+
+
+Workers = Processes | DaskCluster
+"""What makes executors: a fresh one after the last one broke."""

@@ -18,14 +18,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.stats import rankdata, studentized_range
 
-from wfsobs.campaign.compare import LEVEL, Comparison, compare, each_group
+from wfsobs.campaign.compare import LEVEL, Comparison, compare, comparison_groups, each_group
 from wfsobs.campaign.plan import Campaign
 from wfsobs.campaign.store import finished_runs, folder_plan, read_results
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import NOT_OBSERVERS
 from wfsobs.files import write_text
 from wfsobs.observers import OBSERVERS
-from wfsobs.typing import Array
 
 if TYPE_CHECKING:
     import pyarrow
@@ -144,22 +143,16 @@ def first_places(table: pyarrow.Table, rng: np.random.Generator) -> dict[tuple[i
         (cell, target, mode) -> name -> share of RESAMPLES samples in which its rms is the smallest.
     """
     out: dict[tuple[int, str, str], dict[str, float]] = {}
-    for group in each_group(table):
-        columns = np.flatnonzero(group.eligible & ~np.isnan(group.values).any(axis=0))
+    for (cell, _, target, mode), errors in each_group(table):
+        values = errors.values[0]
+        columns = np.flatnonzero(errors.eligible[0] & ~np.isnan(values).any(axis=0))
         if not len(columns):
             continue
-        best = _best_of_samples(group.values[:, columns] ** 2, rng)
+        weights = rng.multinomial(len(values), np.full(len(values), 1 / len(values)), size=RESAMPLES)
+        best = np.argmin(weights @ values[:, columns] ** 2, axis=1)
         shares = np.bincount(best, minlength=len(columns)) / RESAMPLES
-        out[group.cell, group.target, group.mode] = {
-            group.names[i]: float(share) for i, share in zip(columns, shares, strict=True) if share
-        }
+        out[cell, target, mode] = {errors.names[i]: float(share) for i, share in zip(columns, shares, strict=True) if share}
     return out
-
-
-def _best_of_samples(squares: Array, rng: np.random.Generator) -> Array:
-    """Return the column with the smallest mean in samples of the rows, (RESAMPLES,)."""
-    weights = rng.multinomial(len(squares), np.full(len(squares), 1 / len(squares)), size=RESAMPLES)
-    return np.argmin(weights @ squares, axis=1)
 
 
 MOST_ROWS = 4000
@@ -217,7 +210,7 @@ def write_report(folder: Path, path: Path) -> None:
 
     plan, table = folder_plan(folder), read_results(folder)
     comparisons = compare(table)
-    groups = _by_group(comparisons)
+    groups = comparison_groups(comparisons)
     stable = first_places(table, np.random.default_rng(0))
     environment = Environment(
         loader=PackageLoader("wfsobs.campaign"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -253,18 +246,11 @@ def colour(name: str) -> str:
     return entry.look.light if entry is not None else "#555577"
 
 
-def _by_group(comparisons: Sequence[Comparison]) -> dict[tuple[int, str, str], list[Comparison]]:
-    out: dict[tuple[int, str, str], list[Comparison]] = {}
-    for c in comparisons:
-        out.setdefault((c.cell, c.target, c.mode), []).append(c)
-    return out
-
-
 def _maps(plan: Campaign, comparisons: Sequence[Comparison]) -> list[Map]:
     """Return a map of winners for each scenario of a plan that is varied: over its first two settings that are numbers."""
     out = []
     for name in dict.fromkeys(c.scenario for c in comparisons):
-        cells = _by_group([c for c in comparisons if c.scenario == name])
+        cells = comparison_groups([c for c in comparisons if c.scenario == name])
         changes = {key[0]: plan.cells[key[0]].changes for key in cells}
         paths = [p for p in plan.axes if all(isinstance(c.get(p), (int, float)) for c in changes.values())][:2]
         paths = [p for p in paths if len({c[p] for c in changes.values()}) > 1]

@@ -5,19 +5,19 @@ from __future__ import annotations
 import json
 import os
 import socket
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from time import perf_counter, sleep, time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from wfsobs.campaign.plan import Campaign, Cell, wanted_seeds
+from wfsobs.campaign.compare import compare, comparison_groups
+from wfsobs.campaign.plan import Campaign, Cell, Stop
 from wfsobs.campaign.pools import Workers
 from wfsobs.campaign.store import BatchIndex, finished_runs, open_folder, remove_leftovers, row_key, scenario_digest, write_batch
 from wfsobs.closed_loop.design import Design, design
@@ -35,6 +35,9 @@ from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
+
+if TYPE_CHECKING:
+    import pyarrow
 
 Row = dict[str, Any]
 
@@ -62,24 +65,10 @@ class Batch:
     folder: str
 
 
-@dataclass(frozen=True)
-class Summary:
-    """Summary of a batch.
+def wfsobs_batch(batch: Batch) -> float:
+    """Do the runs of a batch, write their rows to a file, and return the time that they took [s].
 
-    Attributes
-    ----------
-    runs : int
-        Number of runs.
-    seconds : float
-        Time that they took [s].
-    """
-
-    runs: int
-    seconds: float
-
-
-def wfsobs_batch(batch: Batch) -> Summary:
-    """Do the runs of a batch and write their rows to a file. Raises OSError where it cannot be written.
+    Raises OSError where the file cannot be written.
 
     The name is what dashboards of schedulers show.
     """
@@ -88,7 +77,7 @@ def wfsobs_batch(batch: Batch) -> Summary:
         rows = [row for cell, seed in batch.runs for row in run_rows(cell, seed, batch.observers, batch.controllers)]
     seconds = perf_counter() - start
     write_batch(Path(batch.folder), rows, {"host": socket.gethostname(), "process": os.getpid(), "written": time()})
-    return Summary(len(batch.runs), seconds)
+    return seconds
 
 
 @dataclass
@@ -101,19 +90,11 @@ class _Ready:
     bounds: list[Bound] | None = None
 
 
-_READY: OrderedDict[str, _Ready] = OrderedDict()
-"""The last scenarios of this process: the seeds of a cell follow each other."""
-
-
-def _ready(cell: Cell) -> _Ready:
-    """Return the scenario of a cell, made once for all seeds. Raises SettingError."""
-    key = json.dumps([cell.base, cell.changes], sort_keys=True)
-    if key not in _READY:
-        scenario = cell.scenario()
-        _READY[key] = _Ready(scenario, scenario_digest(scenario))
-        while len(_READY) > READY:
-            _READY.popitem(last=False)
-    return _READY[key]
+@lru_cache(READY)
+def _ready(settings: str) -> _Ready:
+    """Return the scenario of a cell's `base` and `changes` in JSON, made once for all its seeds. Raises SettingError."""
+    scenario = Cell(0, "", *json.loads(settings)).scenario()
+    return _Ready(scenario, scenario_digest(scenario))
 
 
 def run_rows(cell: Cell, seed: int, observers: Sequence[str], controllers: Sequence[str]) -> list[Row]:
@@ -135,7 +116,7 @@ def run_rows(cell: Cell, seed: int, observers: Sequence[str], controllers: Seque
     """
     same = {"cell": cell.index, "scenario": cell.name, "seed": seed}
     try:
-        ready = _ready(cell)
+        ready = _ready(json.dumps([cell.base, cell.changes]))
         ready.scenario.run.seed = seed  # in place: a copy takes longer than a short record
         record = simulate(ready.scenario)
     except ValueError as error:  # settings that exclude each other, met in this cell alone
@@ -228,6 +209,10 @@ BREAKS = 20
 """How often in a row an executor may break with no batch finished in between."""
 
 
+HELD = 20_000
+"""Rows that are held at a time, but for a scenario that has more."""
+
+
 @dataclass
 class Progress:
     """State of a campaign.
@@ -256,9 +241,9 @@ def run_campaign(
     folder: Path,
     workers: Workers,
     *,
-    shard: tuple[int, int] = (1, 1),
-    report: Callable[[Progress], None] = lambda _: None,
-    must_stop: Callable[[], bool] = lambda: False,
+    shard: tuple[int, int],
+    report: Callable[[Progress], None],
+    must_stop: Callable[[], bool],
 ) -> Progress:
     """Run what is missing of a campaign; call it again to resume.
 
@@ -314,13 +299,52 @@ def _wanted_runs(plan: Campaign, folder: Path, shard: tuple[int, int]) -> tuple[
     finished = finished_runs(plan, folder)
     seeds = wanted_seeds(plan, finished, BatchIndex(folder)) if plan.stop else np.full(len(plan.cells), len(plan.seeds))
     wanted = np.arange(len(plan.seeds)) < seeds[:, None]
-    return wanted.ravel() & _share(plan, shard), finished.ravel()
-
-
-def _share(plan: Campaign, shard: tuple[int, int]) -> Array:
-    """Return the runs of a share, bool (n_runs,): of every scenario some seeds, so that shares take equally long."""
     k, n = shard
-    return np.arange(plan.n_runs) % n == k - 1
+    share = np.arange(plan.n_runs) % n == k - 1  # of every scenario some seeds, so that shares take equally long
+    return wanted.ravel() & share, finished.ravel()
+
+
+def wanted_seeds(plan: Campaign, complete: Array, rows: BatchIndex) -> Array:
+    """Return how many seeds each scenario is to have by what is known, (n_cells,).
+
+    At each look the first seeds alone count, so that the order of arrival does not matter. Some scenarios are decided at a time,
+    so that as many rows are held whatever the number of scenarios.
+
+    Parameters
+    ----------
+    plan : Campaign
+        The campaign.
+    complete : Array
+        Runs that are finished, bool (n_cells, n_seeds).
+    rows : BatchIndex
+        Their rows.
+    """
+    assert plan.stop is not None
+    wanted = np.full(len(plan.cells), plan.stop.looks[0])
+    size = max(1, int(HELD / max(1.0, rows.n_rows / max(1, complete.sum()) * complete.sum(axis=1).max())))
+    for start in range(0, len(wanted), size):
+        cells = range(start, min(start + size, len(wanted)))
+        if complete[cells, : plan.stop.looks[0]].all(axis=1).any():
+            wanted[cells] = _wanted_of(plan, plan.stop, cells, complete[cells], rows.read(cells))
+    return wanted
+
+
+def _wanted_of(plan: Campaign, stop: Stop, cells: range, complete: Array, table: pyarrow.Table) -> Array:
+    """Return how many seeds some scenarios are to have, (n,); complete : (n, n_seeds)."""
+    import pyarrow as pa
+
+    wanted, undecided = np.full(len(cells), stop.looks[0]), np.ones(len(cells), dtype=bool)
+    for count in stop.looks:
+        wanted[undecided] = count
+        undecided &= complete[:, :count].all(axis=1)  # the others wait for their seeds
+        if not undecided.any():
+            break
+        table = table.filter(pa.array(undecided[table["cell"].to_numpy() - cells.start]))
+        first = table.filter(pa.array(table["seed"].to_numpy() < plan.seeds.start + count))
+        groups = comparison_groups(compare(first, stop.level))
+        open_cells = {key[0] for key, compared in groups.items() if not stop.is_decided(compared)}
+        undecided &= np.isin(cells, list(open_cells))
+    return wanted
 
 
 class _Batches:
@@ -331,7 +355,7 @@ class _Batches:
         self.position = 0
         self.again: list[Batch] = []
         self.actual_seconds, self.expected_seconds = 0.0, 0.0
-        self._cost: dict[int, float] = {}
+        self.cost = lru_cache(MOST_RUNS)(partial(run_cost, plan))
 
     def __iter__(self) -> Iterator[Batch]:
         return self
@@ -351,18 +375,10 @@ class _Batches:
             self.position += 1
         return Batch(tuple(runs), self.plan.observers, self.plan.controllers, self.folder)
 
-    def learn(self, batch: Batch, summary: Summary) -> None:
-        """Correct the expected times by that of a batch."""
-        self.actual_seconds += summary.seconds
+    def learn(self, batch: Batch, seconds: float) -> None:
+        """Correct the expected times by that of a batch [s]."""
+        self.actual_seconds += seconds
         self.expected_seconds += sum(self.cost(cell.index) for cell, _ in batch.runs)
-
-    def cost(self, cell: int) -> float:
-        """Return the expected time of a run [s]."""
-        if cell not in self._cost:
-            if len(self._cost) > MOST_RUNS:
-                self._cost.clear()
-            self._cost[cell] = run_cost(self.plan, cell)
-        return self._cost[cell]
 
 
 def run_cost(plan: Campaign, cell: int) -> float:
@@ -378,7 +394,7 @@ def _drive(
     batches: _Batches, workers: Workers, progress: Progress, report: Callable[[Progress], None], must_stop: Callable[[], bool]
 ) -> None:
     """Keep the executor busy until all batches are done."""
-    executor, running, in_a_row = workers.executor(), dict[Future[Summary], Batch](), 0
+    executor, running, in_a_row = workers.executor(), dict[Future[float], Batch](), 0
     while True:
         if not (count := workers.count()):
             if must_stop():  # nothing would end what waits
@@ -397,16 +413,15 @@ def _drive(
         for future in wait(running, timeout=LOOK, return_when=FIRST_COMPLETED).done:
             batch = running.pop(future)
             try:
-                summary = future.result()
+                batches.learn(batch, future.result())
             except Exception as error:
                 if not _is_loss(error):
                     raise
                 broken = True
                 batches.again.append(batch)
                 continue
-            batches.learn(batch, summary)
-            progress.n_done += summary.runs
-            progress.runs += summary.runs
+            progress.n_done += len(batch.runs)
+            progress.runs += len(batch.runs)
             in_a_row = 0
             report(progress)
         if broken:

@@ -54,9 +54,7 @@ class PlanAxis:
 
 def plan_axes(plan: Campaign) -> list[PlanAxis]:
     """Return what the scenarios of a plan differ in, what is constant left out."""
-    columns: dict[str, list[Any]] = {SCENARIO: [cell.name for cell in plan.cells]}
-    columns |= {path: [cell.changes.get(path) for cell in plan.cells] for path in plan.axes}
-    axes = [_axis(path, values) for path, values in columns.items()]
+    axes = [_axis(path, _values(plan, path)) for path in (SCENARIO, *plan.axes)]
     return [axis for axis in axes if len(axis.values) > 1]
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from wfsobs.campaign.follow import CampaignPlace, CampaignState
+from wfsobs.campaign.compare import CampaignPlace
+from wfsobs.campaign.follow import CampaignState
 from wfsobs.typing import Array
 
 BEST, TIED, UNTESTED = "best", "tied", "not tested"

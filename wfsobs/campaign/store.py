@@ -26,6 +26,9 @@ from wfsobs.settings.errors import SettingError
 from wfsobs.typing import Array
 from wfsobs.version import __version__
 
+if TYPE_CHECKING:
+    import pyarrow
+
 PHYSICS_VERSION = 6
 """Number of the simulation and its numerics: rises with every change that moves results (tests/campaign/test_physics.py)."""
 
@@ -80,11 +83,6 @@ def _distribution_version(home: str) -> str:
     names = packages_distributions().get(home, [])
     return version(names[0]) if names else "0"
 
-
-if TYPE_CHECKING:
-    import pyarrow
-
-    from wfsobs.campaign.plan import Campaign
 
 PLAN = "plan.json"
 ROWS = "rows"
@@ -160,40 +158,24 @@ def read_batch(path: Path, columns: Iterable[str]) -> pyarrow.Table | None:
         return None
 
 
-def read_batches(folder: Path, columns: Iterable[str], unreadable: list[Path] | None = None) -> Iterator[pyarrow.Table]:
-    """Yield the rows of one file after the other; one that cannot be read is left out, and appended to `unreadable`."""
+def read_batches(folder: Path, columns: Iterable[str]) -> Iterator[pyarrow.Table]:
+    """Yield the rows of one file after the other; one that cannot be read is left out."""
     columns = list(columns)
     for path in batch_files(folder):
         if (table := read_batch(path, columns)) is not None:
             yield table
-        elif unreadable is not None:
-            unreadable.append(path)
 
 
-def read_results(folder: Path, provenance: bool = False) -> pyarrow.Table:
-    """Return all rows, each once, sorted by key, target and mode.
+def read_results(folder: Path) -> pyarrow.Table:
+    """Return all rows without PROVENANCE, each once, sorted by key, target and mode.
 
     Rows that were computed twice (by a worker that was taken for dead) have one key, and the first counts.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the campaign.
-    provenance : bool
-        Whether to return the columns of PROVENANCE, too.
-
-    Returns
-    -------
-    pyarrow.Table
-        The rows.
     """
-    columns = [*RESULTS, *(PROVENANCE if provenance else ())]
-    return _each_once(list(read_batches(folder, columns)), columns)
+    return _each_once(list(read_batches(folder, RESULTS)), list(RESULTS))
 
 
 def _each_once(tables: Sequence[pyarrow.Table], columns: Sequence[str]) -> pyarrow.Table:
     """Return the rows of tables, each once, sorted."""
-    import numpy as np
     import pyarrow as pa
 
     if not tables:

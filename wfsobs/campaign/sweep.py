@@ -72,6 +72,13 @@ def grid(values: Mapping[str, Any]) -> list[Changes]:
     return list(product([[{path: value} for value in of] for path, of in values.items()]))
 
 
+def check_keys(table: Mapping[str, Any], where: str, *names: str) -> None:
+    """Raise SettingError for a key of a table of a plan that is not known."""
+    for key in table:
+        if key not in names:
+            raise SettingError(f"{where}.{key}: takes {', '.join(names)}")
+
+
 def sample(table: Mapping[str, Any]) -> list[Changes]:
     """Return the points of a Sobol sequence or a Latin hypercube in ranges of settings.
 
@@ -93,9 +100,7 @@ def sample(table: Mapping[str, Any]) -> list[Changes]:
     """
     if not table:
         return [{}]
-    for key in table:
-        if key not in ("method", "points", "seed", "between", "log"):
-            raise SettingError(f"sample.{key}: takes method, points, seed, between, log")
+    check_keys(table, "sample", "method", "points", "seed", "between", "log")
     method, points, seed = table.get("method", "sobol"), table.get("points", 16), table.get("seed", 1)
     ranges, log = dict(leaves(table.get("between", {}))), table.get("log", [])
     if method not in METHODS:
@@ -158,9 +163,7 @@ def conditions(table: Mapping[str, Any], folder: Path) -> list[Changes]:
     """
     if not table:
         return [{}]
-    for key in table:
-        if key not in ("file", "columns"):
-            raise SettingError(f"conditions.{key}: takes file, columns")
+    check_keys(table, "conditions", "file", "columns")
     columns = table.get("columns")
     if not isinstance(columns, dict) or not columns:
         raise SettingError('conditions.columns: takes {column = "setting"} or {column = {setting = "...", factor = 1.0}}')

@@ -10,7 +10,7 @@ import click
 import numpy as np
 from click.core import ParameterSource
 
-from wfsobs.cli.options import json_option, ngs_options, ngs_wiring, scenario_options, stream_elements, told_scenario
+from wfsobs.cli.options import POSITIVE, json_option, ngs_options, ngs_wiring, scenario_options, stream_elements, told_scenario
 from wfsobs.cli.show import print_json, print_note
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.supervisor import SupervisedController, Supervision
@@ -54,51 +54,44 @@ OBSERVERS_ALONE = ("name", "shadow", "commands", "delay", "fallback")
     "--command-delay",
     type=click.FloatRange(1, 50),
     default=DELAY,
-    show_default=True,
     metavar="N",
     help="Frames from a command to the first measurement that sees it, such as 1.5.",
 )
-@click.option("--command-gain", type=float, default=1.0, show_default=True, metavar="G", help="What the mirror does of them.")
+@click.option("--command-gain", type=float, default=1.0, metavar="G", help="What the mirror does of them.")
 @click.option("--out", "sink", metavar="STREAM", help="Where what is sent goes, made if there is none; or tcp://*:port.")
 @click.option("--shadow", is_flag=True, help="Write nothing.")
 @click.option("--prior", metavar="FOUND.toml", help="Prior of the observer: the file of `wfsobs identify --out`.")
-@click.option("--observer", "name", default="kf-multi", show_default=True, metavar="ID", help="Observer that runs.")
+@click.option("--observer", "name", default="kf-multi", metavar="ID", help="Observer that runs.")
 @click.option("--controller", metavar="ID", help="Close the loop: a controller under supervision, its commands go to --out.")
 @click.option(
     "--modes",
-    default=None,
     metavar="I,J,...",
     help="Elements of a frame, from 0, that are its modes; by default the first ones.",
 )
 @ngs_options
-@click.option("--unit", type=click.Choice(UNITS), default="um", show_default=True, help="Unit of the streams.")
+@click.option("--unit", type=click.Choice(UNITS), default="um", help="Unit of the streams.")
 @click.option(
     "--delay",
     type=click.FloatRange(1, 100),
     default=1.0,
-    show_default=True,
     metavar="D",
     help="Frames from the newest measurement to the one that the estimate is for.",
 )
-@click.option(
-    "--fallback", type=click.Choice(["zero", "hold"]), default="zero", show_default=True, help="Output in place of an estimate."
-)
+@click.option("--fallback", type=click.Choice(["zero", "hold"]), default="zero", help="Output in place of an estimate.")
 @click.option(
     "--limit",
     type=click.FloatRange(0, 1e12, min_open=True),
     metavar="X",
     help=f"Magnitude that nothing sent may exceed; by default {LIMIT:g} times the rms of a measurement by the prior.",
 )
-@click.option(
-    "--stuck", type=click.FloatRange(1e-3, 60), default=STUCK, show_default=True, metavar="S", help="Time without a frame."
-)
+@click.option("--stuck", type=click.FloatRange(1e-3, 60), default=STUCK, metavar="S", help="Time without a frame.")
 @click.option(
     "--semaphore",
     type=click.IntRange(0),
     metavar="N",
     help="Wait for this one of the stream, or a free one; else the counter is watched.",
 )
-@click.option("--seconds", type=click.FloatRange(0, min_open=True), metavar="S", help="Duration; by default until Ctrl+C.")
+@click.option("--seconds", type=POSITIVE, metavar="S", help="Duration; by default until Ctrl+C.")
 @json_option("At the end print one JSON object.")
 def attach(
     scenario: Scenario,

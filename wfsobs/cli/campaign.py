@@ -7,7 +7,7 @@ import math
 import re
 import signal
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple, fields
 from pathlib import Path
 from time import perf_counter
@@ -81,11 +81,7 @@ def print_csv(plan: Campaign, table: pyarrow.Table) -> None:
     for part in table.to_batches(max_chunksize=CHUNK):
         for row in part.to_pylist():
             changes = plan.cells[row["cell"]].changes if row["cell"] < len(plan.cells) else {}
-            out.writerow([_text(row[c]) for c in columns] + [_text(changes.get(path)) for path in axes])
-
-
-def _text(value: object) -> object:
-    return "" if value is None else repr(value) if isinstance(value, float) else value
+            out.writerow([row[c] for c in columns] + [changes.get(path) for path in axes])
 
 
 def summary_table(plan: Campaign, rows: object, title: str) -> Table:
@@ -98,12 +94,8 @@ def summary_table(plan: Campaign, rows: object, title: str) -> Table:
         key = (one.cell, one.target, one.mode)
         settings = ", ".join(f"{path.split('.')[-1]} = {value}" for path, value in plan.cells[one.cell].changes.items())
         new = key != before
-        above = (
-            ""
-            if one.difference is None
-            else f"{'~' if one.is_tie else ''}{one.difference:.2f}"
-            + (f" +- {one.half_width:.2f}" if one.half_width is not None else "")
-        )
+        around = "" if one.half_width is None else f" +- {one.half_width:.2f}"
+        above = "" if one.difference is None else f"{'~' if one.is_tie else ''}{one.difference:.2f}{around}"
         label = NOT_OBSERVERS.get(one.name, one.name)
         failed = f" ({one.failures} failed)" if one.failures else ""
         out.add_row(
@@ -132,7 +124,7 @@ def print_together(folder: Path, only: Sequence[str], target: str | None, mode: 
     if as_csv:
         out = csv.writer(sys.stdout, lineterminator="\n")
         out.writerow([field.name for field in fields(TogetherRow)])
-        out.writerows([["" if _is_missing(value) else value for value in astuple(row)] for row in rows])
+        out.writerows([["" if value != value else value for value in astuple(row)] for row in rows])  # NaN is not known
         return
     title = f"{state.plan.name}: {state.n_done} of {state.plan.n_runs} runs, {len(cells)} of {len(state.plan.cells)} scenarios"
     show_table(_table(rows, title))
@@ -167,10 +159,6 @@ def _above(row: TogetherRow) -> str:
     return f"{100 * row.above:.1f}{around}"
 
 
-def _is_missing(value: object) -> bool:
-    return value is None or (isinstance(value, float) and math.isnan(value))
-
-
 KEY_BYTES, ROW_BYTES, FILE_BYTES = 34, 12, 6_000
 """Measured size of a key, which all rows of an observer on a record share, of the rest of a row, and of a file without rows."""
 
@@ -192,7 +180,6 @@ def campaign() -> None:
 @click.option(
     "--workers",
     type=click.IntRange(1, 100_000),
-    default=None,
     metavar="N",
     help="Batches side by side; by default the processors.",
 )
@@ -253,7 +240,6 @@ def rows_of_a_run(plan: Campaign) -> int:
 @click.option(
     "--workers",
     type=click.IntRange(1, 1024),
-    default=None,
     metavar="N",
     help="Processes on this machine; by default one per processor.",
 )
@@ -269,7 +255,7 @@ def run(plan_file: str, out: str, workers: int | None, scheduler: str | None, sh
     if workers and scheduler:
         raise SettingError("--workers: only for this machine, not with --scheduler")
     plan, share = load_plan(plan_file), _shard(shard)
-    stop = _Stop()
+    stop = _stop_signals()
     with _bar(plan.name) as bar:
         place = DaskCluster(scheduler, print_note) if scheduler else Processes(workers or usable_processors())
         task = bar.add_task("runs", total=None)
@@ -290,21 +276,18 @@ def run(plan_file: str, out: str, workers: int | None, scheduler: str | None, sh
         sys.exit(STOPPED)
 
 
-class _Stop:
-    """Set by SIGTERM or the first Ctrl-C: batches that run are finished."""
+def _stop_signals() -> Callable[[], bool]:
+    """Return what tells whether SIGTERM or the first Ctrl-C has come: batches that run are finished."""
+    wishes: list[int] = []
 
-    def __init__(self) -> None:
-        self.set = False
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, self._on_signal)
-
-    def _on_signal(self, number: int, _frame: FrameType | None) -> None:
-        self.set = True
+    def take(number: int, _frame: FrameType | None) -> None:
+        wishes.append(number)
         if number == signal.SIGINT:
             signal.signal(signal.SIGINT, signal.default_int_handler)  # a second one ends at once
 
-    def __call__(self) -> bool:
-        return self.set
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, take)
+    return lambda: bool(wishes)
 
 
 def _bar(title: str) -> Progress:
@@ -371,7 +354,7 @@ def print_table(
 
 @campaign.command()
 @click.argument("folder", metavar="DIR")
-@click.option("--out", default=None, metavar="FILE", help="HTML file; by default report.html in DIR.")
+@click.option("--out", metavar="FILE", help="HTML file; by default report.html in DIR.")
 def report(folder: str, out: str | None) -> None:
     """Write the results of a campaign as one HTML file: maps of winners, ranks, all comparisons."""
     from wfsobs.campaign.report import write_report

@@ -1,4 +1,4 @@
-"""`wfsobs export` and `wfsobs figure`: results as files."""
+"""`wfsobs export`, `wfsobs figure` and `wfsobs design`: results as files."""
 
 from __future__ import annotations
 
@@ -12,14 +12,17 @@ from wfsobs.cli.options import (
     preset_of_command,
     record_options,
     scenario_options,
+    told_scenario,
     training,
     training_options,
 )
-from wfsobs.cli.show import progress_bar, warn
+from wfsobs.cli.show import print_note, progress_bar, warn
+from wfsobs.handover.write import FORMATS, write_design
 from wfsobs.pipeline import observe, run
 from wfsobs.plot.paper import NUMBERS, draw_paper_figure, observers_in
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.grid import MOST, parse_variation
+from wfsobs.settings.group import SettingError
 from wfsobs.telemetry.intake import DeclaredFormat
 
 
@@ -71,9 +74,7 @@ def export(
 @training_options
 @click.option("--out", required=True, metavar="FILE", help="File to write: .pdf, .svg, .pgf, .png or .html.")
 @click.option("--record", "record_file", metavar="RECORD", help="Draw from a record of your own, not from a simulation.")
-@click.option(
-    "--width", type=click.FloatRange(40, 400), default=88.0, show_default=True, metavar="MM", help="One column; 180 are two."
-)
+@click.option("--width", type=click.FloatRange(40, 400), default=88.0, metavar="MM", help="One column; 180 are two.")
 @click.option("--height", type=click.FloatRange(20, 1000), metavar="MM", help="By default 40 for each plot, and legends.")
 def figure(
     name: str,
@@ -101,3 +102,19 @@ def figure(
             result = observe(record, scenario, observers=names, train=learnt, watch=watch)
     warn(result)
     save_figure(draw_paper_figure(name, result), out, width=width, height=height or 0.0)
+
+
+@click.command()
+@scenario_options
+@click.option("--prior", metavar="FOUND.toml", help="Prior of the controller: the file of `wfsobs identify --out`.")
+@click.option("--controller", "name", required=True, metavar="ID", help="Controller to write.")
+@click.option("--to", "form", required=True, metavar="FORMAT", help=f"One of {', '.join(FORMATS)}.")
+@click.option("--out", required=True, metavar="PATH", help="File to write; for c99 a new directory.")
+def design(scenario: Scenario, prior: str | None, name: str, form: str, out: str) -> None:
+    """Write a controller for a program elsewhere: C99 with a test, arrays, python-control."""
+    scenario = told_scenario(prior, scenario)
+    try:
+        write_design(name, scenario, form, out)
+    except ValueError as error:
+        raise SettingError(f"design: {error}") from None
+    print_note(f"design: {name} written to {out}")

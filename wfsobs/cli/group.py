@@ -4,48 +4,39 @@ from __future__ import annotations
 
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, NamedTuple
+from typing import Any
 
 import click
 from threadpoolctl import threadpool_limits
 
 from wfsobs.version import __version__
 
-
-class Place(NamedTuple):
-    """Where a command is, a module of this package, and its line in `wfsobs --help`."""
-
-    module: str
-    help: str
-
-
 COMMANDS = {
-    "attach": Place("attach", "Run an observer or a controller on the streams of a running loop, in shared memory or by ZeroMQ."),
-    "bench": Place("bench", "Time the observers beside textbook versions."),
-    "campaign": Place("campaign", "Run many scenarios and seeds, on many processes or machines."),
-    "check": Place("telemetry", "Check a record: what was read, and what of it can be relied on."),
-    "convert": Place("telemetry", "Write a record in another format: .npz, .aot.fits, .fits, .h5, .mat, .csv or .parquet."),
-    "design": Place("design", "Write a controller for a program elsewhere: C99 with a test, arrays, python-control."),
-    "envelope": Place("simulate", "Compute what every linear controller leaves of the disturbance over an uncertain plant."),
-    "export": Place("export", "Write a report: one HTML file with figures and numbers that opens without a network."),
-    "figure": Place("export", "Draw a figure of the paper as a file."),
-    "gain": Place("telemetry", "Find the integrator's optimal gain from closed-loop telemetry."),
-    "identify": Place("telemetry", "Find noise, turbulence and vibration peaks in a record."),
-    "live": Place("live", "Run a loop by the clock, every observer beside it, frame by frame, and show it on a page."),
-    "loop": Place("simulate", "Close the loop with every controller on the same disturbance and print what is left of it."),
-    "observe": Place("telemetry", "Run the observers on a record of any format."),
-    "plant": Place("telemetry", "Identify what the commands of a closed loop do: delay, gain and rotation."),
-    "presets": Place("presets", "List the presets, or print one as TOML."),
-    "probe": Place("telemetry", "Design a probe: commands by which delay, gain and rotation of a loop are known better."),
-    "promise": Place("telemetry", "State what controllers will leave of a loop, before one of them is switched on."),
-    "rt-check": Place(
-        "realtime", "Tell what this machine can hold: how late a loop at the LGS rate wakes, and what a step takes in it."
-    ),
-    "run": Place("simulate", "Simulate the loop, run every observer and print the RMS table."),
-    "serve": Place("serve", "Serve the dashboard."),
-    "sweep": Place("sweep", "Run a scenario over the values of one or two settings and print the best observer in each."),
-    "tune": Place("tuning", "Search for the best settings of an observer on a record, or of a controller on uncertain plants."),
+    "attach": ("attach", "Run an observer or a controller on the streams of a running loop, in shared memory or by ZeroMQ."),
+    "bench": ("bench", "Time the observers beside textbook versions."),
+    "campaign": ("campaign", "Run many scenarios and seeds, on many processes or machines."),
+    "check": ("telemetry", "Check a record: what was read, and what of it can be relied on."),
+    "convert": ("telemetry", "Write a record in another format: .npz, .aot.fits, .fits, .h5, .mat, .csv or .parquet."),
+    "design": ("export", "Write a controller for a program elsewhere: C99 with a test, arrays, python-control."),
+    "envelope": ("simulate", "Compute what every linear controller leaves of the disturbance over an uncertain plant."),
+    "export": ("export", "Write a report: one HTML file with figures and numbers that opens without a network."),
+    "figure": ("export", "Draw a figure of the paper as a file."),
+    "gain": ("telemetry", "Find the integrator's optimal gain from closed-loop telemetry."),
+    "identify": ("telemetry", "Find noise, turbulence and vibration peaks in a record."),
+    "live": ("live", "Run a loop by the clock, every observer beside it, frame by frame, and show it on a page."),
+    "loop": ("simulate", "Close the loop with every controller on the same disturbance and print what is left of it."),
+    "observe": ("telemetry", "Run the observers on a record of any format."),
+    "plant": ("telemetry", "Identify what the commands of a closed loop do: delay, gain and rotation."),
+    "presets": ("presets", "List the presets, or print one as TOML."),
+    "probe": ("telemetry", "Design a probe: commands by which delay, gain and rotation of a loop are known better."),
+    "promise": ("telemetry", "State what controllers will leave of a loop, before one of them is switched on."),
+    "rt-check": ("bench", "Tell what this machine can hold: how late a loop at the LGS rate wakes, and what a step takes in it."),
+    "run": ("simulate", "Simulate the loop, run every observer and print the RMS table."),
+    "serve": ("serve", "Serve the dashboard."),
+    "sweep": ("sweep", "Run a scenario over the values of one or two settings and print the best observer in each."),
+    "tune": ("tuning", "Search for the best settings of an observer on a record, or of a controller on uncertain plants."),
 }
+"""Command -> the module of this package where it is, and its line in `wfsobs --help`."""
 
 ENTRY_POINTS = "wfsobs.commands"
 """Group of entry points by which installed packages bring commands of their own."""
@@ -64,7 +55,7 @@ class Commands(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Return the command of this name."""
         if cmd_name in COMMANDS:
-            return getattr(import_module(f"wfsobs.cli.{COMMANDS[cmd_name].module}"), cmd_name.replace("-", "_"))
+            return getattr(import_module(f"wfsobs.cli.{COMMANDS[cmd_name][0]}"), cmd_name.replace("-", "_"))
         if (point := _entries().get(cmd_name)) is not None:
             try:
                 return point.load()
@@ -78,7 +69,7 @@ class Commands(click.Group):
         """Write the list of commands, without importing them."""
         lines = {name: f"Of the package {point.module.partition('.')[0]}." for name, point in _entries().items()}
         with formatter.section("Commands"):
-            formatter.write_dl(sorted((lines | {name: place.help for name, place in COMMANDS.items()}).items()))
+            formatter.write_dl(sorted((lines | {name: text for name, (_, text) in COMMANDS.items()}).items()))
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command."""
@@ -101,7 +92,7 @@ def _entries() -> dict[str, EntryPoint]:
     return {point.name: point for point in entry_points(group=ENTRY_POINTS)}
 
 
-@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "show_default": True})
 @click.version_option(__version__, prog_name="wfsobs")
 def main() -> None:
     """Disturbance observers for adaptive optics: turbulence and vibration from wavefront-sensor data."""

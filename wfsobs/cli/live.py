@@ -27,6 +27,7 @@ from wfsobs.live.attached import StreamSource
 from wfsobs.live.checks import can_control, check_slot, observers_on
 from wfsobs.live.crew import USUAL
 from wfsobs.live.follow import follow
+from wfsobs.live.loop import LiveOrder
 from wfsobs.live.programme import acts_of
 from wfsobs.live.recording import open_loop_record, record_of
 from wfsobs.live.replay import Replay
@@ -57,15 +58,13 @@ from wfsobs.units import micrometres_per
 @observer_option
 @controller_option("Run this controller alone beside it; can be repeated.")
 @click.option("--no-controllers", is_flag=True, help="Run no controller beside it.")
-@click.option("--speed", type=click.FloatRange(0.1, 20), default=1.0, metavar="X", help="1 is real time, the default.")
+@click.option("--speed", type=click.FloatRange(0.1, 20), default=1.0, metavar="X", help="1 is real time.")
 @click.option("--record", "record_file", metavar="RECORD", help="Also save what was sent, in the format of its ending.")
 @click.option("--log", "log_file", metavar="FILE", help="Append what happens and alarms, a line each.")
-@click.option(
-    "--port", type=click.IntRange(0, 65535), default=5006, show_default=True, help="Port of the page; 0 for a free one."
-)
+@click.option("--port", type=click.IntRange(0, 65535), default=5006, help="Port of the page; 0 for a free one.")
 @click.option("--open", "open_browser", is_flag=True, help="Open a browser.")
 @click.option("--headless", is_flag=True, help="Run without a page, for --seconds, and print a table.")
-@click.option("--seconds", type=click.FloatRange(0.01, 86_400), default=10.0, metavar="N", help="Duration; by default 10.")
+@click.option("--seconds", type=click.FloatRange(0.01, 86_400), default=10.0, metavar="N", help="Duration.")
 @json_option("Print one JSON object instead of a table.")
 def live(
     scenario: Scenario,
@@ -103,17 +102,8 @@ def live(
     acts_of(scenario)
     if ngs is not None:
         source = _with_ngs(source, scenario, ngs, ngs_modes, declaration.unit or "um", ngs_lag)
-    names = tuple(observers or observers_on(source, scenario))
-    if headless:
-        _run_headless(source, scenario, names, speed, seconds, record_file, log_file, as_json)
-        return
     usual = tuple(name for name in USUAL if can_control(name, source))
     beside = () if no_controllers else controllers or usual
-    for name in (*names, *beside):
-        check_slot(name)
-    with needing("live: the page needs", "app"):
-        from wfsobs.app import serve as server
-        from wfsobs.live.loop import LiveOrder
     addresses = {
         "in": stream,
         "modes": modes,
@@ -125,7 +115,7 @@ def live(
     order = LiveOrder(
         source,
         scenario,
-        names,
+        tuple(observers or observers_on(source, scenario)),
         speed,
         beside,
         key="live",
@@ -134,6 +124,13 @@ def live(
         preset=preset_of_command(),
         options=tuple(word for name, value in addresses.items() if stream and value for word in (f"--{name}", str(value))),
     )
+    if headless:
+        _run_headless(order, seconds, as_json)
+        return
+    for name in (*order.observers, *beside):
+        check_slot(name)
+    with needing("live: the page needs", "app"):
+        from wfsobs.app import serve as server
     server.serve(server.Options(port=port, open_browser=open_browser, runs=max(2, cpu_count() or 1)), order)
 
 
@@ -172,18 +169,10 @@ def _say(line: str) -> None:
     print_note(f"live: {line}")
 
 
-def _run_headless(
-    source: LiveSource,
-    scenario: Scenario,
-    observers: tuple[str, ...],
-    speed: float,
-    seconds: float,
-    record_file: str | None,
-    log_file: str | None,
-    as_json: bool,
-) -> None:
+def _run_headless(order: LiveOrder, seconds: float, as_json: bool) -> None:
     kept: list[LiveFrame] = []
-    n_frames = max(1, round(seconds / source.sampling.dt * speed))
+    source, scenario = order.source, order.scenario
+    n_frames = max(1, round(seconds / source.sampling.dt * order.speed))
     if isinstance(source, Replay):
         n_frames = min(n_frames, source.record.n_steps)
     try:
@@ -191,20 +180,20 @@ def _run_headless(
             result = follow(
                 scenario,
                 n_frames,
-                observers,
+                order.observers,
                 source=source,
-                speed=speed,
-                keep=kept.append if record_file else None,
+                speed=order.speed,
+                keep=kept.append if order.record_file else None,
                 report=watch.progress,
                 say=_say if isinstance(source, StreamSource) else lambda _: None,
-                log_file=log_file or "",
+                log_file=order.log_file,
             )
     finally:  # what has been sent is there, whatever has ended it
-        if record_file and kept:
+        if kept:
             frames = LiveFrame(*(np.array(part) for part in zip(*kept, strict=True)))
             is_simulated = isinstance(source, SimulatedLoop)
             record = record_of(frames, scenario) if is_simulated else open_loop_record(frames, source.sampling)
-            save_record(record_file, record, configfile.to_toml(scenario.before_events))
+            save_record(order.record_file, record, configfile.to_toml(scenario.before_events))
     if as_json:
         print_json(result)
         return

@@ -24,6 +24,9 @@ from wfsobs.telemetry.intake import LONGEST_DELAY, DeclaredFormat
 from wfsobs.telemetry.records import open_record, read_loop_matrix, read_with_delay
 from wfsobs.units import UNITS, micrometres_per
 
+POSITIVE = click.FloatRange(0, min_open=True)
+"""Type of options that take a number above 0."""
+
 
 def add_options(command: Callable, *options: Callable) -> Callable:
     """Return a command with options, the last one first in its help."""
@@ -63,12 +66,10 @@ def uncertainty_options(command: Callable) -> Callable:
     below_1 = click.FloatRange(0, 1, max_open=True)
     return add_options(
         with_uncertainty,
-        click.option("--resonance", type=below_1, default=0.1, show_default=True, help="Of `plant.resonance`."),
-        click.option("--rotation", type=click.FloatRange(0, 180), default=10.0, show_default=True, help="Of the rotation [deg]."),
-        click.option("--gain", type=below_1, default=0.2, show_default=True, help="Of the gain."),
-        click.option(
-            "--delay", type=click.FloatRange(0), default=0.5, show_default=True, help="Largest error of the delay [frames]."
-        ),
+        click.option("--resonance", type=below_1, default=0.1, help="Of `plant.resonance`."),
+        click.option("--rotation", type=click.FloatRange(0, 180), default=10.0, help="Of the rotation [deg]."),
+        click.option("--gain", type=below_1, default=0.2, help="Of the gain."),
+        click.option("--delay", type=click.FloatRange(0), default=0.5, help="Largest error of the delay [frames]."),
     )
 
 
@@ -126,7 +127,6 @@ def ngs_options(command: Callable) -> Callable:
             "--ngs-lag",
             type=click.IntRange(0, 999),
             default=0,
-            show_default=True,
             metavar="L",
             help="LGS frames between the end of an NGS exposure and the NGS frame.",
         ),
@@ -183,11 +183,11 @@ def record_options(command: Callable) -> Callable:
         click.option(
             "--reconstructor", metavar="FILE[:NAME]", help="Matrix from slopes to modes, where the measurements are slopes."
         ),
-        click.option("--rate", type=click.FloatRange(0, min_open=True), metavar="HZ", help="Rate of rows without time stamps."),
+        click.option("--rate", type=POSITIVE, metavar="HZ", help="Rate of rows without time stamps."),
         click.option("--open-loop", is_flag=True, help="The mirror was at rest; commands are not needed, and not used."),
         click.option(
             "--rail",
-            type=click.FloatRange(0, min_open=True),
+            type=POSITIVE,
             metavar="U",
             help="Largest command that the mirror follows, in the unit of the commands.",
         ),
@@ -227,7 +227,7 @@ def training_options(command: Callable) -> Callable:
         command,
         click.option(
             "--train-until",
-            type=click.FloatRange(0, min_open=True),
+            type=POSITIVE,
             metavar="S",
             help="Train on the first S seconds of the record; estimates and scores begin after them.",
         ),
@@ -258,7 +258,7 @@ def load_declared(record_file: str, scenario: Scenario, declaration: DeclaredFor
 
 
 def load_with_delay(
-    record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None = None
+    record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None
 ) -> tuple[Record, float]:
     """As `load_declared`, and the delay of the commands with its fraction [steps]."""
     with open_record(record_file, sha256) as (file, name):

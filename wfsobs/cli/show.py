@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from wfsobs.evaluation.budget import TERMS, Budget, budget_row, error_budget
+from wfsobs.evaluation.budget import TERMS, Budget
 from wfsobs.evaluation.evidence import Evidence, seeds_interval
 from wfsobs.evaluation.recovery import PooledRms, Recovery, recovery, running_rms
 from wfsobs.evaluation.result import Result
@@ -165,7 +165,8 @@ def score_table(rows: Sequence[Row]) -> Table:
     several = len({r["seed"] for r in rows}) > 1
     unknown = any(r["target"] == RESIDUAL for r in rows)
     title, base = ("One-step prediction error of z, and residual,", "z") if unknown else ("RMS error", "truth")
-    bounds = {_group(r): r["rms_um"] for r in rows if r["observer"] in NOT_OBSERVERS}
+    groups = grouped_rows(rows, "target", "mode", "observer")
+    bounds = {key: same[-1]["rms_um"] for key, same in groups.items() if key[2] in NOT_OBSERVERS}
     bounded = ("to limit",) if any(own_bound(r["observer"]) in {name for *_, name in bounds} for r in rows) else ()
     stated = ("sigma, nm",) if any(r["sd_um"] for r in rows) else ()
     numbers = ("error, nm", "95 %, nm", *bounded, *stated, f"{base}, nm", f"error / {base}", "lag, ms", "us / step")
@@ -175,9 +176,15 @@ def score_table(rows: Sequence[Row]) -> Table:
         title=f"{title} after warm-up" + (", mean over seeds" if several else ""),
         caption=_caption(rows),
     )
+    targets, modes = (*SCORED, PREDICTION, RESIDUAL), list(dict.fromkeys(r["mode"] for r in rows))
+
+    def place(group: tuple[tuple[str, ...], list[Row]]) -> tuple:
+        """Turbulence, vibration, then both together; modes as they come, best observer first, those that stand apart last."""
+        (target, mode, _), same = group
+        return targets.index(target), modes.index(mode), any(r["apart"] for r in same), _mean_and_interval(same)[0]
+
     last = None
-    for target, mode, observer in sorted({_group(r) for r in rows}, key=_order(rows)):
-        same = [r for r in rows if _group(r) == (target, mode, observer)]
+    for (target, mode, observer), same in sorted(groups.items(), key=place):
         error, interval = _mean_and_interval(same)
         above = above_bound(error, interval, bounds.get((target, mode, own_bound(observer) or "")))
         if last != (target, mode):
@@ -202,8 +209,12 @@ def score_table(rows: Sequence[Row]) -> Table:
     return table
 
 
-def _group(row: Row) -> tuple[str, str, str]:
-    return row["target"], row["mode"], row["observer"]
+def grouped_rows(rows: Sequence[Row], *keys: str) -> dict[tuple[str, ...], list[Row]]:
+    """Return rows by the values of some of their keys, in the order in which these come."""
+    out: dict[tuple[str, ...], list[Row]] = {}
+    for row in rows:
+        out.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return out
 
 
 def _mean_and_interval(same: Sequence[Row]) -> tuple[float, Sequence[float] | None]:
@@ -215,9 +226,7 @@ def _mean_and_interval(same: Sequence[Row]) -> tuple[float, Sequence[float] | No
 
 def _caption(rows: Sequence[Row]) -> str:
     """Return the interval of the scored samples, target by target where they differ."""
-    found = {
-        target: scored_interval(r for r in rows if r["target"] == target) for target in dict.fromkeys(r["target"] for r in rows)
-    }
+    found = {target: scored_interval(same) for (target,), same in grouped_rows(rows, "target").items()}
     spans = {span for span in found.values() if span}
     if len(spans) > 1:
         return "Scored: " + "; ".join(f"{target} {span}" for target, span in found.items() if span)
@@ -230,29 +239,18 @@ def median_text(same: Sequence[Row], key: str, digits: int, scale: float = 1.0) 
     return f"{median(values):.{digits}f}" if values else "-"
 
 
-def _order(rows: Sequence[Row]):
-    """Turbulence, vibration, then both together; modes as they come, best observer first, those that stand apart last."""
-    modes = list(dict.fromkeys(r["mode"] for r in rows))
-    targets = (*SCORED, PREDICTION, RESIDUAL)
-
-    def key(group: tuple[str, str, str]) -> tuple:
-        same = [r for r in rows if _group(r) == group]
-        return targets.index(group[0]), modes.index(group[1]), any(r["apart"] for r in same), _mean_and_interval(same)[0]
-
-    return key
-
-
 def budget_table(budgets: Sequence[Budget]) -> Table:
     """Return the table of terms, their shares of the total, and the bound; the smallest error of a target and mode first."""
+    missing = dict.fromkeys((row_label(b.observer), b.reason) for b in budgets if b.reason)
     out = new_table(
         ("Target", "Mode", "Observer"),
         title="Error budget: parts of the mean square error, nm^2, and their shares",
-        caption=_reasons(budgets),
+        caption="; ".join(f"{label}: none, {reason}" for label, reason in missing),
     )
     for name in ("error, nm", "nm^2", *TERMS.values(), "limit, nm^2"):
         out.add_column(name, justify="right")
-    last = None
-    for it in sorted((b for b in budgets if b.terms), key=lambda b: (SCORED.index(b.target), _mode_order(budgets, b), b.total)):
+    last, modes = None, list(dict.fromkeys(b.mode for b in budgets))
+    for it in sorted((b for b in budgets if b.terms), key=lambda b: (SCORED.index(b.target), modes.index(b.mode), b.total)):
         if last != (it.target, it.mode):
             out.add_section()
         last = (it.target, it.mode)
@@ -260,16 +258,6 @@ def budget_table(budgets: Sequence[Budget]) -> Table:
         bound = "-" if it.bound is None else f"{it.bound * 1e6:.1f}"
         out.add_row(*last, row_label(it.observer), f"{sqrt(it.total) * 1e3:.2f}", f"{it.total * 1e6:.1f}", *cells, bound)
     return out
-
-
-def _mode_order(budgets: Sequence[Budget], budget: Budget) -> int:
-    return list(dict.fromkeys(b.mode for b in budgets)).index(budget.mode)
-
-
-def _reasons(budgets: Sequence[Budget]) -> str:
-    """Return which observers have no budget, and why."""
-    missing = dict.fromkeys((row_label(b.observer), b.reason) for b in budgets if b.reason)
-    return "; ".join(f"{label}: none, {reason}" for label, reason in missing)
 
 
 def _one_digit(x: float) -> str:
@@ -283,14 +271,6 @@ def show(all_rows: list[Row], as_json: bool) -> None:
         print_json([{k: v for k, v in row.items() if k != TIME} for row in all_rows])
     else:
         show_table(score_table(all_rows))
-
-
-def show_over_time(history: OverTime, as_json: bool) -> None:
-    """Print the error against time, as JSON or as a table."""
-    if as_json:
-        print_json(history.rows)
-    else:
-        show_table(history.table())
 
 
 def new_table(texts: Sequence[str], numbers: Sequence[str] = (), *, no_wrap: bool = True, **options: Any) -> Table:
@@ -322,25 +302,6 @@ def show_verdicts(
     for it in found:
         if it is not None:
             click.echo("\n" + "\n".join(f"{'  ' * bool(i)}{line}" for i, line in enumerate(it.sentences())))
-
-
-def find_budgets(result: Result, observers: Sequence[str] | None) -> list[Budget]:
-    """Return the error budgets of a run, under a progress bar."""
-    with progress_bar("error budget") as watch:
-        return error_budget(result, observers=observers, watch=watch)
-
-
-def add_budgets(all_rows: list[Row], budgets: Sequence[Budget]) -> list[Row]:
-    """Return the rows of one run with their error budgets, where there are any."""
-    found = {(b.observer, b.target, b.mode): budget_row(b) for b in budgets}
-    return [row | {"budget": found.get((row["observer"], row["target"], row["mode"]))} for row in all_rows] if found else all_rows
-
-
-def show_budgets(budgets: Sequence[Budget]) -> None:
-    """Print error budgets as a table."""
-    if budgets:
-        click.echo()
-        show_table(budget_table(budgets))
 
 
 def print_note(line: str) -> None:

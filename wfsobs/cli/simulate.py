@@ -1,4 +1,4 @@
-"""`wfsobs run` and `wfsobs loop`: simulate."""
+"""`wfsobs run`, `wfsobs loop` and `wfsobs envelope`: simulate."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from rich.table import Table
 
 from wfsobs.cli.options import (
+    POSITIVE,
     controller_option,
     json_option,
     load_declared,
@@ -24,16 +25,14 @@ from wfsobs.cli.options import (
 )
 from wfsobs.cli.show import (
     OverTime,
-    add_budgets,
-    find_budgets,
+    budget_table,
+    grouped_rows,
     median_text,
     new_table,
     print_json,
     print_note,
     progress_bar,
     show,
-    show_budgets,
-    show_over_time,
     show_table,
     show_verdicts,
     warn,
@@ -43,6 +42,7 @@ from wfsobs.closed_loop.envelope import POINTS, PlantEnvelope, Uncertainty, plan
 from wfsobs.closed_loop.rows import LIMITED, label, linear, no_theory
 from wfsobs.closed_loop.rows import rows as loop_rows
 from wfsobs.closed_loop.run import closed_loop
+from wfsobs.evaluation.budget import Budget, budget_row, error_budget
 from wfsobs.evaluation.evidence import FEWEST, gather_evidence, seeds_interval
 from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.rows import Row, interval_text, score_rows
@@ -72,9 +72,16 @@ def loop_table(rows: Sequence[Row]) -> Table:
         numbers,
         title="Residual in closed loop after warm-up" + (", mean over seeds" if several else ""),
     )
+    modes = list(dict.fromkeys(r["mode"] for r in rows))
+
+    def place(group: tuple[tuple[str, ...], list[Row]]) -> tuple:
+        """Modes as they come, least residual first, what has none last."""
+        (mode, _), same = group
+        left = [r["residual_rms_nm"] for r in same]
+        return modes.index(mode), mean(float("inf") if x is None else x for x in left)
+
     last = None
-    for mode, controller in sorted({(r["mode"], r["controller"]) for r in rows}, key=_order(rows)):
-        same = [r for r in rows if (r["mode"], r["controller"]) == (mode, controller)]
+    for (mode, controller), same in sorted(grouped_rows(rows, "mode", "controller").items(), key=place):
         if last != mode:
             out.add_section()
         last = mode
@@ -112,17 +119,6 @@ def _margins(row: Row) -> str:
     return "-" if phase is None else f"{'-' if gain is None else f'{gain:.1f}'} dB, {phase:.0f}°"
 
 
-def _order(rows: Sequence[Row]):
-    """Modes as they come, least residual first, what has none last."""
-    modes = list(dict.fromkeys(r["mode"] for r in rows))
-
-    def key(group: tuple[str, str]) -> tuple:
-        left = [r["residual_rms_nm"] for r in rows if (r["mode"], r["controller"]) == group]
-        return modes.index(group[0]), mean(float("inf") if x is None else x for x in left)
-
-    return key
-
-
 @click.command()
 @scenario_options
 @observer_option
@@ -132,7 +128,7 @@ def _order(rows: Sequence[Row]):
 @click.option("--vibration-psd", metavar="FILE", help="Vibration with the spectrum of a CSV or FITS file (docs/data.md).")
 @click.option(
     "--over-time",
-    type=click.FloatRange(0, min_open=True),
+    type=POSITIVE,
     metavar="SECONDS",
     help="Print the running error over this time against time (docs/events.md).",
 )
@@ -181,16 +177,25 @@ def run(
             # Of the others the scores are enough.
             results.append(replace(result, record=results[0].record, estimates=()) if results else result)
     if history:
-        show_over_time(history, as_json)
+        if as_json:
+            print_json(history.rows)
+        else:
+            show_table(history.table())
         return
     for name in sorted(set(budget_of) - {e.observer for e in results[0].estimates}):
         print_note(f"--budget-of {name}: it did not run")
-    budgets = find_budgets(results[0], budget_of or None) if budget or budget_of else []
-    all_rows = [row for it in results for row in score_rows(it.scores, it.scenario.run.seed)]
-    show(add_budgets(all_rows, budgets), as_json)
+    budgets, all_rows = list[Budget](), [row for it in results for row in score_rows(it.scores, it.scenario.run.seed)]
+    if budget or budget_of:
+        with progress_bar("error budget") as watch:
+            budgets = error_budget(results[0], observers=budget_of or None, watch=watch)
+    if found := {(b.observer, b.target, b.mode): budget_row(b) for b in budgets}:
+        all_rows = [row | {"budget": found.get((row["observer"], row["target"], row["mode"]))} for row in all_rows]
+    show(all_rows, as_json)
     if not as_json and seeds not in range(2, FEWEST):
         show_verdicts(results[0], budgets, gather_evidence([it.scores for it in results]), is_simulated=True)
-        show_budgets(budgets)
+        if budgets:
+            click.echo()
+            show_table(budget_table(budgets))
 
 
 @click.command()
@@ -254,9 +259,9 @@ def envelope_table(result: PlantEnvelope) -> Table:
         title=f"Residual over {len(result.errors['delay'])} plants: {result.ranges}",
     )
     rows = result.rows()
-    for mode in dict.fromkeys(r["mode"] for r in rows):
+    for (mode,), same in grouped_rows(rows, "mode").items():
         out.add_section()
-        for r in sorted((r for r in rows if r["mode"] == mode), key=lambda r: r["nominal_rms_nm"] or float("inf")):
+        for r in sorted(same, key=lambda r: r["nominal_rms_nm"] or float("inf")):
             left = [r[f"{name}_rms_nm"] for name in ("nominal", "mean", "p95", "worst")]
             share = "{:.1f} ({:.1f} to {:.1f})".format(*(100.0 * r[f"unstable_{k}"] for k in ("share", "low", "high")))
             shown = ["unstable" if x is None else f"{x:.2f}" for x in left]
@@ -277,12 +282,11 @@ def envelope_table(result: PlantEnvelope) -> Table:
 @click.command()
 @scenario_options
 @controller_option("Of this controller alone; can be repeated.")
-@click.option("--points", type=click.IntRange(1, 100_000), default=POINTS, show_default=True, metavar="N", help="Plants.")
+@click.option("--points", type=click.IntRange(1, 100_000), default=POINTS, metavar="N", help="Plants.")
 @click.option(
     "--simulate",
     "simulation_points",
     type=click.IntRange(1, POINTS),
-    default=None,
     metavar="N",
     help="Others too, at N plants and corners.",
 )
@@ -303,7 +307,6 @@ def envelope(
     if simulation_points and is_tuned:
         raise SettingError("--simulate: not with --tune, which is by theory")
     with progress_bar("controllers") as watch:
-        watch = watch
         if is_tuned:
             result = tuned_envelope(scenario, controllers=names, goal=EnvelopeGoal(uncertainty), points=points, watch=watch)
         else:

@@ -33,7 +33,6 @@ from wfsobs.scenario import Scenario
     "--seeds",
     type=click.IntRange(1, MOST_SEEDS),
     default=4,
-    show_default=True,
     metavar="N",
     help=f"Seeds of every scenario; no difference is significant with fewer than {FEWEST}.",
 )

@@ -11,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from wfsobs.cli.options import (
+    POSITIVE,
     controller_option,
     json_option,
     load_declared,
@@ -133,15 +134,13 @@ def observe(
     "--level",
     type=click.FloatRange(0, 0.5, min_open=True),
     default=LEVEL,
-    show_default=True,
     metavar="P",
     help="Probability of finding any peak where there is none.",
 )
 @click.option(
     "--lowest",
-    type=click.FloatRange(0, min_open=True),
+    type=POSITIVE,
     default=LOWEST,
-    show_default=True,
     metavar="HZ",
     help="Minimum frequency of a peak.",
 )
@@ -241,11 +240,8 @@ def promise(
     as_json: bool,
 ) -> None:
     """State what controllers will leave of a loop, before one of them is switched on (docs/trust.md)."""
-    record, later = (
-        None if name is None else load_declared(name, scenario, declaration.as_commanded, sha)
-        for name, sha in ((record_file, sha256), (after, None))
-    )
-    assert record is not None
+    record = load_declared(record_file, scenario, declaration.as_commanded, sha256)
+    later = None if after is None else load_declared(after, scenario, declaration.as_commanded)
     with progress_bar("controllers") as watch:
         result = make_promise(record, scenario, controllers=controllers or None, watch=watch)
     found = None if later is None else result.left_in(later)
@@ -262,11 +258,8 @@ def promise(
         shares = (f"{100.0 * share:.0f}" for share in (one.stable_share, one.better_share))
         ends = [*shares, "yes" if one.switch_on else f"no{one.note and ': '}{one.note}"]
         for mode, name in enumerate(m.name for m in result.scenario.modes):
-            text = (
-                ""
-                if one.rms is None or one.low is None or one.high is None
-                else (f"{1e3 * one.rms[mode]:.2f} ({1e3 * one.low[mode]:.2f} to {1e3 * one.high[mode]:.2f})")
-            )
+            numbers = [1e3 * rms[mode] for rms in (one.rms, one.low, one.high) if rms]
+            text = "{:.2f} ({:.2f} to {:.2f})".format(*numbers) if numbers else ""
             table.add_row(*((label(one.controller), name, text, *ends) if not mode else ("", name, text)))
     show_table(table)
     if found is not None:
@@ -277,10 +270,10 @@ def promise(
 
 @click.command()
 @scenario_options
-@click.option("--seconds", type=click.FloatRange(1.0, 1e4), default=20.0, show_default=True, help="How long it lasts.")
-@click.option("--delay", type=click.FloatRange(1e-4, 1.0), default=0.03, show_default=True, help="Error of the delay, frames.")
-@click.option("--gain", type=click.FloatRange(1e-4, 1.0), default=0.02, show_default=True, help="Error of the gain.")
-@click.option("--rotation", type=click.FloatRange(1e-3, 90.0), default=1.0, show_default=True, help="Error of it, degrees.")
+@click.option("--seconds", type=click.FloatRange(1.0, 1e4), default=20.0, help="How long it lasts.")
+@click.option("--delay", type=click.FloatRange(1e-4, 1.0), default=0.03, help="Error of the delay, frames.")
+@click.option("--gain", type=click.FloatRange(1e-4, 1.0), default=0.02, help="Error of the gain.")
+@click.option("--rotation", type=click.FloatRange(1e-3, 90.0), default=1.0, help="Error of it, degrees.")
 @click.option("--out", metavar="PROBE.npz", help="Save its commands, `probe` (steps, modes) [um], with `dt` [s].")
 @json_option("Print JSON instead of a line.")
 def probe(scenario: Scenario, seconds: float, delay: float, gain: float, rotation: float, out: str | None, as_json: bool) -> None:

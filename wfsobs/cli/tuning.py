@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import click
 import numpy as np
 from rich.table import Table
 
-from wfsobs.cli.options import json_option, load_declared, record_options, scenario_options, uncertainty_options
+from wfsobs.cli.options import POSITIVE, json_option, load_declared, record_options, scenario_options, uncertainty_options
 from wfsobs.cli.show import new_table, print_json, progress_bar, show_table
 from wfsobs.closed_loop.envelope import Uncertainty
 from wfsobs.control.controllers import CONTROLLERS
@@ -40,15 +40,21 @@ def errors_table(result: TuningResult) -> Table:
         ("validation, before", "after", "test, before", "after"),
         title=f"{result.measure}{'' if result.target == PREDICTION else f' in {result.target}'}, nm",
     )
-    stages = (result.before, result.after)
-    cells = [s.validation for s in stages] + [s.test for s in stages]
-    for mode in next(e for e in cells if e).modes:
-        out.add_row(mode, *(nm(e.modes[mode]) if e else "fails" for e in cells))
-    out.add_section()
-    out.add_row("rms over modes", *(nm(e.rms) if e else "fails" for e in cells))
-    if any(s.other for s in stages):
-        out.add_row("in the other target", "", "", *(nm(s.other.rms) if s.other else "fails" for s in stages))
+    rows = report.tuning_rows(result)
+    validation, test, other = (
+        [row[1:] for row in rows if row[0] == section] for section in (report.VALIDATION, report.TEST, report.OTHER)
+    )
+    for (name, *searched), (_, *tested) in zip(validation, test, strict=True):
+        if name == report.TOGETHER:
+            out.add_section()
+        out.add_row(name, *map(_error, (*searched, *tested)))
+    for _, *tested in other:
+        out.add_row("in the other target", "", "", *map(_error, tested))
     return out
+
+
+def _error(rms: Any) -> str:
+    return "fails" if rms is None else nm(rms)
 
 
 def spreads_table(result: TuningResult) -> Table:
@@ -76,14 +82,12 @@ LINEAR = [c.id for c in CONTROLLERS.values() if c.tunable.usual]
     "--by",
     type=click.Choice(["worst", "p95"]),
     default="worst",
-    show_default=True,
     help="Residual that --envelope minimises.",
 )
 @click.option(
     "--loss",
     type=click.FloatRange(0),
     default=EnvelopeGoal.loss,
-    show_default=True,
     help="How much more --envelope may leave at the nominal plant.",
 )
 @scenario_options
@@ -101,13 +105,12 @@ LINEAR = [c.id for c in CONTROLLERS.values() if c.tunable.usual]
     "--evaluations",
     type=click.IntRange(1, 10_000),
     default=EVALUATIONS,
-    show_default=True,
     metavar="N",
     help="Maximum runs of the observer.",
 )
 @click.option(
     "--validation",
-    type=click.FloatRange(0, min_open=True),
+    type=POSITIVE,
     metavar="S",
     help="Length of the validation record; by default that of the scenario.",
 )

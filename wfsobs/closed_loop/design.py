@@ -107,7 +107,7 @@ def design(scenario: Scenario, controllers: Sequence[str] | None = None, start: 
         laws[name] = tuple(replace(one, predicted_rms=None, margins=None) for one in made[name][0])
     if scenario.events or (actual is not None and actual.start):
         laws = {name: tuple(replace(one, predicted_rms=None) for one in designed) for name, designed in laws.items()}
-        return Design(scenario, plant, laws, {}, priors, max(scenario.run.warm_up, start), actual)
+        true = []
     given = ("lgs", "both") if true else ()
     bounds = {INFORMATION[of]: tuple(least_residual(one, delay, of) for one in true) for of in given}
     return Design(scenario, plant, laws, bounds, priors, max(scenario.run.warm_up, start), actual)

@@ -305,6 +305,10 @@ def plant_envelope(
     names.sort(key=lambda name: not CONTROLLERS[name].is_linear)
     spreads, notes = dict[str, Spread](), dict[str, str]()
     first = replace(plants, points=plants.points[:simulation_points])
+
+    def found() -> PlantEnvelope:
+        return PlantEnvelope(scenario, of, errors, corners, tuple(spreads.values()), dict(notes))
+
     for i, name in enumerate(names):
         watch.check()
         try:
@@ -312,15 +316,15 @@ def plant_envelope(
                 for spread in simulated_spreads(name, scenario, first, watch.part(i / len(names), 1.0 / len(names))):
                     spreads[name] = spread
                     if on_spread:
-                        on_spread(PlantEnvelope(scenario, of, errors, corners, tuple(spreads.values()), dict(notes)))
+                        on_spread(found())
             else:
                 spreads[name] = spread_of(name, scenario, plants, spectra, watch)
         except ValueError as error:
             notes[name] = str(error)
         watch.step((i + 1) / len(names))
         if on_spread:
-            on_spread(PlantEnvelope(scenario, of, errors, corners, tuple(spreads.values()), dict(notes)))
-    return PlantEnvelope(scenario, of, errors, corners, tuple(spreads.values()), notes)
+            on_spread(found())
+    return found()
 
 
 def with_laws(controllers: Sequence[str] | None) -> list[str]:
@@ -356,7 +360,7 @@ def uncertain_plants(
     return errors, corners, Plants(base, plants(errors), plants(corners))
 
 
-def spread_of(name: str, scenario: Scenario, plants: Plants, spectra: Sequence[TrueSpectra], watch: Watch = QUIET) -> Spread:
+def spread_of(name: str, scenario: Scenario, plants: Plants, spectra: Sequence[TrueSpectra], watch: Watch) -> Spread:
     """Return what a controller leaves of these plants. Raises ValueError saying why it cannot, Cancelled."""
     controller, told = CONTROLLERS[name], [told_spectra(one) for one in spectra]
     if controller.law is None or controller.predict is not None:
@@ -370,7 +374,7 @@ def spread_of(name: str, scenario: Scenario, plants: Plants, spectra: Sequence[T
     return Spread(name, left[0], left[1:end], left[end:], scenario.control.caution)
 
 
-def simulated_spreads(name: str, scenario: Scenario, plants: Plants, watch: Watch = QUIET) -> Iterator[Spread]:
+def simulated_spreads(name: str, scenario: Scenario, plants: Plants, watch: Watch) -> Iterator[Spread]:
     """Yield what a controller leaves of these plants in one record, the points one by one. Raises ValueError, Cancelled."""
     believed = scenario.replace({f"plant.{key}": value for key, value in type(scenario)().plant.to_dict().items()})
     plan, record = design(believed, [name]), simulate(believed, watch=watch.silent)

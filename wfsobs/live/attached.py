@@ -142,7 +142,7 @@ class StreamSource:
 
     def staff(self, context: SpawnContext, desk: Desk) -> Staff:
         """Return its process."""
-        return Staff(context.Process(target=_send, args=(self, desk), name="the source", daemon=True), [], [])
+        return Staff(context.Process(target=_send, args=(self, desk), name="the source", daemon=True))
 
 
 def _send(source: StreamSource, desk: Desk) -> None:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from multiprocessing.shared_memory import SharedMemory
 from threading import Lock
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wfsobs.live.ring import LATE, Ring, Rows, merged_rows
+from wfsobs.live.ring import LATE, Ring, Rows, SharedNumbers, merged_rows
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import TOTAL
@@ -90,7 +88,7 @@ class Counts(NamedTuple):
         return float(np.sqrt(self.squares[at].sum() / n)) if n else float("nan")
 
 
-class Board:
+class Board(SharedNumbers):
     """The counts of all observers.
 
     Parameters
@@ -120,8 +118,7 @@ class Board:
     def __init__(self, n_modes: int, name: str | None = None):
         n, scored, bins = len(SLOTS), len(SCORED) * n_modes, len(EDGES) + 1
         size = 3 * len(CREWS) + n * (2 * scored + bins + 3)
-        self._memory = SharedMemory(name=name, create=name is None, size=8 * size if name is None else 0)
-        self._owner = name is None
+        super().__init__(8 * size, name)
         whole = np.ndarray(size, dtype=np.int64, buffer=self._memory.buf)
         self.losses, self.is_ready, self.progress = whole[: 3 * len(CREWS)].reshape(3, -1)
         slots, shape = whole[3 * len(CREWS) :].reshape(n, -1), (n, len(SCORED), n_modes)
@@ -140,11 +137,6 @@ class Board:
         counts = self.late[own], self.frames[own], self._since[own]
         return Counts(self.squares[slot], self.samples[slot], Latencies(self.histograms[slot]), *counts)
 
-    @property
-    def name(self) -> str:
-        """Name by which another process finds it."""
-        return self._memory.name
-
     def __getitem__(self, observer: str) -> Counts:
         return self._counts[observer]
 
@@ -157,10 +149,7 @@ class Board:
         self._counts = {name: counts.copy() for name, counts in self._counts.items()}
         self.losses, self.is_ready, self.progress = self.losses.copy(), self.is_ready.copy(), self.progress.copy()
         self.squares = self.samples = self.histograms = self.late = self.frames = self._since = np.empty(0, dtype=np.int64)
-        self._memory.close()
-        if self._owner:
-            with suppress(FileNotFoundError):  # as in `Rows.release`
-                self._memory.unlink()
+        super().release()
 
 
 class Delivery:

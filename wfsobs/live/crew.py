@@ -281,16 +281,14 @@ class Beside:
         As it is, its optical gain aside.
     rng : numpy.random.Generator
         Of delays and losses of commands.
-    supervision : Supervision, optional
-        When an integrator takes over.
+    supervision : Supervision or None
+        When an integrator takes over; None for never.
     """
 
     controller: StepController
     supervisor: SupervisedController | None
 
-    def __init__(
-        self, controller: StepController, plant: TruePlant, rng: np.random.Generator, supervision: Supervision | None = None
-    ):
+    def __init__(self, controller: StepController, plant: TruePlant, rng: np.random.Generator, supervision: Supervision | None):
         self.controller, self._rng = controller, rng
         self.supervisor = SupervisedController(controller, supervision) if supervision else None
         self._plant = plant

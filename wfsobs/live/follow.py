@@ -97,19 +97,18 @@ def follow(
 def _row(counts: Counts, targets: Sequence[str], modes: Sequence[str]) -> dict[str, Any]:
     """Return what is told of an observer."""
     both = [TOTAL] if set(targets) == set(TARGETS) else []
-    errors = {target: dict(zip(modes, map(_nanometres, counts.rms(target)), strict=True)) for target in (*targets, *both)}
+
+    def by_mode(quantity: str) -> dict[str, float | None]:
+        return {mode: _times(1e3, x) for mode, x in zip(modes, counts.rms(quantity), strict=True)}
+
     return {
         "p50_us": _times(1e6, counts.latencies.quantile(0.5)),
         "p99_9_us": _times(1e6, counts.latencies.quantile(0.999)),
         "late": int(counts.late[0]),
-        "rms_nm": _nanometres(counts.total_rms(targets)),
-        "errors_nm": errors,
-        "next_nm": dict(zip(modes, map(_nanometres, counts.rms(NEXT)), strict=True)),
+        "rms_nm": _times(1e3, counts.total_rms(targets)),
+        "errors_nm": {target: by_mode(target) for target in (*targets, *both)},
+        "next_nm": by_mode(NEXT),
     }
-
-
-def _nanometres(x: float) -> float | None:
-    return _times(1e3, x)
 
 
 def _times(factor: float, x: float) -> float | None:

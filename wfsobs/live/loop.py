@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from math import isnan
 from threading import Event, Lock, Thread
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import Any, Final, TypeVar
 from weakref import ReferenceType, finalize, ref
 
 import numpy as np
 
 from wfsobs.live.board import NEXT
 from wfsobs.live.checks import check_slot, check_speed, make_design
-from wfsobs.live.crew import Beside, ControlView
+from wfsobs.live.crew import ControlView
 from wfsobs.live.finding import Bounds, Change, Finding, bounds_of, identify_frames, peak_changes
 from wfsobs.live.processes import LiveProcesses
 from wfsobs.live.programme import Programme, scenario_on
@@ -26,7 +26,6 @@ from wfsobs.live.source import ALARM, FAILURE, SIMULATION, STREAM, LiveEvent, Li
 from wfsobs.live.view import LiveView, SharedView, read_view
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.step import StepObserver
 from wfsobs.record import Record, Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import to_toml
@@ -34,9 +33,6 @@ from wfsobs.settings.group import SettingError
 from wfsobs.stepping import sampling_of
 from wfsobs.telemetry.records import save_record
 from wfsobs.typing import Array
-
-if TYPE_CHECKING:
-    from wfsobs.live.processes import LiveProcesses
 
 T = TypeVar("T")
 
@@ -100,7 +96,13 @@ class Workshop:
             check_slot(name)
         settings = scenario.to_dict()
         for name in names:
-            self.do(make_design, name, settings, self._sampling, then=self._deliver)
+            self.do(
+                make_design,
+                name,
+                settings,
+                self._sampling,
+                then=lambda design: self._processes.tell({"id": design.id, "design": design}),
+            )
 
     def identify(self, record: Record, scenario: Scenario, names: Sequence[str]) -> None:
         """Identify a record, and design observers and controllers for what is found."""
@@ -121,12 +123,6 @@ class Workshop:
         """Have an identification as the last one."""
         self._findings = [*self._findings[-1:], finding]
         self.change = Change(self._findings)
-
-    def _deliver(self, design: StepObserver | Beside) -> None:
-        if isinstance(design, Beside):
-            self._processes.tell_controllers({"id": design.id, "design": design})
-        else:
-            self._processes.tell_observers({"id": design.id, "design": design})
 
 
 MISSING = 0.01
@@ -301,8 +297,14 @@ class LiveLoop:
     ------
     SettingError
         An observer is unknown or does not run frame by frame, or an event cannot be played.
+
+    Attributes
+    ----------
+    is_playing : bool
+        Whether frames come, or will once the observers are ready.
     """
 
+    is_playing: bool
     source: LiveSource
     readings: SharedView
 
@@ -314,12 +316,13 @@ class LiveLoop:
         self.source = source
         self.sampling: Final = source.sampling
         told = scenario_on(source, scenario)
-        self._speed, self._is_wanted, self._has_begun = check_speed(speed), False, False
+        self.speed: float = check_speed(speed)
+        self.is_playing, self._has_begun = False, False
         self.events: deque[LiveEvent] = deque(maxlen=MOST_EVENTS)
         self.controllers: set[str] = set()
         self._shadow: Shadow | None = None
         self._log_file, self.readings, self._tending = "", SharedView(), Lock()
-        self._processes = LiveProcesses(source, told.before_events, tuple(dict.fromkeys(observers)), self._speed, n_frames)
+        self._processes = LiveProcesses(source, told.before_events, tuple(dict.fromkeys(observers)), speed, n_frames)
         self.feed: Final = self._processes.feed
         self.board: Final = self._processes.board
         self.delivery: Final = self._processes.delivery
@@ -330,19 +333,9 @@ class LiveLoop:
         Thread(target=_keep, args=(ref(self), self._processes.is_over), daemon=True, name="wfsobs-live").start()
 
     @property
-    def is_playing(self) -> bool:
-        """Whether frames come, or will once the observers are ready."""
-        return self._is_wanted
-
-    @property
     def is_ready(self) -> bool:
         """Whether the observers are ready for the first frame."""
         return self._processes.are_ready
-
-    @property
-    def speed(self) -> float:
-        """Speed; 1 is real time."""
-        return self._speed
 
     @property
     def count(self) -> int:
@@ -361,13 +354,13 @@ class LiveLoop:
 
     def play(self) -> None:
         """Have frames come by the clock, once the observers are ready."""
-        self._is_wanted, self._has_begun = True, self.is_ready
+        self.is_playing, self._has_begun = True, self.is_ready
         if self._has_begun:
             self.feed.tell({"play": True})
 
     def pause(self) -> None:
         """Have no more frames come."""
-        self._is_wanted = False
+        self.is_playing = False
         self.feed.tell({"play": False})
 
     def step(self, frames: int = 1) -> None:
@@ -377,8 +370,8 @@ class LiveLoop:
 
     def set_speed(self, speed: float) -> None:
         """Set the speed. Raises SettingError."""
-        self._speed = check_speed(speed)
-        self.feed.tell({"speed": self._speed})
+        self.speed = check_speed(speed)
+        self.feed.tell({"speed": speed})
 
     def change(self, settings: Mapping[str, Any]) -> None:
         """Change settings, path -> value, of the simulation. Raises SettingError as `become` does."""
@@ -409,39 +402,29 @@ class LiveLoop:
         """Switch lasers and NGS sensor on and off, and lose a part of the frames."""
         self.programme.lose(lgs, ngs, loss)
 
-    def switch(self, observer: str, on: bool) -> None:
-        """Switch an observer off, or on with a design for the present settings. Raises SettingError."""
-        check_slot(observer)
+    def switch(self, name: str, on: bool) -> None:
+        """Switch an observer or a controller off, or on with a design for the present settings. Raises SettingError."""
+        check_slot(name)
         if on:
-            self.redesign([observer])
+            self.redesign([name])
         else:
-            self._processes.tell_observers({"id": observer, "design": None})
+            self._processes.tell({"id": name, "design": None})
 
     def control(self, controller: str, on: bool) -> None:
         """Switch a controller beside the loop off, or on with a design for the present settings. Raises SettingError."""
-        check_slot(controller)
-        if on:
-            self.controllers.add(controller)
-            self.redesign([controller])
-        else:
-            self.controllers.discard(controller)
-            self._processes.tell_controllers({"id": controller, "design": None})
+        self.switch(controller, on)
+        (self.controllers.add if on else self.controllers.discard)(controller)
 
-    def redesign(self, names: Sequence[str] | None = None, *, scenario: Scenario | None = None) -> None:
-        """Design observers and controllers anew beside the loop; each goes on where the one before is.
+    def redesign(self, names: Sequence[str] | None = None) -> None:
+        """Design observers and controllers, all that run or `names`, anew for the present settings.
 
-        Parameters
-        ----------
-        names : sequence of str, optional
-            Ids; by default of all that run.
-        scenario : Scenario, optional
-            What they are told; by default the present settings.
+        That is done beside the loop; each goes on where the one before is.
         """
-        self.workshop.redesign(self.running_ids() if names is None else names, scenario or self.scenario)
+        self.workshop.redesign(self.running_ids() if names is None else names, self.scenario)
 
-    def identify(self, names: Sequence[str] | None = None, *, seconds: float = MINUTE) -> None:
-        """Identify the last so many seconds beside the loop, and design all that run for it, or `names`. Raises SettingError."""
-        record = self.recorder.look_back(seconds, self.scenario)
+    def identify(self, names: Sequence[str] | None = None) -> None:
+        """Identify the last minute beside the loop, and design all that run for it, or `names`. Raises SettingError."""
+        record = self.recorder.look_back(MINUTE, self.scenario)
         self.workshop.identify(record, self.scenario, self.running_ids() if names is None else names)
 
     def running_ids(self) -> list[str]:
@@ -472,7 +455,7 @@ class LiveLoop:
     def tend(self) -> None:
         """Look after the processes; called a few times a second."""
         with self._tending:
-            if self._is_wanted and self.is_ready and not self._has_begun:
+            if self.is_playing and self.is_ready and not self._has_begun:
                 self._has_begun = True
                 self.feed.tell({"play": True})
             self.programme.play(self.newest * self.sampling.dt)

@@ -14,7 +14,7 @@ from threading import Event, Lock, RLock
 from time import monotonic, sleep
 from typing import Any, Final
 
-from wfsobs.live.board import CREWS, Board, Delivery, crew_of, trace_width
+from wfsobs.live.board import CREWS, SLOTS, Board, Delivery, crew_of, trace_width
 from wfsobs.live.crew import ROOM, ControlView, ObserverCrew, Site, control_frames, row_width, warm_up_of
 from wfsobs.live.ring import LiveFrame, Ring, Rows, Tracker, merged_rows
 from wfsobs.live.source import (
@@ -211,9 +211,7 @@ class LiveProcesses:
     is_over: Event
     board: Board
 
-    def __init__(
-        self, source: LiveSource, scenario: Scenario, observers: tuple[str, ...], speed: float, n_frames: int | None = None
-    ):
+    def __init__(self, source: LiveSource, scenario: Scenario, observers: tuple[str, ...], speed: float, n_frames: int | None):
         self._context, self._tracker = get_context("spawn"), Tracker()
         self.feed, self.is_over, self._lock = SourceProcess(source, speed, n_frames), Event(), RLock()
         self.board, news = Board(source.sampling.n_modes), self._context.Queue()
@@ -228,11 +226,13 @@ class LiveProcesses:
         self.delivery: Delivery = Delivery(self.feed.ring, self.board, self.traces, self.count)
         self.workshop: SideProcess = SideProcess(self._context)
 
-    def _start_crew(self, place: int, observers: tuple[str, ...], *, joins_late: bool = False) -> None:
+    def _start_crew(self, place: int, observers: tuple[str, ...], *, joins_late: bool = False) -> CrewProcess:
         if joins_late:
             self._late.add(place)
         name, width = f"the observers ({CREWS[place]})", trace_width(self._site.sampling.n_modes)
-        self.crews[place] = CrewProcess(self._context, name, width, observe_frames, self._site, place, observers, joins_late)
+        crew = CrewProcess(self._context, name, width, observe_frames, self._site, place, observers, joins_late)
+        self.crews[place] = crew
+        return crew
 
     def _parts(self) -> dict[int, CrewProcess]:
         """Return the crews without which no frame is taken by all: those that began late once they are ready."""
@@ -279,14 +279,11 @@ class LiveProcesses:
     @property
     def processes(self) -> list[BaseProcess]:
         """All that have begun."""
-        beside = (None if self.controllers is None else self.controllers.process, self.workshop.process)
-        crews = (crew.process for crew in list(self.crews.values()))
-        return [*self.feed.processes, *crews, *(process for process in beside if process is not None)]
+        return [*self.feed.processes, *(crew.process for crew in self._followers()), *filter(None, [self.workshop.process])]
 
-    @property
-    def pids(self) -> list[int]:
-        """Their ids."""
-        return [process.pid for process in self.processes if process.pid is not None]
+    def _followers(self) -> list[CrewProcess]:
+        """Return all that follow the frames."""
+        return [*self.crews.values(), *filter(None, [self.controllers])]
 
     def failure(self) -> str:
         """Return one line that names the processes that have ended otherwise than by themselves; "" without one."""
@@ -295,25 +292,20 @@ class LiveProcesses:
             lines.append("the resource tracker of Python was killed")
         return f"live: {'; '.join(lines)}" if lines else ""
 
-    def tell_observers(self, command: Command) -> None:
-        """Give a command to the crew of the observer that it is about, which begins with its first one."""
-        place = crew_of(command["id"])
+    def tell(self, command: Command) -> None:
+        """Give a command to the process of the observer or controller that it is about, which begins with its first one."""
+        place = crew_of(command["id"]) if command["id"] in SLOTS else None
         with self._lock:
-            if self.is_over.is_set() or (place not in self.crews and command["design"] is None):
+            crew = self.controllers if place is None else self.crews.get(place)
+            if self.is_over.is_set() or (crew is None and command["design"] is None):
                 return
-            if place not in self.crews:
-                self._start_crew(place, (), joins_late=True)
-            self.crews[place].tell(command)
-
-    def tell_controllers(self, command: Command) -> None:
-        """Give a command to the process of the controllers, which begins with the first one."""
-        with self._lock:
-            if self.is_over.is_set() or (self.controllers is None and command["design"] is None):
-                return
-            if self.controllers is None:
+            if place is None:
                 width = row_width(self._site.sampling.n_modes)
-                self.controllers = CrewProcess(self._context, "the controllers", width, control_frames, self._site)
-            self.controllers.tell(command)
+                crew = crew or CrewProcess(self._context, "the controllers", width, control_frames, self._site)
+                self.controllers = crew
+            else:
+                crew = crew or self._start_crew(place, (), joins_late=True)
+            crew.tell(command)
 
     def news(self) -> list[LiveEvent]:
         """Return the events since the last call."""
@@ -325,7 +317,7 @@ class LiveProcesses:
             self.is_over.set()
         self.delivery.collect()
         self._tracker.release()
-        for crew in (*self.crews.values(), *([self.controllers] if self.controllers else ())):
+        for crew in self._followers():
             crew.stop()
         self.workshop.stop()
         self.feed.stop()

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from threading import Lock
+from typing import Any
 
 import numpy as np
 
 from wfsobs.live.ring import CAPACITY, LiveFrame, Ring
+from wfsobs.observers.base import TARGETS
 from wfsobs.record import Record, Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
@@ -31,19 +33,19 @@ class Recording:
         Time before now that is kept, too [s].
     """
 
-    def __init__(self, ring: Ring, sampling: Sampling, look_back: float = 0.0):
+    def __init__(self, ring: Ring, sampling: Sampling, look_back: float):
         self._ring, self._sampling = ring, sampling
         self._next = self._first = first_frame(ring, sampling, look_back)
         self._parts: list[LiveFrame] = []
-        self.is_full = False
 
     def collect(self) -> bool:
-        """Keep what has come; return whether there is room for more."""
+        """Keep what has come; return whether it has left no room for more."""
         stop = min(self._ring.count, self._first + LONGEST)
-        if stop > self._next:
-            self._parts.append(self._ring.read_frames(self._next, stop))
-            self._next = stop
-        return stop < self._first + LONGEST
+        if stop <= self._next:
+            return False
+        self._parts.append(self._ring.read_frames(self._next, stop))
+        self._next = stop
+        return stop == self._first + LONGEST
 
     def frames(self) -> LiveFrame | None:
         """Return the frames so far, None where there is none."""
@@ -101,9 +103,7 @@ class Recorder:
     def collect(self) -> None:
         """Keep what has come; called a few times a second."""
         with self._lock:
-            is_full = self._recording is not None and not self._recording.collect() and not self._recording.is_full
-            if is_full and self._recording is not None:
-                self._recording.is_full = True
+            is_full = self._recording is not None and self._recording.collect()
         if is_full:
             self._say(f"recording is full: {LONGEST} frames")
 
@@ -132,26 +132,17 @@ def open_loop_record(frames: LiveFrame, sampling: Sampling) -> Record:
     """Return frames of which only the pseudo-open-loop measurement is known as a record with the mirror at rest."""
     ngs = frames.ngs.copy()
     ngs[0] = np.nan
-    has_ngs, has_truth = sampling.ratio is not None, not np.isnan(frames.turbulence).all()
-    return Record(
-        y_lgs=frames.z,
-        u=np.zeros_like(frames.z),
-        dt=sampling.dt,
-        y_ngs=ngs if has_ngs else None,
-        ratio=sampling.ratio,
-        turbulence=frames.turbulence if has_truth else None,
-        vibration=frames.vibration if has_truth else None,
-    )
+    y_ngs = None if sampling.ratio is None else ngs
+    return Record(frames.z, np.zeros_like(frames.z), sampling.dt, y_ngs=y_ngs, ratio=sampling.ratio, **_truth_of(frames))
 
 
 def record_of(frames: LiveFrame, scenario: Scenario) -> Record:
     """Return frames as a record of the scenario's loop; without truth where they have none."""
     ngs = frames.ngs.copy()
     ngs[0] = np.nan  # a record begins before its first NGS frame
-    measured = measure_closed_loop(scenario, OpenLoop(frames.z, ngs))
-    has_truth = not np.isnan(frames.turbulence).all()
-    return Record(
-        **vars(measured),
-        turbulence=frames.turbulence if has_truth else None,
-        vibration=frames.vibration if has_truth else None,
-    )
+    return Record(**vars(measure_closed_loop(scenario, OpenLoop(frames.z, ngs))), **_truth_of(frames))
+
+
+def _truth_of(frames: LiveFrame) -> dict[str, Any]:
+    """Return the truth of frames by name; nothing where they have none."""
+    return {} if np.isnan(frames.turbulence).all() else {name: getattr(frames, name) for name in TARGETS}

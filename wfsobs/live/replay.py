@@ -38,7 +38,7 @@ class Replay:
     def staff(self, context: SpawnContext, desk: Desk) -> Staff:
         """Return its process."""
         rows = frame_rows(self.record)
-        return Staff(context.Process(target=_send, args=(rows, self.record.dt, desk), name="the source", daemon=True), [], [])
+        return Staff(context.Process(target=_send, args=(rows, self.record.dt, desk), name="the source", daemon=True))
 
 
 def frame_rows(record: Record) -> Array:

@@ -20,7 +20,35 @@ HEAD = 24
 """Bytes before the rows: the count, whether the writer has ended, and how many came late."""
 
 
-class Rows:
+class SharedNumbers:
+    """Numbers in memory that processes share.
+
+    Parameters
+    ----------
+    size : int
+        Bytes.
+    name : str or None
+        That of memory that exists; None to own a new one.
+    """
+
+    def __init__(self, size: int, name: str | None):
+        self._memory = SharedMemory(name=name, create=name is None, size=size if name is None else 0)
+        self._owner = name is None
+
+    @property
+    def name(self) -> str:
+        """Name by which another process finds it."""
+        return self._memory.name
+
+    def release(self) -> None:
+        """Give the memory back."""
+        self._memory.close()
+        if self._owner:
+            with suppress(FileNotFoundError):  # a resource tracker has done so: that of this process was killed
+                self._memory.unlink()
+
+
+class Rows(SharedNumbers):
     """A ring of rows.
 
     Parameters
@@ -41,17 +69,12 @@ class Rows:
     capacity: int
 
     def __init__(self, width: int, capacity: int, name: str | None = None):
-        self._memory = SharedMemory(name=name, create=name is None, size=HEAD + 8 * capacity * width if name is None else 0)
+        super().__init__(HEAD + 8 * capacity * width, name)
         self._head = np.ndarray(3, dtype=np.int64, buffer=self._memory.buf)
         self._rows = np.ndarray((capacity, width), buffer=self._memory.buf, offset=HEAD)
-        self.capacity, self._owner = capacity, name is None
+        self.capacity = capacity
         if self._owner:
             self._rows[0] = np.nan  # else it would be the one of number 0 before it is written
-
-    @property
-    def name(self) -> str:
-        """Name by which another process finds it."""
-        return self._memory.name
 
     @property
     def count(self) -> int:
@@ -92,10 +115,7 @@ class Rows:
     def release(self) -> None:
         """Give the memory back; what is read from then on is NaN."""
         self._head, self._rows = self._head.copy(), np.broadcast_to(np.nan, self._rows.shape)
-        self._memory.close()
-        if self._owner:
-            with suppress(FileNotFoundError):  # a resource tracker has done so: that of this process was killed
-                self._memory.unlink()
+        super().release()
 
 
 class Tracker:

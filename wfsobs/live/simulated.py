@@ -33,32 +33,7 @@ LENGTH = 40.0
 """Length of a record [s]; a block is half as long."""
 
 
-@dataclass(frozen=True)
-class Block:
-    """Consecutive frames.
-
-    Attributes
-    ----------
-    z : Array
-        Pseudo-open-loop LGS measurement, (n, n_modes) [um].
-    ngs : Array
-        Pseudo-open-loop NGS measurement, (n, n_modes) [um]; NaN in frames without one.
-    turbulence, vibration : Array
-        Truth, (n, n_modes) [um].
-    """
-
-    z: Array
-    ngs: Array
-    turbulence: Array
-    vibration: Array
-
-    def pieces(self, length: int) -> list[Array]:
-        """Return a row per frame, z, ngs, turbulence, vibration, (n, 4 n_modes) [um], in pieces of so many frames."""
-        rows = np.hstack([self.z, self.ngs, self.turbulence, self.vibration])
-        return [rows[at : at + length] for at in range(0, len(rows), length)]
-
-
-def endless_blocks(scenario: Scenario, rng: np.random.Generator, length: float = LENGTH) -> Iterator[Block]:
+def endless_blocks(scenario: Scenario, rng: np.random.Generator, length: float = LENGTH) -> Iterator[Array]:
     """Yield blocks of frames of a scenario for ever.
 
     Parameters
@@ -72,8 +47,9 @@ def endless_blocks(scenario: Scenario, rng: np.random.Generator, length: float =
 
     Yields
     ------
-    Block
-        Half a record each; frame 0 of all is one with an NGS measurement, but for the first.
+    Array
+        Half a record: a row per frame of z, ngs, turbulence and vibration, (n, 4 n_modes) [um], ngs NaN in frames without one.
+        Frame 0 of all is one with an NGS measurement, but for the first.
 
     Raises
     ------
@@ -88,15 +64,15 @@ def endless_blocks(scenario: Scenario, rng: np.random.Generator, length: float =
     before = _record(scenario, 2 * half, rng)
     while True:
         after = _record(scenario, 2 * half, rng)
-        yield Block(**{name: _fade(getattr(before, name)[half:], getattr(after, name)[:half], weight) for name in vars(before)})
+        yield _fade(before[half:], after[:half], weight)
         before = after
 
 
-def _record(scenario: Scenario, n_steps: int, rng: np.random.Generator) -> Block:
+def _record(scenario: Scenario, n_steps: int, rng: np.random.Generator) -> Array:
     disturbance_rng, sensor_rng = rng.spawn(2)
     disturbance = make_disturbance(scenario, n_steps, disturbance_rng)
     seen = measure_open_loop(scenario, disturbance, sensor_rng)
-    return Block(seen.lgs, seen.ngs, disturbance.turbulence, disturbance.vibration)
+    return np.hstack([seen.lgs, seen.ngs, disturbance.turbulence, disturbance.vibration])
 
 
 def _fade(before: Array, after: Array, weight: Array) -> Array:
@@ -161,13 +137,14 @@ def _make(settings: dict[str, Any], inbox: Connection, ready: Queue[Piece]) -> N
     """
     enter_process(niceness=0 if may_go_first() else 10)
     scenario, generation, is_first = Scenario.from_dict(settings), 0, True
+    length = piece_length(scenario)
     rng = np.random.default_rng(scenario.run.seed)
     blocks = endless_blocks(scenario, rng)
     while True:
-        changed = None
-        for rows in next(blocks).pieces(piece_length(scenario)):
+        changed, block = None, next(blocks)
+        for at in range(0, len(block), length):
             # a first block is whole, so that it lasts until the next one
-            if not _put(ready, (generation, rows), None if is_first else inbox):
+            if not _put(ready, (generation, block[at : at + length]), None if is_first else inbox):
                 break
         is_first = False
         while inbox.poll():  # only the newest settings are simulated
@@ -191,37 +168,6 @@ def _send(settings: dict[str, Any], ready: Queue[Piece], desk: Desk) -> None:
     send_frames(desk, SimulatedFrames(scenario, ready), scenario.dt)
 
 
-class RowQueue:
-    """Rows of one generation, as they come in pieces."""
-
-    def __init__(self, rows: Array):
-        self._pieces, self._at = deque([rows]), 0
-
-    @property
-    def left(self) -> int:
-        """Number of rows that are here."""
-        return sum(map(len, self._pieces)) - self._at
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether no row is here."""
-        return not self._pieces
-
-    def add(self, rows: Array) -> None:
-        """Append rows."""
-        self._pieces.append(rows)
-
-    def next_row(self) -> Array:
-        """Return the next row, of those that are here."""
-        first = self._pieces[0]
-        row = first[self._at]
-        self._at += 1
-        if self._at == len(first):
-            self._pieces.popleft()
-            self._at = 0
-        return row
-
-
 class SimulatedFrames:
     """Frames of a simulation whose settings may change.
 
@@ -235,9 +181,11 @@ class SimulatedFrames:
 
     def __init__(self, scenario: Scenario, ready: Queue[Piece]):
         self._ready, self._ratio, self._dt = ready, scenario.sensors.exposure_ratio, scenario.dt
-        self._loop, self._losses = Integrator(scenario), Losses(len(scenario.modes))
+        self._loop, self._rng = Integrator(scenario), np.random.default_rng(0)
+        self._losses = {"lgs": 0.0, "ngs": 0.0}  # shares of the measurements of the two sensors
+        self._missing = np.full(len(scenario.modes), np.nan)
         self._target, (self._generation, rows) = 0, ready.get()
-        self._old, self._new = RowQueue(rows), None
+        self._old, self._new = deque(rows), None
         self._weight = np.empty(0)
         self._new_at = 0
 
@@ -251,14 +199,14 @@ class SimulatedFrames:
         if self._new is not None:
             row = self._mix(row, self._next_of(self._new))
             self._new_at += 1
-        m = len(row) // 4
-        z, ngs = self._losses.apply(row[:m], row[m : 2 * m])
-        return np.concatenate((z, ngs, self._loop.command(z), row[2 * m :]))
+        z, ngs, *truth = row.reshape(4, -1)
+        draw = self._rng.random()  # one for both: they are lost together
+        z, ngs = (x if draw >= self._losses[name] else self._missing for name, x in (("lgs", z), ("ngs", ngs)))
+        return np.concatenate((z, ngs, self._loop.command(z), *truth))
 
     def take(self, command: Command, number: int) -> str:
         """Follow "settings", for which frames of another generation are to be expected, and "losses"."""
-        if "losses" in command:
-            self._losses.take(**command["losses"])
+        self._losses = command.get("losses", self._losses)
         if "settings" in command:
             self._loop.take(Scenario.from_dict(command["settings"]))
             self._target += command["is_new"]
@@ -277,44 +225,18 @@ class SimulatedFrames:
             except Empty:
                 return
             if generation == self._generation:
-                self._old.add(rows)
+                self._old.extend(rows)
             elif generation == self._target:
-                steps = min(round(FADE / self._dt), self._old.left) // self._ratio * self._ratio
+                steps = min(round(FADE / self._dt), len(self._old)) // self._ratio * self._ratio
                 self._weight = np.sin(0.5 * np.pi * np.arange(steps) / max(steps, 1))
-                self._new, self._new_at, self._generation = RowQueue(rows), 0, generation
+                self._new, self._new_at, self._generation = deque(rows), 0, generation
                 return
 
-    def _next_of(self, queue: RowQueue) -> Array:
-        if queue.is_empty:
+    def _next_of(self, queue: deque[Array]) -> Array:
+        if not queue:
             self._generation, rows = self._ready.get()
-            queue.add(rows)
-        return queue.next_row()
-
-
-class Losses:
-    """What of the frames does not arrive.
-
-    Attributes
-    ----------
-    lgs, ngs : float
-        Shares of the measurements of the two sensors that are lost, 0 to 1.
-    """
-
-    lgs: float
-    ngs: float
-
-    def __init__(self, n_modes: int):
-        self.lgs = self.ngs = 0.0
-        self._missing, self._rng = np.full(n_modes, np.nan), np.random.default_rng(0)
-
-    def take(self, lgs: float, ngs: float) -> None:
-        """Change what arrives."""
-        self.lgs, self.ngs = lgs, ngs
-
-    def apply(self, z: Array, ngs: Array) -> tuple[Array, Array]:
-        """Return the measurements of a frame that arrive; NaN in place of others. One draw for both: they are lost together."""
-        draw = self._rng.random()
-        return z if draw >= self.lgs else self._missing, ngs if draw >= self.ngs else self._missing
+            queue.extend(rows)
+        return queue.popleft()
 
 
 class Integrator:

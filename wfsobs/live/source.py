@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import os
 import signal
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import get_context, parent_process
@@ -116,8 +115,8 @@ class Staff(NamedTuple):
     """
 
     sender: BaseProcess
-    others: list[BaseProcess]
-    outboxes: list[Connection]
+    others: Sequence[BaseProcess] = ()
+    outboxes: Sequence[Connection] = ()
     queue: object = None
 
 
@@ -237,7 +236,7 @@ def prefer(niceness: int) -> None:
 
     Only root, and who has CAP_SYS_NICE, may lower it.
     """
-    with contextlib.suppress(AttributeError, OSError):  # another system, or no right to it
+    with suppress(AttributeError, OSError):  # another system, or no right to it
         os.setpriority(os.PRIO_PROCESS, 0, niceness)
 
 
@@ -310,7 +309,7 @@ class SourceProcess:
 
     ring: Ring
 
-    def __init__(self, source: LiveSource, speed: float = 1.0, n_frames: int | None = None):
+    def __init__(self, source: LiveSource, speed: float, n_frames: int | None):
         os.environ["OPENBLAS_NUM_THREADS"] = "1"  # read by the processes
         context = get_context("spawn")
         n_modes = source.sampling.n_modes

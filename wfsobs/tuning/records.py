@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -88,18 +87,12 @@ class Space:
 
     def values(self, scenario: Scenario) -> dict[str, float]:
         """Dotted path -> number that a scenario has for every axis."""
-        now = {**numbers(scenario), **self.by_hand}
-        return {a.path: now[a.path] for a in self.axes}
+        return {a.path: self.by_hand.get(a.path, scenario.lookup(a.path)) for a in self.axes}
 
     def start(self, scenario: Scenario) -> Array:
         """Where a scenario is in the unit cube."""
         now = self.values(scenario)
         return np.array([a.place(now[a.path]) for a in self.axes])
-
-
-def numbers(scenario: Scenario) -> dict[str, float]:
-    """Dotted path -> value of every setting that is one number."""
-    return {path: _value(scenario, path) for path, _, p in scenario.walk() if isinstance(p, param.Number)}
 
 
 def space(
@@ -125,7 +118,7 @@ def space(
             raise SettingError(f"{path}: is given twice")
     by_hand = {}
     for switch, (paths, matched) in BY_HAND.items():
-        if set(paths) & set(chosen) and _value(scenario, switch) != "manual":
+        if set(paths) & set(chosen) and scenario.lookup(switch) != "manual":
             by_hand |= {
                 switch: "manual",
                 **{p: _clip_to_limits(scenario, p, v) for p, v in zip(paths, matched(scenario), strict=True)},
@@ -133,8 +126,7 @@ def space(
     gain_from = by_hand.get("control.integrator", scenario.control.integrator)
     if name == "integrator" and "control.caution" in chosen and gain_from == "manual":
         raise SettingError("control.caution: has no effect on an integrator while control.integrator = manual")
-    values = {**numbers(scenario), **by_hand}
-    return Space(tuple(_axis(scenario, path, values[path]) for path in chosen), by_hand)
+    return Space(tuple(_axis(scenario, path, by_hand.get(path, scenario.lookup(path))) for path in chosen), by_hand)
 
 
 def _check(scenario: Scenario, of: str, tunable: Tunable, path: str) -> None:
@@ -147,33 +139,19 @@ def _check(scenario: Scenario, of: str, tunable: Tunable, path: str) -> None:
     if path not in (*usual, *others):
         raise SettingError(f"{path}: not a setting of {of} that can be tuned; there are {', '.join((*usual, *others))}")
     group, _, name = path.rpartition(".")
-    if name == "highpass" and (way := _value(scenario, f"{group}.inputs_filter")) != "high-pass":
+    if name == "highpass" and (way := scenario.lookup(f"{group}.inputs_filter")) != "high-pass":
         raise SettingError(f"{path}: has no effect while {group}.inputs_filter = {way}")
 
 
-def _value(group: Any, path: str) -> Any:
-    """Return the value of a setting, or of an item of a list, by its dotted path."""
-    return reduce(lambda node, key: node[int(key)] if isinstance(node, list) else getattr(node, key), path.split("."), group)
-
-
-def _parameter(scenario: Scenario, path: str) -> Any:
-    return next(p for known, _, p in scenario.walk() if known == path)
-
-
-def _limits(bounds: tuple[Any, Any] | None) -> tuple[float, float]:
-    """Bounds as numbers: every setting that is one has both."""
-    assert bounds is not None
-    return float(bounds[0]), float(bounds[1])
-
-
 def _clip_to_limits(scenario: Scenario, path: str, value: float) -> float:
-    low, high = _limits(_parameter(scenario, path).bounds)
+    p: Any = scenario.parameter(path)
+    low, high = map(float, p.bounds)
     return min(max(float(f"{value:.{DIGITS}g}"), low), high)
 
 
 def _axis(scenario: Scenario, path: str, start: float) -> Axis:
-    p = _parameter(scenario, path)
-    low, high = _limits(p.get_soft_bounds())
+    p: Any = scenario.parameter(path)
+    low, high = map(float, p.get_soft_bounds())
     if low == 0 and not isinstance(p, param.Integer):
         low = FROM_ZERO * high
     return Axis(path, min(low, start) if start > 0 else low, max(high, start), isinstance(p, param.Integer))

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import reduce
 from typing import Any
 
 import numpy as np
 
 from wfsobs.closed_loop.envelope import Spread
-from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import add_comments, changed_settings, to_toml
 from wfsobs.tuning.records import P95, TRUTH, WORST
 from wfsobs.tuning.trials import Errors, Evaluation, Stage
@@ -76,15 +74,16 @@ def settings(result: TuningResult) -> list[tuple[str, str, str]]:
     before = {path: _before(result, path) for path in (*changed, *result.start)}
     if result.scenario == result.before.scenario:
         return [(path, text, text) for path, text in before.items()]
-    return [(path, text, _format(_value(result.scenario, path))) for path, text in before.items()]
+    return [(path, text, _format(result.scenario.lookup(path))) for path, text in before.items()]
 
 
 def _before(result: TuningResult, path: str) -> str:
-    return _format(result.start.get(path, _value(result.before.scenario, path)))
+    return _format(result.start.get(path, result.before.scenario.lookup(path)))
 
 
-def _value(scenario: Scenario, path: str) -> Any:
-    return reduce(getattr, path.split("."), scenario)
+def _scores(result: TuningResult) -> list[tuple[str, Errors | None, Errors | None]]:
+    """(section, before, after) of either record."""
+    return [(name, getattr(result.before, name), getattr(result.after, name)) for name in (VALIDATION, TEST)]
 
 
 def _format(value: Any) -> str:
@@ -121,13 +120,7 @@ def tuning_toml(result: TuningResult) -> str:
     evaluations, where = len(result.history), "at" if result.after.spreads else "against"
     head = [
         f"{result.label} tuned for {result.target}, {where} {result.against}, in {evaluations} evaluations.",
-        *(
-            f"{result.measure}, {name}: {_of(before)} before, {_of(after)} after"
-            for name, before, after in (
-                ("validation", result.before.validation, result.after.validation),
-                ("test", result.before.test, result.after.test),
-            )
-        ),
+        *(f"{result.measure}, {name}: {_of(before)} before, {_of(after)} after" for name, before, after in _scores(result)),
     ]
     return "\n".join(f"# {line}" for line in head) + "\n\n" + add_comments(to_toml(result.scenario), notes)
 
@@ -138,20 +131,14 @@ def _of(errors: Errors | None) -> str:
 
 def best_so_far(history: Sequence[Evaluation]) -> list[float]:
     """Compute the least error after every evaluation [um], infinite until one has succeeded."""
-    out: list[float] = []
-    for evaluation in history:
-        out.append(min(evaluation.rms, out[-1] if out else evaluation.rms))
-    return out
+    return np.minimum.accumulate([evaluation.rms for evaluation in history]).tolist()
 
 
 def tuning_rows(result: TuningResult) -> Rows:
     """List settings as text, errors [um] by mode and together, a GPR's log marginal likelihoods by mode; None for failures."""
     out: Rows = [(SETTING, *row) for row in settings(result)]
     stages = result.before, result.after
-    for section, before, after in (
-        (VALIDATION, *(s.validation for s in stages)),
-        (TEST, *(s.test for s in stages)),
-    ):
+    for section, before, after in _scores(result):
         out += [(section, name, _error(before, name), _error(after, name)) for name in (*_mode_names(stages), TOGETHER)]
     if any(s.other for s in stages):
         before, after = stages

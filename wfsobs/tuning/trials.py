@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from math import inf, isfinite
 from typing import Any
 
@@ -54,41 +54,6 @@ class Errors:
     def rms(self) -> float:
         """Root of the mean square over the modes [um]."""
         return float(np.sqrt(np.mean(np.square([*self.modes.values()]))))
-
-
-@dataclass(frozen=True)
-class Judge:
-    """The errors of one observer in one target: "turbulence", "vibration", or PREDICTION where there is no truth."""
-
-    observer: str
-    target: str
-
-    def estimates(self, record: Record, scenario: Scenario, watch: Watch) -> list[Estimate]:
-        """Run the observer on a record. Raises ValueError in one line where it cannot, Cancelled."""
-        scenario.validate()
-        out = []
-        for item in each_estimate(record, scenario, watch, [self.observer]):
-            if isinstance(item, Failure):
-                raise RecordError(item.reason)
-            out.append(item)
-        return out
-
-    def errors(self, record: Record, scenario: Scenario, estimates: list[Estimate], warm_up: float) -> Errors:
-        """Over the steps after the warm-up [s] that have an estimate. Raises RecordError where there is none."""
-        names = [m.name for m in scenario.modes][: record.n_modes]
-        if self.target == PREDICTION:
-            scores = [s for s in unsupervised_scores(record, estimates, warm_up, names) if s.observer == self.observer]
-        else:
-            scores = supervised_scores(record, [e for e in estimates if e.target == self.target], warm_up, names)
-        modes = {s.mode: s.rms for s in scores}
-        if len(modes) < len(names) or not all(map(isfinite, modes.values())):
-            raise RecordError(f"{self.observer} has no estimate after the warm-up, {warm_up:g} s")
-        return Errors(modes)
-
-    def begins(self, estimates: list[Estimate]) -> int:
-        """Return the first step with estimates."""
-        silent = np.logical_or.reduce([np.isnan(e.values).any(axis=1) for e in estimates])[:-1]  # a reference lacks the last
-        return int(silent.size - np.argmax(silent[::-1])) if silent.any() else 0
 
 
 def target_of(observer: str, target: str | None) -> str:
@@ -290,7 +255,7 @@ class RecordTrials(Trials):
     """Runs of an observer on the validation record; scores begin where the first has its estimates, if that is later."""
 
     records: Records
-    judge: Judge
+    observer: str
     warm_up: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -300,26 +265,49 @@ class RecordTrials(Trials):
     def errors_of(self, scenario: Scenario) -> Errors:
         """Return the errors on the validation record."""
         record = self.records.validation
-        estimates = self.judge.estimates(record, scenario, self.inner())
-        begins = self.judge.begins(estimates) * record.dt
+        estimates = self._estimates(record, scenario)
+        silent = np.logical_or.reduce([np.isnan(e.values).any(axis=1) for e in estimates])[:-1]  # a reference lacks the last
+        begins = (silent.size - int(np.argmax(silent[::-1]))) * record.dt if silent.any() else 0.0
         if not self.history and begins <= LATEST * record.n_steps * record.dt:
             self.warm_up = max(self.warm_up, begins)
         if begins > self.warm_up:
             raise RecordError(
-                f"{self.judge.observer} has its first estimate after {begins:g} s; the scores begin at {self.warm_up:g} s"
+                f"{self.observer} has its first estimate after {begins:g} s; the scores begin at {self.warm_up:g} s"
             )
-        return self.judge.errors(record, scenario, estimates, self.warm_up)
+        return self._errors(record, scenario, estimates, self.warm_up, self.records.target)
 
     def stage(self, evaluation: Evaluation) -> Stage:
         """Score the scenario of an evaluation on the test record."""
         scenario = self.scenario.replace(evaluation.changes)
-        record, judge, errors, other = self.records.test(scenario), self.judge, None, None
-        others = {*OBSERVERS[judge.observer].targets} - {judge.target} if judge.target != PREDICTION else set[str]()
+        record, own, errors, other = self.records.test(scenario), self.records.target, None, None
+        others = {*OBSERVERS[self.observer].targets} - {own} if own != PREDICTION else set[str]()
         try:
-            estimates = judge.estimates(record, scenario, self.inner())
-            errors = judge.errors(record, scenario, estimates, scenario.run.warm_up)
+            estimates = self._estimates(record, scenario)
+            errors = self._errors(record, scenario, estimates, scenario.run.warm_up, own)
             for target in others:
-                other = replace(judge, target=target).errors(record, scenario, estimates, scenario.run.warm_up)
+                other = self._errors(record, scenario, estimates, scenario.run.warm_up, target)
         except ValueError:
             pass  # of the scenario as it was: the reason is in the history
-        return Stage(scenario, evaluation.errors, errors, other, likelihood(judge.observer, record, scenario, self.watch))
+        return Stage(scenario, evaluation.errors, errors, other, likelihood(self.observer, record, scenario, self.watch))
+
+    def _estimates(self, record: Record, scenario: Scenario) -> list[Estimate]:
+        """Run the observer on a record. Raises ValueError in one line where it cannot, Cancelled."""
+        scenario.validate()
+        out = []
+        for item in each_estimate(record, scenario, self.inner(), [self.observer]):
+            if isinstance(item, Failure):
+                raise RecordError(item.reason)
+            out.append(item)
+        return out
+
+    def _errors(self, record: Record, scenario: Scenario, estimates: list[Estimate], warm_up: float, target: str) -> Errors:
+        """Over the steps after the warm-up [s] that have an estimate. Raises RecordError where there is none."""
+        names = [m.name for m in scenario.modes][: record.n_modes]
+        if target == PREDICTION:
+            scores = [s for s in unsupervised_scores(record, estimates, warm_up, names) if s.observer == self.observer]
+        else:
+            scores = supervised_scores(record, [e for e in estimates if e.target == target], warm_up, names)
+        modes = {s.mode: s.rms for s in scores}
+        if len(modes) < len(names) or not all(map(isfinite, modes.values())):
+            raise RecordError(f"{self.observer} has no estimate after the warm-up, {warm_up:g} s")
+        return Errors(modes)

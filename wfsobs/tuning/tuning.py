@@ -36,7 +36,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.true_spectra import TrueSpectra
 from wfsobs.tuning.records import DESIGN, MEASURES, P95, WORST, cut_record, simulate_records, space, stream
-from wfsobs.tuning.trials import Errors, Evaluation, Judge, RecordTrials, Stage, Trials, minimise, target_of
+from wfsobs.tuning.trials import Errors, Evaluation, RecordTrials, Stage, Trials, minimise, target_of
 
 if TYPE_CHECKING:
     import pandas
@@ -171,7 +171,7 @@ def tune(
         records = simulate_records(scenario, searched, target, validation, watch)
     else:
         records = cut_record(record, scenario, observer, target)
-    trials = RecordTrials(scenario, searched, evaluations, watch, on_evaluation, records, Judge(observer, records.target))
+    trials = RecordTrials(scenario, searched, evaluations, watch, on_evaluation, records, observer)
     return _search(trials, observer, records.target, records.against)
 
 
@@ -185,16 +185,8 @@ def _search(trials: Trials, observer: str, target: str, against: str) -> TuningR
     before, after = (trials.stage(e) for e in (first, best))
     trials.watch.step(1.0)
     start = {path: v for path, v in {**searched.by_hand, **searched.values(scenario)}.items() if not isinstance(v, str)}
-    return TuningResult(
-        observer,
-        target,
-        against,
-        tuple(a.path for a in searched.axes),
-        start,
-        before,
-        after,
-        tuple(trials.history),
-    )
+    paths = tuple(a.path for a in searched.axes)
+    return TuningResult(observer, target, against, paths, start, before, after, tuple(trials.history))
 
 
 CAUTION_EVALUATIONS = 20

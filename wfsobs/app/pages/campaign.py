@@ -23,7 +23,8 @@ from wfsobs.app.service import BackgroundTask
 from wfsobs.app.share import CAMPAIGN, EXPLORED, CopiedTask
 from wfsobs.app.store import Store
 from wfsobs.app.style import look, make_select, named_row
-from wfsobs.campaign.follow import CampaignErrors, CampaignState, progress_text
+from wfsobs.campaign.compare import CampaignErrors
+from wfsobs.campaign.follow import CampaignState, progress_text
 from wfsobs.campaign.report import name_label
 from wfsobs.campaign.selection import SCENARIO, PlanAxis, condition, plan_axes
 from wfsobs.campaign.standings import UNTESTED, TogetherRow, standings
