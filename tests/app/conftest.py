@@ -14,6 +14,7 @@ import pytest
 
 from wfsobs.app.cache import freeze
 from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.idle_work import SeedRuns
 from wfsobs.app.jobs import RUNNING, Tell
 from wfsobs.app.limits import NONE, Limits
 from wfsobs.app.service import Service, Session, run_key
@@ -155,6 +156,12 @@ def dashboard(loop: Loop, short: Scenario, enter: Callable[..., Session]) -> Das
     dashboard.start()
     loop.finish(dashboard.store)
     return dashboard
+
+
+class OneSeed(SeedRuns):
+    """Seeds of which none but the first runs."""
+
+    possible = False  # type: ignore[assignment]
 
 
 @pytest.fixture

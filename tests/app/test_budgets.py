@@ -6,15 +6,14 @@ from typing import Any
 
 import pytest
 
-from tests.app.conftest import compute_once
+from tests.app.conftest import OneSeed, compute_once
 from wfsobs.app.display import Display
 from wfsobs.app.idle_work import Budgets
 from wfsobs.app.render import number
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.style import TERM_COLOURS
-from wfsobs.app.views.strip import Strip
-from wfsobs.app.views.verdict import MainLines, VerdictLine
+from wfsobs.app.views.errors import MainLines, Strip, VerdictLine
 from wfsobs.evaluation.budget import TERMS, Budget
 from wfsobs.evaluation.rows import own_bound
 from wfsobs.observers import OBSERVERS
@@ -30,9 +29,9 @@ class Page:
 
     def __init__(self, store: Store):
         self.store, self.display = store, Display()
-        self.lines = MainLines(store.run, self.display)
-        self.budgets = Budgets(store, lambda _target: MAIN)
-        self.strip = Strip("vibration", store.run, self.display, None, self.lines, self.budgets)
+        seeds = OneSeed(store)
+        self.budgets = Budgets(seeds, lambda _target: MAIN)
+        self.strip = Strip("vibration", self.display, MainLines(self.display, seeds), self.budgets)
 
     def row(self, observer: str) -> dict[str, Any]:
         return next(item for item in self.strip.cards.items if item["name"] == observer)
@@ -154,7 +153,7 @@ def test_a_change_of_a_setting_shows_the_change_of_every_error(page: Page, loop:
 
 
 def test_the_verdict_names_the_largest_term_of_those_that_do_harm_when_it_is_known(page: Page, loop: Any) -> None:
-    line = VerdictLine("vibration", page.store.run, page.display, None, page.budgets)
+    line = VerdictLine("vibration", page.display, page.budgets)
     page.store.start()
     loop.until(lambda: "kf-lgs" in page.budgets.by_observer and page.store.run.state == "done")
     for mode in ("tip", "tilt"):

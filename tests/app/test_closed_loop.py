@@ -123,7 +123,7 @@ def test_marks_hiding_colours_and_reasons(page: ClosedLoopPage, dashboard: Dashb
     assert not page.trace.lines["integrator"].visible and page.trace.lines["lqg-multirate-multi"].visible
     assert top(page) < before and not len(page.nyquist.marks.data["x"])
     dashboard.display.dark = True
-    assert page.trace.lines["integrator"].glyph.line_color == look("integrator").dark
+    assert page.trace.lines["integrator"].renderer.glyph.line_color == look("integrator").dark
     page.work.refuse("the record has no truth")
     assert "No closed loop: the record has no truth" in page.note.html
     assert not page.cards.visible and page.results is None, "those of other results"

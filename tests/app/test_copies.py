@@ -216,11 +216,11 @@ def test_sweep(dashboard: Dashboard, loop: Any, tmp_path: Path, monkeypatch: Any
     page = dashboard.pages.by_name["sweep"]
     assert isinstance(page, SweepPage)
     (first, values), *second = over.items()
-    page.settings[0].value, page.settings[1].value = first, ""
-    page.values[0].value, page.seeds.value = values, "1" if second else "2"
+    page.axes[0].select.value, page.axes[1].select.value = first, ""
+    page.axes[0].values.value, page.seeds.value = values, "1" if second else "2"
     for path, values in second:
-        page.settings[1].value = path
-        page.values[1].value = values
+        page.axes[1].select.value = path
+        page.axes[1].values.value = values
     page.starter.begin()
     loop.until(lambda: page.work.state != RUNNING, 240)
     assert page.results is not None

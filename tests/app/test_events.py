@@ -62,7 +62,7 @@ def the_marks_are_those_of_the_scenario(dashboard: Dashboard) -> None:
         assert list(marks.spans.data["end"]) == pytest.approx([1.8, 1.8, 1.95])
         assert list(marks.words.data["text"]) == ["5.96 Hz peak −3 Hz × 2", "wind × 2", "25 % LGS lost", "1 LGS out"]
         assert list(marks.words.data["y"]) == [top] * 4 and marks.words.data["below"] == [2, 15, 28, 2]
-        values = np.concatenate([np.asarray(trace.source.data[name]) for name in trace.names])
+        values = np.concatenate([np.asarray(trace.source.data[name]) for name in trace.lines])
         assert np.nanmax(values) < top, "the words have room of their own"
 
 

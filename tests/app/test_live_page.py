@@ -19,8 +19,7 @@ from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.jobs import FAILED, RUNNING, Job
 from wfsobs.app.limits import NONE
 from wfsobs.app.live_work import record_saves
-from wfsobs.app.pages.live import LivePage
-from wfsobs.app.pages.live_controls import events_html, peaks_html, ranking
+from wfsobs.app.pages.live import LivePage, events_html, peaks_html, ranking
 from wfsobs.app.pages.live_figures import LiveMarks, Painter
 from wfsobs.app.pages.pages import EXPLORE, LIVE
 from wfsobs.app.render import number

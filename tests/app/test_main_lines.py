@@ -15,9 +15,9 @@ from wfsobs.app.display import Display
 from wfsobs.app.jobs import DONE, RUNNING
 from wfsobs.app.render import number
 from wfsobs.app.style import look, observers_of
+from wfsobs.app.views.errors import REFERENCES, MainLines, main_observers
 from wfsobs.app.views.plots import GREY, MOST_COLOURED, ROOM_OF_NAME
 from wfsobs.app.views.traces import first_window
-from wfsobs.app.views.verdict import REFERENCES, MainLines, main_observers
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.evidence import gather_evidence, rank_observers
 from wfsobs.evaluation.rows import NO_ESTIMATE, NOTHING, PEAKS, is_non_causal, prior_knowledge
@@ -46,10 +46,15 @@ def others_of(scores: tuple[Score, ...], target: str) -> list[str]:
 
 
 class Run(param.Parameterized):
-    """What a run says of itself."""
+    """What a run says of itself, and its seeds, which say nothing."""
 
     state = param.String(RUNNING)
     result = param.Parameter()
+    evidence = param.Parameter()
+
+    @property
+    def run(self) -> Run:
+        return self
 
 
 class TestRule:
@@ -113,14 +118,14 @@ class TestChoice:
 
     def test_a_link_that_says_it_of_one_target_leaves_the_main_ones_of_the_other(self, dashboard: Dashboard) -> None:
         run, display = Run(), Display()
-        MainLines(run, display).choose("vibration", ["truth"])  # type: ignore[arg-type]
+        MainLines(display, run).choose("vibration", ["truth"])  # type: ignore[arg-type]
         run.result = dashboard.store.run.result
         assert display.hidden_lines["vibration"] == ["truth"]
         assert display.hidden_lines["turbulence"] == others_of(run.result.result.scores, "turbulence")
 
     def test_the_first_choice_of_a_run_gives_way_to_that_of_all_results(self, dashboard: Dashboard) -> None:
         run, display = Run(), Display()
-        lines = MainLines(run, display)  # type: ignore[arg-type]
+        lines = MainLines(display, run)  # type: ignore[arg-type]
         whole = dashboard.store.run.result
         few = tuple(s for s in whole.result.scores if s.observer in ("kf-lgs", "kf-ngs", "multirate"))
         run.result = replace(whole, result=replace(whole.result, scores=few))

@@ -115,7 +115,9 @@ class TestFigures:
     def test_colours_and_captions(self, figures: Figures, dashboard: Dashboard) -> None:
         for sheet in figures.sheets:
             for plot in sheet.plots:
-                assert {n: line.glyph.line_color for n, line in plot.lines.items()} == {n: look(n).light for n in plot.lines}
+                assert {n: line.renderer.glyph.line_color for n, line in plot.lines.items()} == {
+                    n: look(n).light for n in plot.lines
+                }
         heads = [words(sheet.head.html) for sheet in figures.sheets]
         assert [head.split(" of the paper")[0] for head in heads] == ["Figure 4a", "Figure 4b", "Figure 5", "Figure 6"]
         captions = [words(sheet.caption.html) for sheet in figures.sheets]
@@ -125,7 +127,7 @@ class TestFigures:
         # an rms coefficient of 16.6 nm is a slope of four times that over 8 m, 8.3 nrad
         assert f"(paper {8.3e-9 * np.degrees(1.0) * 3.6e6:.2f})" in words(figures.sheets[3].caption.html)
         assert figures.sheets[0].plots[0].figure.yaxis.axis_label == "tip [mas]"
-        assert figures.sheets[0].plots[0].lines[TRUTH].glyph.line_color == look(TRUTH).dark
+        assert figures.sheets[0].plots[0].lines[TRUTH].renderer.glyph.line_color == look(TRUTH).dark
 
     def test_without_a_vibration(self, figures: Figures, dashboard: Dashboard, loop: Any) -> None:
         dashboard.store.change("vibration.source", "none")

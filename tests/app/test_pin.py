@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wfsobs.app.compared import differences, name_of_difference, thin_lines
+from wfsobs.app.compared import differences, find_score, name_of_difference, thin_lines
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.render import change, hundredths, number
 from wfsobs.app.style import observers_of
@@ -40,7 +40,7 @@ def order(dashboard: Dashboard, target: str) -> list[str]:
 class TestPin:
     def test_the_table_shows_the_change(self, pinned: Dashboard) -> None:
         (kept,), shown = pinned.display.compared_runs, pinned.store.run.result
-        before = kept.score("kf-lgs", "turbulence", "tip").rms
+        before = find_score(kept.scores, "kf-lgs", "turbulence", "tip").rms
         now = next(s for s in shown.result.scores if (s.observer, s.target, s.mode) == ("kf-lgs", "turbulence", "tip")).rms
         assert now != before
         html = pinned.explore.table.pane.html

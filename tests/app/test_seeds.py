@@ -12,13 +12,11 @@ import pytest
 
 from wfsobs.app.cache import Cache
 from wfsobs.app.display import Display
-from wfsobs.app.idle_work import SeedRuns
+from wfsobs.app.idle_work import Budgets, SeedRuns
 from wfsobs.app.jobs import BATCH, CLICK, DONE, IDLE_TIME, Job, JobQueue
 from wfsobs.app.store import Store
-from wfsobs.app.views.strip import Strip
+from wfsobs.app.views.errors import MainLines, Strip, Table, VerdictLine
 from wfsobs.app.views.switches import SeedSwitch
-from wfsobs.app.views.table import Table
-from wfsobs.app.views.verdict import VerdictLine
 from wfsobs.pipeline import run
 from wfsobs.progress import Watch
 
@@ -99,8 +97,10 @@ def store(make_store: Any) -> Store:
 def test_every_seed_is_that_of_the_library_and_the_views_say_so(store: Store, loop: Any, short: Any) -> None:
     seeds, display = SeedRuns(store), Display()
     seeds.count = 3
-    table, strip = Table(store.run, display, seeds), Strip("vibration", store.run, display, seeds)
-    verdict, switch = VerdictLine("vibration", store.run, display, seeds), SeedSwitch(seeds)
+    lines = MainLines(display, seeds)
+    budgets = Budgets(seeds, lines.names)
+    table, strip = Table(display, seeds), Strip("vibration", display, lines, budgets)
+    verdict, switch = VerdictLine("vibration", display, budgets), SeedSwitch(seeds)
     store.start()
     loop.until(lambda: seeds.n_known == 3)
     assert seeds.evidence is not None and seeds.evidence.n_seeds == 3

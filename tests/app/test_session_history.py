@@ -9,7 +9,7 @@ import pytest
 
 from wfsobs.app import history as module
 from wfsobs.app.cache import size_of
-from wfsobs.app.compared import LETTERS, ComparedRun, name_of_change
+from wfsobs.app.compared import LETTERS, ComparedRun, find_score, name_of_change
 from wfsobs.app.display import Display
 from wfsobs.app.history import History
 from wfsobs.app.limits import NONE, Limits
@@ -274,4 +274,5 @@ def test_entries_of_another_session(history: History) -> None:
 def test_a_run_has_the_score_of_its_kind() -> None:
     score = Score("kf-lgs", "turbulence", "tip", 1.0, 1.0, None, None, 1e-6)
     run = ComparedRun("key", "A", "name", Scenario(), (score,))
-    assert run.score("kf-lgs", "turbulence", "tip") is score and run.score("kf-lgs", "turbulence", "tilt") is None
+    assert find_score(run.scores, "kf-lgs", "turbulence", "tip") is score
+    assert find_score(run.scores, "kf-lgs", "turbulence", "tilt") is None

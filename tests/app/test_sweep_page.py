@@ -59,7 +59,7 @@ def cell(page: SweepPage, index: int, target: str) -> dict[str, Any]:
 def test_a_map_is_what_the_core_finds(page: SweepPage, dashboard: Dashboard, loop: Any) -> None:
     store = dashboard.store
     store.change("run.duration", 1.0)
-    page.values[0].value, page.values[1].value, page.seeds.value = "5,20", "5,10", "3"
+    page.axes[0].values.value, page.axes[1].values.value, page.seeds.value = "5,20", "5,10", "3"
     said = f'<p class="text" role="status">2 × 2 scenarios × 3 seeds = 12 runs, about {page.plan().seconds:.0f} s'
     assert page.estimate.html.startswith(said)
     sweep = page.plan()
@@ -143,9 +143,9 @@ def a_cell_is_loaded_and_undone(page: SweepPage, dashboard: Dashboard, loop: Any
 
 
 def test_lines_over_one_setting(page: SweepPage, dashboard: Dashboard, loop: Any) -> None:
-    page.settings[1].value = ""
-    assert page.values[1].disabled
-    page.values[0].value, page.seeds.value = "20,5", "3"
+    page.axes[1].select.value = ""
+    assert page.axes[1].values.disabled
+    page.axes[0].values.value, page.seeds.value = "20,5", "3"
     finish(page, loop)
     results = page.results
     assert results is not None
@@ -175,7 +175,7 @@ def test_settings_and_their_usual_values(page: SweepPage, dashboard: Dashboard) 
         for value in axis.values:  # each is one that the setting takes
             scenario.lookup(group).replace({name: value})
     assert usual_values(scenario, RATIO) == "1,6,10,15,20"
-    page.settings[0].value = "gpr_online.length_scale"
+    page.axes[0].select.value = "gpr_online.length_scale"
     assert "gpr-online" in page.plan().observers and "kf-adaptive" not in page.plan().observers, "its own observer runs"
 
 
@@ -209,7 +209,7 @@ def reason(scenario: Scenario, path: str, values: str) -> str:
 
 def test_the_address_has_the_fields(page: SweepPage, dashboard: Dashboard) -> None:
     assert dashboard.view_state.open("view.page=sweep&view.sweep.over=vibration.peaks.1.frequency&view.sweep.second=") == []
-    page.values[0].value, page.seeds.value = "8:12:3:log", "3"
+    page.axes[0].values.value, page.seeds.value = "8:12:3:log", "3"
     query = dashboard.view_state.query
     assert query == (
         "view.page=sweep&view.sweep.over=vibration.peaks.1.frequency&view.sweep.values=8:12:3:log&view.sweep.second="
@@ -219,7 +219,7 @@ def test_the_address_has_the_fields(page: SweepPage, dashboard: Dashboard) -> No
     dashboard.pages.current = EXPLORE
     assert dashboard.view_state.query == "", "the fields of the page shown alone"
     assert dashboard.view_state.open("view.page=sweep") == []
-    assert page.settings[0].value == WIND and page.values[1].value == "2,5,10,20"
+    assert page.axes[0].select.value == WIND and page.axes[1].values.value == "2,5,10,20"
     assert dashboard.view_state.open(query) == [] and page.plan() == planned and dashboard.view_state.query == query
     colour, over = dashboard.view_state.open("view.page=sweep&view.sweep.over=no.such&view.sweep.colour=red")
     assert colour == "view.sweep.colour: there is no such part of a view"
@@ -229,9 +229,9 @@ def test_the_address_has_the_fields(page: SweepPage, dashboard: Dashboard) -> No
 def test_what_cannot_be_run_is_said_in_one_line(page: SweepPage, dashboard: Dashboard) -> None:
     store = dashboard.store
     for field, text, line in (
-        (page.values[0], "20:5:4", "Wind speed V₀=20:5:4: the first number must be below the second"),
-        (page.values[0], "5:500:3", "Wind speed V₀ = 252.5: takes a number from 0.1 to 100 m/s"),
-        (page.values[1], "", "Exposure ratio n: takes values, such as 5:20:4 or 5,10,20"),
+        (page.axes[0].values, "20:5:4", "Wind speed V₀=20:5:4: the first number must be below the second"),
+        (page.axes[0].values, "5:500:3", "Wind speed V₀ = 252.5: takes a number from 0.1 to 100 m/s"),
+        (page.axes[1].values, "", "Exposure ratio n: takes values, such as 5:20:4 or 5,10,20"),
         (page.seeds, "many", "Seeds of each = 'many': takes a whole number from 1 to 100"),
         (page.seeds, "0", "Seeds of each = '0': takes a whole number from 1 to 100"),
     ):
@@ -294,8 +294,8 @@ def test_a_click_waits_for_one_run_at_most_and_what_was_run_is_kept(
 
 def test_a_cell_that_cannot_be_run_says_why(page: SweepPage, loop: Any) -> None:
     """The warm-up is longer than the record in one combination alone."""
-    page.settings[0].value, page.settings[1].value = "run.duration", "run.warm_up"
-    page.values[0].value, page.values[1].value, page.seeds.value = "2,1", "0.2,1.5", "1"
+    page.axes[0].select.value, page.axes[1].select.value = "run.duration", "run.warm_up"
+    page.axes[0].values.value, page.axes[1].values.value, page.seeds.value = "2,1", "0.2,1.5", "1"
     finish(page, loop)
     assert page.results is not None and set(page.results.failures) == {3} and page.results.n_done == 4
     shown = cell(page, 3, "vibration")

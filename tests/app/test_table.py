@@ -5,17 +5,18 @@ from __future__ import annotations
 import re
 from typing import Any
 
+from tests.app.conftest import OneSeed
 from wfsobs.app.display import Display
 from wfsobs.app.jobs import DONE
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
-from wfsobs.app.views.table import Table
+from wfsobs.app.views.errors import Table
 from wfsobs.simulation.loop import simulate
 
 
 def test_lines_are_true_for_the_simulation_of_the_settings_and_given_for_a_loaded_record(make_store: Any, loop: Any) -> None:
     store: Store = make_store()
-    table = Table(store.run, Display())
+    table = Table(Display(), OneSeed(store))
     store.start()
     loop.until(lambda: store.run.state == DONE)
     assert "Prior knowledge: peak frequencies<" in table.pane.html and "given peak" not in table.pane.html
@@ -26,7 +27,7 @@ def test_lines_are_true_for_the_simulation_of_the_settings_and_given_for_a_loade
 
 def test_every_dash_has_a_reason_and_no_number_an_exponent(make_store: Any, loop: Any) -> None:
     store: Store = make_store()
-    table = Table(store.run, Display())
+    table = Table(Display(), OneSeed(store))
     assert table.html().count("–") == len(re.findall('<span title="[^"]+">–</span>', table.html())) > 20
     store.start()
     loop.until(lambda: store.run.state == DONE)

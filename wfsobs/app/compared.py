@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wfsobs.app.controls.names import preset_title, setting_name
+from wfsobs.app.controls.names import preset_title, setting_name, value_of
 from wfsobs.app.render import NOTHING, change, number
 from wfsobs.app.sources import LoadedRecord, Step, give_same_record
 from wfsobs.app.style import observers_of
@@ -94,14 +94,8 @@ def _change(before: Scenario, now: Scenario, path: str) -> str:
     name, old, new = setting_name(path), before.lookup(path), now.lookup(path)
     if isinstance(new, list):
         return f"{name} changed"
-    if isinstance(new, bool):
-        old, new = ("on" if value else "off" for value in (old, new))
     unit = unit_text(now.unit(path))
-    return f"{name} {_word(old)} → {_word(new)} {unit}".rstrip()
-
-
-def _word(value: Any) -> str:
-    return f"{value:.6g}" if isinstance(value, (int, float)) else str(value)
+    return f"{name} {value_of(old)} → {value_of(new)} {unit}".rstrip()
 
 
 def name_of_difference(before: Scenario, now: Scenario) -> str:
@@ -151,9 +145,10 @@ class ComparedRun:
     scores: tuple[Score, ...]
     lines: DrawnLines | None = None
 
-    def score(self, observer: str, target: str, mode: str) -> Score | None:
-        """Find the score of one observer, target and mode; None if there is none."""
-        return next((s for s in self.scores if (s.observer, s.target, s.mode) == (observer, target, mode)), None)
+
+def find_score(scores: Iterable[Score], observer: str, target: str, mode: str) -> Score | None:
+    """Find the score of one observer, target and mode; None if there is none."""
+    return next((s for s in scores if (s.observer, s.target, s.mode) == (observer, target, mode)), None)
 
 
 def thin_lines(results: RunResults) -> DrawnLines:
@@ -183,7 +178,7 @@ def comparison_of(runs: Sequence[ComparedRun], result: Result) -> dict[str, Any]
         return None
     groups: dict[tuple[str, str], list[list[str]]] = {}
     for now in result.scores:
-        before = [run.score(now.observer, now.target, now.mode) for run in runs]
+        before = [find_score(run.scores, now.observer, now.target, now.mode) for run in runs]
         if any(before):
             cells = [NOTHING if s is None else f"{number(1e3 * s.rms)} ({change(s.rms, now.rms)} %)" for s in before]
             groups.setdefault((now.target, now.mode), []).append([row_label(now.observer), number(1e3 * now.rms), *cells])

@@ -27,8 +27,8 @@ from wfsobs.app.service import Post, Session
 from wfsobs.app.store import Store
 from wfsobs.app.style import Component, labels, script, sheets, theme
 from wfsobs.app.upload import Upload
+from wfsobs.app.views.errors import effect_line
 from wfsobs.app.views.switches import ModeSwitch, UnitSwitch
-from wfsobs.app.views.verdict import effect_line
 from wfsobs.scenario import Scenario
 
 MOST = 1000

@@ -23,7 +23,12 @@ UNITS = {"nm": "nm", "mas": "mas", "um": "µm"}
 
 IN_MOST = "where the error of an optimal observer lies in 95 % of records"
 OVER_SEEDS = "where the mean error over records lies, at 95 % confidence"
-FROM_RECORD = "from one record"
+
+
+def over(n_seeds: int) -> str:
+    """Say what the interval of an error is, from so many seeds."""
+    return f"{OVER_SEEDS}, {f'{n_seeds} seeds' if n_seeds > 1 else 'from one record'}"
+
 
 AT_LIMIT = "at the limit"
 """Note on an observer whose error is, within its interval, the bound of what it measures."""
@@ -85,7 +90,7 @@ class Display(param.Parameterized):
     show: param.Selector[str] = param.Selector(
         default=ERROR, objects={"Signal": SIGNAL, "Error": ERROR, "Running rms": RUNNING_RMS}, label="Show"
     )
-    unit: param.Selector[str] = param.Selector(default="nm", objects=list(UNITS), label="Unit")
+    unit: param.Selector[str] = param.Selector(default="nm", objects={text: unit for unit, text in UNITS.items()}, label="Unit")
     hidden_lines: param.Parameter[dict[str, list[str]]] = param.Parameter({}, doc="Target -> names of its hidden lines.")
     named_lines: param.Parameter[dict[str, list[str]]] = param.Parameter(
         {}, doc="Target -> names of the lines that matter: those that the verdict names."
@@ -114,10 +119,14 @@ class Display(param.Parameterized):
         """The mode as axes write it."""
         return short_name(modes_up_to(HIGHEST_ORDER)[self.column])
 
-    @property
-    def units(self) -> list[str]:
-        """Those that the mode can be in: only tip and tilt are angles."""
-        return [unit for unit in UNITS if unit not in NO_ANGLE or self.mode in [m.name for m in TIP_TILT]]
+    @param.depends("mode", watch=True)
+    def _offer_units(self) -> None:
+        """Offer those that the mode can be in: only tip and tilt are angles."""
+        units = {text: unit for unit, text in UNITS.items() if unit not in NO_ANGLE or self.mode in [m.name for m in TIP_TILT]}
+        if self.unit not in units.values():
+            self.unit = "nm"
+        if units != dict(self.param["unit"].names):
+            self.param["unit"].objects = units
 
     @property
     def runs_drawn(self) -> list[tuple[ComparedRun, DrawnLines]]:

@@ -98,6 +98,15 @@ class SeedRuns(param.Parameterized):
         of = self._of
         return of is not None and not isinstance(of.source, LoadedRecord) and run_seconds(of.scenario) <= PATIENCE
 
+    @property
+    def n_seeds(self) -> int:
+        """How many seeds the errors are means over."""
+        return self.evidence.n_seeds if self.evidence else 1
+
+    def over_seeds(self, score: Score) -> Score:
+        """Return a score with its mean over the seeds, where there are several."""
+        return self.evidence.over_seeds(score) if self.evidence else score
+
     def _follow(self, *_: object) -> None:
         """Begin anew with what is shown, once it is complete."""
         shown = self.run.result if self.run.state == DONE and not self.store.stale else None
@@ -165,8 +174,8 @@ ByObserver = dict[str, Sequence[Budget]]
 class Budgets(param.Parameterized):
     """The budgets of linear observers and of the main ones; of all others too once they are asked for.
 
-    main  : returns the main observers of a target
     seeds : which change the main ones; where one record is enough, nothing else runs in idle time
+    main  : returns the main observers of a target
     """
 
     by_observer: param.Parameter[ByObserver] = param.Parameter(
@@ -176,13 +185,12 @@ class Budgets(param.Parameterized):
         False, doc="Whether observers that are not linear have theirs too, though they are not main ones."
     )
 
-    def __init__(self, store: Store, main: Callable[[str], Collection[str]], seeds: SeedRuns | None = None):
+    def __init__(self, seeds: SeedRuns, main: Callable[[str], Collection[str]]):
         super().__init__()
-        self.store = store
-        self.run: Final = store.run
-        self.main = main
         self.seeds = seeds
-        self.task: Final = BackgroundTask(store.session)
+        self.run: Final = seeds.run
+        self.main = main
+        self.task: Final = BackgroundTask(seeds.store.session)
         self._of: RunResults | None = None
         self._budgets: ByObserver = {}
         self._names: list[str] = []
@@ -218,10 +226,9 @@ class Budgets(param.Parameterized):
     def _order(self, results: RunResults) -> list[str]:
         """List the observers that are to have a budget, the main ones and the quick ones first."""
         ran, each = {e.observer for e in results.result.estimates}, part_seconds(results.scenario)
-        is_one_record = self.seeds is not None and self.seeds.count == 1
-        main = {name for target in TARGETS for name in self.main(target) if not is_one_record}
+        main = {name for target in TARGETS for name in self.main(target) if self.seeds.count > 1}
         seconds = {o.id: 0.0 if o.linear else RUNS * each.get(o.id, UNKNOWN) for o in OBSERVERS.values() if o.id in ran}
-        most = min(BUDGET_PATIENCE, self.store.limits.seconds)
+        most = min(BUDGET_PATIENCE, self.seeds.store.limits.seconds)
         wanted = [name for name, of in seconds.items() if of == 0.0 or (of <= most and (self.every or name in main))]
         return sorted(wanted, key=lambda name: (seconds[name] > 0.0, name not in main, seconds[name]))
 

@@ -136,13 +136,6 @@ def above_bound(rms: float, interval: Sequence[float] | None, bound: float | Non
     return 0.0 if interval is not None and interval[0] <= bound <= interval[1] else rms / bound - 1.0
 
 
-def at_bound(scores: Iterable[Score]) -> set[tuple[str, str, str]]:
-    """Return (observer, target, mode) of scores whose interval has the bound of what the observer measures in it."""
-    of = {(s.observer, s.target, s.mode): s for s in scores}
-    bounds = {key: of.get((own_bound(key[0]) or "", *key[1:])) for key in of}
-    return {key for key, it in bounds.items() if it and above_bound(of[key].rms, of[key].interval, it.rms) == 0.0}
-
-
 def can_be_best(observer: str, apart: bool) -> bool:
     """Return whether a row can be the best: not a bound, nor a row that is not causal or was scored on samples of its own."""
     return observer not in NOT_OBSERVERS and not is_non_causal(observer) and not apart

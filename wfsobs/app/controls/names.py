@@ -5,13 +5,16 @@ from __future__ import annotations
 import re
 from collections import Counter
 from functools import cache
+from typing import Any
 
 import param
 
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.configfile import format_value
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.settings.group import Group, holds_groups
+from wfsobs.units import unit_text
 
 SHORT = {
     "frequency": "f",
@@ -87,6 +90,20 @@ def _item(p: param.List, number: str, *keys: str) -> str:
 def _labels() -> Counter[str]:
     """How many settings have a label."""
     return Counter(str(p.label) for _, _, p in Scenario().walk())
+
+
+def setting_label(scenario: Scenario, path: str) -> str:
+    """Name a setting, with its unit in [brackets]."""
+    unit = unit_text(scenario.unit(path))
+    return f"{setting_name(path)} [{unit}]" if unit else setting_name(path)
+
+
+def value_of(value: Any) -> str:
+    """Write a setting's value for people."""
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    text = f"{value:.6g}" if isinstance(value, (int, float)) else format_value(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 ACRONYMS = ("ut4", "galacsi", "nfm", "wfm")

@@ -11,14 +11,14 @@ import numpy as np
 import panel as pn
 import panel_material_ui as pmui
 
+from wfsobs.app.controls.names import setting_label, value_of
 from wfsobs.app.controls.panel import Status
 from wfsobs.app.display import Display
 from wfsobs.app.jobs import BATCH, FAILED, RUNNING, Job, Work
 from wfsobs.app.pages.parts import WIDE, LinkedFields, Page, box, boxes, html, line, text
 from wfsobs.app.pages.sweep import ErrorLines, SweepMap, line_of
-from wfsobs.app.pages.sweep_views import DECIDED, LEFT_OUT, OPEN, WAITING, axis_title, map_square, verdict_text
+from wfsobs.app.pages.sweep_views import DECIDED, LEFT_OUT, OPEN, WAITING, map_square, verdict_text
 from wfsobs.app.render import NOTHING, number, table
-from wfsobs.app.report.sections import value_of
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.share import CAMPAIGN, EXPLORED, CopiedTask
 from wfsobs.app.store import Store
@@ -53,7 +53,7 @@ class CampaignView:
 
 def axis_name(axis: PlanAxis, base: Scenario) -> str:
     """Name a condition, with its unit."""
-    return "Scenario" if axis.path == SCENARIO else axis_title(base, axis.path)
+    return "Scenario" if axis.path == SCENARIO else setting_label(base, axis.path)
 
 
 def value_names(axis: PlanAxis) -> list[str]:
@@ -103,17 +103,14 @@ def winners_grid(view: CampaignView, x: PlanAxis, y: PlanAxis | None, display: D
     """Describe the map of winners."""
     columns, rows = value_names(x), value_names(y) if y else [""]
     across, down = axis_name(x, view.base), axis_name(y, view.base) if y else ""  # once: it looks through all settings
-    of = np.full((len(columns), len(rows)), None, dtype=object)  # None: the plan has no such scenario
-    shown = np.isin(np.arange(len(x.of_cell)), view.cells)
-    for cell in range(len(x.of_cell)):
-        i, j = int(x.of_cell[cell]), int(y.of_cell[cell]) if y else 0
-        of[i, j] = of[i, j] or []
-        if shown[cell]:
-            of[i, j].append(cell)
+    places = list(zip(x.of_cell.tolist(), y.of_cell.tolist() if y else [0] * len(x.of_cell), strict=True))
+    of: dict[tuple[int, int], list[int]] = {place: [] for place in places}  # the plan has no scenario of the others
+    for cell in view.cells.tolist():
+        of[places[cell]].append(cell)
     key: dict[str, str] = {}
     cells = [
         [
-            _square(view, of[i, j], f"{across} {columns[i]}" + (f", {down} {rows[j]}" if y else ""), display, key)
+            _square(view, of.get((i, j)), f"{across} {columns[i]}" + (f", {down} {rows[j]}" if y else ""), display, key)
             for i in range(len(columns))
         ]
         for j in reversed(range(len(rows)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from html import escape
 from typing import Any, Final
@@ -41,9 +41,10 @@ from wfsobs.app.share import LOOP, CopiedTask
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.style import look, named_row
-from wfsobs.app.views.gain_editor import GainEditor, plane
+from wfsobs.app.views.errors import Cards, card_of, error_fields
+from wfsobs.app.views.gain_editor import GainEditor, decibel, plane
 from wfsobs.app.views.plots import (
-    LoopLines,
+    FigureLines,
     PairedLines,
     in_view,
     new_figure,
@@ -51,7 +52,6 @@ from wfsobs.app.views.plots import (
     on_settle,
     set_ends,
 )
-from wfsobs.app.views.strip import Cards, card_of, error_fields
 from wfsobs.closed_loop.envelope import POINTS, PlantEnvelope, Uncertainty
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label, loop_verdict, no_theory
 from wfsobs.control.controllers import CONTROLLERS
@@ -60,8 +60,6 @@ from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.evaluation.verdict import Verdict
 from wfsobs.settings.errors import SettingError
 from wfsobs.signal.envelope import envelope, envelope_times
-from wfsobs.signal.wiener import Complex
-from wfsobs.typing import Array
 
 UNSTABLE = macro("tag", "above", "unstable")
 
@@ -167,7 +165,7 @@ CURVES = tuple(c.id for c in CONTROLLERS.values() if c.law and not c.predict and
 """Controllers that may have a transfer function."""
 
 
-class Trace(LoopLines):
+class Trace(FigureLines):
     """The residual of every controller over time; that of none would dwarf the rest. seconds : shown of a record at first."""
 
     def __init__(self, seconds: float):
@@ -224,7 +222,7 @@ class Trace(LoopLines):
         set_ends(self.figure.y_range, -top, top)
 
 
-class LoopSpectrum(LoopLines):
+class LoopSpectrum(FigureLines):
     """The power spectral density of every residual."""
 
     def __init__(self) -> None:
@@ -257,14 +255,10 @@ class Response(PairedLines):
         nyquist = 0.5 / results.result.record.dt
         self.figure.x_range.update(start=1e-3 * nyquist, end=nyquist)
         curves = {name: of[display.column] for name, of in results.curves.items()}
-        self.put_both({name: (c.frequency, _decibel(c.rejection), _decibel(c.noise)) for name, c in curves.items()})
+        self.put_both({name: (c.frequency, decibel(c.rejection), decibel(c.noise)) for name, c in curves.items()})
 
 
-def _decibel(x: Complex) -> Array:
-    return 20.0 * np.log10(np.maximum(np.abs(x), 1e-6))
-
-
-class Nyquist(LoopLines):
+class Nyquist(FigureLines):
     """The loop gain in the complex plane, the unit circle, and where the margins are measured."""
 
     def __init__(self) -> None:
@@ -275,7 +269,17 @@ class Nyquist(LoopLines):
         fig.scatter([-1.0], [0.0], marker="x", size=11, line_color="#888888", line_width=2)
         super().__init__(fig, CURVES)
         self.marks: Final = ColumnDataSource({"x": [], "y": [], "colour": [], "marker": []})
-        fig.scatter("x", "y", source=self.marks, marker="marker", line_color="colour", fill_alpha=0.0, size=9, line_width=2)
+        fig.scatter(
+            "x",
+            "y",
+            source=self.marks,
+            marker="marker",
+            line_color="colour",
+            fill_alpha=0.0,
+            size=9,
+            line_width=2,
+            level="annotation",
+        )
         self._at: dict[str, list[tuple[complex, str]]] = {}
 
     def draw(self, results: LoopResults, display: Display) -> None:
@@ -292,9 +296,9 @@ class Nyquist(LoopLines):
                 both = [-np.exp(1j * sign * margins.phase) for sign in (1.0, -1.0)]
                 self._at[name].append((min(both, key=lambda p, L=L: np.nanmin(np.abs(L - p))), "square"))
 
-    def restyle(self, dark: bool, hidden_names: list[str]) -> None:
+    def restyle(self, dark: bool, hidden_names: Sequence[str], main_names: Sequence[str] = ()) -> None:
         """Restyle the marks too."""
-        super().restyle(dark, hidden_names)
+        super().restyle(dark, hidden_names, main_names)
         rows = [
             (point.real, point.imag, look(name).colour(dark), marker)
             for name, at in self._at.items()
@@ -401,17 +405,14 @@ ABOUT = (
 )
 
 
-FILES: Mapping[str, tuple[str, Callable[[LoopResults], bytes]]] = {
-    "Controllers as CSV": ("wfsobs-controllers.csv", lambda shown: table_csv(shown.rows)),
-    "Residuals as CSV": ("wfsobs-residuals.csv", residuals_csv),
-}
-"""The table of `wfsobs loop --json`, and the residuals."""
-
-
 class ClosedLoopPage(Page):
     """The page; computed anew when the results change, while it is visible."""
 
-    files = FILES
+    files = {
+        "Controllers as CSV": ("wfsobs-controllers.csv", lambda shown: table_csv(shown.rows)),
+        "Residuals as CSV": ("wfsobs-residuals.csv", residuals_csv),
+    }
+    """The table of `wfsobs loop --json`, and the residuals."""
 
     def __init__(self, store: Store, display: Display):
         super().__init__(store, display, "mode", "unit")

@@ -22,21 +22,16 @@ from wfsobs.app.pages.parts import (
     box,
     caption,
     grid_style,
-    group,
     tick,
     zoom_buttons,
 )
 from wfsobs.app.render import macro
 from wfsobs.app.style import sheets
+from wfsobs.app.views.errors import MainLines, Strip, Table, VerdictLine
 from wfsobs.app.views.plots import MODEL, PEAKS, call
-from wfsobs.app.views.spectra import SpectraFigures
 from wfsobs.app.views.spectrum_editor import Frames, SpectrumEditor
-from wfsobs.app.views.strip import Strip
-from wfsobs.app.views.switches import Pinning, SeedSwitch
-from wfsobs.app.views.table import Table
-from wfsobs.app.views.target_figures import Stretch
-from wfsobs.app.views.traces import Traces
-from wfsobs.app.views.verdict import MainLines, VerdictLine
+from wfsobs.app.views.switches import Pinning, SeedSwitch, group
+from wfsobs.app.views.traces import SpectraFigures, Stretch, Traces
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.error_spectra import Theory
 from wfsobs.observers.base import TARGETS, VIBRATION
@@ -63,16 +58,15 @@ class Explore(Page):
         self.show_switch: Final = group(display, "show")
         self._wanted_show = display.show
         run.param.watch(self._offer_errors, "result")  # before the figures, which then draw once
-        self.lines: Final = MainLines(run, display, seeds)
+        self.lines: Final = MainLines(display, seeds)
         self.traces: Final = Traces(run, display)
         self.spectra: Final = SpectraFigures(run, display, self.traces.x_range)
-        self.budgets: Final = Budgets(seeds.store, self.lines.names, seeds)
-        self.strips: Final = {target: Strip(target, run, display, seeds, self.lines, self.budgets) for target in TARGETS}
-        self.verdicts: Final = {target: VerdictLine(target, run, display, seeds, self.budgets) for target in TARGETS}
-        axes = self.traces.x_range, self.spectra.x_range
-        self.stretches: Final = {target: Stretch(target, run, display, *axes, self.traces.chosen_window) for target in TARGETS}
-        self.table: Final = Table(run, display, seeds)
-        self.pinning: Final = Pinning(run, display, history)
+        self.budgets: Final = Budgets(seeds, self.lines.names)
+        self.strips: Final = {target: Strip(target, display, self.lines, self.budgets) for target in TARGETS}
+        self.verdicts: Final = {target: VerdictLine(target, display, self.budgets) for target in TARGETS}
+        self.stretches: Final = {target: Stretch(target, self.traces, self.spectra) for target in TARGETS}
+        self.table: Final = Table(display, seeds)
+        self.pinning: Final = Pinning(history)
         self.rooms: dict[str, pn.Column] = {}
         self.editors: dict[str, SpectrumEditor] = {}
         self.sections: Final = pn.Column(self._section(TARGETS[0]), **WIDE, stylesheets=[GAP])

@@ -8,13 +8,13 @@ from typing import Final
 import panel as pn
 from bokeh.models import BoxAnnotation
 
+from wfsobs.app.compared import find_score
 from wfsobs.app.display import Display
 from wfsobs.app.pages.parts import WIDE, Page, boxes
 from wfsobs.app.render import number, render, short
 from wfsobs.app.store import Store
 from wfsobs.app.style import HtmlText, html, look, sheets, swatch
-from wfsobs.app.views.plots import LoopLines, call, new_figure, set_ends
-from wfsobs.app.views.table import find
+from wfsobs.app.views.plots import FigureLines, call, new_figure, set_ends
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.description import Description, describe
 from wfsobs.observers import OBSERVERS
@@ -73,7 +73,7 @@ class _Sheet:
         scale, parts = display.scale(results.scenario), []
         for column in sorted({plot.column for plot in self.figure.plots}):
             mode = TIP_TILT[column].name
-            scores = {name: find(results, name, self.figure.target, mode) for name in self.figure.observers}
+            scores = {name: find_score(results.result.scores, name, self.figure.target, mode) for name in self.figure.observers}
             found = ", ".join(f"{_label(n)} {number(s.rms * scale)}{self._paper_error(n, scale)}" for n, s in scores.items() if s)
             if found:
                 parts.append(f"RMS error of {mode} [{display.unit_label}]: {found}.")
@@ -85,7 +85,7 @@ class _Sheet:
         return "" if error is None else f" (paper {number(error * scale)})"
 
 
-class _PlotLines(LoopLines):
+class _PlotLines(FigureLines):
     """One plot."""
 
     def __init__(self, plot: Plot, names: tuple[str, ...], of: PaperFigure):
@@ -93,9 +93,11 @@ class _PlotLines(LoopLines):
         y, label, log = ((1e-3, 1.0), "frequency [Hz]", "y") if plot.is_spectrum else (None, "time [s]", "")
         fig = new_figure((0.0, 1.0), y, label, log)
         call(fig, f"{of.title}, {TIP_TILT[plot.column].name}, {plot.what}")
-        super().__init__(fig, names)
+        super().__init__(fig, names, line_width=1.6)
+        self.restyle(False, [])
         for name, line in self.lines.items():
-            line.glyph.update(line_width=1.6, line_dash=list(look(name).dash) if is_dashed(name, of) else [])
+            if line.renderer and not is_dashed(name, of):
+                line.renderer.glyph.line_dash = []
         self.window = BoxAnnotation(left=0, right=0, fill_color="#808080", fill_alpha=0.15, line_width=0, level="underlay")
         if plot.what == WHOLE and any(p.what == ZOOMED for p in of.plots):
             self.figure.add_layout(self.window)

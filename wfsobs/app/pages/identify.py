@@ -139,6 +139,9 @@ class SpectrumFigure:
             set_ends(self.figure.y_range, float(np.quantile(positive, 0.01)) / 5.0, float(highest.max()) * 6.0)
         set_ends(self.figure.x_range, float(of.frequency[0]), float(of.frequency[-1]))
         self.figure.yaxis.axis_label = f"PSD of z, {display.mode_label} [{display.unit_label}²/Hz]"
+        for name, renderer in self._glyphs:
+            colour = look(name).colour(display.dark)
+            renderer.glyph.update(**dict.fromkeys({"line_color", "fill_color"} & renderer.glyph.properties(), colour))
 
     def draw_fit(self, mode: IdentifiedMode | None, of: Fit | None, scale: float) -> None:
         """Send the model of the mode shown, or nothing."""
@@ -161,12 +164,6 @@ class SpectrumFigure:
             "y": [1.6 * scale * y for y in height],
             "text": [f"{'line' if p.pure else 'resonance'} {p.frequency.value:.5g} Hz" for p in mode.peaks],
         }
-
-    def restyle(self, dark: bool) -> None:
-        """Set the colours of light or dark mode."""
-        for name, renderer in self._glyphs:
-            colour = look(name).colour(dark)
-            renderer.glyph.update(**dict.fromkeys({"line_color", "fill_color"} & renderer.glyph.properties(), colour))
 
 
 WHITE, COLOURED = macro("tag", "best", "white"), macro("tag", "above", "not white")
@@ -229,17 +226,10 @@ def model_toml(finding: tuple[Identification, Record, Scenario]) -> bytes:
     return identification_toml(result, result.scenario(as_stated(record, scenario))).encode()
 
 
-FILES = {"Model as TOML": ("wfsobs-model.toml", model_toml)}
-
-
-NEITHER: tuple[Identification | None, Record | None] = (None, None)
-"""No model, and no record from which it was identified."""
-
-
 class IdentifyPage(Page):
     """The page. The measured spectrum follows the results shown while it is visible; the model comes when asked for."""
 
-    files = FILES
+    files = {"Model as TOML": ("wfsobs-model.toml", model_toml)}
 
     def __init__(self, store: Store, display: Display):
         super().__init__(store, display)
@@ -285,10 +275,10 @@ class IdentifyPage(Page):
     @property
     def is_used(self) -> bool:
         """Whether the settings are those of the model identified in the record shown."""
-        (result, record), shown = self.work.result or NEITHER, self.run.result
-        if result is None or record is None or shown is None or not same_content(record, shown.result.record):
+        if (found := self.work.result) is None or (shown := self.run.result) is None:
             return False
-        return result.scenario(self.store.scenario) == self.store.scenario
+        result, record = found
+        return same_content(record, shown.result.record) and result.scenario(self.store.scenario) == self.store.scenario
 
     def simulate(self) -> None:
         """Take the model into the settings, and simulate it in place of the record."""
@@ -305,8 +295,8 @@ class IdentifyPage(Page):
         return None if self.work.result is None else (*self.work.result, self.store.scenario)
 
     def _take(self, source: Source | None) -> None:
-        result, _ = self.work.result or NEITHER
-        if result is not None:
+        if self.work.result is not None:
+            result, _ = self.work.result
             self.store.run_on(source, result.scenario(self.store.scenario))
             self._scenario = self.store.scenario if source is None else None
             self.redraw()
@@ -334,13 +324,14 @@ class IdentifyPage(Page):
         if of is None or shown is None or self.display.column >= of.mean.shape[1]:
             return
         scale, column = self.display.scale(shown.scenario), self.display.column
-        result, record = self.work.result or NEITHER
-        mode = result.modes[column] if result and column < len(result.modes) else None
         self.legend.html = legend(NAMES, self.display.dark)
         self.figure.draw_measured(of, self.display, scale**2)
-        self.figure.draw_fit(mode, fitted_spectrum(mode, result) if mode and result else None, scale**2)
-        self.figure.restyle(self.display.dark)
-        if result and record:
+        if self.work.result is None:
+            self.figure.draw_fit(None, None, 1.0)
+        else:
+            result, record = self.work.result
+            mode = result.modes[column] if column < len(result.modes) else None
+            self.figure.draw_fit(mode, fitted_spectrum(mode, result) if mode else None, scale**2)
             self.verdict.html = verdict_html(result)
             self.table.html = identification_html(mode, self.display, scale) if mode else ""
             replaced = self.store.source is None and self._scenario == self.store.scenario

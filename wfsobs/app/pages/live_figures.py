@@ -9,8 +9,6 @@ from typing import Any, Final
 
 import numpy as np
 import panel as pn
-from bokeh.core.validation import silence
-from bokeh.core.validation.warnings import MISSING_RENDERERS
 from bokeh.model import Model
 from bokeh.models import BasicTicker, ColorBar, ColumnDataSource, Image, LogColorMapper, Range1d
 from bokeh.palettes import Viridis256
@@ -19,7 +17,7 @@ from bokeh.plotting import figure
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.pages.parts import WIDE, grid_style
 from wfsobs.app.style import Component, bare, look, script
-from wfsobs.app.views.plots import FigureLines, call, new_figure, new_spectrum
+from wfsobs.app.views.plots import FigureLines, Points, call, new_figure, new_spectrum
 from wfsobs.app.views.traces import WINDOW_S
 from wfsobs.app.work import TRUTH
 from wfsobs.control.controllers import CONTROLLERS
@@ -133,26 +131,23 @@ ROOM = 30
 CLOSE = 0.05
 """Part of the window within which the words of two events would cover each other."""
 NAMES = (TRUTH, *BOUNDS, *SLOTS)
-silence(MISSING_RENDERERS)  # of figures whose lines are made when they are first shown
 
 
-class LiveFigure:
-    """A figure with a line per observer, each made when it is first shown."""
+class LiveFigure(FigureLines):
+    """A figure with a line per observer, whose changes a painter sends."""
 
     def __init__(self, fig: figure, painter: Painter):
-        self.figure = fig
+        super().__init__(fig, NAMES)
         self.painter = painter
-        self.sources: Final = {name: ColumnDataSource({"x": [], "y": []}) for name in NAMES}
-        self.lines: Final = FigureLines(fig, {name: (source, "y") for name, source in self.sources.items()})
-        self._style: tuple[bool, set[str]] = (False, set())
+        self._lines_shown: tuple[bool, set[str]] = (False, set())
 
-    def put(self, data: Mapping[str, tuple[Array, Array]], dark: bool) -> None:
+    def paint(self, data: Mapping[str, Points], dark: bool) -> None:
         """Show these lines, x and y by name, and no others."""
         for name, (x, y) in data.items():
             self.painter.data(self.figure, self.sources[name], {"x": x, "y": y})
-        if (style := (dark, set(data))) != self._style:
-            self._style = style
-            self.lines.restyle(dark, [name for name in NAMES if name not in data])
+        if (shown := (dark, set(data))) != self._lines_shown:
+            self._lines_shown = shown
+            self.restyle(dark, [name for name in NAMES if name not in data])
 
 
 class LiveMarks:
@@ -197,11 +192,6 @@ class RollingTraces(LiveFigure):
         super().__init__(new_figure((0.0, 1.0), (-1.0, 1.0), "time of the loop [s]"), painter)
         self._marks = LiveMarks(self.figure)
 
-    @staticmethod
-    def run_in(display: Display) -> float:
-        """How much before the window is needed [s]."""
-        return WINDOW_S if display.running else 0.0
-
     def draw(
         self,
         view: LiveView,
@@ -223,7 +213,7 @@ class RollingTraces(LiveFigure):
                 x = trailing_rms(x, min(round(WINDOW_S / view.dt), len(x)))
             return envelope(x[first - view.first :, display.column], BINS)
 
-        def drawn(name: str) -> tuple[Array, Array]:
+        def drawn(name: str) -> Points:
             key = ("trace", name, target, display.column, display.show, first)
             return times, scale * view.once(key, lambda: trace(shown_signal(view, name, target, display)))
 
@@ -232,7 +222,7 @@ class RollingTraces(LiveFigure):
         if display.running:
             ends = times[[0, -1]]
             data |= {name: (ends, np.full(2, scale * of[target][display.column])) for name, of in bounds.items() if target in of}
-        self.put(data, display.dark)
+        self.paint(data, display.dark)
         self.painter.update(self.figure, self.figure.x_range, start=first * view.dt, end=last * view.dt)
         self.painter.update(self.figure, self.figure.y_range, start=0.0 if display.running else -top, end=top)
         what = "running rms of error of" if display.running else "error of" if display.error else ""
@@ -269,7 +259,7 @@ class RollingSpectra(LiveFigure):
             before = self._sums.get(name, density)
             now = self._sums[name] = before + share * (density - before) if before.shape == density.shape else density
             data[name] = frequency[1:], display.curve(frequency, now, scenario)
-        self.put(data, display.dark)
+        self.paint(data, display.dark)
         top = 3.0 * max((float(y.max()) for _, y in data.values()), default=1.0) or 1.0
         self.figure.x_range.update(start=1.0, end=0.5 / view.dt)
         self.figure.y_range.update(start=top * 10.0 ** -(DECADES / 2 if display.cumulative else DECADES), end=top)
@@ -283,7 +273,7 @@ def shown_signal(view: LiveView, name: str, target: str, display: Display) -> Ar
     return view.error(name, target) if display.error else view.estimate(name, target)
 
 
-def _last_spectrum(view: LiveView, name: str, target: str, display: Display, n: int) -> tuple[Array, Array] | None:
+def _last_spectrum(view: LiveView, name: str, target: str, display: Display, n: int) -> Points | None:
     """Return frequencies [Hz] and the spectrum of the last n frames [um^2/Hz]; None where too many are missing."""
     x = bridge_missing(shown_signal(view, name, target, display)[-n:, display.column])
     if x is None:

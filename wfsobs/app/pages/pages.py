@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Final
 from urllib.parse import parse_qsl, quote
@@ -161,13 +161,10 @@ class ViewState(param.Parameterized):
         self.traces = explore.traces
         switches = LinkedFields({PAGE: (pages, "current")} | {name: (display, name) for name in SWITCHES})
         switches.fresh[PAGE] = EXPLORE
-        self._parts: list[tuple[Collection[str], LinkPart]] = [
-            ((PAGE, *SWITCHES), switches),
-            *(((HIDE + target,), self._lines_of(target)) for target in TARGETS),
-            ((SEEDS,), LinkedFields({SEEDS: (seeds, "count")})),
-        ]
+        lines = [self._lines_of(target) for target in TARGETS]
+        self._parts: list[LinkPart] = [switches, *lines, LinkedFields({SEEDS: (seeds, "count")})]
         self._theme, self._known_pages = "", set[str]()
-        for _names, part in self._parts:
+        for part in self._parts:
             part.watch(self._refresh)
         pages.param.watch(self._turn, "current")
         on_settle([self.traces.x_range], self._refresh)
@@ -198,11 +195,11 @@ class ViewState(param.Parameterized):
         if (theme := fields.pop(THEME, "")) in ("dark", "light"):
             self._theme = theme
         refused = self._open_window(fields.pop(WINDOW, ""))
-        for names, part in self._parts:
-            refused += part.open({name: fields.pop(name) for name in names if name in fields})
+        for part in self._parts:
+            refused += part.open({name: fields.pop(name) for name in part.names if name in fields})
         of_page = f"{self.pages.current}."
         own = {key: fields.pop(key) for key in [*fields] if key.startswith(of_page)}
-        refused += [of_page + line for line in self.pages.page.open_link({key.removeprefix(of_page): own[key] for key in own})]
+        refused += [of_page + line for line in self.pages.page.link.open({key.removeprefix(of_page): own[key] for key in own})]
         self._refresh()
         return [PREFIX + line for line in (*refused, *not_known(fields))]
 
@@ -224,11 +221,11 @@ class ViewState(param.Parameterized):
 
     def _refresh(self, *_: object) -> None:
         fields: dict[str, str] = {}
-        for _names, part in self._parts[:-1]:
+        for part in self._parts[:-1]:
             fields |= part.texts()
         if (window := self.traces.chosen_window()) is not None:
             fields[WINDOW] = f"{window[0]:.4g},{window[1]:.4g}"
         fields |= {f"{self.pages.current}.{name}": text for name, text in self.pages.page.link.texts().items()}
-        fields |= self._parts[-1][1].texts()
+        fields |= self._parts[-1].texts()
         parts = [f"{PREFIX}{key}={quote(value, safe=',:-')}" for key, value in fields.items()]
         self.query = "&".join([*parts, *([f"{THEME}={self._theme}"] if self._theme else [])])

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import partial
 from html import escape
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import panel as pn
 import panel_material_ui as pmui
@@ -22,32 +22,17 @@ from wfsobs.app.render import render
 from wfsobs.app.service import IDLE, BackgroundTask
 from wfsobs.app.share import EXPLORED, CopiedTask
 from wfsobs.app.store import Store
-from wfsobs.app.style import HEARD, WIDE, HtmlText, bare, html, make_button, sheets, swatch
+from wfsobs.app.style import WIDE, HtmlText, bare, html, make_button, sheets, swatch
 from wfsobs.app.views.plots import call
 from wfsobs.app.work import RunResults
 from wfsobs.settings.errors import SettingError
 from wfsobs.settings.parameters import hint
 
 
-class LinkPart(Protocol):
-    """A part of a view as texts by name."""
-
-    def texts(self) -> dict[str, str]:
-        """Return what differs from a fresh page."""
-        ...
-
-    def open(self, texts: Mapping[str, str]) -> list[str]:
-        """Take texts, for the rest what a fresh page has; return a line for each that is refused."""
-        ...
-
-    def watch(self, act: Callable[..., object], /) -> object:
-        """Call a function after every change."""
-
-
 class LinkedFields:
     """Fields and switches that hold a text, a number or several texts; what they hold when this is made is that of a fresh page.
 
-    What is disabled has no part in a view.
+    What is disabled has no part in a view. `left_alone` returns the names of fields that an address does not change.
 
     Parameters
     ----------
@@ -60,6 +45,7 @@ class LinkedFields:
 
     def __init__(self, fields: Mapping[str, Any] | None, offers: Mapping[str, Callable[[str], object]] = {}):
         self._offers = offers
+        self.left_alone: Callable[[], Collection[str]] = tuple
         self._acts: list[Callable[..., object]] = []
         self._waiting: Mapping[str, str] = {}
         self._is_made = False
@@ -78,6 +64,11 @@ class LinkedFields:
             act()
         return refused
 
+    @property
+    def names(self) -> Collection[str]:
+        """In an address."""
+        return self.fresh
+
     def texts(self) -> dict[str, str]:
         """Return the texts that differ from those of a fresh page, or those that wait."""
         if not self._is_made:
@@ -85,14 +76,14 @@ class LinkedFields:
         now = {name: _text(getattr(*field)) for name, field in self._active_fields()}
         return {name: text for name, text in now.items() if text != self.fresh[name]}
 
-    def open(self, texts: Mapping[str, str], leave: Collection[str] = ()) -> list[str]:
-        """Fill in texts in the order of the fields, of which one may change the next; but for those to be left alone."""
+    def open(self, texts: Mapping[str, str]) -> list[str]:
+        """Fill in texts in the order of the fields, of which one may change the next; return a line for each that is refused."""
         if not self._is_made:
             self._waiting = {**texts}
             return []
         refused = not_known(name for name in texts if name not in self._fields)
         for name, (of, attribute) in self._active_fields():
-            if name not in leave:
+            if name not in self.left_alone():
                 lines = self._fill_in(name, of, attribute, texts.get(name, self.fresh[name]))
                 if lines and not isinstance(getattr(of, attribute), list):
                     self._fill_in(name, of, attribute, self.fresh[name])
@@ -163,7 +154,7 @@ class LinkedLines:
         hide: Callable[[list[str] | None], object],
         watch: Callable[[Callable[..., object]], object],
     ):
-        self.name = name
+        self.names = [name]
         self._lines = lines
         self._choice = choice
         self._hide = hide
@@ -172,15 +163,20 @@ class LinkedLines:
     def texts(self) -> dict[str, str]:
         """Return the lines that are hidden, where a visitor has chosen."""
         hidden = self._choice()
-        return {} if hidden is None else {self.name: ",".join(hidden)}
+        return {} if hidden is None else dict.fromkeys(self.names, ",".join(hidden))
 
     def open(self, texts: Mapping[str, str]) -> list[str]:
         """Hide lines."""
-        text = texts.get(self.name)
+        (own,) = self.names
+        text = texts.get(own)
         names = text.split(",") if text else []
         self._hide(None if text is None else [name for name in names if name in self._lines])
-        refused = [f"{self.name} = {name[:80]}: no line of that name" for name in names if name not in self._lines]
-        return [*not_known(name for name in texts if name != self.name), *refused]
+        refused = [f"{own} = {name[:80]}: no line of that name" for name in names if name not in self._lines]
+        return [*not_known(name for name in texts if name != own), *refused]
+
+
+LinkPart = LinkedFields | LinkedLines
+"""A part of a view as texts by name."""
 
 
 def not_known(names: Iterable[str]) -> list[str]:
@@ -266,10 +262,6 @@ class Page(ABC):
     def goes_on(self) -> bool:
         """Whether what is repeated is to be called."""
         return False
-
-    def open_link(self, texts: Mapping[str, str]) -> list[str]:
-        """Take what an address has of the page; return a line for each text refused."""
-        return self.link.open(texts)
 
     @property
     def task(self) -> CopiedTask:
@@ -413,11 +405,6 @@ def caption(words: str, marks: str = "") -> HtmlText:
 def tick(display: Display, name: str, **options: Any) -> pmui.Checkbox:
     """Make the box of one switch of the display."""
     return pmui.Checkbox.from_param(display.param[name], size="small", margin=0, **options)
-
-
-def group(display: Display, name: str) -> pmui.RadioButtonGroup:
-    """Make the buttons of one switch of the display."""
-    return pmui.RadioButtonGroup.from_param(display.param[name], size="small", margin=0, variant="outlined", stylesheets=[HEARD])
 
 
 def legend(names: Mapping[str, str], dark: bool) -> str:

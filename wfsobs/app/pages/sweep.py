@@ -14,7 +14,7 @@ import panel_material_ui as pmui
 import param
 
 from wfsobs.app.cache import key_of
-from wfsobs.app.controls.names import name_settings
+from wfsobs.app.controls.names import name_settings, setting_label
 from wfsobs.app.display import Display
 from wfsobs.app.downloads import table_csv
 from wfsobs.app.idle_work import SeedScores
@@ -39,7 +39,6 @@ from wfsobs.app.pages.parts import (
 )
 from wfsobs.app.pages.sweep_views import (
     SweepLines,
-    axis_title,
     legend_of_shades,
     line_part,
     map_grid,
@@ -154,7 +153,7 @@ def sweep_settings(scenario: Scenario) -> dict[str, str]:
     for path, _, p in scenario.walk():
         several = not isinstance(p, param.Selector) or len(p.objects) > 1
         if path != SEED and isinstance(p, kinds) and several and not path.startswith(lists):
-            topic, name = str(topics[path.split(".")[0]].label), axis_title(scenario, path)
+            topic, name = str(topics[path.split(".")[0]].label), setting_label(scenario, path)
             out[name if name.startswith(f"{topic}:") else f"{topic}: {name}"] = path
     return out
 
@@ -184,7 +183,7 @@ class AxisFields:
     def offer(self, path: str) -> bool:
         """Have a setting among those to choose from; return whether there is one of that path."""
         if path not in self.select.options.values() and self.store.scenario.parameter(path) is not None:
-            self.select.options = {**self.select.options, axis_title(self.store.scenario, path): path}
+            self.select.options = {**self.select.options, setting_label(self.store.scenario, path): path}
         return path in self.select.options.values()
 
     def _suggest(self, event: Any) -> None:
@@ -248,13 +247,10 @@ class ErrorLines:
         self.legend.html = legend({name: label(name) for name in part["errors"]}, dark)
 
 
-FILES = {"Sweep as CSV": ("wfsobs-sweep.csv", table_csv)}
-
-
 class SweepPage(Page):
     """The page. Nothing is run before it is asked for."""
 
-    files = FILES
+    files = {"Sweep as CSV": ("wfsobs-sweep.csv", table_csv)}
 
     def __init__(self, store: Store, display: Display, explore: Callable[[], None]):
         """Make the page. explore : turns to the page that shows a scenario."""
@@ -268,8 +264,6 @@ class SweepPage(Page):
             AxisFields(store, ("Error over", "Values"), names, *FIRST[0]),
             AxisFields(store, ("and over", "Values of the second"), several, *FIRST[1]),
         )
-        self.settings: Final = [axis.select for axis in self.axes]
-        self.values: Final = [axis.values for axis in self.axes]
         self.seeds: Final = number_field("Seeds of each", SEEDS, 120)
         self.observers: Final = make_select("Observers", OBSERVERS_OF, QUICK, 290)
         first, second = self.axes
@@ -296,7 +290,7 @@ class SweepPage(Page):
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""
-        row = line(*(field for pair in zip(self.settings, self.values, strict=True) for field in pair))
+        row = line(*(field for axis in self.axes for field in (axis.select, axis.values)))
         more = line(self.seeds, self.observers, *self.starter.view())
         sweep = box("Sweep", text(INTRO), row, more, self.estimate, self.starter.status, self.stale)
         return boxes(sweep, example("sweep", self.boxes[0]), *self.boxes, self.shades)

@@ -10,10 +10,9 @@ from bokeh.colors import RGB
 from bokeh.models import ColumnDataSource, FixedTicker
 from bokeh.plotting import figure
 
-from wfsobs.app.controls.names import setting_name
+from wfsobs.app.controls.names import setting_label, setting_name, value_of
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.render import number
-from wfsobs.app.report.sections import value_of
 from wfsobs.app.style import look, observers_of
 from wfsobs.app.views.plots import add_line, call, new_figure, set_ends
 from wfsobs.campaign.sweep import SweepResults
@@ -21,9 +20,7 @@ from wfsobs.evaluation.evidence import FEWEST
 from wfsobs.evaluation.rows import row_label
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH
 from wfsobs.evaluation.verdict import sentence_of_several
-from wfsobs.scenario import Scenario
 from wfsobs.typing import Array
-from wfsobs.units import unit_text
 
 APART = 0.12
 """Of the smallest step between values, what the lines lie apart from the first to the last."""
@@ -108,10 +105,9 @@ REPORT_COLUMNS = ("target", "mode", "observer", "seeds", "mean rms [nm]", "95 % 
 OPEN, DECIDED, WAITING, FAILED, LEFT_OUT = "open", "decided", "waiting", "failed", "left-out"
 
 
-def axis_title(scenario: Scenario, path: str) -> str:
-    """Name a setting of an axis, with its unit in [brackets]."""
-    unit = unit_text(scenario.unit(path))
-    return f"{setting_name(path)} [{unit}]" if unit else setting_name(path)
+def _scale(results: SweepResults, cell: int, display: Display) -> float:
+    """Return how many of the unit shown one micrometre is in a cell."""
+    return per_micrometre(display.unit, results.sweep.value(cell, "telescope.diameter"))
 
 
 def map_grid(results: SweepResults, target: str, display: Display) -> dict[str, Any]:
@@ -124,8 +120,8 @@ def map_grid(results: SweepResults, target: str, display: Display) -> dict[str, 
     names = dict.fromkeys(best.name for best in winners.values() if best)
     return {
         "title": title,
-        "across": axis_title(sweep.base, x.path),
-        "down": axis_title(sweep.base, y.path) if y else "",
+        "across": setting_label(sweep.base, x.path),
+        "down": setting_label(sweep.base, y.path) if y else "",
         "columns": [value_of(value) for value in x.values],
         "rows": [value_of(value) for value in reversed(y.values)] if y else [""],
         "cells": [[_cell(results, i * count + j, target, display) for i in range(len(x.values))] for j in reversed(range(count))],
@@ -138,7 +134,7 @@ def verdict_of_sweep(results: SweepResults, target: str, display: Display) -> st
     sweep = results.sweep
     found = {cell: results.verdict(cell, target, display.mode) for cell in range(len(sweep.cells))}
     verdicts = {cell: it for cell, it in found.items() if it is not None}
-    scales = [per_micrometre(display.unit, sweep.value(cell, "telescope.diameter")) for cell in verdicts]
+    scales = [_scale(results, cell, display) for cell in verdicts]
     if len(sweep.cells) == 1 and verdicts:
         return " ".join(verdicts[0].sentences(scales[0], display.unit_label))
     return sentence_of_several([*verdicts.values()], scales, display.unit_label)
@@ -150,14 +146,14 @@ def line_part(results: SweepResults, target: str, display: Display) -> dict[str,
     is_numeric = all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in axis.values)
     x = np.array(axis.values if is_numeric else range(len(axis.values)), dtype=float)
     cells = np.argsort(x).tolist()
-    scale = np.array([per_micrometre(display.unit, results.sweep.value(cell, "telescope.diameter")) for cell in cells])
+    scale = np.array([_scale(results, cell, display) for cell in cells])
     names = (BOUND, BOUND_BOTH, *(name for name in observers_of(target) if name in results.sweep.observers))
     unknown = (np.nan,) * 3
     errors = {name: [results.error(cell, (name, target, display.mode)) or unknown for cell in cells] for name in names}
     return {
         "title": f"Error over {setting_name(axis.path)}, {target}",
         "mode": display.mode,
-        "across": axis_title(results.sweep.base, axis.path),
+        "across": setting_label(results.sweep.base, axis.path),
         "up": f"mean rms error, {display.mode_label} [{display.unit_label}]",
         "values": x[cells].tolist(),
         "texts": None if is_numeric else [value_of(axis.values[cell]) for cell in cells],
@@ -174,7 +170,7 @@ def report_part(results: SweepResults) -> dict[str, Any]:
     return {
         "maps": [map_grid(results, target, display) for target, display in shown],
         "lines": [line_part(results, target, display) for target, display in shown] if len(axes) == 1 else [],
-        "columns": [*(axis_title(results.sweep.base, path) for path in axes), *REPORT_COLUMNS],
+        "columns": [*(setting_label(results.sweep.base, path) for path in axes), *REPORT_COLUMNS],
         "rows": [[*(value_of(row[path]) for path in axes), *_report_cells(row)] for row in rows[:MOST_ROWS]],
         "left_out": max(0, len(rows) - MOST_ROWS),
         "shades": legend_of_shades(),
@@ -201,7 +197,7 @@ def _cell(results: SweepResults, cell: int, target: str, display: Display) -> di
         reason = results.failures.get(cell, "")
         state, text = (FAILED, "×") if reason else (WAITING, "")
         return map_square(cell, state, f"{where}: {reason or 'not run yet'}", text, display.dark)
-    error = number(best.rms * per_micrometre(display.unit, results.sweep.value(cell, "telescope.diameter")))
+    error = number(best.rms * _scale(results, cell, display))
     said = f"{where}: {row_label(best.name)} {error} {display.unit_label}"
     said += verdict_text(best.margin, map(row_label, best.ties), best.is_significant, "seeds")
     said += f"; {best.seeds} {'seed' if best.seeds == 1 else 'seeds'}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from html import escape
 from itertools import groupby
@@ -130,8 +130,8 @@ class HistoryFigure:
         self._trials = self.figure.scatter("x", "tried", source=self.source, size=6, fill_alpha=0.7)
         self._best = self.figure.step("x", "best", source=self.source, mode="after", line_width=2.0)
 
-    def draw(self, history: Sequence[Evaluation], measure: str, unit: str, diameter: float) -> None:
-        """Send the evaluations so far; what failed has no point."""
+    def draw(self, history: Sequence[Evaluation], measure: str, unit: str, diameter: float, dark: bool) -> None:
+        """Send the evaluations so far, in the colours of light or dark mode; what failed has no point."""
         scale = per_micrometre(unit, diameter)
         tried, best = (scale * np.array(y, dtype=float) for y in ([e.rms for e in history], best_so_far(history)))
         self.source.data = {
@@ -140,9 +140,6 @@ class HistoryFigure:
             "best": np.where(np.isfinite(best), best, np.nan),
         }
         self.figure.yaxis.axis_label = f"{AXES[measure]}, validation [{UNITS[unit]}]"
-
-    def restyle(self, dark: bool) -> None:
-        """Set the colours of light or dark mode."""
         colour = look("tried").colour(dark)
         self._trials.glyph.update(line_color=colour, fill_color=colour)
         self._best.glyph.update(line_color=look("fitted").colour(dark))
@@ -187,20 +184,17 @@ START = "gpr-online"
 COLUMNS: tuple[str, ...] = ("section", "name", "before", "after")
 
 
-FILES: Mapping[str, tuple[str, Callable[[TuningResult], bytes]]] = {
-    "Tuning table as CSV": (
-        "wfsobs-tuning.csv",
-        lambda tuned: table_csv([dict(zip(COLUMNS, row, strict=True)) for row in tuning_rows(tuned)]),
-    ),
-    "Tuned settings as TOML": ("wfsobs-tuned.toml", lambda tuned: tuning_toml(tuned).encode()),
-}
-"""Errors in [um]; the settings as `wfsobs tune --out` writes them."""
-
-
 class TunePage(Page):
     """The page. Nothing is computed before it is asked for."""
 
-    files = FILES
+    files = {
+        "Tuning table as CSV": (
+            "wfsobs-tuning.csv",
+            lambda tuned: table_csv([dict(zip(COLUMNS, row, strict=True)) for row in tuning_rows(tuned)]),
+        ),
+        "Tuned settings as TOML": ("wfsobs-tuned.toml", lambda tuned: tuning_toml(tuned).encode()),
+    }
+    """Errors in [um]; the settings as `wfsobs tune --out` writes them."""
 
     def __init__(self, store: Store, display: Display):
         super().__init__(store, display, "unit", "dark")
@@ -285,8 +279,7 @@ class TunePage(Page):
         """Draw how it went, and what came of it."""
         tuned, (unit, diameter) = self.finding, self._scale()
         self.legend.html = legend(LEGEND, self.display.dark)
-        self.figure.draw(self._history(), self.measure, unit, diameter)
-        self.figure.restyle(self.display.dark)
+        self.figure.draw(self._history(), self.measure, unit, diameter, self.display.dark)
         self.history.visible, self.outcome.visible = bool(self._history()), tuned is not None
         if tuned is not None:
             self.table.html = tuning_html(tuned, self.display, diameter)

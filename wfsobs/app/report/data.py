@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from itertools import pairwise
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wfsobs.app.style import observers_of
-from wfsobs.app.views.verdict import main_observers
+from wfsobs.app.views.errors import main_observers
 from wfsobs.app.work import TRUTH
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import rows as controller_rows
@@ -114,8 +114,8 @@ class State:
     budgets : as `wfsobs run --budget --json` gives them, of the linear observers; none where the sources are not known
     verdicts : (target, mode, sentences); none where the record has no truth
     main    : target -> the observers whose lines are shown at first
-    seeds   : what further seeds say: their number, intervals [um] by "observer/target/mode", and by "target/mode" the best and
-              those that do not differ significantly from it; empty for one record
+    seeds   : what further seeds say: their number, and by "target/mode" the best and those that do not differ significantly from
+              it; empty for one record
     """
 
     scenario: Scenario
@@ -230,11 +230,9 @@ def list_budgets(result: Result) -> list[Budget]:
 
 def seeds_of(evidence: Evidence) -> dict[str, Any]:
     """Write what several seeds say as plain values."""
-    intervals = {"/".join(key): evidence.interval(key) for key in evidence.errors}
     groups = dict.fromkeys(key[1:] for key in evidence.errors)
     return {
         "count": evidence.n_seeds,
-        "intervals": {key: list(ends) for key, ends in intervals.items() if ends},
         "leaders": {"/".join(key): list(evidence.leaders(*key)) for key in groups},
     }
 
@@ -292,26 +290,19 @@ def window_of(states: Sequence[State]) -> tuple[float, float] | None:
 # -------------------------------------------------------------------------------------------- to another process
 
 
-LATER = ("loop", "budgets", "seeds", "verdicts", "main")
-"""Fields of a state after its lines."""
+OF_REPORT = ("preset", "is_recorded", "command", "sweep", "comparison")
+OF_STATE = ("rows", "reasons", "loop", "budgets", "seeds", "verdicts", "main")
+"""Fields of a report and of a state that are plain values."""
 
 
 def pack(report: Report) -> bytes:
     """Write a report as a file of plain arrays and text."""
     words = {
-        "preset": report.preset,
+        **{name: getattr(report, name) for name in OF_REPORT},
         "base": to_toml(report.base),
-        "recorded": report.is_recorded,
-        "command": report.command,
-        "sweep": report.sweep,
-        "comparison": report.comparison,
         "variations": [[v.path, v.values] for v in report.variations],
         "states": [
-            {
-                "toml": to_toml(s.scenario),
-                "grid": [s.grid.n, s.grid.dt, s.grid.bins],
-                **{name: getattr(s, name) for name in ("rows", "reasons", *LATER)},
-            }
+            {**{name: getattr(s, name) for name in OF_STATE}, "scenario": to_toml(s.scenario), "grid": astuple(s.grid)}
             for s in report.states
         ],
     }
@@ -330,17 +321,9 @@ def unpack(content: bytes) -> Report:
             number, slash, name = key.partition("/")
             if slash:
                 lines[int(number)][name] = file[key]
-    states = tuple(
-        State(
-            from_toml(s["toml"]),
-            s["rows"],
-            tuple(s["reasons"]),
-            Grid(*s["grid"]),
-            of,
-            *(s[name] for name in LATER),
-        )
+    states = [
+        State(**s | {"scenario": from_toml(s["scenario"]), "grid": Grid(*s["grid"]), "reasons": tuple(s["reasons"]), "lines": of})
         for s, of in zip(words["states"], lines, strict=True)
-    )
+    ]
     variations = tuple(Variation(path, tuple(values)) for path, values in words["variations"])
-    rest = (words[name] for name in ("recorded", "command", "sweep", "comparison"))
-    return Report(words["preset"], from_toml(words["base"]), variations, states, *rest)
+    return Report(**words | {"base": from_toml(words["base"]), "variations": variations, "states": tuple(states)})

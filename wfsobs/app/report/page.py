@@ -34,6 +34,7 @@ from bokeh.util.paths import bokehjs_path
 from markupsafe import Markup
 from numpy.typing import ArrayLike
 
+from wfsobs.app.controls.names import setting_label, value_of
 from wfsobs.app.display import NO_ANGLE, UNITS, per_micrometre
 from wfsobs.app.glossary import sentence_on
 from wfsobs.app.pages.sweep_views import SweepLines
@@ -46,11 +47,9 @@ from wfsobs.app.report.sections import (
     meaning_values,
     origin_values,
     scenario_values,
-    setting_label,
     state_name,
     state_table,
     summary,
-    value_of,
 )
 from wfsobs.app.style import PRIMARY, asset, look, observers_of
 from wfsobs.app.views.plots import MODEL, PEAKS, add_line, add_marks, model_mark, new_figure, new_spectrum, peak_marks
@@ -196,7 +195,6 @@ def _state(state: State, pool: Pool) -> dict[str, Any]:
         "lines": lines,
         "axes": {name: pool.add(axis.astype("<f4").tobytes()) for name, axis in axes.items()},
         "peaks": peak_marks(scenario),
-        "intervals": state.seeds.get("intervals", {}),
         "model": [model_mark(scenario)],
     }
 

@@ -6,45 +6,45 @@ import base64
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
+from functools import partial
 from itertools import groupby, product
 from typing import Any
 
-from wfsobs.app.display import AT_LIMIT, FROM_RECORD, IN_MOST, OVER_SEEDS, label_of, score_columns
+from markupsafe import Markup
+
+from wfsobs.app.controls.names import setting_label, value_of
+from wfsobs.app.display import score_columns
 from wfsobs.app.render import NOTHING, number
 from wfsobs.app.report.data import Report, State, window_of
 from wfsobs.app.style import BOUND_MARKS, TERM_COLOURS
+from wfsobs.app.views.errors import ScoreWriter
 from wfsobs.bench.measure import machine
 from wfsobs.closed_loop.rows import NOT_APPLICABLE, label
 from wfsobs.evaluation.budget import TERMS
-from wfsobs.evaluation.evidence import marks_of
-from wfsobs.evaluation.rows import (
-    TIME,
-    Row,
-    above_bound,
-    group_by_knowledge,
-    is_non_causal,
-    own_bound,
-    own_interval,
-    row_label,
-    scored_interval,
-    target_title,
-)
-from wfsobs.evaluation.scores import BOUND, BOUNDS, PREDICTION, RESIDUAL
+from wfsobs.evaluation.rows import Row, row_label, target_title
+from wfsobs.evaluation.scores import BOUND, RESIDUAL
 from wfsobs.prior import GIVEN, IDENTIFIED, TRUE
-from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings, format_value, reference_preset, to_toml
 from wfsobs.version import __version__
 
 
 def state_table(state: State, name: str) -> dict[str, Any]:
     """Collect what the table of a state shows: groups by target, mode and prior knowledge, best first, and what is missing."""
-    order = [*dict.fromkeys(map(_group, state.rows))]  # as they come; in each best first, those that stand apart last
-    ordered = sorted(state.rows, key=lambda row: (order.index(_group(row)), row["apart"], row["rms_um"]))
-    groups = [list(rows) for _, rows in groupby(ordered, _group)]
+    words = {word for row in state.rows for word in row["needs"].split()}
+    source = IDENTIFIED if IDENTIFIED in words else GIVEN if GIVEN in words else TRUE
+    unit = Markup('<span class="unit">nm</span>')
+    writer = ScoreWriter(_length, unit, _head, state.grid.dt, state.seeds.get("count", 1), source)
+    groups: list[dict[str, Any]] = []
+    for target, mode in dict.fromkeys(map(_group, state.rows)):
+        rows = {row["observer"]: row for row in state.rows if _group(row) == (target, mode)}
+        leaders = state.seeds.get("leaders", {}).get(f"{target}/{mode}", [])
+        for title, of in writer.groups(target, [target_title(target), mode], rows, leaders):
+            groups.append({"target": target, "mode": mode, "title": title, "rows": of})
+    is_truthless = any(row["target"] == RESIDUAL for row in state.rows)
     return {
         "name": name,
-        "columns": score_columns("nm", "z" if any(row["target"] == RESIDUAL for row in state.rows) else "truth"),
-        "groups": [body for rows in groups for body in _bodies(rows, state.grid.dt, state.seeds)],
+        "columns": score_columns("nm", "z" if is_truthless else "truth"),
+        "groups": groups,
         "reasons": state.reasons,
     }
 
@@ -53,46 +53,14 @@ def _group(row: Row) -> tuple[str, str]:
     return row["target"], row["mode"]
 
 
-def _bodies(rows: list[Row], dt: float, seeds: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Collect a target and mode: its title, and the rows of every kind of prior knowledge."""
-    target, mode = _group(rows[0])
-    leaders = seeds.get("leaders", {}).get(f"{target}/{mode}", [])
-    marks = marks_of({row["observer"]: (row["rms_um"], row["apart"]) for row in rows}, leaders)
-    bounds = {row["observer"]: row["rms_um"] for row in rows if row["observer"] in BOUNDS}
-    limits = {
-        row["observer"]
-        for row in rows
-        if above_bound(row["rms_um"], row["interval_um"], bounds.get(own_bound(row["observer"]) or "")) == 0.0
-    }
-    over_seeds = f"{OVER_SEEDS}, {seeds['count']} seeds" if seeds else f"{OVER_SEEDS}, {FROM_RECORD}"
-    words = {word for row in rows for word in row["needs"].split()}
-    source = IDENTIFIED if IDENTIFIED in words else GIVEN if GIVEN in words else TRUE
-    cells = {
-        row["observer"]: {
-            **row,
-            "label": row_label(row["observer"]),
-            "looks_ahead": is_non_causal(row["observer"]),
-            "stretch": own_interval(row),
-            "mark": marks.get(row["observer"]),
-            "at_limit": row["observer"] in limits and AT_LIMIT,
-            "interval": row["interval_um"],
-            "meaning": IN_MOST if row["observer"] in BOUNDS else over_seeds,
-            "lag": None if row["lag_s"] is None else 1e3 * row["lag_s"],
-            "time": row[TIME],
-            "factor": None if row[TIME] is None else 1e-6 * row[TIME] / dt,
-        }
-        for row in rows
-    }
-    title = ", ".join((target_title(target), mode, *filter(None, [scored_interval(rows)])))
-    place = {"target": target, "mode": mode}
-    size = next(row["truth_rms_um"] for row in rows)
-    return [
-        {**place, "title": title, "of": "z" if target in (PREDICTION, RESIDUAL) else "truth", "size": size, "rows": []},
-        *(
-            {**place, "title": group, "rows": [cells[name] for name in names]}
-            for group, names in group_by_knowledge(cells, source).items()
-        ),
-    ]
+def _length(um: float) -> Markup:
+    """Write a length in nm; the script writes it in another unit."""
+    return Markup('<span data-um="{}">{}</span>').format(um, number(1e3 * um))
+
+
+def _head(name: str) -> Markup:
+    symbol = '<svg class="swatch" width="26" height="8" aria-hidden="true"><use href="#line-{}"/></svg>{}'
+    return Markup(symbol).format(name, row_label(name))
 
 
 # ------------------------------------------------------------------------------------------------- error budgets
@@ -235,23 +203,6 @@ def summary(report: Report, date: datetime) -> str:
     return " · ".join(parts)
 
 
-# ---------------------------------------------------------------------- settings in words
-
-
-def setting_label(scenario: Scenario, path: str) -> str:
-    """Write a setting's label with its unit in [brackets]; the path itself if it has no label."""
-    p = {known: p for known, _, p in scenario.walk()}.get(path)
-    return path if p is None else label_of(p)
-
-
-def value_of(value: Any) -> str:
-    """Write a setting's value for people."""
-    if isinstance(value, bool):
-        return "on" if value else "off"
-    text = f"{value:.6g}" if isinstance(value, (int, float)) else format_value(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
-
-
 def state_name(report: Report, state: State, index: int) -> str:
     """Name a state by the values of what varies."""
     parts = []
@@ -270,27 +221,14 @@ def values_of(report: Report, index: int) -> list[Any]:
 
 
 def scenario_values(report: Report) -> dict[str, Any]:
-    """Collect what differs from the preset, what varies, and every setting."""
+    """Collect what differs from the preset, every setting, and how settings are written."""
     preset = reference_preset(report.preset)
+    before = changed_settings(preset, report.base)
     toml = f'preset = "{report.preset}"\n{to_toml(report.base)}'
     return {
-        "changed": [
-            {
-                "name": setting_label(report.base, path),
-                "path": path,
-                "before": value_of(_at(preset, path)),
-                "now": value_of(value),
-            }
-            for path, value in changed_settings(report.base, preset).items()
-        ],
-        "variations": [
-            {
-                "name": setting_label(report.states[0].scenario, v.path),
-                "path": v.path,
-                "texts": [value_of(value) for value in v.values],
-            }
-            for v in report.variations
-        ],
+        "changed": {path: (before[path], value) for path, value in changed_settings(report.base, preset).items()},
+        "label": partial(setting_label, report.base),
+        "value_of": value_of,
         "file": FILE,
         "toml": toml,
         "toml_base64": base64.b64encode(toml.encode()).decode(),
@@ -353,11 +291,3 @@ def _command(words: Sequence[str]) -> str:
 
 def _words(option: str, values: Iterable[object]) -> list[str]:
     return [word for value in values for word in (option, str(value))]
-
-
-def _at(scenario: Scenario, path: str) -> Any:
-    """Look up the plain value at a dotted path of groups."""
-    node: Any = scenario.to_dict()
-    for key in path.split("."):
-        node = node[key]
-    return node

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from math import degrees
 from typing import Any, Final
@@ -11,14 +11,13 @@ from typing import Any, Final
 import numpy as np
 import panel as pn
 from bokeh.plotting import figure
-from numpy.typing import ArrayLike
 
 from wfsobs.app.display import Display
 from wfsobs.app.loop_work import LoopResults
 from wfsobs.app.render import number
 from wfsobs.app.store import Store
 from wfsobs.app.style import look
-from wfsobs.app.views.plots import ExtraLines
+from wfsobs.app.views.plots import ExtraLines, Points
 from wfsobs.app.views.spectrum_editor import Frames, HandleLayer, positive
 from wfsobs.closed_loop.design import LawDesign, design_mode, nominal_loop
 from wfsobs.control.integrator import highest_stable_gain
@@ -36,33 +35,21 @@ MOST = 0.98
 """The highest gain that a handle gives, over that at which the loop becomes unstable."""
 
 
-class GainHandle(ABC):
-    """The handle in one figure, and the line of the gain that it would set."""
+@dataclass(frozen=True)
+class GainAxis:
+    """How a figure shows the gain: in a place on its horizontal axis, in the height of 0.
 
-    title = ""
+    gain_at : returns the gain for a place, or the highest; raises ValueError for no such place
+    line    : returns what is drawn of the loop's curves
+    place   : returns where the handle stands, and what it says of that
+    limits  : returns the first and the last place
+    """
 
-    def __init__(self, fig: figure, hear: Callable[[GainHandle, Mapping[str, Any]], None]):
-        self.layer: Final = HandleLayer(
-            partial(hear, self), figure=str(fig.name), sizing_mode="stretch_width", margin=0, visible=False
-        )
-        self.lines: Final = ExtraLines(fig, "predicted", line_alpha=1.0, line_width=2.2, line_dash=[2, 2], level="glyph")
-        self.number = 0
-
-    @abstractmethod
-    def gain_at(self, scenario: Scenario, position: object) -> float:
-        """Return the gain for a place of the handle, or the highest. Raises ValueError for no such place."""
-
-    @abstractmethod
-    def line(self, at: Curves) -> tuple[Array, Array]:
-        """Return what is drawn of the loop's curves."""
-
-    @abstractmethod
-    def place(self, at: Curves, design: LawDesign) -> tuple[float, str]:
-        """Return where the handle stands on the horizontal axis, in the height of 0, and what it says of that."""
-
-    @abstractmethod
-    def limits(self, scenario: Scenario) -> list[float]:
-        """Return the first and the last place."""
+    title: str
+    gain_at: Callable[[Scenario, object], float]
+    line: Callable[[Curves], Points]
+    place: Callable[[Curves, LawDesign], tuple[float, str]]
+    limits: Callable[[Scenario], list[float]]
 
     def entry(self, gain: float, at: Curves, design: LawDesign) -> dict[str, Any]:
         """Describe the handle."""
@@ -72,57 +59,68 @@ class GainHandle(ABC):
         return {**handle, "strength": False, "damping": False}
 
 
-class RejectionHandle(GainHandle):
-    """Where the rejection crosses 0 dB."""
+class GainHandle:
+    """The handle in one figure, and the line of the gain that it would set."""
 
-    title = "Integrator gain"
-
-    def gain_at(self, scenario: Scenario, position: object) -> float:
-        """Return the gain whose rejection crosses 0 dB at a frequency [Hz]; see `gain_for_crossover`."""
-        mirror, leak = plant_of(scenario).mirror, scenario.control.leak
-        omega = 2.0 * np.pi * positive(position) * scenario.dt
-        loop = complex(mirror.response(np.array([omega]))[0] / (1.0 - leak * np.exp(-1j * omega)))
-        return gain_for_crossover(loop, MOST * highest_stable_gain(mirror, leak))
-
-    def line(self, at: Curves) -> tuple[Array, Array]:
-        """Return the rejection [dB] over the frequency [Hz]."""
-        return at.frequency, 20.0 * np.log10(np.maximum(np.abs(at.rejection), 1e-6))
-
-    def place(self, at: Curves, design: LawDesign) -> tuple[float, str]:
-        """Return the frequency [Hz]."""
-        frequency = crossover(*self.line(at))
-        return frequency, f"0 dB at {frequency:.3g} Hz"
-
-    def limits(self, scenario: Scenario) -> list[float]:
-        """Return the lowest frequency and that of Nyquist [Hz]."""
-        return [0.01, 0.5 / scenario.dt]
+    def __init__(self, fig: figure, axis: GainAxis, hear: Callable[[GainHandle, Mapping[str, Any]], None]):
+        self.axis = axis
+        self.layer: Final = HandleLayer(
+            partial(hear, self), figure=str(fig.name), sizing_mode="stretch_width", margin=0, visible=False
+        )
+        self.lines: Final = ExtraLines(fig, "predicted", line_alpha=1.0, line_width=2.2, line_dash=[2, 2], level="glyph")
+        self.number = 0
 
 
-class NyquistHandle(GainHandle):
-    """Where the loop gain crosses the negative real axis, which is at -1 where the loop becomes unstable."""
+def _gain_of_crossover(scenario: Scenario, position: object) -> float:
+    """Return the gain whose rejection crosses 0 dB at a frequency [Hz]; see `gain_for_crossover`."""
+    mirror, leak = plant_of(scenario).mirror, scenario.control.leak
+    omega = 2.0 * np.pi * positive(position) * scenario.dt
+    loop = complex(mirror.response(np.array([omega]))[0] / (1.0 - leak * np.exp(-1j * omega)))
+    return gain_for_crossover(loop, MOST * highest_stable_gain(mirror, leak))
 
-    title = "Integrator gain, Nyquist"
 
-    def gain_at(self, scenario: Scenario, position: object) -> float:
-        """Return the gain for a crossing at this real part: the loop gain is in proportion to it."""
-        if not isinstance(position, (int, float)) or not np.isfinite(position):
-            raise ValueError("a handle can be moved to numbers only")
-        share = min(max(-position, 1e-3), MOST)
-        return share * highest_stable_gain(plant_of(scenario).mirror, scenario.control.leak)
+def _rejection(at: Curves) -> Points:
+    """Return the rejection [dB] over the frequency [Hz]."""
+    return at.frequency, decibel(at.rejection)
 
-    def line(self, at: Curves) -> tuple[Array, Array]:
-        """Return the loop gain in the complex plane."""
-        return plane(at.loop_gain)
 
-    def place(self, at: Curves, design: LawDesign) -> tuple[float, str]:
-        """Return the real part at the crossing."""
-        margin = design.margins.gain if design.margins is not None else None
-        crossing = -1.0 / margin if margin else 0.0
-        return crossing, f"crosses the real axis at {crossing:.3f}"
+def _crossover_of(at: Curves, _design: LawDesign) -> tuple[float, str]:
+    frequency = crossover(*_rejection(at))
+    return frequency, f"0 dB at {frequency:.3g} Hz"
 
-    def limits(self, scenario: Scenario) -> list[float]:
-        """Return the limit of stability, and no gain."""
-        return [-1.0, 0.0]
+
+def _gain_at_crossing(scenario: Scenario, position: object) -> float:
+    """Return the gain for a crossing of the real axis at this real part: the loop gain is in proportion to it."""
+    if not isinstance(position, (int, float)) or not np.isfinite(position):
+        raise ValueError("a handle can be moved to numbers only")
+    share = min(max(-position, 1e-3), MOST)
+    return share * highest_stable_gain(plant_of(scenario).mirror, scenario.control.leak)
+
+
+def _crossing_of(_at: Curves, design: LawDesign) -> tuple[float, str]:
+    margin = design.margins.gain if design.margins is not None else None
+    crossing = -1.0 / margin if margin else 0.0
+    return crossing, f"crosses the real axis at {crossing:.3f}"
+
+
+def decibel(x: Complex) -> Array:
+    """Return amplitudes in dB."""
+    return 20.0 * np.log10(np.maximum(np.abs(x), 1e-6))
+
+
+def plane(loop_gain: Complex) -> Points:
+    """Return the real and imaginary parts of a loop gain, without what is far outside of the figure."""
+    near = np.where(np.abs(loop_gain) < 20.0, loop_gain, np.nan)
+    return np.real(near), np.imag(near)
+
+
+REJECTION = GainAxis("Integrator gain", _gain_of_crossover, _rejection, _crossover_of, lambda scenario: [0.01, 0.5 / scenario.dt])
+"""Where the rejection crosses 0 dB."""
+
+NYQUIST = GainAxis(
+    "Integrator gain, Nyquist", _gain_at_crossing, lambda at: plane(at.loop_gain), _crossing_of, lambda _: [-1.0, 0.0]
+)
+"""Where the loop gain crosses the negative real axis, which is at -1 where the loop becomes unstable."""
 
 
 def gain_for_crossover(loop: complex, most: float) -> float:
@@ -161,8 +159,8 @@ class GainEditor:
         self.results = results
         self.frames: Final = Frames(store.session)
         self.theory: Final = Theory()
-        self.handles: Final = RejectionHandle(rejection, self.hear), NyquistHandle(nyquist, self.hear)
-        self._note, self._trial, self._known_gain = "", None, None
+        self.handles: Final = GainHandle(rejection, REJECTION, self.hear), GainHandle(nyquist, NYQUIST, self.hear)
+        self._note, self._trial = "", None
         store.param.watch(self._take_over, "scenario")
         display.param.watch(self.follow, ["editing", "mode", "unit", "dark"])
         self.follow()
@@ -201,7 +199,7 @@ class GainEditor:
             return
         try:
             if action in ("drag", "release"):
-                gain = round(handle.gain_at(self.store.scenario, message["frequency"]), 4)
+                gain = round(handle.axis.gain_at(self.store.scenario, message["frequency"]), 4)
             self._trial = gain if action == "drag" else None
             if action == "release":
                 self.store.replace({"control.integrator": "manual", "control.gain": gain})
@@ -235,12 +233,12 @@ class GainEditor:
         with pn.io.hold():
             for handle, reply_to in zip(self.handles, replies, strict=True):
                 frame: dict[str, Any] = {"handles": [], "numbers": [], "note": why or self._note, "answered": reply_to}
-                frame |= {"hint": HINT, "exponent": 1.0, "limits": handle.limits(self.store.scenario)}
-                lines: dict[str, tuple[ArrayLike, ArrayLike]] = {}
+                frame |= {"hint": HINT, "exponent": 1.0, "limits": handle.axis.limits(self.store.scenario)}
+                lines: dict[str, Points] = {}
                 if answer is not None:
                     gain, design, at = answer
-                    lines = {INTEGRATOR: handle.line(at)}
-                    frame["handles"], frame["numbers"] = [handle.entry(gain, at, design)], self._numbers(gain, design)
+                    lines = {INTEGRATOR: handle.axis.line(at)}
+                    frame["handles"], frame["numbers"] = [handle.axis.entry(gain, at, design)], self._numbers(gain, design)
                 else:  # where it was: a handle that goes takes the focus of the keyboard with it
                     frame["handles"] = handle.layer.frame.get("handles", [])
                 handle.lines.draw(lines, self.display.dark)
@@ -261,9 +259,3 @@ class GainEditor:
             {"name": name, "label": label, "colour": colour, "value": value, "unit": unit, "was": ""}
             for name, label, value, unit in values
         ]
-
-
-def plane(loop_gain: Complex) -> tuple[Array, Array]:
-    """Return the real and imaginary parts of a loop gain, without what is far outside of the figure."""
-    near = np.where(np.abs(loop_gain) < 20.0, loop_gain, np.nan)
-    return np.real(near), np.imag(near)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
 import panel as pn
+from bokeh.core.validation import silence
+from bokeh.core.validation.warnings import MISSING_RENDERERS
 from bokeh.events import DoubleTap
 from bokeh.models import (
     AllIndices,
@@ -21,6 +24,7 @@ from bokeh.models import (
     Line,
     LogAxis,
     Range1d,
+    UnionRenderers,
     VSpan,
 )
 from bokeh.plotting import figure
@@ -32,6 +36,9 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.atmosphere import Peak
 from wfsobs.scenario.measured_spectra import measured_spectrum
 from wfsobs.typing import Array
+
+Points = tuple[Array, Array]
+"""x and y of a line."""
 
 SETTLE_MS = 60
 """A zoom is answered when the window has not moved for this long."""
@@ -156,63 +163,18 @@ def call(fig: figure, name: str) -> None:
     fig.update(name=name, html_attributes={"role": "figure", "aria-label": name})
 
 
-def make_line(name: str, source: ColumnDataSource, y: str = "y", **options: Any) -> GlyphRenderer[Any]:
+def make_line(name: str, source: ColumnDataSource, y: str, **options: Any) -> GlyphRenderer[Any]:
     """Make a line in the look of an observer or of the truth, without the glyphs of what is selected or muted: nothing is."""
     it = look(name)
     glyph = Line(x="x", y=y, line_color=it.light, line_width=it.width, line_dash=list(it.dash))
     return GlyphRenderer(data_source=source, glyph=glyph, name=name, **options)
 
 
-def add_line(fig: figure, name: str, source: ColumnDataSource, y: str = "y", **style: Any) -> GlyphRenderer[Any]:
-    """Draw a line in the look of an observer or of the truth, but for what the style has."""
+def add_line(fig: figure, name: str, source: ColumnDataSource, y: str = "y") -> GlyphRenderer[Any]:
+    """Draw a line in the look of an observer or of the truth."""
     renderer = make_line(name, source, y)
-    renderer.glyph.update(**style)
     fig.renderers.append(renderer)
     return renderer
-
-
-class LoopLines:
-    """A figure with a line per name, of controllers or observers."""
-
-    def __init__(self, fig: figure, names: Iterable[str], **style: Any):
-        self.figure = fig
-        self.sources: Final = {name: ColumnDataSource({"x": [], "y": []}) for name in names}
-        self.lines: Final = {name: add_line(fig, name, source, **style) for name, source in self.sources.items()}
-
-    def put(self, lines: Mapping[str, tuple[Array, Array]]) -> None:
-        """Show these lines (name -> x, y), and nothing of the others."""
-        for name, source in self.sources.items():
-            x, y = lines.get(name, (np.empty(0), np.empty(0)))
-            source.data = {"x": x, "y": y.astype(np.float32)}
-
-    def highest(self, hidden_names: Sequence[str], without: float) -> float:
-        """Return the largest magnitude of the visible lines, or `without` where there are none."""
-        shown = [source.data["y"] for name, source in self.sources.items() if name not in hidden_names]
-        return max((float(np.max(np.abs(y))) for y in shown if len(y)), default=without)
-
-    def restyle(self, dark: bool, hidden_names: list[str]) -> None:
-        """Set the colours of light or dark mode, and hide lines."""
-        for name, line in self.lines.items():
-            line.glyph.line_color = look(name).colour(dark)
-            line.visible = name not in hidden_names
-
-
-class PairedLines(LoopLines):
-    """A figure with a strong and a faint line per controller."""
-
-    def __init__(self, fig: figure, names: Iterable[str]):
-        super().__init__(fig, names, line_width=2.2)
-        self.faint: Final = LoopLines(fig, names, line_alpha=0.45, line_width=1.2)
-
-    def put_both(self, lines: Mapping[str, tuple[Array, Array, Array]]) -> None:
-        """Show these lines (name -> x, strong y, faint y), and nothing of the others."""
-        self.put({name: (x, y) for name, (x, y, _) in lines.items()})
-        self.faint.put({name: (x, y) for name, (x, _, y) in lines.items()})
-
-    def restyle(self, dark: bool, hidden_names: list[str]) -> None:
-        """Set the colours of light or dark mode, and hide lines."""
-        super().restyle(dark, hidden_names)
-        self.faint.restyle(dark, hidden_names)
 
 
 def add_marks(fig: figure) -> dict[str, GlyphRenderer[Any]]:
@@ -279,7 +241,7 @@ class ExtraLines:
         self.style = style
         self.source: ColumnDataSource | None = None
 
-    def draw(self, lines: Mapping[str, tuple[ArrayLike, ArrayLike]], dark: bool) -> None:
+    def draw(self, lines: Mapping[str, Points], dark: bool) -> None:
         """Show these lines (name -> x, y) in place of those before."""
         self._send([(x, y, look(name).colour(dark)) for name, (x, y) in lines.items()])
 
@@ -325,7 +287,7 @@ class EndLabels:
         fig.add_layout(self.labels)
         fig.min_border_right = ROOM_FOR_NAMES
 
-    def draw(self, lines: Mapping[str, tuple[ArrayLike, ArrayLike]], dark: bool) -> None:
+    def draw(self, lines: Mapping[str, Points], dark: bool) -> None:
         """Name lines (name -> x, y) where they leave the axis of x."""
         fig: Any = self.figure
         is_log, end = isinstance(fig.yaxis[0], LogAxis), float(fig.x_range.end)
@@ -380,6 +342,9 @@ def spread(places: Sequence[float], sizes: Sequence[float]) -> list[float]:
     return moved
 
 
+silence(MISSING_RENDERERS)  # of figures whose lines are made when they are first shown
+
+
 class LazyLine:
     """A line that is in its figure once it has been shown."""
 
@@ -406,42 +371,68 @@ class LazyLine:
             self.renderer.update(visible=visible, tags=[own] if own else [], level="underlay" if own else "glyph")
 
 
-class FigureLines(Mapping[str, LazyLine]):
-    """The lines of a figure by name; those that come first lie below."""
+class FigureLines:
+    """A figure with a line per name, each made when it is first shown; those that come first lie below.
 
-    def __init__(self, fig: figure, columns: Mapping[str, tuple[ColumnDataSource, str]]):
-        """Make none yet. columns : name -> where its data are, and the column of y."""
+    Attributes
+    ----------
+    sources : dict
+        Name -> where the data of the line are.
+    lines : dict
+        Name -> the line.
+    """
+
+    def __init__(self, fig: figure, names: Iterable[str], source: ColumnDataSource | None = None, **style: Any):
+        """Make none yet. source : has the y of every line in a column of its name; else each has a source of its own."""
         self.figure = fig
-        self._all = AllIndices()
-        self._lines = {name: LazyLine(self._maker(name, *at)) for name, at in columns.items()}
+        policy, self._all, self._style = UnionRenderers(), AllIndices(), style
+        self.sources: Final = {name: source or ColumnDataSource({"x": [], "y": []}, selection_policy=policy) for name in names}
+        self.lines: Final = {name: LazyLine(partial(self._make, name, name if source else "y")) for name in self.sources}
 
-    def __getitem__(self, name: str) -> LazyLine:
-        return self._lines[name]
+    def put(self, lines: Mapping[str, Points]) -> None:
+        """Show these lines (name -> x, y), and nothing of the others."""
+        for name, source in self.sources.items():
+            x, y = lines.get(name, (np.empty(0), np.empty(0)))
+            source.data = {"x": x, "y": y.astype(np.float32)}
 
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._lines)
-
-    def __len__(self) -> int:
-        return len(self._lines)
+    def highest(self, hidden_names: Sequence[str], without: float) -> float:
+        """Return the largest magnitude of the visible lines, or `without` where there are none."""
+        shown = [source.data["y"] for name, source in self.sources.items() if name not in hidden_names]
+        return max((float(np.max(np.abs(y))) for y in shown if len(y)), default=without)
 
     def restyle(self, dark: bool, hidden_names: Sequence[str], main_names: Sequence[str] = ()) -> None:
         """Show every line but those that are to be hidden, in the colours of light or dark mode.
 
         main_names : the ones that keep their colours where there are many
         """
-        many = len(self) - len({*hidden_names} & {*self}) > MOST_COLOURED and len(main_names) > 0
-        for name, line in self.items():
+        many = len(self.lines) - len({*hidden_names} & {*self.lines}) > MOST_COLOURED and len(main_names) > 0
+        for name, line in self.lines.items():
             own = look(name).colour(dark)
             recedes = many and name != TRUTH and name not in main_names
             line.show(name not in hidden_names, GREY[dark] if recedes else own, own if recedes else "")
 
-    def _maker(self, name: str, source: ColumnDataSource, y: str) -> Callable[[], GlyphRenderer[Any]]:
-        def make() -> GlyphRenderer[Any]:
-            renderer = make_line(name, source, y, view=CDSView(filter=self._all))
-            names = list(self)
-            above = [line.renderer for line in map(self.get, names[names.index(name) + 1 :]) if line and line.renderer]
-            renderers = self.figure.renderers
-            renderers.insert(renderers.index(above[0]) if above else len(renderers), renderer)
-            return renderer
+    def _make(self, name: str, y: str) -> GlyphRenderer[Any]:
+        renderer = make_line(name, self.sources[name], y, view=CDSView(filter=self._all))
+        renderer.glyph.update(**self._style)
+        names, renderers = list(self.lines), self.figure.renderers
+        above = [made for other in names[names.index(name) + 1 :] if (made := self.lines[other].renderer)]
+        renderers.insert(renderers.index(above[0]) if above else len(renderers), renderer)
+        return renderer
 
-        return make
+
+class PairedLines(FigureLines):
+    """A figure with a strong and a faint line per controller."""
+
+    def __init__(self, fig: figure, names: Iterable[str]):
+        super().__init__(fig, names, line_width=2.2)
+        self.faint: Final = FigureLines(fig, names, line_alpha=0.45, line_width=1.2)
+
+    def put_both(self, lines: Mapping[str, tuple[Array, Array, Array]]) -> None:
+        """Show these lines (name -> x, strong y, faint y), and nothing of the others."""
+        self.put({name: (x, y) for name, (x, y, _) in lines.items()})
+        self.faint.put({name: (x, y) for name, (x, _, y) in lines.items()})
+
+    def restyle(self, dark: bool, hidden_names: Sequence[str], main_names: Sequence[str] = ()) -> None:
+        """Set the colours of light or dark mode, and hide lines."""
+        super().restyle(dark, hidden_names, main_names)
+        self.faint.restyle(dark, hidden_names, main_names)

@@ -20,7 +20,7 @@ from wfsobs.app.render import number, render
 from wfsobs.app.service import Session
 from wfsobs.app.store import Store
 from wfsobs.app.style import HtmlComponent, look, observers_of, script, sheets
-from wfsobs.app.views.plots import AFTERWARDS_MS, ExtraLines, once
+from wfsobs.app.views.plots import AFTERWARDS_MS, ExtraLines, Points, once
 from wfsobs.evaluation.error_spectra import TRUTH, Prediction, Theory, is_predicted
 from wfsobs.evaluation.exact_errors import SETTLED
 from wfsobs.evaluation.scores import BOUND
@@ -30,7 +30,6 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.atmosphere import Peak
 from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.turbulence import turbulence_process
-from wfsobs.typing import Array
 
 Work = Callable[[], Any]
 Land = Callable[[Any, str], None]
@@ -184,25 +183,23 @@ def changes_of(scenario: Scenario, target: str, mode: int, to: Handle) -> dict[s
     now = next((h for h in handles_of(scenario, target, mode) if h.id == to.id), None)
     if now is None:
         raise SettingError(f"there is no {to.id} to move")
-    if to.kind == CORNER:  # a corner goes with the wind
-        t = scenario.turbulence
-        wind = t.wind_speed if to.frequency == now.frequency else round_off(t.wind_speed * to.frequency / now.frequency)
-        values = {"turbulence.wind_speed": wind, "turbulence.rms": to.rms}
-        return {path: v for path, v in values.items() if v is not None}
     if to.kind == BAND:
         bands = [*scenario.butterworth.frequencies]
         bands[to.index] = to.frequency
         return {"butterworth.frequencies": bands}
-    if to.kind == MODEL:
+    if to.kind == CORNER:  # a corner goes with the wind
+        t = scenario.turbulence
+        wind = t.wind_speed if to.frequency == now.frequency else round_off(t.wind_speed * to.frequency / now.frequency)
+        values: dict[str, Any] = {"turbulence.wind_speed": wind, "turbulence.rms": to.rms}
+    elif to.kind == MODEL:
         values = {"kalman.frequency": to.frequency, "kalman.damping": to.damping, "kalman.vibration_rms": to.rms}
-        return {path: v for path, v in values.items() if v is not None}
-    where = f"vibration.peaks.{to.index}" if to.kind == PEAK else f"turbulence.processes.{to.index}"
-    out: dict[str, Any] = {f"{where}.frequency": to.frequency, f"{where}.damping": to.damping}
-    if to.rms is not None:
-        rms = [*(scenario.vibration.peaks if to.kind == PEAK else scenario.turbulence.processes)[to.index].rms]
-        rms[mode] = to.rms
-        out[f"{where}.rms"] = rms
-    return out
+    else:
+        where = f"vibration.peaks.{to.index}" if to.kind == PEAK else f"turbulence.processes.{to.index}"
+        values = {f"{where}.frequency": to.frequency, f"{where}.damping": to.damping}
+        if to.rms is not None:
+            values[f"{where}.rms"] = rms = [*scenario.lookup(where).rms]
+            rms[mode] = to.rms
+    return {path: v for path, v in values.items() if v is not None}
 
 
 def with_new_peak(scenario: Scenario, mode: int, frequency: float) -> dict[str, Any]:
@@ -425,7 +422,7 @@ class SpectrumEditor:
             "waits": p.observer in self._left,
         }
 
-    def _curve(self, p: Prediction) -> tuple[Array, Array]:
+    def _curve(self, p: Prediction) -> Points:
         """Return what is drawn: frequencies and densities above zero frequency, or the rms from each on."""
         return p.frequency[1:], self.display.curve(p.frequency, p.density, self.trial)
 

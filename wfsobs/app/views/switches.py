@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import panel_material_ui as pmui
@@ -19,11 +19,13 @@ from wfsobs.app.style import HEARD, follow_html, html, make_button, make_select,
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import TIP_TILT, Mode
 
+BUTTONS: Mapping[str, Any] = {"size": "small", "margin": 0, "variant": "outlined", "stylesheets": [HEARD]}
+"""Style of the buttons of a switch."""
 
-def make_buttons(label: str, options: dict[str, str], value: str) -> pmui.RadioButtonGroup:
-    """Make the buttons of a switch."""
-    style: dict[str, Any] = {"size": "small", "margin": 0, "variant": "outlined", "stylesheets": [HEARD]}
-    return pmui.RadioButtonGroup(label=label, options=options, value=value, **style)
+
+def group(display: Display, name: str) -> pmui.RadioButtonGroup:
+    """Make the buttons of one switch of the display."""
+    return pmui.RadioButtonGroup.from_param(display.param[name], **BUTTONS)
 
 
 class ModeSwitch:
@@ -36,12 +38,12 @@ class ModeSwitch:
         self.run = run
         self.display = display
         options = {_title(mode): mode.name for mode in TIP_TILT}
-        self.buttons: Final = make_buttons("Mode", options, display.mode)
+        self.buttons: Final = pmui.RadioButtonGroup(label="Mode", options=options, value=display.mode, **BUTTONS)
         self.list: Final = make_select("Mode", options, display.mode, 190, visible=False)
         for widget in (self.buttons, self.list):
             widget.param.watch(self._on_choice, "value")
         run.param.watch(self._fit, "result")
-        display.param.watch(self._follow, ["mode", "unit"])
+        display.param.watch(self._follow, "mode")
 
     def view(self) -> list[object]:
         """Return the buttons and the list, one of them visible."""
@@ -66,10 +68,8 @@ class ModeSwitch:
             self.buttons.visible = not self.list.visible
 
     def _follow(self, *_: object) -> None:
-        """Show the mode in the widgets; what is no tilt of the wavefront has no angle."""
+        """Show the mode in the widgets."""
         mode = self.display.mode
-        if self.display.unit not in self.display.units:
-            self.display.unit = "nm"
         if mode in self.list.options.values():
             self.list.value = mode
         if mode in self.buttons.options.values():
@@ -77,31 +77,19 @@ class ModeSwitch:
 
 
 class UnitSwitch:
-    """Chooses among the units of the mode shown, and says why one is missing. Made after the switch between modes."""
+    """Chooses among the units of the mode shown, and says why one is missing."""
 
     def __init__(self, display: Display):
-        self.display = display
-        self.buttons: Final = make_buttons("Unit", self._options(), display.unit)
+        self.buttons: Final = group(display, "unit")
         self.note: Final = html(NO_MAS, visible=False, margin=0)
-        self.buttons.param.watch(self._on_choice, "value")
-        display.param.watch(self._follow, ["mode", "unit"])
+        self.buttons.param.watch(self._follow, "options")
 
     def view(self) -> list[object]:
         """Return the buttons and the note."""
         return [self.buttons, self.note]
 
-    def _options(self) -> dict[str, str]:
-        return {UNITS[unit]: unit for unit in self.display.units}
-
-    def _on_choice(self, event: Any) -> None:
-        if event.new in self.display.units:
-            self.display.unit = event.new
-
-    def _follow(self, *_: object) -> None:
-        options = self._options()
-        if options != self.buttons.options or self.buttons.value != self.display.unit:
-            self.buttons.param.update(options=options, value=self.display.unit)
-        self.note.visible = len(options) < len(UNITS)
+    def _follow(self, event: Any) -> None:
+        self.note.visible = len(event.new) < len(UNITS)
 
 
 NO_MAS = '<span style="font-size:12px;opacity:0.75">mas: tip and tilt only</span>'
@@ -156,13 +144,13 @@ PIN, UNPIN = "Pin this run to compare others with it", "Unpin: compare with no o
 class Pinning:
     """Pin and unpin, one button: the result shown is the first one that is compared, or none is any more."""
 
-    def __init__(self, run: BackgroundTask, display: Display, history: History):
-        self.run = run
-        self.display = display
+    def __init__(self, history: History):
+        self.run = history.store.run
+        self.display = history.display
         self.history = history
         self.button: Final = make_button("Pin", self._press, icon="push_pin", variant="outlined", disabled=True, description=PIN)
         self.note: Final = html(sizing_mode=None, visible=False)
-        watch(self._refresh, (run, "result"), (history, "current"), (display, ["compared_runs", "dark"]))
+        watch(self._refresh, (self.run, "result"), (history, "current"), (self.display, ["compared_runs", "dark"]))
 
     def view(self) -> list[object]:
         """Return the button and the legend."""

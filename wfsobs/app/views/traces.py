@@ -1,38 +1,235 @@
-"""Time traces: one figure per target, sharing their time axis."""
+"""A figure per target, which rests while it is hidden: its time traces and its spectra."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from html import escape
 from typing import Any, Final
 
 import numpy as np
+import panel as pn
 from bokeh.models import BoxAnnotation, ColumnDataSource, CrosshairTool, GlyphRenderer, Label, Range1d, Span, Text, VSpan, VStrip
 from bokeh.plotting import figure
 
+from wfsobs.app.compared import ComparedRun, DrawnLines
 from wfsobs.app.display import Display
+from wfsobs.app.render import number
 from wfsobs.app.service import BackgroundTask
-from wfsobs.app.style import look, observers_of
+from wfsobs.app.style import follow_html, look, observers_of, sheets, swatch
 from wfsobs.app.views.plots import (
     ComparedLines,
     EndLabels,
     FigureLines,
+    Points,
+    add_marks,
     in_view,
+    model_mark,
     new_figure,
+    new_spectrum,
     on_settle,
+    peak_marks,
     send,
+    set_ends,
     show_all_on_double_click,
     zoom_of,
 )
-from wfsobs.app.views.target_figures import TargetFigures, shows_error
-from wfsobs.app.work import TRUTH, RunResults
+from wfsobs.app.work import TRUTH, Key, RunResults, SignalAndError
+from wfsobs.evaluation.error_spectra import band_rms, spectra
 from wfsobs.evaluation.recovery import trailing_rms
 from wfsobs.evaluation.scores import half_width
-from wfsobs.observers.base import TARGETS
+from wfsobs.observers.base import TARGETS, VIBRATION
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.events import LASER, PEAK, WIND, Event
 from wfsobs.signal.envelope import band_envelope, envelope, envelope_times
 from wfsobs.typing import Array
+
+FLEXIBLE = ":host > div { flex: 1 1 240px; width: auto !important; }"
+"""Style of what shares a row with a switch."""
+
+FONT = "Roboto, Helvetica, Arial, sans-serif"
+AXIS_TEXT: Mapping[str, Any] = {
+    "major_label_text_font": FONT,
+    "major_label_text_font_size": "0.925em",
+    "axis_label_text_font": FONT,
+    "axis_label_text_font_size": "1em",
+    "axis_label_text_font_style": "normal",
+    "axis_label_standoff": 12,
+}
+"""Text of axes as the theme of the page sets it: where it sets another the page is laid out anew."""
+
+
+class TargetFigure(FigureLines):
+    """One figure: the truth and the estimates of one target, those of the compared runs, and the names of the lines."""
+
+    def __init__(self, target: str, fig: figure, source: ColumnDataSource | None = None):
+        super().__init__(fig, (TRUTH, *observers_of(target)), source)
+        self.target = target
+        show_all_on_double_click(fig)
+        self.faint: Final = ComparedLines(fig)
+        self.names_at_end: Final = EndLabels(fig)
+
+    def draw_compared(self, display: Display, points: Callable[[ComparedRun, DrawnLines, str], Points | None]) -> list[Points]:
+        """Send the compared runs' visible lines; return them. points : returns x and y of one, or None."""
+        lines = [
+            (run.letter, name, *found)
+            for run, kept in display.runs_drawn
+            for name, line in self.lines.items()
+            if line.visible and (found := points(run, kept, name)) is not None
+        ]
+        self.faint.draw_runs(lines, display.dark)
+        return [(x, y) for _, _, x, y in lines]
+
+    def name_ends(self, lines: Mapping[str, Points], dark: bool) -> None:
+        """Name the lines that do not recede."""
+        self.names_at_end.draw({name: points for name, points in lines.items() if not self.lines[name].recedes}, dark)
+
+
+class TargetFigures(ABC):
+    """A figure per target, drawn when results or switches change while the page shows them."""
+
+    def __init__(self, run: BackgroundTask, display: Display, drawings: Mapping[str, TargetFigure], switches: Sequence[str]):
+        """Watch the results and the switches of the display; drawings : target -> its figure."""
+        self.run = run
+        self.display = display
+        self._drawings = drawings
+        self.visible: bool = True
+        self._behind = False
+        run.param.watch(self._redraw, "result")
+        display.param.watch(self._redraw, [*switches, "dark", "hidden_lines", "named_lines"])
+
+    def pane(self, target: str) -> pn.pane.Bokeh:
+        """Return the figure of one target."""
+        fig = self._drawings[target].figure
+        fig.sizing_mode = "stretch_both"
+        for axis in fig.axis:
+            axis.update(**AXIS_TEXT)
+        return pn.pane.Bokeh(fig, sizing_mode="stretch_both", margin=0)
+
+    def show(self, visible: bool) -> None:
+        """Draw what has come meanwhile, and go on while visible."""
+        self.visible = visible
+        if visible and self._behind:
+            self._redraw()
+
+    def _redraw(self, *_: object) -> None:
+        results = self.run.result
+        self._behind = not self.visible
+        if results is not None and self.visible:
+            with pn.io.hold():
+                for target, drawing in self._drawings.items():
+                    hidden, named = (lines.get(target, []) for lines in (self.display.hidden_lines, self.display.named_lines))
+                    drawing.restyle(self.display.dark, hidden, named)
+                self._draw(results)
+
+    @abstractmethod
+    def _draw(self, results: RunResults) -> None:
+        """Send the data of every figure, whose lines are shown or hidden by now."""
+
+
+def shows_error(results: RunResults, target: str, display: Display) -> bool:
+    """Whether errors are drawn: as chosen, where there is a truth to compare with."""
+    return display.error and results.values(TRUTH, target) is not None
+
+
+DECADES = 8
+"""The most that an axis of densities spans; one of amplitudes spans half of it."""
+
+
+class SpectraFigures(TargetFigures):
+    """The figures, redrawn when the results or the switches change."""
+
+    def __init__(self, run: BackgroundTask, display: Display, times: Range1d):
+        """Watch the results, the switches, and the axis of time where only what it shows counts."""
+        self.x_range: Final = Range1d(start=0.5, end=500.0, reset_start=0.5, reset_end=500.0)
+        self.times = times
+        self.spectra: Final = {target: _Spectrum(target, self.x_range) for target in TARGETS}
+        super().__init__(run, display, self.spectra, ["mode", "show", "unit", "spectrum", "compared_runs", "window_spectra"])
+        on_settle([times], lambda: self._redraw() if display.window_spectra else None)
+
+    def _draw(self, results: RunResults) -> None:
+        window = zoom_of(self.times) if self.display.window_spectra else None
+        spectra = results.spectra if window is None else window_spectra(results, *window)
+        for spectrum in self.spectra.values():
+            spectrum.draw(results, spectra, self.display)
+        frequencies = next((s.frequency for s in results.spectra.values()), None)
+        if frequencies is not None:
+            ends = float(frequencies[1]), float(frequencies[-1])
+            if ends != (self.x_range.reset_start, self.x_range.reset_end):
+                set_ends(self.x_range, *ends)
+
+
+class _Spectrum(TargetFigure):
+    """The spectra of the truth and of the estimates, or of their errors."""
+
+    def __init__(self, target: str, x_range: Range1d):
+        super().__init__(target, new_spectrum(x_range))
+        self.marks = add_marks(self.figure) if target == VIBRATION else {}
+
+    def draw(self, results: RunResults, spectra: Mapping[Key, SignalAndError], display: Display) -> None:
+        """Send every line, its axis and the marks."""
+        error = shows_error(results, self.target, display)
+        drawn: dict[str, Points] = {}
+        for name, source in self.sources.items():
+            spectrum = spectra.get((name, self.target)) if self.lines[name].visible else None
+            if spectrum is None:  # what is hidden is sent when it is shown
+                send(source, {"x": [], "y": []})
+                continue
+            y = _curve(spectrum, error and name != TRUTH, display, results.scenario)
+            send(source, {"x": spectrum.frequency[1:], "y": y})
+            drawn[name] = spectrum.frequency[1:], y
+
+        def compared(run: ComparedRun, lines_of_run: DrawnLines, name: str) -> Points | None:
+            spectrum, of_error = lines_of_run.spectra.get((name, self.target)), error and name != TRUTH
+            if spectrum is None or (of_error and not np.isfinite(spectrum.error).all()):  # errors beside errors alone
+                return None
+            return spectrum.frequency[1:], _curve(spectrum, of_error, display, run.scenario)
+
+        self._fit([y for _, y in [*drawn.values(), *self.draw_compared(display, compared)]], display.cumulative)
+        self.name_ends(drawn, display.dark)
+        self.figure.yaxis.axis_label = display.curve_label(" of error" if error else "")
+        if self.marks:
+            self._draw_marks(results)
+
+    def _fit(self, lines: list[Array], cumulative: bool) -> None:
+        """Have the axis hold every line, but for what lies too far below the highest."""
+        positive = [y[y > 0] for y in lines if (y > 0).any()]
+        if positive:
+            low, high = min(float(np.quantile(y, 0.02)) for y in positive), max(float(y.max()) for y in positive)
+            room, decades = (1.5, DECADES / 2) if cumulative else (3.0, DECADES)
+            self.figure.y_range.update(start=max(low / room, high * 10.0**-decades), end=high * room)
+
+    def _draw_marks(self, results: RunResults) -> None:
+        simulated = results.result.record.vibration is not None  # peaks of the settings are not those of a record
+        found = {"peaks": peak_marks(results.scenario) if simulated else [], "model": [model_mark(results.scenario)]}
+        for name, marks in found.items():
+            send(self.marks[name].data_source, {"x": [x for x, _ in marks], "text": [text for _, text in marks]})
+
+
+def window_spectra(results: RunResults, start: float, end: float) -> dict[Key, SignalAndError]:
+    """Compute the spectra of the truth and of every estimate between two times [s]; without those that are too short."""
+    record = results.result.record
+    cut = slice(max(round(start / record.dt), 0), round(end / record.dt) + 1)
+    out: dict[Key, SignalAndError] = {}
+    for (name, target), whole in results.spectra.items():
+        values = results.values(name, target)
+        if values is None:
+            continue
+        inside = np.full_like(values, np.nan)
+        inside[cut] = values[cut]
+        if (found := spectra(record, target, inside, start)) is not None:
+            frequency, signal, error = found
+            known = np.isfinite(whole.error).all()
+            out[name, target] = SignalAndError(frequency, signal, error if known else np.full_like(error, np.nan))
+    return out
+
+
+def _curve(spectrum: SignalAndError, error: bool, display: Display, scenario: Scenario) -> Array:
+    """Compute what is drawn of a spectrum. In error plots the truth stays: the error of answering zero."""
+    density = (spectrum.error if error else spectrum.signal)[:, display.column]
+    return display.curve(spectrum.frequency, density, scenario)
+
 
 COLOURS = {False: "#7A1FA2", True: "#E0B3FF"}
 """In light and dark mode."""
@@ -114,7 +311,7 @@ class EventMarks:
                 "below": [2 + LINE_PX * level for level in levels(results)],
             },
         )
-        self.restyle(dark)
+        self._line.line_color = self._strip.fill_color = self._text.text_color = COLOURS[dark]
 
     def _make(self) -> None:
         if not self._marks_exist:
@@ -122,10 +319,6 @@ class EventMarks:
             self.figure.add_glyph(self.spans, self._strip, level="underlay")
             self.figure.add_glyph(self.jumps, self._line)
             self.figure.add_glyph(self.words, self._text, level="overlay")
-
-    def restyle(self, dark: bool) -> None:
-        """Set the colour of light or dark mode."""
-        self._line.line_color = self._strip.fill_color = self._text.text_color = COLOURS[dark]
 
 
 BINS = 500
@@ -222,21 +415,15 @@ class _Band:
             self.renderer.visible = self.label.visible = False
 
 
-class _Trace:
-    """One figure: the truth and the estimates of one target, all lines in one data source."""
+class _Trace(TargetFigure):
+    """The truth and the estimates, all lines in one data source."""
 
     def __init__(self, target: str, x_range: Range1d, crosshair: CrosshairTool):
-        self.target = target
-        self.names = [TRUTH, *observers_of(target)]
-        self.source = ColumnDataSource({"x": [], **{name: [] for name in self.names}})
-        self.figure = new_figure(x_range, (-1.0, 1.0), "time [s]")
+        self.source = ColumnDataSource({name: [] for name in ("x", TRUTH, *observers_of(target))})
+        super().__init__(target, new_figure(x_range, (-1.0, 1.0), "time [s]"), self.source)
         self.figure.add_tools(crosshair)
-        show_all_on_double_click(self.figure)
         self.warm_up = BoxAnnotation(left=0, right=0, fill_color="#808080", fill_alpha=0.10, line_width=0, level="underlay")
         self.figure.add_layout(self.warm_up)
-        self.lines = FigureLines(self.figure, {name: (self.source, name) for name in self.names})
-        self.faint = ComparedLines(self.figure)
-        self.names_at_end = EndLabels(self.figure)
         self.events = EventMarks(self.figure)
         self.band = _Band(self.figure)
 
@@ -253,15 +440,14 @@ class _Trace:
         self.warm_up.right = warm_up
         settled = warm_up + WINDOW_S * display.running
         error = shows_error(results, self.target, display)
-        extra = self._draw_compared(display, error, data["x"]) + self._draw_band(results, display, first, last, data["x"])
+        extra = self._draw_runs(display, error, data["x"]) + self._draw_band(results, display, first, last, data["x"])
         self._fit(data, settled, extra, room(results))
-        shown = {name: (data["x"], data[name]) for name, line in self.lines.items() if line.visible and not line.recedes}
-        self.names_at_end.draw(shown, display.dark)
+        self.name_ends({name: (data["x"], data[name]) for name, line in self.lines.items() if line.visible}, display.dark)
         self.events.draw(results, display.dark)
         what = f"{'running rms of ' if error and display.running else ''}{'error of ' if error else ''}{display.mode_label}"
         self.figure.yaxis.axis_label = f"{what} [{display.unit_label}]"
 
-    def _draw_band(self, results: RunResults, display: Display, first: int, last: int, times: Array) -> list[tuple[Array, Array]]:
+    def _draw_band(self, results: RunResults, display: Display, first: int, last: int, times: Array) -> list[Points]:
         """Shade the 95 % band of the one observer that is shown, where it states one; its edges."""
         shown = [name for name, line in self.lines.items() if line.visible and name != TRUTH]
         sd = results.sd(shown[0], self.target) if len(shown) == 1 and not display.running else None
@@ -276,22 +462,21 @@ class _Trace:
         self.band.draw(times, low, high, look(shown[0]).colour(display.dark))
         return [(times, low), (times, high)]
 
-    def _draw_compared(self, display: Display, error: bool, times: Array) -> list[tuple[Array, Array]]:
-        """Send the compared runs' visible lines, errors beside errors, from the first to the last of the times; what was sent."""
-        lines: list[tuple[str, str, Array, Array]] = []
-        for run, kept in display.runs_drawn if not display.running else []:  # what is kept are extremes, of which there is no rms
-            first, last = np.searchsorted(kept.times, [times[0], times[-1]])
-            cut = slice(first, last + 1)
-            x = _times_of_envelope(kept.times[cut])
-            scale = display.scale(run.scenario)
-            for name, line in self.lines.items():
-                values = (kept.errors if error else kept.signals).get((name, self.target))
-                if line.visible and values is not None:
-                    lines.append((run.letter, name, x, scale * envelope(values[cut, display.column].astype(np.float64), BINS)))
-        self.faint.draw_runs(lines, display.dark)
-        return [(x, y) for _, _, x, y in lines]
+    def _draw_runs(self, display: Display, error: bool, times: Array) -> list[Points]:
+        """Send the compared runs, errors beside errors, from the first to the last of the times; return what was sent."""
 
-    def _fit(self, data: dict[str, Any], warm_up: float, extra: Sequence[tuple[Array, Array]], above: float) -> None:
+        def points(run: ComparedRun, lines_of_run: DrawnLines, name: str) -> Points | None:
+            values = (lines_of_run.errors if error else lines_of_run.signals).get((name, self.target))
+            if values is None or display.running:  # what is kept are extremes, of which there is no rms
+                return None
+            first, last = np.searchsorted(lines_of_run.times, [times[0], times[-1]])
+            cut = slice(first, last + 1)
+            y = envelope(values[cut, display.column].astype(np.float64), BINS)
+            return _times_of_envelope(lines_of_run.times[cut]), display.scale(run.scenario) * y
+
+        return self.draw_compared(display, points)
+
+    def _fit(self, data: dict[str, Any], warm_up: float, extra: Sequence[Points], above: float) -> None:
         """Have the axis hold every visible line; what a filter does while it settles does not count."""
         counted = data["x"] >= warm_up
         if not counted.any():
@@ -340,3 +525,58 @@ def _line(results: RunResults, name: str, target: str, display: Display, first: 
     if display.running:  # where there is no estimate yet, that of a while ago is not results in its place
         error = np.where(np.isnan(error), np.nan, trailing_rms(error, n))
     return error[before:, 0]
+
+
+class Stretch:
+    """A line below the figures of a target: the rms error of every line that is shown, where a visitor has zoomed to."""
+
+    def __init__(self, target: str, traces: Traces, spectra: SpectraFigures):
+        self.target = target
+        self.traces = traces
+        self.spectra = spectra
+        self.run = traces.run
+        self.display = traces.display
+        sources = (self.run, "result"), (self.display, ["mode", "unit", "hidden_lines", "dark"])
+        self.pane: Final = follow_html(self.html, *sources, stylesheets=[*sheets("style", "bare"), FLEXIBLE])
+        on_settle([traces.x_range, spectra.x_range], lambda: setattr(self.pane, "html", self.html()))
+
+    def html(self) -> str:
+        """Write the errors; nothing where there is no truth or nothing is zoomed."""
+        results = self.run.result
+        if results is None or results.values(TRUTH, self.target) is None:
+            return ""
+        hidden = self.display.hidden_lines.get(self.target, [])
+        names = [name for name in observers_of(self.target) if name not in hidden]
+        lines = []
+        if (ends := zoom_of(self.traces.x_range)) is not None and self.traces.chosen_window() is not None:
+            lines.append(self._line(f"{ends[0]:.2f} – {ends[1]:.2f} s", self._over_time(results, names, *ends), results))
+        if (ends := zoom_of(self.spectra.x_range)) is not None:
+            lines.append(self._line(f"{ends[0]:.3g} – {ends[1]:.3g} Hz", self._in_band(results, names, *ends), results))
+        return "".join(lines)
+
+    def _over_time(self, results: RunResults, names: list[str], start: float, end: float) -> dict[str, float]:
+        """Compute the rms error of each observer over the samples that all have [um]."""
+        record, truth = results.result.record, results.values(TRUTH, self.target)
+        assert truth is not None
+        cut = slice(max(round(start / record.dt), 0), round(end / record.dt) + 1), self.display.column
+        known = {name: values[cut] for name in names if (values := results.values(name, self.target)) is not None}
+        found = {name: values for name, values in known.items() if np.isfinite(values).any()}
+        if not found:
+            return {}
+        errors = np.column_stack([*found.values()]) - truth[cut][:, None]
+        errors = errors[np.isfinite(errors).all(axis=1)]
+        return dict(zip(found, np.sqrt(np.mean(errors**2, axis=0)), strict=True)) if len(errors) else {}
+
+    def _in_band(self, results: RunResults, names: list[str], low: float, high: float) -> dict[str, float]:
+        """Compute the rms error of each observer in a band, over the whole record [um]."""
+        spectra = {name: spectrum for name in names if (spectrum := results.spectra.get((name, self.target))) is not None}
+        return {name: band_rms(s.frequency, s.error[:, self.display.column], low, high) for name, s in spectra.items()}
+
+    def _line(self, where: str, errors: dict[str, float], results: RunResults) -> str:
+        scale = self.display.scale(results.scenario)
+        entries = [
+            f'<span class="mark">{swatch(name, self.display.dark)}{escape(look(name).label)} '
+            f"<b>{number(error * scale)}</b> {self.display.unit_label}</span>"
+            for name, error in sorted(errors.items(), key=lambda item: item[1])
+        ]
+        return f'<p class="text stretch legend">RMS error, {where}: {"".join(entries)}</p>' if entries else ""
