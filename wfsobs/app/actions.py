@@ -51,7 +51,7 @@ class Menus(HtmlComponent):
     labels = param.Dict({}, doc="Name of a line in the figures -> what it is called, for the legends of figures that are saved.")
     saves = param.List([], doc="What the page can save beside the data, as it is called in the menu.")
 
-    _esm = script("listen", "patch", "markup", "save", "figures", "actions")
+    _esm = script("page", "patch", "markup", "figures", "actions")
     _stylesheets = sheets("base", "bare", "actions")
 
     def save(self, name: str, kind: str, content: bytes) -> None:

@@ -41,7 +41,7 @@ class Connection(Component):
     session = param.String("", doc="A name of the session, to tell it from one made anew.")
     last_arrival = param.Integer(0, doc="Number of the last question that has arrived, and all before it.")
 
-    _esm = script("focus", "connection")
+    _esm = script("page", "connection")
     _stylesheets = sheets("base", "connection")
 
     def __init__(self, take: Callable[[dict[str, Any]], None], **params: Any):
@@ -63,7 +63,7 @@ class Readout(Component):
 
     labels = param.Dict({}, doc="Name of a line in the figures -> what it is called.")
 
-    _esm = script("listen", "readout")
+    _esm = script("page", "readout")
     _stylesheets = sheets("base", "readout")
 
     def __init__(self, **params: Any):
@@ -117,13 +117,13 @@ class Frame(Component):
     stale = param.Boolean(False, doc="Whether to fade the results.")
     dark = param.Boolean(False, doc="Whether the page is dark.")
 
-    _esm = script("frame")
+    _esm = script("page", "frame")
 
 
 class Keyboard(Component):
     """What the keyboard needs, and a first stop that leads to what is after it."""
 
-    _esm = script("listen", "focus", "keyboard")
+    _esm = script("page", "keyboard")
 
 
 class Idle(param.Parameterized):

@@ -108,7 +108,7 @@ SHORTCUTS: Mapping[str, str] = {
 class Help(HtmlComponent):
     """The button at the top, and what it opens."""
 
-    _esm = script("listen", "help")
+    _esm = script("page", "help")
     _stylesheets = sheets("base", "bare", "help")
 
     def __init__(self, **params: Any):

@@ -276,7 +276,7 @@ class Sheet(HtmlComponent):
 
     open: param.Boolean[bool] = param.Boolean(False, doc="Whether it is seen.")
 
-    _esm = script("patch", "markup", "focus", "history")
+    _esm = script("page", "patch", "markup", "history")
     _stylesheets = sheets("base", "history")
 
 

@@ -1,4 +1,4 @@
-// A box that finds settings by their name, their topic or their path; choosing one opens its topic and goes to it.
+// A box that finds settings by name, topic or path, opens the topic and goes there.
 
 const TAG = "setting:"
 const SETTLED = 20 // frames in which a topic opens and moves what is in it
@@ -49,7 +49,7 @@ export function render({model, el}) {
   }})
 }
 
-// Give a setting the focus, as soon as its topic has opened, unless the visitor has gone on to something else by then.
+// Give a setting the focus as soon as its topic has opened, unless the visitor has gone on by then.
 function go(path) {
   const over = new AbortController()
   for (const act of ["pointerdown", "keydown"]) document.addEventListener(act, () => over.abort(), {capture: true, signal: over.signal})

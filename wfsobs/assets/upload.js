@@ -24,7 +24,7 @@ export function render({model, el}) {
     setMarkup(el, model.html)
     el.style.position = model.source_title || model.message ? "" : "absolute"
   }
-  for (const name of ["html", "source_title", "message"]) model.on(name, draw)  // which come one after the other
+  model.on(["html", "source_title", "message"], draw)  // which come one after the other
   draw()
   const [input, sheet, pick] = ["input", "#load", ".pick"].map((it) => el.querySelector(it))
   const take = ([file]) => { if (file) send(model, file) }

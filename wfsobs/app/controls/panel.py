@@ -106,7 +106,7 @@ class Search(Component):
 
     items = param.List([], doc="{path, name} of every setting.")
 
-    _esm = script("listen", "search")
+    _esm = script("page", "search")
     _stylesheets = sheets("base", "search")
 
     def __init__(self, reveal: Callable[[str], None], **params: Any):
