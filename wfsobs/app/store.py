@@ -36,36 +36,6 @@ AFTER_FIT = ("telescope.radial_order", "run.warm_up")
 """Settings that follow a record, and may be changed afterwards."""
 
 
-class RecordPlace:
-    """What the observers of a store run on."""
-
-    def __init__(self, store: Store) -> None:
-        self.store = store
-        self._own: dict[str, Any] = {}
-
-    def take(self, preview: Preview, declaration: DeclaredFormat, sha256: str) -> None:
-        """Run on a record; the settings of rate, ratio and length follow it, but to the ones of a link. Raises SettingError."""
-        before, wanted = self.store.scenario, self.store.wanted_record
-        scenario = fit_to_record(preview.record, before)
-        if wanted is not None and wanted.sha256 == sha256:
-            scenario = scenario.replace({path: before.lookup(path) for path in AFTER_FIT})
-        own = self._own if isinstance(self.store.source, LoadedRecord) else changed_settings(before, scenario)
-        key, line = record_key(preview.record), preview.lines()[0]
-        self.store.run_on(LoadedRecord(preview.record, preview.name, key, line, declaration, sha256), scenario)
-        self._own = own
-
-    def give_back(self) -> None:
-        """Go back to the simulation: of settings that were kept, or of these with its own rate, ratio and length."""
-        self.store.wanted_record = None
-        if (source := self.store.source) is None:
-            return
-        scenario = source.simulation or self.store.scenario
-        try:
-            self.store.run_on(None, scenario.replace(self._own if isinstance(source, LoadedRecord) else {}))
-        except SettingError:  # they do not go with what was changed since
-            self.store.run_on(None, scenario)
-
-
 AT_ONCE = 5.0
 """A run that takes longer waits to be asked for [s]."""
 
@@ -87,12 +57,10 @@ class Store(param.Parameterized):
     wanted_record: param.Parameter[NamedRecord | None] = param.Parameter(
         None, doc="The record of the link that was opened, until its file is given."
     )
-    stale: param.Boolean[bool] = param.Boolean(False, doc="Whether the results shown are not those of the settings.")
-    waiting: param.Number[float] = param.Number(
-        0.0, doc="How long the run would take that waits to be asked for [s]; 0 where none does."
-    )
-    can_undo: param.Boolean[bool] = param.Boolean(False, doc="Whether there is a change to undo.")
-    can_redo: param.Boolean[bool] = param.Boolean(False, doc="Whether there is an undone change to make again.")
+    stale = param.Boolean(False, doc="Whether the results shown are not those of the settings.")
+    waiting = param.Number(0.0, doc="How long the run would take that waits to be asked for [s]; 0 where none does.")
+    can_undo = param.Boolean(False, doc="Whether there is a change to undo.")
+    can_redo = param.Boolean(False, doc="Whether there is an undone change to make again.")
 
     def __init__(self, post: Post, session: Session, scenario: Scenario | None = None):
         live = session.service.live  # whoever changes a setting of the loop that all watch, changes that one alone
@@ -106,6 +74,7 @@ class Store(param.Parameterized):
         self._refusals: dict[str, Any] = {}
         self._past: list[Step] = []
         self._future: list[Step] = []
+        self._own: dict[str, Any] = {}  # settings that a loaded record has replaced
         self.run: Final = BackgroundTask(session, drawn_first=True)
         self.rests: bool = False
         """Whether runs wait until a page needs one."""
@@ -207,6 +176,28 @@ class Store(param.Parameterized):
         if source is not None:
             source.check(self.limits)
         self._accept(step, {})
+
+    def take_record(self, preview: Preview, declaration: DeclaredFormat, sha256: str) -> None:
+        """Run on a record; the settings of rate, ratio and length follow it, but to the ones of a link. Raises SettingError."""
+        before, wanted = self.scenario, self.wanted_record
+        scenario = fit_to_record(preview.record, before)
+        if wanted is not None and wanted.sha256 == sha256:
+            scenario = scenario.replace({path: before.lookup(path) for path in AFTER_FIT})
+        own = self._own if isinstance(self.source, LoadedRecord) else changed_settings(before, scenario)
+        key, line = record_key(preview.record), preview.lines()[0]
+        self.run_on(LoadedRecord(preview.record, preview.name, key, line, declaration, sha256), scenario)
+        self._own = own
+
+    def simulate(self) -> None:
+        """Go back to the simulation: of settings that were kept, or of these with its own rate, ratio and length."""
+        self.wanted_record = None
+        if (source := self.source) is None:
+            return
+        scenario = source.simulation or self.scenario
+        try:
+            self.run_on(None, scenario.replace(self._own if isinstance(source, LoadedRecord) else {}))
+        except SettingError:  # they do not go with what was changed since
+            self.run_on(None, scenario)
 
     def choose(self, name: str) -> None:
         """Start again from a preset."""

@@ -28,7 +28,7 @@ from wfsobs.app.render import render
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.session_file import LARGEST, SUFFIX
 from wfsobs.app.sources import fit_to_record
-from wfsobs.app.store import RecordPlace, Store
+from wfsobs.app.store import Store
 from wfsobs.app.style import HtmlComponent, html, make_button, make_select, script, sheets
 from wfsobs.app.views.plots import new_spectrum, send
 from wfsobs.record import RecordError
@@ -278,7 +278,6 @@ class Upload:
         self.form: ColumnForm | None = None
         proposals = {"variant": "outlined", "margin": 4, "visible": False}
         self.take: Final = make_button("Take the proposed sign and delay", self.take_proposals, **proposals)
-        self.place: Final = RecordPlace(store)
         self.room: Final = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
         self._parcel = PartialFile()
         self._name, self._content, self._digest = "", b"", ""
@@ -306,7 +305,7 @@ class Upload:
         """Do what a message of the browser says; one that makes no sense is a file that cannot be read."""
         action = msg.get("action")
         if action == "simulate":
-            self.place.give_back()
+            self.store.simulate()
         elif action == "large":
             self.discard(too_large(safe_name(str(msg.get("name", "")))))
         elif action == "part":
@@ -433,7 +432,7 @@ class Upload:
         if not isinstance(found, Preview) or self._obstacle(found):
             return
         try:
-            self.place.take(found, self.read_fields(), self._digest)
+            self.store.take_record(found, self.read_fields(), self._digest)
         except SettingError as error:
             self._say(f"{found.name}: {error}")
         else:

@@ -55,10 +55,10 @@ progress::-moz-progress-bar { background: #8fd3f0; }
 class Status(Component):
     """The state of the run in the browser."""
 
-    progress: param.Number[float] = param.Number(0.0, doc="Fraction done.")
-    text: param.String[str] = param.String("", doc="The state, in words.")
-    note: param.String[str] = param.String("", doc="What was refused.")
-    label: param.String[str] = param.String("Progress of the run", doc="What the bar is the progress of.")
+    progress = param.Number(0.0, doc="Fraction done.")
+    text = param.String("", doc="The state, in words.")
+    note = param.String("", doc="What was refused.")
+    label = param.String("Progress of the run", doc="What the bar is the progress of.")
 
     _esm = script("status")
     _stylesheets = sheets("base", "status")
