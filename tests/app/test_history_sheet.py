@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from types import SimpleNamespace
 from typing import Any
 
@@ -59,12 +58,12 @@ def actions(sheet: HistorySheet) -> Actions:
 
 
 def saved(actions: Actions, loop: Any, monkeypatch: pytest.MonkeyPatch) -> bytes:
-    files: list[dict[str, str]] = []
+    files: list[dict[str, Any]] = []
     monkeypatch.setattr(actions.toolbar, "_send_msg", files.append)
     actions.handle({"action": "session"})
     loop.until(lambda: files != [])
     assert files[0]["name"].endswith(SUFFIX)
-    return base64.b64decode(files[0]["content"])
+    return files[0]["content"]
 
 
 def test_rows(sheet: HistorySheet) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
@@ -56,7 +55,7 @@ class Menus(HtmlComponent):
 
     def save(self, name: str, kind: str, content: bytes) -> None:
         """Have the browser save a file."""
-        self._send_msg({"name": name, "kind": kind, "content": base64.b64encode(content).decode()})
+        self._send_msg({"name": name, "kind": kind, "content": content})
 
     @param.depends("ready", "reporting", "saves", watch=True, on_init=True)
     def _draw(self) -> None:

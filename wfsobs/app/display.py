@@ -44,10 +44,10 @@ def per_micrometre(unit: str, diameter: float) -> float:
     return 1.0 / micrometres_per(unit, diameter)
 
 
-def label_of(p: param.Parameter[Any]) -> str:
-    """Write a setting's label with its unit in [brackets]."""
+def label_of(p: param.Parameter[Any], name: str = "") -> str:
+    """Write a setting's label, or another name, with its unit in [brackets]."""
     unit = unit_text(unit_of(p))
-    return f"{p.label} [{unit}]" if unit else str(p.label)
+    return f"{name or p.label} [{unit}]" if unit else name or str(p.label)
 
 
 def score_columns(unit: str, base: str = "truth", compared_columns: Mapping[str, str] = {}) -> dict[str, str]:

@@ -90,8 +90,7 @@ def page_query() -> str:
     """
     if pn.state.location is not None and pn.state.location.search:
         return str(pn.state.location.search)
-    texts = [(key, value) for key, values in pn.state.session_args.items() for value in values]
-    return urlencode(texts, quote_via=quote)
+    return urlencode(pn.state.session_args, doseq=True, quote_via=quote)
 
 
 class Poster:
@@ -111,7 +110,7 @@ class Poster:
         self._waiting: list[Callable[[], None]] | None = []
         self._lock = threading.Lock()
         if self._doc is not None:
-            pn.state.onload(self._on_load)
+            pn.state.onload(partial(self._run_waiting, None))
 
     def __call__(self, function: Callable[[], None]) -> None:
         """Have a function run; from any thread."""
@@ -132,9 +131,6 @@ class Poster:
         """Run what has been posted so far, before the page is sent: known results are part of it."""
         if self._waiting:
             self._run_waiting([])
-
-    def _on_load(self) -> None:
-        self._run_waiting(None)
 
     def _run_waiting(self, then: list[Callable[[], None]] | None) -> None:
         with self._lock:
@@ -227,7 +223,7 @@ class NextPage(Handler):
 
     async def _make(self) -> None:
         assert self.context is not None
-        session = self.service.new_session()
+        session = Session(self.service)
         request = HTTPServerRequest(start_line=RequestStartLine("GET", f"{self._prefix}/", "HTTP/1.0"))
         name = generate_session_id(self._secret, signed=True)
         payload = {"headers": {}, "cookies": {}, "arguments": {}, **self.context.application.process_request(request)}
@@ -466,7 +462,7 @@ def make_server(options: Options, service: Service) -> Server:
     """Make a server that listens but has not started. A page is made and dropped first: its imports take longer than the page."""
     secret = generate_secret_key()
     is_warm = service.live is None  # a page of a live loop needs the event loop to run
-    warm = iter([service.new_session()] if is_warm else [])
+    warm = iter([Session(service)] if is_warm else [])
     applications: Any = build_applications({"/": lambda: new_page(service, next(warm, None))}, title="wfsobs")
     ready = NextPage(service, options.prefix, secret.encode(), TOKEN, options.lifetime)
     applications["/"].add(ready)

@@ -71,13 +71,9 @@ class Service:
 
     def enter(self) -> Session:
         """Open a new session. Raises Full."""
-        session = self.new_session()
+        session = Session(self)
         session.enter()
         return session
-
-    def new_session(self) -> Session:
-        """Make a session whose visitor has not come."""
-        return Session(self)
 
     def count_session(self) -> int:
         """Count a session that begins, and return its number. Raises Full."""

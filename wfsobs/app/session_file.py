@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import time
 import zipfile
 import zlib
@@ -35,6 +36,8 @@ from wfsobs.telemetry.records import record_arrays
 from wfsobs.units import UNITS
 
 LONGEST_TEXT = 2_000
+
+SHA256 = re.compile("[0-9a-f]{64}")
 
 DAMAGED = "damaged, or no session of wfsobs"
 
@@ -364,13 +367,13 @@ def _scenario(values: Mapping[str, Any]) -> Scenario:
 def _source(values: Any, records: _Records) -> Source | None:
     if values is None:
         return None
-    if isinstance(values, dict) and "simulation" in values:
-        return SimulatedRecord(_scenario(get_value(values, "simulation", dict)))
     if not isinstance(values, dict):
         raise SessionError(DAMAGED)
+    if "simulation" in values:
+        return SimulatedRecord(_scenario(get_value(values, "simulation", dict)))
     record, key = records.find(get_value(values, "number", int))
     digits = get_text(values, "sha256")
-    if digits and (len(digits) != 64 or not set(digits) <= set("0123456789abcdef")):
+    if digits and not SHA256.fullmatch(digits):
         raise SessionError("a SHA-256 takes 64 hexadecimal digits")
     name = safe_name(get_text(values, "name"))
     return LoadedRecord(

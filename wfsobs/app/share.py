@@ -22,7 +22,7 @@ import param
 
 from wfsobs.app.controls.fields import parse_number
 from wfsobs.app.render import render
-from wfsobs.app.session_file import SessionError, read_declaration
+from wfsobs.app.session_file import SHA256, SessionError, read_declaration
 from wfsobs.app.sources import LoadedRecord, NamedRecord, SimulatedRecord, Source
 from wfsobs.live.loop import LiveOrder
 from wfsobs.scenario import Scenario, configfile
@@ -36,9 +36,6 @@ from wfsobs.telemetry.preview import safe_name
 from wfsobs.units import UNITS
 
 PREFIX, COLUMN = "record.", "column."
-
-DIGITS = 64
-"""Of a SHA-256 in hexadecimal."""
 
 STATEMENTS: Mapping[str, tuple[str, str]] = {
     "unit": ("unit", f"takes one of {', '.join(UNITS)}"),
@@ -82,8 +79,8 @@ def read_record_fields(fields: Mapping[str, str]) -> tuple[NamedRecord | None, d
     refused: dict[str, str] = {}
     given = {key.removeprefix(PREFIX): text for key, text in fields.items()}
     name, digits, declaration = given.pop("name", ""), given.pop("sha256", ""), DeclaredFormat()
-    if len(digits) != DIGITS or not set(digits) <= set("0123456789abcdef"):
-        return None, {f"{PREFIX}sha256": f"takes {DIGITS} hexadecimal digits"}
+    if not SHA256.fullmatch(digits):
+        return None, {f"{PREFIX}sha256": "takes 64 hexadecimal digits"}
     if name != safe_name(name):
         refused[f"{PREFIX}name"] = "takes the name of a file"
     for key, text in given.items():

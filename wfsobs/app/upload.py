@@ -6,7 +6,6 @@ is confirmed. Reading is done beside the page, in a thread.
 
 from __future__ import annotations
 
-import base64
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -76,19 +75,16 @@ class PartialFile:
 
     def take(self, msg: dict[str, Any]) -> bytes | None:
         """Add a part {name, index, count, data}; the whole file with the last one. Raises ValueError, one line."""
-        index, count = msg.get("index"), msg.get("count")
+        index, count, data = (msg.get(key) for key in ("index", "count", "data"))
         if index == 0:
             self.name, self._parts = safe_name(str(msg.get("name", ""))), []
         parts = self._parts
         if parts is None:  # more of a file that has been given up
             return None
         self._parts = None
-        if type(index) is not int or type(count) is not int or not len(parts) == index < count:
+        if type(index) is not int or type(count) is not int or not len(parts) == index < count or not isinstance(data, bytes):
             raise ValueError(INCOMPLETE)
-        try:
-            parts.append(base64.b64decode(msg["data"], validate=True))
-        except (KeyError, TypeError, ValueError):
-            raise ValueError(INCOMPLETE) from None
+        parts.append(data)
         if sum(map(len, parts)) > LARGEST:
             raise ValueError(too_large(self.name))
         if index == count - 1:
@@ -426,26 +422,20 @@ class Upload:
         self.room.visible = True
 
     def confirm(self) -> None:
-        """Let the record take the place of the simulation, the settings of rate, ratio and length with it."""
-        if isinstance(found := self._preview, SpectrumPreview):
-            self._vibrate(found)
-        if not isinstance(found, Preview) or self._obstacle(found):
-            return
+        """Use what was read: a record with its rate, ratio and length in place of the simulation, or a spectrum of vibration."""
+        found, said = self._preview, ""
         try:
-            self.store.take_record(found, self.read_fields(), self._digest)
+            if isinstance(found, SpectrumPreview):
+                self.store.replace({"vibration.source": "psd", "vibration.psd": found.table})
+                said = f"The vibration has the spectrum of {found.name}."
+            elif isinstance(found, Preview) and not self._obstacle(found):
+                self.store.take_record(found, self.read_fields(), self._digest)
+            else:
+                return
         except SettingError as error:
-            self._say(f"{found.name}: {error}")
+            self._say(f"{found.name}: {str(error)[:300]}")
         else:
-            self.discard()
-
-    def _vibrate(self, preview: SpectrumPreview) -> None:
-        """Take a spectrum as that of the vibration."""
-        try:
-            self.store.replace({"vibration.source": "psd", "vibration.psd": preview.table})
-        except SettingError as error:
-            self._say(f"{preview.name}: {str(error)[:300]}")
-        else:
-            self.discard(f"The vibration has the spectrum of {preview.name}.")
+            self.discard(said)
 
     def discard(self, why: str = "") -> None:
         """Forget the file that is being looked at."""

@@ -23,7 +23,7 @@ export function render({model, view, el}) {
   say(model.message)
   model.on("msg:custom", (event) => {
     const {name, kind, content} = event.data ?? event
-    save(name, new Blob([Uint8Array.from(atob(content), (c) => c.charCodeAt(0))], {type: kind}))
+    save(name, new Blob([content], {type: kind}))
     say(`Saved ${name}.`)
   })
 

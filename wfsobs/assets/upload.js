@@ -2,19 +2,13 @@
 
 const RECORDS = ".npz,.npy,.csv,.txt,.dat,.tsv,.asc,.fits,.fit,.fts,.mat,.h5,.hdf5,.hdf,.he5,.sav,.idl,.parquet,.pq"
 
-const base64 = (blob) => new Promise((done) => {
-  const reader = new FileReader()
-  reader.onload = () => done(reader.result.split(",")[1] ?? "")
-  reader.readAsDataURL(blob)
-})
-
 async function send(model, file) {
   const {name, size} = file
   if (/\.toml$/i.test(name) && size <= model.part) return model.send_msg({action: "scenario", name, text: await file.text()})
   if (size > model.largest) return model.send_msg({action: "large", name})
   const count = Math.max(1, Math.ceil(size / model.part))
   for (let index = 0; index < count; index++) {
-    const data = await base64(file.slice(index * model.part, (index + 1) * model.part))
+    const data = await file.slice(index * model.part, (index + 1) * model.part).arrayBuffer()
     model.send_msg({action: "part", name, index, count, data})
   }
 }

@@ -25,7 +25,7 @@ from wfsobs.app.store import Store
 from wfsobs.app.style import HtmlComponent, html, script, sheets
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.settings.group import Group
-from wfsobs.settings.parameters import Reals, unit_of
+from wfsobs.settings.parameters import Reals
 from wfsobs.units import unit_text
 
 ROOM = {"sizing_mode": "stretch_width", "margin": (4, 0)}
@@ -410,16 +410,9 @@ def _columns(kind: type[Group]) -> list[dict[str, Any]]:
     """One column per number or word, one for tip and one for tilt per list of numbers, named from the settings."""
     out = []
     for setting, p in kind.settings().items():
-        keys = [setting]
-        if isinstance(p, Reals):
-            keys = [f"{setting}.{i}" for i, _ in enumerate(TIP_TILT)]
-        unit = unit_text(unit_of(p))
-        choices = list(p.objects) if isinstance(p, param.Selector) else []
-        out += [
-            {"key": key, "name": f"{name} [{unit}]" if unit else name, "doc": p.doc or "", "choices": choices}
-            for key in keys
-            for name in [column_of(key)]
-        ]
+        keys = [f"{setting}.{i}" for i, _ in enumerate(TIP_TILT)] if isinstance(p, Reals) else [setting]
+        more = {"doc": p.doc or "", "choices": list(p.objects) if isinstance(p, param.Selector) else []}
+        out += [{"key": key, "name": label_of(p, column_of(key)), **more} for key in keys]
     return out
 
 

@@ -127,7 +127,7 @@ def settings_found() -> list[dict[str, str]]:
     lists = dict(scenario.lists())
     inner = tuple(f"{path}." for path in lists)
     known = [*lists.items(), *((path, p) for path, _, p in scenario.walk() if not path.startswith(inner))]
-    return [{"path": path, "name": f"{label_of(p)} · {topics[path.split('.')[0]].label}"} for path, p in known]
+    return [{"path": path, "name": f"{label_of(p)} · {topics[topic_of(path)].label}"} for path, p in known]
 
 
 FIRST: Mapping[str, Sequence[str]] = {
@@ -242,7 +242,7 @@ class Controls:
 
     def open_setting(self, path: str) -> None:
         """Open the topic of a setting."""
-        index = list(self.topics).index(path.split(".")[0])
+        index = list(self.topics).index(topic_of(path))
         if path not in AT_HAND and index not in self.accordion.active:
             self.accordion.active = [*self.accordion.active, index]
 
@@ -349,7 +349,7 @@ class Controls:
         told = f"{len(changed)} changed: {', '.join(map(setting_name, changed))}" if changed else preset_line(self.store.preset)
         self.preset.helper_text = told
         self.reset.disabled = not changed
-        count = Counter(path.split(".")[0] for path in changed)
+        count = Counter(map(topic_of, changed))
         titles = {name: title + (f" · {count[name]} changed" if count[name] else "") for name, title in self.topics.items()}
         if titles != self.titles:
             self.titles = titles
@@ -370,9 +370,7 @@ class Controls:
         self._changed_part = part
 
     def _refresh_run(self, *_: object) -> None:
-        run = self.store.run
-        running = run.state == RUNNING
-        self.cancel.disabled = not running
+        self.cancel.disabled = self.store.run.state != RUNNING
         progress, text, note = status_of(self.store)
         self.status.param.update(progress=progress, text=text, note=note)
 
@@ -385,4 +383,4 @@ def topic_of(path: str) -> str:
 def _names() -> dict[str, str]:
     """Topic -> title, in the order of the drawer."""
     settings = {name: str(p.label) for name, p in Scenario.settings().items()}
-    return {name: settings[name] for name in (*TOPICS, *(n for n in settings if n not in TOPICS))}
+    return {name: settings[name] for name in dict.fromkeys((*TOPICS, *settings))}
