@@ -114,29 +114,22 @@ class SeedRuns(param.Parameterized):
 
     def _go_on(self, *_: object) -> None:
         """Say what is known, and have the next seed run; what is there already does not wait for a turn each."""
-        self._take_known()
+        cache = self.task.session.service.cache
+        while (job := self._next_job()) is not None and (found := cache.get(job.key)) is not None:
+            self._scores.append(found.scores)
         self.evidence = gather_evidence(self._scores[: self.count]) if self.n_known >= FEWEST else None
-        if not self.possible or len(self._scores) >= self.count:
+        if job is None:
             self.task.close()
         else:
-            assert self._of is not None
-            self.task.start(self._job(self._of, len(self._scores)))
+            self.task.start(job)
 
-    def _take_known(self) -> None:
-        service = self.task.session.service
-        while self._of is not None and self.possible and len(self._scores) < self.count:
-            of = self._of
-            found = service.cache.get(service.seed_key(of.scenario, of.source, self._seed(of, len(self._scores))))
-            if not isinstance(found, SeedScores):
-                return
-            self._scores.append(found.scores)
-
-    def _seed(self, of: RunResults, number: int) -> int:
+    def _next_job(self) -> Job | None:
+        """Make the job of the first seed that is not known; None where there is none."""
+        of, number = self._of, len(self._scores)
+        if of is None or not self.possible or number >= self.count:
+            return None
         simulated = of.source.simulation if isinstance(of.source, SimulatedRecord) else of.scenario
-        return simulated.run.seed + number
-
-    def _job(self, of: RunResults, number: int) -> Job:
-        service, args = self.task.session.service, (of.scenario, of.source, self._seed(of, number))
+        service, args = self.task.session.service, (of.scenario, of.source, simulated.run.seed + number)
         return Job(
             "seed",
             partial(run_seed, *args, memo=service.memo),

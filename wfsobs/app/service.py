@@ -55,7 +55,7 @@ class Service:
     def __init__(self, limits: Limits, workers: int, most_bytes: int, work: Compute | None = None, memo: Memo | None = None):
         self.limits = limits
         self.memo: Final = Memo() if memo is None else memo
-        self.cache: Cache[Any] = Cache(most_bytes)
+        self.cache: Final = Cache(most_bytes)
         self.queue: Final = JobQueue(workers, self.cache)
         self.sessions: int = 0
         self._last_wish = monotonic()

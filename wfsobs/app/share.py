@@ -14,7 +14,6 @@ import json
 import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import reduce
 from typing import Any
 from urllib.parse import parse_qsl, quote
 
@@ -170,7 +169,7 @@ def to_query(
 
 
 def _fields(values: Mapping[str, Any], prefix: str = "") -> list[str]:
-    return [f"{prefix}{path}={quote(value_text(path, value), safe=',;:+-.')}" for path, value in values.items()]
+    return [f"{prefix}{path}={quote(value_text(value), safe=',;:+-.')}" for path, value in values.items()]
 
 
 def from_query(query: str, check: Check = Scenario.validate) -> Link:
@@ -209,15 +208,15 @@ def has_settings(query: str) -> bool:
     return any(not key.startswith(PASSED_OVER) for key, _ in parse_qsl(query.removeprefix("?"), keep_blank_values=True))
 
 
-def value_text(path: str, value: Any) -> str:
+def value_text(value: Any) -> str:
     """Write a setting's plain value as a link has it."""
     if isinstance(value, list) and value and isinstance(value[0], dict):
-        return ";".join(
-            value_text(path, [v for one in item.values() for v in (one if isinstance(one, list) else [one])]) for item in value
-        )
+        return ";".join(",".join(map(value_text, item.values())) for item in value)
     if isinstance(value, list):
-        return ",".join(map(_word, value))
-    return _word(value)
+        return ",".join(map(value_text, value))
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return repr(value).removesuffix(".0") if isinstance(value, float) else str(value)
 
 
 def read_value(path: str, text: str, settings: Mapping[str, param.Parameter[Any]]) -> Any:
@@ -258,7 +257,7 @@ def _apply(base: Scenario, fields: Mapping[str, str], check: Check) -> tuple[Sce
         waiting = {path: value for path, value in values.items() if path not in refused}
         for _ in range(ROUNDS):  # what one field needs, a later one may bring
             for path, value in list(waiting.items()):
-                before = reduce(getattr, path.split("."), scenario)
+                before = scenario.lookup(path)
                 _set(scenario, path, value)
                 refused[path] = _clash(scenario, check)
                 if refused[path]:
@@ -288,12 +287,6 @@ def _line(path: str, text: str, reason: str) -> str:
     """Write the line of a field that was refused, with its name in front if the reason lacks it."""
     line = reason if reason.startswith(path) else f"{path} = {text}: {reason}"
     return line if len(line) <= 200 else f"{line[:197]}..."
-
-
-def _word(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    return repr(value).removesuffix(".0") if isinstance(value, float) else str(value)
 
 
 # ---------------------------------------------------------------------- files

@@ -90,16 +90,11 @@ export function render({model, view, el}) {
   listen(model, {keydown: (event) => keyPressed(event, model)})
 }
 
-const TEXT = "[contenteditable], textarea, input:not([type=range], [type=checkbox], [type=radio], [type=button], [type=file])"
-
 function keyPressed(event, model) {
   const at = event.composedPath()[0], key = event.key.toLowerCase()
-  if (event.altKey || at.matches?.(TEXT)) return
-  if (!(event.ctrlKey || event.metaKey)) {
-    if (key === "h" && !at.matches?.("[role=option], [role=combobox]")) model.send_msg({action: "history"})
-    return
-  }
-  const action = key === "z" ? (event.shiftKey ? "redo" : "undo") : key === "y" ? "redo" : ""
+  if (keyAlone(event) && key === "h" && !at.matches?.("[role=option], [role=combobox]")) model.send_msg({action: "history"})
+  if (event.altKey || !(event.ctrlKey || event.metaKey) || at.matches?.(TEXT)) return
+  const action = {z: event.shiftKey ? "redo" : "undo", y: "redo"}[key]
   if (!action) return
   event.preventDefault()
   model.send_msg({action})

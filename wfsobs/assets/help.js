@@ -12,8 +12,5 @@ export function render({model, el}) {
     kept(TOLD, "offered")
     offer.showPopover()
   }, 2000)
-  listen(model, {keydown: (event) => {
-    const isText = event.composedPath()[0].matches?.("input, textarea, select, [contenteditable]")
-    if (event.key === "?" && !isText && !event.ctrlKey && !event.metaKey && !event.altKey) sheet.togglePopover()
-  }})
+  listen(model, {keydown: (event) => { if (keyAlone(event) === "?") sheet.togglePopover() }})
 }

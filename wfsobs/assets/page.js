@@ -12,6 +12,14 @@ function focused() {
   return it
 }
 
+const TEXT = "[contenteditable], textarea, input:not([type=range], [type=checkbox], [type=radio], [type=button], [type=file])"
+
+// The key that is pressed alone, where no text is typed.
+function keyAlone(event) {
+  const isOther = event.ctrlKey || event.metaKey || event.altKey || event.composedPath()[0].matches?.(TEXT)
+  return isOther ? "" : event.key
+}
+
 const figureViews = () => [...Bokeh.index.query((it) => it.model.type === "Figure")]
 
 // What the browser keeps under a name, null for nothing; with a value it keeps that. Some browsers refuse.

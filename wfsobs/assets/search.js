@@ -43,7 +43,7 @@ export function render({model, el}) {
   model.on("items", fill)
   fill()
   listen(model, {keydown: (event) => {
-    if (event.key !== "/" || event.composedPath()[0].matches?.("input, textarea, [contenteditable]")) return
+    if (keyAlone(event) !== "/") return
     event.preventDefault()
     box.focus()
   }})
