@@ -33,7 +33,7 @@ from wfsobs.app.session_file import (
 )
 from wfsobs.app.sources import Step
 from wfsobs.app.store import Store
-from wfsobs.app.style import HtmlComponent, look, script, sheets
+from wfsobs.app.style import NO_ROOM, HtmlComponent, look, script, sheets
 from wfsobs.app.work import RunResults
 from wfsobs.evaluation.evidence import rank_observers
 from wfsobs.evaluation.rows import can_be_best
@@ -329,7 +329,7 @@ class HistorySheet:
 
     def _sheet(self) -> Sheet:
         if self.sheet is None:
-            self.sheet = Sheet(self.handle, width=0, height=0, margin=0, styles={"position": "absolute"})
+            self.sheet = Sheet(self.handle, **NO_ROOM, styles={"position": "absolute"})
             self.history.param.watch(self._refresh, ["entries", "current", "can_undelete"])
             self.history.param.watch(lambda event: self._say(event.new), "note", onlychanged=False)
             self.display.param.watch(self._refresh, ["mode", "unit", "compared_runs"])

@@ -47,6 +47,7 @@ from wfsobs.app.logs import event, to_stream
 from wfsobs.app.pages.pages import LIVE, PAGE, PREFIX
 from wfsobs.app.service import Full, Post, Service, Session
 from wfsobs.app.share import LONGEST, has_settings
+from wfsobs.app.store import FIRST_PRESET
 from wfsobs.app.work import one_blas_thread
 from wfsobs.campaign.follow import CampaignFolder
 from wfsobs.live.loop import LiveOrder
@@ -381,7 +382,7 @@ def serve(options: Options, live: LiveOrder | None = None) -> None:
     if options.campaign:
         service.campaign = CampaignFolder(Path(options.campaign))
     with suppress(SettingError):  # larger than the limits allow
-        service.queue.submit(service.run(PRESETS[next(iter(PRESETS))]()), "server", lambda _news: None)
+        service.queue.submit(service.run(PRESETS[FIRST_PRESET]()), "server", lambda _news: None)
     loop, status = IOLoop.current(), 0
 
     def fail() -> None:

@@ -23,6 +23,7 @@ from wfsobs.app.controls.fields import parse_number
 from wfsobs.app.render import render
 from wfsobs.app.session_file import SHA256, SessionError, read_declaration
 from wfsobs.app.sources import LoadedRecord, NamedRecord, SimulatedRecord, Source
+from wfsobs.app.store import FIRST_PRESET
 from wfsobs.live.loop import LiveOrder
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.configfile import from_toml, parse_toml, reference_preset, to_toml
@@ -111,9 +112,6 @@ Check = Callable[[Scenario], None]
 LONGEST = 8000
 """Characters of a query, or of a command line; what is longer travels as a file."""
 
-SHORTEST_NAME = next(iter(PRESETS))
-"""The preset of a query that names none."""
-
 ROUNDS = 3
 MOST = 200
 """Fields of a query that are read."""
@@ -158,7 +156,7 @@ def to_query(
     simulation : of other settings, which is kept;  record : one that was loaded
     """
     changed = changes(scenario, preset)
-    parts = [f"preset={preset}"] if preset != SHORTEST_NAME or changed or simulation or record else []
+    parts = [f"preset={preset}"] if preset != FIRST_PRESET or changed or simulation or record else []
     parts += _fields(changed)
     if simulation is not None:
         parts += [KEPT, *_fields(changes(simulation, preset), f"{KEPT}.")]
@@ -179,17 +177,17 @@ def from_query(query: str, check: Check = Scenario.validate) -> Link:
     """
     if len(query) > LONGEST:
         return Link(
-            PRESETS[SHORTEST_NAME](),
-            SHORTEST_NAME,
+            PRESETS[FIRST_PRESET](),
+            FIRST_PRESET,
             (f"The link has {len(query)} characters, at most {LONGEST} are allowed: the link is ignored.",),
         )
     pairs = parse_qsl(query.removeprefix("?").replace("+", "%2B"), keep_blank_values=True)
     fields = {key: text for key, text in pairs[:MOST] if not key.startswith(PASSED_OVER)}
-    name = fields.pop("preset", SHORTEST_NAME)
+    name = fields.pop("preset", FIRST_PRESET)
     rejected = []
     if name not in PRESETS:
         rejected.append(_line("preset", name, f"takes one of {', '.join(PRESETS)}"))
-        name = SHORTEST_NAME
+        name = FIRST_PRESET
     kept, named = ({key: fields.pop(key) for key in [*fields] if key.startswith(start)} for start in (KEPT, PREFIX))
     of_simulation = {key.removeprefix(f"{KEPT}."): text for key, text in kept.items() if key != KEPT}
     scenario, refused = _apply(PRESETS[name](), fields, check)

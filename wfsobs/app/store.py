@@ -39,6 +39,9 @@ AFTER_FIT = ("telescope.radial_order", "run.warm_up")
 AT_ONCE = 5.0
 """A run that takes longer waits to be asked for [s]."""
 
+FIRST_PRESET = next(iter(PRESETS))
+"""The preset to start from."""
+
 STEPS_BACK = 100
 """Changes that can be undone."""
 
@@ -48,9 +51,7 @@ class Store(param.Parameterized):
 
     scenario: param.Parameter[Scenario] = param.Parameter(doc="The settings as accepted.")
     errors: param.Parameter[dict[str, str]] = param.Parameter({}, doc="Dotted path of a refused setting -> why, in one line.")
-    preset: param.Selector[str] = param.Selector(
-        default=next(iter(PRESETS)), objects=list(PRESETS), doc="Where the settings started."
-    )
+    preset: param.Selector[str] = param.Selector(default=FIRST_PRESET, objects=list(PRESETS), doc="Where the settings started.")
     source: param.Parameter[Source | None] = param.Parameter(
         None, doc="What the observers run on; None for the simulation of the settings."
     )
@@ -65,9 +66,9 @@ class Store(param.Parameterized):
     def __init__(self, post: Post, session: Session, scenario: Scenario | None = None):
         live = session.service.live  # whoever changes a setting of the loop that all watch, changes that one alone
         if live is not None and scenario is None:
-            super().__init__(scenario=live.scenario, preset=live.preset or next(iter(PRESETS)))
+            super().__init__(scenario=live.scenario, preset=live.preset or FIRST_PRESET)
         else:
-            super().__init__(scenario=scenario or PRESETS[next(iter(PRESETS))]())
+            super().__init__(scenario=scenario or PRESETS[FIRST_PRESET]())
         self.session = session
         self.limits: Final = session.service.limits
         session.post = post

@@ -28,7 +28,7 @@ from wfsobs.app.service import BackgroundTask
 from wfsobs.app.session_file import LARGEST, SUFFIX
 from wfsobs.app.sources import fit_to_record
 from wfsobs.app.store import Store
-from wfsobs.app.style import HtmlComponent, html, make_button, make_select, script, sheets
+from wfsobs.app.style import WIDE, HtmlComponent, html, make_button, make_select, script, sheets
 from wfsobs.app.views.plots import new_spectrum, send
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
@@ -227,7 +227,7 @@ class ColumnForm:
         for choice in self.choices.values():
             choice.param.watch(self._choose, "value")
         self.view: Final = pn.Column(
-            html(f"<p>{HINT}</p>", margin=0, styles=TEXT),
+            html(f"<p>{HINT}</p>", styles=TEXT),
             pn.FlexBox(*self.choices.values(), gap="8px", margin=0),
             sizing_mode="stretch_width",
             margin=(4, 0),
@@ -265,16 +265,16 @@ class Upload:
         """Make the button. actions : open other files, and save."""
         self.store = store
         self.actions: Final = actions
-        self.picker: Final = Picker(sizing_mode="stretch_width", margin=0)
+        self.picker: Final = Picker(**WIDE)
         self.picker.on_message = self.handle
         self.use: Final = make_button("Use this record", self.confirm, color="primary", margin=4)
         self.drop: Final = make_button("Discard", self.discard, variant="outlined", margin=4)
-        self.missing: Final = html("", margin=(8, 4))
+        self.missing: Final = html(margin=(8, 4))
         self.content: Final = PreviewView()
         self.form: ColumnForm | None = None
         proposals = {"variant": "outlined", "margin": 4, "visible": False}
         self.take: Final = make_button("Take the proposed sign and delay", self.take_proposals, **proposals)
-        self.room: Final = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
+        self.room: Final = pn.Column(visible=False, **WIDE)
         self._parcel = PartialFile()
         self._name, self._content, self._digest = "", b"", ""
         self._preview: AnyPreview | None = None
@@ -416,7 +416,7 @@ class Upload:
                 self.content.text,
                 *([self.form.view] if self.form is not None else []),
                 pn.FlexBox(*self.fields.widgets, self.take, gap="8px", align_items="center", margin=0),
-                pn.pane.Bokeh(self.content.figure, sizing_mode="stretch_width", margin=0),
+                pn.pane.Bokeh(self.content.figure, **WIDE),
                 pn.FlexBox(self.use, self.drop, self.missing, align_items="center", margin=0),
             ]
         self.room.visible = True

@@ -17,7 +17,7 @@ from wfsobs.app.controls.names import preset_line, preset_title, setting_name
 from wfsobs.app.display import label_of
 from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.store import Store
-from wfsobs.app.style import PRIMARY, Component, HtmlText, html, make_button, script, sheets
+from wfsobs.app.style import PRIMARY, WIDE, Component, HtmlText, html, make_button, script, sheets
 from wfsobs.app.views.plots import AFTERWARDS_MS, once
 from wfsobs.app.work import RunResults
 from wfsobs.scenario import Scenario
@@ -199,11 +199,11 @@ class Controls:
         self.status: Final = Status(sizing_mode="stretch_width", max_width=200, margin=0, stylesheets=[STATUS_ON_BAR])
         self.search: Final = Search(self.open_setting, sizing_mode="stretch_width", margin=(8, 0, 4, 0))
         self.effect_of: Callable[[RunResults, RunResults], str] = lambda _before, _now: ""
-        self._effect = html("", margin=0, styles=EFFECT)
+        self._effect = html(styles=EFFECT)
         self._before: RunResults | None = None
         self._changed_part: Field | RowEditor | None = None
         self.topics: Final = _names()
-        self.rooms: Final = {name: pn.Column(sizing_mode="stretch_width", margin=0) for name in self.topics}
+        self.rooms: Final = {name: pn.Column(**WIDE) for name in self.topics}
         self.titles = dict(self.topics)
         self.accordion: Final = pmui.Accordion(
             *((title, self.rooms[name]) for name, title in self.topics.items()),
@@ -228,7 +228,7 @@ class Controls:
         self._refresh_parts()
         return pn.Column(
             self.preset,
-            pn.Row(self.undo, self.redo, self.reset, sizing_mode="stretch_width", margin=0),
+            pn.Row(self.undo, self.redo, self.reset, **WIDE),
             *first,
             self.search,
             self.accordion,
@@ -238,7 +238,7 @@ class Controls:
 
     def bar(self) -> pn.Row:
         """Return what stays in sight: the buttons of the run, and how it is going."""
-        return pn.Row(self.run, self.cancel, self.status, sizing_mode="stretch_width", margin=0, stylesheets=[BAR])
+        return pn.Row(self.run, self.cancel, self.status, **WIDE, stylesheets=[BAR])
 
     def open_setting(self, path: str) -> None:
         """Open the topic of a setting."""

@@ -15,7 +15,7 @@ from wfsobs.app.idle_work import Budgets, SeedRuns
 from wfsobs.app.jobs import DONE, RUNNING
 from wfsobs.app.render import NOTHING, change, number, render, with_decimals_of
 from wfsobs.app.service import BackgroundTask
-from wfsobs.app.style import TERM_COLOURS, HtmlComponent, look, observers_of, script, sheets, watch
+from wfsobs.app.style import TERM_COLOURS, WIDE, HtmlComponent, look, observers_of, script, sheets, watch
 from wfsobs.app.views.table import find
 from wfsobs.app.views.verdict import REFERENCES, MainLines
 from wfsobs.app.work import TRUTH, RunResults
@@ -56,7 +56,7 @@ class Cards(HtmlComponent):
         self.kind = kind
         self.on_main: Callable[[], None] = lambda: None
         self.on_all: Callable[[], None] = lambda: None
-        super().__init__(self._take, sizing_mode="stretch_width", margin=0)
+        super().__init__(self._take, **WIDE)
         self.show([])
 
     def show(
