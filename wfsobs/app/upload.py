@@ -35,12 +35,16 @@ from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.settings.errors import SettingError
 from wfsobs.telemetry.columns import ROLES
+from wfsobs.telemetry.formats import FORMATS
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.preview import ColumnsPreview, Preview, SpectrumPreview, preview_any, safe_name
 from wfsobs.telemetry.records import TEMPLATE, sample_csv
 from wfsobs.units import UNITS
 
 BACK, STAY = "Back to the simulation", "Stay with the simulation"
+
+RECORDS = ",".join(ending for form in FORMATS for ending in form.endings)
+"""Of files that are offered to be chosen."""
 
 PART = 1_000_000
 """Of what the browser sends at a time [bytes]."""
@@ -60,7 +64,7 @@ class Picker(HtmlComponent):
 
     @param.depends("message", "source_title", "back", watch=True, on_init=True)
     def _draw(self) -> None:
-        self.html = render("upload.html", title=self.source_title, back=self.back, message=self.message)
+        self.html = render("upload.html", title=self.source_title, back=self.back, message=self.message, records=RECORDS)
 
 
 INCOMPLETE = "The upload is incomplete: choose the file again."

@@ -1,7 +1,5 @@
 // Loading a file: the sheet, the file sent in parts, and what there is to say about it.
 
-const RECORDS = ".npz,.npy,.csv,.txt,.dat,.tsv,.asc,.fits,.fit,.fts,.mat,.h5,.hdf5,.hdf,.he5,.sav,.idl,.parquet,.pq"
-
 async function send(model, file) {
   const {name, size} = file
   if (/\.toml$/i.test(name) && size <= model.part) return model.send_msg({action: "scenario", name, text: await file.text()})
@@ -34,7 +32,7 @@ export function render({model, el}) {
   }
   listen(model, {
     dragover: over, dragenter: over, drop: over,
-    "wfsobs:load": () => { input.accept = RECORDS; sheet.showPopover() },
+    "wfsobs:load": () => { input.accept = input.dataset.records; sheet.showPopover() },
     "wfsobs:open": () => { input.accept = ".toml,.wfsobs-session"; input.click() },
   })
 }
