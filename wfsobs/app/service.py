@@ -243,7 +243,7 @@ class BackgroundTask(param.Parameterized):
         self._generation = 0
         self._news: dict[str, Any] = {}
         self._is_posted = False
-        self._leave: Callable[[], None] = _nothing
+        self._leave: Callable[[], None] = lambda: None
 
     def start(self, job: Job) -> None:
         """Start a job; it supersedes the one before."""
@@ -274,7 +274,7 @@ class BackgroundTask(param.Parameterized):
     def close(self) -> None:
         """Leave the job; later news of it is ignored."""
         self._supersede()
-        before, self._leave = self._leave, _nothing
+        before, self._leave = self._leave, lambda: None
         before()
 
     def line(self, doing: str = "Running") -> str:
@@ -313,7 +313,3 @@ class BackgroundTask(param.Parameterized):
             self.param.update(**news)
         if again:
             self.session.post(self._land)
-
-
-def _nothing() -> None:
-    return None

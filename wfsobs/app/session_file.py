@@ -227,16 +227,10 @@ def write_session(content: SessionContent) -> bytes:
         if isinstance(source, LoadedRecord):
             records.setdefault(source.key, source)
     numbers = {key: number for number, key in enumerate(records)}
-    scenario, preset, source = content.step
     values = {
         "format": FORMAT,
         "version": VERSION,
-        "shown": {
-            "preset": preset,
-            "scenario": scenario.to_dict(),
-            "source": _source_values(source, numbers),
-            "view": content.view,
-        },
+        "shown": _step_values(content.step, numbers) | {"view": content.view},
         "compared": [i for i, entry in enumerate(content.entries) if entry.key in content.compared_keys],
         "entries": [_entry_values(entry, numbers) for entry in content.entries],
     }
@@ -259,12 +253,13 @@ PLAIN: Mapping[str, type] = {"name": str, "own_name": bool, "time": float, "star
 
 
 def _entry_values(entry: HistoryEntry, numbers: Mapping[str, int]) -> dict[str, Any]:
-    return {
-        **{name: getattr(entry, name) for name in ("key", "preset", *PLAIN)},
-        "scenario": entry.scenario.to_dict(),
-        "source": _source_values(entry.source, numbers),
-        "scores": [asdict(s) | {"calibration": s.calibration and list(s.calibration)} for s in entry.scores],
-    }
+    plain = {name: getattr(entry, name) for name in ("key", *PLAIN)}
+    return plain | _step_values(entry.step, numbers) | {"scores": [asdict(score) for score in entry.scores]}
+
+
+def _step_values(step: Step, numbers: Mapping[str, int]) -> dict[str, Any]:
+    scenario, preset, source = step
+    return {"preset": preset, "scenario": scenario.to_dict(), "source": _source_values(source, numbers)}
 
 
 def _source_values(source: Source | None, numbers: Mapping[str, int]) -> dict[str, Any] | None:
