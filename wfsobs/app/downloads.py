@@ -62,7 +62,7 @@ def record_file(name: str, record: Record, scenario: Scenario, more: Mapping[str
     more : arrays beside those of the record, where the format takes them
     """
     file = io.BytesIO()
-    writer_of(name)(file, record_arrays(record, to_toml(scenario)) | more)
+    writer_of(name)(file, {**record_arrays(record, to_toml(scenario)), **more})
     return file.getvalue()
 
 

@@ -437,7 +437,7 @@ class Upload:
             else:
                 return
         except SettingError as error:
-            self._say(f"{found.name}: {str(error)[:300]}")
+            self._say(f"{self._name}: {str(error)[:300]}")
         else:
             self.discard(said)
 
