@@ -12,7 +12,7 @@ import param
 
 from wfsobs.app.cache import size_of
 from wfsobs.app.jobs import DONE, IDLE_TIME, Job, Tell
-from wfsobs.app.service import BackgroundTask
+from wfsobs.app.service import BackgroundTask, run_key
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source
 from wfsobs.app.store import Store
 from wfsobs.app.style import watch
@@ -129,11 +129,11 @@ class SeedRuns(param.Parameterized):
         if of is None or not self.possible or number >= self.count:
             return None
         simulated = of.source.simulation if isinstance(of.source, SimulatedRecord) else of.scenario
-        service, args = self.task.session.service, (of.scenario, of.source, simulated.run.seed + number)
+        seed = simulated.run.seed + number
         return Job(
             "seed",
-            partial(run_seed, *args, memo=service.memo),
-            key=service.seed_key(*args),
+            partial(run_seed, of.scenario, of.source, seed, memo=self.task.session.service.memo),
+            key=f"seed {seed} of {run_key(of.scenario, of.source)}",
             cost=run_seconds(of.scenario),
             priority=IDLE_TIME,
             refusal=SettingError,

@@ -135,10 +135,6 @@ class Service:
         cost = run_seconds(scenario) if seconds is None else seconds
         return Job("run", work, key=run_key(scenario, source), cost=cost, refusal=SettingError)
 
-    def seed_key(self, scenario: Scenario, source: Source | None, seed: int) -> str:
-        """Name the scores of a scenario's observers on the record of another seed."""
-        return f"seed {seed} of {run_key(scenario, source)}"
-
     def start(self, make: Callable[[], Made]) -> Made:
         """Make something that starts processes which keep to a clock."""
         return self._starter.submit(make).result()

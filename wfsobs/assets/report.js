@@ -101,22 +101,14 @@ function drawSpectrum(figure, target) {
   }
 }
 
-// The places of the sliders of a state, and the state of some places; the last slider runs fastest.
-function places(index) {
-  return data.variations.map(({length}, i) => {
-    const below = data.variations.slice(i + 1).reduce((n, v) => n * v.length, 1)
-    return Math.floor(index / below) % length
-  })
-}
-
-function stateAt(of) {
-  return of.reduce((index, place, i) => index * data.variations[i].length + place, 0)
-}
+// The places of the sliders of every state; the last slider runs fastest.
+const places = data.variations.reduce((all, texts) => all.flatMap((of) => texts.map((_, i) => [...of, i])), [[]])
+const stateAt = (of) => places.findIndex((it) => it.join() === of.join())
 
 // RMS errors over the setting chosen, the others as they stand.
 function drawSweep(figure, target) {
   const [label, values] = data.sweeps[shown.over]
-  const now = places(shown.state)
+  const now = places[shown.state]
   const order = values.map((_, i) => i).sort((a, b) => values[a] - values[b])
   const runs = order.map((place) => stateAt(now.with(Number(shown.over), place)))
   const error = (index, name) => (rowOf(index, target, name)?.rms_um ?? NaN) * scaleOf(data.states[index])
@@ -206,7 +198,7 @@ function sliders() {
   const say = () => all.forEach((slider, i) => {
     slider.ariaValueText = slider.nextElementSibling.textContent = data.variations[i][Number(slider.value)]
   })
-  places(data.start).forEach((place, i) => { all[i].value = place })
+  places[data.start].forEach((place, i) => { all[i].value = place })
   for (const slider of all) {
     slider.oninput = () => {
       const before = stateShown()
