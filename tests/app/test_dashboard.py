@@ -124,7 +124,7 @@ def test_importing_the_package_imports_no_panel() -> None:
 def test_a_session_that_has_ended_leaves_nothing_behind(short: Scenario, enter: Any) -> None:
     dashboard = Dashboard(lambda function: function(), enter(), short)
     page = dashboard.page()
-    dashboard.close()
+    dashboard.store.session.leave()
     gone = weakref.ref(dashboard), weakref.ref(page)
     del dashboard, page
     gc.collect()

@@ -27,14 +27,13 @@ def sheet(make_store: Any, loop: Any) -> HistorySheet:
     change(history, loop, WIND, 20)
     shown: list[Sheet] = []
     sheet = HistorySheet(history, shown.append)
-    assert not shown and sheet.sheet is None, "made when it is first opened"
+    assert not shown, "made when it is first opened"
     sheet.toggle()
     assert shown == [sheet.sheet]
     return sheet
 
 
 def model(sheet: HistorySheet) -> Sheet:
-    assert sheet.sheet is not None
     return sheet.sheet
 
 

@@ -227,10 +227,6 @@ class Dashboard:
         else:
             self.store.wake()
 
-    def close(self) -> None:
-        """Release what the session holds; called when it ends."""
-        self.store.close()
-
     def _on_theme(self, event: Any) -> None:
         self.display.dark = event.new
         if event.new != self.frame.wants_dark:

@@ -72,7 +72,7 @@ def session_page(build: Callable[[Post], Dashboard]) -> Any:
             dashboard.actions.open_view(query)
         dashboard.start()
         post.deliver()
-        pn.state.on_session_destroyed(lambda _context: dashboard.close())
+        pn.state.on_session_destroyed(lambda _context: dashboard.store.session.leave())
         return session_page
     except Exception as error:
         log.exception("the page could not be built")

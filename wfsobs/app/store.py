@@ -208,10 +208,6 @@ class Store(param.Parameterized):
         """Dotted paths of the settings that differ from the preset's."""
         return [*changed_settings(self.scenario, reference_preset(self.preset))]
 
-    def close(self) -> None:
-        """Release what the store holds; called when the session ends."""
-        self.session.leave()
-
     @property
     def step(self) -> Step:
         """Settings, preset and record as they stand."""
