@@ -9,7 +9,6 @@ const TIMEOUT = 3_000 // of a question beside the connection [ms]
 const LONGEST = 3_000 // between two attempts to connect [ms]
 const REFUSALS = 5 // of a server that answers, after which it has no such session
 const UNSENT = "wfsobs-unsent"
-const TAG = "setting:"
 const TYPED = ["value", "value_input", "value_throttled"]
 
 const LATER = " Results are as they were; what you change is kept for later."

@@ -1,3 +1,5 @@
+const TAG = "setting:" // before the path of its setting in the tag of a widget
+
 // Hear events of the whole page as long as a component is on it: type -> what is done.
 function listen(model, heard, options = {}) {
   const stop = new AbortController()

@@ -1,6 +1,5 @@
 // A box that finds settings by name, topic or path, opens the topic and goes there.
 
-const TAG = "setting:"
 const SETTLED = 20 // frames in which a topic opens and moves what is in it
 
 export function render({model, el}) {
