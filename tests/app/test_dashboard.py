@@ -42,7 +42,7 @@ def test_a_page_that_cannot_be_assembled(monkeypatch: pytest.MonkeyPatch, loop: 
 
     assert "ValueError: no page" in session_page(build)[0].object
     assert made[0].store.run.state == "idle"
-    made[0].close()
+    made[0].store.session.leave()
 
 
 def test_a_failing_run_shows_inline(loop: Any, short: Scenario, enter: Any) -> None:
