@@ -82,7 +82,7 @@ def loop() -> Iterator[Loop]:
     loop = Loop()
     yield loop
     for thing in loop.closing:
-        thing.close()
+        getattr(thing, "store", thing).session.leave()  # a page or a store
 
 
 @pytest.fixture

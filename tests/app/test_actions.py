@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import io
 import tomllib
 from pathlib import Path
@@ -34,7 +33,7 @@ WIND = "turbulence.wind_speed"
 @pytest.fixture
 def actions(dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch) -> Actions:
     """The row of a dashboard whose first run is done; what it sends is kept in `sent`."""
-    sent: list[dict[str, str]] = []
+    sent: list[dict[str, Any]] = []
     monkeypatch.setattr(dashboard.actions.toolbar, "_send_msg", sent.append)
     dashboard.actions.sent = sent  # type: ignore[attr-defined]
     return dashboard.actions
@@ -114,7 +113,7 @@ def test_the_scenario_file(actions: Actions, loop: Any) -> None:
     actions.handle({"action": "toml"})
     loop.until(lambda: actions.sent != [])  # type: ignore[attr-defined]
     (file,) = actions.sent  # type: ignore[attr-defined]
-    text = base64.b64decode(file["content"]).decode()
+    text = file["content"].decode()
     assert file["name"] == "wfsobs.toml" and tomllib.loads(text)["preset"] == "paper"
     assert from_toml(text) == actions.store.scenario
 
@@ -124,7 +123,7 @@ def test_data_is_made_aside_and_sent(actions: Actions, loop: Any, action: str, m
     actions.handle({"action": action})
     loop.until(lambda: actions.sent)  # type: ignore[attr-defined]
     (file,) = actions.sent  # type: ignore[attr-defined]
-    content = base64.b64decode(file["content"])
+    content = file["content"]
     assert file["name"] == f"wfsobs.{action}" and len(content) == len(make(actions.store.run.result))
 
 
@@ -141,7 +140,7 @@ def test_a_report_is_made_aside_of_what_is_shown_one_at_a_time(
     actions.handle({"action": "report"})
     loop.until(lambda: not actions.toolbar.reporting)
     (file,) = actions.sent  # type: ignore[attr-defined]
-    assert file["name"] == "wfsobs-report.html" and base64.b64decode(file["content"]) == b"<!doctype html>"
+    assert file["name"] == "wfsobs-report.html" and file["content"] == b"<!doctype html>"
     assert shown is not None and asked == [(shown, "paper")]
 
 

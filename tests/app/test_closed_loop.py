@@ -180,7 +180,7 @@ def test_what_would_take_minutes_is_left_out(dashboard: Dashboard, loop: Any, mo
     page = done(opened(dashboard), loop)
     (card,) = [c for c in page.cards.items if c["name"] == "integrator+gpr-online"]
     assert card["note"].startswith("left out") and "integrator+gpr-online" not in page.table.html
-    dashboard.close()
+    dashboard.store.session.leave()
     assert page.run.session.is_closed, "a session that ends takes its loop with it"
 
 

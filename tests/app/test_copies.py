@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import csv
 import hashlib
 import io
@@ -71,7 +70,7 @@ def board(request: Any, dashboard: Dashboard, loop: Any, short: Scenario, tmp_pa
     if request.param == LOADED:
         content = file_of(simulation)
         upload = dashboard.upload
-        upload.handle({"action": "part", "name": FILE, "index": 0, "count": 1, "data": base64.b64encode(content).decode()})
+        upload.handle({"action": "part", "name": FILE, "index": 0, "count": 1, "data": content})
         for widget, value in (
             (upload.fields.unit, "nm"),
             (upload.fields.sign, -1),
@@ -100,7 +99,7 @@ def columns(dashboard: Dashboard, loop: Any, short: Scenario, tmp_path: Path, mo
     table = np.column_stack([record.y_lgs, record.u]).tolist()
     text = "\n".join([",".join(names.values()), *(",".join(map(repr, row)) for row in table)])
     upload, content = dashboard.upload, text.encode()
-    upload.handle({"action": "part", "name": "odd.csv", "index": 0, "count": 1, "data": base64.b64encode(content).decode()})
+    upload.handle({"action": "part", "name": "odd.csv", "index": 0, "count": 1, "data": content})
     loop.until(lambda: upload.form is not None and upload.form.view.visible)
     for role, name in names.items():
         upload.form.choices[role].value = name
@@ -277,23 +276,23 @@ def test_names_that_are_no_words_of_a_shell() -> None:
 
 
 @pytest.fixture
-def sent(dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, str]]:
-    out: list[dict[str, str]] = []
+def sent(dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    out: list[dict[str, Any]] = []
     monkeypatch.setattr(dashboard.actions.toolbar, "_send_msg", out.append)
     return out
 
 
-def saved(dashboard: Dashboard, loop: Any, sent: list[dict[str, str]]) -> dict[str, bytes]:
+def saved(dashboard: Dashboard, loop: Any, sent: list[dict[str, Any]]) -> dict[str, bytes]:
     """Every file of the page shown, by name."""
     del sent[:]
     names = dashboard.actions.toolbar.saves
     for name in names:
         dashboard.actions.handle({"action": "page", "key": name})
     loop.until(lambda: len(sent) == len(names))
-    return {file["name"]: base64.b64decode(file["content"]) for file in sent}
+    return {file["name"]: file["content"] for file in sent}
 
 
-def test_what_pages_have_found_is_saved(dashboard: Dashboard, loop: Any, sent: list[dict[str, str]]) -> None:
+def test_what_pages_have_found_is_saved(dashboard: Dashboard, loop: Any, sent: list[dict[str, Any]]) -> None:
     assert dashboard.actions.toolbar.saves == []
     dashboard.pages.current = "identify"
     dashboard.actions.handle({"action": "page", "key": "Model as TOML"})

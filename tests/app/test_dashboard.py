@@ -42,7 +42,7 @@ def test_a_page_that_cannot_be_assembled(monkeypatch: pytest.MonkeyPatch, loop: 
 
     assert "ValueError: no page" in session_page(build)[0].object
     assert made[0].store.run.state == "idle"
-    made[0].close()
+    made[0].store.session.leave()
 
 
 def test_a_failing_run_shows_inline(loop: Any, short: Scenario, enter: Any) -> None:
@@ -124,7 +124,7 @@ def test_importing_the_package_imports_no_panel() -> None:
 def test_a_session_that_has_ended_leaves_nothing_behind(short: Scenario, enter: Any) -> None:
     dashboard = Dashboard(lambda function: function(), enter(), short)
     page = dashboard.page()
-    dashboard.close()
+    dashboard.store.session.leave()
     gone = weakref.ref(dashboard), weakref.ref(page)
     del dashboard, page
     gc.collect()

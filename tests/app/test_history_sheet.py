@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from types import SimpleNamespace
 from typing import Any
 
@@ -28,14 +27,13 @@ def sheet(make_store: Any, loop: Any) -> HistorySheet:
     change(history, loop, WIND, 20)
     shown: list[Sheet] = []
     sheet = HistorySheet(history, shown.append)
-    assert not shown and sheet.sheet is None, "made when it is first opened"
+    assert not shown, "made when it is first opened"
     sheet.toggle()
     assert shown == [sheet.sheet]
     return sheet
 
 
 def model(sheet: HistorySheet) -> Sheet:
-    assert sheet.sheet is not None
     return sheet.sheet
 
 
@@ -59,12 +57,12 @@ def actions(sheet: HistorySheet) -> Actions:
 
 
 def saved(actions: Actions, loop: Any, monkeypatch: pytest.MonkeyPatch) -> bytes:
-    files: list[dict[str, str]] = []
+    files: list[dict[str, Any]] = []
     monkeypatch.setattr(actions.toolbar, "_send_msg", files.append)
     actions.handle({"action": "session"})
     loop.until(lambda: files != [])
     assert files[0]["name"].endswith(SUFFIX)
-    return base64.b64decode(files[0]["content"])
+    return files[0]["content"]
 
 
 def test_rows(sheet: HistorySheet) -> None:

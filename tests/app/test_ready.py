@@ -12,7 +12,7 @@ import pytest
 from wfsobs.app import serve as ready
 from wfsobs.app.jobs import Job
 from wfsobs.app.limits import Limits
-from wfsobs.app.service import Full, Service
+from wfsobs.app.service import Full, Service, Session
 
 
 @pytest.fixture
@@ -96,7 +96,7 @@ def test_an_old_page_is_made_anew(service: Service, monkeypatch: pytest.MonkeyPa
 
 
 def test_what_is_not_known_waits_for_the_visitor(service: Service) -> None:
-    session, told, ran, done = service.new_session(), [], [], threading.Event()
+    session, told, ran, done = Session(service), [], [], threading.Event()
     service.cache.put("known", 1)
 
     def job(key: str) -> Job:
@@ -115,7 +115,7 @@ def test_what_is_not_known_waits_for_the_visitor(service: Service) -> None:
 
 
 def test_no_more_come_than_there_is_room_for(service: Service) -> None:
-    late = service.new_session()
+    late = Session(service)
     for _ in range(2):
         service.enter()
     with pytest.raises(Full):

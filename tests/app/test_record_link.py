@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import hashlib
 import io
 import json
@@ -94,8 +93,7 @@ def csv_of(scenario: Scenario, seed: int) -> bytes:
 
 
 def give(dashboard: Dashboard, loop: Any, content: bytes, name: str) -> None:
-    data = base64.b64encode(content).decode()
-    dashboard.upload.handle({"action": "part", "name": name, "index": 0, "count": 1, "data": data})
+    dashboard.upload.handle({"action": "part", "name": name, "index": 0, "count": 1, "data": content})
     loop.until(lambda: not dashboard.upload.picker.message.startswith(("Reading", "Waiting")))
 
 

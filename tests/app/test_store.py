@@ -294,7 +294,7 @@ def test_a_closed_session_hears_nothing(make_store: Any, loop: Any) -> None:
     store: Store = make_store(work)
     store.start()
     assert work.entered[15.0].wait(20)
-    store.close()
+    store.session.leave()
     work.gates[15.0].set()
     assert work.left[15.0].wait(20)
     assert loop.queue.empty()

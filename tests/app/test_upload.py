@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import io
 import re
 from dataclasses import replace
@@ -36,7 +35,7 @@ def file_of(short: Scenario, ending: str = ".csv", **changes: Any) -> bytes:
 def sent(dashboard: Dashboard, content: bytes, name: str = "night.csv", part: int = 50_000) -> None:
     count = max(1, -(-len(content) // part))
     for i in range(count):
-        data = base64.b64encode(content[i * part : (i + 1) * part]).decode()
+        data = content[i * part : (i + 1) * part]
         dashboard.upload.handle({"action": "part", "name": name, "index": i, "count": count, "data": data})
 
 
@@ -280,12 +279,12 @@ def test_a_record_whose_unit_nobody_knows_waits_for_it(dashboard: Dashboard, loo
 
 
 def test_template_and_sample(dashboard: Dashboard, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    sent: list[dict[str, str]] = []
+    sent: list[dict[str, Any]] = []
     monkeypatch.setattr(dashboard.actions.toolbar, "_send_msg", sent.append)
     for count, what in enumerate(("template", "sample"), 1):
         dashboard.upload.handle({"action": what})
         loop.until(lambda count=count: len(sent) == count)
-    files = {it["name"]: base64.b64decode(it["content"]) for it in sent}
+    files = {it["name"]: it["content"] for it in sent}
     template = read_record(io.BytesIO(files["wfsobs-template.csv"]), "t.csv")
     assert (template.n_steps, template.ratio, template.delay, template.missing) == (6, 5, 2, 1)
     np.testing.assert_allclose(template.y_ngs[5], [0.0089, -0.0016])
@@ -321,8 +320,8 @@ def test_nothing_of_the_file_before_stays_after_a_refusal(
     refusals: list[dict[str, Any]] = [
         {"action": "large", "name": "a.npz"},
         {"action": "part", "name": "a.npz", "index": 0, "count": 1, "data": "%%%"},
-        {"action": "part", "name": "a.npz", "index": 0, "count": 1, "data": ""},
-        {"action": "part", "name": "a.npz", "index": 0, "count": 1, "data": "AAAA"},
+        {"action": "part", "name": "a.npz", "index": 0, "count": 1, "data": b""},
+        {"action": "part", "name": "a.npz", "index": 0, "count": 1, "data": bytes(3)},
     ]
     for refused in refusals:
         with subtests.test(str(refused)):
@@ -348,8 +347,8 @@ def test_a_record_that_is_too_short_cannot_be_used(dashboard: Dashboard, loop: A
 def test_parts_that_make_no_sense(dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch) -> None:
     upload = dashboard.upload
     for msg in (
-        {"index": 0, "count": 0, "data": "AAAA"},
-        {"index": 0, "count": "x", "data": ""},
+        {"index": 0, "count": 0, "data": bytes(3)},
+        {"index": 0, "count": "x", "data": b""},
         {"index": 0, "count": 1, "data": "%%%"},
         {"index": 0, "count": 1, "data": None},
         {"index": 0},

@@ -49,5 +49,5 @@ def test_the_first_picture_comes_with_the_page_and_is_made_of_little(service: Se
         dashboard.complete()
         assert len([m for m in doc.models if m.__class__.__name__ == "GlyphRenderer" and m.name == "kf-lgs"]) == 4
         assert dashboard.controls.preset.label in [getattr(m, "label", "") for m in doc.models]
-    dashboard.close()
+    dashboard.store.session.leave()
     _cleanup_doc(doc)

@@ -8,7 +8,7 @@ import json
 import threading
 from collections.abc import Hashable, Iterator, Mapping
 from contextlib import suppress
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from cachetools import LRUCache
@@ -66,7 +66,7 @@ def owners_in(value: Any) -> dict[int, int]:
     return owners
 
 
-class Cache(Generic[T]):
+class Cache:
     """Least recently used goes first; for any thread.
 
     most_bytes : of arrays in all; what is larger by itself is not kept
@@ -74,10 +74,10 @@ class Cache(Generic[T]):
 
     def __init__(self, most_bytes: int):
         self.most_bytes = most_bytes
-        self._entries: LRUCache[Hashable, T] = LRUCache(most_bytes, size_of)
+        self._entries: LRUCache[Hashable, Any] = LRUCache(most_bytes, size_of)
         self._lock = threading.Lock()
 
-    def get(self, key: Hashable) -> T | None:
+    def get(self, key: Hashable) -> Any:
         """Return the value under a key, or None."""
         with self._lock:
             return self._entries.get(key)
@@ -93,13 +93,3 @@ class Cache(Generic[T]):
     def __contains__(self, key: Hashable) -> bool:
         with self._lock:
             return key in self._entries
-
-    def __len__(self) -> int:
-        with self._lock:
-            return len(self._entries)
-
-    @property
-    def bytes(self) -> int:
-        """Of arrays that are kept."""
-        with self._lock:
-            return int(self._entries.currsize)

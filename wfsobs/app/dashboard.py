@@ -22,10 +22,10 @@ from wfsobs.app.idle_work import SeedRuns
 from wfsobs.app.jobs import FAILED
 from wfsobs.app.pages.explore import Explore
 from wfsobs.app.pages.pages import AWAY, EXPLORE, LIVE, SHOWN, Pages, ViewState
-from wfsobs.app.pages.parts import ON_ONE_LINE, WIDE, warning
+from wfsobs.app.pages.parts import ON_ONE_LINE, warning
 from wfsobs.app.service import Post, Session
 from wfsobs.app.store import Store
-from wfsobs.app.style import Component, labels, script, sheets, theme
+from wfsobs.app.style import NO_ROOM, WIDE, Component, labels, script, sheets, theme
 from wfsobs.app.upload import Upload
 from wfsobs.app.views.errors import effect_line
 from wfsobs.app.views.switches import ModeSwitch, UnitSwitch
@@ -41,7 +41,7 @@ class Connection(Component):
     session = param.String("", doc="A name of the session, to tell it from one made anew.")
     last_arrival = param.Integer(0, doc="Number of the last question that has arrived, and all before it.")
 
-    _esm = script("focus", "connection")
+    _esm = script("page", "connection")
     _stylesheets = sheets("base", "connection")
 
     def __init__(self, take: Callable[[dict[str, Any]], None], **params: Any):
@@ -63,11 +63,11 @@ class Readout(Component):
 
     labels = param.Dict({}, doc="Name of a line in the figures -> what it is called.")
 
-    _esm = script("listen", "readout")
+    _esm = script("page", "readout")
     _stylesheets = sheets("base", "readout")
 
     def __init__(self, **params: Any):
-        super().__init__(labels=labels(), width=0, height=0, margin=0, **params)
+        super().__init__(labels=labels(), **NO_ROOM, **params)
 
 
 HEADER = """
@@ -118,13 +118,13 @@ class Frame(Component):
     dark = param.Boolean(False, doc="Whether the page is dark.")
     complete = param.Boolean(False, doc="Whether what the first picture does not need is there.")
 
-    _esm = script("frame")
+    _esm = script("page", "frame")
 
 
 class Keyboard(Component):
     """What the keyboard needs, and a first stop that leads to what is after it."""
 
-    _esm = script("listen", "focus", "keyboard")
+    _esm = script("page", "keyboard")
 
 
 class Idle(param.Parameterized):
@@ -153,10 +153,10 @@ class Dashboard:
         self.view_state: Final = ViewState(self.display, self.pages, self.explore, self.seeds)
         self.actions: Final = Actions(self.store, self.history_sheet, self.view_state, self.seeds)
         self.upload: Final = Upload(self.store, self.actions)
-        self.connection: Final = Connection(self.controls.take, width=0, height=0, margin=0)
-        self.drawer: Final = pn.Column(sizing_mode="stretch_width", margin=0)
-        self.frame: Final = Frame(width=0, height=0, margin=0)
-        self.keyboard: Final = Keyboard(width=0, height=0, margin=0, styles={"position": "absolute"})
+        self.connection: Final = Connection(self.controls.take, **NO_ROOM)
+        self.drawer: Final = pn.Column(**WIDE)
+        self.frame: Final = Frame(**NO_ROOM)
+        self.keyboard: Final = Keyboard(**NO_ROOM, styles={"position": "absolute"})
         self.alert: Final = pmui.Alert(object="", severity="error", visible=False, **WIDE)
         self.stale: Final = warning(STALE)
         self.store.run.param.watch(self._refresh, ["state", "message"])
@@ -230,10 +230,6 @@ class Dashboard:
         else:
             self.store.wake()
 
-    def close(self) -> None:
-        """Release what the session holds; called when it ends."""
-        self.store.close()
-
     def _on_theme(self, event: Any) -> None:
         self.display.dark = event.new
         if event.new != self.frame.wants_dark:
@@ -247,7 +243,7 @@ class Dashboard:
         run = self.controls.bar()
         pages = pn.Row(self.pages.switch, self.actions.toolbar, margin=0, css_classes=["pages"], stylesheets=[PAGES])
         run.css_classes = ["run"]
-        return pn.Row(run, pages, Help(), sizing_mode="stretch_width", margin=0, stylesheets=[HEADER])
+        return pn.Row(run, pages, Help(), **WIDE, stylesheets=[HEADER])
 
     def _switches(self) -> pn.FlexBox:
         """Lay out the switches that all pages share, and those of the first."""

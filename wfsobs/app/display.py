@@ -49,10 +49,10 @@ def per_micrometre(unit: str, diameter: float) -> float:
     return 1.0 / micrometres_per(unit, diameter)
 
 
-def label_of(p: param.Parameter[Any]) -> str:
-    """Write a setting's label with its unit in [brackets]."""
+def label_of(p: param.Parameter[Any], name: str = "") -> str:
+    """Write a setting's label, or another name, with its unit in [brackets]."""
     unit = unit_text(unit_of(p))
-    return f"{p.label} [{unit}]" if unit else str(p.label)
+    return f"{name or p.label} [{unit}]" if unit else name or str(p.label)
 
 
 def score_columns(unit: str, base: str = "truth", compared_columns: Mapping[str, str] = {}) -> dict[str, str]:
@@ -95,16 +95,12 @@ class Display(param.Parameterized):
     named_lines: param.Parameter[dict[str, list[str]]] = param.Parameter(
         {}, doc="Target -> names of the lines that matter: those that the verdict names."
     )
-    dark: param.Boolean[bool] = param.Boolean(False, doc="Dark mode.")
+    dark = param.Boolean(False, doc="Dark mode.")
     spectrum: param.Selector[str] = param.Selector(
         default=PSD, objects={"PSD": PSD, "Cumulative rms": CUMULATIVE}, label="Spectrum"
     )
-    window_spectra: param.Boolean[bool] = param.Boolean(
-        False, label="Spectra of the window", doc="Spectra of the stretch of time in view alone."
-    )
-    editing: param.Boolean[bool] = param.Boolean(
-        False, label="Edit figure", doc="Handles on the spectra, and what theory predicts."
-    )
+    window_spectra = param.Boolean(False, label="Spectra of the window", doc="Spectra of the stretch of time in view alone.")
+    editing = param.Boolean(False, label="Edit figure", doc="Handles on the spectra, and what theory predicts.")
     compared_runs: param.List[list[ComparedRun]] = param.List(
         [], item_type=ComparedRun, doc="The runs to compare with, by their letters."
     )

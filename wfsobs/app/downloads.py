@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -37,11 +37,9 @@ class TooLarge(ValueError):
 
 def data_npz(results: RunResults) -> bytes:
     """Write the record as `wfsobs observe` reads it, finished estimates as observer/target, the scenario. Raises TooLarge."""
-    result = results.result
     _check(results)
-    arrays = record_arrays(result.record, to_toml(results.scenario))
-    arrays |= {f"{e.observer}/{e.target}": e.values for e in result.estimates}
-    return _npz(arrays)
+    result = results.result
+    return record_file(".npz", result.record, results.scenario, _estimates(results))
 
 
 def data_csv(results: RunResults) -> bytes:
@@ -53,28 +51,25 @@ def data_csv(results: RunResults) -> bytes:
     record = results.result.record
     # comments of the TOML text too, and what a record is read by
     head = [f"# # dt: {record.dt!r}", *([f"# # ratio: {record.ratio}"] if record.ratio else [])]
-    head += [f"# {line}".rstrip() for line in to_toml(results.scenario).splitlines()]
-    return _csv(head, dict(_columns(results)))
+    signals = {f"truth/{target}": record.truth(target) for target in TARGETS}
+    signals |= {"y_lgs": record.y_lgs, "y_ngs": record.y_ngs, "u": record.u}
+    return _csv(record, results.scenario, signals | _estimates(results), head)
 
 
-def record_file(name: str, record: Record, scenario: Scenario) -> bytes:
-    """Write a record in the format of the name's ending, as `wfsobs observe` reads it, with the scenario. Raises RecordError."""
+def record_file(name: str, record: Record, scenario: Scenario, more: Mapping[str, Array] = {}) -> bytes:
+    """Write a record in the format of the name's ending, as `wfsobs observe` reads it, with the scenario. Raises RecordError.
+
+    more : arrays beside those of the record, where the format takes them
+    """
     file = io.BytesIO()
-    writer_of(name)(file, record_arrays(record, to_toml(scenario)))
+    writer_of(name)(file, {**record_arrays(record, to_toml(scenario)), **more})
     return file.getvalue()
 
 
 def residuals_csv(results: LoopResults) -> bytes:
     """Time and the residual of every controller that has one, a row per step; nine digits; the scenario as comments."""
-    record, scenario = results.result.record, results.result.scenario
-    modes = [m.name for m in scenario.modes][: record.n_modes]
-    columns = {"time_s": np.asarray(np.arange(record.n_steps) * record.dt, dtype=np.float64)} | {
-        f"{o.controller}/{mode}_um": o.residual[:, i]
-        for o in results.result.outcomes
-        if o.residual is not None
-        for i, mode in enumerate(modes)
-    }
-    return _csv([f"# {line}".rstrip() for line in to_toml(scenario).splitlines()], columns)
+    result = results.result
+    return _csv(result.record, result.scenario, {o.controller: o.residual for o in result.outcomes})
 
 
 def table_csv(rows: Sequence[Mapping[str, object]]) -> bytes:
@@ -86,29 +81,20 @@ def table_csv(rows: Sequence[Mapping[str, object]]) -> bytes:
     return text.getvalue().encode()
 
 
-def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
-    file = io.BytesIO()
-    np.savez_compressed(file, allow_pickle=False, **arrays)
-    return file.getvalue()
+def _estimates(results: RunResults) -> dict[str, Array]:
+    return {f"{e.observer}/{e.target}": e.values for e in results.result.estimates}
 
 
-def _csv(head: Sequence[str], columns: Mapping[str, Array]) -> bytes:
-    row = ",".join(["%.9g"] * len(columns))
-    lines = [row % tuple(values) for values in np.column_stack([*columns.values()]).tolist()]
-    return "\n".join([*head, ",".join(columns), *lines, ""]).encode()
-
-
-def _columns(results: RunResults) -> Iterator[tuple[str, Array]]:
-    """(name with its unit, values) of every column."""
-    result, record = results.result, results.result.record
-    modes = [m.name for m in results.scenario.modes][: record.n_modes]
-    signals = {f"truth/{target}": record.truth(target) for target in TARGETS}
-    signals |= {"y_lgs": record.y_lgs, "y_ngs": record.y_ngs, "u": record.u}
-    signals |= {f"{e.observer}/{e.target}": e.values for e in result.estimates}
-    yield "time_s", np.asarray(np.arange(record.n_steps) * record.dt, dtype=np.float64)
+def _csv(record: Record, scenario: Scenario, signals: Mapping[str, Array | None], head: Sequence[str] = ()) -> bytes:
+    """Write the time and every signal that there is, a row per step, under comments."""
+    columns = {"time_s": np.arange(record.n_steps) * record.dt}
     for name, values in signals.items():
         if values is not None:
-            yield from ((f"{name}/{mode}_um", values[:, i]) for i, mode in enumerate(modes))
+            columns |= {f"{name}/{mode.name}_um": column for mode, column in zip(scenario.modes, values.T, strict=False)}
+    row = ",".join(["%.9g"] * len(columns))
+    lines = [row % tuple(values) for values in np.column_stack([*columns.values()]).tolist()]
+    comments = [f"# {line}".rstrip() for line in to_toml(scenario).splitlines()]
+    return "\n".join([*head, *comments, ",".join(columns), *lines, ""]).encode()
 
 
 def _check(results: RunResults) -> None:

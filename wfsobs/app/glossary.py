@@ -14,11 +14,7 @@ from wfsobs.evaluation.rows import target_title
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TURBULENCE, VIBRATION
 
-KF, GPR, LGS, NGS, BOUND, NEEDS, LAG, STREHL, RELATIVE, RMS_ERROR, REAL_TIME, STATED = (
-    "KF",
-    "GPR",
-    "LGS",
-    "NGS",
+BOUND, NEEDS, LAG, STREHL, RELATIVE, RMS_ERROR, REAL_TIME, STATED = (
     "Theoretical limit",
     "Prior knowledge",
     "Lag",
@@ -32,26 +28,26 @@ KF, GPR, LGS, NGS, BOUND, NEEDS, LAG, STREHL, RELATIVE, RMS_ERROR, REAL_TIME, ST
 TERMS: Mapping[str, str] = {
     target_title(TURBULENCE): "Atmospheric tip/tilt, estimated from the guide stars.",
     target_title(VIBRATION): "Structural vibration, separated from turbulence.",
-    KF: (
+    "KF": (
         "Kalman filter: estimates turbulence and vibration step by step from a state-space model of both. A multi-rate one "
         "uses LGS and NGS, each at its own rate; an adaptive one identifies its model from the measurements."
     ),
-    GPR: (
+    "GPR": (
         "Gaussian process regression: predicts the vibration from past measurements, without a model of its peaks. The "
         "offline one is trained on an earlier record, the online one during the run."
     ),
-    LGS: "Laser guide star: measured at the rate of the loop, with a slow error of its own in tip and tilt.",
-    NGS: "Natural guide star: measured once in several steps of the loop (exposure ratio n), without that slow error.",
+    "LGS": "Laser guide star: measured at the rate of the loop, with a slow error of its own in tip and tilt.",
+    "NGS": "Natural guide star: measured once in several steps of the loop (exposure ratio n), without that slow error.",
     RMS_ERROR: (
         "Root mean square of estimate minus truth after the warm-up, over the samples that all observers have. Smaller is better."
     ),
-    RELATIVE: ("RMS error over the RMS of the truth. 0 is perfect, 1 is as good as an estimate of zero, above 1 is worse."),
+    RELATIVE: "RMS error over the RMS of the truth. 0 is perfect, 1 is as good as an estimate of zero, above 1 is worse.",
     BOUND: (
         "Smallest RMS error that a causal linear observer of the mean LGS measurement, or of both sensors, can have, from "
         "the true spectra (Wiener). Where each LGS passes different turbulence, a third row is for an observer that has each "
         "of them separately. On a single record an observer may come out slightly below."
     ),
-    NEEDS: ("What an observer must know beside measurements: a model, peak frequencies, frequency bands or training data."),
+    NEEDS: "What an observer must know beside measurements: a model, peak frequencies, frequency bands or training data.",
     LAG: (
         "Delay of the estimate: where its cross-correlation with the truth has its maximum. Negative if the estimate leads. "
         "For an oscillation it is ambiguous by whole periods: the value nearest to zero is shown."
@@ -108,7 +104,7 @@ SHORTCUTS: Mapping[str, str] = {
 class Help(HtmlComponent):
     """The button at the top, and what it opens."""
 
-    _esm = script("listen", "help")
+    _esm = script("page", "help")
     _stylesheets = sheets("base", "bare", "help")
 
     def __init__(self, **params: Any):

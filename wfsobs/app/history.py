@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, Final
 
 import param
@@ -33,7 +34,7 @@ from wfsobs.app.session_file import (
 )
 from wfsobs.app.sources import Step
 from wfsobs.app.store import Store
-from wfsobs.app.style import HtmlComponent, look, script, sheets
+from wfsobs.app.style import NO_ROOM, HtmlComponent, look, script, sheets
 from wfsobs.app.work import RunResults
 from wfsobs.evaluation.evidence import rank_observers
 from wfsobs.evaluation.rows import can_be_best
@@ -49,9 +50,9 @@ class History(param.Parameterized):
     """The entries, newest first, in step with the store; and the runs of the display that are compared."""
 
     entries: param.List[list[HistoryEntry]] = param.List([], item_type=HistoryEntry, doc="Every result, newest first.")
-    current: param.String[str] = param.String("", doc="Key of the entry shown.")
-    note: param.String[str] = param.String("", doc="What was done or refused, in one line.")
-    can_undelete: param.Boolean[bool] = param.Boolean(False, doc="Whether an entry was deleted that can come back.")
+    current = param.String("", doc="Key of the entry shown.")
+    note = param.String("", doc="What was done or refused, in one line.")
+    can_undelete = param.Boolean(False, doc="Whether an entry was deleted that can come back.")
 
     def __init__(self, store: Store, display: Display):
         super().__init__()
@@ -274,9 +275,9 @@ FILE = f"session{SUFFIX}"
 class Sheet(HtmlComponent):
     """The sheet in the browser; it asks by messages {action, key, name, on}, and has contents only while it is open."""
 
-    open: param.Boolean[bool] = param.Boolean(False, doc="Whether it is seen.")
+    open = param.Boolean(False, doc="Whether it is seen.")
 
-    _esm = script("patch", "markup", "focus", "history")
+    _esm = script("page", "patch", "markup", "history")
     _stylesheets = sheets("base", "history")
 
 
@@ -288,22 +289,21 @@ class HistorySheet:
         self.history = history
         self.display: Final = history.display
         self._show = show
-        self.sheet: Sheet | None = None
         self.message = ""
         self.rows, self._stars_alone = list[dict[str, Any]](), False
 
     def toggle(self) -> None:
         """Open the sheet, or close it."""
-        if self._sheet().open:
+        if self.sheet.open:
             self.close()
         else:
-            self._sheet().open = True
+            self.sheet.open = True
             self._refresh()
 
     def close(self) -> None:
         """Close the sheet, which needs no rows then."""
         self.rows = []
-        self._sheet().param.update(open=False, html="")
+        self.sheet.param.update(open=False, html="")
 
     def handle(self, msg: dict[str, Any]) -> None:
         """Do what a message of the sheet says."""
@@ -323,18 +323,19 @@ class HistorySheet:
 
     def show_session(self, name: str, content: SessionContent) -> None:
         """Add what a session's file of this name holds, where it is seen."""
-        if not self._sheet().open:
+        if not self.sheet.open:
             self.toggle()
         self.history.open(content, name)
 
-    def _sheet(self) -> Sheet:
-        if self.sheet is None:
-            self.sheet = Sheet(self.handle, width=0, height=0, margin=0, styles={"position": "absolute"})
-            self.history.param.watch(self._refresh, ["entries", "current", "can_undelete"])
-            self.history.param.watch(lambda event: self._say(event.new), "note", onlychanged=False)
-            self.display.param.watch(self._refresh, ["mode", "unit", "compared_runs"])
-            self._show(self.sheet)
-        return self.sheet
+    @cached_property
+    def sheet(self) -> Sheet:
+        """The sheet in the browser."""
+        sheet = Sheet(self.handle, **NO_ROOM, styles={"position": "absolute"})
+        self.history.param.watch(self._refresh, ["entries", "current", "can_undelete"])
+        self.history.param.watch(lambda event: self._say(event.new), "note", onlychanged=False)
+        self.display.param.watch(self._refresh, ["mode", "unit", "compared_runs"])
+        self._show(sheet)
+        return sheet
 
     def _say(self, line: str) -> None:
         self.message = name_settings(line)
@@ -345,11 +346,10 @@ class HistorySheet:
         self._refresh()
 
     def _refresh(self, *_: object) -> None:
-        sheet = self._sheet()
-        if sheet.open:
+        if self.sheet.open:
             runs = {run.key: run for run in self.display.compared_runs}
             self.rows = [self._row(entry, runs.get(entry.key)) for entry in self.history.entries]
-            sheet.html = render(
+            self.sheet.html = render(
                 "history.html",
                 rows=[row for row in self.rows if row["star"] or not self._stars_alone],
                 starred=self._stars_alone,

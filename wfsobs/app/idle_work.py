@@ -12,7 +12,7 @@ import param
 
 from wfsobs.app.cache import size_of
 from wfsobs.app.jobs import DONE, IDLE_TIME, Job, Tell
-from wfsobs.app.service import BackgroundTask
+from wfsobs.app.service import BackgroundTask, run_key
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source
 from wfsobs.app.store import Store
 from wfsobs.app.style import watch
@@ -70,9 +70,7 @@ def run_seed(
 class SeedRuns(param.Parameterized):
     """One seed after the other, once a run is done; what has been found of a scenario goes with it."""
 
-    count: param.Integer[int] = param.Integer(
-        SEEDS, bounds=(1, MOST), label="Seeds", doc="Seeds whose records are compared; 1 is the one shown."
-    )
+    count = param.Integer(SEEDS, bounds=(1, MOST), label="Seeds", doc="Seeds whose records are compared; 1 is the one shown.")
     evidence: param.Parameter[Evidence | None] = param.Parameter(None, doc="What the seeds done so far say; None for too few.")
 
     def __init__(self, store: Store):
@@ -125,33 +123,26 @@ class SeedRuns(param.Parameterized):
 
     def _go_on(self, *_: object) -> None:
         """Say what is known, and have the next seed run; what is there already does not wait for a turn each."""
-        self._take_known()
+        cache = self.task.session.service.cache
+        while (job := self._next_job()) is not None and (found := cache.get(job.key)) is not None:
+            self._scores.append(found.scores)
         self.evidence = gather_evidence(self._scores[: self.count]) if self.n_known >= FEWEST else None
-        if not self.possible or len(self._scores) >= self.count:
+        if job is None:
             self.task.close()
         else:
-            assert self._of is not None
-            self.task.start(self._job(self._of, len(self._scores)))
+            self.task.start(job)
 
-    def _take_known(self) -> None:
-        service = self.task.session.service
-        while self._of is not None and self.possible and len(self._scores) < self.count:
-            of = self._of
-            found = service.cache.get(service.seed_key(of.scenario, of.source, self._seed(of, len(self._scores))))
-            if not isinstance(found, SeedScores):
-                return
-            self._scores.append(found.scores)
-
-    def _seed(self, of: RunResults, number: int) -> int:
+    def _next_job(self) -> Job | None:
+        """Make the job of the first seed that is not known; None where there is none."""
+        of, number = self._of, len(self._scores)
+        if of is None or not self.possible or number >= self.count:
+            return None
         simulated = of.source.simulation if isinstance(of.source, SimulatedRecord) else of.scenario
-        return simulated.run.seed + number
-
-    def _job(self, of: RunResults, number: int) -> Job:
-        service, args = self.task.session.service, (of.scenario, of.source, self._seed(of, number))
+        seed = simulated.run.seed + number
         return Job(
             "seed",
-            partial(run_seed, *args, memo=service.memo),
-            key=service.seed_key(*args),
+            partial(run_seed, of.scenario, of.source, seed, memo=self.task.session.service.memo),
+            key=f"seed {seed} of {run_key(of.scenario, of.source)}",
             cost=run_seconds(of.scenario),
             priority=IDLE_TIME,
             refusal=SettingError,
@@ -181,9 +172,7 @@ class Budgets(param.Parameterized):
     by_observer: param.Parameter[ByObserver] = param.Parameter(
         {}, doc="Observer -> its budgets (a sequence of Budget), as far as they are known."
     )
-    every: param.Boolean[bool] = param.Boolean(
-        False, doc="Whether observers that are not linear have theirs too, though they are not main ones."
-    )
+    every = param.Boolean(False, doc="Whether observers that are not linear have theirs too, though they are not main ones.")
 
     def __init__(self, seeds: SeedRuns, main: Callable[[str], Collection[str]]):
         super().__init__()

@@ -193,7 +193,7 @@ class JobQueue:
     turn first come first served. What is wanted twice is done once.
     """
 
-    def __init__(self, workers: int, cache: Cache[Any], rest: float = REST):
+    def __init__(self, workers: int, cache: Cache, rest: float = REST):
         self.cache = cache
         self.rest = rest
         self.closing: bool = False

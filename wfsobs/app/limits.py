@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import reduce
 
 from wfsobs.app.jobs import Job, Work
 from wfsobs.cost import run_bytes, run_seconds
@@ -52,7 +51,7 @@ class Limits:
             group = getattr(scenario, name)
             _most(f"{name}.training_size", group.training_size, self.training_size)
             _most(f"{name}.depth", group.depth, self.depth)
-        of_groups = [(path, len(reduce(getattr, path.split("."), scenario))) for path, _ in scenario.lists()]
+        of_groups = [(path, len(scenario.lookup(path))) for path, _ in scenario.lists()]
         of_numbers = [(path, len(getattr(owner, str(p.name)))) for path, owner, p in scenario.walk() if isinstance(p, Reals)]
         for path, items in (*of_groups, *of_numbers):
             if items > self.items:

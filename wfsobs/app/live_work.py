@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from functools import partial
 from time import sleep
 from typing import Any
 
@@ -68,9 +69,15 @@ def live_job(order: LiveOrder, service: Service) -> Job:
     """Make the job of a loop. Raises SettingError where there is no room for one."""
     if service.queue.workers < 2:
         raise SettingError("A live loop takes one of at least two jobs at once: wfsobs serve --runs 2")
-    work: Any = lambda watch, tell: compute(order, service, watch, tell)  # noqa: E731
-    limits = service.limits
-    return Job("live", work, key=order.key, priority=CLICK, time_limit=limits.live_seconds, endless=True, refusal=SettingError)
+    return Job(
+        "live",
+        partial(compute, order, service),
+        key=order.key,
+        priority=CLICK,
+        time_limit=service.limits.live_seconds,
+        endless=True,
+        refusal=SettingError,
+    )
 
 
 def record_saves(loop: LiveLoop | None, look_back: float) -> dict[str, Save | None]:

@@ -47,6 +47,7 @@ from wfsobs.app.logs import event, to_stream
 from wfsobs.app.pages.pages import LIVE, PAGE, PREFIX
 from wfsobs.app.service import Full, Post, Service, Session
 from wfsobs.app.share import LONGEST, has_settings
+from wfsobs.app.store import FIRST_PRESET
 from wfsobs.app.work import one_blas_thread
 from wfsobs.campaign.follow import CampaignFolder
 from wfsobs.live.loop import LiveOrder
@@ -71,7 +72,7 @@ def session_page(build: Callable[[Post], Dashboard]) -> Any:
             dashboard.actions.open_view(query)
         dashboard.start()
         post.deliver()
-        pn.state.on_session_destroyed(lambda _context: dashboard.close())
+        pn.state.on_session_destroyed(lambda _context: dashboard.store.session.leave())
         return session_page
     except Exception as error:
         log.exception("the page could not be built")
@@ -90,8 +91,7 @@ def page_query() -> str:
     """
     if pn.state.location is not None and pn.state.location.search:
         return str(pn.state.location.search)
-    texts = [(key, value) for key, values in pn.state.session_args.items() for value in values]
-    return urlencode(texts, quote_via=quote)
+    return urlencode(pn.state.session_args, doseq=True, quote_via=quote)
 
 
 class Poster:
@@ -111,7 +111,7 @@ class Poster:
         self._waiting: list[Callable[[], None]] | None = []
         self._lock = threading.Lock()
         if self._doc is not None:
-            pn.state.onload(self._on_load)
+            pn.state.onload(partial(self._run_waiting, None))
 
     def __call__(self, function: Callable[[], None]) -> None:
         """Have a function run; from any thread."""
@@ -132,9 +132,6 @@ class Poster:
         """Run what has been posted so far, before the page is sent: known results are part of it."""
         if self._waiting:
             self._run_waiting([])
-
-    def _on_load(self) -> None:
-        self._run_waiting(None)
 
     def _run_waiting(self, then: list[Callable[[], None]] | None) -> None:
         with self._lock:
@@ -227,7 +224,7 @@ class NextPage(Handler):
 
     async def _make(self) -> None:
         assert self.context is not None
-        session = self.service.new_session()
+        session = Session(self.service)
         request = HTTPServerRequest(start_line=RequestStartLine("GET", f"{self._prefix}/", "HTTP/1.0"))
         name = generate_session_id(self._secret, signed=True)
         payload = {"headers": {}, "cookies": {}, "arguments": {}, **self.context.application.process_request(request)}
@@ -385,7 +382,7 @@ def serve(options: Options, live: LiveOrder | None = None) -> None:
     if options.campaign:
         service.campaign = CampaignFolder(Path(options.campaign))
     with suppress(SettingError):  # larger than the limits allow
-        service.queue.submit(service.run(PRESETS[next(iter(PRESETS))]()), "server", lambda _news: None)
+        service.queue.submit(service.run(PRESETS[FIRST_PRESET]()), "server", lambda _news: None)
     loop, status = IOLoop.current(), 0
 
     def fail() -> None:
@@ -466,7 +463,7 @@ def make_server(options: Options, service: Service) -> Server:
     """Make a server that listens but has not started. A page is made and dropped first: its imports take longer than the page."""
     secret = generate_secret_key()
     is_warm = service.live is None  # a page of a live loop needs the event loop to run
-    warm = iter([service.new_session()] if is_warm else [])
+    warm = iter([Session(service)] if is_warm else [])
     applications: Any = build_applications({"/": lambda: new_page(service, next(warm, None))}, title="wfsobs")
     ready = NextPage(service, options.prefix, secret.encode(), TOKEN, options.lifetime)
     applications["/"].add(ready)

@@ -55,7 +55,7 @@ class Service:
     def __init__(self, limits: Limits, workers: int, most_bytes: int, work: Compute | None = None, memo: Memo | None = None):
         self.limits = limits
         self.memo: Final = Memo() if memo is None else memo
-        self.cache: Cache[Any] = Cache(most_bytes)
+        self.cache: Final = Cache(most_bytes)
         self.queue: Final = JobQueue(workers, self.cache)
         self.sessions: int = 0
         self._last_wish = monotonic()
@@ -71,13 +71,9 @@ class Service:
 
     def enter(self) -> Session:
         """Open a new session. Raises Full."""
-        session = self.new_session()
+        session = Session(self)
         session.enter()
         return session
-
-    def new_session(self) -> Session:
-        """Make a session whose visitor has not come."""
-        return Session(self)
 
     def count_session(self) -> int:
         """Count a session that begins, and return its number. Raises Full."""
@@ -138,10 +134,6 @@ class Service:
         work: Work = lambda watch, tell: self._work(scenario, watch, tell, source)  # noqa: E731
         cost = run_seconds(scenario) if seconds is None else seconds
         return Job("run", work, key=run_key(scenario, source), cost=cost, refusal=SettingError)
-
-    def seed_key(self, scenario: Scenario, source: Source | None, seed: int) -> str:
-        """Name the scores of a scenario's observers on the record of another seed."""
-        return f"seed {seed} of {run_key(scenario, source)}"
 
     def start(self, make: Callable[[], Made]) -> Made:
         """Make something that starts processes which keep to a clock."""
@@ -229,9 +221,9 @@ class BackgroundTask(param.Parameterized):
     """
 
     state: param.Selector[str] = param.Selector(default=IDLE, objects=[IDLE, RUNNING, DONE, CANCELLED, FAILED])
-    progress: param.Number[float] = param.Number(0.0, bounds=(0.0, 1.0), doc="Fraction done.")
-    place: param.Integer[int] = param.Integer(0, doc="Place in the line of jobs, from 1; 0 when it is being done.")
-    message: param.String[str] = param.String("", doc="Why it failed, in one line.")
+    progress = param.Number(0.0, bounds=(0.0, 1.0), doc="Fraction done.")
+    place = param.Integer(0, doc="Place in the line of jobs, from 1; 0 when it is being done.")
+    message = param.String("", doc="Why it failed, in one line.")
     latest: param.Parameter[Any] = param.Parameter(None, doc="What the work has told of itself so far.")
     result: param.Parameter[Any] = param.Parameter(None, doc="The latest result, in parts where it comes in parts.")
 
@@ -247,7 +239,7 @@ class BackgroundTask(param.Parameterized):
         self._generation = 0
         self._news: dict[str, Any] = {}
         self._is_posted = False
-        self._leave: Callable[[], None] = _nothing
+        self._leave: Callable[[], None] = lambda: None
 
     def start(self, job: Job) -> None:
         """Start a job; it supersedes the one before."""
@@ -278,7 +270,7 @@ class BackgroundTask(param.Parameterized):
     def close(self) -> None:
         """Leave the job; later news of it is ignored."""
         self._supersede()
-        before, self._leave = self._leave, _nothing
+        before, self._leave = self._leave, lambda: None
         before()
 
     def line(self, doing: str = "Running") -> str:
@@ -317,7 +309,3 @@ class BackgroundTask(param.Parameterized):
             self.param.update(**news)
         if again:
             self.session.post(self._land)
-
-
-def _nothing() -> None:
-    return None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import time
 import zipfile
 import zlib
@@ -35,6 +36,8 @@ from wfsobs.telemetry.records import record_arrays
 from wfsobs.units import UNITS
 
 LONGEST_TEXT = 2_000
+
+SHA256 = re.compile("[0-9a-f]{64}")
 
 DAMAGED = "damaged, or no session of wfsobs"
 
@@ -224,16 +227,10 @@ def write_session(content: SessionContent) -> bytes:
         if isinstance(source, LoadedRecord):
             records.setdefault(source.key, source)
     numbers = {key: number for number, key in enumerate(records)}
-    scenario, preset, source = content.step
     values = {
         "format": FORMAT,
         "version": VERSION,
-        "shown": {
-            "preset": preset,
-            "scenario": scenario.to_dict(),
-            "source": _source_values(source, numbers),
-            "view": content.view,
-        },
+        "shown": _step_values(content.step, numbers) | {"view": content.view},
         "compared": [i for i, entry in enumerate(content.entries) if entry.key in content.compared_keys],
         "entries": [_entry_values(entry, numbers) for entry in content.entries],
     }
@@ -256,12 +253,13 @@ PLAIN: Mapping[str, type] = {"name": str, "own_name": bool, "time": float, "star
 
 
 def _entry_values(entry: HistoryEntry, numbers: Mapping[str, int]) -> dict[str, Any]:
-    return {
-        **{name: getattr(entry, name) for name in ("key", "preset", *PLAIN)},
-        "scenario": entry.scenario.to_dict(),
-        "source": _source_values(entry.source, numbers),
-        "scores": [asdict(s) | {"calibration": s.calibration and list(s.calibration)} for s in entry.scores],
-    }
+    plain = {name: getattr(entry, name) for name in ("key", *PLAIN)}
+    return plain | _step_values(entry.step, numbers) | {"scores": [asdict(score) for score in entry.scores]}
+
+
+def _step_values(step: Step, numbers: Mapping[str, int]) -> dict[str, Any]:
+    scenario, preset, source = step
+    return {"preset": preset, "scenario": scenario.to_dict(), "source": _source_values(source, numbers)}
 
 
 def _source_values(source: Source | None, numbers: Mapping[str, int]) -> dict[str, Any] | None:
@@ -364,13 +362,13 @@ def _scenario(values: Mapping[str, Any]) -> Scenario:
 def _source(values: Any, records: _Records) -> Source | None:
     if values is None:
         return None
-    if isinstance(values, dict) and "simulation" in values:
-        return SimulatedRecord(_scenario(get_value(values, "simulation", dict)))
     if not isinstance(values, dict):
         raise SessionError(DAMAGED)
+    if "simulation" in values:
+        return SimulatedRecord(_scenario(get_value(values, "simulation", dict)))
     record, key = records.find(get_value(values, "number", int))
     digits = get_text(values, "sha256")
-    if digits and (len(digits) != 64 or not set(digits) <= set("0123456789abcdef")):
+    if digits and not SHA256.fullmatch(digits):
         raise SessionError("a SHA-256 takes 64 hexadecimal digits")
     name = safe_name(get_text(values, "name"))
     return LoadedRecord(

@@ -14,7 +14,6 @@ import json
 import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import reduce
 from typing import Any
 from urllib.parse import parse_qsl, quote
 
@@ -22,8 +21,9 @@ import param
 
 from wfsobs.app.controls.fields import parse_number
 from wfsobs.app.render import render
-from wfsobs.app.session_file import SessionError, read_declaration
+from wfsobs.app.session_file import SHA256, SessionError, read_declaration
 from wfsobs.app.sources import LoadedRecord, NamedRecord, SimulatedRecord, Source
+from wfsobs.app.store import FIRST_PRESET
 from wfsobs.live.loop import LiveOrder
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.configfile import from_toml, parse_toml, reference_preset, to_toml
@@ -36,9 +36,6 @@ from wfsobs.telemetry.preview import safe_name
 from wfsobs.units import UNITS
 
 PREFIX, COLUMN = "record.", "column."
-
-DIGITS = 64
-"""Of a SHA-256 in hexadecimal."""
 
 STATEMENTS: Mapping[str, tuple[str, str]] = {
     "unit": ("unit", f"takes one of {', '.join(UNITS)}"),
@@ -82,8 +79,8 @@ def read_record_fields(fields: Mapping[str, str]) -> tuple[NamedRecord | None, d
     refused: dict[str, str] = {}
     given = {key.removeprefix(PREFIX): text for key, text in fields.items()}
     name, digits, declaration = given.pop("name", ""), given.pop("sha256", ""), DeclaredFormat()
-    if len(digits) != DIGITS or not set(digits) <= set("0123456789abcdef"):
-        return None, {f"{PREFIX}sha256": f"takes {DIGITS} hexadecimal digits"}
+    if not SHA256.fullmatch(digits):
+        return None, {f"{PREFIX}sha256": "takes 64 hexadecimal digits"}
     if name != safe_name(name):
         refused[f"{PREFIX}name"] = "takes the name of a file"
     for key, text in given.items():
@@ -114,9 +111,6 @@ Check = Callable[[Scenario], None]
 
 LONGEST = 8000
 """Characters of a query, or of a command line; what is longer travels as a file."""
-
-SHORTEST_NAME = next(iter(PRESETS))
-"""The preset of a query that names none."""
 
 ROUNDS = 3
 MOST = 200
@@ -162,7 +156,7 @@ def to_query(
     simulation : of other settings, which is kept;  record : one that was loaded
     """
     changed = changes(scenario, preset)
-    parts = [f"preset={preset}"] if preset != SHORTEST_NAME or changed or simulation or record else []
+    parts = [f"preset={preset}"] if preset != FIRST_PRESET or changed or simulation or record else []
     parts += _fields(changed)
     if simulation is not None:
         parts += [KEPT, *_fields(changes(simulation, preset), f"{KEPT}.")]
@@ -173,7 +167,7 @@ def to_query(
 
 
 def _fields(values: Mapping[str, Any], prefix: str = "") -> list[str]:
-    return [f"{prefix}{path}={quote(value_text(path, value), safe=',;:+-.')}" for path, value in values.items()]
+    return [f"{prefix}{path}={quote(value_text(value), safe=',;:+-.')}" for path, value in values.items()]
 
 
 def from_query(query: str, check: Check = Scenario.validate) -> Link:
@@ -183,17 +177,17 @@ def from_query(query: str, check: Check = Scenario.validate) -> Link:
     """
     if len(query) > LONGEST:
         return Link(
-            PRESETS[SHORTEST_NAME](),
-            SHORTEST_NAME,
+            PRESETS[FIRST_PRESET](),
+            FIRST_PRESET,
             (f"The link has {len(query)} characters, at most {LONGEST} are allowed: the link is ignored.",),
         )
     pairs = parse_qsl(query.removeprefix("?").replace("+", "%2B"), keep_blank_values=True)
     fields = {key: text for key, text in pairs[:MOST] if not key.startswith(PASSED_OVER)}
-    name = fields.pop("preset", SHORTEST_NAME)
+    name = fields.pop("preset", FIRST_PRESET)
     rejected = []
     if name not in PRESETS:
         rejected.append(_line("preset", name, f"takes one of {', '.join(PRESETS)}"))
-        name = SHORTEST_NAME
+        name = FIRST_PRESET
     kept, named = ({key: fields.pop(key) for key in [*fields] if key.startswith(start)} for start in (KEPT, PREFIX))
     of_simulation = {key.removeprefix(f"{KEPT}."): text for key, text in kept.items() if key != KEPT}
     scenario, refused = _apply(PRESETS[name](), fields, check)
@@ -212,15 +206,15 @@ def has_settings(query: str) -> bool:
     return any(not key.startswith(PASSED_OVER) for key, _ in parse_qsl(query.removeprefix("?"), keep_blank_values=True))
 
 
-def value_text(path: str, value: Any) -> str:
+def value_text(value: Any) -> str:
     """Write a setting's plain value as a link has it."""
     if isinstance(value, list) and value and isinstance(value[0], dict):
-        return ";".join(
-            value_text(path, [v for one in item.values() for v in (one if isinstance(one, list) else [one])]) for item in value
-        )
+        return ";".join(",".join(map(value_text, item.values())) for item in value)
     if isinstance(value, list):
-        return ",".join(map(_word, value))
-    return _word(value)
+        return ",".join(map(value_text, value))
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return repr(value).removesuffix(".0") if isinstance(value, float) else str(value)
 
 
 def read_value(path: str, text: str, settings: Mapping[str, param.Parameter[Any]]) -> Any:
@@ -261,7 +255,7 @@ def _apply(base: Scenario, fields: Mapping[str, str], check: Check) -> tuple[Sce
         waiting = {path: value for path, value in values.items() if path not in refused}
         for _ in range(ROUNDS):  # what one field needs, a later one may bring
             for path, value in list(waiting.items()):
-                before = reduce(getattr, path.split("."), scenario)
+                before = scenario.lookup(path)
                 _set(scenario, path, value)
                 refused[path] = _clash(scenario, check)
                 if refused[path]:
@@ -291,12 +285,6 @@ def _line(path: str, text: str, reason: str) -> str:
     """Write the line of a field that was refused, with its name in front if the reason lacks it."""
     line = reason if reason.startswith(path) else f"{path} = {text}: {reason}"
     return line if len(line) <= 200 else f"{line[:197]}..."
-
-
-def _word(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    return repr(value).removesuffix(".0") if isinstance(value, float) else str(value)
 
 
 # ---------------------------------------------------------------------- files

@@ -36,38 +36,11 @@ AFTER_FIT = ("telescope.radial_order", "run.warm_up")
 """Settings that follow a record, and may be changed afterwards."""
 
 
-class RecordPlace:
-    """What the observers of a store run on."""
-
-    def __init__(self, store: Store) -> None:
-        self.store = store
-        self._own: dict[str, Any] = {}
-
-    def take(self, preview: Preview, declaration: DeclaredFormat, sha256: str) -> None:
-        """Run on a record; the settings of rate, ratio and length follow it, but to the ones of a link. Raises SettingError."""
-        before, wanted = self.store.scenario, self.store.wanted_record
-        scenario = fit_to_record(preview.record, before)
-        if wanted is not None and wanted.sha256 == sha256:
-            scenario = scenario.replace({path: before.lookup(path) for path in AFTER_FIT})
-        own = self._own if isinstance(self.store.source, LoadedRecord) else changed_settings(before, scenario)
-        key, line = record_key(preview.record), preview.lines()[0]
-        self.store.run_on(LoadedRecord(preview.record, preview.name, key, line, declaration, sha256), scenario)
-        self._own = own
-
-    def give_back(self) -> None:
-        """Go back to the simulation: of settings that were kept, or of these with its own rate, ratio and length."""
-        self.store.wanted_record = None
-        if (source := self.store.source) is None:
-            return
-        scenario = source.simulation or self.store.scenario
-        try:
-            self.store.run_on(None, scenario.replace(self._own if isinstance(source, LoadedRecord) else {}))
-        except SettingError:  # they do not go with what was changed since
-            self.store.run_on(None, scenario)
-
-
 AT_ONCE = 5.0
 """A run that takes longer waits to be asked for [s]."""
+
+FIRST_PRESET = next(iter(PRESETS))
+"""The preset to start from."""
 
 STEPS_BACK = 100
 """Changes that can be undone."""
@@ -78,34 +51,31 @@ class Store(param.Parameterized):
 
     scenario: param.Parameter[Scenario] = param.Parameter(doc="The settings as accepted.")
     errors: param.Parameter[dict[str, str]] = param.Parameter({}, doc="Dotted path of a refused setting -> why, in one line.")
-    preset: param.Selector[str] = param.Selector(
-        default=next(iter(PRESETS)), objects=list(PRESETS), doc="Where the settings started."
-    )
+    preset: param.Selector[str] = param.Selector(default=FIRST_PRESET, objects=list(PRESETS), doc="Where the settings started.")
     source: param.Parameter[Source | None] = param.Parameter(
         None, doc="What the observers run on; None for the simulation of the settings."
     )
     wanted_record: param.Parameter[NamedRecord | None] = param.Parameter(
         None, doc="The record of the link that was opened, until its file is given."
     )
-    stale: param.Boolean[bool] = param.Boolean(False, doc="Whether the results shown are not those of the settings.")
-    waiting: param.Number[float] = param.Number(
-        0.0, doc="How long the run would take that waits to be asked for [s]; 0 where none does."
-    )
-    can_undo: param.Boolean[bool] = param.Boolean(False, doc="Whether there is a change to undo.")
-    can_redo: param.Boolean[bool] = param.Boolean(False, doc="Whether there is an undone change to make again.")
+    stale = param.Boolean(False, doc="Whether the results shown are not those of the settings.")
+    waiting = param.Number(0.0, doc="How long the run would take that waits to be asked for [s]; 0 where none does.")
+    can_undo = param.Boolean(False, doc="Whether there is a change to undo.")
+    can_redo = param.Boolean(False, doc="Whether there is an undone change to make again.")
 
     def __init__(self, post: Post, session: Session, scenario: Scenario | None = None):
         live = session.service.live  # whoever changes a setting of the loop that all watch, changes that one alone
         if live is not None and scenario is None:
-            super().__init__(scenario=live.scenario, preset=live.preset or next(iter(PRESETS)))
+            super().__init__(scenario=live.scenario, preset=live.preset or FIRST_PRESET)
         else:
-            super().__init__(scenario=scenario or PRESETS[next(iter(PRESETS))]())
+            super().__init__(scenario=scenario or PRESETS[FIRST_PRESET]())
         self.session = session
         self.limits: Final = session.service.limits
         session.post = post
         self._refusals: dict[str, Any] = {}
         self._past: list[Step] = []
         self._future: list[Step] = []
+        self._own: dict[str, Any] = {}  # settings that a loaded record has replaced
         self.run: Final = BackgroundTask(session, drawn_first=True)
         self.rests: bool = False
         """Whether runs wait until a page needs one."""
@@ -208,6 +178,28 @@ class Store(param.Parameterized):
             source.check(self.limits)
         self._accept(step, {})
 
+    def take_record(self, preview: Preview, declaration: DeclaredFormat, sha256: str) -> None:
+        """Run on a record; the settings of rate, ratio and length follow it, but to the ones of a link. Raises SettingError."""
+        before, wanted = self.scenario, self.wanted_record
+        scenario = fit_to_record(preview.record, before)
+        if wanted is not None and wanted.sha256 == sha256:
+            scenario = scenario.replace({path: before.lookup(path) for path in AFTER_FIT})
+        own = self._own if isinstance(self.source, LoadedRecord) else changed_settings(before, scenario)
+        key, line = record_key(preview.record), preview.lines()[0]
+        self.run_on(LoadedRecord(preview.record, preview.name, key, line, declaration, sha256), scenario)
+        self._own = own
+
+    def simulate(self) -> None:
+        """Go back to the simulation: of settings that were kept, or of these with its own rate, ratio and length."""
+        self.wanted_record = None
+        if (source := self.source) is None:
+            return
+        scenario = source.simulation or self.scenario
+        try:
+            self.run_on(None, scenario.replace(self._own if isinstance(source, LoadedRecord) else {}))
+        except SettingError:  # they do not go with what was changed since
+            self.run_on(None, scenario)
+
     def choose(self, name: str) -> None:
         """Start again from a preset."""
         self.load(PRESETS[name](), name)
@@ -215,10 +207,6 @@ class Store(param.Parameterized):
     def changed_paths(self) -> list[str]:
         """Dotted paths of the settings that differ from the preset's."""
         return [*changed_settings(self.scenario, reference_preset(self.preset))]
-
-    def close(self) -> None:
-        """Release what the store holds; called when the session ends."""
-        self.session.leave()
 
     @property
     def step(self) -> Step:

@@ -57,7 +57,7 @@ class HtmlComponent(Component):
 
     __abstract = True
 
-    html: param.String[str] = param.String("", doc="What is in it.")
+    html = param.String("", doc="What is in it.")
 
 
 RUNS: Mapping[str, Look] = {
@@ -157,6 +157,7 @@ def sheets(*names: str) -> list[str]:
 
 
 WIDE: Mapping[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
+NO_ROOM: Mapping[str, Any] = {"width": 0, "height": 0, "margin": 0}
 
 
 class HtmlText(HtmlComponent):

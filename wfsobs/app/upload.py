@@ -6,7 +6,6 @@ is confirmed. Reading is done beside the page, in a thread.
 
 from __future__ import annotations
 
-import base64
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -28,20 +27,24 @@ from wfsobs.app.render import render
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.session_file import LARGEST, SUFFIX
 from wfsobs.app.sources import fit_to_record
-from wfsobs.app.store import RecordPlace, Store
-from wfsobs.app.style import HtmlComponent, html, make_button, make_select, script, sheets
+from wfsobs.app.store import Store
+from wfsobs.app.style import WIDE, HtmlComponent, html, make_button, make_select, script, sheets
 from wfsobs.app.views.plots import new_spectrum, send
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.settings.errors import SettingError
 from wfsobs.telemetry.columns import ROLES
+from wfsobs.telemetry.formats import FORMATS
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.preview import ColumnsPreview, Preview, SpectrumPreview, preview_any, safe_name
 from wfsobs.telemetry.records import TEMPLATE, sample_csv
 from wfsobs.units import UNITS
 
 BACK, STAY = "Back to the simulation", "Stay with the simulation"
+
+RECORDS = ",".join(ending for form in FORMATS for ending in form.endings)
+"""Of files that are offered to be chosen."""
 
 PART = 1_000_000
 """Of what the browser sends at a time [bytes]."""
@@ -56,12 +59,12 @@ class Picker(HtmlComponent):
     largest = param.Integer(LARGEST, doc="The largest file that is sent [bytes].")
     part = param.Integer(PART, doc="How much is sent at a time [bytes].")
 
-    _esm = script("listen", "patch", "markup", "upload")
+    _esm = script("page", "patch", "markup", "upload")
     _stylesheets = sheets("base", "bare", "upload")
 
     @param.depends("message", "source_title", "back", watch=True, on_init=True)
     def _draw(self) -> None:
-        self.html = render("upload.html", title=self.source_title, back=self.back, message=self.message)
+        self.html = render("upload.html", title=self.source_title, back=self.back, message=self.message, records=RECORDS)
 
 
 INCOMPLETE = "The upload is incomplete: choose the file again."
@@ -76,19 +79,16 @@ class PartialFile:
 
     def take(self, msg: dict[str, Any]) -> bytes | None:
         """Add a part {name, index, count, data}; the whole file with the last one. Raises ValueError, one line."""
-        index, count = msg.get("index"), msg.get("count")
+        index, count, data = (msg.get(key) for key in ("index", "count", "data"))
         if index == 0:
             self.name, self._parts = safe_name(str(msg.get("name", ""))), []
         parts = self._parts
         if parts is None:  # more of a file that has been given up
             return None
         self._parts = None
-        if type(index) is not int or type(count) is not int or not len(parts) == index < count:
+        if type(index) is not int or type(count) is not int or not len(parts) == index < count or not isinstance(data, bytes):
             raise ValueError(INCOMPLETE)
-        try:
-            parts.append(base64.b64decode(msg["data"], validate=True))
-        except (KeyError, TypeError, ValueError):
-            raise ValueError(INCOMPLETE) from None
+        parts.append(data)
         if sum(map(len, parts)) > LARGEST:
             raise ValueError(too_large(self.name))
         if index == count - 1:
@@ -231,7 +231,7 @@ class ColumnForm:
         for choice in self.choices.values():
             choice.param.watch(self._choose, "value")
         self.view: Final = pn.Column(
-            html(f"<p>{HINT}</p>", margin=0, styles=TEXT),
+            html(f"<p>{HINT}</p>", styles=TEXT),
             pn.FlexBox(*self.choices.values(), gap="8px", margin=0),
             sizing_mode="stretch_width",
             margin=(4, 0),
@@ -269,17 +269,16 @@ class Upload:
         """Make the button. actions : open other files, and save."""
         self.store = store
         self.actions: Final = actions
-        self.picker: Final = Picker(sizing_mode="stretch_width", margin=0)
+        self.picker: Final = Picker(**WIDE)
         self.picker.on_message = self.handle
         self.use: Final = make_button("Use this record", self.confirm, color="primary", margin=4)
         self.drop: Final = make_button("Discard", self.discard, variant="outlined", margin=4)
-        self.missing: Final = html("", margin=(8, 4))
+        self.missing: Final = html(margin=(8, 4))
         self.content: Final = PreviewView()
         self.form: ColumnForm | None = None
         proposals = {"variant": "outlined", "margin": 4, "visible": False}
         self.take: Final = make_button("Take the proposed sign and delay", self.take_proposals, **proposals)
-        self.place: Final = RecordPlace(store)
-        self.room: Final = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
+        self.room: Final = pn.Column(visible=False, **WIDE)
         self._parcel = PartialFile()
         self._name, self._content, self._digest = "", b"", ""
         self._preview: AnyPreview | None = None
@@ -306,7 +305,7 @@ class Upload:
         """Do what a message of the browser says; one that makes no sense is a file that cannot be read."""
         action = msg.get("action")
         if action == "simulate":
-            self.place.give_back()
+            self.store.simulate()
         elif action == "large":
             self.discard(too_large(safe_name(str(msg.get("name", "")))))
         elif action == "part":
@@ -421,32 +420,26 @@ class Upload:
                 self.content.text,
                 *([self.form.view] if self.form is not None else []),
                 pn.FlexBox(*self.fields.widgets, self.take, gap="8px", align_items="center", margin=0),
-                pn.pane.Bokeh(self.content.figure, sizing_mode="stretch_width", margin=0),
+                pn.pane.Bokeh(self.content.figure, **WIDE),
                 pn.FlexBox(self.use, self.drop, self.missing, align_items="center", margin=0),
             ]
         self.room.visible = True
 
     def confirm(self) -> None:
-        """Let the record take the place of the simulation, the settings of rate, ratio and length with it."""
-        if isinstance(found := self._preview, SpectrumPreview):
-            self._vibrate(found)
-        if not isinstance(found, Preview) or self._obstacle(found):
-            return
+        """Use what was read: a record with its rate, ratio and length in place of the simulation, or a spectrum of vibration."""
+        found, said = self._preview, ""
         try:
-            self.place.take(found, self.read_fields(), self._digest)
+            if isinstance(found, SpectrumPreview):
+                self.store.replace({"vibration.source": "psd", "vibration.psd": found.table})
+                said = f"The vibration has the spectrum of {found.name}."
+            elif isinstance(found, Preview) and not self._obstacle(found):
+                self.store.take_record(found, self.read_fields(), self._digest)
+            else:
+                return
         except SettingError as error:
-            self._say(f"{found.name}: {error}")
+            self._say(f"{self._name}: {str(error)[:300]}")
         else:
-            self.discard()
-
-    def _vibrate(self, preview: SpectrumPreview) -> None:
-        """Take a spectrum as that of the vibration."""
-        try:
-            self.store.replace({"vibration.source": "psd", "vibration.psd": preview.table})
-        except SettingError as error:
-            self._say(f"{preview.name}: {str(error)[:300]}")
-        else:
-            self.discard(f"The vibration has the spectrum of {preview.name}.")
+            self.discard(said)
 
     def discard(self, why: str = "") -> None:
         """Forget the file that is being looked at."""

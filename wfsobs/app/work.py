@@ -159,7 +159,7 @@ class _Work:
             stated.validate()
         self.record, self.known_estimates = record, RecordMemo(self.memo, record)
         self.usual = usual_observers(stated, record)
-        self.bounds = self.memo.get(self._name_of_bounds(record)) if self.simulation is not None else _Bounds()
+        self.bounds = _Bounds() if self.simulation is None else self.memo.get(self._name_of_bounds(self.simulation, record))
         self._add_truth(record)
         known = self.known_estimates
         for item in each_estimate(record, stated, self.watch, on_partial=self._grow, memo=known):
@@ -178,19 +178,15 @@ class _Work:
                 self.tell(result=shown)
                 self._let_draw()
                 if stage == len(WEIGHTS) and self.bounds is None and self.simulation is not None:
-                    self.bounds = self.memo.put(self._name_of_bounds(record), _Bounds(self._bounds_of(record)))
+                    bounds = _Bounds(record_bounds(self.simulation, record, self.usual))
+                    self.bounds = self.memo.put(self._name_of_bounds(self.simulation, record), bounds)
         return self._so_far(record)
 
-    def _bounds_of(self, record: Record) -> list[Bound]:
-        assert self.simulation is not None
-        return record_bounds(self.simulation, record, self.usual)
-
-    def _name_of_bounds(self, record: Record) -> str:
+    def _name_of_bounds(self, simulation: Scenario, record: Record) -> str:
         """Name the bounds by what they depend on: the simulation, whatever its seed."""
-        assert self.simulation is not None
-        settings = record_settings(self.simulation)
+        settings = record_settings(simulation)
         del settings["run"]["seed"]
-        return digest("bounds", settings, record.n_steps, record.n_modes, joint_observers(self.simulation, self.usual))
+        return digest("bounds", settings, record.n_steps, record.n_modes, joint_observers(simulation, self.usual))
 
     def _left(self) -> set[str]:
         """List the observers that have not delivered everything."""
@@ -257,9 +253,9 @@ class _Work:
             if truth is None:
                 continue
             name = digest("spectra", self.known_estimates.record, target, self.scenario.run.warm_up)
-            spectrum = self.memo.get(name) or self._spectrum(record, target, truth)
+            spectrum = self.memo.keep(name, partial(self._spectrum, record, target, truth))
             if spectrum is not None:
-                self.spectra[TRUTH, target] = self.memo.put(name, spectrum)
+                self.spectra[TRUTH, target] = spectrum
 
     def _spectrum(self, record: Record, target: str, values: Array) -> SignalAndError | None:
         """Over the samples that count for the scores; None where there are too few."""

@@ -1,5 +1,5 @@
-// The menus of files and of sharing, the button of the history, and what there is to say about them. It also keeps the address in
-// step with the settings, and hears the keys for undo and redo.
+// The menus of files and of sharing, the button of the history, and what there is to say about them. It keeps the address in step
+// with the settings, and hears the keys for undo and redo.
 
 const SAID_MS = 6_000 // for which something that was done is told
 
@@ -9,7 +9,7 @@ export function render({model, view, el}) {
     <div class="notes" hidden><div role="alert"></div><button type="button">Dismiss</button></div>`
   const [bar, said, text, notes] = el.children
 
-  // What was done, in one line: in words of the browser, or of the server, which is told when they have been there for long enough.
+  // What was done, in words of the browser, or of the server, which is told when they have been read.
   let over
   const say = (words) => {
     said.textContent = words
@@ -21,9 +21,12 @@ export function render({model, view, el}) {
   }
   model.on("message", () => say(model.message))
   say(model.message)
-  takeFiles(model, (name) => say(`Saved ${name}.`))
+  model.on("msg:custom", (event) => {
+    const {name, kind, content} = event.data ?? event
+    save(name, new Blob([content], {type: kind}))
+    say(`Saved ${name}.`)
+  })
 
-  // What was refused.
   const note = () => {
     notes.hidden = model.notes.length === 0
     notes.firstChild.replaceChildren(...model.notes.map((it) => Object.assign(document.createElement("p"), {textContent: it})))
@@ -87,22 +90,17 @@ export function render({model, view, el}) {
   listen(model, {keydown: (event) => keyPressed(event, model)})
 }
 
-const TEXT = "[contenteditable], textarea, input:not([type=range], [type=checkbox], [type=radio], [type=button], [type=file])"
-
 function keyPressed(event, model) {
   const at = event.composedPath()[0], key = event.key.toLowerCase()
-  if (event.altKey || at.matches?.(TEXT)) return
-  if (!(event.ctrlKey || event.metaKey)) {
-    if (key === "h" && !at.matches?.("[role=option], [role=combobox]")) model.send_msg({action: "history"})
-    return
-  }
-  const action = key === "z" ? (event.shiftKey ? "redo" : "undo") : key === "y" ? "redo" : ""
+  if (keyAlone(event) && key === "h" && !at.matches?.("[role=option], [role=combobox]")) model.send_msg({action: "history"})
+  if (event.altKey || !(event.ctrlKey || event.metaKey) || at.matches?.(TEXT)) return
+  const action = {z: event.shiftKey ? "redo" : "undo", y: "redo"}[key]
   if (!action) return
   event.preventDefault()
   model.send_msg({action})
 }
 
-// Parts of a view that are one of their own, to which the browser's Back returns; the others belong to the one they are changed in.
+// Parts of a view that make another one, to which the browser's Back returns.
 const OWN = ["view.page", "view.mode", "view.unit", "view.show", "view.spectrum"]
 
 // Keep the address in step with the view, and the view with where Back and Forward lead.

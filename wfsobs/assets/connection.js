@@ -1,22 +1,22 @@
-// Watches the connection to the server: says at once when it is lost, takes it up again where the server still has the session,
-// and keeps what was changed meanwhile. One for the document, which outlives what is drawn of it.
+// Watches the connection to the server: says when it is lost, takes it up again where the server still has the session, and keeps
+// what was changed meanwhile. One for the document, which outlives what is drawn of it.
 
-const TICK = 250 // [ms]; only those count in which this page gets to work, so that a busy computer is no lost connection
-const PATIENCE = 16 // with a question to the server: to make the page of another visitor takes two seconds on a busy machine [ticks]
+const TICK = 250 // [ms]; only those count in which this page gets to work
+const PATIENCE = 16 // with a question: another visitor's page takes the server two seconds [ticks]
 const GIVEN_UP = 40 // after which another way to the server is tried [ticks]
 const PERIOD = 12 // between questions where nothing is changed [ticks]
 const TIMEOUT = 3_000 // of a question beside the connection [ms]
 const LONGEST = 3_000 // between two attempts to connect [ms]
 const REFUSALS = 5 // of a server that answers, after which it has no such session
 const UNSENT = "wfsobs-unsent"
-const TAG = "setting:"
 const TYPED = ["value", "value_input", "value_throttled"]
 
+const LATER = " Results are as they were; what you change is kept for later."
 const SAID = {
   connected: "Connected again.",
-  offline: "This computer is offline. Results are as they were; what you change is kept for later.",
-  silent: "The server does not answer. Results are as they were; what you change is kept for later.",
-  lost: "The connection to the server is lost: connecting again … Results are as they were; what you change is kept for later.",
+  offline: "This computer is offline." + LATER,
+  silent: "The server does not answer." + LATER,
+  lost: "The connection to the server is lost: connecting again …" + LATER,
   gone: "The server does not have this session any more.",
 }
 
@@ -32,7 +32,7 @@ async function reachable() {
 
 // The socket that something is sent by.
 function socketOf(act) {
-  const send = WebSocket.prototype.send
+  const {send} = WebSocket.prototype
   let socket = null
   WebSocket.prototype.send = function (...args) {
     socket = this
@@ -51,15 +51,17 @@ function refuse(event) {
   if (!event.data.includes('"ACK"')) event.target.close()
 }
 
-// The path of the setting that a component, or what holds its data, stands for; or nothing.
+// The path of the setting that a component, or what holds its data, stands for.
 function settingOf(model) {
   const of = model?.data ? model : [...model?.document?.all_models ?? []].find((it) => it.data === model)
-  return of?.tags.find((tag) => tag.startsWith?.(TAG))?.slice(TAG.length)
+  return tagOf(of)?.slice(TAG.length)
 }
 
-// Whether the settings are drawn: a line below one that comes while it is being drawn is not seen.
+const tagOf = (model) => model?.tags?.find((tag) => tag.startsWith?.(TAG))
+
+// A line below a setting that comes while it is being drawn is not seen.
 function areSettingsDrawn() {
-  const fields = [...Bokeh.index.query((it) => it.model.tags?.some((tag) => tag.startsWith?.(TAG)))]
+  const fields = [...Bokeh.index.query((it) => tagOf(it.model))]
   return fields.length > 0 && fields.every((it) => it.has_finished())
 }
 
@@ -77,7 +79,7 @@ class Link {
     setInterval(() => this.tick(), TICK)
   }
 
-  // What is drawn of the document is there, for the first time or anew.
+  // The document is drawn, for the first time or anew.
   attach(model, draw) {
     const again = this.model !== undefined
     Object.assign(this, {model, draw, session: model.session, arrived: model.last_arrival})
@@ -94,7 +96,9 @@ class Link {
     this.draw(state === "connected" && before === "connected" ? "" : SAID[state], state)
   }
 
-  // ---------------------------------------------------------------- questions and answers
+  fail(state) {
+    this.turn(navigator.onLine ? state : "offline")
+  }
 
   ask() {
     if (!this.model || !this.ready) return
@@ -109,14 +113,13 @@ class Link {
     socket.addEventListener("message", () => { this.ticks = 0 }) // whatever comes is a sign of life
   }
 
-  // The connection stands, as far as one knows.
   tick() {
     if (!this.model || document.hidden) return
     this.deliver()
     this.ticks += 1
     const waiting = this.asked > this.model.last_arrival
     if (!waiting && (this.unsent.length || this.ticks >= PERIOD)) this.ask()
-    if (waiting && this.ticks === PATIENCE) this.turn(navigator.onLine ? "silent" : "offline")
+    if (waiting && this.ticks === PATIENCE) this.fail("silent")
     if (waiting && this.ticks % GIVEN_UP === 0) this.another()
   }
 
@@ -127,7 +130,7 @@ class Link {
     if (["offline", "silent"].includes(this.state)) this.turn("connected")
   }
 
-  // Where the server is there but this way to it is not. One that was busy answers both now: its answer by the socket comes first.
+  // Where the server is there but this way to it is not. One that was busy answers by the socket first.
   async another() {
     const {socket} = this
     if (!await reachable()) return
@@ -139,14 +142,12 @@ class Link {
     }, TIMEOUT)
   }
 
-  // ---------------------------------------------------------------- lost, and found again
-
   // A lost connection is not used again: its reader may be in the middle of a message.
   lost(connection) {
     this.connection = connection
     this.model = null
     connection.close()
-    this.turn(navigator.onLine ? "lost" : "offline")
+    this.fail("lost")
     this.retry()
   }
 
@@ -165,7 +166,7 @@ class Link {
     } catch {
       this.refused = await reachable() ? this.refused + 1 : 0
       if (this.refused > REFUSALS) return this.turn("gone")
-      this.turn(navigator.onLine ? "lost" : "offline")
+      this.fail("lost")
       this.wait = Math.min(2 * this.wait + 500, LONGEST)
       this.retrying = setTimeout(() => this.retry(), this.wait)
     } finally {
@@ -200,8 +201,7 @@ class Link {
     location.reload()
   }
 
-  // ---------------------------------------------------------------- what was changed and may not have arrived
-
+  // What is changed may not arrive.
   changed(event) {
     if (!event.sync) return
     const number = this.asked + 1
@@ -221,7 +221,7 @@ class Link {
     queueMicrotask(() => this.ask())
   }
 
-  // Once the page is drawn for the first time: what the server changes before then is not seen.
+  // What the server changes before the page is drawn is not seen.
   deliver() {
     this.ready ||= this.doc.is_idle
     if (!this.ready || !this.due || !areSettingsDrawn()) return
@@ -242,18 +242,13 @@ class Link {
   }
 
   keep() {
-    try {
-      if (this.unsent.length) sessionStorage.setItem(UNSENT, JSON.stringify([location.search, this.unsent]))
-      else sessionStorage.removeItem(UNSENT)
-    } catch { /* a browser that keeps nothing */ }
+    kept(UNSENT, this.unsent.length ? JSON.stringify([location.search, this.unsent]) : null, "sessionStorage")
   }
 
   restore() {
-    try {
-      const [search, unsent] = JSON.parse(sessionStorage.getItem(UNSENT)) ?? []
-      if (search === location.search) this.unsent = unsent.map((it) => ({...it, id: "", number: 1}))
-      this.kept = new Set(this.unsent)
-    } catch { /* nothing kept */ }
+    const [search, unsent] = JSON.parse(kept(UNSENT, undefined, "sessionStorage") ?? "[]")
+    if (search === location.search) this.unsent = unsent.map((it) => ({...it, id: "", number: 1}))
+    this.kept = new Set(this.unsent)
   }
 }
 

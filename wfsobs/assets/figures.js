@@ -1,10 +1,9 @@
-// Figures as SVG, with a legend that on the page the cards above them are; as PNG the toolbar of a figure saves it.
+// Figures as SVG, with a legend in place of the cards above them.
 
 const ENTRY = 170 // of the legend [px]
 
 function figures() {
-  const views = [...Bokeh.index.query((it) => it.model.type === "Figure" && it.el.checkVisibility())]
-  return views.map((view) => {
+  return figureViews().filter((it) => it.el.checkVisibility()).map((view) => {
     const axes = [view.model.left[0]?.axis_label, view.model.below[0]?.axis_label]
     return [view.model.name ?? axes.filter(Boolean).join(" over "), view]
   })
@@ -24,4 +23,10 @@ async function exported(view, labels) {
   const blob = await view.export("svg").to_blob()
   view.model.setv({above}, {sync: false})
   return blob
+}
+
+function save(name, blob) {
+  const url = URL.createObjectURL(blob)
+  Object.assign(document.createElement("a"), {href: url, download: name}).click()
+  setTimeout(() => URL.revokeObjectURL(url), 60_000)
 }

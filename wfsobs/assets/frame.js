@@ -1,41 +1,28 @@
-// Stands below the results: closes the drawer of a phone, tells when the first picture stands, and fades the results while they
-// are stale. Fading them from here costs nothing; a change of their own style has the browser lay them all out anew.
-// The theme is the system's, until another is chosen: that one is remembered.
+// Stands below the results: closes the drawer of a phone, tells when the first picture stands, and fades stale results, which costs
+// nothing from here; a change of their own style has the browser lay them all out anew.
 
 const THEME = "wfsobs-theme"
 
-function remembered() {
-  const asked = new URLSearchParams(location.search).get("theme")
-  try {
-    return asked ?? localStorage.getItem(THEME)
-  } catch {
-    return asked
-  }
-}
-
+// The theme is the system's, until another is chosen: that one is remembered.
 function themes(model) {
   const system = matchMedia("(prefers-color-scheme: dark)")
   const follow = () => {
-    const chosen = remembered()
+    const chosen = new URLSearchParams(location.search).get("theme") ?? kept(THEME)
     model.wants_dark = chosen ? chosen === "dark" : system.matches
   }
   system.addEventListener("change", follow)
   model.on("remove", () => system.removeEventListener("change", follow))
-  model.on("preferred_theme", () => {
-    try {
-      localStorage.setItem(THEME, model.preferred_theme)
-    } catch { /* a browser that keeps nothing */ }
-  })
+  model.on("preferred_theme", () => kept(THEME, model.preferred_theme))
   follow()
 }
 
-// A React component gives what the server sets back to its model a moment later. By then the server may have set something newer,
-// which the older would undo, on the page and in the server. What comes back is left out; it is what the model had been given.
+// A React component gives what the server sets back to its model a moment later, which would undo what is newer by then. It is
+// left out.
 const ECHO_MS = 2000
 function ignoreEchoes({model: {data}}) {
   if (!data || Object.hasOwn(data, "setv")) return
   const {setv} = data
-  let given = []  // {name, value, at} of the last moments
+  let given = []  // {name, value, at}
   data.setv = function (changes, options = {}) {
     given = given.filter(({at}) => performance.now() - at < ECHO_MS)
     const [[name, value] = [], ...more] = Object.entries(changes)
@@ -58,8 +45,8 @@ function ignoreAllEchoes() {
 }
 ignoreAllEchoes()
 
-// What the first picture does not need is made when it stands: when its figures have been painted, or a page has none. It is told
-// until it has come: what is told while a connection breaks is lost.
+// What the first picture does not need is made once its figures have been painted, or a page has none. It is told until it has
+// come: what is told while a connection breaks is lost.
 const PATIENCE = 1500, STEP = 30, AGAIN = 3000
 function tellDrawn(model) {
   const end = performance.now() + PATIENCE
@@ -70,7 +57,7 @@ function tellDrawn(model) {
   }
   const idle = window.requestIdleCallback ?? ((act) => setTimeout(act, STEP))
   const look = () => {
-    const figures = [...Bokeh.index.query((it) => it.model.type === "Figure")]
+    const figures = figureViews()
     const drawn = figures.length > 0 && figures.every((it) => it.has_finished())
     if (drawn || performance.now() > end) idle(tell, {timeout: PATIENCE})
     else setTimeout(look, STEP)
@@ -78,7 +65,7 @@ function tellDrawn(model) {
   look()
 }
 
-// In a narrow window the drawer lies over the page: its style hides it until it has been closed here, and is opened.
+// In a narrow window the drawer lies over the page, hidden until it has been closed here and is opened.
 const NARROW = "(max-width: 999.95px)"
 function closeDrawer(doc) {
   const page = [...doc.all_models].find((it) => it.data?.attributes && "sidebar_open" in it.data.attributes)
@@ -95,7 +82,7 @@ export function render({model, view, el}) {
   const fade = () => {
     const results = el.getRootNode().host?.previousElementSibling
     if (results) {
-      // Results that come within a second are not faded before: without a graphics card each frame of that draws all of them.
+      // Not within a second: without a graphics card each frame of that draws all results.
       results.style.transition = model.stale ? "opacity 0.2s 1s" : "none"
       results.style.opacity = model.stale ? "0.45" : "1"
     }

@@ -1,6 +1,6 @@
 // Handles over a spectrum: drag one, or move it with the arrow keys, and the server says what theory expects of the settings it
-// would make; let go, and the settings are those. Where handles are and what they are called is the server's to say: this sends
-// wishes, one at a time, the newest of those that came up meanwhile, and shows a handle where the pointer is until it is let go.
+// would make; let go, and the settings are those. Where handles are is the server's to say: this sends wishes, one at a time, the
+// newest of those that came up meanwhile, and shows a handle where the pointer is until it is let go.
 
 const SETTLE = 700  // keys: the move is over after this time without one [ms]
 const STEPS = {frequency: 1.005, strength: 1.06, damping: 1.12}, LEAP = 4  // as many at once with Shift
@@ -19,18 +19,16 @@ export function render({model, el}) {
   const handles = () => model.frame.handles ?? []
   const handleOf = (it) => handles()[[...marks.children].indexOf(it)]
 
-  // ------------------------------------------------------------------ messages
-
   const send = (message) => {
     if (!waiting) model.send_msg({...message, number: waiting = ++number})
     else if (!newest?.last || message.last) newest = message
-    root.classList.toggle("pending", true)
+    root.classList.add("pending")
   }
   const hear = () => {
     if (!waiting || model.frame.answered < waiting) return
     const next = newest
     waiting = newest = null
-    root.classList.toggle("pending", false)
+    root.classList.remove("pending")
     if (next) send(next)
   }
   const wish = (action) => {
@@ -54,8 +52,6 @@ export function render({model, el}) {
     move.frequency = Math.min(Math.max(move.frequency, start), end, move.handle.highest ?? Infinity)
     wish("drag")
   }
-
-  // ------------------------------------------------------------------ where things are
 
   const find = () => {
     const [found] = Bokeh.index.query((it) => it.model.type === "Figure" && it.model.name === model.figure)
@@ -102,8 +98,6 @@ export function render({model, el}) {
     marks.children[handles().findIndex(({id}) => id === model.frame.added)]?.focus()
     adding = 0
   }
-
-  // ------------------------------------------------------------------ by pointer and by keyboard
 
   marks.onpointerdown = (event) => {
     const handle = handleOf(event.target)

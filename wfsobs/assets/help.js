@@ -1,28 +1,16 @@
 // The help at the top right: a tour, shortcuts and words, by button or by the key "?"; offered once.
 
-const TOLD = "wfsobs-tour"
+const TOLD = "wfsobs-tour" // whether somebody has been here with this browser
 
 export function render({model, el}) {
   el.innerHTML = model.html
   const [open, sheet, offer] = [".open", "#help", "#offer"].map((it) => el.querySelector(it))
   offer.onclick = () => offer.hidePopover()
   sheet.onbeforetoggle = () => { if (sheet.matches(":focus-within")) open.focus() }  // the browser knows the host of the shadow alone
-  if (isFirst()) setTimeout(() => {
+  if (kept(TOLD) === null) setTimeout(() => {
     if (!el.isConnected) return
-    localStorage.setItem(TOLD, "offered")
+    kept(TOLD, "offered")
     offer.showPopover()
   }, 2000)
-  listen(model, {keydown: (event) => {
-    const isText = event.composedPath()[0].matches?.("input, textarea, select, [contenteditable]")
-    if (event.key === "?" && !isText && !event.ctrlKey && !event.metaKey && !event.altKey) sheet.togglePopover()
-  }})
-}
-
-// Whether nobody has been here with this browser, as far as it tells.
-function isFirst() {
-  try {
-    return localStorage.getItem(TOLD) === null
-  } catch {
-    return false
-  }
+  listen(model, {keydown: (event) => { if (keyAlone(event) === "?") sheet.togglePopover() }})
 }

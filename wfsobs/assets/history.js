@@ -26,6 +26,6 @@ export function render({model, el}) {
       before?.focus()
     }
   }
-  for (const name of ["open", "html"]) model.on(name, follow)
+  model.on(["open", "html"], follow)
   requestAnimationFrame(() => { if (sheet.isConnected) follow() })
 }

@@ -1,10 +1,9 @@
-// What the keyboard needs beyond what the widgets do themselves: a way past the drawer, lists that open, items that say which of
-// them is chosen, tips where the focus is.
+// What widgets lack for the keyboard: a way past the drawer, lists that open, items that say which is chosen, tips where the focus is.
 
 export function render({model, el}) {
   const skip = skipLink(() => el.getRootNode().host.nextElementSibling)
   model.on("remove", () => skip.remove())
-  // What moves the focus within one shadow root is not heard of out here: so every key is followed.
+  // A focus that moves within one shadow root is not heard of out here: so every key is followed.
   let last = null, mark = null
   const tell = (at, isEnded) => {
     if (at === last && !isEnded) return
@@ -34,7 +33,7 @@ export function render({model, el}) {
 // The mark beside a field's name, whose tip is told where the focus is.
 const MARK = "label > svg.MuiSvgIcon-root, .MuiFormControlLabel-label > svg.MuiSvgIcon-root"
 
-// Names for what Bokeh and panel-material-ui leave without: a plot that has the focus, and a fieldset whose group within has one.
+// A plot that has the focus has no name, and a fieldset repeats that of the group within.
 function name(at) {
   at.closest("fieldset.MuiFormControl-root")?.setAttribute("role", "presentation")
   if (!at.matches(".bk-events")) return
@@ -44,7 +43,7 @@ function name(at) {
   at.setAttribute("aria-label", at.getRootNode().host.getRootNode().host.getAttribute("aria-label"))
 }
 
-// The first stop of the page, seen while it has the focus.
+// The first stop, seen while it has the focus.
 function skipLink(results) {
   const room = Object.assign(document.createElement("nav"), {ariaLabel: "Skip", innerHTML: `<style>
     .skip { position: fixed; left: 8px; top: 8px; z-index: 10000; padding: 10px 14px; background: #fff; color: #0b4f6c; outline: 3px solid }
@@ -62,8 +61,7 @@ function skipLink(results) {
 
 const LIST = "[role=combobox][aria-haspopup=listbox]"
 
-// A list of panel-material-ui 0.16 opens by click alone: what opens it by keyboard calls a function that it has not been given.
-// The space bar opens it when it comes up, or it would choose the first item by that.
+// A list of panel-material-ui 0.16 opens by click alone. The space bar opens it when it comes up, or it would choose the first item.
 function openList(event) {
   const box = event.composedPath()[0]
   if (!["Enter", " ", "ArrowDown", "ArrowUp"].includes(event.key) || !box.matches?.(LIST)) return
@@ -72,7 +70,7 @@ function openList(event) {
   if ((event.key === " ") === (event.type === "keyup")) box.click()
 }
 
-// Nor do its items say that they are those of a list, and which one is chosen; that one has the focus first.
+// Nor do its items say which one is chosen; that one has the focus first.
 function markItems(at, tries = 600) {
   const box = at.closest?.(LIST)
   if (!box || !tries) return

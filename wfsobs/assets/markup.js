@@ -1,4 +1,4 @@
-// HTML of the server, brought up to date in place; what is pressed or changed in it is told by its name: data-do, and of which row.
+// HTML of the server, in place; what is pressed or changed in it is told by its name (data-do) and its row (data-key).
 
 function setMarkup(root, html) {
   patchHtml(root, html)

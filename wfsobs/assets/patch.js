@@ -1,5 +1,4 @@
-// Brings what stands in an element to what is to stand there, and leaves alone what is the same: it keeps its focus, its popover
-// and a click that is under way. What listens does so on the element itself, which stays.
+// Bring what stands in an element to what is to stand there; what is the same keeps its focus, its popover and a click under way.
 function patch(element, wanted) {
   wanted.forEach((to, i) => {
     const at = element.childNodes[i]

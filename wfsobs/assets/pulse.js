@@ -1,5 +1,4 @@
-// Answers each picture once it has been painted; the next one waits for that. A page that sleeps paints nothing, so that none are
-// kept for it, and it is sent the present when it wakes.
+// Answers each picture once it has been painted; the next one waits for that, so that none are kept for a page that sleeps.
 
 // What of a figure that is not to be seen waits for it to be scrolled to, a second at most.
 const PATIENCE = 1_000
@@ -25,8 +24,8 @@ function make(place) {
   place.last = performance.now()
 }
 
-// Make the changes of a picture: for each model its figure, its id, the columns and their length, or properties and their values;
-// the numbers of all columns lie one after the other. They come from the server, which is not told of them.
+// Make the changes of a picture: for each model its figure, its id, the columns and their length, or properties and their values.
+// They come from the server, which is not told of them.
 function change([steps, numbers]) {
   const all = new Float32Array(numbers.buffer, numbers.byteOffset, numbers.length)
   const changed = new Set()

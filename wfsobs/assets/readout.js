@@ -1,5 +1,5 @@
-// The values of all lines of a figure where the pointer is, or where the arrow keys have led a figure that has the focus. The line of
-// a card that is pointed at, or has the focus, has its own colour where it recedes.
+// The values of all lines of a figure where the pointer is, or where the arrow keys have led one that has the focus. The line of a
+// card that is pointed at or has the focus has its own colour.
 
 const STEP = 0.01, LEAP = 0.1 // of the width, for an arrow key alone and with Shift
 
@@ -12,7 +12,7 @@ export function render({model, el}) {
   const viewOf = (event) => {
     const figure = event.composedPath().find((it) => it.classList?.contains("bk-Figure"))
     if (figure && !views.has(figure)) {
-      for (const view of Bokeh.index.query((it) => it.model.type === "Figure")) views.set(view.el, view)
+      for (const view of figureViews()) views.set(view.el, view)
     }
     return views.get(figure)
   }
@@ -43,7 +43,7 @@ export function render({model, el}) {
     const name = event.composedPath().find((it) => it.classList?.contains("card"))?.dataset.name
     if (name === pointed.name) return
     for (const [glyph, colour] of pointed) glyph.setv({line_color: colour}, {sync: false})
-    const all = name ? [...Bokeh.index.query((it) => it.model.type === "Figure")].flatMap((it) => it.model.renderers) : []
+    const all = name ? figureViews().flatMap((it) => it.model.renderers) : []
     const lines = all.filter((it) => it.name === name && it.tags.length)
     pointed = Object.assign(lines.map(({glyph}) => [glyph, glyph.line_color]), {name})
     for (const {glyph, tags} of lines) glyph.setv({line_color: {value: tags[0]}}, {sync: false})

@@ -1,10 +1,12 @@
 // The script of a report: reads the data embedded in the page and keeps figures, their lines and the table in step with the controls.
 
 const read = (id) => JSON.parse(document.getElementById(id).textContent)
-const data = read("data")
-const states = read("rows")
+const data = read("data"), states = read("rows"), embedded = read("figures")
 const switches = [...document.querySelectorAll(".switches select")]
 const shown = {state: data.start, mode: data.modes[0], over: Object.keys(data.sweeps)[0], ...Object.fromEntries(switches.map((it) => [it.name, it.value]))}
+const stateShown = () => data.states[shown.state]
+const unitShown = () => data.units[shown.unit]
+const scaleOf = (state) => state.scale[shown.unit]  // of the unit shown, one micrometre
 const boxes = [...document.querySelectorAll("[data-target] input")]  // a line each, those of both figures of the target
 const boxesOf = (target) => boxes.filter((it) => it.closest("[data-target]").dataset.target === target)
 const linesOf = (target) => boxesOf(target).map((it) => it.name)
@@ -15,17 +17,14 @@ const DECADES = 8  // that an axis of densities spans at most; one of amplitudes
 const VIEW = 2  // of a trace at first; the reset of the toolbar shows all [s]
 const NONE = 65535
 
-// ------------------------------------------------------------------ numbers and lines
-
 // Three significant digits and no exponent where it is of common size, as in the tables.
-function number(value, digits = 3) {
+function number(value) {
   if (value === null || value === undefined) return "–"
   if (value === 0) return "0"
   const size = Math.abs(value)
-  const exponent = (text) => text.replace(/e([+-])(\d)$/, "e$10$2")
-  const text = size < 1e-4 || size >= 1e6 ? exponent(value.toExponential(digits - 1))
-    : value.toPrecision(digits).includes("e") ? value.toFixed(0) : value.toPrecision(digits)
-  return size < 1e-4 || size >= 1e6 ? text : text.replace("-", "−")
+  if (size < 1e-4 || size >= 1e6) return value.toExponential(2).replace(/e([+-])(\d)$/, "e$10$2")
+  const text = value.toPrecision(3)
+  return (text.includes("e") ? value.toFixed(0) : text).replace("-", "−")
 }
 
 const packed = Uint8Array.from(atob(data.arrays), (c) => c.charCodeAt(0))
@@ -33,47 +32,38 @@ const pool = await new Response(new Blob([packed]).stream().pipeThrough(new Deco
 const ends = data.lengths.reduce((sums, length) => [...sums, sums.at(-1) + length], [0])
 const bytes = (index) => pool.slice(ends[index], ends[index + 1])
 
-function axis(state, name) {
-  const index = state.axes[name]
+function axis(name) {
+  const index = stateShown().axes[name]
   return new Float32Array(index === undefined ? 0 : bytes(index))
 }
 
 // The points of a line [um], or of a density [um^2/Hz]; nothing where there is no such line.
-function points(state, kind, target, name) {
-  const line = state.lines[`${kind}/${target}/${name}/${shown.mode}`]
+function points(kind, target, name) {
+  const line = stateShown().lines[`${kind}/${target}/${name}/${shown.mode}`]
   if (!line) return null
-  const [index, low, step] = line
-  const logarithmic = kind.startsWith("psd") || kind.startsWith("cumulative")
-  const raw = new Uint8Array(bytes(index)), n = raw.length / 2
+  const [index, low, step] = line, raw = new Uint8Array(bytes(index)), n = raw.length / 2
+  const isLogarithmic = /^(psd|cumulative)/.test(kind)
   let level = 0
   return Float64Array.from({length: n}, (_, i) => {
     const change = raw[i] | raw[n + i] << 8
     level = level + (change >> 1 ^ -(change & 1)) & NONE
     const value = level === NONE ? NaN : low + step * level
-    return logarithmic ? 10 ** value : value
+    return isLogarithmic ? 10 ** value : value
   })
 }
 
-// ------------------------------------------------------------------ figures
-
-const embedded = read("figures")
-
 async function embed() {
-  const id = "report"
-  await Bokeh.embed.embed_items({[id]: embedded.document},
-                                [{docid: id, roots: embedded.roots, root_ids: Object.keys(embedded.roots)}])
-  const document_ = Bokeh.documents[0]
-  return Object.fromEntries(document_.roots().map((figure) => [figure.name, figure]))
+  const id = "report", roots = embedded.roots
+  await Bokeh.embed.embed_items({[id]: embedded.document}, [{docid: id, roots, root_ids: Object.keys(roots)}])
+  return Object.fromEntries(Bokeh.documents[0].roots().map((figure) => [figure.name, figure]))
 }
 
-function lines(figure) {
-  return figure.renderers.filter((r) => data.names.includes(r.name))
-}
+const lines = (figure) => figure.renderers.filter((it) => data.names.includes(it.name))
 
 // The lines of a figure over x, and of those that are shown the lowest point but for a share of them, and the highest.
 function fill(figure, target, x, share, kindOf, scale, from = -Infinity) {
   const columns = Object.fromEntries(linesOf(target).map((name) => {
-    const y = points(data.states[shown.state], kindOf(name), target, name)
+    const y = points(kindOf(name), target, name)
     return [name, y ? y.map((v) => v * scale) : new Float64Array(x.length).fill(NaN)]
   }))
   lines(figure)[0].data_source.data = {x, ...columns}  // they share it
@@ -84,56 +74,49 @@ function fill(figure, target, x, share, kindOf, scale, from = -Infinity) {
 
 const fit = (axis, start, end) => { if (start < end) axis.setv({start, end, reset_start: start, reset_end: end}) }
 
-function drawTrace(figure, target, state) {
+function drawTrace(figure, target) {
   // What a filter does while it settles does not count.
-  const [low, high] = fill(figure, target, axis(state, "time"), 0, () => shown.show, state.scale[shown.unit], state.warm_up)
+  const {warm_up} = stateShown()
+  const [low, high] = fill(figure, target, axis("time"), 0, () => shown.show, scaleOf(stateShown()), warm_up)
   const room = 0.05 * (high - low) || 1
   fit(figure.y_range, low - room, high + room)
-  figure.left[0].axis_label = `${shown.show === "error" ? "error of " : ""}${shown.mode} [${data.units[shown.unit]}]`
-  const boxes = Object.fromEntries(figure.center.filter((r) => r.type === "BoxAnnotation").map((r) => [r.name, r]))
-  boxes["warm-up"].right = state.warm_up
+  figure.left[0].axis_label = `${shown.show === "error" ? "error of " : ""}${shown.mode} [${unitShown()}]`
+  const boxOf = (name) => figure.center.find((it) => it.type === "BoxAnnotation" && it.name === name)
   const [left, right] = data.window ?? [0, 0]
-  boxes.window.setv({left, right})
+  boxOf("warm-up").right = warm_up
+  boxOf("window").setv({left, right})
 }
 
-function drawSpectrum(figure, target, state) {
-  const cumulative = shown.spectrum === "cumulative", ofError = shown.show === "error"
+function drawSpectrum(figure, target) {
+  const isCumulative = shown.spectrum === "cumulative", ofError = shown.show === "error"
   const kindOf = (name) => shown.spectrum + (ofError && name !== "truth" ? "-error" : "")
-  const x = axis(state, cumulative ? "frequency-cumulative" : "frequency"), scale = state.scale[shown.unit] ** (cumulative ? 1 : 2)
-  const [low, high] = fill(figure, target, x, 0.02, kindOf, scale), room = cumulative ? 1.5 : 3
-  fit(figure.y_range, Math.max(low / room, high / 10 ** (cumulative ? DECADES / 2 : DECADES)), high * room)
-  const what = `${cumulative ? "cumulative rms" : "PSD"}${ofError ? " of error" : ""}`
-  figure.left[0].axis_label = `${what}, ${shown.mode} [${data.units[shown.unit]}${cumulative ? "" : "²/Hz"}]`
-  for (const mark of figure.renderers.filter((r) => ["peaks", "model"].includes(r.name))) {
-    const marks = state[mark.name]
+  const x = axis(isCumulative ? "frequency-cumulative" : "frequency"), scale = scaleOf(stateShown()) ** (isCumulative ? 1 : 2)
+  const [low, high] = fill(figure, target, x, 0.02, kindOf, scale), room = isCumulative ? 1.5 : 3
+  fit(figure.y_range, Math.max(low / room, high / 10 ** (isCumulative ? DECADES / 2 : DECADES)), high * room)
+  const what = `${isCumulative ? "cumulative rms" : "PSD"}${ofError ? " of error" : ""}`
+  figure.left[0].axis_label = `${what}, ${shown.mode} [${unitShown()}${isCumulative ? "" : "²/Hz"}]`
+  for (const mark of figure.renderers.filter((it) => ["peaks", "model"].includes(it.name))) {
+    const marks = stateShown()[mark.name]
     mark.data_source.data = {x: marks.map(([at]) => at), text: marks.map(([, text]) => text)}
   }
 }
 
-// The places of the sliders of a state, and the state of some places; the last slider runs fastest.
-function places(index) {
-  return data.variations.map(({length}, i) => {
-    const below = data.variations.slice(i + 1).reduce((n, v) => n * v.length, 1)
-    return Math.floor(index / below) % length
-  })
-}
-
-function stateAt(of) {
-  return of.reduce((index, place, i) => index * data.variations[i].length + place, 0)
-}
+// The places of the sliders of every state; the last slider runs fastest.
+const places = data.variations.reduce((all, texts) => all.flatMap((of) => texts.map((_, i) => [...of, i])), [[]])
+const stateAt = (of) => places.findIndex((it) => it.join() === of.join())
 
 // RMS errors over the setting chosen, the others as they stand.
 function drawSweep(figure, target) {
   const [label, values] = data.sweeps[shown.over]
-  const now = places(shown.state)
+  const now = places[shown.state]
   const order = values.map((_, i) => i).sort((a, b) => values[a] - values[b])
   const runs = order.map((place) => stateAt(now.with(Number(shown.over), place)))
-  const error = (index, name) => (rowOf(index, target, name)?.rms_um ?? NaN) * data.states[index].scale[shown.unit]
+  const error = (index, name) => (rowOf(index, target, name)?.rms_um ?? NaN) * scaleOf(data.states[index])
   const columns = linesOf(target).map((name) => [name, runs.map((index) => error(index, name))])
   lines(figure)[0].data_source.data = {x: order.map((place) => values[place]), ...Object.fromEntries(columns)}
   figure.renderers.find((it) => it.name === "now").data_source.data = {x: [values[now[shown.over]]]}
   figure.below[0].axis_label = label
-  figure.left[0].axis_label = `rms error, ${shown.mode} [${data.units[shown.unit]}]`
+  figure.left[0].axis_label = `rms error, ${shown.mode} [${unitShown()}]`
 }
 
 function rowOf(index, target, name) {
@@ -144,9 +127,9 @@ function rowOf(index, target, name) {
 // Axes have their colours from the style sheet.
 function paint() {
   const style = getComputedStyle(document.documentElement)
-  for (const it of Object.values(figures).flatMap(lines)) {
-    const colour = {value: style.getPropertyValue(`--line-${it.name}`)}
-    it.glyph.setv(it.glyph.type === "Scatter" ? {line_color: colour, fill_color: colour} : {line_color: colour})
+  for (const {name, glyph} of Object.values(figures).flatMap(lines)) {
+    const colour = {value: style.getPropertyValue(`--line-${name}`)}
+    glyph.setv(glyph.type === "Scatter" ? {line_color: colour, fill_color: colour} : {line_color: colour})
   }
 }
 
@@ -165,14 +148,11 @@ function toPaper(isPaper) {
   }
 }
 
-// ------------------------------------------------------------------ numbers of lines, and table
-
 function drawNumbers(target) {
   for (const it of boxesOf(target)) {
     const row = rowOf(shown.state, target, it.name) ?? rowOf(shown.state, "next z", it.name)
     const value = it.name === "truth" ? row?.truth_rms_um : row?.rms_um
-    const text = row ? `${number(value * data.states[shown.state].scale[shown.unit])} ${data.units[shown.unit]}` : "–"
-    it.parentElement.querySelector("output").textContent = text
+    it.parentElement.querySelector("output").textContent = row ? `${number(value * scaleOf(stateShown()))} ${unitShown()}` : "–"
   }
 }
 
@@ -181,24 +161,18 @@ function drawTable() {
   copy.removeAttribute("data-state")
   copy.querySelector(".scroll").setAttribute("aria-label", "RMS errors")
   for (const body of copy.querySelectorAll("tbody")) body.hidden = body.dataset.mode !== shown.mode
-  inUnit(copy, data.states[shown.state].scale[shown.unit])
+  for (const it of copy.querySelectorAll(".unit")) it.textContent = unitShown()
+  for (const it of copy.querySelectorAll("[data-um]")) it.textContent = number(Number(it.dataset.um) * scaleOf(stateShown()))
   document.getElementById("table").replaceChildren(copy)
 }
 
-function inUnit(table, scale) {
-  for (const it of table.querySelectorAll(".unit")) it.textContent = data.units[shown.unit]
-  for (const it of table.querySelectorAll("[data-um]")) it.textContent = number(Number(it.dataset.um) * scale)
-}
-
-// ------------------------------------------------------------------ all together
-
 let figures = {}
 function drawFigures(target) {
-  const state = data.states[shown.state], of = (kind) => figures[`${kind}-${target}`]
-  for (const it of [of("trace"), of("spectrum"), of("sweep")].filter(Boolean).flatMap(lines)) it.visible = isShown(target, it.name)
-  drawTrace(of("trace"), target, state)
-  drawSpectrum(of("spectrum"), target, state)
-  if (shown.over) drawSweep(of("sweep"), target)
+  const [trace, spectrum, sweep] = ["trace", "spectrum", "sweep"].map((kind) => figures[`${kind}-${target}`])
+  for (const it of [trace, spectrum, sweep].filter(Boolean).flatMap(lines)) it.visible = isShown(target, it.name)
+  drawTrace(trace, target)
+  drawSpectrum(spectrum, target)
+  if (shown.over) drawSweep(sweep, target)
 }
 
 function draw() {
@@ -213,28 +187,25 @@ function draw() {
 }
 
 function drawAxes() {
-  const [target] = data.targets, state = data.states[shown.state], f = axis(state, "frequency")
-  const middle = state.length / 2, half = Math.min(VIEW, state.length) / 2
-  figures[`trace-${target}`].x_range.setv({start: middle - half, end: middle + half, reset_start: 0, reset_end: state.length})
+  const [target] = data.targets, {length} = stateShown(), f = axis("frequency")
+  const middle = length / 2, half = Math.min(VIEW, length) / 2
+  figures[`trace-${target}`].x_range.setv({start: middle - half, end: middle + half, reset_start: 0, reset_end: length})
   fit(figures[`spectrum-${target}`].x_range, f[0], f.at(-1))
 }
 
 function sliders() {
   const all = data.variations.map((_, i) => document.getElementById(`vary-${i}`))
   const say = () => all.forEach((slider, i) => {
-    const text = data.variations[i][Number(slider.value)]
-    slider.setAttribute("aria-valuetext", text)
-    slider.nextElementSibling.textContent = text
+    slider.ariaValueText = slider.nextElementSibling.textContent = data.variations[i][Number(slider.value)]
   })
-  places(data.start).forEach((place, i) => { all[i].value = place })
+  places[data.start].forEach((place, i) => { all[i].value = place })
   for (const slider of all) {
     slider.oninput = () => {
-      const before = data.states[shown.state]
+      const before = stateShown()
       shown.state = stateAt(all.map((it) => Number(it.value)))
-      const after = data.states[shown.state]
       say()
       draw()
-      if (before.length !== after.length || before.dt !== after.dt) drawAxes()
+      if (before.length !== stateShown().length || before.dt !== stateShown().dt) drawAxes()
     }
   }
   say()

@@ -1,6 +1,5 @@
-// A box that finds settings by their name, their topic or their path; choosing one opens its topic and goes to it.
+// A box that finds settings by name, topic or path, opens the topic and goes there.
 
-const TAG = "setting:"
 const SETTLED = 20 // frames in which a topic opens and moves what is in it
 
 export function render({model, el}) {
@@ -43,13 +42,13 @@ export function render({model, el}) {
   model.on("items", fill)
   fill()
   listen(model, {keydown: (event) => {
-    if (event.key !== "/" || event.composedPath()[0].matches?.("input, textarea, [contenteditable]")) return
+    if (keyAlone(event) !== "/") return
     event.preventDefault()
     box.focus()
   }})
 }
 
-// Give a setting the focus, as soon as its topic has opened, unless the visitor has gone on to something else by then.
+// Give a setting the focus as soon as its topic has opened, unless the visitor has gone on by then.
 function go(path) {
   const over = new AbortController()
   for (const act of ["pointerdown", "keydown"]) document.addEventListener(act, () => over.abort(), {capture: true, signal: over.signal})

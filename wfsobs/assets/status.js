@@ -1,4 +1,4 @@
-// The state of the run: a bar, a line, and what was refused. Drawn here, so that progress costs no layout of the page.
+// The state of the run. Drawn here, so that progress costs no layout of the page.
 
 export function render({model, el}) {
   el.innerHTML = `<progress max="1"></progress><div class="line" role="status"></div><div class="note" role="alert"></div>`
@@ -9,6 +9,6 @@ export function render({model, el}) {
     line.textContent = model.text
     note.textContent = note.title = model.note
   }
-  for (const name of ["progress", "text", "note"]) model.on(name, draw)
+  model.on(["progress", "text", "note"], draw)
   draw()
 }

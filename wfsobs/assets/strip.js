@@ -1,14 +1,13 @@
 // A table of the lines of the figures below it. A click hides or shows a line, a double click or the key S shows it alone, and once
-// more those that were shown before. The table asks for what is hidden by message and shows it at once; what the server sends
-// counts once it has heard the last click, so that neither undoes the other.
+// more those that were shown before. What the server sends counts once it has heard the last click, so that neither undoes the other.
 
 export function render({model, el}) {
   let hidden = model.hidden_lines
-  let before = hidden  // the click: a double click is about what stood there before its first one
+  let before = hidden  // the first click of a double one
   let among = []  // what is hidden again once a line is no longer alone
   let asked = model.last_arrival
   let told = null  // whose row is pointed at or has the focus
-  let open = false  // whether there are rows of all, or of the main ones and those whose lines are shown
+  let open = false  // whether there are rows of all
 
   const rows = () => [...el.querySelectorAll(".card")]
   const nameAt = (target) => target.closest(".card")?.dataset.name
@@ -94,7 +93,6 @@ export function render({model, el}) {
     if (isOwn) mark()
     else draw()
   }
-  model.on("hidden_lines", follow)
-  model.on("last_arrival", follow)
+  model.on(["hidden_lines", "last_arrival"], follow)
   draw()
 }

@@ -1,20 +1,12 @@
 // Loading a file: the sheet, the file sent in parts, and what there is to say about it.
 
-const RECORDS = ".npz,.npy,.csv,.txt,.dat,.tsv,.asc,.fits,.fit,.fts,.mat,.h5,.hdf5,.hdf,.he5,.sav,.idl,.parquet,.pq"
-
-const base64 = (blob) => new Promise((done) => {
-  const reader = new FileReader()
-  reader.onload = () => done(reader.result.split(",")[1] ?? "")
-  reader.readAsDataURL(blob)
-})
-
 async function send(model, file) {
   const {name, size} = file
   if (/\.toml$/i.test(name) && size <= model.part) return model.send_msg({action: "scenario", name, text: await file.text()})
   if (size > model.largest) return model.send_msg({action: "large", name})
   const count = Math.max(1, Math.ceil(size / model.part))
   for (let index = 0; index < count; index++) {
-    const data = await base64(file.slice(index * model.part, (index + 1) * model.part))
+    const data = await file.slice(index * model.part, (index + 1) * model.part).arrayBuffer()
     model.send_msg({action: "part", name, index, count, data})
   }
 }
@@ -24,7 +16,7 @@ export function render({model, el}) {
     setMarkup(el, model.html)
     el.style.position = model.source_title || model.message ? "" : "absolute"
   }
-  for (const name of ["html", "source_title", "message"]) model.on(name, draw)  // which come one after the other
+  model.on(["html", "source_title", "message"], draw)  // which come one after the other
   draw()
   const [input, sheet, pick] = ["input", "#load", ".pick"].map((it) => el.querySelector(it))
   const take = ([file]) => { if (file) send(model, file) }
@@ -40,7 +32,7 @@ export function render({model, el}) {
   }
   listen(model, {
     dragover: over, dragenter: over, drop: over,
-    "wfsobs:load": () => { input.accept = RECORDS; sheet.showPopover() },
+    "wfsobs:load": () => { input.accept = input.dataset.records; sheet.showPopover() },
     "wfsobs:open": () => { input.accept = ".toml,.wfsobs-session"; input.click() },
   })
 }

@@ -22,10 +22,10 @@ from wfsobs.app.controls.names import column_of, name_settings
 from wfsobs.app.display import label_of
 from wfsobs.app.render import render
 from wfsobs.app.store import Store
-from wfsobs.app.style import HtmlComponent, html, script, sheets
+from wfsobs.app.style import WIDE, HtmlComponent, html, script, sheets
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.settings.group import Group
-from wfsobs.settings.parameters import Reals, unit_of
+from wfsobs.settings.parameters import Reals
 from wfsobs.units import unit_text
 
 ROOM = {"sizing_mode": "stretch_width", "margin": (4, 0)}
@@ -47,7 +47,7 @@ class Field(ABC):
         self.idle: str = ""
         self._note_html = ""
         self.widgets: Final = self._widgets()
-        self.view: Final = pn.Column(self._row(), sizing_mode="stretch_width", margin=0)
+        self.view: Final = pn.Column(self._row(), **WIDE)
         self.refresh()
         store.param.watch(self.refresh, ["scenario", "errors"])
 
@@ -273,7 +273,7 @@ class SliderField(TextField):
         super().enter(value if isinstance(value, str) else self._value_at(float(value)))
 
     def _row(self) -> Any:
-        return pn.Row(*self.widgets, sizing_mode="stretch_width", margin=0)
+        return pn.Row(*self.widgets, **WIDE)
 
     def _on_release(self, event: Any) -> None:
         if event.new is None or (self._value is not None and event.new == self._place(self._value)):
@@ -355,7 +355,7 @@ class RowEditor:
         )
         self.label: Final = str(p.label)
         self.idle: str = ""
-        self.view: Final = pn.Column(self.table, sizing_mode="stretch_width", margin=0)
+        self.view: Final = pn.Column(self.table, **WIDE)
         self.refresh()
         store.param.watch(self.refresh, ["scenario", "errors"])
 
@@ -410,16 +410,9 @@ def _columns(kind: type[Group]) -> list[dict[str, Any]]:
     """One column per number or word, one for tip and one for tilt per list of numbers, named from the settings."""
     out = []
     for setting, p in kind.settings().items():
-        keys = [setting]
-        if isinstance(p, Reals):
-            keys = [f"{setting}.{i}" for i, _ in enumerate(TIP_TILT)]
-        unit = unit_text(unit_of(p))
-        choices = list(p.objects) if isinstance(p, param.Selector) else []
-        out += [
-            {"key": key, "name": f"{name} [{unit}]" if unit else name, "doc": p.doc or "", "choices": choices}
-            for key in keys
-            for name in [column_of(key)]
-        ]
+        keys = [f"{setting}.{i}" for i, _ in enumerate(TIP_TILT)] if isinstance(p, Reals) else [setting]
+        more = {"doc": p.doc or "", "choices": list(p.objects) if isinstance(p, param.Selector) else []}
+        out += [{"key": key, "name": label_of(p, column_of(key)), **more} for key in keys]
     return out
 
 

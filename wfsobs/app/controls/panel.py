@@ -17,7 +17,7 @@ from wfsobs.app.controls.names import preset_line, preset_title, setting_name
 from wfsobs.app.display import label_of
 from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.store import Store
-from wfsobs.app.style import PRIMARY, Component, HtmlText, html, make_button, script, sheets
+from wfsobs.app.style import PRIMARY, WIDE, Component, HtmlText, html, make_button, script, sheets
 from wfsobs.app.views.plots import AFTERWARDS_MS, once
 from wfsobs.app.work import RunResults
 from wfsobs.scenario import Scenario
@@ -55,10 +55,10 @@ progress::-moz-progress-bar { background: #8fd3f0; }
 class Status(Component):
     """The state of the run in the browser."""
 
-    progress: param.Number[float] = param.Number(0.0, doc="Fraction done.")
-    text: param.String[str] = param.String("", doc="The state, in words.")
-    note: param.String[str] = param.String("", doc="What was refused.")
-    label: param.String[str] = param.String("Progress of the run", doc="What the bar is the progress of.")
+    progress = param.Number(0.0, doc="Fraction done.")
+    text = param.String("", doc="The state, in words.")
+    note = param.String("", doc="What was refused.")
+    label = param.String("Progress of the run", doc="What the bar is the progress of.")
 
     _esm = script("status")
     _stylesheets = sheets("base", "status")
@@ -106,7 +106,7 @@ class Search(Component):
 
     items = param.List([], doc="{path, name} of every setting.")
 
-    _esm = script("listen", "search")
+    _esm = script("page", "search")
     _stylesheets = sheets("base", "search")
 
     def __init__(self, reveal: Callable[[str], None], **params: Any):
@@ -127,7 +127,7 @@ def settings_found() -> list[dict[str, str]]:
     lists = dict(scenario.lists())
     inner = tuple(f"{path}." for path in lists)
     known = [*lists.items(), *((path, p) for path, _, p in scenario.walk() if not path.startswith(inner))]
-    return [{"path": path, "name": f"{label_of(p)} · {topics[path.split('.')[0]].label}"} for path, p in known]
+    return [{"path": path, "name": f"{label_of(p)} · {topics[topic_of(path)].label}"} for path, p in known]
 
 
 FIRST: Mapping[str, Sequence[str]] = {
@@ -199,11 +199,11 @@ class Controls:
         self.status: Final = Status(sizing_mode="stretch_width", max_width=200, margin=0, stylesheets=[STATUS_ON_BAR])
         self.search: Final = Search(self.open_setting, sizing_mode="stretch_width", margin=(8, 0, 4, 0))
         self.effect_of: Callable[[RunResults, RunResults], str] = lambda _before, _now: ""
-        self._effect = html("", margin=0, styles=EFFECT)
+        self._effect = html(styles=EFFECT)
         self._before: RunResults | None = None
         self._changed_part: Field | RowEditor | None = None
         self.topics: Final = _names()
-        self.rooms: Final = {name: pn.Column(sizing_mode="stretch_width", margin=0) for name in self.topics}
+        self.rooms: Final = {name: pn.Column(**WIDE) for name in self.topics}
         self.titles = dict(self.topics)
         self.accordion: Final = pmui.Accordion(
             *((title, self.rooms[name]) for name, title in self.topics.items()),
@@ -228,7 +228,7 @@ class Controls:
         self._refresh_parts()
         return pn.Column(
             self.preset,
-            pn.Row(self.undo, self.redo, self.reset, sizing_mode="stretch_width", margin=0),
+            pn.Row(self.undo, self.redo, self.reset, **WIDE),
             *first,
             self.search,
             self.accordion,
@@ -238,11 +238,11 @@ class Controls:
 
     def bar(self) -> pn.Row:
         """Return what stays in sight: the buttons of the run, and how it is going."""
-        return pn.Row(self.run, self.cancel, self.status, sizing_mode="stretch_width", margin=0, stylesheets=[BAR])
+        return pn.Row(self.run, self.cancel, self.status, **WIDE, stylesheets=[BAR])
 
     def open_setting(self, path: str) -> None:
         """Open the topic of a setting."""
-        index = list(self.topics).index(path.split(".")[0])
+        index = list(self.topics).index(topic_of(path))
         if path not in AT_HAND and index not in self.accordion.active:
             self.accordion.active = [*self.accordion.active, index]
 
@@ -349,7 +349,7 @@ class Controls:
         told = f"{len(changed)} changed: {', '.join(map(setting_name, changed))}" if changed else preset_line(self.store.preset)
         self.preset.helper_text = told
         self.reset.disabled = not changed
-        count = Counter(path.split(".")[0] for path in changed)
+        count = Counter(map(topic_of, changed))
         titles = {name: title + (f" · {count[name]} changed" if count[name] else "") for name, title in self.topics.items()}
         if titles != self.titles:
             self.titles = titles
@@ -370,9 +370,7 @@ class Controls:
         self._changed_part = part
 
     def _refresh_run(self, *_: object) -> None:
-        run = self.store.run
-        running = run.state == RUNNING
-        self.cancel.disabled = not running
+        self.cancel.disabled = self.store.run.state != RUNNING
         progress, text, note = status_of(self.store)
         self.status.param.update(progress=progress, text=text, note=note)
 
@@ -385,4 +383,4 @@ def topic_of(path: str) -> str:
 def _names() -> dict[str, str]:
     """Topic -> title, in the order of the drawer."""
     settings = {name: str(p.label) for name, p in Scenario.settings().items()}
-    return {name: settings[name] for name in (*TOPICS, *(n for n in settings if n not in TOPICS))}
+    return {name: settings[name] for name in dict.fromkeys((*TOPICS, *settings))}

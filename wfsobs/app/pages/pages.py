@@ -97,7 +97,7 @@ class Pages(param.Parameterized):
         self.switch: Final = pmui.RadioButtonGroup.from_param(
             self.param.current, options=known, size="small", margin=0, css_classes=["tabs"], sx=TABS, stylesheets=[HEARD]
         )
-        self.view: Final = pn.Column(*self.rooms.values(), sizing_mode="stretch_width", margin=0)
+        self.view: Final = pn.Column(*self.rooms.values(), **WIDE)
         self.param.watch(self._turn, "current")
 
     @property

@@ -19,7 +19,7 @@ from wfsobs.app.idle_work import Budgets, SeedRuns
 from wfsobs.app.jobs import DONE, RUNNING
 from wfsobs.app.render import NOTHING, Row, change, hundredths, macro, missing, number, render, table, with_decimals_of
 from wfsobs.app.service import IDLE
-from wfsobs.app.style import TERM_COLOURS, HtmlComponent, follow_html, look, observers_of, script, sheets, swatch, watch
+from wfsobs.app.style import TERM_COLOURS, WIDE, HtmlComponent, follow_html, look, observers_of, script, sheets, swatch, watch
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.budget import TERMS as BUDGET_TERMS
 from wfsobs.evaluation.evidence import Evidence, gather_evidence, marks_of, rank_observers
@@ -397,7 +397,7 @@ class Cards(HtmlComponent):
         self.kind = kind
         self.on_main: Callable[[], None] = lambda: None
         self.on_all: Callable[[], None] = lambda: None
-        super().__init__(self._take, sizing_mode="stretch_width", margin=0)
+        super().__init__(self._take, **WIDE)
         self.show([])
 
     def show(
