@@ -20,7 +20,8 @@ from wfsobs.execution import run_observer
 from wfsobs.live.checks import observers_on
 from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.kalman.coupled import INDEPENDENT, CoupledEstimator, CoupledModel
+from wfsobs.observers.kalman.coupled import INDEPENDENT, flow_model
+from wfsobs.observers.kalman.joint import AsterismModel, JointEstimator
 from wfsobs.pipeline import observe, run
 from wfsobs.prior import Flow, Lines
 from wfsobs.priors_from.scenario import arguments, has_prior, prior_of, usual_observers
@@ -33,12 +34,12 @@ LINE = {"frequency": 31.0, "damping": 0.02, "rms": [0.05, 0.04]}
 SHAKEN = FLOW.replace({"vibration.source": "peaks", "vibration.peaks": [LINE], "vibration.cutoff": 60.0})
 
 
-def model_of(scenario: Scenario) -> CoupledModel:
-    return CoupledModel(prior_of(scenario, None, (Lines, Flow)), scenario.multipeak)
+def model_of(scenario: Scenario) -> AsterismModel:
+    return flow_model(prior_of(scenario, None, (Lines, Flow)), scenario.multipeak)
 
 
 def stated(scenario: Scenario, target: str = "turbulence") -> np.ndarray:
-    return model_of(scenario).plan(0.0, target)[1]
+    return model_of(scenario).plan(0.0, target)[1][-1]
 
 
 @pytest.mark.slow
@@ -152,7 +153,7 @@ def test_predictions_go_on_from_the_estimate() -> None:
         ("turbulence", np.sqrt(prior_of(SHAKEN, None, (Flow,)).flow.own.sum(axis=1))[:2]),
         ("vibration", [0.05, 0.04]),
     ):
-        sd = np.array([model.plan(frames, target)[1][:2] for frames in (0.0, 0.5, 1.0, 1.5, 2.0, 1e5)])
+        sd = np.array([model.plan(frames, target)[1][-1, :2] for frames in (0.0, 0.5, 1.0, 1.5, 2.0, 1e5)])
         assert (np.diff(sd, axis=0) > 0).all()
         np.testing.assert_allclose(sd[-1], truth, rtol=0.02)
 
@@ -162,7 +163,7 @@ def test_a_mode_is_told_by_the_others() -> None:
     observer = wfsobs.design("kf-coupled", FLOW)
     observer.update(np.array([0.1, 0.0, 0.0, 0.0, 0.0]))
     answer = np.abs(observer.predict(1, "turbulence")[0])
-    assert isinstance(observer.estimator, CoupledEstimator)
+    assert isinstance(observer.estimator, JointEstimator)
     assert (answer[[0, 2, 4]] > 1e-4).all() and (answer[[1, 3]] < 1e-9).all()
 
 

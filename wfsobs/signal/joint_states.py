@@ -99,26 +99,6 @@ def running_means(spans: Sequence[float], turns: Sequence[float] = (0.0,)) -> St
     return StateFilter(block_diag(*blocks), np.array(into))
 
 
-class OwnShare(NamedTuple):
-    """What the disturbance of one mode alone, and noise, bring into the states: covariances [um^2].
-
-    states      : of the states, (n, n)
-    disturbance : of the disturbance's state and the filter's, (n_disturbance, n)
-    """
-
-    states: Array
-    disturbance: Array
-
-
-def own_share(one: StateFilter, model: DisturbanceModel, gain: float, noise: float) -> OwnShare:
-    """Return the share of a disturbance that is measured with a gain, and of white noise [um]."""
-    n, m = len(model.A), len(one.F)
-    into = np.outer(one.G, gain * model.C)
-    F = np.block([[model.A, np.zeros((n, m))], [into, one.F]])  # of the disturbance at k + 1, the filter at k
-    S = lyapunov(F, block_diag(model.Q, noise**2 * np.outer(one.G, one.G)))
-    return OwnShare(S[n:, n:], S[:n, n:] @ one.F.T + S[:n, :n] @ into.T)
-
-
 def shared_covariance(powers: Complex, responses: Sequence[Complex]) -> Array:
     """Return the covariance of the states of all filters, of inputs of these cross powers (m, m, n_nodes)."""
     starts = np.cumsum([0, *(len(one) for one in responses)])
