@@ -19,7 +19,7 @@ import numpy as np
 from wfsobs.observers.base import TARGETS, Look, Observer
 from wfsobs.observers.kalman.joint import MEANS, AsterismModel, JointEstimator
 from wfsobs.observers.kalman.single import PEAKS, TUNABLE_PEAKS, MultiPeak, vibration_used
-from wfsobs.prior import Asterism, Flow, Lines, Prior
+from wfsobs.prior import Flow, Lines, Prior
 from wfsobs.record import Sampling
 from wfsobs.signal.joint_states import StateFilter
 
@@ -29,22 +29,9 @@ INDEPENDENT = "the modes tell nothing of one another: `kf-multi` estimates each 
 
 def flow_model(prior: Prior, settings: MultiPeak, means: StateFilter = MEANS) -> AsterismModel:
     """Return the weights of the LGS in all modes; means : of each measurement. Raises ValueError where the prior has no flow."""
-    flow = prior.flow
-    if flow is None:
+    if prior.flow is None:
         raise ValueError(INDEPENDENT)
-    n_modes = len(flow.own)
-    star = Asterism(
-        omega=flow.omega,
-        own=flow.own,
-        measurement=flow.measurement[None, :, None],
-        cross=flow.cross[:, None],
-        basis=np.eye(1),
-        noise=np.array([one.noise for one in prior.lines]),
-        ngs_noise=np.zeros(n_modes),
-        combination=np.eye(n_modes)[:, None],
-        line_gain=flow.line_gain,
-        ratio=1,
-    )
+    star = replace(prior.flow, noise=np.array([one.noise for one in prior.lines]))
     return AsterismModel(replace(prior, asterism=star), settings, 1, means)
 
 

@@ -520,9 +520,9 @@ def _run_at_once(model: AsterismModel, each: Array, frames: Array | None, watch:
             out[:n] += _outputs(one, y[:n], own[n:])
             out[n:] += _outputs(one, y, own[:n], since=n)
             at += len(one.first)
-    for mode, late in enumerate(model.slow) if frames is not None else ():
+    for late, y in zip(model.slow, [] if frames is None else frames.T, strict=False):
         own = weights[:n, :, at : at + len(late.first)].reshape(1, n * 2 * m, -1)  # of all steps until the next frame
-        out[n:] += _outputs(late, frames[:, mode], own).reshape(-1, 2 * m)[: max(steps - n, 0)]
+        out[n:] += _outputs(late, y, own).reshape(-1, 2 * m)[: max(steps - n, 0)]
         at += len(late.first)
     phase = np.where(np.arange(steps) < n, n, np.arange(steps) % n)
     sd = {name: spread[phase] for name, (_, spread) in plans.items()}
