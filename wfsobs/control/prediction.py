@@ -9,18 +9,13 @@ from __future__ import annotations
 
 from typing import Any, TypeVar
 
-import numpy as np
-
-from wfsobs.control.mirror import Mirror, Plant
+from wfsobs.control.mirror import Plant
 from wfsobs.observers.base import VIBRATION
-from wfsobs.observers.gpr.inputs import Windows, scale_of, scales_of, training_signals, window_signals
-from wfsobs.observers.gpr.offline import OfflineEstimator, OfflineGpr, TrainedGpr, train, training_targets
-from wfsobs.observers.gpr.online import OnlineEstimator, OnlineGpr, kernel_of
-from wfsobs.observers.per_mode import over_modes
-from wfsobs.observers.step import run_frames
+from wfsobs.observers.gpr.offline import OfflineEstimator, OfflineGpr, trained_estimator
+from wfsobs.observers.gpr.online import OnlineEstimator, OnlineGpr, learning_estimator
 from wfsobs.prior import Prior
-from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Measurements, RecordError, Sampling
+from wfsobs.progress import Watch
+from wfsobs.record import Measurements, Sampling
 from wfsobs.typing import Array
 
 G = TypeVar("G", OfflineGpr, OnlineGpr)
@@ -31,63 +26,24 @@ def gpr_offline_ahead(measurements: Measurements, prior: Prior, plant: Plant, se
 
     The GPR is trained once on the training record, with targets as many steps later.
     """
-    g, training = of_z(settings.gpr_offline), prior.training
-    if training is None:
-        raise RecordError("the record has no training data")
-    assert prior.bands is not None
-    if measurements.n_steps < g.depth:
-        raise RecordError(f"the record has {measurements.n_steps} steps; depth needs {g.depth}")
-    dt, delay = measurements.dt, measurements.delay
-
-    def one(mode: int, watch: Watch) -> Array:
-        model = _train_ahead(prior, g, mode, plant, dt, delay, watch)
-        scale = scale_of(g, training, delay, mode)
-        return model.predict(window_signals(g, measurements.y_lgs, measurements.u, measurements.z, mode, dt, scale), watch)
-
-    return over_modes(measurements.n_modes, one, watch)
-
-
-def _train_ahead(prior: Prior, g: OfflineGpr, mode: int, plant: Plant, dt: float, delay: int, watch: Watch = QUIET) -> TrainedGpr:
-    """Train on the vibration while u[k] acts, in one mode of the training record. Raises RecordError."""
-    training = prior.training
-    if training is None:
-        raise RecordError("the record has no training data")
-    assert prior.bands is not None
-    steps, ahead = training.y_lgs.shape[0], plant.mirror.taps.size - 2  # by which the targets end earlier
-    if steps < (needed := g.depth + g.training_size + ahead):
-        raise RecordError(f"the training data has {steps} steps, depth + training size + {ahead} need {needed}")
-    targets = _ahead(training_targets(training, prior.bands, dt, delay)[:, mode], plant.mirror)
-    return train(training_signals(g, training, mode, dt, delay), targets, g.depth, g.training_size, kernel_of(g), watch)
+    estimator = step_gpr_offline_ahead(prior, plant, settings, measurements.sampling)
+    return estimator.run(measurements, watch, with_sd=False)[VIBRATION]
 
 
 def step_gpr_offline_ahead(prior: Prior, plant: Plant, settings: Any, sampling: Sampling) -> OfflineEstimator:
     """Return `gpr_offline_ahead`, one frame at a time."""
-    g = of_z(settings.gpr_offline)
-    models = [_train_ahead(prior, g, mode, plant, sampling.dt, sampling.delay) for mode in range(sampling.n_modes)]
-    return OfflineEstimator(Windows(g, sampling, g.depth, scales_of(g, prior.training, sampling)), models, None)
+    return trained_estimator(prior, of_z(settings.gpr_offline), sampling, plant.mirror.taps[1:], None)
 
 
 def step_gpr_online_ahead(prior: Prior, plant: Plant, settings: Any, sampling: Sampling) -> OnlineEstimator:
     """Return `gpr_online_ahead`, one frame at a time."""
-    g = of_z(settings.gpr_online)
-    assert prior.bands is not None
-    windows = Windows(g, sampling, 1, scales_of(g, prior.training, sampling))
-    return OnlineEstimator(windows, prior.bands, sampling, g.depth, g.training_size, kernel_of(g), plant.mirror.taps[1:])
+    return learning_estimator(prior, of_z(settings.gpr_online), sampling, plant.mirror.taps[1:])
 
 
 def of_z(settings: G) -> G:
     """Return the settings of a GPR with windows of z."""
     out = settings.copy()
     out.inputs = "z"
-    return out
-
-
-def _ahead(x: Array, mirror: Mirror) -> Array:
-    """Return the mean of x (n, ...) while u[k] acts; NaN at the end, where it is not known."""
-    out = np.zeros_like(x)
-    for steps, tap in enumerate(mirror.taps[1:]):
-        if tap:
-            out += tap * np.concatenate([x[steps:], np.full((steps, *x.shape[1:]), np.nan)])
     return out
 
 
@@ -98,4 +54,4 @@ def gpr_online_ahead(measurements: Measurements, prior: Prior, plant: Plant, set
     up to k - mirror.taps.size + 1.
     """
     estimator = step_gpr_online_ahead(prior, plant, settings, measurements.sampling)
-    return run_frames(estimator, (VIBRATION,), measurements, watch)[VIBRATION]
+    return estimator.run(measurements, watch)[VIBRATION]
