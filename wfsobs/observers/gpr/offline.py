@@ -25,7 +25,7 @@ from numpy.lib.stride_tricks import as_strided
 from wfsobs.observers.base import VIBRATION, Look, Observer, Tunable
 from wfsobs.observers.baselines import open_loop_reference
 from wfsobs.observers.estimates import Estimates
-from wfsobs.observers.gpr.inputs import Gpr, Windows, scales_of, training_signals, tunable
+from wfsobs.observers.gpr.inputs import Gpr, Windows, over_modes, scales_of, training_signals, tunable, turns
 from wfsobs.observers.gpr.kernels import (
     Points,
     SquaredExponential,
@@ -36,7 +36,6 @@ from wfsobs.observers.gpr.kernels import (
     squared_norms,
 )
 from wfsobs.observers.gpr.online import kernel_of
-from wfsobs.observers.per_mode import over_modes, turns
 from wfsobs.observers.step import HeldEstimate, whole_frames
 from wfsobs.prior import Bands, OfflineBands, Prior
 from wfsobs.progress import QUIET, Watch

@@ -14,10 +14,9 @@ import numpy as np
 from wfsobs.observers.base import VIBRATION, Look, Observer, Tunable
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.estimates import Estimates
-from wfsobs.observers.gpr.inputs import Gpr, Windows, scales_of, tunable
+from wfsobs.observers.gpr.inputs import Gpr, Windows, over_modes, scales_of, tunable, turns
 from wfsobs.observers.gpr.kernels import SquaredExponential, band, check_condition, square_from_band
 from wfsobs.observers.gpr.sliding_regression import LateRegression, SlidingRegression, finish, run_lengths, slide
-from wfsobs.observers.per_mode import over_modes, turns
 from wfsobs.observers.step import HeldEstimate, StepError, run_frames, whole_frames
 from wfsobs.observers.stepping import FilterBank, Saved
 from wfsobs.prior import Bands, OnlineBands, Part, Prior, Training

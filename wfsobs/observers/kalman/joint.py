@@ -4,8 +4,7 @@
 something that their mean does not. The prior `Asterism` has the spectra between the target, all modes in every beam and the NGS.
 The LGS are taken as their mean and orthonormal differences, whose noise is independent; vibration is in the mean and in the NGS
 alone. The states of the independent filters of `kf-multi` on the mean, running means of every measurement, and running means of
-the NGS frames are put together by the weights of least variance (`signal.joint_states`); they repeat with
-the NGS frames.
+the NGS frames are put together by the weights of least variance (`signal.joint_states`); they repeat with the frames.
 
 `multirate-coupled` has the mean of the LGS, or what `sensors.lgs_combination` makes of them, in the place of a single star: for
 LGS that see the same, and where a record or a loop has them together alone. Where modes tell nothing of one another there is
@@ -16,9 +15,8 @@ are made when a set of LGS first occurs. The states of one that is out go on wit
 so that it can come back at any time. One of which a mode is missing is out. While an NGS frame is lost the weights are those of
 the frames before it; when the next comes, or after several, the filter of the frames takes for it what all states told of it.
 
-The states of the asterism's filter are those of the independent filter of a mode and running means, of the mean of the LGS in
-all modes, then of each difference; and those of the filter and the means of the NGS frames, mode after mode. Where LGS are out,
-the weights are of the states of the others alone (`signal.joint_states`).
+The states are those of the independent filter of a mode and running means, of the mean of the LGS in all modes, then of each
+difference; and those of the filter and the means of the NGS frames, mode after mode.
 """
 
 from __future__ import annotations
@@ -36,12 +34,12 @@ from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimates, by_name
 from wfsobs.observers.kalman.mode_filter import ModeFilter
 from wfsobs.observers.kalman.single import NGS, PEAKS, TUNABLE_PEAKS, MultiPeak, independent_filters, steady_mode, vibration_used
 from wfsobs.observers.kalman.step import carry_state, matrix_power
-from wfsobs.observers.step import PromptEstimator, StepError, run_frames
+from wfsobs.observers.step import Estimator, StepError, run_frames
 from wfsobs.prior import Asterism, FlowOfBoth, Lines, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.filter_covariance import lyapunov
+from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.joint_states import (
     Present,
     PresentInputs,
@@ -55,6 +53,7 @@ from wfsobs.signal.joint_states import (
     shared_covariance,
 )
 from wfsobs.signal.periodic import PeriodicFilter
+from wfsobs.signal.riccati import lyapunov
 from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
@@ -281,14 +280,14 @@ class AsterismModel:
         return [np.hstack([*fast, *slow]) for slow in late]
 
     def _of_vibration(self, frames: float) -> list[tuple[Array, Array]]:
-        found = []
+        targets = [model.outputs[VIBRATION] for model in self._peaks]
+        rows = [now @ matrix_power(model.A, frames) for now, model in zip(targets, self._peaks, strict=True)]
+        variances, found = np.array([now @ now for now in targets]), []  # the states have unit variance
         for phase in range(self.ratio):
-            out, variances = np.zeros((len(self._peaks), self.n_states)), []
-            for i, (model, cross) in enumerate(zip(self._peaks, self._of_lines, strict=True)):
-                now = model.outputs[VIBRATION]
-                out[i, self._places[i]] = now @ matrix_power(model.A, frames) @ cross[phase]
-                variances.append(now @ now)  # the states have unit variance
-            found.append((out, np.array(variances)))
+            out = np.zeros((len(rows), self.n_states))
+            for i, (row, cross) in enumerate(zip(rows, self._of_lines, strict=True)):
+                out[i, self._places[i]] = row @ cross[phase]
+            found.append((out, variances))
         return found
 
 
@@ -312,13 +311,12 @@ def line_models(prior: Prior, settings: MultiPeak) -> list[DisturbanceModel]:
 
 def frame_filters(prior: Prior, settings: MultiPeak, asterism: Asterism) -> list[ModeFilter]:
     """Return a filter of the NGS frames of each mode, with its lines, as if frames were samples."""
-    found = []
-    for one, noise in zip(prior.lines, asterism.ngs_noise, strict=True):
-        step = asterism.ratio * one.dt
-        peaks = [peak.at(step) for peak in one.vibration(settings.line_width)]
-        turbulence = [replace(process, dt=step) for process in one.turbulence]
-        found.append(steady_mode(disturbance_model(turbulence, peaks), float(noise)))
-    return found
+
+    def slow(processes: Sequence[Ar2 | Ar3]) -> list[Ar2 | Ar3]:
+        return [replace(process, dt=asterism.ratio * process.dt) for process in processes]
+
+    models = [disturbance_model(slow(one.turbulence), slow(one.vibration(settings.line_width))) for one in prior.lines]
+    return [steady_mode(model, float(noise)) for model, noise in zip(models, asterism.ngs_noise, strict=True)]
 
 
 def begin_with_means(one: ModeFilter, means: StateFilter) -> Beginning:
@@ -374,7 +372,7 @@ class _Bank:
         return out
 
 
-class JointEstimator(PromptEstimator):
+class JointEstimator(Estimator):
     """The filter one frame at a time.
 
     Attributes
