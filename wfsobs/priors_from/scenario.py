@@ -346,13 +346,17 @@ def prior_of(
     dt = record.dt if record else scenario.dt
     model, bands = _most_of(Model, asked), _most_of(Bands, asked)
     beams = [kind for kind in (Asterism, FlowOfBoth) if kind in asked]
+
+    def each(part: Part, make: Callable[[Scenario, int, float], Any]) -> tuple[Any, ...]:
+        return tuple(make(scenario, mode, dt) for mode in modes) if part in asked else ()
+
     return Prior(
         model=tuple(model_of(scenario, mode, dt, model) for mode in modes) if model else (),
         noise=tuple(Noise(*measurement_noise(scenario, mode)) for mode in modes) if Noise in asked else (),
-        lgs_error=tuple(lgs_error_of(scenario, mode, dt) for mode in modes) if LgsError in asked else (),
-        lines=tuple(lines_of(scenario, mode, dt) for mode in modes) if Lines in asked else (),
-        stars=tuple(stars_of(scenario, mode, dt) for mode in modes) if LgsStars in asked else (),
-        beams=tuple(beams_of(scenario, mode, dt) for mode in modes) if Beams in asked else (),
+        lgs_error=each(LgsError, lgs_error_of),
+        lines=each(Lines, lines_of),
+        stars=each(LgsStars, stars_of),
+        beams=each(Beams, beams_of),
         flow=turbulence_together(Flow, scenario, len(modes), dt) if Flow in asked else None,
         asterism=turbulence_together(beams[0], scenario, len(modes), dt) if beams else None,
         bands=bands_of(scenario, bands) if bands else None,
