@@ -176,6 +176,19 @@ def test_a_new_design_takes_over() -> None:
     np.testing.assert_allclose(new.predict(0, "turbulence")[0], old.predict(0, "turbulence")[0], atol=0.02)
 
 
+def test_a_new_design_with_another_line_takes_over() -> None:
+    """The turbulence is where it was, and so is the sum of the lines."""
+    weak = {"frequency": 47.0, "damping": 0.02, "rms": [0.001, 0.001]}
+    old, new = wfsobs.design("kf-coupled", SHAKEN), wfsobs.design("kf-coupled", SHAKEN.replace({"vibration.peaks": [LINE, weak]}))
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        old.update(0.1 * rng.standard_normal(5))
+    new.take_over(old)
+    for target in ("turbulence", "vibration"):
+        before = old.predict(0, target)[0]
+        np.testing.assert_allclose(new.predict(0, target)[0], before, atol=0.05 * np.abs(before).max())
+
+
 def test_figures_of_single_modes_leave_it_out() -> None:
     assert not is_predicted(OBSERVERS["kf-coupled"], "turbulence")
     with pytest.raises(ValueError, match="every mode by itself"):
