@@ -25,7 +25,8 @@ def test_where_the_truth_is_the_model_it_is_the_covariance_and_the_bound(name: s
     ratio = MATCHED.sensors.exposure_ratio
     found = exact_errors(OBSERVERS[name], MATCHED)
     for mode, errors in enumerate(found):
-        steps, rows, *_ = optimal_model(MATCHED.multirate, prior_of(MATCHED, None, (Model, LgsError)), mode, ratio)
+        model = optimal_model(MATCHED.multirate, prior_of(MATCHED, None, (Model, LgsError)), mode, ratio)
+        steps, rows = model.steps, model.filter().rows(("turbulence", "vibration"))
         states = periodic_steady_state(steps)
         for target, row in (("turbulence", rows[0]), ("vibration", rows[1]), ("total", rows.sum(axis=0))):
             # The frame is at the last step of the cycle, so that step j is j steps after one.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.joint_states import LeastVariance, StateFilter, own_share, shared_covariance
+from wfsobs.signal.joint_states import LeastVariance, StateFilter, frame_shares, shared_covariance
 from wfsobs.signal.statespace import disturbance_model
 
 RNG = np.random.default_rng(3)
@@ -35,7 +35,7 @@ def test_the_share_of_a_mode_is_the_sum_over_its_past() -> None:
     model, taps = disturbance_model((), [line]), pulse_response(one, n)
     r = line.autocovariance(2 * n)
     lag = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
-    found = own_share(one, model, gain, noise)
+    (found,) = frame_shares(one, StateFilter(np.zeros((0, 0)), np.zeros(0)), 1, model, noise, 0.0, gain)
     np.testing.assert_allclose(found.states, taps @ (gain**2 * r[lag] + noise**2 * np.eye(n)) @ taps.T, rtol=1e-9, atol=1e-15)
     now = model.outputs["vibration"] @ found.disturbance  # z[k] is of step k - 1
     np.testing.assert_allclose(now, gain * taps @ r[1 : n + 1], rtol=1e-9, atol=1e-15)

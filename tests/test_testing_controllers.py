@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -40,10 +39,15 @@ def knows_the_scenario(scenario: Scenario, prior: Prior, mode: int, plant: Plant
     return half(prior, mode, plant, settings)
 
 
-def backwards(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
+class BackwardLaw(Law):
     """A law whose filter runs from the end of the record."""
-    law = half(prior, mode, plant, settings)
-    return replace(law, run=lambda z: law.run(z[::-1])[::-1])
+
+    def run(self, z: np.ndarray) -> np.ndarray:
+        return super().run(z[::-1])[::-1]
+
+
+def backwards(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
+    return BackwardLaw(**vars(half(prior, mode, plant, settings)))
 
 
 def next_measurement(measured: Measurements, *_: Any) -> np.ndarray:

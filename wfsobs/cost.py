@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from wfsobs.atmosphere.von_karman import FIELD
 from wfsobs.dependence import observers_reached
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.per_mode import AT_ONCE
+from wfsobs.observers.gpr.inputs import AT_ONCE
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import TRAINING_MARGIN
 

@@ -20,8 +20,8 @@ from wfsobs.record import Record, RecordError, delay_signal
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
-from wfsobs.signal.filter_covariance import RiccatiError
 from wfsobs.signal.periodic import PeriodicFilter
+from wfsobs.signal.riccati import RiccatiError
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.spectral.model import BACKGROUND_WORTH, Spectrum, densities
 from wfsobs.spectral.periodogram import periodogram_frequencies

@@ -24,8 +24,8 @@ from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.filter_covariance import lyapunov
 from wfsobs.signal.joint_states import PresentInputs, StateFilter, frame_shares
+from wfsobs.signal.riccati import lyapunov
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.simulation.flow_spectra import star_basis
 from wfsobs.simulation.guide_stars import lgs_weights

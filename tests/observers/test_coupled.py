@@ -20,7 +20,8 @@ from wfsobs.execution import run_observer
 from wfsobs.live.checks import observers_on
 from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.kalman.coupled import INDEPENDENT, CoupledEstimator, CoupledModel
+from wfsobs.observers.kalman.coupled import INDEPENDENT, flow_model
+from wfsobs.observers.kalman.joint import AsterismModel, JointEstimator
 from wfsobs.pipeline import observe, run
 from wfsobs.prior import Flow, Lines
 from wfsobs.priors_from.scenario import arguments, has_prior, prior_of, usual_observers
@@ -33,12 +34,12 @@ LINE = {"frequency": 31.0, "damping": 0.02, "rms": [0.05, 0.04]}
 SHAKEN = FLOW.replace({"vibration.source": "peaks", "vibration.peaks": [LINE], "vibration.cutoff": 60.0})
 
 
-def model_of(scenario: Scenario) -> CoupledModel:
-    return CoupledModel(prior_of(scenario, None, (Lines, Flow)), scenario.multipeak)
+def model_of(scenario: Scenario) -> AsterismModel:
+    return flow_model(prior_of(scenario, None, (Lines, Flow)), scenario.multipeak)
 
 
 def stated(scenario: Scenario, target: str = "turbulence") -> np.ndarray:
-    return model_of(scenario).plan(0.0, target)[1]
+    return model_of(scenario).plan(0.0, target)[1][-1]
 
 
 @pytest.mark.slow
@@ -152,7 +153,7 @@ def test_predictions_go_on_from_the_estimate() -> None:
         ("turbulence", np.sqrt(prior_of(SHAKEN, None, (Flow,)).flow.own.sum(axis=1))[:2]),
         ("vibration", [0.05, 0.04]),
     ):
-        sd = np.array([model.plan(frames, target)[1][:2] for frames in (0.0, 0.5, 1.0, 1.5, 2.0, 1e5)])
+        sd = np.array([model.plan(frames, target)[1][-1, :2] for frames in (0.0, 0.5, 1.0, 1.5, 2.0, 1e5)])
         assert (np.diff(sd, axis=0) > 0).all()
         np.testing.assert_allclose(sd[-1], truth, rtol=0.02)
 
@@ -162,7 +163,7 @@ def test_a_mode_is_told_by_the_others() -> None:
     observer = wfsobs.design("kf-coupled", FLOW)
     observer.update(np.array([0.1, 0.0, 0.0, 0.0, 0.0]))
     answer = np.abs(observer.predict(1, "turbulence")[0])
-    assert isinstance(observer.estimator, CoupledEstimator)
+    assert isinstance(observer.estimator, JointEstimator)
     assert (answer[[0, 2, 4]] > 1e-4).all() and (answer[[1, 3]] < 1e-9).all()
 
 
@@ -173,6 +174,19 @@ def test_a_new_design_takes_over() -> None:
         old.update(rng.standard_normal(5))
     new.take_over(old)
     np.testing.assert_allclose(new.predict(0, "turbulence")[0], old.predict(0, "turbulence")[0], atol=0.02)
+
+
+def test_a_new_design_with_another_line_takes_over() -> None:
+    """The turbulence is where it was, and so is the sum of the lines."""
+    weak = {"frequency": 47.0, "damping": 0.02, "rms": [0.001, 0.001]}
+    old, new = wfsobs.design("kf-coupled", SHAKEN), wfsobs.design("kf-coupled", SHAKEN.replace({"vibration.peaks": [LINE, weak]}))
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        old.update(0.1 * rng.standard_normal(5))
+    new.take_over(old)
+    for target in ("turbulence", "vibration"):
+        before = old.predict(0, target)[0]
+        np.testing.assert_allclose(new.predict(0, target)[0], before, atol=0.05 * np.abs(before).max())
 
 
 def test_figures_of_single_modes_leave_it_out() -> None:

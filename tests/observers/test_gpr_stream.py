@@ -8,7 +8,7 @@ from wfsobs.execution import run_observer
 from wfsobs.observers.base import VIBRATION
 from wfsobs.observers.gpr import sliding_regression
 from wfsobs.observers.gpr.kernels import ConditionError, SquaredExponential
-from wfsobs.observers.gpr.online import GPR_ONLINE, predict_sliding, step_gpr_online
+from wfsobs.observers.gpr.online import GPR_ONLINE, gpr_online, predict_sliding
 from wfsobs.observers.gpr.sliding_regression import ENOUGH, SlidingRegression
 from wfsobs.observers.step import run_frames
 from wfsobs.priors_from.scenario import prior_of
@@ -76,7 +76,7 @@ def test_the_stream_gives_the_numbers_of_the_record_version(inputs, kind, enough
     )
     record = simulate(scenario)
     expected = run_observer("gpr-online", record, scenario)["vibration"][:, 1]
-    estimator = step_gpr_online(
+    estimator = gpr_online(
         prior_of(scenario, record, GPR_ONLINE.parts(scenario.gpr_online)), scenario.gpr_online, record.sampling, 0.0
     )
     got = run_frames(estimator, (VIBRATION,), record.measurements(), QUIET)[VIBRATION][:, 1]
@@ -91,7 +91,7 @@ def test_learning_waits_for_the_next_frame_and_z_windows_need_no_command():
     scenario = paper().replace(settings)
     record = simulate(scenario.replace({"run.duration": 1.2}))
     prior = prior_of(scenario, record, GPR_ONLINE.parts(scenario.gpr_online))
-    settled, left = (step_gpr_online(prior, scenario.gpr_online, record.sampling, 0.0) for _ in range(2))
+    settled, left = (gpr_online(prior, scenario.gpr_online, record.sampling, 0.0) for _ in range(2))
     record_version = run_observer("gpr-online", record, scenario)[VIBRATION]
     for z, expected in zip(record.z[:200], record_version[:200], strict=True):
         for estimator in (settled, left):

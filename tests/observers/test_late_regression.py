@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from wfsobs.control.controllers import gpr_online_ahead, of_z
 from wfsobs.control.mirror import Mirror, Plant
-from wfsobs.control.prediction import gpr_online_ahead, of_z
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.gpr.inputs import scale_of, window_signals
 from wfsobs.observers.gpr.kernels import SquaredExponential

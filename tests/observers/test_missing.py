@@ -58,7 +58,7 @@ def model_of(name: str, scenario: Scenario, record: Record, mode: int) -> Model:
         found = every_peak_model(scenario.multirate, scenario.multipeak, prior, mode, RATIO)
     else:
         found = optimal_model(scenario.multirate, prior, mode, RATIO)
-    return Model(found.steps, found.rows)
+    return Model(found.steps, found.filter().rows(TARGETS))
 
 
 def textbook(model: Model, z: Array, at: Sequence[Model] | None = None) -> tuple[Array, Array]:

@@ -15,8 +15,7 @@ from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.filter_covariance import RiccatiError
-from wfsobs.signal.riccati import steady_state
+from wfsobs.signal.riccati import RiccatiError, steady_state
 from wfsobs.signal.statespace import disturbance_model, paper_matrices
 from wfsobs.simulation.loop import simulate
 

@@ -153,7 +153,8 @@ def test_over_a_record_it_matches_its_textbook_recursion():
     record = simulate(scenario)
     got = run_observer("multirate-optimal", record, scenario)
     for mode in range(2):
-        cycle, rows, *_ = optimal_model(scenario.multirate, prior_of(scenario, record, PARTS), mode, 5)
+        found = optimal_model(scenario.multirate, prior_of(scenario, record, PARTS), mode, 5)
+        cycle, rows = found.steps, found.filter().rows(("turbulence", "vibration"))
         states = periodic_steady_state(cycle)
         x, expected = np.zeros(len(cycle[0][0])), []
         for k in range(record.n_steps):
@@ -178,7 +179,8 @@ def test_the_error_state_is_what_makes_it_useful_with_a_slow_lgs_error():
         record = simulate(scenario)
         error = (run_observer("multirate-optimal", record, scenario)["turbulence"] - record.turbulence)[1000:]
         realised[known] = np.sqrt(np.mean(error**2))
-        cycle, rows, *_ = optimal_model(scenario.multirate, prior_of(scenario, record, PARTS), 0, 5)
+        found = optimal_model(scenario.multirate, prior_of(scenario, record, PARTS), 0, 5)
+        cycle, rows = found.steps, found.filter().rows(("turbulence", "vibration"))
         predicted[known] = np.sqrt(np.mean([(rows @ s.posterior @ rows.T)[0, 0] for s in periodic_steady_state(cycle)]))
     # A minute of a process with a correlation time of 0.1 s: the rms is good to about 5 %.
     assert realised[True] == pytest.approx(predicted[True], rel=0.1)

@@ -14,9 +14,8 @@ import pytest
 import wfsobs
 from tests.records import ON_PAPER, short, third_of_pairs
 from wfsobs import PRESETS
-from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.control.controllers import CONTROLLERS, gpr_offline_ahead, gpr_online_ahead
 from wfsobs.control.mirror import Mirror, Plant
-from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
 from wfsobs.observers.gpr.offline import training_targets

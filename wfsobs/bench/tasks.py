@@ -41,7 +41,7 @@ from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.gpr.inputs import window_signals
 from wfsobs.observers.gpr.kernels import SquaredExponential
 from wfsobs.observers.gpr.offline import train, training_targets
-from wfsobs.observers.gpr.online import gpr_online, kernel_of, step_gpr_online
+from wfsobs.observers.gpr.online import gpr_online, kernel_of
 from wfsobs.observers.kalman.adaptive import adapt
 from wfsobs.observers.kalman.multirate import multirate_filter, multirate_noise
 from wfsobs.observers.kalman.single import steady_filter
@@ -313,8 +313,9 @@ def _online_record(record: Record, scenario: Scenario, sizes: Sizes, count: int,
     ours = []
     for variant, n_modes in ((OURS, 1), ("ours-two-modes", 2)) if both else ((OURS, 1),):
         part = cut_windows(record, record.n_steps, n_modes)
-        given = part.measurements(), prior_of(scenario, part, (Bands,)), g
-        seconds, result = measure_time(lambda given=given: gpr_online(*given, QUIET)[VIBRATION], sizes.repeats)
+        estimator, given = gpr_online(prior_of(scenario, part, (Bands,)), g, part.sampling, 0.0), part.measurements()
+        run = partial(estimator.run, given, QUIET)
+        seconds, result = measure_time(lambda run=run: run()[VIBRATION], sizes.repeats)
         ours.append((variant, seconds, result[:, 0]))
     problem = online_problem(record, scenario, count)  # only now: much memory held slows down the allocation of more
     std = float(np.nanstd(ours[0][2]))
@@ -349,7 +350,7 @@ def online_stream(sizes: Sizes) -> Iterator[Row]:
 def _stream(scenario: Scenario, record: Record) -> tuple[Array, Array]:
     """Estimates (n_steps,), and for every step that has one: sample to estimate, whole step [s]."""
     prior, sampling = prior_of(scenario, record, (Bands,)), record.sampling._replace(n_modes=1)
-    estimator = step_gpr_online(prior, scenario.gpr_online, sampling, 0.0)
+    estimator = gpr_online(prior, scenario.gpr_online, sampling, 0.0)
     values, times = np.empty(record.n_steps), np.empty((record.n_steps, 2))
     for k, (z, u) in enumerate(zip(record.z[:, :1], record.u[:, :1], strict=True)):
         start = perf_counter()

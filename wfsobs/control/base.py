@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from wfsobs.control.integrator import limited_integrator
-from wfsobs.control.mirror import Law, Plant
+from wfsobs.control.mirror import Law, Mirror, Plant
 from wfsobs.control.step import KalmanLaws, MakeStepLaw, StepController, StepPredict, VibrationAhead, step_law, take_missing
 from wfsobs.observers.base import NOT_TUNED, NOTHING, PLAIN, Look, Tunable
 from wfsobs.observers.baselines import online_reference
@@ -221,10 +221,12 @@ class Controller:
             frames = each_frame(stepper, replace(measurements, u=hold_last(measurements.u)), watch)
             u = np.array([stepper.update_open_loop(z, ngs if self.ngs else None) for z, ngs, _ in frames])
             return u, plant.mirror.at_limit(u)
-        if self._takes_missing(laws):
-            return self._without_missing(laws, replace(measurements, u=hold_last(measurements.u)), plant, watch)
-        measurements = fill_missing(measurements, prior, _line_width(settings))
-        z = measurements.z
+        takes_missing = self._takes_missing(laws)
+        if takes_missing:
+            measurements = replace(measurements, u=hold_last(measurements.u))
+        else:
+            measurements = fill_missing(measurements, prior, _line_width(settings))
+        z, n = measurements.z, measurements.ratio
         forward = np.zeros_like(z)
         if self.law is None:
             return forward, forward > 0.0
@@ -236,44 +238,26 @@ class Controller:
             known = ~np.isnan(ahead)
             forward = -np.where(known, ahead, 0.0)
             z = z - np.where(known, online_reference(prior.bands, z, measurements.dt), 0.0)
-        inputs = self._inputs(measurements, z)
-        modes = [_limit_commands(law, plant, inputs[:, :, mode], forward[:, mode]) for mode, law in enumerate(laws)]
+        lost = np.isnan(z).any() or (self.ngs and n is not None and np.isnan(measurements.z_ngs[n::n]).any())
+        if takes_missing and (lost or measurements.lgs_stars is not None):
+            wanted = KalmanLaws(laws).run(measurements, watch)
+        else:
+            inputs = np.stack([z, np.nan_to_num(measurements.z_ngs)], axis=1) if self.ngs else z[:, None]
+            wanted = np.column_stack([law.run(inputs[:, :, mode]) for mode, law in enumerate(laws)]) + forward
+        columns = zip(laws, wanted.T, z.T, forward.T, strict=True)
+        modes = [_limit_commands(plant.mirror, *of_mode) for of_mode in columns]
         return np.column_stack([u for u, _ in modes]), np.column_stack([u != wanted for u, wanted in modes])
 
     def _takes_missing(self, laws: Sequence[Law]) -> bool:
         return self.step_law is not None or (self.predict is None and take_missing(laws))
-
-    def _inputs(self, measurements: Measurements, z: Array) -> Array:
-        """Return the inputs of the laws, (n_steps, 1 or 2, n_modes) [um], zero where no NGS frame is due."""
-        return np.stack([z, np.nan_to_num(measurements.z_ngs)], axis=1) if self.ngs else z[:, None]
-
-    def _without_missing(
-        self, laws: Sequence[Law], measurements: Measurements, plant: Plant, watch: Watch
-    ) -> tuple[Array, Array]:
-        """Return `commands` of Kalman filters: where measurements are missing, frame by frame."""
-        z, n = measurements.z, measurements.ratio
-        lost = np.isnan(z).any() or (self.ngs and n is not None and np.isnan(measurements.z_ngs[n::n]).any())
-        if lost or measurements.lgs_stars is not None:
-            wanted = KalmanLaws(laws).run(measurements, watch)
-        else:
-            inputs = self._inputs(measurements, z)
-            wanted = np.column_stack([law.run(inputs[:, :, mode]) for mode, law in enumerate(laws)])
-        taken = np.column_stack([u if plant.mirror.within(u) else plant.mirror.follow(u) for u in wanted.T])
-        return taken, taken != wanted
 
 
 def _line_width(settings: Settings) -> float:
     return getattr(getattr(settings, "multipeak", None), "line_width", LINE_WIDTH)
 
 
-def _limit_commands(law: Law, plant: Plant, inputs: Array, forward: Array) -> tuple[Array, Array]:
-    """(commands that the mirror takes, commands wanted) of one mode, (n_steps,).
-
-    inputs : (n_steps, n_inputs); forward : (n_steps,)
-    """
-    wanted = law.run(inputs) + forward
-    if plant.mirror.within(wanted):
-        return wanted, wanted
-    if law.gain is None:
-        return plant.mirror.follow(wanted), wanted
-    return limited_integrator(plant.mirror, law.gain, law.leak, inputs[:, 0], forward)
+def _limit_commands(mirror: Mirror, law: Law, commands: Array, z: Array, forward: Array) -> tuple[Array, Array]:
+    """(commands that the mirror takes, commands wanted) of one mode, (n_steps,); z, forward : what they are made of."""
+    if law.gain is None or mirror.within(commands):
+        return mirror.follow(commands), commands
+    return limited_integrator(mirror, law.gain, law.leak, z, forward)

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import toeplitz
 
-from wfsobs.control.mirror import Law, Mirror, Plant, steady_law
+from wfsobs.control.mirror import Law, Mirror, Plant
 from wfsobs.observers.stepping import Gain, GainCycle
 from wfsobs.prior import Prior, Spectra
 from wfsobs.typing import Array
@@ -49,7 +49,7 @@ def h2_fir(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """Return the law of one mode of least residual within the limits, by the spectra in the prior; `control.caution` counts."""
     q = taps_of(prior.spectra[mode], plant.mirror, settings.control.caution)
     gains = GainCycle([Gain(np.eye(q.size, k=-1), np.zeros((1, q.size)), np.eye(q.size)[:, :1])])  # the state is the last z
-    return replace(steady_law(gains.filter(-q[None])), gains=gains, row=-q)
+    return Law(gains.filter(-q[None]), gains=gains, row=-q)
 
 
 def taps_of(spectra: Spectra, mirror: Mirror, caution: float) -> Array:

@@ -11,14 +11,14 @@ observatories optimise modal gains (Gendron and Lena 1994, A&A 291, 337), taken 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 
 from wfsobs.control.margins import residual_density
-from wfsobs.control.mirror import Law, Mirror, steady_law
+from wfsobs.control.mirror import Law, Mirror
 from wfsobs.observers.stepping import Gain, GainCycle
 from wfsobs.prior import Spectra
 from wfsobs.record import hold_last
@@ -41,7 +41,7 @@ def integrator_law(mirror: Mirror, gain: float, leak: float) -> Law:
     A = np.vstack([row, np.eye(n)[:-1]])
     into = np.array([-gain])
     cycle = PeriodicFilter([(A, np.eye(n)[:, :1] * into, row[None, :], into[:, None])])
-    return replace(steady_law(cycle, gain, leak), gains=_as_observer(taps, gain, leak), row=np.eye(n + 1)[0])
+    return Law(cycle, gain, leak, gains=_as_observer(taps, gain, leak), row=np.eye(n + 1)[0])
 
 
 def _as_observer(taps: Array, gain: float, leak: float) -> GainCycle:

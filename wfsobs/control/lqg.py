@@ -13,30 +13,20 @@ first window is full an integrator closes the loop.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from wfsobs.control.integrator import integrator_law
-from wfsobs.control.mirror import Law, Mirror, Plant, steady_law
+from wfsobs.control.mirror import Law, Mirror, Plant
 from wfsobs.control.step import Integrators, PredictionLaws
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.adaptive import AdaptiveEstimator, kf_adaptive, multirate_adaptive
-from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean
-from wfsobs.observers.kalman.multirate import (
-    Cycle,
-    MultiRateFilter,
-    every_peak_model,
-    multirate_mode,
-    multirate_noise,
-    optimal_model,
-)
-from wfsobs.observers.kalman.single import steady_mode
+from wfsobs.observers.kalman.mode_filter import ModeFilter
+from wfsobs.observers.kalman.multirate import every_peak_model, multirate_mode, optimal_model
+from wfsobs.observers.kalman.single import every_peak_filter, one_peak_filter
 from wfsobs.prior import Noise, Prior
 from wfsobs.record import Sampling
-from wfsobs.signal.gap_gains import ONE, SensorMean
-from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
 
 
@@ -51,16 +41,6 @@ def command_rows(A: Array, phi: Array, mirror: Mirror) -> Array:
         out += tap * row
         row = row @ A
     return out[None, :]
-
-
-def _rows_of(model: DisturbanceModel, mirror: Mirror) -> Array:
-    return command_rows(model.A, model.output_rows(TARGETS).sum(axis=0), mirror)
-
-
-def lqg_of(model: DisturbanceModel, noise: float, mirror: Mirror, mean: SensorMean = ONE) -> Law:
-    """LQG on the LGS with any model; noise [um] of a measurement, the mean over all LGS. Raises RiccatiError."""
-    found, row = steady_mode(model, noise, mean), _rows_of(model, mirror)
-    return replace(steady_law(found.gains.filter(row)), gains=found.gains, row=row[0], filter=found)
 
 
 def _with_caution(prior: Prior, settings: Any) -> Prior:
@@ -78,53 +58,37 @@ def _with_caution(prior: Prior, settings: Any) -> Prior:
 
 def lqg_kf_lgs(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With the model of the LGS Kalman filter: turbulence and one vibration peak."""
-    prior = _with_caution(prior, settings)
-    model = prior.model[mode]
-    return lqg_of(model.disturbance(), model.lgs_noise, plant.mirror, lgs_mean(prior, mode))
+    return _law(one_peak_filter(_with_caution(prior, settings), mode), plant.mirror)
 
 
 def lqg_kf_multi(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With every peak of the vibration in the model."""
-    prior = _with_caution(prior, settings)
-    lines = prior.lines[mode]
-    return lqg_of(lines.disturbance(settings.multipeak.line_width), lines.noise, plant.mirror, lgs_mean(prior, mode))
+    return _law(every_peak_filter(_with_caution(prior, settings), mode, settings.multipeak), plant.mirror)
 
 
 def lqg_multirate(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With the paper's multi-rate filter. Raises UnstableCycle."""
-    prior = _with_caution(prior, settings)
-    known = prior.model[mode]
-    model, noise = known.disturbance(), multirate_noise(settings.multirate, prior.noise_of(mode))
-    found = multirate_mode(model, plant.ratio, *noise)._replace(mean=lgs_mean(prior, mode))
-    return _two_sensors(found, _rows_of(model, plant.mirror))
+    return _law(multirate_mode(settings.multirate, _with_caution(prior, settings), mode, plant.ratio), plant.mirror)
 
 
 def lqg_multirate_optimal(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With the optimal multi-rate filter."""
     prior = _with_caution(prior, settings)
-    return _optimal(optimal_model(settings.multirate, prior, mode, plant.ratio), prior, mode, plant.mirror)
+    return _law(optimal_model(settings.multirate, prior, mode, plant.ratio).filter_of(prior, mode), plant.mirror)
 
 
 def lqg_multirate_multi(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With the optimal multi-rate filter and every peak of the vibration in its model."""
     prior = _with_caution(prior, settings)
     cycle = every_peak_model(settings.multirate, settings.multipeak, prior, mode, plant.ratio)
-    return _optimal(cycle, prior, mode, plant.mirror)
+    return _law(cycle.filter_of(prior, mode), plant.mirror)
 
 
-def _optimal(cycle: Cycle, prior: Prior, mode: int, mirror: Mirror) -> Law:
-    row = command_rows(cycle.steps[0][0], cycle.rows.sum(axis=0), mirror)
-    return _two_sensors(cycle.filter(lgs_mean(prior, mode, cycle.has_lgs_error)), row)
-
-
-def _two_sensors(mode_filter: ModeFilter, row: Array) -> Law:
-    filter_, gains = MultiRateFilter(mode_filter.gains, row), mode_filter.gains
-    run, first = partial(_run_first, filter_), gains.first and gains.first.filter_step(row)
-    return Law(filter_.cycle, run, first=first, gains=gains, row=row[0], filter=mode_filter)
-
-
-def _run_first(filter_: MultiRateFilter, z: Array) -> Array:
-    return filter_.run(z)[:, 0]
+def _law(mode_filter: ModeFilter, mirror: Mirror) -> Law:
+    """Return the law that commands against what a filter predicts. Raises RiccatiError."""
+    row = command_rows(mode_filter.cycle[0][0], mode_filter.rows(TARGETS).sum(axis=0), mirror)
+    law = mode_filter.gains.recursion(row)
+    return Law(law.cycle, first=law.first, gains=mode_filter.gains, row=row[0], filter=mode_filter)
 
 
 def lqg_kf_adaptive(prior: Prior, plant: Plant, settings: Any, sampling: Sampling) -> PredictionLaws:

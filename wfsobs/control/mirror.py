@@ -17,9 +17,7 @@ mirror's delay,
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from math import inf
 
 import numpy as np
@@ -28,7 +26,7 @@ from scipy.signal import lfilter
 
 from wfsobs.observers.kalman.mode_filter import ModeFilter
 from wfsobs.observers.stepping import GainCycle
-from wfsobs.signal.periodic import FilterStep, PeriodicFilter
+from wfsobs.signal.periodic import FilterStep, PeriodicFilter, Recursion
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
 
@@ -70,6 +68,10 @@ class Mirror:
         near = min(max(command, last - self.slew), last + self.slew)
         return min(max(near, -self.stroke), self.stroke)
 
+    def clip_commands(self, u: Array, last: Array) -> Array:
+        """Return the commands of all modes nearest to u (n_modes,) within the limits after `last` [um]."""
+        return np.clip(np.clip(u, last - self.slew, last + self.slew), -self.stroke, self.stroke) if self.has_limits else u
+
     def within(self, u: Array) -> bool:
         """Whether commands u (n_steps,) [um], from rest, keep the limits."""
         return bool(np.abs(u).max() <= self.stroke and np.abs(np.diff(u, prepend=0.0)).max() <= self.slew)
@@ -104,7 +106,6 @@ class Law:
     """A linear law of one mode.
 
     cycle : the filter from z (LGS, or LGS and NGS) to u
-    run   : z (n_steps, n_inputs) [um] -> u (n_steps,) [um]
     gain, leak : of an integrator
     first : step 0, where it is not one of the cycle
     gains, row : the same filter as an observer: u[k] = row x_hat[k]; None where it is not known as one
@@ -112,13 +113,16 @@ class Law:
     """
 
     cycle: PeriodicFilter
-    run: Callable[[Array], Array]
     gain: float | None = None
     leak: float = 1.0
     first: FilterStep | None = None
     gains: GainCycle | None = None
     row: Array | None = None
     filter: ModeFilter | None = None
+
+    def run(self, z: Array) -> Array:
+        """Return the commands (n_steps,) [um] of measurements z (n_steps, n_inputs) [um]."""
+        return Recursion(self.cycle.steps, self.first).run(z[:, : self.cycle.steps[0][1].shape[1]])[:, 0]
 
     @property
     def poles(self) -> Complex:
@@ -139,15 +143,6 @@ class Law:
         """F = -u / z at omega (n,) [rad per step], (n,); of time-invariant laws."""
         F, G, H, J = self.cycle.steps[0]
         return -transfer(F, G[:, 0], H[0], float(J[0, 0]), np.exp(1j * omega))
-
-
-def steady_law(cycle: PeriodicFilter, gain: float | None = None, leak: float = 1.0) -> Law:
-    """Return the law of a filter of the LGS alone."""
-    return Law(cycle, partial(_run_steady, cycle), gain, leak)
-
-
-def _run_steady(cycle: PeriodicFilter, z: Array) -> Array:
-    return cycle.run(z[:, :1, None])[:, 0, 0]
 
 
 def transfer(F: Array, G: Array, H: Array, J: float, z: Complex) -> Complex:

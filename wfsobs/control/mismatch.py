@@ -384,17 +384,10 @@ def step_matrices(
 def radius(laws: Sequence[Law], nominal: Mirror, plant: TruePlant) -> float:
     """Spectral radius of coupled loops over a cycle; below 1 they are stable, in the mean square where delays are random."""
     if not (plant.jitter or plant.loss):
-        return float(np.abs(np.linalg.eigvals(_product(step_matrices(laws, nominal, plant)))).max())
+        return float(np.abs(np.linalg.eigvals(_cycle(np.array(step_matrices(laws, nominal, plant)), 0))).max())
     draws = draws_of(plant)
     steps = [step_matrices(laws, nominal, plant, late, lost) for _, late, lost in draws]
     return mean_square_radius([weight for weight, *_ in draws], steps)
-
-
-def _product(steps: Sequence[Array]) -> Array:
-    out = steps[0]
-    for A in steps[1:]:
-        out = A @ out
-    return out
 
 
 def draws_of(plant: TruePlant) -> list[tuple[float, float, bool]]:

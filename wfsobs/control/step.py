@@ -7,7 +7,7 @@ prediction of the vibration beside it. Over a frame it does what `Controller.com
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,7 +16,7 @@ from wfsobs.control.mirror import Law, Mirror, Plant
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.observers.missing import Bridge
-from wfsobs.observers.step import Estimator, StepBase, StepError, each_frame
+from wfsobs.observers.step import Estimator, StepBase, StepError, each_frame, take_state
 from wfsobs.observers.stepping import FilterBank, StateArrays, Stateful
 from wfsobs.prior import Bands, Prior
 from wfsobs.progress import Watch
@@ -37,44 +37,28 @@ DECIMALS = 9
 """Of z [um] where a model is identified from it: it is then the same in whichever order commands were added."""
 
 
-class StepLaw(Stateful, Protocol):
-    """The laws of all modes, one frame at a time."""
+class StepLaw(StateArrays):
+    """The laws of all modes, one frame at a time; by default commands sent do not matter to them."""
 
     def see_stars(self, count: int | None) -> None:
         """Take the LGS measurement of the next frame for the mean over so many stars; None for all."""
-        ...
 
     def command(self, z: Array, ngs: Array | None, forward: Array) -> Array:
         """Return the commands (n_modes,) [um] that the laws want, `forward` included."""
-        ...
+        raise NotImplementedError
 
     def tell(self, command: Array, forward: Array) -> None:
         """Tell what the mirror took of them."""
-        ...
 
     def amend(self, difference: Array) -> None:
         """Go on from a command that differs by this from the one told last."""
-        ...
 
     def take_over(self, old: Any) -> None:
         """Go on from the state of other laws. Raises StepError."""
-        ...
+        take_state(self, old)
 
 
-class _Laws(StateArrays):
-    """Laws of one gain, for which the commands sent do not matter."""
-
-    def see_stars(self, count: int | None) -> None:
-        """Ignored: constant gain."""
-
-    def tell(self, command: Array, forward: Array) -> None:
-        """Ignored: z holds none of the commands."""
-
-    def amend(self, difference: Array) -> None:
-        """Ignored, as what is told."""
-
-
-class LinearLaws(_Laws):
+class LinearLaws(StepLaw):
     """Laws as filters of z."""
 
     state_names: tuple[str, ...] = ("bank",)
@@ -93,16 +77,8 @@ class LinearLaws(_Laws):
             v[:, 1] = 0.0 if ngs is None else ngs
         return self.bank.step(v)[:, 0] + forward
 
-    def take_over(self, old: Any) -> None:
-        """Go on from a state of the same size."""
-        if not isinstance(old, LinearLaws) or len(old.bank.maps) != len(self.bank.maps):
-            raise StepError("the laws are of another kind")
-        if old.bank.x.shape != self.bank.x.shape:
-            raise StepError("the laws have states of another size")
-        self.bank.load(old.bank.save())
 
-
-class KalmanLaws(_Laws):
+class KalmanLaws(StepLaw):
     """Laws as rows of what Kalman filters estimate; a measurement that is missing, NaN, is none to them."""
 
     laws: tuple[Law, ...]
@@ -139,7 +115,7 @@ class KalmanLaws(_Laws):
         self.filters.take_over(old.filters)
 
 
-class Integrators(_Laws):
+class Integrators(StepLaw):
     """Integrators whose state are their own commands, so that a limit of the mirror stops them (anti-windup)."""
 
     state_names: tuple[str, ...] = ("_own",)
@@ -164,14 +140,8 @@ class Integrators(_Laws):
         """Go on from a command that differs by this from the one told last."""
         self._own[0] += difference
 
-    def take_over(self, old: Any) -> None:
-        """Go on from the last commands."""
-        if not isinstance(old, Integrators) or old._own.shape != self._own.shape:
-            raise StepError("the laws are of another kind")
-        self._own[...] = old._own
 
-
-class PredictionLaws(_Laws):
+class PredictionLaws(StepLaw):
     """Minus what an observer predicts that needs time until it does; until then integrators."""
 
     state_names: tuple[str, ...] = ("estimator", "integrators")
@@ -354,7 +324,7 @@ class StepController(StepBase):
         u = self._none.copy()
         if self.law is not None:
             self.law.see_stars(stars)
-            u = self._clip(self.law.command(z, slow, forward))
+            u = self.plant.mirror.clip_commands(self.law.command(z, slow, forward), self._commands[0])
             self.law.tell(u, forward)
         push_row(self._commands, u)
         self.frame += 1
@@ -387,11 +357,3 @@ class StepController(StepBase):
             if self.ahead.bank.x.shape == old.ahead.bank.x.shape:
                 self.ahead.bank.load(old.ahead.bank.save())
         self._take_over(old)
-
-    def _clip(self, command: Array) -> Array:
-        """Return the commands nearest to these within the limits of the mirror."""
-        mirror = self.plant.mirror
-        if not mirror.has_limits:
-            return command
-        last = self._commands[0]
-        return np.clip(np.clip(command, last - mirror.slew, last + mirror.slew), -mirror.stroke, mirror.stroke)

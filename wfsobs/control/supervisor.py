@@ -212,7 +212,8 @@ class SupervisedController(StateArrays):
         error = np.where(is_missing, 0.0, seen)
         excess = not is_missing.any() and self._level.exceeds(error)  # a dropout is no small residual
         self._follow_ngs(seen, slow)
-        safe = self._within(plan.leak * self._command - plan.gain * np.where(is_missing, 0.0, seen - self._slow_error))
+        wanted = plan.leak * self._command - plan.gain * np.where(is_missing, 0.0, seen - self._slow_error)
+        safe = self.mirror.clip_commands(wanted, self._command)
         if self._why:
             self._wait(command, safe, excess)
         elif fault := self._fault(command, excess):
@@ -220,7 +221,7 @@ class SupervisedController(StateArrays):
         u = safe
         if not self._why:
             self._offset *= BLEND
-            u = self._within(command + self._offset)
+            u = self.mirror.clip_commands(command + self._offset, self._command)
             is_clipped = (np.abs(u) >= self.mirror.stroke) | (np.abs(u - self._command) >= self.mirror.slew)
             self._limit_share += (bool(is_clipped.any()) - self._limit_share) / 100.0
         self.amend(u)
@@ -272,14 +273,6 @@ class SupervisedController(StateArrays):
             self._usual, self._why, self._since = self._level.mean.copy(), 0, self.frame
             self._offset = (safe - command) / BLEND
             self._level.begin(self.supervision.worse**2 * self._level.limit, cap)
-
-    def _within(self, u: Array) -> Array:
-        """Return the commands nearest to these within the limits of the mirror."""
-        mirror, last = self.mirror, self._command
-        if not mirror.has_limits:
-            return u
-        near = np.minimum(np.maximum(u, last - mirror.slew), last + mirror.slew)
-        return np.minimum(np.maximum(near, -mirror.stroke), mirror.stroke)
 
     def take_over(self, old: SupervisedController) -> None:
         """Go on where another design of the same controller is supervised. Raises StepError."""

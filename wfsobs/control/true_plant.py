@@ -21,7 +21,7 @@ from scipy.signal import lfilter
 
 from wfsobs.control.step import StepController, push_row
 from wfsobs.control.supervisor import SupervisedController
-from wfsobs.observers.step import EVERY
+from wfsobs.observers.step import frames_of
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, hold_last
 from wfsobs.signal.wiener import Complex
@@ -249,22 +249,18 @@ def drive(
     It ends where a command is beyond FAR: later rows are infinite. Raises Cancelled.
     """
     measurements = replace(measurements, u=hold_last(measurements.u))
-    z, n, start = measurements.z, measurements.ratio, plant.start
+    z, start = measurements.z, plant.start
     known = controller.mirror if isinstance(controller, SupervisedController) else controller.plant.mirror
-    loop = ActingLoop(controller, TruePlant(np.eye(z.shape[1]), known.delay) if start else plant, n)
-    z_ngs = None if n is None or measurements.y_ngs is None else measurements.z_ngs
+    loop = ActingLoop(controller, TruePlant(np.eye(z.shape[1]), known.delay) if start else plant, measurements.ratio)
     gain = np.append(np.ones(start), plant.sensor_gain(len(z), rng))
     late, lost = plant.jitter * rng.uniform(-1.0, 1.0, len(z)), rng.uniform(size=len(z)) < plant.loss
     late[:start], lost[:start] = 0.0, False
     u, correction = np.full_like(z, inf), np.full_like(z, inf)
-    for k in range(len(z)):
-        if k % EVERY == 0:
-            watch.step(k / len(z))
+    for k, frame in enumerate(frames_of(measurements, watch)):
         if k == start > 0:
             loop.change(plant)
-        ngs = z_ngs[k] if z_ngs is not None and n is not None and k > 0 and k % n == 0 else None
-        stars = None if measurements.lgs_stars is None else int(measurements.lgs_stars[k])
-        u[k] = loop.take(z[k], ngs, gain=gain[k], late=float(late[k]), is_lost=bool(lost[k]), stars=stars)
+        is_lost = bool(lost[k])
+        u[k] = loop.take(frame.z, frame.ngs, gain=gain[k], late=float(late[k]), is_lost=is_lost, stars=frame.stars)
         if loop.has_diverged:
             break
         correction[k] = loop.correction

@@ -57,7 +57,7 @@ from wfsobs.evaluation.scores import (
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, TURBULENCE
 from wfsobs.observers.estimates import TOTAL
-from wfsobs.observers.kalman.coupled import CoupledModel
+from wfsobs.observers.kalman.coupled import flow_model
 from wfsobs.observers.kalman.joint import AsterismModel
 from wfsobs.prior import Asterism, Flow, FlowOfBoth, Lines
 from wfsobs.priors_from.scenario import has_prior, prior_of
@@ -375,12 +375,11 @@ def _least_together(scenario: Scenario, row: str, ahead: float) -> list[Errors]:
         raise ValueError("the modes of this scenario are independent: the bound of each is its own")
     true = scenario.replace({**TRUE_MODEL, "multipeak.line_width": line_width(scenario)})
     if row == BOUND_MODES:
-        coupled = CoupledModel(prior_of(true, None, (Lines, Flow)), true.multipeak, MEANS)
-        variance = {target: coupled.plan(ahead, target)[1][None] ** 2 for target in (*TARGETS, TOTAL)}
+        model = flow_model(prior_of(true, None, (Lines, Flow)), true.multipeak, MEANS)
     else:
         prior, ratio = prior_of(true, None, (Lines, Asterism if of_stars else FlowOfBoth)), scenario.sensors.exposure_ratio
         model = AsterismModel(prior, true.multipeak, ratio, MEANS_OF_BOTH, FRAME_MEANS)
-        variance = {target: model.plan(ahead, target)[1][:-1] ** 2 for target in (*TARGETS, TOTAL)}
+    variance = {target: model.plan(ahead, target)[1][:-1] ** 2 for target in (*TARGETS, TOTAL)}
     modes = range(len(scenario.modes))
     return [{target: PeriodicError(of[:, mode]) for target, of in variance.items()} for mode in modes]
 

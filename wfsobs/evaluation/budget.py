@@ -37,7 +37,7 @@ from wfsobs.evaluation.scores import Score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Observer
 from wfsobs.observers.estimates import TOTAL
-from wfsobs.observers.kalman.multirate import beam_model, estimated_cycle, optimal_filter
+from wfsobs.observers.kalman.multirate import beam_model, estimated_cycle
 from wfsobs.observers.kalman.single import MIN_NOISE, steady_filter
 from wfsobs.observers.step import Estimator
 from wfsobs.prior import Beams, Line, Lines
@@ -438,8 +438,8 @@ def follow_signal(
         ngs_noise = max(noise_rms(scenario, "ngs")[mode], MIN_NOISE)
         cycle = estimated_cycle(model, scenario.sensors.exposure_ratio, noise, ngs_noise, beams.lgs)
         used = np.array([[float(both)], [1.0]])
-        kalman, _ = optimal_filter([(A, used * C, Q, R) for A, C, Q, R in cycle.steps], cycle.rows)
-        out = kalman.run(np.column_stack([open_loop.lgs[:, mode], open_loop.ngs[:, mode]]))
+        kalman = cycle._replace(steps=[(A, used * C, Q, R) for A, C, Q, R in cycle.steps]).filter()
+        out = kalman.gains.recursion(kalman.rows(TARGETS)).run(np.column_stack([open_loop.lgs[:, mode], open_loop.ngs[:, mode]]))
     return {target: out[:, i] for i, target in enumerate(TARGETS)}
 
 

@@ -60,6 +60,11 @@ class LinearDesign:
     modes: tuple[ModeMatrices, ...]
 
     @property
+    def mirror_text(self) -> str:
+        """The commands in a measurement, as text."""
+        return " + ".join(f"{tap:g} u[k-{i}]" for i, tap in enumerate(self.taps) if tap)
+
+    @property
     def period(self) -> int:
         """Steps after which the gains repeat."""
         return max(len(mode.gains.steps) for mode in self.modes)
@@ -67,11 +72,10 @@ class LinearDesign:
     def conventions(self, takes_gaps: bool) -> list[str]:
         """Return units, signs and timing, as lines of text; takes_gaps : whether measurements may be missing."""
         gaps = "none to a Kalman filter, to others predicted, or the last one held"
-        seen = " + ".join(f"{tap:g} u[k-{i}]" for i, tap in enumerate(self.taps) if tap)
         lines = [
             f"Controller {self.id} of wfsobs, {len(self.modes)} modes, one call every {self.dt:g} s.",
             "In: z, the pseudo-open-loop measurement of every mode [um rms, Noll-normalised Zernike coefficients].",
-            f"    z[k] = y[k] - ({seen}), y the measurement of the sensor, u the commands that the mirror took.",
+            f"    z[k] = y[k] - ({self.mirror_text}), y the measurement of the sensor, u the commands that the mirror took.",
             f"    NaN is a missing measurement: {gaps}." if takes_gaps else "    None may be missing.",
             "Out: u[k], the command of every mode [um], computed once y[k] is known. The residual is disturbance + u.",
             "    Limits of the mirror are the caller's: subtract in z the commands that it took.",

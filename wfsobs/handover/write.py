@@ -142,11 +142,10 @@ def estimator_system(design: LinearDesign) -> tuple[Array, Array, Array]:
 
 def conventions(design: LinearDesign, lines: tuple[str, ...]) -> list[str]:
     """Return what a file says of its controller."""
-    delay = " + ".join(f"{tap:g} u[k-{i}]" for i, tap in enumerate(design.taps) if tap)
     return [
         f"Controller {design.id} of wfsobs, {len(design.modes)} modes, one step every {design.dt:g} s.",
         "In: y[k], the residual of every mode that the sensor measures; out: its command, both in the same unit.",
-        f"Designed for a loop in which y[k] contains {delay}. None may be missing.",
+        f"Designed for a loop in which y[k] contains {design.mirror_text}. None may be missing.",
         *lines,
     ]
 

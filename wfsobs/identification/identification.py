@@ -24,7 +24,7 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.signal.ar3 import Ar3
-from wfsobs.signal.filter_covariance import RiccatiError
+from wfsobs.signal.riccati import RiccatiError
 from wfsobs.spectral.missing import find_outlying
 from wfsobs.spectral.periodogram import fast_length, periodogram
 from wfsobs.spectral.search import LOWEST, PAD, Candidate, SearchResult, search_peaks

@@ -12,6 +12,7 @@ from functools import partial
 import numpy as np
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Look, Observer, Tunable
+from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.step import HeldEstimate, StepError
 from wfsobs.observers.stepping import FilterBank
 from wfsobs.prior import Bands, OfflineBands, OnlineBands, Prior
@@ -40,25 +41,6 @@ def butterworth_ol(measurements: Measurements, prior: Prior, _settings: None, wa
     return {VIBRATION: open_loop_reference(prior.bands, measurements.open_loop_y, measurements.dt)}
 
 
-def butterworth_cl(measurements: Measurements, prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
-    """Causal, on the record's own pseudo-open-loop measurement."""
-    watch.step(0.0)
-    assert prior.bands is not None
-    return {VIBRATION: online_reference(prior.bands, measurements.z, measurements.dt)}
-
-
-def persistence(measurements: Measurements, _prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
-    """Return the newest measurement as the turbulence: no model, all of the noise and the vibration, one step late."""
-    watch.step(0.0)
-    return {TURBULENCE: measurements.z}
-
-
-def zero(measurements: Measurements, _prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
-    """Return zero, the trivial baseline."""
-    watch.step(0.0)
-    return {target: np.zeros_like(measurements.y_lgs) for target in TARGETS}
-
-
 class BankEstimator(HeldEstimate):
     """The causal band-passes of all modes, one frame at a time. They predict nothing."""
 
@@ -66,9 +48,14 @@ class BankEstimator(HeldEstimate):
 
     def __init__(self, bands: Bands, sampling: Sampling):
         super().__init__(sampling.n_modes, 0.0, 0.0)
-        bank = bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, sampling.dt)
+        self._bands, bank = bands, bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, sampling.dt)
         self.filters: FilterBank = FilterBank([bank_recursion(bank)] * sampling.n_modes)
         self.mark_start()
+
+    def run(self, measurements: Measurements, watch: Watch) -> Estimates:
+        """Filter the pseudo-open-loop measurement of a record."""
+        watch.step(0.0)
+        return Estimates({VIBRATION: online_reference(self._bands, measurements.z, measurements.dt)})
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame."""
@@ -83,21 +70,26 @@ class LastValue(HeldEstimate):
         self._factor = factor
         self.mark_start()
 
+    def run(self, measurements: Measurements, watch: Watch) -> Estimates:
+        """Return the measurements of a record times the factor, as either target."""
+        watch.step(0.0)
+        return Estimates(dict.fromkeys(TARGETS, self._factor * measurements.z))
+
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame."""
         np.multiply(z, self._factor, out=self._mean)
 
 
-def step_butterworth_cl(prior: Prior, _settings: None, sampling: Sampling, horizon: float) -> BankEstimator:
-    """Return `butterworth_cl`, one frame at a time. Raises StepError for a horizon."""
+def butterworth_cl(prior: Prior, _settings: None, sampling: Sampling, horizon: float) -> BankEstimator:
+    """Return the causal band-passes on the pseudo-open-loop measurement. Raises StepError for a horizon."""
     assert prior.bands is not None
     if horizon != 0:
         raise StepError(f"butterworth-cl: band-passes predict nothing: takes horizon = 0, not {horizon:g}")
     return BankEstimator(prior.bands, sampling)
 
 
-def step_last_value(factor: float, _prior: Prior, _settings: None, sampling: Sampling, _horizon: float) -> LastValue:
-    """Return z times a factor, one frame at a time: `persistence` or `zero`."""
+def last_value(factor: float, _prior: Prior, _settings: None, sampling: Sampling, _horizon: float) -> LastValue:
+    """Return z times a factor: no model, all of the noise and the vibration, one step late; or zero, the trivial baseline."""
     return LastValue(sampling, factor)
 
 
@@ -119,35 +111,32 @@ BUTTERWORTH_CL = Observer(
     "butterworth-cl",
     "Butterworth, closed loop",
     (VIBRATION,),
-    butterworth_cl,
     help="band-pass filters run forward only: causal",
     prior=(OnlineBands,),
     linear=True,
     tunable=Tunable(("butterworth.bandwidth_online",), ("butterworth.order",)),
     look=Look("Butterworth CL", "#B40000", "#E4695E", (8, 3)),
-    step=step_butterworth_cl,
+    step=butterworth_cl,
 )
 
 PERSISTENCE = Observer(
     "persistence",
     "Persistence",
     (TURBULENCE,),
-    persistence,
     help="the newest measurement taken for the turbulence",
     linear=True,
     weight=0.1,
     look=Look("Persistence", "#8F8F63", "#A37F9E", (1, 3)),
-    step=partial(step_last_value, 1.0),
+    step=partial(last_value, 1.0),
 )
 
 ZERO = Observer(
     "zero",
     "Zero",
     TARGETS,
-    zero,
     help="estimate of zero: the trivial baseline",
     linear=True,
     weight=0.1,
     look=Look("Zero", "#8A8A8A", "#9A9A9A", (2, 4)),
-    step=partial(step_last_value, 0.0),
+    step=partial(last_value, 0.0),
 )

@@ -138,7 +138,7 @@ def _targets(prior: Prior, mode: int, dt: float, delay: int, horizon: int) -> tu
     """Return the training data, and the vibration of one mode `horizon` frames ahead."""
     training, bands = prior.training, prior.bands
     assert training is not None and bands is not None
-    return training, training_targets(training, bands, dt, delay, horizon)[:, mode]
+    return training, training_targets(training, bands, dt, delay, np.eye(horizon + 1)[-1])[:, mode]
 
 
 def fit_ridge(prior: Prior, g: OfflineGpr, mode: int, dt: float, delay: int, horizon: int = 0) -> tuple[Array, float]:

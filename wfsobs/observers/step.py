@@ -8,10 +8,10 @@ After frame k `predict(0)` is row k of the observer's run over the record.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from math import inf, isfinite, isnan
 from textwrap import shorten
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,7 +20,7 @@ from wfsobs.observers.estimates import Estimates, by_name
 from wfsobs.observers.missing import Bridge
 from wfsobs.observers.stepping import StateArrays, Stateful, load_parts, save_parts
 from wfsobs.prior import Prior
-from wfsobs.progress import Watch
+from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.signal.gate import GateSettings, OutlierGate, frame_mean_of
 from wfsobs.typing import Array
@@ -30,7 +30,15 @@ class StepError(ValueError):
     """Error: a step that cannot be taken, or an observer that has none; one line with the reason."""
 
 
-class Estimator(Stateful, Protocol):
+def take_state(new: StateArrays, old: StateArrays) -> None:
+    """Go on from the state of another design. Raises StepError where that is of another kind, or has other shapes."""
+    state = old.save() if type(old) is type(new) else {}
+    if {name: x.shape for name, x in state.items()} != {name: x.shape for name, x in new.save().items()}:
+        raise StepError("the designs have states of another kind, or of other shapes")
+    new.load(state)
+
+
+class Estimator(StateArrays):
     """What differs from observer to observer. Measurements come complete, or with NaN where it takes missing ones.
 
     Over a record it is driven frame by frame. One that is faster over all steps at once has a method `run` (measurements, watch)
@@ -45,40 +53,26 @@ class Estimator(Stateful, Protocol):
         Whether `advance` needs u.
     """
 
-    @property
-    def horizon(self) -> float | None: ...  # noqa: D102
-
-    @property
-    def needs_command(self) -> bool: ...  # noqa: D102
+    horizon: float | None = None
+    needs_command: bool = False
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame: z (n_modes,) [um]; ngs (n_modes,) [um] where an NGS frame is due; u (n_modes,) [um]."""
-        ...
+        raise NotImplementedError
 
     def predict(self, frames: float, target: str) -> tuple[Array, Array]:
         """Return (mean, sd) of the target so many frames ahead, (n_modes,) [um], good until the next call. Raises StepError."""
-        ...
+        raise NotImplementedError
 
     def settle(self) -> None:
-        """Do now what `advance` left for later."""
-        ...
+        """Do now what `advance` left for later; by default nothing."""
 
     def take_over(self, old: Any) -> None:
         """Go on from the state of another design of the same observer. Raises StepError."""
-        ...
+        take_state(self, old)
 
 
-class PromptEstimator(StateArrays):
-    """An estimator of z and NGS frames that predicts any horizon and defers no work."""
-
-    horizon: float | None = None
-    needs_command = False
-
-    def settle(self) -> None:
-        """No deferred work."""
-
-
-class HeldEstimate(PromptEstimator):
+class HeldEstimate(Estimator):
     """An estimator that makes its estimate in `advance`, for one horizon.
 
     Parameters
@@ -101,13 +95,6 @@ class HeldEstimate(PromptEstimator):
         """Return mean and standard deviation of the last frame."""
         return self._mean, self._sd
 
-    def take_over(self, old: Any) -> None:
-        """Go on from another design with a state of the same shapes. Raises StepError."""
-        state = old.save()
-        if any(x.shape != state[name].shape for name, x in self.save().items()):
-            raise StepError("the designs have states of other shapes")
-        self.load(state)
-
 
 MakeEstimator = Callable[[Prior, Any, Sampling, float], Estimator]
 """(prior, settings, sampling, horizon) -> estimator. Raises ValueError with the reason where there is none."""
@@ -116,23 +103,46 @@ EVERY = 200
 """Frames between two looks at whether to stop: the largest training set of a GPR takes 10 ms a frame."""
 
 
+class RecordFrame(NamedTuple):
+    """A frame of a record, as `StepObserver.update` takes it: NaN is missing, None is none."""
+
+    z: Array
+    ngs: Array | None
+    u: Array
+    stars: int | None
+    each: Array | None
+
+
+def frames_of(measurements: Measurements, watch: Watch = QUIET, steps: Iterable[int] | None = None) -> Iterator[RecordFrame]:
+    """Yield the frames of a record, NGS frames where they are due; steps : those wanted, by default all. Raises Cancelled."""
+    z, u, n, stars = measurements.z, measurements.u, measurements.ratio, measurements.lgs_stars
+    z_ngs = measurements.z_ngs if n is not None and measurements.y_ngs is not None else None
+    each = None if measurements.y_stars is None else measurements.z_stars
+    for k in range(len(z)) if steps is None else steps:
+        if k % EVERY == 0:
+            watch.step(k / len(z))
+        is_due = n is not None and k > 0 and k % n == 0
+        yield RecordFrame(
+            z[k],
+            z_ngs[k] if z_ngs is not None and is_due else None,
+            u[k],
+            None if stars is None else int(stars[k]),
+            None if each is None else each[k],
+        )
+
+
 def each_frame(estimator: Any, measurements: Measurements, watch: Watch) -> Iterator[tuple[Array, Array | None, Array]]:
-    """Yield z, the NGS frame where one is due, and u, each (n_modes,) [um], NaN where a measurement is missing. Raises Cancelled.
+    """Yield z, NGS frame and u of `frames_of`.
 
     Filters that take the number of LGS, or every LGS by itself, are given these before the frame.
     """
-    z, u, n, stars = measurements.z, measurements.u, measurements.ratio, measurements.lgs_stars
     see_stars, see_each = getattr(estimator, "see_stars", None), getattr(estimator, "see_each", None)
-    z_ngs = measurements.z_ngs if n is not None and measurements.y_ngs is not None else None
-    each = measurements.z_stars if see_each is not None else None
-    for k, row in enumerate(z):
-        if k % EVERY == 0:
-            watch.step(k / len(z))
+    for z, ngs, u, stars, each in frames_of(measurements, watch):
         if stars is not None and see_stars is not None:
-            see_stars(int(stars[k]))
+            see_stars(stars)
         if each is not None and see_each is not None:
-            see_each(each[k])
-        yield row, z_ngs[k] if z_ngs is not None and n is not None and k > 0 and k % n == 0 else None, u[k]
+            see_each(each)
+        yield z, ngs, u
 
 
 def run_frames(estimator: Any, targets: Sequence[str], measurements: Measurements, watch: Watch) -> Estimates:

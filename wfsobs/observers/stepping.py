@@ -155,15 +155,11 @@ class GainCycle:
 
     def filter(self, outputs: Array) -> PeriodicFilter:
         """Return the filter of the steps that repeat, with these outputs (p, n) of x_hat[k]."""
-        return PeriodicFilter([step.filter_step(outputs) for step in self.steps])
+        return self.recursion(outputs).cycle
 
-    def run(self, outputs: Array, v: Array) -> Array:
-        """Return outputs (p, n) of x_hat at every step of a record v (n_steps, m) from rest, (n_steps, p)."""
-        cycle = self.filter(outputs)
-        if self.first is None:
-            return cycle.run(v[:, :, None])[:, :, 0]
-        _, G, _, J = self.first.filter_step(outputs)
-        return np.vstack([J @ v[0], cycle.run(v[1:, :, None], (G @ v[0])[:, None])[:, :, 0]])
+    def recursion(self, outputs: Array) -> Recursion:
+        """Return the filter with these outputs (p, n) of x_hat[k]."""
+        return Recursion([step.filter_step(outputs) for step in self.steps], self.first and self.first.filter_step(outputs))
 
     def estimator(self) -> Recursion:
         """Return the recursion of x_hat, which is its state after a step; it has no outputs of its own."""

@@ -174,17 +174,12 @@ class CommandAhead:
     ----------
     controller : StepController
         Designed for a mirror with this delay and without limits.
-    n_modes : int
-        Its modes.
-    delay : int
-        Frames from a command to the first measurement that sees it.
     """
 
     targets: tuple[str, ...] = ("disturbance",)
 
-    def __init__(self, controller: StepController, n_modes: int, delay: int):
-        self._controller, self._commands = controller, np.zeros((delay, n_modes))
-        self._mirror = np.zeros((controller.sampling.ratio or 1, n_modes))
+    def __init__(self, controller: StepController):
+        self._controller, self._command = controller, np.zeros(controller.sampling.n_modes)
 
     @property
     def frame(self) -> int:
@@ -197,32 +192,26 @@ class CommandAhead:
         return self._controller.sampling
 
     def update(self, z: Array, ngs: Array | None = None) -> None:
-        """Take pseudo-open-loop measurements, (n_modes,) [um]: of its own loop they would be residuals. Raises StepError."""
-        seen = self._commands[-1].copy()
-        self._mirror[1:] = self._mirror[:-1].copy()
-        self._mirror[0] = seen
-        u = self._controller.update(z + seen, None if ngs is None else ngs + self._mirror.mean(axis=0))
-        self._commands[1:] = self._commands[:-1].copy()
-        self._commands[0] = u
+        """Take pseudo-open-loop measurements, (n_modes,) [um]. Raises StepError."""
+        self._command[:] = self._controller.update_open_loop(z, ngs)
 
     def predict(self, frames: float = 0.0, target: str = "disturbance") -> tuple[Array, Array]:
         """Return mean and standard deviation, which it does not know, (n_modes,) [um] each."""
-        return -self._commands[0], np.full(self._commands.shape[1], np.nan)
+        return -self._command, np.full(len(self._command), np.nan)
 
     def reset(self) -> None:
         """Go back to before the first frame."""
         self._controller.reset()
-        self._commands[:] = self._mirror[:] = 0.0
+        self._command[:] = 0.0
 
     def state_dict(self) -> dict[str, Array]:
         """Return a copy of the state."""
-        own = {"ahead.commands": self._commands.copy(), "ahead.mirror": self._mirror.copy()}
-        return own | self._controller.state_dict()
+        return {"ahead.command": self._command.copy()} | self._controller.state_dict()
 
     def load_state_dict(self, state: Mapping[str, Array]) -> None:
         """Go on from a state of `state_dict`. Raises StepError where it is that of another design."""
         rest = dict(state)
-        self._commands[:], self._mirror[:] = rest.pop("ahead.commands"), rest.pop("ahead.mirror")
+        self._command[:] = rest.pop("ahead.command")
         self._controller.load_state_dict(rest)
 
 
@@ -395,4 +384,4 @@ class LoopPredictor:
         if self._id in OBSERVERS:
             return design(self._id, prior, scenario=scenario, sampling=sampling, horizon=self.horizon - 1)
         controller = design(self._id, prior, scenario=scenario, sampling=sampling, train=history)
-        return CommandAhead(controller, sampling.n_modes, self.horizon)
+        return CommandAhead(controller)

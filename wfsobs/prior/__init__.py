@@ -208,34 +208,11 @@ class Spectra:
 
 
 @dataclass(frozen=True)
-class Flow:
-    """Turbulence of all modes together, as the target has it and as the LGS together see it, without noise.
-
-    Spectra stand for sums: E t_i[k] m_j[k-n] is the real part of the sum over nodes of cross[i, j] exp(i omega n).
-
-    omega       : nodes [rad per step], (n,)
-    own         : powers of the target, (n_modes, n) [um^2]
-    measurement : cross powers between modes of the LGS, (n_modes, n_modes, n) [um^2]
-    cross       : those of the target and the LGS, (n_modes, n_modes, n) [um^2]
-    line_gain   : of the LGS for the vibration, (n_modes,)
-    """
-
-    omega: Array
-    own: Array
-    measurement: Complex
-    cross: Complex
-    line_gain: Array
-
-    def first(self, n: int) -> Flow:
-        """Return that of the first n modes."""
-        return Flow(self.omega, self.own[:n], self.measurement[:n, :n], self.cross[:n, :n], self.line_gain[:n])
-
-
-@dataclass(frozen=True)
 class Asterism:
-    """Turbulence of all modes as the target, every LGS and the NGS have it, without noise; sums as in `Flow`.
+    """Turbulence of all modes as the target, every LGS and the NGS have it, without noise.
 
-    Beams are the mean of the LGS, their orthonormal differences, and the NGS.
+    Spectra stand for sums: E t_i[k] m_j[k-n] is the real part of the sum over nodes of cross[i, j] exp(i omega n). Beams are the
+    mean of the LGS, their orthonormal differences, and the NGS.
 
     omega       : nodes [rad per step], (n,)
     own         : powers of the target, (n_modes, n) [um^2]
@@ -276,6 +253,10 @@ class Asterism:
 
 class FlowOfBoth(Asterism):
     """As an asterism, with what is made of all LGS together in the place of one star."""
+
+
+class Flow(FlowOfBoth):
+    """That without an NGS, as of frames of every step."""
 
 
 __all__ = [

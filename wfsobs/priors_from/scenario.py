@@ -14,7 +14,7 @@ from dataclasses import replace
 from functools import lru_cache
 from math import sqrt
 from types import MappingProxyType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -66,28 +66,14 @@ from wfsobs.typing import Array
 Of = TypeVar("Of", bound=Asterism)
 
 
-def flow_of(scenario: Scenario, n_modes: int, dt: float | None = None) -> Flow | None:
-    """Return the turbulence of the first modes together; None where they tell nothing of one another.
+def turbulence_together(kind: type[Of], scenario: Scenario, n_modes: int, dt: float) -> Of | None:
+    """Return the turbulence of the first modes together, at steps of dt [s].
 
-    dt : [s], by default that of the scenario. Where the strength of the model is set by hand the flow has that.
+    None where all LGS see the same, or for `Flow` and `FlowOfBoth` where modes tell nothing of one another. Where the strength of
+    the model is set by hand the turbulence has that.
     """
-    if not are_coupled(scenario) or n_modes < 2:
-        return None
-    return _flow(scenario, dt or scenario.dt).first(n_modes)
-
-
-def asterism_of(scenario: Scenario, n_modes: int, dt: float | None = None) -> Asterism | None:
-    """Return the turbulence of the first modes in every beam; None where all LGS see the same. dt, strength : as in `flow_of`."""
-    if not has_stars_apart(scenario):
-        return None
-    return _make_asterism(scenario, dt or scenario.dt).first(n_modes)
-
-
-def flow_of_both(scenario: Scenario, n_modes: int, dt: float | None = None) -> FlowOfBoth | None:
-    """Return that in what is made of all LGS, and in the NGS; None as in `flow_of`, which has dt and strength."""
-    if not are_coupled(scenario) or n_modes < 2:
-        return None
-    return _flow_of_both(scenario, dt or scenario.dt).first(n_modes)
+    is_known = has_stars_apart(scenario) if kind is Asterism else are_coupled(scenario) and n_modes > 1
+    return _of_beams(kind, scenario, dt).first(n_modes) if is_known else None
 
 
 def has_stars_apart(scenario: Scenario) -> bool:
@@ -95,68 +81,36 @@ def has_stars_apart(scenario: Scenario) -> bool:
     return any(stars_differ(scenario, mode) for mode in range(len(scenario.modes)))
 
 
-@lru_cache(maxsize=4)
-def _flow(scenario: Scenario, dt: float) -> Flow:
-    """Return that of all modes, which takes a while."""
+@lru_cache(maxsize=8)
+def _of_beams(kind: type[Asterism], scenario: Scenario, dt: float) -> Any:
+    """Return that of all modes in the beams of the LGS, and but for `Flow` in the NGS, which takes a while."""
     frequency, weight = frequency_rule(scenario)
-    found, strength = mode_spectra(scenario, frequency), _strength(scenario, dt)
-    by_pair = weight * np.outer(strength, strength)[:, :, None]
-    return Flow(
-        omega=2.0 * np.pi * frequency * dt,
-        own=found.own * weight * strength[:, None] ** 2,
-        measurement=found.measurement * by_pair,
-        cross=found.cross * by_pair,
-        line_gain=_line_gain(scenario),
-    )
-
-
-@lru_cache(maxsize=2)
-def _make_asterism(scenario: Scenario, dt: float) -> Asterism:
-    """Return that of all modes, which takes a while."""
-    every, m = lgs_weights(scenario), range(len(scenario.modes))
-    alone = np.sqrt(np.sum(every[m, :, m] ** 2, axis=1))  # noise of their combination, over that of one
-    return _of_beams(Asterism, scenario, dt, beam_spectra, star_basis(len(every[0])), alone, every, np.ones(len(m)))
-
-
-@lru_cache(maxsize=2)
-def _flow_of_both(scenario: Scenario, dt: float) -> FlowOfBoth:
-    """Return that of all modes, which takes a while."""
-    m = len(scenario.modes)
-    itself = np.eye(m)[:, None]
-    return _of_beams(FlowOfBoth, scenario, dt, combined_spectra, np.eye(1), np.ones(m), itself, _line_gain(scenario))
-
-
-def _of_beams(
-    kind: type[Of],
-    scenario: Scenario,
-    dt: float,
-    spectra: Callable[[Scenario, Array], ModeSpectra],
-    basis: Array,
-    noise_gain: Array,
-    combination: Array,
-    line_gain: Array,
-) -> Of:
-    """Return the turbulence in the beams of the LGS and in the NGS.
-
-    noise_gain : noise of all LGS together, over that of one, (n_modes,);  the others as in `Asterism`
-    """
-    frequency, weight = frequency_rule(scenario)
-    found, strength, beams = spectra(scenario, frequency), _strength(scenario, dt), len(basis) + 1
-    m = len(strength)
-    by_pair = weight * np.outer(strength, strength)[:, :, None]
+    found, strength, m = _SPECTRA[kind](scenario, frequency), _strength(scenario, dt), len(scenario.modes)
+    by_pair, beams = weight * np.outer(strength, strength)[:, :, None], len(found.measurement) // m
     noise, ngs_noise = np.array([measurement_noise(scenario, mode) for mode in range(m)]).T
+    combination, line_gain, ratio = np.eye(m)[:, None], _line_gain(scenario), scenario.sensors.exposure_ratio
+    if kind is Asterism:
+        combination, line_gain = lgs_weights(scenario), np.ones(m)
+        noise = noise / np.sqrt(np.sum(combination[range(m), :, range(m)] ** 2, axis=1))  # of one, from that of all together
+    elif kind is Flow:
+        ngs_noise, ratio = np.zeros(m), 1
     return kind(
         omega=2.0 * np.pi * frequency * dt,
         own=found.own * weight * strength[:, None] ** 2,
         measurement=found.measurement.reshape(beams, m, beams, m, -1) * by_pair[:, None],
         cross=found.cross.reshape(m, beams, m, -1) * by_pair[:, None],
-        basis=basis,
-        noise=noise / noise_gain,
+        basis=star_basis(combination.shape[1]),
+        noise=noise,
         ngs_noise=ngs_noise,
         combination=combination,
         line_gain=line_gain,
-        ratio=scenario.sensors.exposure_ratio,
+        ratio=ratio,
     )
+
+
+_SPECTRA: Mapping[type[Asterism], Callable[[Scenario, Array], ModeSpectra]] = MappingProxyType(
+    {Asterism: beam_spectra, FlowOfBoth: combined_spectra, Flow: mode_spectra}
+)
 
 
 def _line_gain(scenario: Scenario) -> Array:
@@ -391,25 +345,24 @@ def prior_of(
         modes = range(record.n_modes if record else len(scenario.modes))
     dt = record.dt if record else scenario.dt
     model, bands = _most_of(Model, asked), _most_of(Bands, asked)
+    beams = [kind for kind in (Asterism, FlowOfBoth) if kind in asked]
+
+    def each(part: Part, make: Callable[[Scenario, int, float], Any]) -> tuple[Any, ...]:
+        return tuple(make(scenario, mode, dt) for mode in modes) if part in asked else ()
+
     return Prior(
         model=tuple(model_of(scenario, mode, dt, model) for mode in modes) if model else (),
         noise=tuple(Noise(*measurement_noise(scenario, mode)) for mode in modes) if Noise in asked else (),
-        lgs_error=tuple(lgs_error_of(scenario, mode, dt) for mode in modes) if LgsError in asked else (),
-        lines=tuple(lines_of(scenario, mode, dt) for mode in modes) if Lines in asked else (),
-        stars=tuple(stars_of(scenario, mode, dt) for mode in modes) if LgsStars in asked else (),
-        beams=tuple(beams_of(scenario, mode, dt) for mode in modes) if Beams in asked else (),
-        flow=flow_of(scenario, len(modes), dt) if Flow in asked else None,
-        asterism=_asterism(asked, scenario, len(modes), dt),
+        lgs_error=each(LgsError, lgs_error_of),
+        lines=each(Lines, lines_of),
+        stars=each(LgsStars, stars_of),
+        beams=each(Beams, beams_of),
+        flow=turbulence_together(Flow, scenario, len(modes), dt) if Flow in asked else None,
+        asterism=turbulence_together(beams[0], scenario, len(modes), dt) if beams else None,
         bands=bands_of(scenario, bands) if bands else None,
         spectra=tuple(spectra or [spectra_of(scenario, mode) for mode in modes]) if Spectra in asked else (),
         training=training_of(record, modes) if Training in asked and record else None,
     )
-
-
-def _asterism(parts: Collection[Part], scenario: Scenario, n_modes: int, dt: float) -> Asterism | None:
-    if Asterism in parts:
-        return asterism_of(scenario, n_modes, dt)
-    return flow_of_both(scenario, n_modes, dt) if FlowOfBoth in parts else None
 
 
 def _most_of(kind: type[T], parts: Collection[Part]) -> type[T] | None:

@@ -17,8 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
-from wfsobs.signal.filter_covariance import lyapunov
-from wfsobs.signal.riccati import Step
+from wfsobs.signal.riccati import Step, lyapunov
 from wfsobs.typing import Array
 
 STEADY = 3e-3

@@ -32,7 +32,7 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 from scipy.linalg import block_diag, cho_solve, helmert, schur
 
-from wfsobs.signal.filter_covariance import lyapunov
+from wfsobs.signal.riccati import lyapunov
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
@@ -97,26 +97,6 @@ def running_means(spans: Sequence[float], turns: Sequence[float] = (0.0,)) -> St
             blocks.append(np.array([[c, -s], [s, c]] if turn else [[c]]))
             into += [1.0 - decay, 0.0][: len(blocks[-1])]
     return StateFilter(block_diag(*blocks), np.array(into))
-
-
-class OwnShare(NamedTuple):
-    """What the disturbance of one mode alone, and noise, bring into the states: covariances [um^2].
-
-    states      : of the states, (n, n)
-    disturbance : of the disturbance's state and the filter's, (n_disturbance, n)
-    """
-
-    states: Array
-    disturbance: Array
-
-
-def own_share(one: StateFilter, model: DisturbanceModel, gain: float, noise: float) -> OwnShare:
-    """Return the share of a disturbance that is measured with a gain, and of white noise [um]."""
-    n, m = len(model.A), len(one.F)
-    into = np.outer(one.G, gain * model.C)
-    F = np.block([[model.A, np.zeros((n, m))], [into, one.F]])  # of the disturbance at k + 1, the filter at k
-    S = lyapunov(F, block_diag(model.Q, noise**2 * np.outer(one.G, one.G)))
-    return OwnShare(S[n:, n:], S[:n, n:] @ one.F.T + S[:n, :n] @ into.T)
 
 
 def shared_covariance(powers: Complex, responses: Sequence[Complex]) -> Array:

@@ -30,6 +30,18 @@ class Recursion:
     steps: Sequence[FilterStep]
     first: FilterStep | None = None
 
+    @property
+    def cycle(self) -> PeriodicFilter:
+        """The steps that repeat."""
+        return PeriodicFilter(self.steps)
+
+    def run(self, v: Array) -> Array:
+        """Return the outputs at every step of a record v (n_steps, m) from rest, (n_steps, p)."""
+        if self.first is None:
+            return self.cycle.run(v[:, :, None])[:, :, 0]
+        _, G, _, J = self.first
+        return np.vstack([J @ v[0], self.cycle.run(v[1:, :, None], (G @ v[0])[:, None])[:, :, 0]])
+
 
 @dataclass(frozen=True)
 class PeriodicFilter:

@@ -23,11 +23,81 @@ from itertools import groupby
 
 import numpy as np
 
-from wfsobs.signal.filter_covariance import RiccatiError, Step, lyapunov
 from wfsobs.typing import Array
 
 RESIDUAL = 1e-9
 """Maximum residual of an accepted solution, relative to the covariance."""
+
+Step = tuple[Array, Array, Array, Array]
+"""(A, C, Q, R) of one step: measure with C and R, then predict with A and Q."""
+
+
+class RiccatiError(ValueError):
+    """Error: no usable steady-state filter for the given model; one line with the reason."""
+
+
+def posteriors_of_gains(cycle: Sequence[Step], gains: Sequence[Array]) -> list[Array]:
+    """Return the covariances of a filter whose gains need not be optimal, in its steady state.
+
+    Parameters
+    ----------
+    cycle : sequence of Step
+        (A, C, Q, R) of every step of the cycle, as for `steady_state`.
+    gains : sequence of Array
+        Filter gain of every step, (n, m).
+
+    Returns
+    -------
+    list of Array
+        Covariance after the measurement of every step, (n, n).
+
+    Raises
+    ------
+    RiccatiError
+        The filter is not stable.
+    """
+    F, W = np.eye(len(cycle[0][0])), np.zeros_like(cycle[0][0])
+    for (A, C, Q, R), L in zip(cycle, gains, strict=True):
+        reduced = np.eye(len(A)) - L @ C
+        W = A @ (reduced @ W @ reduced.T + L @ R @ L.T) @ A.T + Q
+        F = A @ reduced @ F
+    P, out = lyapunov(F, W), []
+    for (A, C, Q, R), L in zip(cycle, gains, strict=True):
+        reduced = np.eye(len(A)) - L @ C
+        out.append(reduced @ P @ reduced.T + L @ R @ L.T)
+        P = A @ out[-1] @ A.T + Q
+    return out
+
+
+def lyapunov(F: Array, W: Array) -> Array:
+    """Solve S = F S F' + W by doubling the number of terms of its series in every pass.
+
+    Parameters
+    ----------
+    F, W : Array
+        Transition matrix, stable, and covariance of the drive, both (n, n).
+
+    Returns
+    -------
+    Array
+        S, (n, n).
+
+    Raises
+    ------
+    RiccatiError
+        F is not stable.
+    """
+    S = W
+    for _ in range(60):
+        with np.errstate(over="ignore", invalid="ignore"):
+            step = F @ S @ F.T
+            S = S + step
+            F = F @ F
+        if not np.isfinite(S).all():
+            break
+        if np.abs(step).max() <= 1e-17 * np.abs(S).max():
+            return 0.5 * (S + S.T)
+    raise RiccatiError("the filter is not stable: its error would grow without bound")
 
 
 @dataclass(frozen=True)
@@ -111,7 +181,7 @@ def periodic_steady_state(cycle: Sequence[Step]) -> list[SteadyState]:
             f"no accurate steady-state filter: the Riccati equation is met to {residual:.1e} only; "
             "measurement noise and process noise are too far apart"
         )
-    radius = np.abs(np.linalg.eigvals(_closed_loop(cycle, found))).max()
+    radius = np.abs(np.linalg.eigvals(_carry_around(cycle, found)[0])).max()
     if radius >= 1.0:
         raise RiccatiError(f"the steady-state filter is not stable: spectral radius {radius:.6f}")
     return found
@@ -123,7 +193,7 @@ def _refine(cycle: Sequence[Step], P: Array) -> list[SteadyState]:
     states, idle = best, 0
     while idle < 3 and best[0].residual > 1e-14:
         try:
-            states = _around(cycle, _lyapunov_around(cycle, states))
+            states = _around(cycle, lyapunov(*_carry_around(cycle, states)))
         except RiccatiError:  # gains from a poor start need not be stable
             break
         idle = 0 if states[0].residual < 0.5 * best[0].residual else idle + 1
@@ -188,7 +258,7 @@ def _power_of_map(m: Map, times: int) -> Map:
 def _without_measurements(cycle: Sequence[Step]) -> Array:
     """Return the covariance of the model itself; Kleinman steps from it converge as surely, but more slowly."""
     blind = _around([(A, np.zeros_like(C), Q, R) for A, C, Q, R in cycle], np.zeros_like(cycle[0][2]))
-    return _lyapunov_around(cycle, blind)
+    return lyapunov(*_carry_around(cycle, blind))
 
 
 def _around(cycle: Sequence[Step], P: Array) -> list[SteadyState]:
@@ -208,19 +278,12 @@ def _around(cycle: Sequence[Step], P: Array) -> list[SteadyState]:
     return [SteadyState(*one, residual) for one in found]
 
 
-def _lyapunov_around(cycle: Sequence[Step], states: Sequence[SteadyState]) -> Array:
-    """Return the prediction covariance at the start of the cycle for the given gains."""
+def _carry_around(cycle: Sequence[Step], states: Sequence[SteadyState]) -> tuple[Array, Array]:
+    """Return the map of the error of a prediction over the cycle, and the covariance that it adds, for the given gains."""
     F = np.eye(len(cycle[0][0]))
     W = np.zeros_like(F)
     for (A, C, Q, R), state in zip(cycle, states, strict=True):
         Fj = A - state.K @ C
         W = Fj @ W @ Fj.T + state.K @ R @ state.K.T + Q
         F = Fj @ F
-    return lyapunov(F, W)
-
-
-def _closed_loop(cycle: Sequence[Step], states: Sequence[SteadyState]) -> Array:
-    F = np.eye(len(cycle[0][0]))
-    for (A, C, _, _), state in zip(cycle, states, strict=True):
-        F = (A - state.K @ C) @ F
-    return F
+    return F, W

@@ -261,8 +261,7 @@ def _frame_factor(spectrum: Array, slow: SlowSensor, n: int) -> Complex:
     """Return the factor of the spectrum of the frames' rests, noise included, one coefficient every `ratio` steps."""
     frames = n // 2 // slow.ratio
     covariance = fft.irfft(spectrum, n)[: frames * slow.ratio + 1 : slow.ratio]
-    circle = np.concatenate([covariance, covariance[-2:0:-1]])
-    found = factorise(np.maximum(fft.rfft(circle).real, 0.0) + slow.noise)
+    found = _frame_whitener(covariance, slow.noise)
     spread = np.zeros(n)
     spread[: frames * slow.ratio : slow.ratio] = fft.irfft(found.factor * np.sqrt(found.innovation_variance), 2 * frames)[:frames]
     return fft.rfft(spread)

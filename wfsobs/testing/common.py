@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -13,7 +13,7 @@ import numpy as np
 
 from wfsobs.control.step import StepController
 from wfsobs.observers.base import Observer
-from wfsobs.observers.step import StepObserver
+from wfsobs.observers.step import StepObserver, frames_of
 from wfsobs.prior import Prior
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, hold_last
@@ -71,6 +71,17 @@ def arrays_of(measurements: Measurements) -> dict[str, Array]:
     return {name: x for name, x in vars(measurements).items() if isinstance(x, np.ndarray)}
 
 
+LOST = 7
+"""Measurements in a row that are missing."""
+
+
+def with_gap(measurements: Measurements) -> Measurements:
+    """Return measurements without LOST samples in the middle."""
+    y, start = measurements.y_lgs.copy(), measurements.n_steps // 2
+    y[start : start + LOST] = np.nan
+    return replace(measurements, y_lgs=y)
+
+
 RESIDUES = 7
 COMMON_MULTIPLE = 420
 """Of the whole numbers up to RESIDUES."""
@@ -125,21 +136,16 @@ Estimates = dict[str, Array]
 STEPS = "cannot run frame by frame"
 
 
-def run_steps(observer: StepObserver, measurements: Measurements, steps: Iterable[int] | None = None) -> Estimates:
+def run_steps(observer: StepObserver, measurements: Measurements, steps: Sequence[int] | None = None) -> Estimates:
     """Return `predict(0)` after every frame of measurements, target -> (n_steps, n_modes) [um]; steps : those to take.
 
     A lost command is held, as the mirror holds its position; NGS frames are given where they are due, NaN where they are lost.
     """
     measurements = replace(measurements, u=hold_last(measurements.u))
-    z, u, n = measurements.z, measurements.u, measurements.ratio
-    z_ngs = None if n is None or measurements.y_ngs is None else measurements.z_ngs
-    z_stars = None if measurements.y_stars is None else measurements.z_stars
-    out = {target: np.full_like(z, np.nan) for target in observer.targets}
-    for k in range(measurements.n_steps) if steps is None else steps:
-        due = z_ngs is not None and n is not None and k > 0 and k % n == 0
-        stars = None if measurements.lgs_stars is None else int(measurements.lgs_stars[k])
-        each = None if z_stars is None else z_stars[k]
-        observer.update(z[k], z_ngs[k] if z_ngs is not None and due else None, u=u[k], stars=stars, each=each)
+    out = {target: np.full_like(measurements.z, np.nan) for target in observer.targets}
+    steps = range(measurements.n_steps) if steps is None else steps
+    for k, frame in zip(steps, frames_of(measurements, steps=steps), strict=True):
+        observer.update(frame.z, frame.ngs, frame.u, stars=frame.stars, each=frame.each)
         for target, values in out.items():
             values[k] = observer.predict(0, target)[0]
     return out
@@ -148,18 +154,14 @@ def run_steps(observer: StepObserver, measurements: Measurements, steps: Iterabl
 def run_loop(controller: StepController, measurements: Measurements) -> Array:
     """Return the commands (n_steps, n_modes) [um] in a loop with the mirror and these pseudo-open-loop measurements."""
     measurements = replace(measurements, u=hold_last(measurements.u))
-    z, n, mirror = measurements.z, measurements.ratio, controller.plant.mirror
-    z_ngs = None if n is None or measurements.y_ngs is None else measurements.z_ngs
-    u, seen = np.zeros_like(z), np.zeros_like(z)
+    n, mirror = measurements.ratio or 1, controller.plant.mirror
+    u, seen = np.zeros_like(measurements.z), np.zeros_like(measurements.z)
     back = np.arange(1, mirror.taps.size)
-    for k in range(len(z)):
+    for k, frame in enumerate(frames_of(measurements)):
         past = back[back <= k]
         seen[k] = mirror.taps[past] @ u[k - past]
-        ngs = None
-        if z_ngs is not None and n is not None and k > 0 and k % n == 0:
-            ngs = z_ngs[k] + seen[k + 1 - n : k + 1].mean(axis=0)
-        stars = None if measurements.lgs_stars is None else int(measurements.lgs_stars[k])
-        u[k] = controller.update(z[k] + seen[k], ngs, stars=stars)
+        ngs = None if frame.ngs is None else frame.ngs + seen[k + 1 - n : k + 1].mean(axis=0)
+        u[k] = controller.update(frame.z + seen[k], ngs, stars=frame.stars)
     return u
 
 
@@ -190,12 +192,10 @@ def check_steps(observer: Observer, measurements: Measurements, prior: Prior, se
     """
     if observer.step is None:
         return
-    y, half = measurements.y_lgs.copy(), measurements.n_steps // 2
-    y[half : half + 7] = np.nan
-    with_gap = replace(measurements, y_lgs=y)
+    broken, half = with_gap(measurements), measurements.n_steps // 2
     with report_errors(observer.id, watch, STEPS):
-        differences = [step_difference(observer, seen, prior, settings) for seen in (measurements, with_gap)]
-    measurements = with_gap
+        differences = [step_difference(observer, seen, prior, settings) for seen in (measurements, broken)]
+    measurements = broken
     if not max(differences) <= SAME:
         raise CheckError(f"{observer.id}: frame by frame its estimate is not that of its run over the record")
     with report_errors(observer.id, watch, STEPS):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 from types import BuiltinFunctionType, FunctionType, ModuleType
 from typing import Any, NamedTuple
@@ -27,6 +26,7 @@ from wfsobs.scenario.groups.plant import Run
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
 from wfsobs.testing.common import (
+    LOST,
     QUICK,
     SAME,
     STEPS,
@@ -37,6 +37,7 @@ from wfsobs.testing.common import (
     report_errors,
     run_loop,
     steps_to_check,
+    with_gap,
 )
 from wfsobs.typing import Array
 
@@ -81,10 +82,6 @@ def given_away(record: Record, *roots: Any, seed: int = SEED) -> set[str]:
                 if np.shares_memory(x, truth) or any(np.isin(column, x).all() for column in truth.T if column.any()):
                     found.add(name)
     return found
-
-
-LOST = 7
-"""Measurements in a row that are missing."""
 
 
 class ControllerInputs(NamedTuple):
@@ -221,17 +218,10 @@ def _check_causal(runs: ControllerRuns, inputs: ControllerInputs, base: Array) -
 
 
 def _check_gaps(runs: ControllerRuns, inputs: ControllerInputs) -> None:
-    gap = _with_gap(inputs.measurements)
+    gap = with_gap(inputs.measurements)
     u = runs.commands(inputs._replace(measurements=gap), " after missing samples")
     if not runs.controller.is_idle and not np.ptp(u[gap.n_steps // 2 + LOST :], axis=0).any():
         raise CheckError(f"{runs.controller.id}: does not recover after missing samples")
-
-
-def _with_gap(measurements: Measurements) -> Measurements:
-    """Return measurements without LOST samples in the middle."""
-    y, start = measurements.y_lgs.copy(), measurements.n_steps // 2
-    y[start : start + LOST] = np.nan
-    return replace(measurements, y_lgs=y)
 
 
 def _check_steps(runs: ControllerRuns, inputs: ControllerInputs) -> None:
@@ -239,7 +229,7 @@ def _check_steps(runs: ControllerRuns, inputs: ControllerInputs) -> None:
     controller = runs.controller
     if controller.predict is not None and controller.step_predict is None:
         return
-    measured = _with_gap(inputs.measurements)
+    measured = with_gap(inputs.measurements)
     with report_errors(controller.id, runs.watch, STEPS):
         got = run_loop(controller.design(inputs.prior, inputs.plant, inputs.settings, measured.sampling), measured)
     base = runs.commands(inputs._replace(measurements=measured))

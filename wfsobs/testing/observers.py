@@ -7,7 +7,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,6 +31,7 @@ from wfsobs.testing.common import (
     in_a_fresh_process,
     report_errors,
     steps_to_check,
+    with_gap,
 )
 
 
@@ -136,11 +136,9 @@ def _check_causal(runs: ObserverRuns, arguments: tuple[Measurements, Prior, Any]
 
 def _check_gaps(runs: ObserverRuns, arguments: tuple[Measurements, Prior, Any]) -> None:
     measured, *rest = arguments
-    y, start = measured.y_lgs.copy(), measured.n_steps // 2
-    y[start : start + 7] = np.nan
-    found = runs.estimate(replace(measured, y_lgs=y), *rest)
+    found = runs.estimate(with_gap(measured), *rest)
     for target in runs.observer.targets:
-        if np.isnan(found[target][start + 1 :]).all():
+        if np.isnan(found[target][measured.n_steps // 2 + 1 :]).all():
             raise CheckError(f"{runs.observer.id}: {target} does not recover after missing samples")
 
 

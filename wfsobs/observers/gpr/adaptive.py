@@ -56,9 +56,8 @@ from wfsobs.observers.stepping import FilterBank, SampleHistory, Saved
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, RecordError, Sampling
-from wfsobs.signal.filter_covariance import lyapunov
 from wfsobs.signal.periodic import FilterStep, PeriodicFilter, Recursion
-from wfsobs.signal.riccati import steady_state
+from wfsobs.signal.riccati import lyapunov, steady_state
 from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
 from wfsobs.spectral.model import Spectrum
 from wfsobs.spectral.periodogram import periodogram, periodogram_frequencies
@@ -150,7 +149,7 @@ def learn(z: Array, dt: float, depth: int, most: int, lowest: float, last: Learn
             missed = missed_variance(lines, z, lowest)
             if not lines.resonances:
                 return Learnt(fit, mean, np.zeros(depth), float(np.sqrt(missed)))
-            target = smoother(_model(lines), VIBRATION, max(lines.noise, MIN_NOISE))
+            target = smoother(disturbance_model(lines.continuum, lines.resonances), VIBRATION, max(lines.noise, MIN_NOISE))
             x = PeriodicFilter([whitener_of(fit)]).run(z[:, None, None])[:, 0, 0]
             first = SETTLED * depth
             found = fit_bands(x, target.run(z)[first + horizon :], first, weight_covariance(lines, depth))
@@ -187,10 +186,6 @@ def weight_covariance(lines: Spectrum, depth: int) -> Array:
     f = np.fft.rfftfreq(BINS, lines.dt)
     whole, continuum = lines.psd(f), replace(lines, resonances=()).psd(f)
     return np.fft.irfft((whole - continuum) * continuum / whole)[:depth]
-
-
-def _model(lines: Spectrum) -> DisturbanceModel:
-    return disturbance_model(lines.continuum, lines.resonances)
 
 
 class BandRegression(NamedTuple):

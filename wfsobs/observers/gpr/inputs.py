@@ -3,11 +3,17 @@
 Turbulence is a hundred times the vibration that a GPR is after, and in raw inputs the distance between windows is turbulence
 nearly alone. A high-pass takes it out; standardising gives every channel the same weight. Both are causal: the high-pass starts
 from rest at the first sample, and the means and deviations are those of the training record.
+
+The modes of an observer are at work at the same time (`over_modes`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from types import MappingProxyType
 from typing import ClassVar, NamedTuple
 
@@ -17,6 +23,7 @@ from scipy.signal import butter, sosfilt, sosfilt_zi
 
 from wfsobs.observers.step import StepError
 from wfsobs.observers.stepping import SampleHistory, StateArrays
+from wfsobs.progress import Watch
 from wfsobs.record import Measurements, RecordError, Sampling, Training, pseudo_open_loop
 from wfsobs.settings import Group, Real, Whole
 from wfsobs.settings.group import UsedWhen
@@ -94,13 +101,7 @@ def window_signals(settings: Gpr, y: Array, u: Array, z: Array, mode: int, dt: f
     scale : for standardised ones, from `scale_of`
     """
     x = _channels(settings, y, u, z, mode)
-    if settings.inputs_filter == "high-pass":
-        sos = high_pass(settings.highpass, dt)
-        return sosfilt(sos, x, axis=0, zi=at_rest(sos, x[0]))[0]
-    if settings.inputs_filter == "standardised":
-        assert scale is not None
-        return (x - scale.mean) / scale.std
-    return x
+    return StreamingInputs(settings, dt, scale, x.shape[1]).run(x)
 
 
 def scale_of(settings: Gpr, training: Training | None, delay: int, mode: int) -> Scale | None:
@@ -143,7 +144,7 @@ def _channels(settings: Gpr, y: Array, u: Array, z: Array, mode: int) -> Array:
 
 
 class StreamingInputs(StateArrays):
-    """`window_signals`, one sample at a time, of so many channels."""
+    """What is done to the samples of so many channels, as many at a time as there are."""
 
     state_names: tuple[str, ...] = ("_filter", "_is_started")
 
@@ -155,14 +156,14 @@ class StreamingInputs(StateArrays):
         self._filter = None if self._sos is None else np.zeros((len(self._sos), 2, channels))
         self.mark_start()
 
-    def step(self, sample: Array) -> Array:
-        """Return the inputs (channels,) of this step's sample (channels,)."""
+    def run(self, samples: Array) -> Array:
+        """Return the inputs of the next samples, both (n, channels)."""
         if self._sos is not None and self._filter is not None:
-            start = self._filter if self._is_started else at_rest(self._sos, sample)
-            out, self._filter[...] = sosfilt(self._sos, sample[None], axis=0, zi=start)
+            start = self._filter if self._is_started else at_rest(self._sos, samples[0])
+            out, self._filter[...] = sosfilt(self._sos, samples, axis=0, zi=start)
             self._is_started = True
-            return out[0]
-        return sample if self._scale is None else (sample - self._scale.mean) / self._scale.std
+            return out
+        return samples if self._scale is None else (samples - self._scale.mean) / self._scale.std
 
 
 class Windows(StateArrays):
@@ -225,7 +226,7 @@ class Windows(StateArrays):
             past[0] = held
         else:
             sample[...] = z
-        out = sample if self._inputs is None else self._inputs.step(sample)
+        out = sample if self._inputs is None else self._inputs.run(sample[None])[0]
         self._samples.push(out)
         self.count += 1
         return out
@@ -248,3 +249,30 @@ class Windows(StateArrays):
 def tunable(group: str) -> tuple[str, ...]:
     """Return the settings of a group of a GPR that are tuned only if they are named."""
     return tuple(f"{group}.{name}" for name in ("signal_std", "training_size", "highpass"))
+
+
+CORES = 2
+"""Processors of the machine that computing times were measured on (`wfsobs.cost`)."""
+
+AT_ONCE = max(os.cpu_count() or 1, 2)
+"""Modes at work at the same time: more would only need more memory."""
+
+
+def turns(n_modes: int) -> int:
+    """How many modes that machine does one after the other, where modes run side by side."""
+    return -(-n_modes // CORES)
+
+
+def over_modes(n_modes: int, work: Callable[[int, Watch], Array], watch: Watch) -> Array:
+    """Columns work(mode, watch) of every mode, as many at a time as there are processors, (n_steps, n_modes).
+
+    If one fails, or the wait for them is interrupted, the others are told to stop by the watch they were given.
+    """
+    stop = threading.Event()
+    told = replace(watch, is_cancelled=lambda: stop.is_set() or watch.is_cancelled())
+    with ThreadPoolExecutor(min(n_modes, AT_ONCE)) as pool:
+        try:
+            return np.column_stack(list(pool.map(lambda mode: work(mode, told), range(n_modes))))
+        except BaseException:
+            stop.set()
+            raise

@@ -25,7 +25,7 @@ from numpy.lib.stride_tricks import as_strided
 from wfsobs.observers.base import VIBRATION, Look, Observer, Tunable
 from wfsobs.observers.baselines import open_loop_reference
 from wfsobs.observers.estimates import Estimates
-from wfsobs.observers.gpr.inputs import Gpr, Windows, scale_of, scales_of, training_signals, tunable, window_signals
+from wfsobs.observers.gpr.inputs import Gpr, Windows, over_modes, scales_of, training_signals, tunable, turns
 from wfsobs.observers.gpr.kernels import (
     Points,
     SquaredExponential,
@@ -36,7 +36,6 @@ from wfsobs.observers.gpr.kernels import (
     squared_norms,
 )
 from wfsobs.observers.gpr.online import kernel_of
-from wfsobs.observers.per_mode import over_modes, turns
 from wfsobs.observers.step import HeldEstimate, whole_frames
 from wfsobs.prior import Bands, OfflineBands, Prior
 from wfsobs.progress import QUIET, Watch
@@ -156,56 +155,47 @@ class OfflineGpr(Gpr):
 OFFLINE = Section("gpr_offline", "Offline GPR", OfflineGpr)
 
 
-def training_targets(training: Training, bands: Bands, dt: float, delay: int = DELAY, horizon: int = 0) -> Array:
-    """Return the vibration reference `horizon` steps ahead of every step of the training record, (n, n_modes) [um].
+def training_targets(
+    training: Training, bands: Bands, dt: float, delay: int = DELAY, weights: Sequence[float] | Array = (1.0,)
+) -> Array:
+    """Return the vibration reference of every step of the training record, (n, n_modes) [um].
 
-    NaN at the last step, and where it lies beyond the record.
+    weights : of the vibration at the step, one step ahead and so on. NaN at the last step, and where it lies beyond the record
     """
     twin = training.open_loop_y
     at = open_loop_reference(bands, pseudo_open_loop(training.y_lgs, training.u, delay) if twin is None else twin, dt)
-    return np.vstack([at[horizon:], np.full((horizon, at.shape[1]), np.nan)])
+    longer = np.vstack([at, np.full((len(weights) - 1, at.shape[1]), np.nan)])
+    return np.sum([w * longer[k : k + len(at)] for k, w in enumerate(weights) if w], axis=0)
 
 
-def train_mode(
-    prior: Prior, g: OfflineGpr, mode: int, dt: float, delay: int, horizon: int = 0, watch: Watch = QUIET
-) -> TrainedGpr:
-    """Train on one mode of the training record, for the vibration `horizon` steps ahead. Raises RecordError, ConditionError."""
+def train_mode(prior: Prior, g: OfflineGpr, mode: int, sampling: Sampling, weights: Array) -> TrainedGpr:
+    """Train on one mode of the training record; weights : as in `training_targets`. Raises RecordError, ConditionError."""
     training, bands = prior.training, prior.bands
-    assert training is not None and bands is not None
-    if len(training.y_lgs) < (needed := g.depth + g.training_size + horizon):
-        raise RecordError(f"the training data has {len(training.y_lgs)} steps, depth + training size need {needed}")
-    targets = training_targets(training, bands, dt, delay, horizon)[:, mode]
-    return train(training_signals(g, training, mode, dt, delay), targets, g.depth, g.training_size, kernel_of(g), watch)
+    if training is None:
+        raise RecordError("the record has no training data")
+    assert bands is not None
+    ahead = f" + {len(weights) - 1}" if len(weights) > 1 else ""
+    if len(training.y_lgs) < (needed := g.depth + g.training_size + len(weights) - 1):
+        raise RecordError(f"the training data has {len(training.y_lgs)} steps, depth + training size{ahead} need {needed}")
+    targets = training_targets(training, bands, sampling.dt, sampling.delay, weights)[:, mode]
+    signals = training_signals(g, training, mode, sampling.dt, sampling.delay)
+    return train(signals, targets, g.depth, g.training_size, kernel_of(g))
 
 
-def gpr_offline(measurements: Measurements, prior: Prior, settings: OfflineGpr, watch: Watch) -> Estimates:
-    """Train on the training record and predict over the measurements, all modes at the same time."""
-    g, dt, delay, n_steps = settings, measurements.dt, measurements.delay, measurements.n_steps
-    if n_steps < g.depth:
-        raise RecordError(f"the record has {n_steps} steps; depth needs {g.depth}")
-
-    def one(mode: int, watch: Watch) -> Array:
-        model = train_mode(prior, g, mode, dt, delay, watch=watch)
-        scale = scale_of(g, prior.training, delay, mode)
-        signals, sd = (
-            window_signals(g, measurements.y_lgs, measurements.u, measurements.z, mode, dt, scale),
-            np.full(n_steps, np.nan),
-        )
-        return np.column_stack([model.predict(signals, watch, sd), sd])
-
-    found = over_modes(measurements.n_modes, one, watch)
-    return Estimates({VIBRATION: found[:, ::2]}, {VIBRATION: found[:, 1::2]})
+def gpr_offline(prior: Prior, settings: OfflineGpr, sampling: Sampling, horizon: float) -> OfflineEstimator:
+    """Return the GPR of all modes, trained for `horizon` frames ahead."""
+    ahead = whole_frames(horizon, "gpr-offline")
+    return trained_estimator(prior, settings, sampling, np.eye(ahead + 1)[-1], ahead)
 
 
-def step_gpr_offline(prior: Prior, settings: OfflineGpr, sampling: Sampling, horizon: float) -> OfflineEstimator:
-    """Return `gpr_offline`, one frame at a time, trained for `horizon` frames ahead."""
-    g, ahead = settings, whole_frames(horizon, "gpr-offline")
-    models = [train_mode(prior, g, mode, sampling.dt, sampling.delay, ahead) for mode in range(sampling.n_modes)]
-    return OfflineEstimator(Windows(g, sampling, g.depth, scales_of(g, prior.training, sampling)), models, ahead)
+def trained_estimator(prior: Prior, g: OfflineGpr, sampling: Sampling, weights: Array, horizon: float | None) -> OfflineEstimator:
+    """Return the GPR of all modes for this horizon; weights : as in `training_targets`."""
+    models = [train_mode(prior, g, mode, sampling, weights) for mode in range(sampling.n_modes)]
+    return OfflineEstimator(Windows(g, sampling, g.depth, scales_of(g, prior.training, sampling)), models, horizon)
 
 
 class OfflineEstimator(HeldEstimate):
-    """Trained GPR of all modes, one frame at a time; `train_mode` made them for `horizon` frames ahead."""
+    """Trained GPR of all modes, for one horizon."""
 
     windows: Windows
     models: tuple[TrainedGpr, ...]
@@ -217,6 +207,20 @@ class OfflineEstimator(HeldEstimate):
         super().__init__(len(models), horizon)
         self.windows, self.models, self.needs_command = windows, tuple(models), windows.needs_command
         self.mark_start()
+
+    def run(self, measurements: Measurements, watch: Watch, *, with_sd: bool = True) -> Estimates:
+        """Predict over a record, all modes at the same time. Raises RecordError for one that is shorter than a window."""
+        n_steps = measurements.n_steps
+        if n_steps < self.windows.depth:
+            raise RecordError(f"the record has {n_steps} steps; depth needs {self.windows.depth}")
+
+        def one(mode: int, watch: Watch) -> Array:
+            sd = np.full(n_steps, np.nan)
+            signals = self.windows.channels(measurements, mode)
+            return np.column_stack([self.models[mode].predict(signals, watch, sd if with_sd else None), sd])
+
+        found = over_modes(measurements.n_modes, one, watch)
+        return Estimates({VIBRATION: found[:, ::2]}, {VIBRATION: found[:, 1::2]})
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame."""
@@ -241,7 +245,6 @@ GPR_OFFLINE = Observer(
     "gpr-offline",
     "Offline GPR",
     (VIBRATION,),
-    gpr_offline,
     help="Gaussian process regression trained on another record",
     prior=(Training, OfflineBands),
     settings=OFFLINE,
@@ -254,5 +257,5 @@ GPR_OFFLINE = Observer(
     weight=20.0,
     seconds=seconds,
     look=Look("Offline GPR", "#183B2C", "#37C9B2", (12, 2, 2, 2, 2, 2)),
-    step=step_gpr_offline,
+    step=gpr_offline,
 )

@@ -14,11 +14,10 @@ import numpy as np
 from wfsobs.observers.base import VIBRATION, Look, Observer, Tunable
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.estimates import Estimates
-from wfsobs.observers.gpr.inputs import Gpr, Windows, scale_of, scales_of, tunable, window_signals
+from wfsobs.observers.gpr.inputs import Gpr, Windows, over_modes, scales_of, tunable, turns
 from wfsobs.observers.gpr.kernels import SquaredExponential, band, check_condition, square_from_band
 from wfsobs.observers.gpr.sliding_regression import LateRegression, SlidingRegression, finish, run_lengths, slide
-from wfsobs.observers.per_mode import over_modes, turns
-from wfsobs.observers.step import HeldEstimate, StepError, whole_frames
+from wfsobs.observers.step import HeldEstimate, StepError, run_frames, whole_frames
 from wfsobs.observers.stepping import FilterBank, Saved
 from wfsobs.prior import Bands, OnlineBands, Part, Prior, Training
 from wfsobs.progress import QUIET, Watch
@@ -64,36 +63,6 @@ def online_targets(record: Signals, bands: Bands) -> Array:
     """Return the vibration at every step, from the causal bank one step later, (n, n_modes) [um]; 0 at the last step."""
     f = online_reference(bands, record.z, record.dt)
     return np.vstack([f[1:], np.zeros((1, record.n_modes))])
-
-
-def gpr_online(measurements: Measurements, prior: Prior, settings: OnlineGpr, watch: Watch) -> Estimates:
-    """Run the online GPR over a record, all modes at the same time, in blocks."""
-    if measurements.n_steps < settings.depth + settings.training_size:
-        needed = settings.depth + settings.training_size
-        raise RecordError(f"the record has {measurements.n_steps} steps; depth + training size need {needed}")
-    assert prior.bands is not None
-    targets = online_targets(measurements, prior.bands)
-    values = np.full((measurements.n_steps, measurements.n_modes), np.nan)
-    done = np.zeros(measurements.n_modes)
-
-    def one(mode: int, watch: Watch) -> Array:
-        def deliver(start: int, stop: int, mean: Array) -> None:
-            values[start:stop, mode] = mean
-            done[mode] = stop / measurements.n_steps
-            watch.step(float(done.mean()))
-            watch.partial(VIBRATION, values)
-
-        scale = scale_of(settings, prior.training, measurements.delay, mode)
-        signals = window_signals(settings, measurements.y_lgs, measurements.u, measurements.z, mode, measurements.dt, scale)
-        return np.column_stack(
-            predict_sliding(
-                signals, targets[:, mode], settings.depth, settings.training_size, kernel_of(settings), deliver, watch.check
-            )
-        )
-
-    found = over_modes(measurements.n_modes, one, watch)
-    latent = np.sqrt(np.maximum(found[:, 1::2] - settings.noise_std**2, 0.0))  # of the vibration, not of a noisy target
-    return Estimates({VIBRATION: found[:, ::2]}, {VIBRATION: latent})
 
 
 def predict_sliding(
@@ -188,12 +157,36 @@ class OnlineEstimator(HeldEstimate):
         self.windows, self.weights, self.needs_command = windows, weights, windows.needs_command
         self._band_signals = np.zeros((len(weights), sampling.n_modes))  # oldest first
         self._size = depth, m, 2 if windows.needs_command else 1, kernel
-        bank = bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, sampling.dt)
+        self._bands, bank = bands, bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, sampling.dt)
         self.bank: FilterBank = FilterBank([bank_recursion(bank)] * sampling.n_modes)
         self._pending, late, n = False, len(weights) - 1, sampling.n_modes
         self.regression: LateRegression | SlidingRegression = (
             LateRegression(*self._size, late, n) if late else SlidingRegression(*self._size, n)
         )
+
+    def run(self, measurements: Measurements, watch: Watch) -> Estimates:
+        """Run over a record, for the vibration now all modes at the same time, in blocks; that to come frame by frame."""
+        if len(self.weights) > 1:
+            return run_frames(self, (VIBRATION,), measurements, watch)
+        (depth, m, _, kernel), n_steps = self._size, measurements.n_steps
+        if n_steps < depth + m:
+            raise RecordError(f"the record has {n_steps} steps; depth + training size need {depth + m}")
+        targets = online_targets(measurements, self._bands)
+        values, done = np.full((n_steps, measurements.n_modes), np.nan), np.zeros(measurements.n_modes)
+
+        def one(mode: int, watch: Watch) -> Array:
+            def deliver(start: int, stop: int, mean: Array) -> None:
+                values[start:stop, mode] = mean
+                done[mode] = stop / n_steps
+                watch.step(float(done.mean()))
+                watch.partial(VIBRATION, values)
+
+            signals = self.windows.channels(measurements, mode)
+            return np.column_stack(predict_sliding(signals, targets[:, mode], depth, m, kernel, deliver, watch.check))
+
+        found = over_modes(measurements.n_modes, one, watch)
+        latent = np.sqrt(np.maximum(found[:, 1::2] - kernel.noise_std**2, 0.0))  # of the vibration, not of a noisy target
+        return Estimates({VIBRATION: found[:, ::2]}, {VIBRATION: latent})
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame."""
@@ -234,13 +227,16 @@ class OnlineEstimator(HeldEstimate):
         self.load(old.save())
 
 
-def step_gpr_online(prior: Prior, settings: OnlineGpr, sampling: Sampling, horizon: float) -> OnlineEstimator:
-    """Return the online GPR, one frame at a time, learning the vibration `horizon` frames ahead."""
-    g = settings
+def gpr_online(prior: Prior, settings: OnlineGpr, sampling: Sampling, horizon: float) -> OnlineEstimator:
+    """Return the online GPR, which learns the vibration `horizon` frames ahead."""
+    return learning_estimator(prior, settings, sampling, np.eye(whole_frames(horizon, "gpr-online") + 1)[-1])
+
+
+def learning_estimator(prior: Prior, g: OnlineGpr, sampling: Sampling, weights: Array) -> OnlineEstimator:
+    """Return the online GPR; weights : of the vibration now, one frame ahead and so on in what it learns."""
     assert prior.bands is not None
     windows = Windows(g, sampling, 1, scales_of(g, prior.training, sampling))
-    ahead = whole_frames(horizon, "gpr-online")
-    return OnlineEstimator(windows, prior.bands, sampling, g.depth, g.training_size, kernel_of(g), np.eye(ahead + 1)[-1])
+    return OnlineEstimator(windows, prior.bands, sampling, g.depth, g.training_size, kernel_of(g), weights)
 
 
 def standardised_parts(settings: Gpr) -> tuple[Part, ...]:
@@ -258,7 +254,6 @@ GPR_ONLINE = Observer(
     "gpr-online",
     "Online GPR",
     (VIBRATION,),
-    gpr_online,
     help="Gaussian process regression retrained at every step on the last windows",
     prior=(OnlineBands,),
     settings=Section("gpr_online", "Online GPR", OnlineGpr),
@@ -271,5 +266,5 @@ GPR_ONLINE = Observer(
     weight=200.0,
     seconds=seconds,
     look=Look("Online GPR", "#046D72", "#5B8A77", (10, 2, 2, 2)),
-    step=step_gpr_online,
+    step=gpr_online,
 )

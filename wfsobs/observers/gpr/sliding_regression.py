@@ -187,7 +187,7 @@ class SlidingRegression:
         self._columns = np.zeros((n, 2 * WAITING, m))  # N is the one above, plus those of points that came, minus those that went
         self._signs = np.repeat([1.0, -1.0], WAITING)
         self._turns = (np.arange(n) * max(1, WAITING // n) - 1) % WAITING  # of WAITING steps: when the columns of a mode come in
-        self.reset()
+        self._begin()
 
     @property
     def ready(self) -> bool:
@@ -220,6 +220,9 @@ class SlidingRegression:
         """Set the state back to before the first sample."""
         for name in SAVED:
             getattr(self, f"_{name}")[...] = 0.0
+        self._begin()
+
+    def _begin(self) -> None:
         self.step, self._end, n = -1, self._span, len(self._kappa)
         self._points, self._newest = self.kernel.points(np.zeros((n, self.m))), self.kernel.points(np.zeros((n, 1)))
         self._last_target = np.zeros(n)

@@ -37,7 +37,7 @@ from wfsobs.observers.kalman.window_model import (
     unpack_spectrum,
     window_lengths,
 )
-from wfsobs.observers.step import PromptEstimator, StepError, run_frames
+from wfsobs.observers.step import Estimator, StepError, run_frames
 from wfsobs.observers.stepping import SampleHistory, Saved
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
@@ -259,7 +259,7 @@ class ModeWindow:
             kalman.bank.load({"x": state["states"][None, :n], **own})
 
 
-class AdaptiveEstimator(PromptEstimator):
+class AdaptiveEstimator(Estimator):
     """The adaptive filter of one sensor, or of both where the sampling has NGS frames that it uses.
 
     It identifies in `advance`, each mode when its window is due. Over a record without gaps it runs a filter over all steps to
@@ -306,10 +306,7 @@ class AdaptiveEstimator(PromptEstimator):
             return run_frames(self, TARGETS, measurements, watch)
         columns = []
         for mode, window in enumerate(self.windows):  # one after the other: steps as short as these leave a second thread no room
-
-            def tell(fraction: float, mode: int = mode) -> None:
-                watch.step((mode + fraction) / m)
-
+            tell = watch.part(mode / m, 1.0 / m).step
             columns.append(window.run(np.ascontiguousarray(v[:, :, mode]), measurements.dt, self.settings, tell))
         return Estimates(*(by_name(np.stack(found, axis=-1)) for found in zip(*columns, strict=True)))
 

@@ -4,8 +4,7 @@
 something that their mean does not. The prior `Asterism` has the spectra between the target, all modes in every beam and the NGS.
 The LGS are taken as their mean and orthonormal differences, whose noise is independent; vibration is in the mean and in the NGS
 alone. The states of the independent filters of `kf-multi` on the mean, running means of every measurement, and running means of
-the NGS frames are put together by the weights of least variance (`signal.joint_states`); they repeat with
-the NGS frames.
+the NGS frames are put together by the weights of least variance (`signal.joint_states`); they repeat with the frames.
 
 `multirate-coupled` has the mean of the LGS, or what `sensors.lgs_combination` makes of them, in the place of a single star: for
 LGS that see the same, and where a record or a loop has them together alone. Where modes tell nothing of one another there is
@@ -16,9 +15,8 @@ are made when a set of LGS first occurs. The states of one that is out go on wit
 so that it can come back at any time. One of which a mode is missing is out. While an NGS frame is lost the weights are those of
 the frames before it; when the next comes, or after several, the filter of the frames takes for it what all states told of it.
 
-The states of the asterism's filter are those of the independent filter of a mode and running means, of the mean of the LGS in
-all modes, then of each difference; and those of the filter and the means of the NGS frames, mode after mode. Where LGS are out,
-the weights are of the states of the others alone (`signal.joint_states`).
+The states are those of the independent filter of a mode and running means, of the mean of the LGS in all modes, then of each
+difference; and those of the filter and the means of the NGS frames, mode after mode.
 """
 
 from __future__ import annotations
@@ -33,15 +31,15 @@ from scipy.linalg import block_diag
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Look, Observer
 from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimates, by_name
-from wfsobs.observers.kalman.coupled import MEANS, line_models, with_means
 from wfsobs.observers.kalman.mode_filter import ModeFilter
 from wfsobs.observers.kalman.single import NGS, PEAKS, TUNABLE_PEAKS, MultiPeak, independent_filters, steady_mode, vibration_used
-from wfsobs.observers.kalman.step import matrix_power
-from wfsobs.observers.step import PromptEstimator, StepError, run_frames
+from wfsobs.observers.kalman.step import carry_state, matrix_power
+from wfsobs.observers.step import Estimator, StepError, run_frames
 from wfsobs.prior import Asterism, FlowOfBoth, Lines, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
-from wfsobs.signal.filter_covariance import lyapunov
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.joint_states import (
     Present,
     PresentInputs,
@@ -55,9 +53,13 @@ from wfsobs.signal.joint_states import (
     shared_covariance,
 )
 from wfsobs.signal.periodic import PeriodicFilter
-from wfsobs.signal.statespace import disturbance_model
+from wfsobs.signal.riccati import lyapunov
+from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
+
+MEANS = running_means((0.0, 3.0, 9.0, 27.0, 81.0, 243.0))
+"""The running means of each measurement, the first of them the measurement itself."""
 
 FRAME_MEANS = running_means((0.0, 1.0, 3.0, 9.0, 27.0, 81.0))
 """Of the NGS: over these frames."""
@@ -98,6 +100,7 @@ class AsterismModel:
     basis: Array
     ratio: int
     n_states: int
+    slow: list[Beginning]
 
     def __init__(
         self,
@@ -118,13 +121,18 @@ class AsterismModel:
         self.basis, self.ratio, self._asterism = asterism.basis, asterism.ratio, asterism
         self._age, self._steps = age, range(age, age + asterism.ratio)
         self.fast: list[Beginning] = [begin_with_means(one, means) for one in independent_filters(prior, settings)]
-        self.slow: list[Beginning] = [begin_with_means(one, frame_means) for one in frame_filters(prior, settings, asterism)]
         self._peaks = line_models(prior, settings)
+        self.has_frames: bool = len(asterism.measurement) > self.n_stars
+        if self.has_frames:
+            self.slow = [begin_with_means(one, frame_means) for one in frame_filters(prior, settings, asterism)]
+        else:
+            self.slow = [NO_STATES] * len(self._peaks)
         omega = asterism.omega
         self._responses = responses([one.filter for one in self.fast], means, omega) * self.n_stars
-        of_frames = responses([one.filter for one in self.slow], frame_means, asterism.ratio * omega)
+        frames = [one.filter for one in self.slow] if self.has_frames else []
+        of_frames = responses(frames, frame_means, asterism.ratio * omega)
         self._of_frames = [one * frame_mean_response(asterism.ratio, omega) for one in of_frames]
-        n_inputs = (self.n_stars + 1) * len(self._peaks)
+        n_inputs = len(asterism.measurement) * len(self._peaks)
         self._powers = asterism.measurement.reshape(n_inputs, n_inputs, -1)
         self._estimates = self._add_states()
 
@@ -215,6 +223,8 @@ class AsterismModel:
 
     def _between(self, powers: Complex) -> list[Array]:
         """Return the covariances of the states of the LGS and of the NGS in every step after a frame."""
+        if not self.has_frames:
+            return [np.zeros((sum(map(len, self._responses)), 0))]
         late = [np.concatenate(parts) for parts in zip(*(self._late(phase) for phase in self._steps), strict=True)]
 
         def row(i: int) -> list[Array]:
@@ -235,8 +245,8 @@ class AsterismModel:
         return self._of_turbulence(frames) if target == TURBULENCE else self._of_vibration(frames)
 
     def _of_turbulence(self, frames: float) -> list[tuple[Array, Array]]:
-        asterism, m = self._asterism, len(self._peaks)
-        ahead = (asterism.cross * np.exp(1j * asterism.omega * (1.0 + frames))).reshape(m, (self.n_stars + 1) * m, -1)
+        asterism = self._asterism
+        ahead = (asterism.cross * np.exp(1j * asterism.omega * (1.0 + frames))).reshape(-1, *self._powers.shape[1:])
         return [(cross, asterism.own.sum(axis=1)) for cross in self._with_states(ahead)]
 
     def _next_measurement(self) -> list[Array]:
@@ -270,39 +280,51 @@ class AsterismModel:
         return [np.hstack([*fast, *slow]) for slow in late]
 
     def _of_vibration(self, frames: float) -> list[tuple[Array, Array]]:
-        found = []
+        targets = [model.outputs[VIBRATION] for model in self._peaks]
+        rows = [now @ matrix_power(model.A, frames) for now, model in zip(targets, self._peaks, strict=True)]
+        variances, found = np.array([now @ now for now in targets]), []  # the states have unit variance
         for phase in range(self.ratio):
-            out, variances = np.zeros((len(self._peaks), self.n_states)), []
-            for i, (model, cross) in enumerate(zip(self._peaks, self._of_lines, strict=True)):
-                now = model.outputs[VIBRATION]
-                out[i, self._places[i]] = now @ matrix_power(model.A, frames) @ cross[phase]
-                variances.append(now @ now)  # the states have unit variance
-            found.append((out, np.array(variances)))
+            out = np.zeros((len(rows), self.n_states))
+            for i, (row, cross) in enumerate(zip(rows, self._of_lines, strict=True)):
+                out[i, self._places[i]] = row @ cross[phase]
+            found.append((out, variances))
         return found
 
 
 class Beginning(NamedTuple):
-    """A filter, and its state where the first measurement is 1: (n,)."""
+    """A filter, its state where the first measurement is 1: (n,), and the model of which its first states are."""
 
     filter: StateFilter
     first: Array
+    model: DisturbanceModel | None = None
+
+
+NO_STATES = Beginning(StateFilter(np.zeros((0, 0)), np.zeros(0)), np.zeros(0))
+"""Of the NGS, where there is none."""
+
+
+def line_models(prior: Prior, settings: MultiPeak) -> list[DisturbanceModel]:
+    """Return the models of the lines of each mode; of a mode without any, of a line that is zero."""
+    silent = Ar2(1.0, 1.0, 0.0, prior.lines[0].dt)
+    return [disturbance_model((), one.vibration(settings.line_width) or [silent]) for one in prior.lines]
 
 
 def frame_filters(prior: Prior, settings: MultiPeak, asterism: Asterism) -> list[ModeFilter]:
     """Return a filter of the NGS frames of each mode, with its lines, as if frames were samples."""
-    found = []
-    for one, noise in zip(prior.lines, asterism.ngs_noise, strict=True):
-        step = asterism.ratio * one.dt
-        peaks = [peak.at(step) for peak in one.vibration(settings.line_width)]
-        turbulence = [replace(process, dt=step) for process in one.turbulence]
-        found.append(steady_mode(disturbance_model(turbulence, peaks), float(noise)))
-    return found
+
+    def slow(processes: Sequence[Ar2 | Ar3]) -> list[Ar2 | Ar3]:
+        return [replace(process, dt=asterism.ratio * process.dt) for process in processes]
+
+    models = [disturbance_model(slow(one.turbulence), slow(one.vibration(settings.line_width))) for one in prior.lines]
+    return [steady_mode(model, float(noise)) for model, noise in zip(models, asterism.ngs_noise, strict=True)]
 
 
 def begin_with_means(one: ModeFilter, means: StateFilter) -> Beginning:
     """Return a filter and means of the same measurement, of which the means begin as if it had always been what it is first."""
-    at_rest = np.linalg.solve(np.eye(len(means.F)) - means.F, means.G)
-    return Beginning(with_means(one, means), np.concatenate([np.zeros(len(one.gains.steps[0].A)), at_rest]))
+    step, at_rest = one.gains.steps[0], np.linalg.solve(np.eye(len(means.F)) - means.F, means.G)
+    reduced = (np.eye(len(step.A)) - step.L @ step.C) @ step.A
+    both = StateFilter(block_diag(reduced, means.F), np.concatenate([step.L[:, 0], means.G]))
+    return Beginning(both, np.concatenate([np.zeros(len(step.A)), at_rest]), one.model)
 
 
 INDEPENDENT = "the modes tell nothing of one another: `multirate-multi` estimates each by itself"
@@ -322,11 +344,11 @@ class _Bank:
     """Filters of several modes, padded to the longest: F (n_modes, n, n), G, first and is_state (n_modes, n)."""
 
     def __init__(self, modes: Sequence[Beginning]):
-        sizes = np.array([len(one.first) for one in modes])
+        self.modes, sizes = modes, np.array([len(one.first) for one in modes])
         n = int(sizes.max())
         self.is_state = np.arange(n) < sizes[:, None]
         self.F, self.G, self.first = np.zeros((len(modes), n, n)), np.zeros((len(modes), n)), np.zeros((len(modes), n))
-        for i, (one, first) in enumerate(modes):
+        for i, (one, first, _) in enumerate(modes):
             self.F[i, : sizes[i], : sizes[i]], self.G[i, : sizes[i]], self.first[i, : sizes[i]] = *one, first
 
     def begin(self, y: Array) -> Array:
@@ -338,8 +360,19 @@ class _Bank:
         """Return the state after a measurement."""
         return (self.F @ x[..., None])[..., 0] + self.G * y[..., None]
 
+    def carry(self, old: _Bank, x: Array) -> Array:
+        """Return the states in which disturbances and means are what they are in the states x (..., n_modes, n) of another."""
+        out = np.zeros((*x.shape[:-1], self.first.shape[1]))
+        for mode, (new, was) in enumerate(zip(self.modes, old.modes, strict=True)):
+            if new.model is not None and was.model is not None:
+                m, mine = len(was.model.A), x[..., mode, : len(was.first)]
+                is_same = np.array_equal(new.model.pairs, was.model.pairs)
+                states = mine[..., :m] if is_same else carry_state(new.model, was.model, mine[..., :m].T).T
+                out[..., mode, : len(new.first)] = np.concatenate([states, mine[..., m:]], axis=-1)
+        return out
 
-class JointEstimator(PromptEstimator):
+
+class JointEstimator(Estimator):
     """The filter one frame at a time.
 
     Attributes
@@ -441,9 +474,9 @@ class JointEstimator(PromptEstimator):
 
     def run(self, measurements: Measurements, watch: Watch) -> Estimates:
         """Run the filter over a record from rest: all steps at once where nothing is missing."""
-        each = self._each_of(measurements)
-        frames = measurements.z_ngs[self.model.ratio :: self.model.ratio]
-        if np.isnan(each).any() or np.isnan(frames).any():
+        each, n = self._each_of(measurements), self.model.ratio
+        frames = measurements.z_ngs[n::n] if self.model.has_frames else None
+        if np.isnan(each).any() or (frames is not None and np.isnan(frames).any()):
             return run_frames(self, TARGETS, measurements, watch)
         return _run_at_once(self.model, each, frames, watch)
 
@@ -461,9 +494,10 @@ class JointEstimator(PromptEstimator):
 
     def take_over(self, old: Any) -> None:
         """Go on from another design. Raises StepError where that has other states."""
-        if old.x.shape != self.x.shape or old.frames.shape != self.frames.shape:
+        if old.x.shape[:2] != self.x.shape[:2] or old.model.has_frames != self.model.has_frames:
             raise StepError("its states are not those of the other design")
-        self.load(old.save())
+        self.x, self.frames = self._fast.carry(old._fast, old.x), self._slow.carry(old._slow, old.frames)
+        self.stand_in_frames[...], self.phase, self.present = old.stand_in_frames, old.phase, old.present
 
 
 def _as_set(missing: Array) -> Present:
@@ -471,8 +505,8 @@ def _as_set(missing: Array) -> Present:
     return tuple(not any(one) for one in missing)
 
 
-def _run_at_once(model: AsterismModel, each: Array, frames: Array, watch: Watch) -> Estimates:
-    """Return the estimates of a record without gaps."""
+def _run_at_once(model: AsterismModel, each: Array, frames: Array | None, watch: Watch) -> Estimates:
+    """Return the estimates of a record without gaps; frames : None where there are none of an NGS."""
     n, (steps, _, m) = model.ratio, each.shape
     plans = {name: model.plan(0.0, name) for name in (*TARGETS, TOTAL)}
     weights = np.concatenate([plans[name][0] for name in TARGETS], axis=1)
@@ -484,9 +518,9 @@ def _run_at_once(model: AsterismModel, each: Array, frames: Array, watch: Watch)
             out[:n] += _outputs(one, y[:n], own[n:])
             out[n:] += _outputs(one, y, own[:n], since=n)
             at += len(one.first)
-    for mode, late in enumerate(model.slow):
+    for late, y in zip(model.slow, [] if frames is None else frames.T, strict=False):
         own = weights[:n, :, at : at + len(late.first)].reshape(1, n * 2 * m, -1)  # of all steps until the next frame
-        out[n:] += _outputs(late, frames[:, mode], own).reshape(-1, 2 * m)[: max(steps - n, 0)]
+        out[n:] += _outputs(late, y, own).reshape(-1, 2 * m)[: max(steps - n, 0)]
         at += len(late.first)
     phase = np.where(np.arange(steps) < n, n, np.arange(steps) % n)
     sd = {name: spread[phase] for name, (_, spread) in plans.items()}

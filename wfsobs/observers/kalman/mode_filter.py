@@ -10,9 +10,8 @@ import numpy as np
 from wfsobs.observers.estimates import TARGETS
 from wfsobs.observers.stepping import GainCycle
 from wfsobs.prior import Prior
-from wfsobs.signal.filter_covariance import lyapunov
 from wfsobs.signal.gap_gains import ONE, GapGains, SensorMean
-from wfsobs.signal.riccati import Step
+from wfsobs.signal.riccati import Step, lyapunov
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
 
@@ -42,10 +41,6 @@ class ModeFilter(NamedTuple):
         """Return the covariance of the state, (n, n), but for a running NGS frame."""
         return lyapunov(self.cycle[-1][0], self.cycle[-1][2])
 
-    def stated_errors(self) -> StatedErrors:
-        """Return the standard deviations of its errors by its own model."""
-        return StatedErrors(self)
-
     def innovation_variances(self) -> list[float]:
         """Return the variance of z less its prediction at every step that repeats [um^2]."""
         before = zip(self.posterior[-1:] + self.posterior[:-1], self.cycle[-1:] + self.cycle[:-1], self.cycle, strict=True)
@@ -54,7 +49,7 @@ class ModeFilter(NamedTuple):
 
     def steady_sd(self) -> Array:
         """Return `StatedErrors.sd` of every step that repeats, (steps, 4) [um]."""
-        stated = self.stated_errors()
+        stated = StatedErrors(self)
         return np.array([stated.sd(P, j) for j, P in enumerate(self.posterior)])
 
     def gaps(self) -> GapGains:

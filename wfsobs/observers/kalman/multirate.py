@@ -43,10 +43,9 @@ from wfsobs.settings import Group, Real, Section
 from wfsobs.settings.group import UsedWhen
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
-from wfsobs.signal.filter_covariance import Step, posteriors_of_gains
 from wfsobs.signal.gap_gains import ONE, SensorMean
-from wfsobs.signal.periodic import PeriodicFilter
-from wfsobs.signal.riccati import SteadyState, periodic_steady_state, steady_state
+from wfsobs.signal.periodic import Recursion
+from wfsobs.signal.riccati import SteadyState, Step, periodic_steady_state, posteriors_of_gains, steady_state
 from wfsobs.signal.statespace import DisturbanceModel, blocks_along_diagonal, disturbance_model
 from wfsobs.typing import Array
 
@@ -106,22 +105,6 @@ def matched_noise(settings: MultiRate) -> tuple[Part, ...]:
     return () if settings.measurement_noise == "manual" else (Noise,)
 
 
-class MultiRateFilter(NamedTuple):
-    """A filter with these gains, whose step 0 has no NGS frame, and outputs (p, n) of the state."""
-
-    gains: GainCycle
-    outputs: Array
-
-    @property
-    def cycle(self) -> PeriodicFilter:
-        """The steps from k = 1 on, the frame last."""
-        return self.gains.filter(self.outputs)
-
-    def run(self, z: Array) -> Array:
-        """Filter z (n_steps, 2) = (z_lgs, z_ngs), any number where there is no frame; (n_steps, p)."""
-        return self.gains.run(self.outputs, z)
-
-
 def multirate_gains(model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float) -> GainCycle:
     """Return the gains for an NGS frame every `ratio` steps; lgs_noise, ngs_noise: square roots of r [um].
 
@@ -143,30 +126,26 @@ def multirate_gains(model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_n
 
 def multirate_filter(
     model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float, outputs: Array | None = None
-) -> MultiRateFilter:
-    """Return the filter of `multirate_gains`.
+) -> Recursion:
+    """Return the filter of `multirate_gains`, whose step 0 has no NGS frame; its cycle begins at k = 1, the frame last.
 
     outputs : rows of the state x_hat[k] to return, (p, n); every target by default. Raises UnstableCycle.
     """
     gains = multirate_gains(model, ratio, lgs_noise, ngs_noise)
-    return MultiRateFilter(gains, model.output_rows(TARGETS) if outputs is None else outputs)
+    return gains.recursion(model.output_rows(TARGETS) if outputs is None else outputs)
 
 
-def multirate_posteriors(model: DisturbanceModel, gains: GainCycle, lgs_noise: float, ngs_noise: float) -> list[Array]:
-    """Return the covariances after the measurement at steps 1 ... n, by the model that the gains are of."""
-    R = np.diag([lgs_noise**2, ngs_noise**2])
-    return posteriors_of_gains([(A, C, model.Q, R) for A, C, _ in gains.steps], [step.L for step in gains.steps])
-
-
-def multirate_mode(model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float) -> ModeFilter:
+def multirate_mode(settings: MultiRate, prior: Prior, mode: int, ratio: int) -> ModeFilter:
     """Return the filter of a mode; near gaps it has more gains than two: those of the covariance as it is there.
 
     Raises UnstableCycle.
     """
+    model, (lgs_noise, ngs_noise) = prior.model[mode].disturbance(), multirate_noise(settings, prior.noise_of(mode))
     gains = multirate_gains(model, ratio, lgs_noise, ngs_noise)
     R, last = np.diag([lgs_noise**2, ngs_noise**2]), gains.steps[-1]
     cycle = tuple((A, C if step is last else C * [[1.0], [0.0]], model.Q, R) for step in gains.steps for A, C, _ in [step])
-    return ModeFilter(model, gains, tuple(multirate_posteriors(model, gains, lgs_noise, ngs_noise)), cycle)
+    posteriors = posteriors_of_gains([(A, C, model.Q, R) for A, C, _ in gains.steps], [step.L for step in gains.steps])
+    return ModeFilter(model, gains, tuple(posteriors), cycle, lgs_mean(prior, mode))
 
 
 def noise_used(prior: Prior, settings: MultiRate) -> list[tuple[float, float]]:
@@ -177,9 +156,7 @@ def noise_used(prior: Prior, settings: MultiRate) -> list[tuple[float, float]]:
 def multirate(prior: Prior, settings: MultiRate, sampling: Sampling, _horizon: float) -> KalmanEstimator:
     """Return the paper's multi-rate filters of all modes, for turbulence."""
     assert sampling.ratio is not None
-    noises = noise_used(prior, settings)
-    found = [multirate_mode(one.disturbance(), sampling.ratio, *noise) for one, noise in zip(prior.model, noises, strict=True)]
-    return KalmanEstimator([one._replace(mean=lgs_mean(prior, mode)) for mode, one in enumerate(found)])
+    return KalmanEstimator([multirate_mode(settings, prior, mode, sampling.ratio) for mode in range(len(prior.model))])
 
 
 MULTIRATE = Observer(
@@ -242,21 +219,20 @@ def optimal_gains(cycle: list[Step]) -> tuple[GainCycle, list[SteadyState]]:
     return GainCycle(steps, Gain(A, alone, L)), states
 
 
-def optimal_filter(cycle: list[Step], outputs: Array) -> tuple[MultiRateFilter, list[SteadyState]]:
+def optimal_filter(cycle: list[Step], outputs: Array) -> tuple[Recursion, list[SteadyState]]:
     """Return the filter of `optimal_gains` and the covariances; outputs (p, n_states) rows of the state."""
     gains, states = optimal_gains(cycle)
-    return MultiRateFilter(gains, outputs), states
+    return gains.recursion(outputs), states
 
 
 class Cycle(NamedTuple):
     """What is estimated in one mode.
 
-    steps : (A, C, Q, R) of the steps;  rows : of the state per target
+    steps : (A, C, Q, R) of the steps
     model : of the disturbance alone;  has_lgs_error : whether the slow error of the LGS is among the states
     """
 
     steps: list[Step]
-    rows: Array
     model: DisturbanceModel
     has_lgs_error: bool = False
 
@@ -264,6 +240,10 @@ class Cycle(NamedTuple):
         """Return the optimal filter; mean : the LGS whose mean it measures."""
         gains, states = optimal_gains(self.steps)
         return ModeFilter(self.model, gains, tuple(state.posterior for state in states), tuple(self.steps), mean)
+
+    def filter_of(self, prior: Prior, mode: int) -> ModeFilter:
+        """Return the optimal filter on the LGS of a prior."""
+        return self.filter(lgs_mean(prior, mode, self.has_lgs_error))
 
 
 def optimal_model(settings: MultiRate, prior: Prior, mode: int, ratio: int, model: DisturbanceModel | None = None) -> Cycle:
@@ -276,10 +256,8 @@ def optimal_model(settings: MultiRate, prior: Prior, mode: int, ratio: int, mode
 def estimated_cycle(
     model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float, lgs_error: Sequence[Ar2 | Ar3]
 ) -> Cycle:
-    """Return `optimal_cycle` with the rows of all targets."""
-    steps = optimal_cycle(model, ratio, lgs_noise, ngs_noise, lgs_error)
-    rows = model.output_rows(TARGETS)
-    return Cycle(steps, np.hstack([rows, np.zeros((len(rows), len(steps[0][0]) - rows.shape[1]))]), model, bool(lgs_error))
+    """Return `optimal_cycle` with what it is of."""
+    return Cycle(optimal_cycle(model, ratio, lgs_noise, ngs_noise, lgs_error), model, bool(lgs_error))
 
 
 def optimal_filters(
@@ -288,7 +266,7 @@ def optimal_filters(
     """Return the optimal filters of all modes; cycle_of : (settings, prior, mode, ratio) -> the cycle of that mode."""
     assert sampling.ratio is not None
     found = [cycle_of(settings, prior, mode, sampling.ratio) for mode in range(sampling.n_modes)]
-    return KalmanEstimator([one.filter(lgs_mean(prior, mode, one.has_lgs_error)) for mode, one in enumerate(found)])
+    return KalmanEstimator([one.filter_of(prior, mode) for mode, one in enumerate(found)])
 
 
 MULTIRATE_OPTIMAL = Observer(

@@ -64,8 +64,13 @@ def steady_filter(model: DisturbanceModel, noise: float, outputs: Array | None =
 
 def kf_lgs(prior: Prior, _settings: None, _sampling: Sampling, _horizon: float) -> KalmanEstimator:
     """Return the Kalman filters of all modes on the LGS measurement, at every fast step."""
-    found = enumerate(prior.model)
-    return KalmanEstimator([steady_mode(one.disturbance(), one.lgs_noise, lgs_mean(prior, mode)) for mode, one in found])
+    return KalmanEstimator([one_peak_filter(prior, mode) for mode in range(len(prior.model))])
+
+
+def one_peak_filter(prior: Prior, mode: int) -> ModeFilter:
+    """Return the steady-state filter of a mode with one peak."""
+    one = prior.model[mode]
+    return steady_mode(one.disturbance(), one.lgs_noise, lgs_mean(prior, mode))
 
 
 def steady_mode(
@@ -182,8 +187,13 @@ class MultiPeak(Group):
 
 def independent_filters(prior: Prior, settings: MultiPeak) -> list[ModeFilter]:
     """Return the steady-state filters of all modes, each of its own."""
-    found = enumerate(prior.lines)
-    return [steady_mode(one.disturbance(settings.line_width), one.noise, lgs_mean(prior, mode)) for mode, one in found]
+    return [every_peak_filter(prior, mode, settings) for mode in range(len(prior.lines))]
+
+
+def every_peak_filter(prior: Prior, mode: int, settings: MultiPeak) -> ModeFilter:
+    """Return the steady-state filter of a mode with every peak."""
+    one = prior.lines[mode]
+    return steady_mode(one.disturbance(settings.line_width), one.noise, lgs_mean(prior, mode))
 
 
 def vibration_used(prior: Prior, settings: MultiPeak) -> list[list[Ar2]]:

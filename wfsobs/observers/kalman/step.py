@@ -18,12 +18,12 @@ from scipy.linalg import block_diag, fractional_matrix_power
 
 from wfsobs.observers.estimates import TARGETS, Estimates, by_name
 from wfsobs.observers.kalman.mode_filter import ModeFilter, StatedErrors
-from wfsobs.observers.step import PromptEstimator, StepError, run_frames, whole_frames
+from wfsobs.observers.step import Estimator, StepError, run_frames, whole_frames
 from wfsobs.observers.stepping import FilterBank, Gain, GainCycle, Saved
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements
-from wfsobs.signal.filter_covariance import lyapunov
 from wfsobs.signal.gap_gains import GapGains, GapStep, SensorMean
+from wfsobs.signal.riccati import lyapunov
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
 
@@ -162,7 +162,7 @@ def plan(rows: Sequence[Array], n: int, sd: Array) -> Plan:
     return Plan(padded, np.zeros(len(rows)), sd)
 
 
-class LinearEstimator(PromptEstimator):
+class LinearEstimator(Estimator):
     """What Kalman filters share: a bank of filters in the state after the measurement, and rows of it per prediction."""
 
     state_names: tuple[str, ...] = ("bank",)
@@ -240,7 +240,7 @@ class KalmanEstimator(LinearEstimator):
             n = self.bank.x.shape[1]
             rows = [np.pad(one.rows(TARGETS), ((0, 0), (0, n - len(one.gains.steps[0].A)))) for one in self.modes]
             steady = np.stack([one.steady_sd() for one in self.modes], axis=-1)
-            self._record = np.array(rows), steady, [one.stated_errors() for one in self.modes]
+            self._record = np.array(rows), steady, [StatedErrors(one) for one in self.modes]
         rows, steady, stated = self._record
         j = self.bank.last_in_cycle
         sd = steady[j].copy() if self.bank.last or not self.bank.has_first else np.full(steady[j].shape, np.nan)
@@ -262,7 +262,7 @@ class KalmanEstimator(LinearEstimator):
         columns, sd = [], []
         for mode, one in enumerate(self.modes):
             watch.step(mode / len(self.modes))
-            columns.append(one.gains.run(one.rows(TARGETS), v[:, :, mode]))
+            columns.append(one.gains.recursion(one.rows(TARGETS)).run(v[:, :, mode]))
             sd.append(one.steady_sd())
         return by_target(columns, sd, first=int(self.bank.has_first))
 
@@ -272,18 +272,25 @@ class KalmanEstimator(LinearEstimator):
         for mode, (near, row) in enumerate(zip(self.bank.near, plan.rows[:, 0], strict=True)):
             if near is not None:
                 model = self.modes[mode].model
-                if mode not in self._variances:
-                    self._variances[mode] = lyapunov(model.A, model.Q)
-                out[mode] = prediction_sd(model.outputs[target], row[: len(model.A)], self._variances[mode], near.posterior)
+                out[mode] = prediction_sd(model.outputs[target], row[: len(model.A)], self._variance(mode), near.posterior)
         return out
+
+    def _variance(self, mode: int) -> Array:
+        """Return the covariance of the disturbance of a mode."""
+        if mode not in self._variances:
+            self._variances[mode] = lyapunov(self.modes[mode].model.A, self.modes[mode].model.Q)
+        return self._variances[mode]
 
     def _plan(self, frames: float, target: str) -> Plan:
         powers = [matrix_power(mode.model.A, frames) for mode in self.modes]
         rows = [mode.model.outputs[target] @ power for mode, power in zip(self.modes, powers, strict=True)]
         sd = np.full((len(self.bank.maps), len(rows)), np.nan)
         if self.modes[0].posterior:
-            repeat = len(self.modes[0].posterior)
-            sd[-repeat:] = np.array([_prediction_sd(m, row, target) for m, row in zip(self.modes, rows, strict=True)]).T
+            found = [
+                [prediction_sd(one.model.outputs[target], row, self._variance(mode), P) for P in one.posterior]
+                for mode, (one, row) in enumerate(zip(self.modes, rows, strict=True))
+            ]
+            sd[-len(found[0]) :] = np.array(found).T
         self._plans[frames, target] = out = plan(rows, self.bank.x.shape[1], sd)
         return out
 
@@ -356,11 +363,6 @@ class FrameEstimator(LinearEstimator):
             return one.mean, self._unknown
         return one.mean, self._sd(one.rows, since + frames, target, self._pairs) if self.bank.is_near else one.sd[0]
 
-    def estimate(self) -> tuple[Array, Array]:
-        """Return the estimates (2, n_modes) of the last frame, and their standard deviations, (2, n_modes)."""
-        values, sd = np.array([self.predict(0, target) for target in TARGETS]).swapaxes(0, 1)
-        return values, sd
-
     def run(self, measurements: Measurements, watch: Watch) -> Estimates:
         """Run the filters over a record from rest: all frames at once where none is missing."""
         n, n_states = measurements.ratio, self.bank.x.shape[1]
@@ -373,7 +375,7 @@ class FrameEstimator(LinearEstimator):
         columns = []
         for mode, one in enumerate(self.modes):
             watch.step(mode / len(self.modes))
-            slow = one.gains.run(np.eye(n_states)[:, : len(one.model.A)], frames[:, mode, None])
+            slow = one.gains.recursion(np.eye(n_states)[:, : len(one.model.A)]).run(frames[:, mode, None])
             fast = np.full((measurements.n_steps, len(TARGETS)), np.nan)
             fast[n:] = (slow @ rows[:, :, mode].swapaxes(1, 2)).reshape(len(TARGETS), -1).T[: measurements.n_steps - n]
             columns.append(fast)
@@ -494,12 +496,6 @@ def _sums(model: DisturbanceModel) -> Array:
     now, before = model.pairs[::2], model.pairs[1::2]
     is_turbulence = (now @ model.outputs["turbulence"] > 0.0).astype(float)
     return np.array([weight @ rows for weight in (is_turbulence, 1.0 - is_turbulence) for rows in (now, before)])
-
-
-def _prediction_sd(mode: ModeFilter, row: Array, target: str) -> list[float]:
-    """Return the standard deviation [um] of the prediction `row` of the model's state, for every step that repeats."""
-    S = lyapunov(mode.model.A, mode.model.Q)
-    return [prediction_sd(mode.model.outputs[target], row, S, P) for P in mode.posterior]
 
 
 def prediction_sd(now: Array, row: Array, S: Array, P: Array) -> float:

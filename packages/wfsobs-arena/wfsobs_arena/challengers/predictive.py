@@ -33,7 +33,7 @@ PENALTY = 1e-6
 """Of the squares of the weights at the start [um^2]."""
 
 
-class PredictiveLaw:
+class PredictiveLaw(StepLaw):
     """The law of all modes, learnt one frame at a time.
 
     Parameters
