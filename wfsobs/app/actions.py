@@ -37,18 +37,20 @@ class Menus(HtmlComponent):
     A component whose name ended in Toolbar would be styled as one of a figure, and the whole page laid out anew each time.
     """
 
-    query = param.String("", doc="What a link to the settings has after its ?.")
-    view = param.String("", doc="What the address has beside the settings, of the view.")
-    has_link = param.Boolean(True, doc="Whether the settings are short enough for a link.")
-    record = param.String("", doc="The loaded record, where a link cannot name it.")
-    command = param.String("", doc="The settings as a command line.")
-    python = param.String("", doc="The settings as Python.")
-    ready = param.Boolean(False, doc="Whether there are results to save.")
-    reporting = param.Boolean(False, doc="Whether a report is being made.")
-    message = param.String("", doc="What was done, in one line.")
-    notes = param.List([], doc="What was refused, a line each.")
-    labels = param.Dict({}, doc="Name of a line in the figures -> what it is called, for the legends of figures that are saved.")
-    saves = param.List([], doc="What the page can save beside the data, as it is called in the menu.")
+    query: param.String[str] = param.String("", doc="What a link to the settings has after its ?.")
+    view: param.String[str] = param.String("", doc="What the address has beside the settings, of the view.")
+    has_link: param.Boolean[bool] = param.Boolean(True, doc="Whether the settings are short enough for a link.")
+    record: param.String[str] = param.String("", doc="The loaded record, where a link cannot name it.")
+    command: param.String[str] = param.String("", doc="The settings as a command line.")
+    python: param.String[str] = param.String("", doc="The settings as Python.")
+    ready: param.Boolean[bool] = param.Boolean(False, doc="Whether there are results to save.")
+    reporting: param.Boolean[bool] = param.Boolean(False, doc="Whether a report is being made.")
+    message: param.String[str] = param.String("", doc="What was done, in one line.")
+    notes: param.List[list[Any]] = param.List([], doc="What was refused, a line each.")
+    labels: param.Dict[dict[str, str]] = param.Dict(
+        {}, doc="Name of a line in the figures -> what it is called, for the legends of figures that are saved."
+    )
+    saves: param.List[list[Any]] = param.List([], doc="What the page can save beside the data, as it is called in the menu.")
 
     _esm = script("page", "patch", "markup", "figures", "actions")
     _stylesheets = sheets("base", "bare", "actions")

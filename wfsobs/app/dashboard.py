@@ -38,8 +38,8 @@ MOST = 1000
 class Connection(Component):
     """The banner in the browser: questions {ask} and unsent changes {changes} up, the last question that has arrived down."""
 
-    session = param.String("", doc="A name of the session, to tell it from one made anew.")
-    last_arrival = param.Integer(0, doc="Number of the last question that has arrived, and all before it.")
+    session: param.String[str] = param.String("", doc="A name of the session, to tell it from one made anew.")
+    last_arrival: param.Integer[int] = param.Integer(0, doc="Number of the last question that has arrived, and all before it.")
 
     _esm = script("page", "connection")
     _stylesheets = sheets("base", "connection")
@@ -61,7 +61,7 @@ class Connection(Component):
 class Readout(Component):
     """Follows the pointer, and the arrow keys in a figure that has the focus; one for all figures of the page."""
 
-    labels = param.Dict({}, doc="Name of a line in the figures -> what it is called.")
+    labels: param.Dict[dict[str, str]] = param.Dict({}, doc="Name of a line in the figures -> what it is called.")
 
     _esm = script("page", "readout")
     _stylesheets = sheets("base", "readout")
@@ -110,13 +110,15 @@ UNSEEN = {"position": "absolute", "width": "1px", "height": "1px", "overflow": "
 class Frame(Component):
     """Closes the drawer of a phone, tells the theme that is wanted and when the first picture stands, and fades stale results."""
 
-    wants_dark = param.Boolean(False, doc="Whether the visitor's system has a dark theme, unless one was chosen here.")
+    wants_dark: param.Boolean[bool] = param.Boolean(
+        False, doc="Whether the visitor's system has a dark theme, unless one was chosen here."
+    )
     preferred_theme = param.Selector(
         default="", objects=["", "dark", "light"], doc="The theme that was chosen, for the browser to keep."
     )
-    stale = param.Boolean(False, doc="Whether to fade the results.")
-    dark = param.Boolean(False, doc="Whether the page is dark.")
-    complete = param.Boolean(False, doc="Whether what the first picture does not need is there.")
+    stale: param.Boolean[bool] = param.Boolean(False, doc="Whether to fade the results.")
+    dark: param.Boolean[bool] = param.Boolean(False, doc="Whether the page is dark.")
+    complete: param.Boolean[bool] = param.Boolean(False, doc="Whether what the first picture does not need is there.")
 
     _esm = script("page", "frame")
 
@@ -130,7 +132,7 @@ class Keyboard(Component):
 class Idle(param.Parameterized):
     """Never busy."""
 
-    busy = param.Boolean(default=False, constant=True)
+    busy: param.Boolean[bool] = param.Boolean(default=False, constant=True)
 
 
 class Dashboard:

@@ -95,12 +95,16 @@ class Display(param.Parameterized):
     named_lines: param.Parameter[dict[str, list[str]]] = param.Parameter(
         {}, doc="Target -> names of the lines that matter: those that the verdict names."
     )
-    dark = param.Boolean(False, doc="Dark mode.")
+    dark: param.Boolean[bool] = param.Boolean(False, doc="Dark mode.")
     spectrum: param.Selector[str] = param.Selector(
         default=PSD, objects={"PSD": PSD, "Cumulative rms": CUMULATIVE}, label="Spectrum"
     )
-    window_spectra = param.Boolean(False, label="Spectra of the window", doc="Spectra of the stretch of time in view alone.")
-    editing = param.Boolean(False, label="Edit figure", doc="Handles on the spectra, and what theory predicts.")
+    window_spectra: param.Boolean[bool] = param.Boolean(
+        False, label="Spectra of the window", doc="Spectra of the stretch of time in view alone."
+    )
+    editing: param.Boolean[bool] = param.Boolean(
+        False, label="Edit figure", doc="Handles on the spectra, and what theory predicts."
+    )
     compared_runs: param.List[list[ComparedRun]] = param.List(
         [], item_type=ComparedRun, doc="The runs to compare with, by their letters."
     )

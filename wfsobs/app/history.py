@@ -50,9 +50,9 @@ class History(param.Parameterized):
     """The entries, newest first, in step with the store; and the runs of the display that are compared."""
 
     entries: param.List[list[HistoryEntry]] = param.List([], item_type=HistoryEntry, doc="Every result, newest first.")
-    current = param.String("", doc="Key of the entry shown.")
-    note = param.String("", doc="What was done or refused, in one line.")
-    can_undelete = param.Boolean(False, doc="Whether an entry was deleted that can come back.")
+    current: param.String[str] = param.String("", doc="Key of the entry shown.")
+    note: param.String[str] = param.String("", doc="What was done or refused, in one line.")
+    can_undelete: param.Boolean[bool] = param.Boolean(False, doc="Whether an entry was deleted that can come back.")
 
     def __init__(self, store: Store, display: Display):
         super().__init__()
@@ -275,7 +275,7 @@ FILE = f"session{SUFFIX}"
 class Sheet(HtmlComponent):
     """The sheet in the browser; it asks by messages {action, key, name, on}, and has contents only while it is open."""
 
-    open = param.Boolean(False, doc="Whether it is seen.")
+    open: param.Boolean[bool] = param.Boolean(False, doc="Whether it is seen.")
 
     _esm = script("page", "patch", "markup", "history")
     _stylesheets = sheets("base", "history")

@@ -70,7 +70,9 @@ def run_seed(
 class SeedRuns(param.Parameterized):
     """One seed after the other, once a run is done; what has been found of a scenario goes with it."""
 
-    count = param.Integer(SEEDS, bounds=(1, MOST), label="Seeds", doc="Seeds whose records are compared; 1 is the one shown.")
+    count: param.Integer[int] = param.Integer(
+        SEEDS, bounds=(1, MOST), label="Seeds", doc="Seeds whose records are compared; 1 is the one shown."
+    )
     evidence: param.Parameter[Evidence | None] = param.Parameter(None, doc="What the seeds done so far say; None for too few.")
 
     def __init__(self, store: Store):
@@ -172,7 +174,9 @@ class Budgets(param.Parameterized):
     by_observer: param.Parameter[ByObserver] = param.Parameter(
         {}, doc="Observer -> its budgets (a sequence of Budget), as far as they are known."
     )
-    every = param.Boolean(False, doc="Whether observers that are not linear have theirs too, though they are not main ones.")
+    every: param.Boolean[bool] = param.Boolean(
+        False, doc="Whether observers that are not linear have theirs too, though they are not main ones."
+    )
 
     def __init__(self, seeds: SeedRuns, main: Callable[[str], Collection[str]]):
         super().__init__()

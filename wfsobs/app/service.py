@@ -221,9 +221,9 @@ class BackgroundTask(param.Parameterized):
     """
 
     state: param.Selector[str] = param.Selector(default=IDLE, objects=[IDLE, RUNNING, DONE, CANCELLED, FAILED])
-    progress = param.Number(0.0, bounds=(0.0, 1.0), doc="Fraction done.")
-    place = param.Integer(0, doc="Place in the line of jobs, from 1; 0 when it is being done.")
-    message = param.String("", doc="Why it failed, in one line.")
+    progress: param.Number[float] = param.Number(0.0, bounds=(0.0, 1.0), doc="Fraction done.")
+    place: param.Integer[int] = param.Integer(0, doc="Place in the line of jobs, from 1; 0 when it is being done.")
+    message: param.String[str] = param.String("", doc="Why it failed, in one line.")
     latest: param.Parameter[Any] = param.Parameter(None, doc="What the work has told of itself so far.")
     result: param.Parameter[Any] = param.Parameter(None, doc="The latest result, in parts where it comes in parts.")
 

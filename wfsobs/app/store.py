@@ -58,10 +58,12 @@ class Store(param.Parameterized):
     wanted_record: param.Parameter[NamedRecord | None] = param.Parameter(
         None, doc="The record of the link that was opened, until its file is given."
     )
-    stale = param.Boolean(False, doc="Whether the results shown are not those of the settings.")
-    waiting = param.Number(0.0, doc="How long the run would take that waits to be asked for [s]; 0 where none does.")
-    can_undo = param.Boolean(False, doc="Whether there is a change to undo.")
-    can_redo = param.Boolean(False, doc="Whether there is an undone change to make again.")
+    stale: param.Boolean[bool] = param.Boolean(False, doc="Whether the results shown are not those of the settings.")
+    waiting: param.Number[float] = param.Number(
+        0.0, doc="How long the run would take that waits to be asked for [s]; 0 where none does."
+    )
+    can_undo: param.Boolean[bool] = param.Boolean(False, doc="Whether there is a change to undo.")
+    can_redo: param.Boolean[bool] = param.Boolean(False, doc="Whether there is an undone change to make again.")
 
     def __init__(self, post: Post, session: Session, scenario: Scenario | None = None):
         live = session.service.live  # whoever changes a setting of the loop that all watch, changes that one alone

@@ -57,7 +57,7 @@ class HtmlComponent(Component):
 
     __abstract = True
 
-    html = param.String("", doc="What is in it.")
+    html: param.String[str] = param.String("", doc="What is in it.")
 
 
 RUNS: Mapping[str, Look] = {

@@ -53,11 +53,11 @@ PART = 1_000_000
 class Picker(HtmlComponent):
     """The button and what is said beside it; files up in parts."""
 
-    message = param.String("", doc="What there is to say, in one line.")
-    source_title = param.String("", doc="What takes the place of the simulation.")
-    back = param.String(BACK, doc="What the button is called that ends it.")
-    largest = param.Integer(LARGEST, doc="The largest file that is sent [bytes].")
-    part = param.Integer(PART, doc="How much is sent at a time [bytes].")
+    message: param.String[str] = param.String("", doc="What there is to say, in one line.")
+    source_title: param.String[str] = param.String("", doc="What takes the place of the simulation.")
+    back: param.String[str] = param.String(BACK, doc="What the button is called that ends it.")
+    largest: param.Integer[int] = param.Integer(LARGEST, doc="The largest file that is sent [bytes].")
+    part: param.Integer[int] = param.Integer(PART, doc="How much is sent at a time [bytes].")
 
     _esm = script("page", "patch", "markup", "upload")
     _stylesheets = sheets("base", "bare", "upload")

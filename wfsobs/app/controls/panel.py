@@ -55,10 +55,10 @@ progress::-moz-progress-bar { background: #8fd3f0; }
 class Status(Component):
     """The state of the run in the browser."""
 
-    progress = param.Number(0.0, doc="Fraction done.")
-    text = param.String("", doc="The state, in words.")
-    note = param.String("", doc="What was refused.")
-    label = param.String("Progress of the run", doc="What the bar is the progress of.")
+    progress: param.Number[float] = param.Number(0.0, doc="Fraction done.")
+    text: param.String[str] = param.String("", doc="The state, in words.")
+    note: param.String[str] = param.String("", doc="What was refused.")
+    label: param.String[str] = param.String("Progress of the run", doc="What the bar is the progress of.")
 
     _esm = script("status")
     _stylesheets = sheets("base", "status")
@@ -104,7 +104,7 @@ def waiting_text(seconds: float) -> str:
 class Search(Component):
     """The box in the browser; it gets the settings when it is first used, and says which one has been chosen."""
 
-    items = param.List([], doc="{path, name} of every setting.")
+    items: param.List[list[Any]] = param.List([], doc="{path, name} of every setting.")
 
     _esm = script("page", "search")
     _stylesheets = sheets("base", "search")

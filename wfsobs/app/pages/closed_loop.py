@@ -114,11 +114,11 @@ class UncertainPlant:
 
     def __init__(self, store: Store, display: Display):
         self.store, self.display = store, display
-        self.work = BackgroundTask(store.session, title="Uncertain plant")
-        self.starter = Starter(self.work, self._start, "Compute", "Progress of the uncertain plant")
-        self.figure = DelayFigure()
+        self.work: Final = BackgroundTask(store.session, title="Uncertain plant")
+        self.starter: Final = Starter(self.work, self._start, "Compute", "Progress of the uncertain plant")
+        self.figure: Final = DelayFigure()
         drawn = figure_with_caption("Residual against delay error", self.figure.figure)
-        self.room = pn.Column(drawn, text(PLANT_ABOUT), **WIDE, visible=False)
+        self.room: Final = pn.Column(drawn, text(PLANT_ABOUT), **WIDE, visible=False)
 
     def view(self) -> pn.Column:
         """Return the box."""
@@ -443,7 +443,7 @@ class ClosedLoopPage(Page):
         self.editor: GainEditor | None = None
         display.param.watch(self._edit, "editing")
         self._edit()
-        self.uncertain = UncertainPlant(store, display)
+        self.uncertain: Final = UncertainPlant(store, display)
         self.uncertain.work.param.watch(self._restyle, ["state", "result"])
         self._figures = (self.trace, self.zoom, self.spectrum, self.response, self.nyquist)
         self.work.param.watch(self._say, ["state", "place", "message"])

@@ -151,14 +151,14 @@ MOST = 50
 class ViewState(param.Parameterized):
     """The view as a query, kept in step with the page; and the page, brought to the view of a query."""
 
-    query = param.String("", doc="What the address has of the view, without ?.")
+    query: param.String[str] = param.String("", doc="What the address has of the view, without ?.")
 
     def __init__(self, display: Display, pages: Pages, explore: Explore, seeds: SeedRuns):
         super().__init__()
         self.display = display
         self.pages = pages
-        self.lines = explore.lines
-        self.traces = explore.traces
+        self.lines: Final = explore.lines
+        self.traces: Final = explore.traces
         switches = LinkedFields({PAGE: (pages, "current")} | {name: (display, name) for name in SWITCHES})
         switches.fresh[PAGE] = EXPLORE
         lines = [self._lines_of(target) for target in TARGETS]

@@ -106,9 +106,9 @@ class MainLines:
     """
 
     def __init__(self, display: Display, seeds: SeedRuns):
-        self.run = seeds.run
+        self.run: Final = seeds.run
         self.display = display
-        self.seeds = seeds
+        self.seeds: Final = seeds
         self._chosen_targets: set[str] = set()
         self.run.param.watch(self._on_results, ["result", "state"])  # the last result may come before the run is over
         watch(self._follow, (display, "mode"), (seeds, "evidence"))
@@ -305,9 +305,9 @@ class Table:
     """Every score of the mode shown, one row per observer and target."""
 
     def __init__(self, display: Display, seeds: SeedRuns):
-        self.run = seeds.run
+        self.run: Final = seeds.run
         self.display = display
-        self.seeds = seeds
+        self.seeds: Final = seeds
         switches = ["mode", "unit", "dark", "compared_runs"]
         self.pane: Final = follow_html(self.html, (self.run, ["result", "state"]), (seeds, "evidence"), (display, switches))
 
@@ -386,8 +386,8 @@ LIMIT = "limit"
 class Cards(HtmlComponent):
     """A row per line in the browser; a click on one hides or shows its line, a double click shows it alone."""
 
-    hidden_lines = param.List([], doc="Names of the rows whose lines are hidden.")
-    last_arrival = param.Integer(0, doc="Number of the last click that has arrived, and all before it.")
+    hidden_lines: param.List[list[Any]] = param.List([], doc="Names of the rows whose lines are hidden.")
+    last_arrival: param.Integer[int] = param.Integer(0, doc="Number of the last click that has arrived, and all before it.")
 
     _esm = script("patch", "strip")
     _stylesheets = sheets("style", "strip", "bare")

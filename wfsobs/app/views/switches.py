@@ -35,8 +35,8 @@ class ModeSwitch:
     """
 
     def __init__(self, run: BackgroundTask, display: Display):
-        self.run = run
-        self.display = display
+        self.run: Final = run
+        self.display: Final = display
         options = {_title(mode): mode.name for mode in TIP_TILT}
         self.buttons: Final = pmui.RadioButtonGroup(label="Mode", options=options, value=display.mode, **BUTTONS)
         self.list: Final = make_select("Mode", options, display.mode, 190, visible=False)
@@ -145,8 +145,8 @@ class Pinning:
     """Pin and unpin, one button: the result shown is the first one that is compared, or none is any more."""
 
     def __init__(self, history: History):
-        self.run = history.store.run
-        self.display = history.display
+        self.run: Final = history.store.run
+        self.display: Final = history.display
         self.history = history
         self.button: Final = make_button("Pin", self._press, icon="push_pin", variant="outlined", disabled=True, description=PIN)
         self.note: Final = html(sizing_mode=None, visible=False)

@@ -91,8 +91,8 @@ class TargetFigures(ABC):
 
     def __init__(self, run: BackgroundTask, display: Display, drawings: Mapping[str, TargetFigure], switches: Sequence[str]):
         """Watch the results and the switches of the display; drawings : target -> its figure."""
-        self.run = run
-        self.display = display
+        self.run: Final = run
+        self.display: Final = display
         self._drawings = drawings
         self.visible: bool = True
         self._behind = False
@@ -534,8 +534,8 @@ class Stretch:
         self.target = target
         self.traces = traces
         self.spectra = spectra
-        self.run = traces.run
-        self.display = traces.display
+        self.run: Final = traces.run
+        self.display: Final = traces.display
         sources = (self.run, "result"), (self.display, ["mode", "unit", "hidden_lines", "dark"])
         self.pane: Final = follow_html(self.html, *sources, stylesheets=[*sheets("style", "bare"), FLEXIBLE])
         on_settle([traces.x_range, spectra.x_range], lambda: setattr(self.pane, "html", self.html()))
