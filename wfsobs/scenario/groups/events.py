@@ -7,10 +7,9 @@ from types import MappingProxyType
 from typing import ClassVar
 
 import numpy as np
-import param
 
 from wfsobs.settings.group import Group, UsedWhen
-from wfsobs.settings.parameters import Real, Whole
+from wfsobs.settings.parameters import Choice, Real, Whole
 from wfsobs.typing import Array
 
 PEAK, WIND, LASER, FRAMES = "peak", "wind", "laser", "frames"
@@ -30,66 +29,51 @@ class Event(Group):
         {name: ("kind", (kind,)) for kind, names in OF_KIND.items() for name in names}
     )
 
-    kind: param.Selector[str] = param.Selector(
-        default=PEAK,
-        objects=[PEAK, WIND, LASER, FRAMES],
-        label="Kind",
-        doc="peak: a vibration peak changes in frequency and strength; wind: the wind changes; laser: laser guide "
+    kind: Choice = Choice(
+        [PEAK, WIND, LASER, FRAMES],
+        "Kind",
+        "peak: a vibration peak changes in frequency and strength; wind: the wind changes; laser: laser guide "
         "stars drop out; frames: frames are missing at random.",
     )
     start: Real = Real(
-        5.0,
-        bounds=(0.0, 3600.0),
-        softbounds=(0.0, 60.0),
-        step=0.5,
-        label="Start",
-        doc="Start of the event, from the start of the record [s].",
+        5.0, (0.0, 3600.0), "Start", "Start of the event, from the start of the record [s].", softbounds=(0.0, 60.0), step=0.5
     )
     duration: Real = Real(
         0.0,
-        bounds=(0.0, 3600.0),
+        (0.0, 3600.0),
+        "Duration",
+        "Duration of the event [s]; 0 is a jump of a peak or of the wind.",
         softbounds=(0.0, 60.0),
         step=0.5,
-        label="Duration",
-        doc="Duration of the event [s]; 0 is a jump of a peak or of the wind.",
     )
-    peak: Whole = Whole(0, bounds=(0, 99), label="Peak", doc="For kind peak: number of the peak in vibration.peaks, from 0.")
+    peak: Whole = Whole(0, (0, 99), "Peak", "For kind peak: number of the peak in vibration.peaks, from 0.")
     frequency_shift: Real = Real(
         0.0,
-        bounds=(-5000.0, 5000.0),
+        (-5000.0, 5000.0),
+        "Frequency shift",
+        "For kind peak: change of its frequency [Hz].",
         softbounds=(-10.0, 10.0),
         step=0.1,
-        label="Frequency shift",
-        doc="For kind peak: change of its frequency [Hz].",
     )
     strength: Real = Real(
-        1.0,
-        bounds=(0.0, 100.0),
-        softbounds=(0.0, 4.0),
-        step=0.1,
-        label="Strength factor",
-        doc="For kind peak: factor on its rms.",
+        1.0, (0.0, 100.0), "Strength factor", "For kind peak: factor on its rms.", softbounds=(0.0, 4.0), step=0.1
     )
     wind_factor: Real = Real(
         1.0,
-        bounds=(0.1, 10.0),
+        (0.1, 10.0),
+        "Wind factor",
+        "For kind wind: factor on the wind speed of every layer.",
         softbounds=(0.2, 4.0),
         step=0.1,
-        label="Wind factor",
-        doc="For kind wind: factor on the wind speed of every layer.",
     )
     lasers: Whole = Whole(
         1,
-        bounds=(1, 16),
-        label="Lasers lost",
-        doc="For kind laser: number of LGS that drop out, the last ones first; with none left there is no LGS measurement.",
+        (1, 16),
+        "Lasers lost",
+        "For kind laser: number of LGS that drop out, the last ones first; with none left there is no LGS measurement.",
     )
-    sensor: param.Selector[str] = param.Selector(
-        default="lgs", objects=["lgs", "ngs"], label="Sensor", doc="For kind frames: sensor with missing frames."
-    )
-    share: Real = Real(
-        0.1, bounds=(0.0, 1.0), step=0.01, label="Share of frames", doc="For kind frames: share of missing frames."
-    )
+    sensor: Choice = Choice(["lgs", "ngs"], "Sensor", "For kind frames: sensor with missing frames.")
+    share: Real = Real(0.1, (0.0, 1.0), "Share of frames", "For kind frames: share of missing frames.", step=0.01)
 
 
 def progress_of_change(event: Event, t: Array) -> Array:
