@@ -26,8 +26,8 @@ from wfsobs.simulation.guide_stars import MEAN, lgs_weights, stars_differ
 from wfsobs.typing import Array
 
 
-class FlowSpectra(NamedTuple):
-    """One-sided spectra of one mode [um^2/Hz].
+class TurbulenceSpectra(NamedTuple):
+    """Spectra of the turbulence in one mode, one-sided [um^2/Hz], or per sample, with the errors of the combined LGS.
 
     Attributes
     ----------
@@ -39,13 +39,13 @@ class FlowSpectra(NamedTuple):
 
     own: Array
     measurement: Array
-    cross: Complex
+    cross: Complex | Array
     ngs: Array
-    ngs_cross: Complex
-    sensors_cross: Complex
+    ngs_cross: Complex | Array
+    sensors_cross: Complex | Array
 
 
-def flow_spectra(scenario: Scenario, mode: int, frequency: Array) -> FlowSpectra:
+def flow_spectra(scenario: Scenario, mode: int, frequency: Array) -> TurbulenceSpectra:
     """Compute the spectra of one mode of frozen flow.
 
     Parameters
@@ -59,7 +59,7 @@ def flow_spectra(scenario: Scenario, mode: int, frequency: Array) -> FlowSpectra
 
     Returns
     -------
-    FlowSpectra
+    TurbulenceSpectra
         Six densities, (n,) each [um^2/Hz].
     """
     if scenario.sensors.lgs_combination == MEAN and stars_differ(scenario, mode):
@@ -69,8 +69,8 @@ def flow_spectra(scenario: Scenario, mode: int, frequency: Array) -> FlowSpectra
     own, ngs, measurement = shared.density
     cross = shared.pair(0, 2)
     if atmosphere.natural_star(scenario) == atmosphere.on_axis():
-        return FlowSpectra(own, measurement, cross, own, own + 0j, cross)
-    return FlowSpectra(own, measurement, cross, ngs, shared.pair(0, 1), shared.pair(1, 2))
+        return TurbulenceSpectra(own, measurement, cross, own, own + 0j, cross)
+    return TurbulenceSpectra(own, measurement, cross, ngs, shared.pair(0, 1), shared.pair(1, 2))
 
 
 def star_flow_spectra(scenario: Scenario, mode: int, frequency: Array) -> SpectraBetween:
