@@ -15,8 +15,7 @@ from wfsobs.atmosphere.von_karman import TurbulenceLayer
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.sensors import Kind
 from wfsobs.simulation import layers as atmosphere
-from wfsobs.simulation.flow_integral import PlaneWaves, spectra_between
-from wfsobs.simulation.flow_spectra import TurbulenceSpectra, ideal_mode, of_stars
+from wfsobs.simulation.flow_spectra import PlaneWaves, TurbulenceSpectra, ideal_mode, of_stars, spectra_between
 from wfsobs.simulation.sensor_noise import shack_hartmann
 from wfsobs.simulation.true_spectra import TrueSpectra, n_frequencies, per_sample, true_spectra
 from wfsobs.typing import Array

@@ -329,10 +329,16 @@ def _through_lgs(scenario: Scenario, mode: int, own: Array) -> TurbulenceSpectra
     return TurbulenceSpectra(own, gain**2 * own + error, gain * own, own, own, gain * own)
 
 
+def notched_frequencies(n: int, dt: float) -> Array:
+    """Return the frequencies of a DFT [Hz] at which spectra of frozen flow are taken.
+
+    Along the wind they fall as f^2 to zero at 0 Hz, a notch that the DFT does not resolve: here it is a bin wide.
+    """
+    return np.hypot(np.fft.rfftfreq(n, dt), 1.0 / (n * dt))
+
+
 def per_sample(scenario: Scenario, n: int, densities: Callable[[Array], TurbulenceSpectra]) -> TurbulenceSpectra:
     """Return the spectra of frozen flow for a DFT of `n` steps; densities : frequencies [Hz] -> spectra [um^2/Hz]."""
-    # Along the wind the spectrum falls as f^2 to zero at 0 Hz, a notch that the DFT does not resolve: here it is a bin wide.
-    frequency = np.hypot(np.fft.rfftfreq(n, scenario.dt), 1.0 / (n * scenario.dt))
-    found = densities(frequency)
+    found = densities(notched_frequencies(n, scenario.dt))
     scaled = {id(part): 0.5 / scenario.dt * part for part in found}  # on the axis the NGS shares its arrays with the truth
     return TurbulenceSpectra(*(scaled[id(part)] for part in found))

@@ -11,7 +11,7 @@ from math import hypot, pi
 
 import numpy as np
 
-from wfsobs.atmosphere.frozen_flow import frozen_flow
+from wfsobs.atmosphere.frozen_flow import View, frozen_flow
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.atmosphere import PsdTable
@@ -145,7 +145,7 @@ def _frozen_flow(scenario: Scenario, n: int, rng: np.random.Generator, watch: Wa
     ideal, on_ngs, on_lgs = atmosphere.ideal_sensor(scenario), sensor(scenario, "ngs"), sensor(scenario, "lgs")
     looking = [(ideal, atmosphere.on_axis()), (on_ngs, atmosphere.natural_star(scenario))]
     looking += [(on_lgs, star) for star in atmosphere.laser_stars(scenario)]
-    views = [atmosphere.view(what, star, layers) for what, star in looking]
+    views = [View(what, tuple(atmosphere.footprint(star, layer) for layer in layers)) for what, star in looking]
     on_axis, ngs, *lgs = frozen_flow(
         layers, scenario.turbulence.outer_scale, scenario.telescope.diameter, views, n, scenario.dt, rng, watch
     )
