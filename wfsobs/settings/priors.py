@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import MappingProxyType
 from typing import ClassVar
 
 from wfsobs.settings.group import Group, UsedWhen
@@ -15,14 +14,12 @@ PAPER_PEAK_HZ = 47.4969
 class Kalman(Group):
     """The model inside the Kalman filters: AR(2) turbulence plus one vibration peak."""
 
-    used_when: ClassVar[UsedWhen] = MappingProxyType(
-        {
-            "turbulence_rms": ("process_noise", ("manual",)),
-            "vibration_rms": ("process_noise", ("manual",)),
-            "lgs_noise": ("measurement_noise", ("manual",)),
-            "ngs_noise": ("measurement_noise", ("manual",)),
-        }
-    )
+    used_when: ClassVar[UsedWhen] = {
+        "turbulence_rms": ("process_noise", ("manual",)),
+        "vibration_rms": ("process_noise", ("manual",)),
+        "lgs_noise": ("measurement_noise", ("manual",)),
+        "ngs_noise": ("measurement_noise", ("manual",)),
+    }
 
     peak: Choice = Choice(
         ["manual", "matched"],

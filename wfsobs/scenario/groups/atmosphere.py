@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import MappingProxyType
 from typing import ClassVar
 
 import param
@@ -105,16 +104,14 @@ class Process(Group):
 class Turbulence(Group):
     """Atmospheric turbulence."""
 
-    used_when: ClassVar[UsedWhen] = MappingProxyType(
-        {
-            "third_corner": ("source", ("ar3",)),
-            "rms": ("source", ("ar2", "ar3")),
-            "r0": ("source", ("frozen-flow",)),
-            "layers": ("source", ("frozen-flow",)),
-            "processes": ("source", ("processes",)),
-            "psd": ("source", ("psd",)),
-        }
-    )
+    used_when: ClassVar[UsedWhen] = {
+        "third_corner": ("source", ("ar3",)),
+        "rms": ("source", ("ar2", "ar3")),
+        "r0": ("source", ("frozen-flow",)),
+        "layers": ("source", ("frozen-flow",)),
+        "processes": ("source", ("processes",)),
+        "psd": ("source", ("psd",)),
+    }
 
     source: Choice = Choice(
         ["ar2", "ar3", "processes", "frozen-flow", "psd", "none"],
@@ -205,16 +202,14 @@ class Peak(Group):
 class Vibration(Group):
     """Structural vibration of the telescope."""
 
-    used_when: ClassVar[UsedWhen] = MappingProxyType(
-        {
-            "synthesis": ("source", ("peaks", "psd", "measured")),
-            "spectrum": ("source", ("measured",)),
-            "part": ("source", ("measured",)),
-            "cutoff": ("source", ("peaks", "psd", "measured")),
-            "peaks": ("source", ("peaks", "ar2")),
-            "psd": ("source", ("psd",)),
-        }
-    )
+    used_when: ClassVar[UsedWhen] = {
+        "synthesis": ("source", ("peaks", "psd", "measured")),
+        "spectrum": ("source", ("measured",)),
+        "part": ("source", ("measured",)),
+        "cutoff": ("source", ("peaks", "psd", "measured")),
+        "peaks": ("source", ("peaks", "ar2")),
+        "psd": ("source", ("psd",)),
+    }
 
     source: Choice = Choice(
         ["peaks", "psd", "measured", "ar2", "none"],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import ClassVar
 
 import numpy as np
@@ -13,9 +12,12 @@ from wfsobs.settings.parameters import Choice, Real, Whole
 from wfsobs.typing import Array
 
 PEAK, WIND, LASER, FRAMES = "peak", "wind", "laser", "frames"
-OF_KIND: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {PEAK: ("peak", "frequency_shift", "strength"), WIND: ("wind_factor",), LASER: ("lasers",), FRAMES: ("sensor", "share")}
-)
+OF_KIND: Mapping[str, tuple[str, ...]] = {
+    PEAK: ("peak", "frequency_shift", "strength"),
+    WIND: ("wind_factor",),
+    LASER: ("lasers",),
+    FRAMES: ("sensor", "share"),
+}
 """Settings of each kind alone."""
 
 
@@ -25,9 +27,7 @@ class Event(Group):
     Changes of a peak and of the wind ramp up over `duration` and stay; a laser outage and missing frames end after it.
     """
 
-    used_when: ClassVar[UsedWhen] = MappingProxyType(
-        {name: ("kind", (kind,)) for kind, names in OF_KIND.items() for name in names}
-    )
+    used_when: ClassVar[UsedWhen] = {name: ("kind", (kind,)) for kind, names in OF_KIND.items() for name in names}
 
     kind: Choice = Choice(
         [PEAK, WIND, LASER, FRAMES],
@@ -100,14 +100,17 @@ def phase_turns(events: Sequence[Event], t: Array) -> Array:
 
 def strength(events: Sequence[Event], t: Array) -> Array:
     """Return the factor on a peak's rms at the times t [s]; those of several events multiply."""
-    return np.prod([np.ones_like(t), *(1.0 + (event.strength - 1.0) * progress_of_change(event, t) for event in events)], axis=0)
+    return _factor("strength", events, t)
 
 
 def wind(events: Sequence[Event], t: Array) -> Array:
     """Return the factor on the wind speed at the times t [s]; those of several events multiply."""
-    return np.prod(
-        [np.ones_like(t), *(1.0 + (event.wind_factor - 1.0) * progress_of_change(event, t) for event in events)], axis=0
-    )
+    return _factor("wind_factor", events, t)
+
+
+def _factor(name: str, events: Sequence[Event], t: Array) -> Array:
+    changes = (1.0 + (getattr(event, name) - 1.0) * progress_of_change(event, t) for event in events)
+    return np.prod([np.ones_like(t), *changes], axis=0)
 
 
 def turbulence_time(events: Sequence[Event], t: Array) -> Array:

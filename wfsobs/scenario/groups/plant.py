@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import MappingProxyType
 from typing import ClassVar, NamedTuple
 
 import param
@@ -18,16 +17,14 @@ class Mount(NamedTuple):
     damping: float
 
 
-MOUNTS = MappingProxyType(
-    {
-        # FSM-CD300B manual, "Typical Specifications", at their limits: peaking of 3 dB, lag of 60 degrees at 400 Hz. Its
-        # amplitude is 3 dB down at 692 Hz then (specified: at 800 Hz or above), which no second order has with that lag.
-        "newport-fsm-300": Mount(498.2, 0.3832),
-        # Secondary mirror with fast drives, design study of the European Solar Telescope: 3 dB down at 150 Hz. No damping is
-        # published: that of the flattest response is assumed.
-        "est-m2": Mount(150.0, 0.7071),
-    }
-)
+MOUNTS = {
+    # FSM-CD300B manual, "Typical Specifications", at their limits: peaking of 3 dB, lag of 60 degrees at 400 Hz. Its
+    # amplitude is 3 dB down at 692 Hz then (specified: at 800 Hz or above), which no second order has with that lag.
+    "newport-fsm-300": Mount(498.2, 0.3832),
+    # Secondary mirror with fast drives, design study of the European Solar Telescope: 3 dB down at 150 Hz. No damping is
+    # published: that of the flattest response is assumed.
+    "est-m2": Mount(150.0, 0.7071),
+}
 """Tip-tilt mounts by name, from their data sheets."""
 
 
@@ -37,7 +34,7 @@ class PlantErrors(Group):
     The plant of the controllers is the mirror of `control`, of gain 1, and its delay.
     """
 
-    used_when: ClassVar[UsedWhen] = MappingProxyType({"resonance": ("mount", ("custom",)), "damping": ("mount", ("custom",))})
+    used_when: ClassVar[UsedWhen] = {"resonance": ("mount", ("custom",)), "damping": ("mount", ("custom",))}
 
     start: Real = Real(
         0.0,
@@ -161,7 +158,7 @@ class PlantErrors(Group):
 class Loop(Group):
     """The control loop that makes the record."""
 
-    used_when: ClassVar[UsedWhen] = MappingProxyType({"gain": ("closed", (True,)), "leak": ("closed", (True,))})
+    used_when: ClassVar[UsedWhen] = {"gain": ("closed", (True,)), "leak": ("closed", (True,))}
 
     closed: param.Boolean[bool] = param.Boolean(True, label="Closed loop", doc="Drive the deformable mirror; off keeps u = 0.")
     gain: Real = Real(
@@ -186,7 +183,7 @@ class Run(Group):
 class Control(Group):
     """The mirror and the controllers of the closed-loop comparison; the loop's own integrator makes the record."""
 
-    used_when: ClassVar[UsedWhen] = MappingProxyType({"gain": ("integrator", ("manual",))})
+    used_when: ClassVar[UsedWhen] = {"gain": ("integrator", ("manual",))}
 
     delay: Real = Real(
         2.0,

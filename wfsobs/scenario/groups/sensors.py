@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import MappingProxyType
 from typing import ClassVar, Literal
 
 import param
@@ -90,15 +89,13 @@ class Spots(Group):
 class Sensors(Group):
     """Wavefront sensors: a natural guide star (NGS) and laser guide stars (LGS)."""
 
-    used_when: ClassVar[UsedWhen] = MappingProxyType(
-        {
-            "lgs_noise": ("noise_from", ("nm",)),
-            "lgs_noise_per_mode": ("noise_from", ("nm",)),
-            "ngs_noise": ("noise_from", ("nm",)),
-            "spots": ("noise_from", ("photons",)),
-            "gate_level": ("gate", ("reject", "clip")),
-        }
-    )
+    used_when: ClassVar[UsedWhen] = {
+        "lgs_noise": ("noise_from", ("nm",)),
+        "lgs_noise_per_mode": ("noise_from", ("nm",)),
+        "ngs_noise": ("noise_from", ("nm",)),
+        "spots": ("noise_from", ("photons",)),
+        "gate_level": ("gate", ("reject", "clip")),
+    }
 
     lgs_rate: Real = Real(
         1000.0, (10.0, 100_000.0), "LGS rate 1/T", "Frame rate of the LGS sensors and of the loop [Hz] (paper, Table 3: 1000 Hz)."
