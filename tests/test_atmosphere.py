@@ -54,7 +54,7 @@ def test_airmass(angle: float) -> None:
     way = 1 / np.cos(np.radians(angle))
     (layer,) = atmosphere.layers(s)
     assert layer.strength ** (-3 / 5) == pytest.approx(0.157 * way ** (-3 / 5)) and layer.height == pytest.approx(8000 * way)
-    (footprint,) = atmosphere.view(atmosphere.ideal_sensor(s), atmosphere.laser_stars(s)[0], (layer,)).footprints
+    footprint = atmosphere.footprint(atmosphere.laser_stars(s)[0], layer)
     assert footprint.scale == pytest.approx(1 - 8 / 90)
     assert footprint.shift == pytest.approx((8000 * way * np.radians(60 / 3600), 0.0))
 

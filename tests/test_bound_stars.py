@@ -16,6 +16,7 @@ from wfsobs.simulation.flow_spectra import star_basis, star_flow_spectra
 from wfsobs.simulation.guide_stars import stars_differ
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.mode_spectra import StarSpectra, star_spectra
+from wfsobs.simulation.true_spectra import true_spectra
 from wfsobs.simulation.turbulence import SOURCES
 from wfsobs.typing import Array
 
@@ -91,7 +92,8 @@ CASES = {
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_the_best_estimate_of_a_long_record_comes_near_from_above(case: str) -> None:
-    stars = star_spectra(ASTERISM.replace(CASES[case]), 0)
+    s = ASTERISM.replace(CASES[case])
+    stars = star_spectra(s, 0, true_spectra(s, 0))
     for phase, ahead in ((0, 0), (3, 1)):
         least, both = least_errors_of_both(stars.mean, ahead, stars), least_errors_of_both(stars.mean, ahead)
         for name, exact in exact_errors(stars, 1000, phase, ahead).items():
@@ -120,7 +122,7 @@ def test_regression_on_a_long_record_finds_the_same() -> None:
     truth, half = air.on_axis[at, 0], len(at) // 2
     found = np.linalg.lstsq(inputs[:half], truth[:half], rcond=None)[0]
     error = np.sqrt(np.mean((inputs[half:] @ found - truth[half:]) ** 2))
-    expected = exact_errors(star_spectra(s, 0), taps, phase, 0)["turbulence"]
+    expected = exact_errors(star_spectra(s, 0, true_spectra(s, 0)), taps, phase, 0)["turbulence"]
     # 320 coefficients from 10,000 equations: 1.6 % above; errors alike over some five of 10,000: 1.6 % at one sigma.
     assert error == pytest.approx(1.016 * expected, rel=0.05)
 

@@ -9,7 +9,7 @@ from scipy.signal import welch
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.shack_hartmann import Aliasing
 from wfsobs.simulation import layers as atmosphere
-from wfsobs.simulation.flow_spectra import FlowSpectra, flow_spectra
+from wfsobs.simulation.flow_spectra import TurbulenceSpectra, flow_spectra
 from wfsobs.simulation.lenslet_spectra import lenslet_flow_spectra, true_lenslet_spectra
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.sensor_noise import shack_hartmann
@@ -35,7 +35,7 @@ FLOW = Scenario().replace(
 FREQUENCY = np.fft.rfftfreq(8192, 1.0 / 500.0)
 
 
-def difference_variance(found: FlowSpectra) -> float:
+def difference_variance(found: TurbulenceSpectra) -> float:
     """Return the variance of what the NGS measures less the truth."""
     density = found.own + found.ngs - 2.0 * found.ngs_cross.real
     return float(np.trapezoid(density, FREQUENCY))

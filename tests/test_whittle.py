@@ -11,8 +11,7 @@ from wfsobs.priors_from.scenario import measurement_noise, modelled_processes
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.ar3 import TOLERANCE, Ar3, Ar3Fits
 from wfsobs.signal.whittle import information, whittle_fit
-from wfsobs.simulation.true_spectra import lgs_turbulence_spectrum
-from wfsobs.simulation.turbulence_spectra import turbulence_spectra
+from wfsobs.simulation.true_spectra import lgs_turbulence_spectrum, turbulence_spectra
 from wfsobs.typing import Array
 
 F = np.geomspace(1.0, 100.0, 200)

@@ -17,8 +17,7 @@ from wfsobs.signal.ar2 import Ar2, turbulence_corner
 from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.wiener import advance_spectrum, circle_mean, error_spectrum, explained_variance, factorise
 from wfsobs.simulation.disturbance import vibration_variance
-from wfsobs.simulation.true_spectra import TrueSpectra, line_width, n_frequencies, true_spectra
-from wfsobs.simulation.turbulence_spectra import turbulence_spectra
+from wfsobs.simulation.true_spectra import TrueSpectra, line_width, n_frequencies, true_spectra, turbulence_spectra
 from wfsobs.typing import Array
 
 # The loop of one 530 nm turbulence, one 50 nm line at 47.5 Hz, 20 nm of noise.

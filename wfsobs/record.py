@@ -61,9 +61,8 @@ class Training:
     def copy(self, modes: Sequence[int] | None = None) -> Training:
         """Return a copy in memory of its own; modes : of these alone."""
         own = slice(None) if modes is None else list(modes)
-        y, u, open_loop_y = (None if x is None else _own(x[:, own]) for x in (self.y_lgs, self.u, self.open_loop_y))
-        assert y is not None and u is not None
-        return Training(y, u, open_loop_y)
+        open_loop_y = None if self.open_loop_y is None else _own(self.open_loop_y[:, own])
+        return Training(_own(self.y_lgs[:, own]), _own(self.u[:, own]), open_loop_y)
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from math import inf, log, pi
-from types import MappingProxyType
 
 import numpy as np
 from scipy import fft
@@ -68,14 +67,12 @@ from wfsobs.signal.sensor_array import FastSensors, SlowSensor, SlowTarget, vari
 from wfsobs.signal.spectrum import rms
 from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean, degrees_of_freedom, explained_variance
 from wfsobs.simulation.guide_stars import MEAN, stars_differ
-from wfsobs.simulation.mode_spectra import StarSpectra, are_coupled, star_spectra
+from wfsobs.simulation.mode_spectra import AXIS, FIRST, LGS, NGS, StarSpectra, are_coupled, star_spectra
 from wfsobs.simulation.synthesis import line_width
 from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, true_spectra
 from wfsobs.typing import Array
 
-INFORMATION: Mapping[str, str] = MappingProxyType(
-    dict(zip(("lgs", "both", "stars", "modes", "both-modes", "asterism"), BOUNDS, strict=True))
-)
+INFORMATION: Mapping[str, str] = dict(zip(("lgs", "both", "stars", "modes", "both-modes", "asterism"), BOUNDS, strict=True))
 """Information that an observer can have -> row of its bound."""
 
 ALONE: dict[str, str] = dict(zip(BOUNDS[3:], BOUNDS[:3], strict=True))
@@ -313,12 +310,12 @@ def least_errors_of_both(spectra: TrueSpectra, ahead: int = 0, stars: StarSpectr
     else:
 
         def with_frames(i: int) -> Complex:
-            return advance_spectrum(stars.with_ngs(i) * exposure, 1)
+            return advance_spectrum(stars.pair(NGS, FIRST + i) * exposure, 1)
 
         def with_axis(i: int) -> Complex:
-            return advance_spectrum(stars.with_axis(i), 1 + ahead)
+            return advance_spectrum(stars.pair(AXIS, FIRST + i), 1 + ahead)
 
-        others = FastSensors(stars.n_differences, stars.between, stars.with_z, with_frames)
+        others = FastSensors(stars.n_differences, stars.between, lambda i: stars.pair(FIRST + i, LGS), with_frames)
         targets = [(one, with_axis if name == TURBULENCE else None) for name, one in zip(parts, wanted, strict=True)]
         gained = variance_from_sensors(targets, known.whitener, others, frames)
     alone = {name: circle_mean(known.estimate(*parts[of], ahead=ahead).error) for name, of in _sums(parts).items()}

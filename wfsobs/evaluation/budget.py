@@ -52,7 +52,7 @@ from wfsobs.simulation.guide_stars import lgs_noise_rms
 from wfsobs.simulation.loop import measure_closed_loop, simulate_noise
 from wfsobs.simulation.sensing import OpenLoop
 from wfsobs.simulation.sensor_noise import noise_rms
-from wfsobs.simulation.turbulence import processes, third_order_process, turbulence_process
+from wfsobs.simulation.turbulence import processes
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:
@@ -445,18 +445,18 @@ def follow_signal(
 
 def true_beams(scenario: Scenario, mode: int) -> Beams:
     """Return processes that have the spectra of the turbulence as the target has it and as the LGS see it, or are nearest."""
-    if scenario.turbulence.source in ("none", "processes", "ar2", "ar3"):
+    if _is_sum(scenario):
         return replace(beams_of(scenario, mode), common=true_turbulence(scenario, mode), target=())
     return beams_of(scenario.replace(TRUE_MODEL), mode)
 
 
 def true_turbulence(scenario: Scenario, mode: int) -> tuple[Ar2 | Ar3, ...]:
     """Return processes that have the spectrum of the turbulence, or are nearest to it."""
-    source, of = scenario.turbulence.source, (mode, scenario.dt)
-    if source == "none":
-        return ()
-    if source == "processes":
-        return tuple(processes(scenario, *of))
-    if source in ("ar2", "ar3"):
-        return ((turbulence_process if source == "ar2" else third_order_process)(scenario, *of),)
-    return (modelled_turbulence(scenario.replace(TRUE_MODEL), *of),)
+    if _is_sum(scenario):
+        return tuple(processes(scenario, mode, scenario.dt))
+    return (modelled_turbulence(scenario.replace(TRUE_MODEL), mode, scenario.dt),)
+
+
+def _is_sum(scenario: Scenario) -> bool:
+    """Return whether the turbulence is a sum of processes, or of none."""
+    return scenario.turbulence.source not in ("frozen-flow", "psd")

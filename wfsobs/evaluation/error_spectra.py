@@ -38,9 +38,9 @@ from wfsobs.scenario import Scenario
 from wfsobs.signal.ar3 import Ar3Fits
 from wfsobs.signal.spectrum import expected_psd, psd
 from wfsobs.signal.wiener import circle_mean
+from wfsobs.simulation.flow_spectra import TurbulenceSpectra
 from wfsobs.simulation.guide_stars import MEAN
-from wfsobs.simulation.true_spectra import MOST, TrueSpectra, has_known_spectra, n_frequencies, true_spectra
-from wfsobs.simulation.turbulence_spectra import TurbulenceSpectra, turbulence_spectra
+from wfsobs.simulation.true_spectra import MOST, TrueSpectra, has_known_spectra, n_frequencies, true_spectra, turbulence_spectra
 from wfsobs.typing import Array
 
 TRUTH = "truth"

@@ -18,7 +18,7 @@ from scipy.special import ndtr, ndtri, stdtrit
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimate
 from wfsobs.record import Record
-from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
+from wfsobs.sensors.modes import MODE_NAMES
 from wfsobs.signal.spectrum import rms
 from wfsobs.typing import Array
 
@@ -195,7 +195,7 @@ def score(
     list of Score
         One per estimate and mode, and one of the sum of both estimates of an observer.
     """
-    names = [m.name for m in modes_up_to(HIGHEST_ORDER)][: record.n_modes] if mode_names is None else list(mode_names)
+    names = list(MODE_NAMES[: record.n_modes] if mode_names is None else mode_names)
     known = record.turbulence is not None or record.vibration is not None
     if known:
         return supervised_scores(record, estimates, warm_up, names, derive or make_anew)

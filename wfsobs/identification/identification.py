@@ -18,11 +18,12 @@ from wfsobs.identification.result import (
     innovations,
     read_difference,
     read_mode,
+    seen_z,
     sensor_differences,
 )
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
-from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
+from wfsobs.sensors.modes import MODE_NAMES
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.riccati import RiccatiError
 from wfsobs.spectral.missing import find_outlying
@@ -136,18 +137,15 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
     --------
     wfsobs.observe : Run observers on a record.
     """
-    if np.isinf(record.y_lgs).any() or np.isinf(record.u).any():
-        raise RecordError("the record has infinite samples; NaN stands for a missing one")
-    z = record.z[record.delay :]
+    z = seen_z(record)
     z = z[: fast_length(len(z))]
     if len(z) < SHORTEST:
         raise RecordError(f"the record has {record.n_steps} samples, identification needs {SHORTEST + record.delay} or more")
     if not lowest < 0.25 / record.dt:
         raise RecordError(f"lowest peak frequency = {lowest:g} Hz: must be below a quarter of the rate, {0.25 / record.dt:g} Hz")
-    names = [mode.name for mode in modes_up_to(HIGHEST_ORDER)]
-    if record.n_modes > len(names):
-        raise RecordError(f"the record has {record.n_modes} modes, at most {len(names)} can be identified")
-    for name, column in zip(names, z.T, strict=False):
+    if record.n_modes > len(MODE_NAMES):
+        raise RecordError(f"the record has {record.n_modes} modes, at most {len(MODE_NAMES)} can be identified")
+    for name, column in zip(MODE_NAMES, z.T, strict=False):
         if (count := np.count_nonzero(np.isfinite(column))) < max(SHORTEST, LEAST * len(z)):
             raise RecordError(
                 f"{name}: {count} of {len(z)} samples are measured, identification needs {SHORTEST}, and {LEAST:.0%}"
@@ -162,9 +160,8 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
         modes.append(OneMode(column, record.dt, lowest))
     add_peaks(modes, level, lowest, watch)
     left = count_unexplained(modes, level, lowest)
-    found = tuple(
-        read_mode(name, mode, lowest, check_whiteness(mode, count)) for name, mode, count in zip(names, modes, left, strict=False)
-    )
+    tests = map(check_whiteness, modes, left)
+    found = (read_mode(name, mode, lowest, test) for name, mode, test in zip(MODE_NAMES, modes, tests, strict=False))
     found = tuple(replace(mode, outlying=int(count)) for mode, count in zip(found, outlying.sum(axis=0), strict=True))
     y_lgs = record.y_lgs.copy()
     y_lgs[record.delay :][: len(z)][outlying] = np.nan

@@ -15,13 +15,13 @@ import numpy as np
 from scipy.optimize import minimize
 
 from wfsobs.identification.process import Number
-from wfsobs.identification.result import MATCHED, base_scenario, model_settings
+from wfsobs.identification.result import MATCHED, base_scenario, model_settings, seen_z
 from wfsobs.notebook import import_extra
 from wfsobs.observers.gp.kernels import Kernel, Matern, Sho, SquaredExponentialInTime, Sum, log_likelihood
 from wfsobs.prior import Line, Lines
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
-from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
+from wfsobs.sensors.modes import MODE_NAMES
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.typing import Array
 
@@ -152,12 +152,10 @@ def fit_kernels(
     Cancelled
         `watch` asks to stop.
     """
-    if np.isinf(record.y_lgs).any() or np.isinf(record.u).any():
-        raise RecordError("the record has infinite samples; NaN stands for a missing one")
-    z = record.z[record.delay :]
+    z = seen_z(record)
     if np.isfinite(z).sum(axis=0).min(initial=len(z)) < SHORTEST:
         raise RecordError(f"a mode has fewer than {SHORTEST} samples")
-    names = [mode.name for mode in modes_up_to(HIGHEST_ORDER)[: z.shape[1]]]
+    names = MODE_NAMES[: z.shape[1]]
     parts = {"turbulence": tuple(turbulence), "vibration": tuple(vibration), "background": tuple(background)}
     fits = []
     for i, name in enumerate(names):

@@ -140,7 +140,7 @@ def strongest_bin(candidate: Candidate, f: Array, ratio: Array) -> float:
 
 def is_peak(p: Ar2, bin_width: float) -> bool:
     """Return whether a resonance is narrower than turbulence, not slower than the record, and below half the rate."""
-    return p.damping < WIDEST and 2.0 * bin_width < p.omega / (2 * pi) < 0.5 / p.dt - bin_width
+    return p.damping < WIDEST and 2.0 * bin_width < p.frequency < 0.5 / p.dt - bin_width
 
 
 def add_resonance(spectrum: Spectrum, f: Array, I: Array, candidate: Candidate) -> Spectrum:  # noqa: E741
@@ -155,7 +155,7 @@ def add_resonance(spectrum: Spectrum, f: Array, I: Array, candidate: Candidate) 
         damping = min(max(share * half / f0, 1e-6), 0.5)
         new = Ar2(2.0 * pi * f0, damping, np.sqrt(max(power, 1e-16)), spectrum.dt)
         wider = replace(spectrum, resonances=(*spectrum.resonances, new))
-        cells = Cells(f, I, keep, [p.omega / (2 * pi) for p in wider.resonances])
+        cells = Cells(f, I, keep, [p.frequency for p in wider.resonances])
         count = len(wider.vector)
         shape = fit_spectrum(wider, cells, range(count - 3, count))
         value = spectrum_negative_log_likelihood(shape, cells)
@@ -170,14 +170,14 @@ def split_resonance(spectrum: Spectrum, f: Array, I: Array, p: Ar2) -> Spectrum 
 
     Neighbours look like one resonance of several bins.
     """
-    f0 = p.omega / (2 * pi)
+    f0 = p.frequency
     half = p.damping * f0
     if half < 2.0 * NEIGHBOURS * f[0]:
         return None
     two = [Ar2(2 * pi * (f0 + sign * 0.7 * half), 0.4 * p.damping, p.rms / np.sqrt(2.0), spectrum.dt) for sign in (-1, 1)]
     start = replace(spectrum, resonances=(*spectrum.without(p).resonances, *two))
     keep = np.where(window_about(Candidate(f0, int(4.0 * half / f[0]), 0.0), f), 1.0, 0.0)
-    cells = Cells(f, I, keep, [q.omega / (2 * pi) for q in (*start.resonances, p)])
+    cells = Cells(f, I, keep, [q.frequency for q in (*start.resonances, p)])
     count = len(start.vector)
     shape = fit_spectrum(start, cells, range(count - 6, count))
     gain = spectrum_negative_log_likelihood(spectrum, cells) - spectrum_negative_log_likelihood(shape, cells)
@@ -251,8 +251,6 @@ class OneMode:
         Time step [s].
     lowest : float
         Minimum frequency of a peak [Hz].
-    rng : numpy.random.Generator, optional
-        For the draws of missing samples.
 
     Attributes
     ----------
@@ -277,10 +275,10 @@ class OneMode:
     strong: Array
     left: Array
 
-    def __init__(self, z: Array, dt: float, lowest: float = LOWEST, rng: np.random.Generator | None = None):
+    def __init__(self, z: Array, dt: float, lowest: float = LOWEST):
         self.lowest = lowest
         self.measurement, self.dt, self.n = z - np.nanmean(z), dt, len(z)
-        self.missing: MissingSamples = MissingSamples(np.isnan(z), dt, rng or np.random.default_rng(0))
+        self.missing: MissingSamples = MissingSamples(np.isnan(z), dt, np.random.default_rng(0))
         self.f: Array = periodogram_frequencies(self.n, dt)
         self.share, self.unknown, self.missing_power = np.ones(len(self.f)), np.zeros((0, self.n)), np.zeros(len(self.f))
         self.z = self.missing.interpolate(self.measurement)
@@ -333,9 +331,9 @@ class OneMode:
         """Return the bins for a fit: all but those far above a test's limit without a resonance near."""
         keep = np.ones(len(self.f)) if everything else np.where(self.strong, 0.0, 1.0)
         for p in self.spectrum.resonances:
-            centre, half = p.omega / (2 * pi), max(4.0 * p.damping * p.omega / (2 * pi), 20.0 * self.f[0])
+            centre, half = p.frequency, max(4.0 * p.damping * p.frequency, 20.0 * self.f[0])
             keep[np.abs(self.f - centre) < half] = 1.0
-        return Cells(self.f, self.I, keep, [p.omega / (2 * pi) for p in self.spectrum.resonances], self.share)
+        return Cells(self.f, self.I, keep, [p.frequency for p in self.spectrum.resonances], self.share)
 
     def refit(self, reshape: bool = False, third: bool = False) -> None:
         """Fit all parameters of the spectrum at once.
@@ -351,7 +349,7 @@ class OneMode:
             self.spectrum = with_background(without_sway(choose_order(self.spectrum, cells, third)), cells)
         for p in [p for p in self.spectrum.resonances if not is_peak(p, self.f[0])]:
             self.spectrum = self.spectrum.without(p)
-            self.rejections.append(Candidate(p.omega / (2 * pi), WIDEST_LINE, 0.0))  # or it would come back
+            self.rejections.append(Candidate(p.frequency, WIDEST_LINE, 0.0))  # or it would come back
         self._fill()
 
     def explain(self, candidate: Candidate) -> bool:
@@ -364,7 +362,7 @@ class OneMode:
         lines, spectrum, reach = self.lines, self.spectrum, reach_of(candidate, self.f[0])
         beside = [line for line in lines if abs(line.frequency - candidate.frequency) < reach]
         trials: list[tuple[list[Sinusoid], Spectrum]] = []
-        if not beside and not any(abs(p.omega / (2 * pi) - candidate.frequency) < reach for p in spectrum.resonances):
+        if not beside and not any(abs(p.frequency - candidate.frequency) < reach for p in spectrum.resonances):
             shape = add_resonance(spectrum, self.f, self.I, candidate)
             at = shape.resonances[-1].omega / (2 * pi)  # its own skirt may have been the candidate
             beside = [line for line in lines if abs(line.frequency - at) < NEIGHBOURS * self.f[0]]
@@ -420,7 +418,7 @@ class OneMode:
 
         Not where one was removed before: it would come back, and be removed again.
         """
-        frequency = p.omega / (2 * pi)
+        frequency = p.frequency
         if any(abs(one - frequency) <= 2.0 * p.damping * frequency for one in self.removals):
             return
         shape = split_resonance(self.spectrum, self.f, self.I, p)
@@ -445,7 +443,7 @@ class OneMode:
             rest = whole.without(p)
             if misfit_of(fit_spectrum(rest, self.cells(everything=True)), self.f, self.I) - before > KEPT:
                 continue
-            frequency = p.omega / (2 * pi)
+            frequency = p.frequency
             self.spectrum: Spectrum = rest
             self.removals.append(frequency)
             self.rejections.append(Candidate(frequency, max(round(2.0 * p.damping * frequency / self.f[0]), WIDEST_LINE), 0.0))
@@ -473,7 +471,7 @@ def is_continuum(spectrum: Spectrum, p: Ar2 | Ar3, lowest: float) -> bool:
     whole model has no maximum there that stands out of the dip on its lower side. Likelihood cannot decide: where no model
     of turbulence fits, a resonance raises it by any amount.
     """
-    f0 = p.omega / (2.0 * pi)
+    f0 = p.frequency
     if f0 < lowest:
         return True
     if p.damping <= BROAD:

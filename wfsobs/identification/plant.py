@@ -30,9 +30,10 @@ from wfsobs.identification.plant_likelihood import (
     known_signals,
     second_order,
 )
+from wfsobs.identification.process import Number, format_number
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
-from wfsobs.sensors.modes import HIGHEST_ORDER, TIP_TILT, modes_up_to
+from wfsobs.sensors.modes import MODE_NAMES, TIP_TILT
 from wfsobs.sensors.zernike import noll
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.spectral.model import Spectrum
@@ -84,8 +85,7 @@ class PlantNumber:
         """Return it with its standard deviation, in two digits of that."""
         if self.value is None or self.sd is None:
             return "not identifiable"
-        digits = max(1 - int(np.floor(np.log10(self.sd))), 0)
-        return f"{self.value:.{digits}f} +- {self.sd:.{digits}f}{unit}"
+        return format_number(Number(self.value, self.sd)) + unit
 
 
 @dataclass(frozen=True)
@@ -142,6 +142,11 @@ class GroupPlant:
         """Whether a probe shows that the mirror does more than delay."""
         return self.rigid < OTHERWISE
 
+    def numbers(self, subject: str) -> tuple[PlantNumber, ...]:
+        """Return the "delay" or the "gain", one number where the modes do not differ in it."""
+        one: PlantNumber = getattr(self, f"common_{subject}")
+        return (one,) if one.value is not None else getattr(self, subject)
+
     @property
     def degrees(self) -> PlantNumber:
         """The rotation [degrees]."""
@@ -185,7 +190,7 @@ def identify_plant(record: Record, watch: Watch = QUIET) -> tuple[GroupPlant, ..
     groups = list(_groups(record.n_modes))
     for i, columns in enumerate(groups):
         watch.check()
-        names = tuple(modes_up_to(HIGHEST_ORDER)[c].name for c in columns)
+        names = tuple(MODE_NAMES[c] for c in columns)
         _check_motion(names, y[:, columns], u[:, columns])
         out.append(_identify_group(names, y[:, columns], u[:, columns], record.dt))
         watch.step((i + 1) / len(groups))

@@ -85,7 +85,7 @@ LONGEST = 6
 
 ORDER, SPAN, DEGREE = 16, 12, 4
 """Of the first guess: frames of the past that predict a measurement, and frames after it over which the response of a disturbance
-is a polynomial of this degree."""
+is a polynomial of this degree, which follows lines up to about a tenth of the rate."""
 
 PEAKS, MOST_PEAKS, LOWEST = 10, 40, 5.0
 """Maximum number of resonances per mode, while a maximum is looked for and then; their minimum frequency [Hz]."""
@@ -217,10 +217,7 @@ class PlantLikelihood:
         ties : theta by its free numbers (p, q);  stays : delays do not go beyond the whole numbers on either side
         """
         theta, spectra, mirror = start.theta, list(start.spectra), start.mirror
-        cells = [
-            Cells(self.f, np.zeros_like(self.f), np.ones_like(self.f), [p.omega / (2.0 * np.pi) for p in s.resonances])
-            for s in spectra
-        ]
+        cells = [Cells(self.f, np.zeros_like(self.f), np.ones_like(self.f), [p.frequency for p in s.resonances]) for s in spectra]
         lower, held = np.minimum(theta[: self.k].astype(int), LONGEST), 1e-3
         best, F = np.inf, np.zeros((0, 0))
         theta_there, spectra_there, lower_there = theta, spectra, lower
@@ -360,6 +357,19 @@ def _means(x: Array, cells: Cells) -> Array:
     return np.add.reduceat(x, _edges(cells)) / cells.count
 
 
+def prediction_errors(y: Array, u: Array) -> tuple[Array, Array]:
+    """Return what is new in measurements and commands, (n, ...) each, from their ORDER th sample on: not told by their past."""
+    n = len(y) - ORDER
+    past = np.column_stack([x[ORDER - i : ORDER - i + n] for x in (y, u) for i in range(1, ORDER + 1)])
+    new_y, new_u = (x[ORDER:] - past @ np.linalg.lstsq(past, x[ORDER:], rcond=1e-10)[0] for x in (y, u))
+    return new_y, new_u
+
+
+def smooth_basis() -> Array:
+    """Return an orthonormal basis of the polynomials that smooth responses are, (SPAN, DEGREE + 1)."""
+    return np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, SPAN), DEGREE + 1))[0]
+
+
 def guess_plant(data: PlantLikelihood) -> tuple[Array, float, Array]:
     """Return a plant to start from, but for its delay, the share of what is new in u that y does not explain, and that (n, k).
 
@@ -368,15 +378,12 @@ def guess_plant(data: PlantLikelihood) -> tuple[Array, float, Array]:
     off, as of other units, the one that makes the response of the disturbance smoothest: with w[k] the error of the prediction of
     y[k] from the past, h[i] = cov(y[k+i], w[k]) / var(w) and g[i] the same of u, that response is h[i] - gain R g[i - delay].
     """
-    y, u, k = data.filled_y, data.u[0], data.k
-    n = data.n - ORDER
-    past = np.column_stack([x[ORDER - i : ORDER - i + n] for x in (y, u) for i in range(1, ORDER + 1)])
-    w, v = (x[ORDER:] - past @ np.linalg.lstsq(past, x[ORDER:], rcond=1e-10)[0] for x in (y, u))
+    y, u, k, n = data.filled_y, data.u[0], data.k, data.n - ORDER
+    w, v = prediction_errors(y, u)
     turn = -np.linalg.lstsq(w, v, rcond=None)[0]
     own = v + w @ turn
     excited = float(np.sum(own**2) / max(np.sum(v**2), 1e-300))
-    source, basis = w if excited < 0.5 else own, np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, SPAN), DEGREE + 1))[0]
-    source = source[: n - SPAN]
+    source, basis = (w if excited < 0.5 else own)[: n - SPAN], smooth_basis()
     inverse = np.linalg.inv(source.T @ source)
     h, g = (np.array([x[ORDER + i : ORDER + i + len(source)].T @ source @ inverse for i in range(SPAN + 1)]) for x in (y, u))
     if excited >= 0.5:  # commands of their own: what they do is seen directly

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import hypot, isnan, log, nan, pi, sqrt
+from math import hypot, isnan, log, nan, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -121,7 +121,7 @@ def read_process(p: Ar2 | Ar3, std: Array) -> IdentifiedProcess:
     beyond = p.corner / p.omega - 1.0 if isinstance(p, Ar3) else 0.0
     third = Number(1.0 + beyond, max(beyond, NO_NEARER - 1.0) * float(std[3])) if isinstance(p, Ar3) else None
     return IdentifiedProcess(
-        with_reliable_std(scale_number(Number(1.0, float(std[0])), p.omega / (2 * pi))),
+        with_reliable_std(scale_number(Number(1.0, float(std[0])), p.frequency)),
         with_reliable_std(Number(p.damping, nan if at_bound else float(std[1]))),
         with_reliable_std(scale_number(Number(1.0, float(std[2])), p.rms)),
         third and with_reliable_std(third),
@@ -168,7 +168,7 @@ def _rms_of_bins(mode: OneMode, p: Ar2) -> tuple[float, float]:
     """
     spectrum, df = mode.spectrum, float(mode.f[0])
     start, rest = spectrum.starts[spectrum.processes.index(p)], spectrum.without(p).psd(mode.f)
-    h = short_taper(mode.n, mode.dt, p.omega / (2 * pi))
+    h = short_taper(mode.n, mode.dt, p.frequency)
     seen = 2.0 * mode.dt / np.sum(h**2) * np.abs(rfft(h * mode.left)[1 : len(mode.f) + 1]) ** 2 + mode.missing_power
 
     def power_and_variance(move: Array) -> tuple[float, float]:

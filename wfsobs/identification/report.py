@@ -168,7 +168,7 @@ def bin_periodogram(z: Array, dt: float) -> tuple[Array, Array, Array]:
 def fitted_spectrum(mode: IdentifiedMode, result: Identification) -> Fit:
     """Compute the spectrum of the model identified in a mode."""
     s, T = mode.spectrum, result.duration
-    centres = [(p.omega / (2 * np.pi), p.damping) for p in s.processes]
+    centres = [(p.frequency, p.damping) for p in s.processes]
     near = [c * (1.0 + max(damping, 1e-5) * np.linspace(-8.0, 8.0, 65)) for c, damping in centres]
     f = np.unique(np.concatenate([np.geomspace(1.0 / T, 0.5 / result.dt, 600), *near]))
     f = f[(f >= 1.0 / T) & (f <= 0.5 / result.dt)]

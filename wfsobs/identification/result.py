@@ -35,7 +35,7 @@ from wfsobs.identification.process import (
 from wfsobs.notebook import PlotAccessor, html_table, import_extra
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.prior import Line, Lines
-from wfsobs.record import Record, hold_last, pseudo_open_loop
+from wfsobs.record import Record, RecordError, hold_last, pseudo_open_loop
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import order_of
 from wfsobs.signal.ar2 import Ar2, turbulence_corner
@@ -63,6 +63,13 @@ MATCHED: dict[str, Any] = {
 }
 """Settings by which filters take the models as they are told."""
 WIDTHS = ("bandwidth_offline", "bandwidth_online")
+
+
+def seen_z(record: Record) -> Array:
+    """Return the pseudo-open-loop measurements whose commands are in the record. Raises RecordError where some are infinite."""
+    if np.isinf(record.y_lgs).any() or np.isinf(record.u).any():
+        raise RecordError("the record has infinite samples; NaN stands for a missing one")
+    return record.z[record.delay :]
 
 
 def base_scenario(n_modes: int, dt: float, base: Scenario | None) -> Scenario:
@@ -121,7 +128,7 @@ def band_settings(scenario: Scenario, nyquist: float) -> dict[str, Any]:
 
 def _process(p: Ar2 | Ar3, rms: list[float]) -> dict[str, Any]:
     return {
-        "frequency": p.omega / (2 * pi),
+        "frequency": p.frequency,
         "damping": max(p.damping, LEAST_DAMPING),
         "rms": rms,
         "third_corner": p.corner / p.omega if isinstance(p, Ar3) else 0.0,

@@ -52,14 +52,20 @@ from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3, Ar3Fits, SharedProcess, fit_shared_process
 from wfsobs.signal.statespace import MIN_MODEL_DAMPING, DisturbanceModel
 from wfsobs.simulation.disturbance import vibration_lines, vibration_power, vibration_variance
-from wfsobs.simulation.flow_spectra import star_basis
+from wfsobs.simulation.flow_spectra import TurbulenceSpectra, star_basis
 from wfsobs.simulation.guide_stars import lgs_error_process, lgs_error_variance, lgs_noise_rms, lgs_weights, stars_differ
 from wfsobs.simulation.layers import relative_rms
 from wfsobs.simulation.mode_spectra import ModeSpectra, are_coupled, beam_spectra, combined_spectra, frequency_rule, mode_spectra
 from wfsobs.simulation.sensor_noise import noise_rms
-from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, lgs_turbulence_spectrum, n_frequencies, true_spectra
+from wfsobs.simulation.true_spectra import (
+    TrueSpectra,
+    has_known_spectra,
+    lgs_turbulence_spectrum,
+    n_frequencies,
+    true_spectra,
+    turbulence_spectra,
+)
 from wfsobs.simulation.turbulence import processes, turbulence_process, turbulence_rms
-from wfsobs.simulation.turbulence_spectra import TurbulenceSpectra, turbulence_spectra
 from wfsobs.spectral.rational import fit_processes
 from wfsobs.typing import Array
 

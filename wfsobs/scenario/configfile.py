@@ -160,12 +160,12 @@ def preset(name: Any) -> Scenario:
     return PRESETS[name]()
 
 
-def preset_name(name: str | None, config: str | Path | None, default: str = "paper") -> str:
+def preset_name(name: str | None, config: str | Path | None) -> str:
     """Return the preset that `scenario_from` starts from. Raises SettingError where the file cannot be read."""
     if name is not None or config is None:
-        return name or default
+        return name or "paper"
     try:
-        return parse_toml(_text(config)).get("preset", default)
+        return parse_toml(_text(config)).get("preset", "paper")
     except SettingError as error:
         raise SettingError(f"{config}: {error}") from None
 
@@ -181,13 +181,18 @@ def parse_assignment(text: str) -> tuple[str, Any]:
     path, equals, value = text.partition("=")
     if not equals or not path.strip():
         raise SettingError(f"--set {text}: takes name=value, such as turbulence.wind_speed=20")
+    return path.strip(), parse_value(value.strip(), f"--set {path.strip()}")
+
+
+def parse_value(text: str, where: str) -> Any:
+    """Return a value in TOML's syntax, or the text itself. Raises SettingError, its line starting with `where`."""
     try:
-        parsed = parse_toml(f"value = {value.strip()}")
+        parsed = parse_toml(f"value = {text}")
     except NotToml:
-        return path.strip(), value.strip()
+        return text
     except SettingError as error:
-        raise SettingError(f"--set {path.strip()}: {error}") from None
-    return path.strip(), parsed["value"] if set(parsed) == {"value"} else value.strip()
+        raise SettingError(f"{where}: {error}") from None
+    return parsed["value"] if set(parsed) == {"value"} else text
 
 
 def changed_settings(scenario: Scenario, base: Scenario) -> dict[str, Any]:
@@ -212,18 +217,13 @@ def _inline(value: Any) -> str:
     return json.dumps(value)
 
 
-def scenario_from(
-    preset_name: str | None, config: str | Path | None, assignments: tuple[str, ...], default: str = "paper"
-) -> Scenario:
+def scenario_from(preset_name: str | None, config: str | Path | None, assignments: tuple[str, ...]) -> Scenario:
     """Return the scenario of a command line.
 
-    The preset (or the file's own, or `default`), then the file, then each assignment. Raises SettingError.
+    The preset (or the file's own, or paper), then the file, then each assignment. Raises SettingError.
     """
     base = preset(preset_name) if preset_name is not None else None
-    if config is not None:
-        scenario = load_scenario(config, base)
-    else:
-        scenario = base if base is not None else preset(default)
+    scenario = load_scenario(config, base) if config is not None else base or preset("paper")
     for path, value in map(parse_assignment, assignments):
         scenario.set(path, value)
     scenario.validate()

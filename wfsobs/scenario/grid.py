@@ -9,7 +9,7 @@ from math import prod
 from typing import Any
 
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.configfile import NotToml, format_value, parse_toml
+from wfsobs.scenario.configfile import format_value, parse_value
 from wfsobs.settings.errors import SettingError
 from wfsobs.settings.tree import Plain
 
@@ -42,16 +42,13 @@ def parse_variation(text: str, option: str = "--vary") -> Variation:
     path, equals, listed = (part.strip() for part in text.partition("="))
     if not (path and equals and listed):
         raise SettingError(f"{option} {text}: takes name=value,value, such as turbulence.wind_speed=5,10,15")
-    try:
-        parsed = parse_toml(f"values = [{listed}]")
-    except NotToml:
-        parsed = {}
-    except SettingError as error:
-        raise SettingError(f"{option} {path}: {error}") from None
-    values = parsed["values"] if set(parsed) == {"values"} else [_word(part.strip()) for part in listed.split(",")]
+    where = f"{option} {path}"
+    values = parse_value(f"[{listed}]", where)
+    if not isinstance(values, list):
+        values = [parse_value(part.strip(), where) for part in listed.split(",")]
     for i, value in enumerate(values):
         if value in values[:i]:
-            raise SettingError(f"{option} {path}: has {value!r} twice")
+            raise SettingError(f"{where}: has {value!r} twice")
     return Variation(path, tuple(values))
 
 
@@ -83,15 +80,6 @@ def _check_number(variations: Sequence[Variation]) -> None:
     counts = [len(v.values) for v in variations]
     if prod(counts) > MOST:
         raise SettingError(f"--vary: {' x '.join(map(str, counts))} = {prod(counts)} combinations, at most {MOST} can be run")
-
-
-def _word(text: str) -> Any:
-    """Return one value in TOML's syntax, or the bare word."""
-    try:
-        parsed = parse_toml(f"value = {text}")
-    except NotToml:
-        return text
-    return parsed["value"] if set(parsed) == {"value"} else text
 
 
 def _join_changes(changes: Iterable[tuple[str, Any]]) -> str:

@@ -38,3 +38,5 @@ def order_of(n_modes: int) -> int | None:
 
 
 TIP_TILT = modes_up_to(1)
+MODE_NAMES = tuple(mode.name for mode in modes_up_to(HIGHEST_ORDER))
+"""Of the columns of an array of any width."""

@@ -269,7 +269,6 @@ class Aliasing:
     """The aliasing error of one sensor, for any layer and beam."""
 
     def __init__(self, sensor: ShackHartmann) -> None:
-        self.sensor = sensor
         self._radius = sensor.lenslets.diameter / 2.0
         kx, ky = RADII[:, None] * np.cos(ANGLES), RADII[:, None] * np.sin(ANGLES)
         wrong = sensor.transform(kx / self._radius, ky / self._radius)

@@ -7,7 +7,6 @@ TOML files and shareable links all go through the functions here.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, Self, TypeVar, cast
 
 import param
@@ -22,28 +21,6 @@ UsedWhen = Mapping[str, tuple[str, tuple[Any, ...]]]
 
 SHOWN = 3
 """Maximum number of settings in the representation of a group."""
-
-
-def one_line(group: Group) -> str:
-    """Return a group with the first settings that are not at their defaults."""
-    changed = _changed_settings(group)
-    shown = ", ".join(f"{path}={value}" for path, value in changed[:SHOWN])
-    return f"{type(group).__name__}({shown}{f', and {len(changed) - SHOWN} more' if len(changed) > SHOWN else ''})"
-
-
-def settings_html(group: Group) -> str:
-    """Return a table of the settings that are not at their defaults."""
-    changed = _changed_settings(group)
-    return html_table((type(group).__name__, "" if changed else "default settings"), changed)
-
-
-def _changed_settings(group: Group) -> list[tuple[str, str]]:
-    """Return (dotted path, value, shortened) of the settings that are not at their defaults."""
-
-    def text(value: Any) -> str:
-        return f"[{len(value)} entries]" if isinstance(value, list) and len(value) > 3 else shorten(value, 40)
-
-    return [(path, text(value)) for path, value in leaves(group.difference(type(group)()))]
 
 
 def why_idle(group: Group, other: str, values: tuple[Any, ...]) -> str:
@@ -62,7 +39,7 @@ class Group(param.Parameterized):
     used_when : setting -> another one of the group, and the values of it with which it has an effect
     """
 
-    used_when: ClassVar[UsedWhen] = MappingProxyType({})
+    used_when: ClassVar[UsedWhen] = {}
 
     def __init_subclass__(cls) -> None:
         """Make a declaration that of the class: without this param copies it for every object whose value is set."""
@@ -100,12 +77,23 @@ class Group(param.Parameterized):
         return {name: _effective(getattr(self, name)) for name in self.settings() if name not in idle}
 
     def __repr__(self) -> str:
-        return one_line(self)
+        changed = self._changed_settings()
+        shown = ", ".join(f"{path}={value}" for path, value in changed[:SHOWN])
+        return f"{type(self).__name__}({shown}{f', and {len(changed) - SHOWN} more' if len(changed) > SHOWN else ''})"
 
     __str__ = __repr__
 
     def _repr_html_(self) -> str:
-        return settings_html(self)
+        changed = self._changed_settings()
+        return html_table((type(self).__name__, "" if changed else "default settings"), changed)
+
+    def _changed_settings(self) -> list[tuple[str, str]]:
+        """Return (dotted path, value, shortened) of the settings that are not at their defaults."""
+
+        def text(value: Any) -> str:
+            return f"[{len(value)} entries]" if isinstance(value, list) and len(value) > 3 else shorten(value, 40)
+
+        return [(path, text(value)) for path, value in leaves(self.difference(type(self)()))]
 
     def __eq__(self, other: object) -> bool:
         return self is other or (isinstance(other, Group) and type(self) is type(other) and self.to_dict() == other.to_dict())

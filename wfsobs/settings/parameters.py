@@ -10,9 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import param
 
+Bounds = tuple[float, float]
+
 
 class Real(param.Number[float]):
     """A finite number; integers become floats, booleans and NaN are refused."""
+
+    def __init__(self, default: float = 0.0, bounds: Bounds | None = None, label: str = "", doc: str = "", **kwargs: Any):
+        super().__init__(default, bounds=bounds, label=label or None, doc=doc, **kwargs)
 
     if not TYPE_CHECKING:
         __get__ = param.Parameter.__get__
@@ -30,6 +35,9 @@ class Real(param.Number[float]):
 class Whole(param.Integer[int]):
     """A whole number; booleans are refused."""
 
+    def __init__(self, default: int = 0, bounds: tuple[int, int] | None = None, label: str = "", doc: str = "", **kwargs: Any):
+        super().__init__(default, bounds=bounds, label=label or None, doc=doc, **kwargs)
+
     if not TYPE_CHECKING:
         __get__ = param.Parameter.__get__
 
@@ -43,11 +51,19 @@ class Reals(param.List[list[float]]):
     """A list of finite numbers, each within `item_bounds`; its length within `bounds`."""
 
     __slots__ = ["item_bounds"]
-    item_bounds: tuple[float, float]
+    item_bounds: Bounds
 
-    def __init__(self, default: Sequence[float] = (), *, item_bounds: tuple[float, float], **kwargs: Any):
+    def __init__(
+        self,
+        default: Sequence[float],
+        item_bounds: Bounds,
+        bounds: tuple[int, int | None] = (0, None),
+        label: str = "",
+        doc: str = "",
+        **kwargs: Any,
+    ):
         self.item_bounds = item_bounds
-        super().__init__(default=[float(v) for v in default], **kwargs)
+        super().__init__([float(v) for v in default], bounds=bounds, label=label or None, doc=doc, **kwargs)
 
     def __set__(self, obj: Any, val: Any) -> None:
         if isinstance(val, (list, tuple)):
@@ -60,6 +76,13 @@ class Reals(param.List[list[float]]):
         for v in val:
             if not isinstance(v, float) or not low <= v <= high:
                 raise ValueError(f"{self.name} takes numbers from {low:g} to {high:g}, not {v!r}")
+
+
+class Choice(param.Selector[str]):
+    """One of some words, by default the first."""
+
+    def __init__(self, objects: list[str], label: str, doc: str):
+        super().__init__(default=objects[0], objects=objects, label=label, doc=doc)
 
 
 def _as_float(value: Any) -> Any:

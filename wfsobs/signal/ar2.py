@@ -64,6 +64,11 @@ class Ar2:
         return replace(self, dt=dt)
 
     @property
+    def frequency(self) -> float:
+        """Corner or natural frequency [Hz]."""
+        return self.omega / (2.0 * np.pi)
+
+    @property
     def a1(self) -> float:
         """First AR coefficient, 2 exp(-xi w T) cos(w sqrt(1 - xi^2) T) (paper, eq. 1b)."""
         angle = self.omega * np.sqrt(1.0 - self.damping**2) * self.dt

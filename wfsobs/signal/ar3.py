@@ -60,6 +60,11 @@ class Ar3:
     dt: float
 
     @property
+    def frequency(self) -> float:
+        """That of the pole pair, omega / 2 pi [Hz]."""
+        return self.omega / (2.0 * np.pi)
+
+    @property
     def poles(self) -> NDArray[np.complex128]:
         """The three poles."""
         return np.exp(-self.decays)

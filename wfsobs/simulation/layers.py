@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wfsobs.atmosphere.frozen_flow import View
-from wfsobs.atmosphere.plane_waves import Footprint, Sensor
+from wfsobs.atmosphere.plane_waves import Footprint
 from wfsobs.atmosphere.von_karman import CORE, TurbulenceLayer, fine_rule, nodes_across_wind, von_karman_density
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.zernike import ZernikeProjection, bessel_ratio, tabulated_bessel_ratio
@@ -78,11 +77,6 @@ def laser_stars(scenario: Scenario) -> list[Star]:
     angles = np.radians(s.lgs_angle) + 2.0 * np.pi * np.arange(s.lgs_count) / s.lgs_count
     radius, distance = s.lgs_radius * ARCSEC, s.lgs_altitude * airmass(scenario)
     return [Star((radius * float(np.cos(a)), radius * float(np.sin(a))), distance) for a in angles]
-
-
-def view(sensor: Sensor, star: Star, of: tuple[TurbulenceLayer, ...]) -> View:
-    """Return a sensor and the footprints of its star's beam on the layers."""
-    return View(sensor, tuple(footprint(star, layer) for layer in of))
 
 
 def footprint(star: Star, layer: TurbulenceLayer) -> Footprint:
@@ -171,14 +165,14 @@ def _covariance(sensor: ZernikeProjection, of: tuple[TurbulenceLayer, ...], oute
     """Integrate by the rule of frozen flow across the wind, in both directions."""
     n = len(stars) * sensor.n_outputs
     total = np.zeros((n, n))
-    for i, layer in enumerate(of):
+    for layer in of:
         nodes, weights = nodes_across_wind(
             2.0 * np.pi / outer_scale, CORE / (0.5 * sensor.diameter), *fine_rule(layer.height, sensor.diameter)
         )
         half = nodes.size // 2
         kx, ky = nodes[half:], nodes[:, None]
         power = 2.0 * weights[half:] * weights[:, None] * von_karman_density(kx**2 + ky**2, layer.strength, outer_scale)
-        footprints = [view(sensor, star, of).footprints[i] for star in stars]
+        footprints = [footprint(star, layer) for star in stars]
         distinct = list(dict.fromkeys(footprints))
         seen = np.concatenate(
             [sensor.transform(kx, ky, f, tabulated_bessel_ratio).reshape(sensor.n_outputs, -1) for f in distinct]

@@ -15,11 +15,9 @@ from wfsobs.atmosphere.von_karman import TurbulenceLayer
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.sensors import Kind
 from wfsobs.simulation import layers as atmosphere
-from wfsobs.simulation.flow_integral import PlaneWaves, spectra_between
-from wfsobs.simulation.flow_spectra import FlowSpectra, ideal_mode, of_stars
+from wfsobs.simulation.flow_spectra import PlaneWaves, TurbulenceSpectra, ideal_mode, of_stars, spectra_between
 from wfsobs.simulation.sensor_noise import shack_hartmann
-from wfsobs.simulation.true_spectra import TrueSpectra, n_frequencies, true_spectra
-from wfsobs.simulation.turbulence_spectra import per_sample
+from wfsobs.simulation.true_spectra import TrueSpectra, n_frequencies, per_sample, true_spectra
 from wfsobs.typing import Array
 
 
@@ -49,7 +47,7 @@ def true_lenslet_spectra(scenario: Scenario, mode: int) -> TrueSpectra:
     return true_spectra(scenario, mode, air)
 
 
-def lenslet_flow_spectra(scenario: Scenario, mode: int, frequency: Array) -> FlowSpectra:
+def lenslet_flow_spectra(scenario: Scenario, mode: int, frequency: Array) -> TurbulenceSpectra:
     """Compute the spectra of one mode, as `flow_spectra`, of the signals of Shack-Hartmann sensors.
 
     Parameters
@@ -63,14 +61,14 @@ def lenslet_flow_spectra(scenario: Scenario, mode: int, frequency: Array) -> Flo
 
     Returns
     -------
-    FlowSpectra
+    TurbulenceSpectra
         Six densities, (n,) each [um^2/Hz].
     """
     beams = [atmosphere.footprint(star, layer).scale for star in _stars(scenario) for layer in atmosphere.layers(scenario)]
     reach = max(shack_hartmann(scenario, kind).reach for kind in ("lgs", "ngs")) / min(beams)
     shared = spectra_between(scenario, mode, frequency, _through_lenslets, reach)
     own, measurement, ngs = shared.density
-    return FlowSpectra(own, measurement, shared.pair(0, 1), ngs, shared.pair(0, 2), shared.pair(2, 1))
+    return TurbulenceSpectra(own, measurement, shared.pair(0, 1), ngs, shared.pair(0, 2), shared.pair(2, 1))
 
 
 def _stars(scenario: Scenario) -> list[atmosphere.Star]:

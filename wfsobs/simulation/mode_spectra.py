@@ -25,11 +25,19 @@ from wfsobs.scenario import Scenario
 from wfsobs.signal.wiener import Complex
 from wfsobs.simulation import layers as atmosphere
 from wfsobs.simulation.disturbance import vibration_lines
-from wfsobs.simulation.flow_integral import ModesInBeams, PlaneWaves, Sight, SpectraBetween, spectra_between
-from wfsobs.simulation.flow_spectra import ideal_mode, star_basis, star_flow_spectra
-from wfsobs.simulation.guide_stars import MEAN, lgs_weights
+from wfsobs.simulation.flow_spectra import (
+    ModesInBeams,
+    PlaneWaves,
+    Sight,
+    SpectraBetween,
+    ideal_mode,
+    spectra_between,
+    star_basis,
+    star_flow_spectra,
+)
+from wfsobs.simulation.guide_stars import lgs_weights
 from wfsobs.simulation.sensor_noise import noise_rms
-from wfsobs.simulation.true_spectra import FLOOR, TrueSpectra, n_frequencies, true_spectra
+from wfsobs.simulation.true_spectra import FLOOR, TrueSpectra, n_frequencies, notched_frequencies
 from wfsobs.typing import Array
 
 PER_DECADE, PER_SMOOTH_DECADE = 200, 40
@@ -225,34 +233,17 @@ class StarSpectra:
 
     def between(self, i: int, j: int) -> Complex:
         """Return the cross spectrum of two of the measured differences, with noise, (n // 2 + 1,) [um^2 per sample]."""
-        return self._pair(FIRST + i, FIRST + j) + (self.noise if i == j else 0.0)
+        return self.pair(FIRST + i, FIRST + j) + (self.noise if i == j else 0.0)
 
-    def with_z(self, i: int) -> Complex:
-        """Return that of a difference and z, at the same step."""
-        return self._pair(FIRST + i, LGS)
-
-    def with_axis(self, i: int) -> Complex:
-        """Return that of the turbulence on the axis at step k, and a difference measured at k + 1."""
-        return self._pair(AXIS, FIRST + i)
-
-    def with_ngs(self, i: int) -> Complex:
-        """Return that of the turbulence in the beam of the NGS at step k, and a difference measured at k + 1."""
-        return self._pair(NGS, FIRST + i)
-
-    def _pair(self, i: int, j: int) -> Complex:
+    def pair(self, i: int, j: int) -> Complex:
+        """Return the cross spectrum of two signals by their places: the turbulence at step k, measurements at k + 1."""
         found = self.flow.pair(i, j)
         found *= 0.5 / self.dt
         return found
 
 
-def star_spectra(scenario: Scenario, mode: int, mean: TrueSpectra | None = None) -> StarSpectra:
-    """Compute the spectra of one mode of an asterism whose stars differ (`stars_differ`).
-
-    mean : those of the plain mean, where already computed
-    """
-    n = n_frequencies(scenario, mode)
-    # The notch at 0 Hz is a bin wide, as in `turbulence_spectra`.
-    frequency = np.hypot(np.fft.rfftfreq(n, scenario.dt), 1.0 / (n * scenario.dt))
+def star_spectra(scenario: Scenario, mode: int, mean: TrueSpectra) -> StarSpectra:
+    """Compute the spectra of one mode of an asterism whose stars differ (`stars_differ`); mean : those of the plain mean."""
+    frequency = notched_frequencies(n_frequencies(scenario, mode), scenario.dt)
     noise = max(float(noise_rms(scenario, "lgs")[mode]), FLOOR) ** 2
-    mean = mean or true_spectra(scenario.replace({"sensors.lgs_combination": MEAN}), mode)
     return StarSpectra(mean, star_flow_spectra(scenario, mode, frequency), scenario.dt, noise)

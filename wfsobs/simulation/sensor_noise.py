@@ -51,7 +51,7 @@ def noise_covariance(scenario: Scenario, kind: Kind) -> Array:
     s = scenario.sensors
     if s.noise_from == "nm":
         return np.diag(_stated_noise(scenario, kind) ** 2)
-    photons, fwhm = (s.spots.lgs_photons, s.spots.lgs_fwhm) if kind == "lgs" else (s.spots.ngs_photons, s.spots.ngs_fwhm)
+    photons, fwhm = (getattr(s.spots, f"{kind}_{name}") for name in ("photons", "fwhm"))
     spots = SpotModel(photons, s.spots.read_noise, fwhm, s.spots.pixel_scale, s.spots.pixels)
     return shack_hartmann(scenario, kind).noise_covariance(spots)
 
@@ -90,11 +90,10 @@ def aliasing_rms(scenario: Scenario, kind: Kind) -> Array:
     if scenario.turbulence.source != "frozen-flow" or scenario.sensors.kind == "zernike":
         return np.zeros(len(scenario.modes))
     error, outer_scale = _aliasing(shack_hartmann(scenario, kind)), scenario.turbulence.outer_scale
-    layers = atmosphere.layers(scenario)
     star = atmosphere.laser_stars(scenario)[0] if kind == "lgs" else atmosphere.natural_star(scenario)
     variance = sum(
-        np.diag(error.covariance(layer.strength, outer_scale, footprint.scale))
-        for layer, footprint in zip(layers, atmosphere.view(error.sensor, star, layers).footprints, strict=True)
+        np.diag(error.covariance(layer.strength, outer_scale, atmosphere.footprint(star, layer).scale))
+        for layer in atmosphere.layers(scenario)
     )
     return np.sqrt(variance)
 

@@ -7,6 +7,7 @@ a controller they are taken `line_width` wide at half maximum.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from math import ceil, log2, pi
@@ -17,14 +18,15 @@ import numpy as np
 from wfsobs.scenario import Scenario
 from wfsobs.sensors import zernike
 from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.wiener import Complex, Whitener, advance_spectrum, error_spectrum, factorise, innovations_to_come
 from wfsobs.simulation import layers as atmosphere
 from wfsobs.simulation.disturbance import peak_rms, pure_lines, vibration_power
-from wfsobs.simulation.guide_stars import lgs_noise_rms, lgs_weights
+from wfsobs.simulation.flow_spectra import TurbulenceSpectra, flow_spectra
+from wfsobs.simulation.guide_stars import lgs_noise_rms, lgs_weights, low_frequency_process
 from wfsobs.simulation.sensor_noise import noise_rms
 from wfsobs.simulation.synthesis import damping_for_width, line_width, widen_lines
-from wfsobs.simulation.turbulence import processes, turbulence_process
-from wfsobs.simulation.turbulence_spectra import TURBULENCE_SPECTRA, TurbulenceSpectra, density, turbulence_spectra
+from wfsobs.simulation.turbulence import processes, table_variance, turbulence_process
 from wfsobs.typing import Array
 
 DECAYED = 2.5
@@ -276,11 +278,8 @@ def has_known_spectra(scenario: Scenario) -> bool:
 
     They are not for frozen flow so slow that its low frequencies would not be resolved, nor where events change them.
     """
-    source = scenario.turbulence.source
-    if scenario.events:
-        return False
-    longest = max(wanted_frequencies(scenario, mode) for mode in range(len(scenario.modes)))
-    return source in TURBULENCE_SPECTRA and (source != "frozen-flow" or longest <= 2 * MOST)
+    is_flow, modes = scenario.turbulence.source == "frozen-flow", range(len(scenario.modes))
+    return not scenario.events and not (is_flow and max(wanted_frequencies(scenario, mode) for mode in modes) > 2 * MOST)
 
 
 def _vibration(scenario: Scenario, mode: int, n: int) -> Array:
@@ -301,3 +300,45 @@ def _pure_lines(scenario: Scenario, mode: int, n: int) -> Array | None:
     for frequency, variance in pure_lines(scenario, mode):
         power[min(round(frequency * n * scenario.dt), n // 2)] += variance
     return widen_lines(0.5 * n * power, line_width(scenario) * scenario.dt) if power.any() else None
+
+
+# ---------------------------------------------------------------------- turbulence by its source
+
+
+def turbulence_spectra(scenario: Scenario, mode: int, n: int) -> TurbulenceSpectra:
+    """Return the spectra of the turbulence of one mode alone, for a DFT of `n` steps."""
+    if scenario.turbulence.source == "frozen-flow":
+        return per_sample(scenario, n, lambda frequency: flow_spectra(scenario, mode, frequency))
+    if scenario.turbulence.source == "psd":
+        return _through_lgs(scenario, mode, 0.5 * n * table_variance(scenario, mode, n))
+    own = [density(p, n) for p in processes(scenario, mode, scenario.dt)]
+    return _through_lgs(scenario, mode, sum(own, np.zeros(n // 2 + 1)))
+
+
+def density(process: Ar2 | Ar3, n: int) -> Array:
+    """Return the spectrum of an autoregressive process, per sample."""
+    return process.psd(np.fft.rfftfreq(n, process.dt)) / (2.0 * process.dt)
+
+
+def _through_lgs(scenario: Scenario, mode: int, own: Array) -> TurbulenceSpectra:
+    """Return the spectra of turbulence that is common to all stars, each LGS with a slow error of its own."""
+    weights = lgs_weights(scenario)[mode, :, mode]
+    error = density(low_frequency_process(scenario, mode), 2 * (own.size - 1)) * np.sum(weights**2)
+    blind = scenario.sensors.tip_tilt_indetermination and scenario.modes[mode].radial_order == 1
+    gain = 0.0 if blind else weights.sum()
+    return TurbulenceSpectra(own, gain**2 * own + error, gain * own, own, own, gain * own)
+
+
+def notched_frequencies(n: int, dt: float) -> Array:
+    """Return the frequencies of a DFT [Hz] at which spectra of frozen flow are taken.
+
+    Along the wind they fall as f^2 to zero at 0 Hz, a notch that the DFT does not resolve: here it is a bin wide.
+    """
+    return np.hypot(np.fft.rfftfreq(n, dt), 1.0 / (n * dt))
+
+
+def per_sample(scenario: Scenario, n: int, densities: Callable[[Array], TurbulenceSpectra]) -> TurbulenceSpectra:
+    """Return the spectra of frozen flow for a DFT of `n` steps; densities : frequencies [Hz] -> spectra [um^2/Hz]."""
+    found = densities(notched_frequencies(n, scenario.dt))
+    scaled = {id(part): 0.5 / scenario.dt * part for part in found}  # on the axis the NGS shares its arrays with the truth
+    return TurbulenceSpectra(*(scaled[id(part)] for part in found))

@@ -11,7 +11,7 @@ from math import hypot, pi
 
 import numpy as np
 
-from wfsobs.atmosphere.frozen_flow import frozen_flow
+from wfsobs.atmosphere.frozen_flow import View, frozen_flow
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.atmosphere import PsdTable
@@ -66,9 +66,11 @@ def turbulence_process(scenario: Scenario, mode: int, dt: float) -> Ar2:
 
 
 def processes(scenario: Scenario, mode: int, dt: float) -> list[Ar2 | Ar3]:
-    """Return the coloured noises whose sum is the turbulence of one mode, for source processes."""
-    out: list[Ar2 | Ar3] = []
-    for p in scenario.turbulence.processes:
+    """Return the coloured noises whose sum is the turbulence of one mode, for the sources that are such sums; else none."""
+    t, out = scenario.turbulence, list[Ar2 | Ar3]()
+    if t.source in ("ar2", "ar3"):
+        return [(turbulence_process if t.source == "ar2" else third_order_process)(scenario, mode, dt)]
+    for p in t.processes if t.source == "processes" else ():
         omega, rms = 2.0 * pi * p.frequency, p.rms[mode] if mode < len(p.rms) else 0.0
         if rms > 0:
             third = p.third_corner * omega
@@ -123,24 +125,11 @@ def _mode_by_mode(source: ModeSource) -> Source:
     return lambda scenario, n, rng, watch: TurbulenceSignals(columns(source, scenario, n, rng, watch))
 
 
-def _none(_scenario: Scenario, _mode: int, n: int, _rng: np.random.Generator) -> Array:
-    return np.zeros(n)
-
-
-def _ar2(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
-    return turbulence_process(scenario, mode, scenario.dt).sample(n, rng)
-
-
-def _ar3(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
-    return sample_ar3(third_order_process(scenario, mode, scenario.dt), n, rng)
-
-
-def _processes(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
+def _sum_of_processes(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
+    """Draw the processes; those of a list have a random stream each."""
     found = processes(scenario, mode, scenario.dt)
-    parts = [
-        sample_ar3(p, n, own) if isinstance(p, Ar3) else p.sample(n, own)
-        for p, own in zip(found, rng.spawn(len(found)), strict=True)
-    ]
+    streams = rng.spawn(len(found)) if scenario.turbulence.source == "processes" else [rng]
+    parts = [sample_ar3(p, n, own) if isinstance(p, Ar3) else p.sample(n, own) for p, own in zip(found, streams, strict=False)]
     return np.sum(parts, axis=0) if parts else np.zeros(n)
 
 
@@ -156,7 +145,7 @@ def _frozen_flow(scenario: Scenario, n: int, rng: np.random.Generator, watch: Wa
     ideal, on_ngs, on_lgs = atmosphere.ideal_sensor(scenario), sensor(scenario, "ngs"), sensor(scenario, "lgs")
     looking = [(ideal, atmosphere.on_axis()), (on_ngs, atmosphere.natural_star(scenario))]
     looking += [(on_lgs, star) for star in atmosphere.laser_stars(scenario)]
-    views = [atmosphere.view(what, star, layers) for what, star in looking]
+    views = [View(what, tuple(atmosphere.footprint(star, layer) for layer in layers)) for what, star in looking]
     on_axis, ngs, *lgs = frozen_flow(
         layers, scenario.turbulence.outer_scale, scenario.telescope.diameter, views, n, scenario.dt, rng, watch
     )
@@ -164,10 +153,7 @@ def _frozen_flow(scenario: Scenario, n: int, rng: np.random.Generator, watch: Wa
 
 
 SOURCES: dict[str, Source] = {
-    "ar2": _mode_by_mode(_ar2),
-    "ar3": _mode_by_mode(_ar3),
-    "processes": _mode_by_mode(_processes),
+    **dict.fromkeys(("ar2", "ar3", "processes", "none"), _mode_by_mode(_sum_of_processes)),
     "frozen-flow": _frozen_flow,
     "psd": _mode_by_mode(_psd),
-    "none": _mode_by_mode(_none),
 }

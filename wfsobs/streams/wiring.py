@@ -7,63 +7,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Protocol, Self
+from typing import Literal
 
 import numpy as np
 
 from wfsobs.signal.gate import RUN, GateSettings
-from wfsobs.streams.layout import Semaphore, StreamError
+from wfsobs.streams.layout import StreamError
+from wfsobs.streams.network import Publication, Subscription
+from wfsobs.streams.shared_image import SharedImage
 from wfsobs.typing import Array
 
-# Each is described where it is written, in SharedImage.
-# ruff: noqa: D102
+FrameStream = SharedImage | Subscription
+"""A stream that is read and waited for."""
 
-
-class AnyStream(Protocol):
-    """Frames of `n` numbers."""
-
-    path: str
-
-    @property
-    def n(self) -> int: ...
-
-
-class FrameStream(AnyStream, Protocol):
-    """A stream that is read."""
-
-    first: int
-
-    @property
-    def count(self) -> int: ...
-
-    @property
-    def write_time(self) -> int: ...
-
-    @property
-    def is_current(self) -> bool: ...
-
-    def read(self, patience: float = ..., /) -> tuple[int, Array] | None: ...
-
-    def reopen(self) -> Self: ...
-
-
-class SourceStream(FrameStream, Protocol):
-    """A stream that is read and waited for."""
-
-    def wait(self, after: int, seconds: float, semaphore: Semaphore | None = ..., /) -> bool: ...
-
-    def claim(self, number: int, /) -> int: ...
-
-    def semaphore(self, number: int, /) -> Semaphore | None: ...
-
-    def release(self, number: int, /) -> None: ...
-
-
-class SinkStream(AnyStream, Protocol):
-    """A stream that is written."""
-
-    def write(self, values: Array, elements: Array, /) -> None: ...
-
+SinkStream = SharedImage | Publication
+"""A stream that is written."""
 
 Fallback = Literal["zero", "hold"]
 
@@ -227,7 +185,7 @@ class NgsWiring:
     stuck: float = STUCK
 
 
-def check_elements(stream: AnyStream, elements: Sequence[int]) -> None:
+def check_elements(stream: FrameStream | SinkStream, elements: Sequence[int]) -> None:
     """Raise StreamError where a frame has not all of these numbers."""
     if max(elements) >= stream.n:
         raise StreamError(f"{stream.path}: mode {max(elements)}: a frame has {stream.n} numbers, 0 to {stream.n - 1}")

@@ -22,7 +22,7 @@ from wfsobs.identification.result import Identification
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError, hold_last
 from wfsobs.scenario.groups.sensors import Sensors
-from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
+from wfsobs.sensors.modes import MODE_NAMES
 from wfsobs.signal.gate import BLOCK
 from wfsobs.telemetry.preview import Reading
 from wfsobs.telemetry.records import PLAUSIBLE, z_rms
@@ -84,7 +84,7 @@ class Check:
     findings: tuple[Remark, ...]
     identification: Identification | None
     corrections: Mapping[str, str]
-    plant: tuple[GroupPlant, ...] = ()
+    plant: tuple[GroupPlant, ...]
 
     @property
     def is_reliable(self) -> bool:
@@ -101,7 +101,7 @@ class Check:
         return f"An identification of it can be relied on{but}."
 
 
-def check_record(record: Record, reading: Reading, raw: Record | None = None, watch: Watch = QUIET) -> Check:
+def check_record(record: Record, reading: Reading, raw: Record, watch: Watch = QUIET) -> Check:
     """Look at all that has to be right before an identification of a record can be relied on.
 
     Parameters
@@ -110,8 +110,8 @@ def check_record(record: Record, reading: Reading, raw: Record | None = None, wa
         Measurements and commands.
     reading : Reading
         How it was read, and what the data say of the unit and of limits of the commands.
-    raw : Record, optional
-        The record with the commands as they were given, without delay and gain; by default `record`.
+    raw : Record
+        The record with the commands as they were given, without delay and gain.
     watch : Watch, optional
         Receives the progress of the identification, and is asked whether to stop.
 
@@ -125,7 +125,7 @@ def check_record(record: Record, reading: Reading, raw: Record | None = None, wa
     Cancelled
         `watch` asks to stop.
     """
-    plant, commands = _plant(raw or record, reading)
+    plant, commands = _plant(raw, reading)
     findings = [*_frames(record), *_unit(record, reading), *commands, *_stationarity(record)]
     result = None
     try:
@@ -146,10 +146,10 @@ def _frames(record: Record) -> Iterator[Remark]:
     if not low <= 1.0 / record.dt <= high:
         yield Remark("rate", "excluded", f"that of a loop is {low:g} to {high:g} Hz: check dt, or the unit of the time")
     for name, y in (("y_lgs", record.y_lgs), ("y_ngs", record.y_ngs)):
-        for mode, values in zip(modes_up_to(HIGHEST_ORDER), () if y is None else y.T, strict=False):
+        for mode, values in zip(MODE_NAMES, () if y is None else y.T, strict=False):
             known = values[~np.isnan(values)]
             if known.size and np.ptp(known) == 0.0:
-                yield Remark("frames", "excluded", f"{name}/{mode.name} is {known[0]:g} all the time; a measurement has noise")
+                yield Remark("frames", "excluded", f"{name}/{mode} is {known[0]:g} all the time; a measurement has noise")
     if record.origin:
         yield Remark("read as", "ok", record.origin)
 
@@ -199,12 +199,10 @@ def _in_halves(plant: tuple[GroupPlant, ...], record: Record) -> tuple[tuple[Gro
         return plant, []
     for group, *found in zip(plant, *halves, strict=True):
         of = f" of {' and '.join(group.modes)}" * (len(plant) > 1)
-        for name, common in (("delay", "common_delay"), ("gain", "common_gain")):
-            both = [(one,) * len(group.modes) if (one := getattr(part, common)).sd else getattr(part, name) for part in found]
-            pairs = list(zip(*both, strict=True))
+        for name in OFF:
+            pairs = list(zip(*(_each(part, part.numbers(name)) for part in found), strict=True))
             if any(n.sd and m.sd and abs(abs(n.value) - abs(m.value)) > SURE * hypot(n.sd, m.sd) for n, m in pairs):
-                blank = {name: (PlantNumber(),) * len(group.modes), common: PlantNumber()}
-                group = replace(group, **blank)
+                group = replace(group, **{name: (PlantNumber(),) * len(group.modes), f"common_{name}": PlantNumber()})
                 each = " and ".join(n.text() for n in pairs[0])
                 text = f"{each} in the halves of the record: the disturbance has not the form that is fitted"
                 remarks.append(Remark(f"command {name}{of}", "undecided", text))
@@ -234,16 +232,13 @@ def _commands(group: GroupPlant, reading: Reading, several: bool) -> Iterator[Re
         yield Remark(f"command rotation{of}", verdict, f"{degrees.text(' degrees')}, y = R u{turn}")
     elif group.rotation is not None:
         yield Remark(f"command rotation{of}", "undecided", "not identifiable")
-    for subject, one, each, stated, least in (
-        ("delay", group.common_delay, group.delay, (reading.delay,), OFF_DELAY),
-        ("gain", group.common_gain, group.gain, reading.gain or (1.0,), OFF_GAIN),
-    ):
+    for subject, stated in (("delay", (reading.delay,)), ("gain", reading.gain or (1.0,))):
         numbers = known_numbers(group, subject)
-        text = " and ".join(dict.fromkeys(n.text() for n in ((one,) if one.value is not None else each)))
+        text = " and ".join(dict.fromkeys(n.text() for n in group.numbers(subject)))
         if numbers is None:
             yield Remark(f"command {subject}{of}", "undecided", f"{text}: not decided by the data")
             continue
-        wrong = any(_is_off(n, s, least) for n in numbers for s in stated)
+        wrong = any(_is_off(n, s, subject) for n in numbers for s in stated)
         told = f"; {', '.join(f'{s:g}' for s in stated)} is stated"
         yield Remark(f"command {subject}{of}", "note" if wrong else "ok", text + told * wrong)
 
@@ -251,7 +246,7 @@ def _commands(group: GroupPlant, reading: Reading, several: bool) -> Iterator[Re
 SURE, TURNED = 3.0, 2.0
 """Standard deviations by which a number has to be off what is stated; and minimum angle that matters [degrees]."""
 
-OFF_DELAY, OFF_GAIN = 0.1, 0.06
+OFF = {"delay": 0.1, "gain": 0.06}
 """Minimum distance of a delay [frames] and of a gain from what is stated; a number is decided that is known to half of it."""
 
 
@@ -263,31 +258,32 @@ def sign_of(group: GroupPlant) -> int | None:
     return -1 if (abs(turn) > 135.0 if group.rotation is not None else turn < 0) else 1
 
 
-def known_numbers(group: GroupPlant, subject: str) -> list[PlantNumber] | None:
+def known_numbers(group: GroupPlant, subject: str) -> tuple[PlantNumber, ...] | None:
     """Return the delay or the gain of a group, one number where its modes have one, if known well enough; else None.
 
     Beside a coloured background they are as good as its form is, unless there is a probe.
     """
-    delay = subject == "delay"
-    one, each = (group.common_delay, group.delay) if delay else (group.common_gain, group.gain)
-    numbers, least = [one] if one.value is not None else list(each), OFF_DELAY if delay else OFF_GAIN
-    sure = not group.has_background or group.own_share > EXCITED
-    return numbers if sure and all(n.sd is not None and n.sd < 0.5 * least for n in numbers) else None
+    numbers, sure = group.numbers(subject), not group.has_background or group.own_share > EXCITED
+    return numbers if sure and all(n.sd is not None and n.sd < 0.5 * OFF[subject] for n in numbers) else None
 
 
-def _is_off(n: PlantNumber, right: float, least: float) -> bool:
-    return n.value is not None and n.sd is not None and abs(abs(n.value) - right) > max(SURE * n.sd, least)
+def _each(group: GroupPlant, numbers: tuple[PlantNumber, ...]) -> tuple[PlantNumber, ...]:
+    """Return a number per mode, also where the modes have one."""
+    return (numbers * len(group.modes))[: len(group.modes)]
+
+
+def _is_off(n: PlantNumber, right: float, subject: str) -> bool:
+    return n.value is not None and n.sd is not None and abs(abs(n.value) - right) > max(SURE * n.sd, OFF[subject])
 
 
 def _stationarity(record: Record) -> Iterator[Remark]:
-    names = [mode.name for mode in modes_up_to(HIGHEST_ORDER)]
     begin = record.delay + (BLOCK if record.gate else 0)  # the first ones all pass a gate
     z = hold_last(record.without_outliers.z[begin:])
     length = len(z) // SECTIONS
     if length < 8 * FEWEST_BINS:
         yield Remark("stationarity", "undecided", f"{record.n_steps} frames are too few to compare {SECTIONS} sections")
         return
-    columns = [(name, column) for name, column in zip(names, z.T, strict=False) if np.ptp(column) > 0.0]
+    columns = [(name, column) for name, column in zip(MODE_NAMES, z.T, strict=False) if np.ptp(column) > 0.0]
     changes = [(name, *change) for name, column in columns for change in find_changes(column, record.dt)]
     for name, low, high, section, ratio in changes:
         start, end = ((begin + part * length) * record.dt for part in (section, section + 1))
@@ -348,11 +344,11 @@ def _corrections(reading: Reading, plant: Sequence[GroupPlant]) -> dict[str, str
         out["command-sign"] = f"{-reading.sign:+d}"
     delays = [known_numbers(group, "delay") for group in plant]
     known = [n for numbers in delays if numbers is not None and len(numbers) == 1 for n in numbers]
-    if known and _is_off(best := min(known, key=lambda n: n.sd or 0.0), reading.delay, OFF_DELAY):
+    if known and _is_off(best := min(known, key=lambda n: n.sd or 0.0), reading.delay, "delay"):
         out["command-delay"] = f"{best.value:.3g}"
     gains = [known_numbers(group, "gain") for group in plant]
-    each = [n for g, group in zip(gains, plant, strict=True) if g is not None for n in (g * len(group.modes))[: len(group.modes)]]
-    if each and None not in gains and any(_is_off(n, s, OFF_GAIN) for n in each for s in reading.gain or (1.0,)):
+    each = [n for g, group in zip(gains, plant, strict=True) if g is not None for n in _each(group, g)]
+    if each and None not in gains and any(_is_off(n, s, "gain") for n in each for s in reading.gain or (1.0,)):
         text = [f"{abs(n.value or 1.0):.3g}" for n in each]
         out["command-gain"] = text[0] if len(set(text)) == 1 else ",".join(text)
     return out

@@ -43,32 +43,21 @@ ROLES: dict[str, str] = {TIME: "time", FRAME: "frame counter"} | {
 """What a column can be -> how it is called."""
 
 WORDS = {
-    "turbulence": {"turbulence", "turb", "atmosphere", "atm"},
-    "vibration": {"vibration", "vib"},
-    NGS: {"ngs"},
-    "u": {"u", "command", "commands", "cmd", "cmds", "com", "dm", "mirror", "ttm", "ftm", "actuator", "volts", "positions"},
-    "y_lgs": {
-        "measurement",
-        "measurements",
-        "meas",
-        "slope",
-        "slopes",
-        "gradients",
-        "centroid",
-        "centroids",
-        "wfs",
-        "residual",
-        "residuals",
-        "res",
-        "err",
-    }
-    | {"error", "lgs", "y"},
+    signal: set(words.split())
+    for signal, words in {
+        "turbulence": "turbulence turb atmosphere atm",
+        "vibration": "vibration vib",
+        NGS: "ngs",
+        "u": "u command commands cmd cmds com dm mirror ttm ftm actuator volts positions",
+        "y_lgs": "measurement measurements meas slope slopes gradients centroid centroids wfs residual residuals res err error"
+        " lgs y",
+    }.items()
 }
 """Words in the name of a column that tell a signal, those that tell most first."""
 
 AXES = {"tip": {"tip", "x", "0"}, "tilt": {"tilt", "y", "1"}}
-TIMES = {"time", "t", "timestamp", "stamp", "seconds", "clock", "mjd", "jd"}
-COUNTERS = {"frame", "framecounter", "framecount", "framenumber", "frameno", "frameid", "counter"}
+TIMES = set("time t timestamp stamp seconds clock mjd jd".split())
+COUNTERS = set("frame framecounter framecount framenumber frameno frameid counter".split())
 OTHER_COUNTS = {"rate", "lost", "missing", "skipped"}
 """Words beside those of a counter, of what it does not count."""
 

@@ -17,21 +17,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wfsobs.identification.plant_likelihood import LONGEST, ORDER, SPAN, prediction_errors, smooth_basis
 from wfsobs.record import Record, hold_last
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.typing import Array
-
-LONGEST = 6
-"""Largest delay that is compared [steps]."""
-
-SPAN = 12
-"""Steps after a measurement over which responses are compared."""
-
-DEGREE = 4
-"""Of the polynomial that a smooth response is: with SPAN it follows lines up to about a tenth of the rate."""
-
-ORDER = 16
-"""Steps of the past that predict a measurement."""
 
 MOST_STEPS = 100_000
 """Steps of a record that are looked at, its first."""
@@ -115,7 +104,7 @@ def command_response(record: Record) -> CommandResponse | None:
     The record's own delay plays no part; its sign is that of u as it stands. Of the modes, the first two.
     None for a record of fewer than 40 steps per block, or with measurements or commands that never move.
     """
-    y, u = (hold_last(x[:MOST_STEPS, : len(TIP_TILT)]) for x in (record.y_lgs, record.u))
+    y, u = _first_modes(record)
     moving = (np.ptp(y, axis=0) > 0) & (np.ptp(u, axis=0) > 0)
     if len(y) - ORDER - SPAN < 40 * BLOCKS or not moving.any():
         return None
@@ -153,7 +142,7 @@ def saturation_lines(record: Record, rail: float | None = None) -> list[str]:
 
     A loop is linear but for that: measurements are predicted from their past and that of the commands, whole and cut at a level.
     """
-    y, u = (hold_last(x[:MOST_STEPS, : len(TIP_TILT)]) for x in (record.y_lgs, record.u))
+    y, u = _first_modes(record)
     if len(y) <= 40 * ORDER:
         return []
     lines = []
@@ -169,6 +158,12 @@ def saturation_lines(record: Record, rail: float | None = None) -> list[str]:
         elif rail is None and (count := max(_count_at_end(commands), _count_at_end(-commands))):
             lines.append(f"{mode.name}: commands stay at their largest value in {count} frames, as at the limit of a mirror")
     return lines
+
+
+def _first_modes(record: Record) -> tuple[Array, Array]:
+    """Return tip and tilt of measurements and commands, gaps held, of MOST_STEPS at most."""
+    y, u = (hold_last(x[:MOST_STEPS, : len(TIP_TILT)]) for x in (record.y_lgs, record.u))
+    return y, u
 
 
 def _highest_followed(y: Array, u: Array) -> float:
@@ -203,11 +198,9 @@ def _count_at_end(u: Array) -> int:
 
 def _responses(y: Array, u: Array) -> tuple[Array, Array, float]:
     """Return the responses of y and u to what is new in y, (blocks, 1 + SPAN) each, and the correlation of what is new in u."""
-    n = len(y) - ORDER
-    past = np.column_stack([x[ORDER - i : ORDER - i + n] for x in (y, u) for i in range(1, ORDER + 1)])
-    new = [x[ORDER:] - past @ np.linalg.lstsq(past, x[ORDER:], rcond=1e-10)[0] for x in (y, u)]
-    w, reply = new[0], float(np.corrcoef(new[0], new[1])[0, 1]) if np.ptp(new[1]) > 0 else 0.0
-    length = (n - SPAN) // BLOCKS
+    w, v = prediction_errors(y, u)
+    reply = float(np.corrcoef(w, v)[0, 1]) if np.ptp(v) > 0 else 0.0
+    length = (len(w) - SPAN) // BLOCKS
     starts = range(0, BLOCKS * length, length)
     power = w[: BLOCKS * length] @ w[: BLOCKS * length] / BLOCKS
 
@@ -226,7 +219,7 @@ def _shift(g: Array, delay: int) -> Array:
 
 def _rough(x: Array) -> Array:
     """Return what a polynomial leaves of the last axis."""
-    basis, _ = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, SPAN), DEGREE + 1))
+    basis = smooth_basis()
     return x - x @ basis @ basis.T
 
 

@@ -75,7 +75,7 @@ class DeclaredFormat:
         """What is stated but for delay and gain of the mirror: with it the commands are read as they were given."""
         return replace(self, command_delay=1.0, command_gain=None, trust=True)
 
-    def options(self, corrections: Mapping[str, str] | None = None) -> list[str]:
+    def options(self, corrections: Mapping[str, str]) -> list[str]:
         """List the options of the command line that state this, with corrections by the names of options."""
         named = {
             "unit": self.unit,
@@ -86,7 +86,7 @@ class DeclaredFormat:
             "rate": self.rate,
             "reconstructor": self.reconstructor and self.reconstructor.source,
             "command-modes": self.command_modes and self.command_modes.source,
-        } | dict(corrections or {})
+        } | dict(corrections)
         words = [word for name, value in named.items() if value is not None for word in (f"--{name}", str(value))]
         words += ["--trust"] * self.trust + ["--open-loop"] * self.open_loop
         return words + [word for role, name in self.columns.items() for word in ("--column", f"{role}={name}")]
@@ -121,9 +121,7 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
             raise RecordError(f"{name} has shape {signals[name].shape}; expected ({rows}, {n_modes}){actuators}")
     if APART in arrays:
         signals[APART] = _stars_apart(arrays[APART], n, n_modes)
-    delay = _number_of("delay", arrays, declaration.command_delay, DELAY, declaration.trust)
-    if not 1 <= delay <= LONGEST_DELAY:
-        raise RecordError(f"delay takes a number of steps from 1 to {LONGEST_DELAY}, not {delay:g}")
+    delay = stated_delay(contents, declaration)
     mirror = modes + _limit(signals, declaration)
     origin, sign = _into_micrometres(signals, contents, declaration, scenario.telescope.diameter)
     for name in {"u", "training_u"} & signals.keys():
@@ -195,13 +193,11 @@ def _into_micrometres(
         raise RecordError("angles are units of tip and tilt alone, which are two modes")
     for name, unit in units.items():
         signals[name] *= micrometres_per(unit, diameter)
-    sign = _number_of("command_sign", arrays, declaration.command_sign, 1, declaration.trust)
-    if sign not in (1, -1):
-        raise RecordError(f"command_sign takes 1 or -1, not {sign:g}")
+    sign = stated_sign(contents, declaration)
     said = [f"unit {unit}" for unit in dict.fromkeys(units.values()) if unit != "um"]
     said += [f"aperture {diameter:g} m"] * bool(set(units.values()) & set(ANGLES))
     said += ["command sign -1"] if sign < 0 else []
-    return ", ".join([*([str(arrays["origin"])] if "origin" in arrays else []), *said]), int(sign)
+    return ", ".join([*([str(arrays["origin"])] if "origin" in arrays else []), *said]), sign
 
 
 def _name_unused(columns: Sequence[str]) -> str:
@@ -315,6 +311,22 @@ def _number_of(
     if declaration is not None and value != declaration:
         raise RecordError(f"{name} is {value:g}, but {declaration:g} is stated" + "; --trust takes that" * (name != "ratio"))
     return value
+
+
+def stated_sign(contents: Contents, declaration: DeclaredFormat) -> int:
+    """Return the sign of the commands as the file or the user states it, 1 where neither does. Raises RecordError."""
+    sign = _number_of("command_sign", contents.arrays, declaration.command_sign, 1, declaration.trust)
+    if sign not in (1, -1):
+        raise RecordError(f"command_sign takes 1 or -1, not {sign:g}")
+    return int(sign)
+
+
+def stated_delay(contents: Contents, declaration: DeclaredFormat) -> float:
+    """Return the delay of the commands as the file or the user states it [steps], with its fraction. Raises RecordError."""
+    delay = _number_of("delay", contents.arrays, declaration.command_delay, DELAY, declaration.trust)
+    if not 1 <= delay <= LONGEST_DELAY:
+        raise RecordError(f"delay takes a number of steps from 1 to {LONGEST_DELAY}, not {delay:g}")
+    return delay
 
 
 def _ratio(arrays: Mapping[str, Array], default: int | None = None) -> int:

@@ -19,8 +19,8 @@ from wfsobs.telemetry.columns import describe_values, suggest_clock, suggest_rol
 from wfsobs.telemetry.command_response import CommandResponse, command_response, saturation_lines
 from wfsobs.telemetry.formats.contents import TIME, Contents
 from wfsobs.telemetry.formats.psd import NoSpectrumError, read_psd
-from wfsobs.telemetry.intake import DeclaredFormat, to_record
-from wfsobs.telemetry.records import contradiction_of, plausible_units, read_columns, read_contents, stated_delay, stated_sign
+from wfsobs.telemetry.intake import DeclaredFormat, stated_delay, stated_sign, to_record
+from wfsobs.telemetry.records import contradiction_of, plausible_units, read_columns, read_contents
 from wfsobs.typing import Array
 
 MOST_FILE = 64_000_000
@@ -104,7 +104,7 @@ class Preview:
     rms: dict[str, tuple[float, ...]]
     frequency: Array
     spectrum: Array
-    reading: Reading = field(default_factory=lambda: Reading())
+    reading: Reading
 
     @property
     def rate(self) -> float:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from wfsobs.files import write_whole
 from wfsobs.identification.plant import contradiction
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import DELAY, Record, RecordError
+from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
 from wfsobs.simulation.loop import simulate
@@ -28,7 +28,7 @@ from wfsobs.telemetry.formats.aot import TRANSLATED, translate
 from wfsobs.telemetry.formats.contents import Contents, FileColumns
 from wfsobs.telemetry.formats.csv import write
 from wfsobs.telemetry.formats.npz import write as write_npz
-from wfsobs.telemetry.intake import DeclaredFormat, to_record
+from wfsobs.telemetry.intake import DeclaredFormat, stated_delay, stated_sign, to_record
 from wfsobs.typing import Array
 from wfsobs.units import UNITS, micrometres_per, parse_unit
 
@@ -261,18 +261,6 @@ def read_with_delay(
         return record, stated_delay(contents, stated)
     except RecordError as error:
         raise RecordError(f"{name}: {error}") from None
-
-
-def stated_sign(contents: Contents, declaration: DeclaredFormat) -> int:
-    """Return the sign of the commands as the file or the user states it, 1 where neither does."""
-    stated = declaration.command_sign or 1
-    return stated if declaration.trust and declaration.command_sign else int(contents.arrays.get("command_sign", stated))
-
-
-def stated_delay(contents: Contents, declaration: DeclaredFormat) -> float:
-    """Return the delay of the commands as the file or the user states it [steps], with its fraction."""
-    stated = declaration.command_delay or DELAY
-    return stated if declaration.trust and declaration.command_delay else float(contents.arrays.get("delay", stated))
 
 
 def contradiction_of(record: Record, contents: Contents, declaration: DeclaredFormat, scenario: Scenario) -> str:

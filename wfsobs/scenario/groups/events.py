@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import ClassVar
 
 import numpy as np
-import param
 
 from wfsobs.settings.group import Group, UsedWhen
-from wfsobs.settings.parameters import Real, Whole
+from wfsobs.settings.parameters import Choice, Real, Whole
 from wfsobs.typing import Array
 
 PEAK, WIND, LASER, FRAMES = "peak", "wind", "laser", "frames"
-OF_KIND: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {PEAK: ("peak", "frequency_shift", "strength"), WIND: ("wind_factor",), LASER: ("lasers",), FRAMES: ("sensor", "share")}
-)
+OF_KIND: Mapping[str, tuple[str, ...]] = {
+    PEAK: ("peak", "frequency_shift", "strength"),
+    WIND: ("wind_factor",),
+    LASER: ("lasers",),
+    FRAMES: ("sensor", "share"),
+}
 """Settings of each kind alone."""
 
 
@@ -26,70 +27,53 @@ class Event(Group):
     Changes of a peak and of the wind ramp up over `duration` and stay; a laser outage and missing frames end after it.
     """
 
-    used_when: ClassVar[UsedWhen] = MappingProxyType(
-        {name: ("kind", (kind,)) for kind, names in OF_KIND.items() for name in names}
-    )
+    used_when: ClassVar[UsedWhen] = {name: ("kind", (kind,)) for kind, names in OF_KIND.items() for name in names}
 
-    kind: param.Selector[str] = param.Selector(
-        default=PEAK,
-        objects=[PEAK, WIND, LASER, FRAMES],
-        label="Kind",
-        doc="peak: a vibration peak changes in frequency and strength; wind: the wind changes; laser: laser guide "
+    kind: Choice = Choice(
+        [PEAK, WIND, LASER, FRAMES],
+        "Kind",
+        "peak: a vibration peak changes in frequency and strength; wind: the wind changes; laser: laser guide "
         "stars drop out; frames: frames are missing at random.",
     )
     start: Real = Real(
-        5.0,
-        bounds=(0.0, 3600.0),
-        softbounds=(0.0, 60.0),
-        step=0.5,
-        label="Start",
-        doc="Start of the event, from the start of the record [s].",
+        5.0, (0.0, 3600.0), "Start", "Start of the event, from the start of the record [s].", softbounds=(0.0, 60.0), step=0.5
     )
     duration: Real = Real(
         0.0,
-        bounds=(0.0, 3600.0),
+        (0.0, 3600.0),
+        "Duration",
+        "Duration of the event [s]; 0 is a jump of a peak or of the wind.",
         softbounds=(0.0, 60.0),
         step=0.5,
-        label="Duration",
-        doc="Duration of the event [s]; 0 is a jump of a peak or of the wind.",
     )
-    peak: Whole = Whole(0, bounds=(0, 99), label="Peak", doc="For kind peak: number of the peak in vibration.peaks, from 0.")
+    peak: Whole = Whole(0, (0, 99), "Peak", "For kind peak: number of the peak in vibration.peaks, from 0.")
     frequency_shift: Real = Real(
         0.0,
-        bounds=(-5000.0, 5000.0),
+        (-5000.0, 5000.0),
+        "Frequency shift",
+        "For kind peak: change of its frequency [Hz].",
         softbounds=(-10.0, 10.0),
         step=0.1,
-        label="Frequency shift",
-        doc="For kind peak: change of its frequency [Hz].",
     )
     strength: Real = Real(
-        1.0,
-        bounds=(0.0, 100.0),
-        softbounds=(0.0, 4.0),
-        step=0.1,
-        label="Strength factor",
-        doc="For kind peak: factor on its rms.",
+        1.0, (0.0, 100.0), "Strength factor", "For kind peak: factor on its rms.", softbounds=(0.0, 4.0), step=0.1
     )
     wind_factor: Real = Real(
         1.0,
-        bounds=(0.1, 10.0),
+        (0.1, 10.0),
+        "Wind factor",
+        "For kind wind: factor on the wind speed of every layer.",
         softbounds=(0.2, 4.0),
         step=0.1,
-        label="Wind factor",
-        doc="For kind wind: factor on the wind speed of every layer.",
     )
     lasers: Whole = Whole(
         1,
-        bounds=(1, 16),
-        label="Lasers lost",
-        doc="For kind laser: number of LGS that drop out, the last ones first; with none left there is no LGS measurement.",
+        (1, 16),
+        "Lasers lost",
+        "For kind laser: number of LGS that drop out, the last ones first; with none left there is no LGS measurement.",
     )
-    sensor: param.Selector[str] = param.Selector(
-        default="lgs", objects=["lgs", "ngs"], label="Sensor", doc="For kind frames: sensor with missing frames."
-    )
-    share: Real = Real(
-        0.1, bounds=(0.0, 1.0), step=0.01, label="Share of frames", doc="For kind frames: share of missing frames."
-    )
+    sensor: Choice = Choice(["lgs", "ngs"], "Sensor", "For kind frames: sensor with missing frames.")
+    share: Real = Real(0.1, (0.0, 1.0), "Share of frames", "For kind frames: share of missing frames.", step=0.01)
 
 
 def progress_of_change(event: Event, t: Array) -> Array:
@@ -116,14 +100,17 @@ def phase_turns(events: Sequence[Event], t: Array) -> Array:
 
 def strength(events: Sequence[Event], t: Array) -> Array:
     """Return the factor on a peak's rms at the times t [s]; those of several events multiply."""
-    return np.prod([np.ones_like(t), *(1.0 + (event.strength - 1.0) * progress_of_change(event, t) for event in events)], axis=0)
+    return _factor("strength", events, t)
 
 
 def wind(events: Sequence[Event], t: Array) -> Array:
     """Return the factor on the wind speed at the times t [s]; those of several events multiply."""
-    return np.prod(
-        [np.ones_like(t), *(1.0 + (event.wind_factor - 1.0) * progress_of_change(event, t) for event in events)], axis=0
-    )
+    return _factor("wind_factor", events, t)
+
+
+def _factor(name: str, events: Sequence[Event], t: Array) -> Array:
+    changes = (1.0 + (getattr(event, name) - 1.0) * progress_of_change(event, t) for event in events)
+    return np.prod([np.ones_like(t), *changes], axis=0)
 
 
 def turbulence_time(events: Sequence[Event], t: Array) -> Array:

@@ -15,7 +15,7 @@ from typing import IO
 
 from wfsobs.record import RecordError
 from wfsobs.telemetry.formats import aot, csv, fits, libraries, npz
-from wfsobs.telemetry.formats.contents import FileColumns, TooLargeError
+from wfsobs.telemetry.formats.contents import FileColumns, read_at_most
 from wfsobs.typing import Array
 
 
@@ -63,12 +63,9 @@ def from_gzip(file: IO[bytes], most: int) -> IO[bytes]:
     """Return the content of an open gzip file. Raises RecordError where it is damaged, TooLargeError beyond `most` bytes."""
     try:
         with gzip.open(file) as packed:
-            content = packed.read(most + 1)
+            return io.BytesIO(read_at_most(packed, most))
     except (EOFError, gzip.BadGzipFile, zlib.error) as error:
         raise RecordError(f"cannot be unpacked: {error}") from None
-    if len(content) > most:
-        raise TooLargeError(most)
-    return io.BytesIO(content)
 
 
 def writer_of(name: str) -> Callable[[IO[bytes], Mapping[str, Array]], None]:

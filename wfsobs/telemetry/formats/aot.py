@@ -12,6 +12,7 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import IO, Any
 
 import numpy as np
@@ -23,10 +24,12 @@ from wfsobs.telemetry.formats.contents import (
     Contents,
     FileColumns,
     TooLargeError,
+    import_library,
     mean_slopes,
     numbers_and_texts,
+    read_at_most,
 )
-from wfsobs.telemetry.formats.fits import open_fits, read_whole, tables_and_images
+from wfsobs.telemetry.formats.fits import open_fits, tables_and_images
 from wfsobs.typing import Array
 from wfsobs.units import parse_unit
 
@@ -36,12 +39,7 @@ KEYWORD = "AOT-VERS"
 """In the header of an AOT file."""
 
 
-def _aotpy() -> Any:
-    try:
-        import aotpy
-    except ModuleNotFoundError:
-        raise RecordError("AOT files need aotpy; install wfsobs with its extra: wfsobs[aot]") from None
-    return aotpy
+_aotpy = partial(import_library, "aotpy", "aot", "AOT files")
 
 
 def read(file: IO[bytes], most: int) -> FileColumns:
@@ -58,7 +56,7 @@ def read(file: IO[bytes], most: int) -> FileColumns:
     critical = AOTFITSErrorLevel.CRITICAL
     try:
         reader = aotpy.AOTFITSReader(
-            io.BytesIO(read_whole(file)), externals="disallow", exception_level=critical, log_level=critical
+            io.BytesIO(read_at_most(file, most)), externals="disallow", exception_level=critical, log_level=critical
         )
         loop = _first_loop(system := reader.get_system(), aotpy)
         return FileColumns(contents=_contents(system, loop, aotpy), matrices=_matrices(loop))

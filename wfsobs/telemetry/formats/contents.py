@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from importlib import import_module
+from io import BufferedIOBase
+from typing import IO, Any
 
 import numpy as np
 
@@ -201,7 +209,7 @@ DEEPEST = 6
 STAMP = re.compile(r"(?:(\d{4}[-/]\d\d[-/]\d\d)[T ])?(\d\d:\d\d:\d\d)(?:[.,](\d{1,9}))?\d*(?:Z|[+-]\d\d:?\d\d)?")
 """A time stamp of ISO 8601, or the time of a day; the time zone is that of all."""
 
-ABSENT = frozenset(("", "na", "n/a", "null", "none", "-", "--"))
+ABSENT = frozenset(("", *"na n/a null none - --".split()))
 """What stands in a cell for a missing number."""
 
 
@@ -253,10 +261,14 @@ def from_columns(columns: Mapping[str, tuple[Array, str]]) -> Contents:
         if unit:
             contents.state_unit(name, unit)
     first = [mode.name for mode in TIP_TILT]
+
+    def in_order(modes: Iterable[str]) -> list[str]:
+        return sorted(modes, key=lambda mode: first.index(mode) if mode in first else len(first))
+
     for name, by_mode in found.items():
-        modes = sorted(found.get("y_lgs", by_mode), key=lambda mode: first.index(mode) if mode in first else len(first))
+        modes = in_order(found.get("y_lgs", by_mode))
         if max(len(by_mode), len(modes)) > len(first) and len(by_mode) != len(modes):  # slopes or actuators
-            modes = sorted(by_mode, key=lambda mode: first.index(mode) if mode in first else len(first))
+            modes = in_order(by_mode)
         elif set(by_mode) != set(modes):
             raise RecordError(f"{name} has the modes {', '.join(by_mode)}; y_lgs has {', '.join(modes)}")
         if name == "y_lgs" and modes == first[1:]:
@@ -276,13 +288,13 @@ def _pad_fast(contents: Contents) -> None:
         contents.arrays[name] = np.pad(values, ((0, n - len(values)), (0, 0)), constant_values=np.nan)
 
 
-def to_columns(arrays: Mapping[str, Array], unit: str = "um") -> dict[str, Array]:
+def to_columns(arrays: Mapping[str, Array]) -> dict[str, Array]:
     """Return the signals and clocks as columns (n,), named as COLUMN."""
     columns = {f"{name}_s": np.asarray(arrays[name]) for name in CLOCKS if name in arrays}
     for name in SIGNALS:
         if name in arrays:
             for i, values in enumerate(np.asarray(arrays[name]).T):
-                columns[f"{name}/{column_mode(i)}_{unit}"] = values
+                columns[f"{name}/{column_mode(i)}_um"] = values
     return columns
 
 
@@ -306,6 +318,41 @@ class TooLargeError(RecordError):
 
     def __init__(self, most: int):
         super().__init__(f"holds more than {most / 1e6:.4g} MB of numbers, which is the most that is read here")
+
+
+def read_at_most(file: IO[bytes] | BufferedIOBase, most: int) -> bytes:
+    """Return all bytes of an open file from its beginning. Raises TooLargeError."""
+    file.seek(0)
+    if len(content := file.read(most + 1)) > most:
+        raise TooLargeError(most)
+    return content
+
+
+DAMAGES = (
+    *(OSError, ValueError, TypeError, LookupError, RuntimeError, MemoryError, AttributeError, ArithmeticError, NameError),
+    *(EOFError, AssertionError, StopIteration, struct.error, zlib.error, zipfile.BadZipFile, tokenize.TokenError),
+)
+"""What libraries raise of a damaged file."""
+
+
+@contextmanager
+def refuse_damage(what: str, *more: type[Exception]) -> Iterator[None]:
+    """Raise RecordError, saying what a file is, in place of DAMAGES and of `more`, which a library raises of its own."""
+    try:
+        yield
+    except RecordError:
+        raise
+    except (*DAMAGES, *more):
+        raise RecordError(what) from None
+
+
+def import_library(name: str, extra: str, files: str = "files of this kind") -> Any:
+    """Import what reads some files. Raises RecordError naming the extra where it is not installed."""
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        library = (error.name or name).partition(".")[0]
+        raise RecordError(f"{files} need {library}; install wfsobs with its extra: wfsobs[{extra}]") from None
 
 
 MEAN_SLOPES = "mean_slopes"

@@ -11,6 +11,7 @@ import io
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib import import_module
 from typing import IO, Any
 
 import numpy as np
@@ -23,8 +24,11 @@ from wfsobs.telemetry.formats.contents import (
     TRAINING,
     FileColumns,
     TooLargeError,
+    import_library,
     is_rate,
     numbers_and_texts,
+    read_at_most,
+    refuse_damage,
 )
 from wfsobs.typing import Array
 
@@ -41,50 +45,22 @@ MOST_HDUS = 200
 
 def astropy_fits() -> Any:
     """Return astropy.io.fits. Raises RecordError naming the extra where it is not installed."""
-    try:
-        from astropy.io import fits
-    except ModuleNotFoundError:
-        raise RecordError("FITS files need astropy; install wfsobs with its extra: wfsobs[fits]") from None
-    return fits
+    import_library("astropy.io", "fits", "FITS files")
+    return import_module("astropy.io.fits")
 
 
 @contextmanager
 def open_fits(file: IO[bytes], most: int) -> Iterator[HDUList]:
     """Yield the HDUs of a file, after a check that their stated lengths fit the file and the limit."""
     fits = astropy_fits()
-    content = read_whole(file)
-    length = len(content)
+    content = read_at_most(file, most)
     if not content.startswith(b"SIMPLE  ="):  # neither a compressed file, which astropy would unpack
         raise RecordError("not a FITS file, or a compressed one")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of headers that are not quite to the standard
-            with fits.open(io.BytesIO(content), memmap=False, lazy_load_hdus=False, disable_image_compression=True) as hdus:
-                _check_sizes(hdus, length, most)
-                yield hdus
-    except RecordError:
-        raise
-    except (
-        OSError,
-        ValueError,
-        TypeError,
-        KeyError,
-        IndexError,
-        EOFError,
-        AttributeError,
-        MemoryError,
-        OverflowError,
-        AssertionError,
-        ZeroDivisionError,
-        fits.VerifyError,
-    ):
-        raise RecordError(DAMAGED) from None
-
-
-def read_whole(file: IO[bytes]) -> bytes:
-    """Return all bytes of a file from its beginning: astropy closes the file it is given."""
-    file.seek(0)
-    return file.read()
+    with refuse_damage(DAMAGED, fits.VerifyError), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of headers that are not quite to the standard
+        with fits.open(io.BytesIO(content), memmap=False, lazy_load_hdus=False, disable_image_compression=True) as hdus:
+            _check_sizes(hdus, len(content), most)
+            yield hdus
 
 
 def _check_sizes(hdus: HDUList, length: int, most: int) -> None:

@@ -13,10 +13,8 @@ import subprocess
 import sys
 import tempfile
 import warnings
-import zipfile
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
-from importlib import import_module
 from math import prod
 from typing import IO, Any
 
@@ -30,9 +28,12 @@ from wfsobs.telemetry.formats.contents import (
     TEXTS,
     FileColumns,
     TooLargeError,
+    import_library,
     is_rate,
     numbers_and_texts,
     parse_cell,
+    read_at_most,
+    refuse_damage,
     to_columns,
 )
 from wfsobs.typing import Array
@@ -40,9 +41,6 @@ from wfsobs.typing import Array
 HDF5 = b"\x89HDF\r\n\x1a\n"
 USERBLOCK = 512
 """Bytes before the HDF5 of a MATLAB file of version 7.3."""
-
-WRONG = (OSError, ValueError, TypeError, LookupError, RuntimeError, MemoryError, AttributeError, ArithmeticError, NameError)
-"""What libraries raise of a damaged file."""
 
 LONGEST_READING = 600.0
 """Time that a file is given to be read [s]."""
@@ -61,13 +59,6 @@ CLASSES = {1: "cell", 2: "struct", 3: "object", 5: "sparse matrix", 16: "functio
 """Classes of its arrays, and a flag."""
 
 
-def _import(name: str, extra: str) -> Any:
-    try:
-        return import_module(name)
-    except ModuleNotFoundError as error:
-        raise RecordError(f"files of this kind need {error.name}; install wfsobs with its extra: wfsobs[{extra}]") from None
-
-
 # ---------------------------------------------------------------------- MATLAB
 
 
@@ -79,11 +70,8 @@ def read_matlab(file: IO[bytes], most: int) -> FileColumns:
     head = file.read(USERBLOCK + len(HDF5))
     if head.endswith(HDF5) or head.startswith(HDF5):
         return read_hdf5(file, most)
-    file.seek(0)
-    out, content = FileColumns(), file.read(most + 1)
-    if len(content) > most:
-        raise TooLargeError(most)
-    try:
+    out, content = FileColumns(), read_at_most(file, most)
+    with refuse_damage("damaged, or not a MATLAB file"):
         if (order := {b"IM": "<", b"MI": ">"}.get(content[126:128])) is None:
             _add_version_4(out, content)
         else:
@@ -97,10 +85,6 @@ def read_matlab(file: IO[bytes], most: int) -> FileColumns:
                     _add_matrix(out, body, order, most)
                 if sum(values.nbytes for values in out.columns.values()) > most:
                     raise TooLargeError(most)
-    except RecordError:
-        raise
-    except (*WRONG, StopIteration, zlib.error, struct.error):
-        raise RecordError("damaged, or not a MATLAB file") from None
     return out
 
 
@@ -174,25 +158,22 @@ def write_matlab(file: IO[bytes], arrays: Mapping[str, Array]) -> None:
 
 # ---------------------------------------------------------------------- HDF5
 
+DAMAGED = "damaged, or not an HDF5 file"
+
 
 def read_hdf5(file: IO[bytes], most: int) -> FileColumns:
     """Read the arrays of an HDF5 file under their paths, of MATLAB with the axes as it shows them. Raises RecordError.
 
     This is done in a process of its own, since the HDF5 library may end it at a damaged file.
     """
-    file.seek(0)
-    out, content = FileColumns(), file.read(most + 1)
-    if len(content) > most:
-        raise TooLargeError(most)
+    out, content = FileColumns(), read_at_most(file, most)
     command = [sys.executable, "-c", f"import {__name__} as of; of.send_hdf5({most})"]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    try:
+    with refuse_damage(DAMAGED, subprocess.SubprocessError):
         done = subprocess.run(command, input=content, capture_output=True, timeout=LONGEST_READING, env=environment, check=True)
         with np.load(io.BytesIO(done.stdout), allow_pickle=False) as found:
             said = json.loads(str(found["said"]))
             arrays = {key: found[key] for key in found}
-    except (*WRONG, subprocess.SubprocessError, zipfile.BadZipFile):
-        raise RecordError("damaged, or not an HDF5 file") from None
     if "error" in said:
         raise TooLargeError(most) if said["error"] == "large" else RecordError(said["error"])
     for key, (name, unit) in said["arrays"].items():
@@ -234,31 +215,26 @@ def send_hdf5(most: int) -> None:
 
 
 def _read_parts(out: _Parts, file: IO[bytes], most: int) -> None:
-    h5py = _import("h5py", "hdf5")
+    h5py = import_library("h5py", "hdf5")
     room, paths = most, ["/"]
-    try:
-        with h5py.File(file, "r") as source:
-            for count, path in enumerate(paths):
-                if count > MOST_PARTS:  # also where a group is within itself
-                    raise RecordError(f"has more than {MOST_PARTS} groups and arrays")
-                item = source[path]
-                _add_attributes(out, item)
-                if isinstance(item, h5py.Dataset):
-                    room -= max(item.size or 0, prod(item.chunks or ())) * max(item.dtype.itemsize, 8)
-                    if room < 0:
-                        raise TooLargeError(most)
-                    is_text = h5py.check_string_dtype(item.dtype) is not None and item.size == 1
-                    _add_dataset(out, path[1:], item, is_text or not item.dtype.hasobject)
-                elif isinstance(item, h5py.Group):
-                    for name in item:
-                        if isinstance(item.get(name, getlink=True), h5py.HardLink):
-                            paths.append(f"{path.rstrip('/')}/{name}")
-                        else:
-                            out.leave(name, f"{name} is a link, which is not followed")
-    except RecordError:
-        raise
-    except WRONG:
-        raise RecordError("damaged, or not an HDF5 file") from None
+    with refuse_damage(DAMAGED), h5py.File(file, "r") as source:
+        for count, path in enumerate(paths):
+            if count > MOST_PARTS:  # also where a group is within itself
+                raise RecordError(f"has more than {MOST_PARTS} groups and arrays")
+            item = source[path]
+            _add_attributes(out, item)
+            if isinstance(item, h5py.Dataset):
+                room -= max(item.size or 0, prod(item.chunks or ())) * max(item.dtype.itemsize, 8)
+                if room < 0:
+                    raise TooLargeError(most)
+                is_text = h5py.check_string_dtype(item.dtype) is not None and item.size == 1
+                _add_dataset(out, path[1:], item, is_text or not item.dtype.hasobject)
+            elif isinstance(item, h5py.Group):
+                for name in item:
+                    if isinstance(item.get(name, getlink=True), h5py.HardLink):
+                        paths.append(f"{path.rstrip('/')}/{name}")
+                    else:
+                        out.leave(name, f"{name} is a link, which is not followed")
 
 
 def _add_attributes(out: _Parts, item: Any) -> None:
@@ -289,7 +265,7 @@ def _text(value: object) -> str:
 
 def write_hdf5(file: IO[bytes], arrays: Mapping[str, Array]) -> None:
     """Write the arrays as HDF5, numbers and texts among them."""
-    h5py, content = _import("h5py", "hdf5"), io.BytesIO()
+    h5py, content = import_library("h5py", "hdf5"), io.BytesIO()
     with h5py.File(content, "w") as out:
         for name, values in arrays.items():
             text = values.dtype.kind == "U"
@@ -304,7 +280,7 @@ def read_sav(file: IO[bytes], most: int) -> FileColumns:
     """Read the variables of an IDL save file and the fields of its structures. Raises RecordError, TooLargeError."""
     from scipy.io import readsav
 
-    out, content, is_whole = FileColumns(), file.read(most + 1), False
+    out, content, is_whole = FileColumns(), read_at_most(file, most), False
     with warnings.catch_warnings(), tempfile.NamedTemporaryFile() as copy:
         warnings.simplefilter("ignore")
         try:
@@ -325,8 +301,6 @@ def read_sav(file: IO[bytes], most: int) -> FileColumns:
 
 def _check_sav(content: bytes, most: int) -> None:
     """Check what a save file unpacks to: a record begins with its kind and where the next one is."""
-    if len(content) > most:
-        raise TooLargeError(most)
     place, room = 4, most
     while content[2:4] == b"\x00\x06" and place + 16 <= len(content):
         low, high = struct.unpack_from(">II", content, place + 4)
@@ -353,10 +327,10 @@ UNPACKED = 1 << 20
 
 def read_parquet(file: IO[bytes], most: int) -> FileColumns:
     """Read the columns of a Parquet file, and lists of one length as columns each. Raises RecordError, TooLargeError."""
-    pyarrow, parquet = _import("pyarrow", "campaign"), _import("pyarrow.parquet", "campaign")
+    pyarrow, parquet = import_library("pyarrow", "campaign"), import_library("pyarrow.parquet", "campaign")
     out, types = FileColumns(), pyarrow.types
     file.seek(0)
-    try:
+    with refuse_damage("damaged, or not a Parquet file", pyarrow.ArrowException):
         source = parquet.ParquetFile(pyarrow.PythonFile(file, mode="r"))
         groups = [source.metadata.row_group(i) for i in range(source.num_row_groups)]
         if 8 * sum(group.column(j).num_values for group in groups for j in range(group.num_columns)) > most:
@@ -371,10 +345,6 @@ def read_parquet(file: IO[bytes], most: int) -> FileColumns:
                 continue
             column = source.read([field.name]).column(0)
             _add_column(out, field.name, column.combine_chunks(), of is not field.type)
-    except RecordError:
-        raise
-    except (*WRONG, pyarrow.ArrowException):
-        raise RecordError("damaged, or not a Parquet file") from None
     return out
 
 
@@ -398,7 +368,7 @@ def _add_column(out: FileColumns, name: str, column: Any, is_list: bool) -> None
 
 def write_parquet(file: IO[bytes], arrays: Mapping[str, Array]) -> None:
     """Write the arrays as columns, those that end early with nulls, numbers and texts as metadata."""
-    pyarrow, parquet = _import("pyarrow", "campaign"), _import("pyarrow.parquet", "campaign")
+    pyarrow, parquet = import_library("pyarrow", "campaign"), import_library("pyarrow.parquet", "campaign")
     columns = {name: np.asarray(values, dtype=np.float64) for name, values in to_columns(arrays).items()}
     n = max(map(len, columns.values()), default=0)
     padded = {name: pyarrow.array(np.pad(x, (0, n - len(x))), mask=np.arange(n) >= len(x)) for name, x in columns.items()}

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import tokenize
 import zipfile
-import zlib
 from collections.abc import Mapping
 from typing import IO
 
@@ -13,21 +11,10 @@ import numpy as np
 from numpy.lib import format as npy
 
 from wfsobs.record import RecordError
-from wfsobs.telemetry.formats.contents import NAMES, FileColumns, TooLargeError
+from wfsobs.telemetry.formats.contents import DAMAGES, NAMES, FileColumns, TooLargeError, refuse_damage
 from wfsobs.typing import Array
 
 DAMAGED = "damaged, or holds more than plain arrays"
-DAMAGES = (
-    ValueError,
-    EOFError,
-    tokenize.TokenError,
-    zipfile.BadZipFile,
-    zlib.error,
-    KeyError,
-    RuntimeError,
-    NotImplementedError,
-    MemoryError,
-)
 LARGE, PACKED = 100_000_000, 200
 """Bytes from which arrays are not unpacked where they are packed in so many times less: those of noise hardly shrink."""
 
@@ -43,25 +30,20 @@ def read(file: IO[bytes], most: int) -> FileColumns:
     if not zipfile.is_zipfile(file):
         raise RecordError("not an .npz file; a record is an .npz with y_lgs, u and dt")
     out = FileColumns()
-    try:
-        with zipfile.ZipFile(file) as archive:
-            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            known = {name: info for name, info in members.items() if name.lower() in NAMES}
-            size, packed = (sum(getattr(info, what) for info in known.values()) for what in ("file_size", "compress_size"))
-            if (room := most - size) < 0:
-                raise TooLargeError(most)
-            if size > LARGE and size > PACKED * packed:
-                raise RecordError(f"unpacks from {packed / 1e6:.3g} to {size / 1e6:.4g} MB, as no measurements do")
-            for name, info in known.items():
+    with refuse_damage(DAMAGED), zipfile.ZipFile(file) as archive:
+        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+        known = {name: info for name, info in members.items() if name.lower() in NAMES}
+        size, packed = (sum(getattr(info, what) for info in known.values()) for what in ("file_size", "compress_size"))
+        if (room := most - size) < 0:
+            raise TooLargeError(most)
+        if size > LARGE and size > PACKED * packed:
+            raise RecordError(f"unpacks from {packed / 1e6:.3g} to {size / 1e6:.4g} MB, as no measurements do")
+        for name, info in known.items():
+            out.add(name, _array(archive, info, name))
+        for name, info in members.items():
+            if name not in known and info.file_size <= room and _is_table(archive, info):
+                room -= info.file_size
                 out.add(name, _array(archive, info, name))
-            for name, info in members.items():
-                if name not in known and info.file_size <= room and _is_table(archive, info):
-                    room -= info.file_size
-                    out.add(name, _array(archive, info, name))
-    except RecordError:
-        raise
-    except DAMAGES:
-        raise RecordError(DAMAGED) from None
     return out
 
 
@@ -104,12 +86,8 @@ def read_npy(file: IO[bytes], most: int) -> FileColumns:
     if length > most:
         raise TooLargeError(most)
     file.seek(0)
-    try:
+    with refuse_damage(DAMAGED):
         out.add("array", _values(file, length, "array"))
-    except RecordError:
-        raise
-    except DAMAGES:
-        raise RecordError(DAMAGED) from None
     return out
 
 
