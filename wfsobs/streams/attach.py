@@ -6,7 +6,7 @@ takes residual measurements, and its commands go out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from time import monotonic
 from typing import Any
@@ -16,10 +16,11 @@ import numpy as np
 from wfsobs.control.supervisor import SupervisedController
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.step import StepObserver
+from wfsobs.record import Sampling
 from wfsobs.signal.gate import OutlierGate, frame_mean_of
 from wfsobs.streams.follower import LONGEST_GAP, StreamFollower
-from wfsobs.streams.ngs_frames import NgsStream, SendingController
-from wfsobs.streams.wiring import FrameStream, SinkStream, Watchdog, Wiring, check_elements
+from wfsobs.streams.ngs_frames import NgsStream
+from wfsobs.streams.wiring import FrameStream, SinkStream, SourceStream, Watchdog, Wiring, check_elements
 from wfsobs.typing import Array
 
 FAR = 6.0
@@ -154,7 +155,7 @@ class Attachment(StreamFollower):
 
     Parameters
     ----------
-    source : FrameStream
+    source : SourceStream
         Pseudo-open-loop modes, one frame after the other.
     sink : SinkStream or None
         Where the estimates go, frames as long as those of the source; None writes nothing.
@@ -177,7 +178,7 @@ class Attachment(StreamFollower):
 
     def __init__(
         self,
-        source: FrameStream,
+        source: SourceStream,
         sink: SinkStream | None,
         observer: StepObserver,
         wiring: Wiring,
@@ -256,6 +257,69 @@ class Attachment(StreamFollower):
         return {**super().summary(), "outliers": self._gate.outliers.tolist(), **more, "fallbacks": self._watchdog.trips}
 
 
+class SendingController:
+    """A controller and the commands that were sent: in every frame the previous one, unless `send` confirms the new one.
+
+    `GoingBack` repeats frames; they are repeated with the commands that were sent.
+
+    Parameters
+    ----------
+    controller : SupervisedController
+        Before its first frame.
+    command : Array
+        Command at which the mirror rests, (n_modes,) [um].
+
+    Attributes
+    ----------
+    answer : Array
+        Command of the controller after the last frame, (n_modes,) [um].
+    command : Array
+        Last command that was sent, (n_modes,) [um].
+    """
+
+    def __init__(self, controller: SupervisedController, command: Array):
+        self.controller, self.command, self.answer = controller, command, command
+        self._commands: dict[int, Array] = {}
+        self.reset()
+
+    @property
+    def frame(self) -> int:
+        """Frames so far."""
+        return self.controller.frame
+
+    @property
+    def sampling(self) -> Sampling:
+        """Sampling of the controller."""
+        return self.controller.controller.sampling
+
+    def update(self, y: Array, ngs: Array | None = None, /) -> None:
+        """Take the measurements of a frame, (n_modes,) [um], as `StepController.update`."""
+        self.answer = self.controller.update(y, ngs)
+        self.controller.amend(self._commands.setdefault(self.frame, self.command))
+        self._commands.pop(self.frame - (self.sampling.ratio or 1), None)
+
+    def send(self) -> None:
+        """Record that the answer was sent."""
+        self.command = self._commands[self.frame] = self.answer
+        self.controller.amend(self.answer)
+
+    def reset(self) -> None:
+        """Reset the controller with the mirror at rest at the last command; the next frame is one with an NGS measurement."""
+        self.controller.reset()
+        self._commands.clear()
+        ratio = self.sampling.ratio or 1
+        for _ in range(-(-self.controller.mirror.taps.size // ratio) * ratio):
+            self.update(np.full(self.sampling.n_modes, np.nan))
+
+    def state_dict(self) -> dict[str, Array]:
+        """Return a copy of the state of the controller."""
+        return self.controller.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Array], /) -> None:
+        """Go on from a state of `state_dict`."""
+        self.controller.load_state_dict(state)
+
+
 class ControllerAttachment(StreamFollower):
     """Closes a loop through streams.
 
@@ -263,7 +327,7 @@ class ControllerAttachment(StreamFollower):
 
     Parameters
     ----------
-    source : FrameStream
+    source : SourceStream
         Residual measurements of the modes, one frame after the other.
     sink : SinkStream
         Where the commands go.
@@ -288,7 +352,7 @@ class ControllerAttachment(StreamFollower):
 
     def __init__(
         self,
-        source: FrameStream,
+        source: SourceStream,
         sink: SinkStream | None,
         controller: SupervisedController,
         gain: float,

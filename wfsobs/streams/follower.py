@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from wfsobs.streams.layout import Semaphore, StreamError
 from wfsobs.streams.ngs_frames import GoingBack, NgsStream, StateObserver
-from wfsobs.streams.wiring import FrameStream, SinkStream, Wiring, check_elements
+from wfsobs.streams.wiring import SinkStream, SourceStream, Wiring, check_elements
 from wfsobs.typing import Array
 
 EDGES = np.geomspace(1e-7, 10.0, 1601)
@@ -182,7 +182,7 @@ class StreamFollower(ABC):
 
     Parameters
     ----------
-    source : FrameStream
+    source : SourceStream
         One frame after the other.
     sink : SinkStream or None
         Where the answers go; None writes nothing.
@@ -203,7 +203,7 @@ class StreamFollower(ABC):
 
     def __init__(
         self,
-        source: FrameStream,
+        source: SourceStream,
         sink: SinkStream | None,
         wiring: Wiring,
         observer: StateObserver,

@@ -7,12 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from time import monotonic
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from wfsobs.control.supervisor import SupervisedController
-from wfsobs.observers.step import StepObserver
 from wfsobs.record import Sampling
 from wfsobs.streams.layout import StreamError
 from wfsobs.streams.wiring import FrameStream, NgsWiring, check_elements
@@ -195,71 +193,22 @@ class NgsStream:
         self._say(f"{self._stream.path}: {line}")
 
 
-class SendingController:
-    """A controller and the commands that were sent: in every frame the previous one, unless `send` confirms the new one.
-
-    `GoingBack` repeats frames; they are repeated with the commands that were sent.
-
-    Parameters
-    ----------
-    controller : SupervisedController
-        Before its first frame.
-    command : Array
-        Command at which the mirror rests, (n_modes,) [um].
-
-    Attributes
-    ----------
-    answer : Array
-        Command of the controller after the last frame, (n_modes,) [um].
-    command : Array
-        Last command that was sent, (n_modes,) [um].
-    """
-
-    def __init__(self, controller: SupervisedController, command: Array):
-        self.controller, self.command, self.answer = controller, command, command
-        self._commands: dict[int, Array] = {}
-        self.reset()
+class StateObserver(Protocol):
+    """What it takes of a `StepObserver`."""
 
     @property
-    def frame(self) -> int:
-        """Frames so far."""
-        return self.controller.frame
+    def frame(self) -> int: ...  # noqa: D102
 
     @property
-    def sampling(self) -> Sampling:
-        """Sampling of the controller."""
-        return self.controller.controller.sampling
+    def sampling(self) -> Sampling: ...  # noqa: D102
 
-    def update(self, y: Array, ngs: Array | None = None, /) -> None:
-        """Take the measurements of a frame, (n_modes,) [um], as `StepController.update`."""
-        self.answer = self.controller.update(y, ngs)
-        self.controller.amend(self._commands.setdefault(self.frame, self.command))
-        self._commands.pop(self.frame - (self.sampling.ratio or 1), None)
+    def update(self, z: Array, ngs: Array | None = None, /) -> None: ...  # noqa: D102
 
-    def send(self) -> None:
-        """Record that the answer was sent."""
-        self.command = self._commands[self.frame] = self.answer
-        self.controller.amend(self.answer)
+    def reset(self) -> None: ...  # noqa: D102
 
-    def reset(self) -> None:
-        """Reset the controller with the mirror at rest at the last command; the next frame is one with an NGS measurement."""
-        self.controller.reset()
-        self._commands.clear()
-        ratio = self.sampling.ratio or 1
-        for _ in range(-(-self.controller.mirror.taps.size // ratio) * ratio):
-            self.update(np.full(self.sampling.n_modes, np.nan))
+    def state_dict(self) -> dict[str, Array]: ...  # noqa: D102
 
-    def state_dict(self) -> dict[str, Array]:
-        """Return a copy of the state of the controller."""
-        return self.controller.state_dict()
-
-    def load_state_dict(self, state: Mapping[str, Array], /) -> None:
-        """Go on from a state of `state_dict`."""
-        self.controller.load_state_dict(state)
-
-
-StateObserver = StepObserver | SendingController
-"""What frames are repeated for."""
+    def load_state_dict(self, state: Mapping[str, Array], /) -> None: ...  # noqa: D102
 
 
 class GoingBack:

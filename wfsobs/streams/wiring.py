@@ -7,21 +7,63 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, Protocol, Self
 
 import numpy as np
 
 from wfsobs.signal.gate import RUN, GateSettings
-from wfsobs.streams.layout import StreamError
-from wfsobs.streams.network import Publication, Subscription
-from wfsobs.streams.shared_image import SharedImage
+from wfsobs.streams.layout import Semaphore, StreamError
 from wfsobs.typing import Array
 
-FrameStream = SharedImage | Subscription
-"""A stream that is read and waited for."""
+# Each is described where it is written, in SharedImage.
+# ruff: noqa: D102
 
-SinkStream = SharedImage | Publication
-"""A stream that is written."""
+
+class AnyStream(Protocol):
+    """Frames of `n` numbers."""
+
+    path: str
+
+    @property
+    def n(self) -> int: ...
+
+
+class FrameStream(AnyStream, Protocol):
+    """A stream that is read."""
+
+    first: int
+
+    @property
+    def count(self) -> int: ...
+
+    @property
+    def write_time(self) -> int: ...
+
+    @property
+    def is_current(self) -> bool: ...
+
+    def read(self, patience: float = ..., /) -> tuple[int, Array] | None: ...
+
+    def reopen(self) -> Self: ...
+
+
+class SourceStream(FrameStream, Protocol):
+    """A stream that is read and waited for."""
+
+    def wait(self, after: int, seconds: float, semaphore: Semaphore | None = ..., /) -> bool: ...
+
+    def claim(self, number: int, /) -> int: ...
+
+    def semaphore(self, number: int, /) -> Semaphore | None: ...
+
+    def release(self, number: int, /) -> None: ...
+
+
+class SinkStream(AnyStream, Protocol):
+    """A stream that is written."""
+
+    def write(self, values: Array, elements: Array, /) -> None: ...
+
 
 Fallback = Literal["zero", "hold"]
 
@@ -185,7 +227,7 @@ class NgsWiring:
     stuck: float = STUCK
 
 
-def check_elements(stream: FrameStream | SinkStream, elements: Sequence[int]) -> None:
+def check_elements(stream: AnyStream, elements: Sequence[int]) -> None:
     """Raise StreamError where a frame has not all of these numbers."""
     if max(elements) >= stream.n:
         raise StreamError(f"{stream.path}: mode {max(elements)}: a frame has {stream.n} numbers, 0 to {stream.n - 1}")
