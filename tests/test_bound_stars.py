@@ -15,7 +15,7 @@ from wfsobs.simulation import layers as atmosphere
 from wfsobs.simulation.flow_spectra import star_basis, star_flow_spectra
 from wfsobs.simulation.guide_stars import stars_differ
 from wfsobs.simulation.loop import simulate
-from wfsobs.simulation.mode_spectra import StarSpectra, star_spectra
+from wfsobs.simulation.mode_spectra import AXIS, FIRST, LGS, NGS, StarSpectra, star_spectra
 from wfsobs.simulation.true_spectra import true_spectra
 from wfsobs.simulation.turbulence import SOURCES
 from wfsobs.typing import Array
@@ -47,9 +47,9 @@ def exact_errors(stars: StarSpectra, n_steps: int, phase: int, ahead: int) -> di
     exposure = exposure_response(n, known.measurement.size)
     # The signals are the mean and the differences, then the frame. A measurement is a step later than what it measures.
     each = range(stars.n_differences)
-    cross = np.array([known.measurement + 0j, *(stars.with_z(i) for i in each)])
+    cross = np.array([known.measurement + 0j, *(stars.pair(FIRST + i, LGS) for i in each)])
     among = np.array([cross.conj(), *([cross[1 + i], *(stars.between(i, j) for j in each)] for i in each)])
-    frames = np.array([known.ngs.measurement_cross + 0j, *(stars.with_ngs(i) for i in each)]) * exposure
+    frames = np.array([known.ngs.measurement_cross + 0j, *(stars.pair(NGS, FIRST + i) for i in each)]) * exposure
     back = np.linalg.inv(star_basis(len(among)))
     among = np.einsum("ai,ijf,bj->abf", back, among, back)
     by_star = np.einsum("ai,if->af", back, advance_spectrum(frames, 1))
@@ -66,7 +66,7 @@ def exact_errors(stars: StarSpectra, n_steps: int, phase: int, ahead: int) -> di
     measured = np.block([*([*row, beside[i].T] for i, row in enumerate(blocks)), [*beside, own]])
     wanted = []
     for name in known.signal:
-        axis = np.array([known.cross[name] + 0j, *(stars.with_axis(i) * (name == "turbulence") for i in each)])
+        axis = np.array([known.cross[name] + 0j, *(stars.pair(AXIS, FIRST + i) * (name == "turbulence") for i in each)])
         stars_of = np.einsum("ai,if->af", back, advance_spectrum(axis, 1 + ahead))
         frame = covariance(advance_spectrum(known.ngs.cross[name] * exposure.conj(), ahead))[slow]
         wanted.append(np.concatenate([*(covariance(star)[fast] for star in stars_of), frame]))
