@@ -241,9 +241,9 @@ def run_campaign(
     folder: Path,
     workers: Workers,
     *,
-    shard: tuple[int, int],
-    report: Callable[[Progress], None],
-    must_stop: Callable[[], bool],
+    shard: tuple[int, int] = (1, 1),
+    report: Callable[[Progress], None] = lambda _: None,
+    must_stop: Callable[[], bool] = lambda: False,
 ) -> Progress:
     """Run what is missing of a campaign; call it again to resume.
 
