@@ -12,10 +12,13 @@ import wfsobs
 from tests.records import short, third_of_pairs
 from wfsobs import PRESETS
 from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.control.mirror import Law
+from wfsobs.control.step import LinearLaws
 from wfsobs.observers.step import StepError
 from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
+from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.testing.common import run_loop
 
 ROUNDING, GPR = 1e-12, 1e-9
@@ -89,6 +92,17 @@ def test_a_design_takes_over_without_a_bump(name: str) -> None:
     y = record.y_lgs[-1]
     want, got, cold = old.update(y), new.update(y), rest.update(y)
     assert np.abs(got - want).max() < 0.05 * np.abs(cold - want).max()
+
+
+def test_filters_of_a_longer_cycle_are_not_taken_over() -> None:
+    """Their place in the cycle may be beyond the shorter one's."""
+    step = np.eye(1), np.ones((1, 1)), np.ones((1, 1)), np.zeros((1, 1))
+    long, brief = (LinearLaws([Law(PeriodicFilter([step] * n))]) for n in (5, 1))
+    for _ in range(3):
+        long.command(np.ones(1), None, np.zeros(1))
+    with pytest.raises(StepError, match="cycles of another length"):
+        brief.take_over(long)
+    assert brief.command(np.ones(1), None, np.zeros(1)) == 0.0, "as it began"
 
 
 def test_wrong_input_is_one_line_and_takes_no_frame() -> None:

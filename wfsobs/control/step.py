@@ -6,6 +6,7 @@ prediction of the vibration beside it. Over a frame it does what `Controller.com
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -37,15 +38,15 @@ DECIMALS = 9
 """Of z [um] where a model is identified from it: it is then the same in whichever order commands were added."""
 
 
-class StepLaw(StateArrays):
+class StepLaw(StateArrays, ABC):
     """The laws of all modes, one frame at a time; by default commands sent do not matter to them."""
 
     def see_stars(self, count: int | None) -> None:
         """Take the LGS measurement of the next frame for the mean over so many stars; None for all."""
 
+    @abstractmethod
     def command(self, z: Array, ngs: Array | None, forward: Array) -> Array:
         """Return the commands (n_modes,) [um] that the laws want, `forward` included."""
-        raise NotImplementedError
 
     def tell(self, command: Array, forward: Array) -> None:
         """Tell what the mirror took of them."""
@@ -76,6 +77,12 @@ class LinearLaws(StepLaw):
         if v.shape[1] > 1:
             v[:, 1] = 0.0 if ngs is None else ngs
         return self.bank.step(v)[:, 0] + forward
+
+    def take_over(self, old: Any) -> None:
+        """Go on from filters of as many states and of a cycle as long. Raises StepError."""
+        if isinstance(old, LinearLaws) and len(old.bank.maps) != len(self.bank.maps):
+            raise StepError("the laws have cycles of another length")
+        super().take_over(old)
 
 
 class KalmanLaws(StepLaw):

@@ -8,6 +8,7 @@ After frame k `predict(0)` is row k of the observer's run over the record.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from math import inf, isfinite, isnan
 from textwrap import shorten
@@ -38,7 +39,7 @@ def take_state(new: StateArrays, old: StateArrays) -> None:
     new.load(state)
 
 
-class Estimator(StateArrays):
+class Estimator(StateArrays, ABC):
     """What differs from observer to observer. Measurements come complete, or with NaN where it takes missing ones.
 
     Over a record it is driven frame by frame. One that is faster over all steps at once has a method `run` (measurements, watch)
@@ -56,13 +57,13 @@ class Estimator(StateArrays):
     horizon: float | None = None
     needs_command: bool = False
 
+    @abstractmethod
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame: z (n_modes,) [um]; ngs (n_modes,) [um] where an NGS frame is due; u (n_modes,) [um]."""
-        raise NotImplementedError
 
+    @abstractmethod
     def predict(self, frames: float, target: str) -> tuple[Array, Array]:
         """Return (mean, sd) of the target so many frames ahead, (n_modes,) [um], good until the next call. Raises StepError."""
-        raise NotImplementedError
 
     def settle(self) -> None:
         """Do now what `advance` left for later; by default nothing."""
