@@ -366,8 +366,11 @@ def _join(names: Sequence[str]) -> str:
 
     >>> _join(["LGS KF", "Ridge", "Multi-peak KF"])
     'LGS KF, Ridge and Multi-peak KF'
+    >>> _join(["LQG, multi-rate KF", "LQG, LGS KF", "4 others"])
+    'LQG, multi-rate KF; LQG, LGS KF and 4 others'
     """
-    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+    between = "; " if any("," in name for name in names) else ", "
+    return " and ".join(filter(None, (between.join(names[:-1]), names[-1])))
 
 
 def _format_number(x: float) -> str:
