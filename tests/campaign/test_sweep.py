@@ -194,12 +194,13 @@ def test_the_verdict_on_a_cell_is_its_winner_and_that_on_all_counts_them(results
                 assert f"{row_label(best[0].observer)} in " in counts[1]
 
 
-def test_an_error_of_a_wide_interval_is_not_at_the_limit(results: SweepResults) -> None:
-    """Four times the limit, with the limit in its interval; over the same records another is better."""
+def test_an_error_is_at_the_limit_where_its_interval_is_narrow_and_none_is_better(results: SweepResults) -> None:
+    """Of 40 nm with the limit in its interval: to be equal to it that must be narrow, and no other better over the same records."""
     found = results.verdict(0, "turbulence", "tip")
     assert found is not None
-    wide = replace(found.best, knowledge="nothing", rms=0.04, interval=(0.005, 0.075), limit=(0.01, "bound-both"), is_tie=False)
-    assert wide.above_limit == 0.0
-    for is_tie in (False, True):
-        said = sentence_of_several([replace(found, places=(replace(wide, is_tie=is_tie),))], [1e3], "nm")
-        assert said.endswith(f"40.0 to 40.0 nm{', at the theoretical limit in 1' * is_tie}.")
+    for low, high, limit, equal in ((0.005, 0.075, 0.01, False), (0.028, 0.052, 0.03, False), (0.032, 0.048, 0.035, True)):
+        place = replace(found.best, knowledge="nothing", rms=0.04, interval=(low, high), limit=(limit, "bound-both"))
+        assert place.above_limit == pytest.approx(0.0 if equal else 0.04 / limit - 1.0)
+        for is_tie in (False, True):
+            said = sentence_of_several([replace(found, places=(replace(place, is_tie=is_tie),))], [1e3], "nm")
+            assert said.endswith(f"40.0 to 40.0 nm{', at the theoretical limit in 1' * (is_tie and equal)}.")

@@ -351,7 +351,7 @@ def sentence_of_several(verdicts: Sequence[Verdict], scales: Sequence[float], un
         if best:
             counts = Counter(row_label(place.observer) for place, _ in best).most_common()
             errors = [place.rms * scale for place, scale in best]
-            n_equal = sum(place.is_tie and place.above_limit == 0.0 for place, _ in best)  # a wide interval is no equality
+            n_equal = sum(place.is_tie and place.above_limit == 0.0 for place, _ in best)
             parts.append(
                 f"{HEADINGS[kind]}: smallest error of "
                 f"{', '.join(f'{name} in {n}' for name, n in counts)} of {len(best)} scenarios"
