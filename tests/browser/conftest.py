@@ -154,7 +154,7 @@ class Watched:
 
     def __init__(self, page: Page):
         self.faults: list[str] = []
-        page.on("console", lambda m: self.faults.append(f"console: {m.text}") if m.type == "error" else None)
+        page.on("console", lambda m: self.faults.append(f"console: {m.text}") if m.type in ("error", "warning") else None)
         page.on("pageerror", lambda e: self.faults.append(f"page: {e}"))
         page.on("request", self._request)
 
@@ -266,6 +266,10 @@ SETTINGS = """() => [...(window.Bokeh?.index?.roots?.[0]?.model.document.all_mod
 """Whether the drawer has its settings: they come after the first picture."""
 
 
+COMPLETE = "() => Bokeh.index.roots.every((it) => it.has_finished())"
+"""Whether the page has all of its parts: the drawer's come one after the other, and move what is below them."""
+
+
 ANSWERED = """() => {
   const link = Bokeh.index.roots[0].model.document.wfsobs
   window.question ??= (link.ask(), link.asked)
@@ -300,7 +304,8 @@ def eventually(page: Page, holds: Callable[[], object], seconds: float = PATIENC
 
 
 def finished(page: Page) -> None:
-    """Wait until the settings are there, the run is over and its results are drawn."""
+    """Wait until the settings are there, the run is over, its results are drawn and nothing moves any more."""
     until(page, SETTINGS, every=200)
+    until(page, COMPLETE, every=200)
     until(page, DONE, every=200)
     until(page, DRAWN, every=200)  # it looks through all of the page

@@ -11,11 +11,24 @@ from playwright.sync_api import Browser, Page, expect
 from tests.browser.conftest import PATIENCE, QUICK, finished, until
 from wfsobs.observers import OBSERVERS
 
+TOPICS_AT = """() => [...(window.Bokeh?.index?.query((it) => it.model.data?._names && it.model.data.active) ?? [])]
+    .map((it) => it.el.getBoundingClientRect().top).find((top) => top > 0)"""
+"""Where the topics of the drawer begin."""
+
 
 @pytest.fixture(scope="module")
-def wide(open_shared: Any) -> Page:
+def opened(open_shared: Any) -> tuple[Page, float]:
+    """A page, and where the topics of its drawer stood when they came."""
+    page = open_shared(1280, 720, wait=False)
+    top = until(page, TOPICS_AT, every=20).json_value()
+    finished(page)
+    return page, top
+
+
+@pytest.fixture(scope="module")
+def wide(opened: tuple[Page, float]) -> Page:
     """A page for the tests below, in this order."""
-    return open_shared(1280, 720)
+    return opened[0]
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +52,12 @@ FIRST_FIGURE = """() => {
 @pytest.mark.parametrize(("name", "lowest"), [("wide", 430), ("phone", 700)])
 def test_the_first_figure_begins_in_the_first_window(request: pytest.FixtureRequest, name: str, lowest: int) -> None:
     assert request.getfixturevalue(name).evaluate(FIRST_FIGURE) < lowest
+
+
+def test_what_the_drawer_is_to_hold_has_its_room_from_the_first(opened: tuple[Page, float]) -> None:
+    """Its settings are made one after the other; what is below them must not move away from a click."""
+    page, top = opened
+    assert page.evaluate(TOPICS_AT) == pytest.approx(top, abs=2.0)  # heights in whole pixels
 
 
 def test_a_logarithmic_slider_says_its_value(wide: Page) -> None:

@@ -195,7 +195,7 @@ def test_the_verdict_on_a_cell_is_its_winner_and_that_on_all_counts_them(results
 
 
 def test_an_error_is_at_the_limit_where_its_interval_is_narrow_and_none_is_better(results: SweepResults) -> None:
-    """Of 40 nm with the limit in its interval: to be equal to it that must be narrow, and no other better over the same records."""
+    """Of 40 nm with the limit in its interval: this must be narrow, and no other may be better over the same records."""
     found = results.verdict(0, "turbulence", "tip")
     assert found is not None
     for low, high, limit, equal in ((0.005, 0.075, 0.01, False), (0.028, 0.052, 0.03, False), (0.032, 0.048, 0.035, True)):

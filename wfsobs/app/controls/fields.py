@@ -39,6 +39,8 @@ class Field(ABC):
 
     has_help = False
     """Whether its box has a line of help, which says why it has no effect; else a line below does."""
+    height = 45
+    """Of its row [px], kept from the first: rows come one after the other, and what is clicked must not move away."""
 
     def __init__(self, store: Store, path: str, p: param.Parameter[Any]):
         self.store = store
@@ -47,7 +49,7 @@ class Field(ABC):
         self.idle: str = ""
         self._note_html = ""
         self.widgets: Final = self._widgets()
-        self.view: Final = pn.Column(self._row(), **WIDE)
+        self.view: Final = pn.Column(self._row(), min_height=self.height, **WIDE)
         self.refresh()
         store.param.watch(self.refresh, ["scenario", "errors"])
 
@@ -232,6 +234,7 @@ class SliderField(TextField):
     """
 
     has_help = False
+    height = 56
     _value: Any = None
     """What the slider stands for, as far as it has said or was told."""
 

@@ -184,6 +184,7 @@ class Controls:
             helper_text=preset_line(store.preset),
             size="small",
             stylesheets=[TWO_LINES],
+            min_height=75,
             **ROOM,
         )
         self.reset: Final = make_button("Reset", lambda: store.choose(store.preset), variant="text", margin=(4, 0))
@@ -228,7 +229,7 @@ class Controls:
         self._refresh_parts()
         return pn.Column(
             self.preset,
-            pn.Row(self.undo, self.redo, self.reset, **WIDE),
+            pn.Row(self.undo, self.redo, self.reset, min_height=43, **WIDE),
             *first,
             self.search,
             self.accordion,

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 import panel as pn
+from bokeh.core.properties import value
 from bokeh.core.validation import silence
 from bokeh.core.validation.warnings import MISSING_RENDERERS
 from bokeh.events import DoubleTap
@@ -103,6 +104,7 @@ def later(function: Any, milliseconds: int) -> None:
         doc.add_timeout_callback(function, milliseconds)
 
 
+FONT = "Roboto, Helvetica, Arial, sans-serif"
 HEIGHT = 230
 
 PEAKS, MODEL = "#888888", "#FF6600"
@@ -281,7 +283,7 @@ class EndLabels:
         self.figure = fig
         self.source: Final = ColumnDataSource({name: [] for name in ("x", "y", "text", "colour", "dash")})
         box: dict[str, Any] = {"border_line_color": "colour", "border_line_dash": "dash", "text_baseline": "middle"}
-        box |= {"text_font": "Roboto, Helvetica, Arial, sans-serif", "text_font_size": "12px"}
+        box |= {"text_font": value(FONT), "text_font_size": "12px"}
         # In the page and not on the canvas, where what is beside the frame would be cut off.
         self.labels: Final = HTMLLabelSet(x="x", y="y", text="text", x_offset=5, source=self.source, **box)
         fig.add_layout(self.labels)

@@ -19,6 +19,7 @@ from wfsobs.app.render import number
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.style import follow_html, look, observers_of, sheets, swatch
 from wfsobs.app.views.plots import (
+    FONT,
     ComparedLines,
     EndLabels,
     FigureLines,
@@ -48,7 +49,6 @@ from wfsobs.typing import Array
 FLEXIBLE = ":host > div { flex: 1 1 240px; width: auto !important; }"
 """Style of what shares a row with a switch."""
 
-FONT = "Roboto, Helvetica, Arial, sans-serif"
 AXIS_TEXT: Mapping[str, Any] = {
     "major_label_text_font": FONT,
     "major_label_text_font_size": "0.925em",
