@@ -136,3 +136,18 @@ def test_together_has_a_row_per_name(folder):
     rows = list(csv.DictReader(table(folder, "--together", "--csv").stdout.splitlines()))
     assert {(r["target"], r["mode"]) for r in rows} >= {("turbulence", "tip"), ("vibration", "tilt")}
     assert table(folder, "--together", "--parquet", folder / "all.parquet").exit_code != 0
+
+
+def test_who_has_no_error_is_named_with_the_reason_before_and_after(tmp_path):
+    """In the plan for its first run, in the table for the runs that are shown."""
+    text = PLAN.replace('"persistence"', '"persistence", "kf-adaptive"')
+    (tmp_path / "plan.toml").write_text(text, encoding="utf-8")
+    plan = parse_plan(text, tmp_path)
+    open_folder(plan, tmp_path)
+    rows = [row for cell in plan.cells for row in run_rows(cell, 1, plan.observers, ())]
+    write_batch(tmp_path, rows, {"host": "here", "process": 1, "written": 1.0})
+    why = next(row["note"] for row in rows if row["name"] == "kf-adaptive").removeprefix("kf-adaptive ")
+    said = CliRunner().invoke(main, ["campaign", "plan", str(tmp_path / "plan.toml")]).stdout
+    assert said.endswith(f"without errors: kf-adaptive, 1 run: {why}\n") and "300 steps" in why
+    for only, n in (((), 4), (("--only", "turbulence.wind_speed=20", "--target", "vibration"), 2)):
+        assert table(tmp_path, *only).stderr == f"wfsobs: without errors: kf-adaptive, {n} runs: {why}\n"

@@ -7,7 +7,8 @@ import math
 import re
 import signal
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import astuple, fields
 from pathlib import Path
 from time import perf_counter
@@ -110,6 +111,15 @@ def summary_table(plan: Campaign, rows: object, title: str) -> Table:
     return out
 
 
+def failure_lines(failures: Mapping[tuple[str, str], int]) -> list[str]:
+    """Write why there are no errors; failures : (name, reason) -> in how many runs.
+
+    >>> failure_lines({("ridge-30", "ridge-30 left out: too short"): 2, ("mine", "ValueError: no model"): 1})
+    ['mine, 1 run: ValueError: no model', 'ridge-30, 2 runs: left out: too short']
+    """
+    return [f"{name}, {n} run{'s' * (n > 1)}: {why.removeprefix(f'{name} ')}" for (name, why), n in sorted(failures.items())]
+
+
 NUMBERS = ("rms, nm", "rms / limit", "95 %", "above the best, %", "rank", "wins", "records", "failed")
 
 
@@ -186,7 +196,7 @@ def campaign() -> None:
 def print_plan(plan_file: str, workers: int | None) -> None:
     """Say how many runs, hours and bytes a campaign takes."""
     plan, side_by_side = load_plan(plan_file), workers or usable_processors()
-    hours, measured = _core_hours(plan)
+    hours, measured, failures = _core_hours(plan)
     rows = rows_of_a_run(plan) * plan.n_runs
     batches = max(1.0, hours * 3600 / BATCH)
     click.echo(f"{plan.name}: {len(plan.cells)} scenarios x {len(plan.seeds)} seeds = {plan.n_runs} runs")
@@ -197,6 +207,8 @@ def print_plan(plan_file: str, workers: int | None) -> None:
     click.echo(f"{_span(hours)} of one processor{measured}")
     click.echo(f"{_span(hours / side_by_side)} on {side_by_side} workers, in about {batches:.0f} batches")
     click.echo(f"{rows} rows, about {stored_bytes(plan, batches) / 1e6:.3g} MB")
+    for line in failure_lines(failures):
+        click.echo(f"without errors: {line}")
 
 
 def stored_bytes(plan: Campaign, batches: float) -> float:
@@ -210,20 +222,20 @@ def _span(hours: float) -> str:
     return f"{hours:.3g} h" if hours >= 1 else f"{hours * 60:.2g} min" if hours >= 0.05 else f"{hours * 3600:.2g} s"
 
 
-def _core_hours(plan: Campaign) -> tuple[float, str]:
-    """Return the time of all runs [h], by that of the first one on this machine, and how it was found."""
+def _core_hours(plan: Campaign) -> tuple[float, str, Counter[tuple[str, str]]]:
+    """Return the time of all runs [h], by that of the first one on this machine, how it was found, and what failed in that."""
     step = max(1, len(plan.cells) // 200)  # of many scenarios some
     costs = [run_cost(plan, cell) for cell in range(0, len(plan.cells), step)]
-    mean, how = sum(costs) / len(costs), ""
+    mean, how, rows = sum(costs) / len(costs), "", []
     if costs[0] < LONG:
         times = [perf_counter()]
         for _ in range(2):
-            run_rows(plan.cells[0], plan.seeds[0], plan.observers, plan.controllers)
+            rows = run_rows(plan.cells[0], plan.seeds[0], plan.observers, plan.controllers)
             times.append(perf_counter())
         first, again = times[1] - times[0], times[2] - times[1]
         mean = mean * again / costs[0] + max(first - again, 0.0) / len(plan.seeds)  # designs and bounds, once for all seeds
         how = f" (the first run took {again:.2g} s here)"
-    return mean * plan.n_runs / 3600, how
+    return mean * plan.n_runs / 3600, how, Counter((row["name"], row["note"]) for row in rows if not row["target"])
 
 
 def rows_of_a_run(plan: Campaign) -> int:
@@ -350,6 +362,9 @@ def print_table(
         return
     done = int(finished_runs(plan, Path(folder)).sum())
     show_table(summary_table(plan, rows, f"{plan.name}: {done} of {plan.n_runs} runs"))
+    failed = rows.filter(rows["rms_nm"].is_null()).select(["name", "note"]).to_batches(max_chunksize=CHUNK)
+    for line in failure_lines(Counter((it["name"], it["note"]) for part in failed for it in part.to_pylist())):
+        print_note(f"without errors: {line}")
 
 
 @campaign.command()
