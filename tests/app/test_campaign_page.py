@@ -177,6 +177,23 @@ def test_a_scenario_alone_is_tested_over_its_seeds(dashboard: Dashboard, loop: A
         assert cells_of(page, "kf-lgs")["Wins"] == "1 (1)" and squares(page)[3]["state"] == "decided"
 
 
+def test_who_has_no_error_where_the_page_looks_is_named(dashboard: Dashboard, loop: Any, plan: Campaign, tmp_path: Path) -> None:
+    """Persistence fails in every run at 20 m/s: among all scenarios it has a row, at 20 m/s alone a line below the table."""
+    for path in batch_files(tmp_path):
+        path.unlink()
+    rows = [row for cell in plan.cells for row in run_rows(cell, 7, plan.observers, ())]
+    fails = {
+        row["key"]: {**row, "target": "", "rms_nm": None, "note": "too short"} for row in rows if row["name"] == "persistence"
+    }
+    fast = [i for i, cell in enumerate(plan.cells) if cell.changes["turbulence.wind_speed"] == 20]
+    kept = [row for row in rows if row["name"] != "persistence" or row["cell"] not in fast]
+    write_batch(tmp_path, [*kept, *(row for row in fails.values() if row["cell"] in fast)], PLACE)
+    page = open_campaign(dashboard, loop)
+    assert cells_of(page, "persistence")["Failed"] == "2" and "Without errors" not in page.table.html
+    page.filters["turbulence.wind_speed"].value = "20"
+    assert "<p>Without errors: Persistence; <code>wfsobs campaign table</code> says why.</p>" in page.table.html
+
+
 def test_a_reload_returns_to_the_fields(dashboard: Dashboard, loop: Any) -> None:
     said = dashboard.view_state.open(
         "view.page=campaign&view.campaign.target=vibration&view.campaign.only.sensors.exposure_ratio=7"

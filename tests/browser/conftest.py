@@ -154,9 +154,14 @@ class Watched:
 
     def __init__(self, page: Page):
         self.faults: list[str] = []
-        page.on("console", lambda m: self.faults.append(f"console: {m.text}") if m.type in ("error", "warning") else None)
+        page.on("console", self._console)
         page.on("pageerror", lambda e: self.faults.append(f"page: {e}"))
         page.on("request", self._request)
+
+    def _console(self, message: Any) -> None:
+        """Keep errors, and that a property of a figure names no column; that an axis has no data yet is no fault."""
+        if message.type == "error" or "nonexistent field" in message.text:
+            self.faults.append(f"console: {message.text}")
 
     def _request(self, request: Any) -> None:
         if not request.url.startswith(("http://localhost:", "ws://localhost:", "data:", "blob:")):

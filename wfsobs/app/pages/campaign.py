@@ -77,8 +77,8 @@ def standings_html(view: CampaignView, display: Display) -> str:
         "Records": "",
         "Failed": "runs without an estimate",
     }
-    rows = []
-    for s in standings(view.state, view.target, view.mode, view.cells):
+    rows, shown = [], standings(view.state, view.target, view.mode, view.cells)
+    for s in shown:
         low, high = s.over_bound_low, s.over_bound_high
         cells_of = [
             number(scale * s.rms_nm),
@@ -91,7 +91,10 @@ def standings_html(view: CampaignView, display: Display) -> str:
             NOTHING if s.failures is None else str(s.failures),
         ]
         rows.append(named_row(s.name, name_label(s.name), display.dark, cells_of))
-    return table("Observers of the campaign", columns, rows)
+    lost = {name for name, n in view.state.failures.items() if n[view.cells].any()} - {s.name for s in shown}
+    names = escape(", ".join(map(name_label, sorted(lost))))
+    why = f"<p>Without errors: {names}; <code>wfsobs campaign table</code> says why.</p>" if lost else ""
+    return table("Observers of the campaign", columns, rows) + why
 
 
 def _above(s: TogetherRow) -> str:
