@@ -256,6 +256,14 @@ def test_separators_and_decimal_commas(separator: str, decimal: str, heading: bo
     is_as_clean(read_record(io.BytesIO(content), "a.txt", declaration=stated), f"unit nm{said}")
 
 
+def test_exponents_of_fortran() -> None:
+    """As its D descriptor and IDL write double precision."""
+    written = [np.array([f"{x:.17E}".replace("E", "D") for x in column]) for column in (*Y.T, *U.T)]
+    is_as_clean(read_record(io.BytesIO(table(OWN, TIME, *written, separator=" ")), "a.txt"), "unit nm, cells separated by blanks")
+    with pytest.raises(RecordError, match=r"line 2, y_lgs/tip.*: 'added' is not a number"):
+        read_record(io.BytesIO(table(OWN, TIME, np.full(len(TIME), "added"), *written[1:])), "a.csv")
+
+
 def test_columns_of_text() -> None:
     """Left out where it begins with text or comes to it, also with a separator between quotation marks; never what is needed."""
     good = np.array(["ok", '"seen, then lost"'] * (N // 2))

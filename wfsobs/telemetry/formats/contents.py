@@ -214,17 +214,19 @@ ABSENT = frozenset(("", *"na n/a null none - --".split()))
 
 
 def parse_cell(text: str) -> float:
-    """Return the number of a cell, also with a decimal comma, or the seconds since 1970 of a stamp; NaN where there is none.
+    """Return the number of a cell, or the seconds since 1970 of a stamp; NaN where there is none.
 
-    >>> parse_cell("0,5"), parse_cell("1970-01-02 00:00:00.25Z"), parse_cell("N/A")
-    (0.5, 86400.25, nan)
+    A number may have a decimal comma, and the exponent of Fortran's double precision.
+
+    >>> parse_cell("0,5"), parse_cell("-2.5D-01"), parse_cell("1970-01-02 00:00:00.25Z"), parse_cell("N/A")
+    (0.5, -0.25, 86400.25, nan)
 
     Raises ValueError.
     """
     if text.strip().lower() in ABSENT:
         return np.nan
     if (match := STAMP.fullmatch(text.strip())) is None:
-        return float(text.replace(",", "."))
+        return float(text.replace(",", ".").upper().replace("D", "E"))
     day, clock, part = match.groups()
     whole = np.datetime64(f"{(day or '1970-01-01').replace('/', '-')}T{clock}").astype(np.int64)
     return float(whole + float(f"0.{part or 0}"))
