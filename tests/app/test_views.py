@@ -300,7 +300,7 @@ class TestHigherModes:
         switch, display, store = dashboard.modes, dashboard.display, dashboard.store
         assert switch.buttons.visible and not switch.list.visible
         display.unit = "mas"
-        store.change("telescope.radial_order", 2)
+        store.replace({"telescope.radial_order": 2, "run.duration": 1.0})
         loop.finish(store)
         assert switch.list.visible and list(switch.list.options.values()) == [m.name for m in store.scenario.modes]
         switch.list.value = "defocus"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 import param
 
@@ -59,15 +59,15 @@ def setting_name(path: str) -> str:
     >>> setting_name("gpr_online.depth"), setting_name("vibration.peaks.14"), setting_name("vibration.peaks.0.height")
     ('Online GPR: Depth d', 'Peak 15', 'vibration.peaks.0.height')
     """
-    node: Group = Scenario()
+    node: type[Group] = Scenario
     topic, *_ = keys = path.split(".")
     for i, key in enumerate(keys):
         p = node.settings().get(key)
         if p is None:
             return path
-        value, rest = getattr(node, key), keys[i + 1 :]
-        if isinstance(value, Group):
-            node = value
+        rest = keys[i + 1 :]
+        if isinstance(p, param.ClassSelector):
+            node = cast(type[Group], p.class_)
         elif isinstance(p, param.List) and holds_groups(p) and rest:
             return _item(p, *rest) or path
         else:
