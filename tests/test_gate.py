@@ -177,7 +177,7 @@ def errors(record: Record, observers: Sequence[str] = FILTERS, **settings: str) 
 def test_one_percent_of_outliers_costs_less_than_five_percent(ut4: Record) -> None:
     """Every filter, of 40, 10 and 6 sigma, both targets and their sum; a clean record loses less than 0.1 %.
 
-    Of 10 s: one outlier in a hundred frames of either sensor, 100 and 20, tell a cost of 5 %.
+    10 s have 100 outliers of the LGS and 20 of the NGS: enough to tell a cost of 5 %.
     """
     clean_of_20_s = errors(ut4, gate="off")
     assert max(abs(e / clean_of_20_s[key] - 1.0) for key, e in errors(ut4).items()) < 1e-3

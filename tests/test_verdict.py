@@ -10,7 +10,7 @@ import pytest
 from scipy.signal import lfilter
 
 from wfsobs.evaluation.budget import error_budget
-from wfsobs.evaluation.evidence import LEVEL, means_differ
+from wfsobs.evaluation.evidence import LEVEL, Evidence, means_differ
 from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.rows import NOTHING, PEAKS, can_be_best, prior_knowledge, row_label, target_title
 from wfsobs.evaluation.scores import BATCHES, BOUND_BOTH, BOUNDS, PREDICTION, batch_means
@@ -233,6 +233,19 @@ def test_the_best_with_each_kind_of_prior_knowledge_is_the_least_error_of_those_
         best = found.best_with(kind)
         assert best is not None and best.rms == min(of[name] for name in names) and best.observer in names
     assert found.best_with("nothing") is None
+
+
+def test_errors_that_few_seeds_cannot_tell_apart_are_equal_only_where_they_are_alike() -> None:
+    """Of three seeds that scatter by 40 % no difference is significant, and 25 % is the most that is called equal."""
+    result = run(SCENARIOS["paper"].replace({"run.duration": 2.0}), observers=("kf-lgs", "kf-multi", "multirate-optimal", "zero"))
+    means, scatter = {"kf-multi": 10.0, "multirate-optimal": 12.4, "kf-lgs": 12.6}, np.array([[0.6, 1.0, 1.4], [1.4, 0.6, 1.0]])
+    errors = {(n, "vibration", "tip"): m * scatter[int(m > 10.0)] for n, m in means.items()}
+    few = Evidence(errors, {key: np.full(3, 20.0) for key in errors}, 3)
+    assert few.leaders("vibration", "tip") == tuple(means), "none differs significantly"
+    given = (result.scenario, result.record, result.estimates, result.scores, "vibration", "tip")
+    found = verdict(*given, evidence=few)
+    assert found is not None and [p.observer for p in found.places] == list(means) and found.ties == ("multirate-optimal",)
+    assert "statistically equal to Optimal" in found.sentences()[0].replace(row_label("multirate-optimal"), "Optimal")
 
 
 def test_without_truth_there_is_no_verdict_and_without_a_simulation_no_lines() -> None:

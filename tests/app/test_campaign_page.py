@@ -177,7 +177,7 @@ def test_a_scenario_alone_is_tested_over_its_seeds(dashboard: Dashboard, loop: A
         assert cells_of(page, "kf-lgs")["Wins"] == "1 (1)" and squares(page)[3]["state"] == "decided"
 
 
-def test_who_has_no_error_where_the_page_looks_is_named(dashboard: Dashboard, loop: Any, plan: Campaign, tmp_path: Path) -> None:
+def test_observers_without_errors_are_listed(dashboard: Dashboard, loop: Any, plan: Campaign, tmp_path: Path) -> None:
     """Persistence fails in every run at 20 m/s: among all scenarios it has a row, at 20 m/s alone a line below the table."""
     for path in batch_files(tmp_path):
         path.unlink()

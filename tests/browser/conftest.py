@@ -305,7 +305,7 @@ def eventually(page: Page, holds: Callable[[], object], seconds: float = PATIENC
     end = time.monotonic() + seconds
     while not holds():
         assert time.monotonic() < end, "it never was so"
-        page.wait_for_timeout(50)
+        page.wait_for_timeout(50)  # which hears what the page says meanwhile, unlike time.sleep
 
 
 def finished(page: Page) -> None:

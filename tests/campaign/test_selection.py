@@ -138,7 +138,7 @@ def test_together_has_a_row_per_name(folder):
     assert table(folder, "--together", "--parquet", folder / "all.parquet").exit_code != 0
 
 
-def test_who_has_no_error_is_named_with_the_reason_before_and_after(tmp_path):
+def test_observers_without_errors_are_listed_with_the_reason_before_and_after(tmp_path):
     """In the plan for its first run, in the table for the runs that are shown."""
     text = PLAN.replace('"persistence"', '"persistence", "kf-adaptive"')
     (tmp_path / "plan.toml").write_text(text, encoding="utf-8")

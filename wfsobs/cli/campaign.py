@@ -112,12 +112,21 @@ def summary_table(plan: Campaign, rows: object, title: str) -> Table:
 
 
 def failure_lines(failures: Mapping[tuple[str, str], int]) -> list[str]:
-    """Write why there are no errors; failures : (name, reason) -> in how many runs.
+    """Write a line for each observer without errors in some runs; failures : (name, reason) -> in how many runs.
 
-    >>> failure_lines({("ridge-30", "ridge-30 left out: too short"): 2, ("mine", "ValueError: no model"): 1})
-    ['mine, 1 run: ValueError: no model', 'ridge-30, 2 runs: left out: too short']
+    Of several reasons, which may have numbers of their run in them, the most frequent.
+
+    >>> failure_lines({("ridge-30", "ridge-30 left out: too short"): 2, ("mine", "no model at 3 Hz"): 1, ("mine", "singular"): 2})
+    ['mine, 3 runs, of which 2: singular', 'ridge-30, 2 runs: left out: too short']
     """
-    return [f"{name}, {n} run{'s' * (n > 1)}: {why.removeprefix(f'{name} ')}" for (name, why), n in sorted(failures.items())]
+    reasons: dict[str, Counter[str]] = {}
+    for (name, why), n in sorted(failures.items()):
+        reasons.setdefault(name, Counter())[why.removeprefix(f"{name} ")] += n
+    lines = []
+    for name, of in reasons.items():
+        (why, n), total = of.most_common(1)[0], of.total()
+        lines.append(f"{name}, {total} run{'s' * (total > 1)}{f', of which {n}' * (n < total)}: {why}")
+    return lines
 
 
 NUMBERS = ("rms, nm", "rms / limit", "95 %", "above the best, %", "rank", "wins", "records", "failed")
@@ -196,7 +205,7 @@ def campaign() -> None:
 def print_plan(plan_file: str, workers: int | None) -> None:
     """Say how many runs, hours and bytes a campaign takes."""
     plan, side_by_side = load_plan(plan_file), workers or usable_processors()
-    hours, measured, failures = _core_hours(plan)
+    hours, measured, failures = _try_first_run(plan)
     rows = rows_of_a_run(plan) * plan.n_runs
     batches = max(1.0, hours * 3600 / BATCH)
     click.echo(f"{plan.name}: {len(plan.cells)} scenarios x {len(plan.seeds)} seeds = {plan.n_runs} runs")
@@ -222,8 +231,8 @@ def _span(hours: float) -> str:
     return f"{hours:.3g} h" if hours >= 1 else f"{hours * 60:.2g} min" if hours >= 0.05 else f"{hours * 3600:.2g} s"
 
 
-def _core_hours(plan: Campaign) -> tuple[float, str, Counter[tuple[str, str]]]:
-    """Return the time of all runs [h], by that of the first one on this machine, how it was found, and what failed in that."""
+def _try_first_run(plan: Campaign) -> tuple[float, str, Counter[tuple[str, str]]]:
+    """Return the time of all runs [h], how it was found (by the first one here, unless that is LONG), and what failed in it."""
     step = max(1, len(plan.cells) // 200)  # of many scenarios some
     costs = [run_cost(plan, cell) for cell in range(0, len(plan.cells), step)]
     mean, how, rows = sum(costs) / len(costs), "", []
@@ -343,6 +352,8 @@ def print_table(
     folder: str, only: tuple[str, ...], target: str | None, mode: str | None, together: bool, as_csv: bool, parquet: str | None
 ) -> None:
     """Print the results of a campaign: errors over the seeds and paired differences from the best."""
+    import pyarrow.compute as pc
+
     if together and parquet:
         raise SettingError("--parquet: takes all rows, not --together")
     plan = folder_plan(Path(folder))
@@ -362,8 +373,8 @@ def print_table(
         return
     done = int(finished_runs(plan, Path(folder)).sum())
     show_table(summary_table(plan, rows, f"{plan.name}: {done} of {plan.n_runs} runs"))
-    failed = rows.filter(rows["rms_nm"].is_null()).select(["name", "note"]).to_batches(max_chunksize=CHUNK)
-    for line in failure_lines(Counter((it["name"], it["note"]) for part in failed for it in part.to_pylist())):
+    failed = rows.filter(pc.field("target") == "").group_by(["name", "note"]).aggregate([([], "count_all")]).to_pylist()
+    for line in failure_lines({(it["name"], it["note"]): it["count_all"] for it in failed}):
         print_note(f"without errors: {line}")
 
 

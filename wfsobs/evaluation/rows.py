@@ -54,10 +54,6 @@ JOINT_BOUNDS = {"kf-coupled": BOUND_MODES, "multirate-coupled": BOUND_BOTH_MODES
 """Observers of all modes together, and the bound of what they measure."""
 
 
-WIDEST = 0.25
-"""Half width of an interval, as a share of the error, above which it cannot show that two errors are equal."""
-
-
 def own_bound(observer: str) -> str | None:
     """Return the bound of the measurements of an observer; None where there is none: it looks ahead, or has the NGS alone.
 
@@ -127,11 +123,15 @@ def row_label(observer: str) -> str:
     return NOT_OBSERVERS.get(observer) or OBSERVERS[observer].label
 
 
+EQUAL = 0.25
+"""Largest share by which errors may differ, or an interval reach to either side, to be called equal: what few seeds cannot tell
+apart may well be different."""
+
+
 def above_bound(rms: float, interval: Sequence[float] | None, bound: float | None) -> float | None:
     """Return by which share an error is above the bound of what the observer measures, 0 where they are equal.
 
-    They are where the error's interval has the bound in it, unless it is wider than WIDEST to either side, as of few seeds: it
-    would have nearly any bound in it. None where there is no bound.
+    They are equal where the bound is in the error's interval, which reaches at most EQUAL to either side. None without a bound.
 
     >>> above_bound(9.7, (9.2, 10.2), 10.0), round(above_bound(11.0, (10.5, 11.5), 10.0), 6), above_bound(9.7, None, None)
     (0.0, 0.1, None)
@@ -140,7 +140,7 @@ def above_bound(rms: float, interval: Sequence[float] | None, bound: float | Non
     """
     if not bound:
         return None
-    if interval is not None and interval[0] <= bound <= interval[1] and interval[1] - interval[0] <= 2.0 * WIDEST * rms:
+    if interval is not None and interval[0] <= bound <= interval[1] and interval[1] - interval[0] <= 2.0 * EQUAL * rms:
         return 0.0
     return rms / bound - 1.0
 

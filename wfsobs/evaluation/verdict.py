@@ -13,6 +13,7 @@ from wfsobs.evaluation.budget import NOISE, TERMS, Budget, error_budget
 from wfsobs.evaluation.evidence import Evidence, gather_evidence
 from wfsobs.evaluation.rows import (
     BANDS,
+    EQUAL,
     JOINT_BOUNDS,
     NOTHING,
     ONE_PEAK,
@@ -81,7 +82,7 @@ class Contender:
     """An observer that can be the best.
 
     rms, interval : mean of its error over the seeds, or its error on the record, and the interval of that [um]
-    is_tie        : whether the error does not differ significantly from the smallest
+    is_tie        : whether the error is not significantly larger than the smallest, and by a share of EQUAL at most
     knowledge     : of `prior_knowledge`
     n_peaks       : peaks in its model: of those of the vibration where they are known
     limit         : the least error possible [um], and of which row of BOUNDS; None where it is not known
@@ -179,7 +180,7 @@ class Verdict:
 
     @property
     def ties(self) -> tuple[str, ...]:
-        """Observers whose error is larger, but not significantly so."""
+        """Observers whose errors are equal to the smallest."""
         return tuple(place.observer for place in self.places[1:] if place.is_tie)
 
     @property
@@ -306,13 +307,15 @@ def contenders(
     """
     column = [m.name for m in scenario.modes].index(mode)
     bounds = {s.observer: s.rms for s in scores if (s.target, s.mode) == (target, mode) and s.observer in BOUNDS}
-    leaders, out = evidence.leaders(target, mode), []
-    for name in evidence.ranking(target, mode):
+    ranked, leaders, out = evidence.ranking(target, mode), evidence.leaders(target, mode), []
+    smallest = min((float(evidence.errors[name, target, mode].mean()) for name in ranked), default=0.0)
+    for name in ranked:
         given, bound = given_lines(scenario, name, column), JOINT_BOUNDS.get(name, BOUND_BOTH)
         n_peaks = min(int(is_near(np.array(lines), given).sum()), len(given)) if lines else len(given)
         mean, interval = float(evidence.errors[name, target, mode].mean()), evidence.interval((name, target, mode))
         limit = (bounds[bound], bound) if bound in bounds else None
-        out.append(Contender(name, mean, interval, name in leaders, prior_knowledge(name), n_peaks, limit))
+        is_tie = name in leaders and mean <= (1.0 + EQUAL) * smallest
+        out.append(Contender(name, mean, interval, is_tie, prior_knowledge(name), n_peaks, limit))
     return tuple(out)
 
 

@@ -72,7 +72,7 @@ def standings_html(view: CampaignView, display: Display) -> str:
         "Error / limit": "geometric mean over the scenarios; the lowest theoretical limit of each",
         "95 %": "of error / limit, over the scenarios",
         "Above the best [%]": f"paired over the {'scenarios' if several else 'seeds'}, with its interval of 95 %",
-        "Rank": f"best: all others differ significantly; tied: statistically equal to the best; {NOTHING}: not tested",
+        "Rank": f"best: all others differ significantly; tied: not significantly different from the best; {NOTHING}: not tested",
         "Wins": "scenarios with the smallest error, and how many of them are significant",
         "Records": "",
         "Failed": "runs without an estimate",

@@ -208,7 +208,7 @@ def verdict_text(margin: float | None, ties: Iterable[str], is_decided: bool, fe
     """Say how far the best is before the next; few : what there is too little of where that is not decided."""
     said = "" if margin is None else f", {100 * margin:.0f} % before the next"
     tied = ", ".join(ties)
-    return said + (f"; statistically equal to {tied}" if tied else "" if is_decided else f"; too few {few} to tell")
+    return said + (f"; not significantly different from {tied}" if tied else "" if is_decided else f"; too few {few} to tell")
 
 
 def map_square(
