@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import groupby
-from math import inf, sqrt
+from math import inf, isnan, sqrt
 from statistics import median
 from typing import Any
 
@@ -199,7 +199,11 @@ def score_table(rows: Sequence[Row]) -> Table:
             same[0]["needs"],
             f"{error * 1e3:.2f}",
             interval_text(interval, 1e3),
-            *(("-" if above is None else f"{100.0 * above:+.0f} %" if above else "at",) if bounded else ()),
+            *(
+                ("-" if above is None else "?" if isnan(above) else f"{100.0 * above:+.0f} %" if above else "at",)
+                if bounded
+                else ()
+            ),
             *((median_text(same, "sd_um", 2, 1e3),) if stated else ()),
             f"{median(r['truth_rms_um'] for r in same) * 1e3:.2f}",
             median_text(same, "normalised_rms", 3),

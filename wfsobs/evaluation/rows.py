@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from math import nan
 from typing import Any
 
 import numpy as np
@@ -131,17 +132,18 @@ apart may well be different."""
 def above_bound(rms: float, interval: Sequence[float] | None, bound: float | None) -> float | None:
     """Return by which share an error is above the bound of what the observer measures, 0 where they are equal.
 
-    They are equal where the bound is in the error's interval, which reaches at most EQUAL to either side. None without a bound.
+    With the bound in the error's interval they are, but if that reaches further than EQUAL to either side nobody knows: NaN.
+    None without a bound.
 
     >>> above_bound(9.7, (9.2, 10.2), 10.0), round(above_bound(11.0, (10.5, 11.5), 10.0), 6), above_bound(9.7, None, None)
     (0.0, 0.1, None)
-    >>> round(above_bound(48.0, (30.0, 66.0), 32.0), 6)
-    0.5
+    >>> above_bound(48.0, (30.0, 66.0), 32.0)
+    nan
     """
     if not bound:
         return None
-    if interval is not None and interval[0] <= bound <= interval[1] and interval[1] - interval[0] <= 2.0 * EQUAL * rms:
-        return 0.0
+    if interval is not None and interval[0] <= bound <= interval[1]:
+        return 0.0 if interval[1] - interval[0] <= 2.0 * EQUAL * rms else nan
     return rms / bound - 1.0
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from math import isnan
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -100,7 +101,7 @@ class Contender:
 
     @property
     def above_limit(self) -> float | None:
-        """By which share the error is above the limit: 0 where its interval has the limit in it."""
+        """By which share the error is above the limit: of `above_bound`."""
         return above_bound(self.rms, self.interval, self.limit[0] if self.limit else None)
 
     @property
@@ -214,9 +215,7 @@ class Verdict:
                 words += ["statistically equal to the best"] * place.is_tie
             else:
                 if place.above_limit is not None and place.limit is not None:
-                    percent = round(100.0 * place.above_limit)
-                    where = f"{abs(percent)} % {'above' if percent > 0 else 'below'}" if percent else "at"
-                    words.append(f"{where} the theoretical limit using {USING[place.limit[1]]}")
+                    words.append(f"{_where(place.above_limit)} the theoretical limit using {USING[place.limit[1]]}")
                 if equal:
                     shown = equal if len(equal) <= MOST + 1 else [*equal[:MOST], f"{len(equal) - MOST} others"]
                     words.append(f"statistically equal to {_join(shown)}")
@@ -362,6 +361,18 @@ def sentence_of_several(verdicts: Sequence[Verdict], scales: Sequence[float], un
                 f"{f', at the theoretical limit in {n_equal}' if n_equal else ''}."
             )
     return " ".join(parts)
+
+
+def _where(above: float) -> str:
+    """Say where an error is that is above the limit by a share, NaN where that is not known.
+
+    >>> _where(0.123), _where(-0.5), _where(0.001), _where(float("nan"))
+    ('12 % above', '50 % below', 'at', 'possibly at')
+    """
+    if isnan(above):
+        return "possibly at"
+    percent = round(100.0 * above)
+    return f"{abs(percent)} % {'above' if percent > 0 else 'below'}" if percent else "at"
 
 
 def _join(names: Sequence[str]) -> str:
