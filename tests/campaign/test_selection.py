@@ -111,6 +111,10 @@ def test_rows_are_those_of_some_scenarios_a_target_and_a_mode(folder):
         if r["cell"] in (0, 2) and (r["target"], r["mode"]) == ("vibration", "tilt")
     ]
     assert rows == wanted and {cell for cell, *_ in rows} == {0, 2}
+    said = table(folder).stdout
+    groups = [f"{target:10} │ {mode}" for target in ("turbulence", "vibration", "total") for mode in ("tip", "tilt")]
+    places = [said.index(group) for group in groups]
+    assert places == sorted(places), "in the order of the dashboard"
     short = table(folder, "--only", "scenario=other", "--mode", "tip").stdout
     assert "other" in short and "the one" not in short and "tilt" not in short
 

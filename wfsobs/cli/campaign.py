@@ -32,7 +32,7 @@ from wfsobs.campaign.store import RESULTS, add_settings, finished_runs, folder_p
 from wfsobs.cli.options import json_option
 from wfsobs.cli.show import new_table, print_json, print_note, show_table
 from wfsobs.evaluation.rows import NOT_OBSERVERS
-from wfsobs.evaluation.scores import COMMON_BOUNDS
+from wfsobs.evaluation.scores import COMMON_BOUNDS, SCORED
 from wfsobs.observers import OBSERVERS
 from wfsobs.settings.errors import SettingError
 
@@ -91,7 +91,7 @@ def summary_table(plan: Campaign, rows: object, title: str) -> Table:
     caption = "+-: interval of 95 % of the paired difference from the best; ~: not significant"
     out = new_table(texts, numbers, no_wrap=False, title=title, caption=caption)
     before = None
-    for one in compare(rows):
+    for one in sorted(compare(rows), key=lambda it: (it.cell, *_place(plan, it.target, it.mode))):
         key = (one.cell, one.target, one.mode)
         settings = ", ".join(f"{path.split('.')[-1]} = {value}" for path, value in plan.cells[one.cell].changes.items())
         new = key != before
@@ -109,6 +109,11 @@ def summary_table(plan: Campaign, rows: object, title: str) -> Table:
         )
         before = key
     return out
+
+
+def _place(plan: Campaign, target: str, mode: str) -> tuple[int, int]:
+    """Return the place of a target and a mode in a table: turbulence first, modes as in the scenario."""
+    return (*SCORED, "residual").index(target), [m.name for m in plan.cells[0].scenario().modes].index(mode)
 
 
 def failure_lines(failures: Mapping[tuple[str, str], int]) -> list[str]:
@@ -139,7 +144,7 @@ def print_together(folder: Path, only: Sequence[str], target: str | None, mode: 
     check_known("target", target, sorted({key[0] for key in state.errors}))
     check_known("mode", mode, sorted({key[1] for key in state.errors}))
     keys = [key for key in state.errors if target in (None, key[0]) and mode in (None, key[1])]
-    rows = [row for key in keys for row in standings(state, *key, cells)]
+    rows = [row for key in sorted(keys, key=lambda it: _place(state.plan, *it)) for row in standings(state, *key, cells)]
     if as_csv:
         out = csv.writer(sys.stdout, lineterminator="\n")
         out.writerow([field.name for field in fields(TogetherRow)])
