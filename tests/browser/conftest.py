@@ -38,13 +38,18 @@ SEEDS = "view.seeds="
 QUICK = "?run.duration=2&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.5"
 """Settings of a short record: what one test has had run, a server knows for the next."""
 PRESET = {"run.duration": 4.0, "run.warm_up": 1.0, "adaptive.window": 1.0}
-"""What the first preset has on the server of the tests: pages that open with it, and changes on them, take less than half."""
+"""What the first preset has on the server of the tests: pages that open with it, and changes on them, take less than half.
+
+An uncertain plant has fewer points there, too."""
 SERVE = f"""
 import sys
+from functools import partial
 from panel.command import main
+from wfsobs.closed_loop import envelope
 from wfsobs.scenario.presets import PRESETS
 whole = PRESETS["paper"]
 PRESETS["paper"] = lambda: whole().replace({PRESET})
+envelope.plant_envelope = partial(envelope.plant_envelope, points=50)
 sys.argv[0] = "panel"
 main()
 """
@@ -173,21 +178,11 @@ def with_seeds(url: str, seeds: int) -> str:
     return url if not seeds or SEEDS in url else f"{url}{'&' if '?' in url else '?'}{SEEDS}{seeds}"
 
 
-Contexts = Callable[..., BrowserContext]
-
-
 @pytest.fixture(scope="session")
-def contexts(browser: Browser) -> Contexts:
-    """A function that gives the one browsing context of some options: what a page has loaded, the next need not compile again."""
-    made: dict[str, BrowserContext] = {}
-
-    def context(**options: Any) -> BrowserContext:
-        named = repr(sorted(options.items()))
-        if named not in made:
-            made[named] = browser.new_context(**options)
-            made[named].add_init_script("try { localStorage.setItem('wfsobs-tour', 'offered') } catch {}")  # no visitor's first
-        return made[named]
-
+def context(browser: Browser) -> BrowserContext:
+    """The one browsing context: what a page has loaded, the next need not compile again."""
+    context = browser.new_context()
+    context.add_init_script("try { localStorage.setItem('wfsobs-tour', 'offered') } catch {}")  # no visitor's first
     return context
 
 
@@ -200,7 +195,7 @@ def leave(page: Page) -> None:
 
 
 @contextmanager
-def opening(server: Server, contexts: Contexts) -> Iterator[Any]:
+def opening(server: Server, context: BrowserContext) -> Iterator[Any]:
     """A function that opens the dashboard in a window of some size and waits for the first result; in the end they close.
 
     It has one seed, so that nothing runs on in idle time and takes the processor from the next test; 0: as many as a visitor has.
@@ -209,10 +204,11 @@ def opening(server: Server, contexts: Contexts) -> Iterator[Any]:
     opened: list[tuple[Page, Watched]] = []
 
     def open_it(
-        width: int = 1400, height: int = 1000, url: str = "", wait: bool = True, seeds: int = 1, script: str = "", **options: Any
+        width: int = 1400, height: int = 1000, url: str = "", wait: bool = True, seeds: int = 1, script: str = "", **media: Any
     ) -> Page:
-        page = contexts(**options).new_page()
+        page = context.new_page()
         page.set_viewport_size({"width": width, "height": height})
+        page.emulate_media(**media)
         page.set_default_timeout(PATIENCE)
         if script:
             page.add_init_script(script)
@@ -232,16 +228,16 @@ def opening(server: Server, contexts: Contexts) -> Iterator[Any]:
 
 
 @pytest.fixture
-def open_page(server: Server, contexts: Contexts) -> Iterator[Any]:
+def open_page(server: Server, context: BrowserContext) -> Iterator[Any]:
     """As `opening`, for the pages of one test."""
-    with opening(server, contexts) as open_it:
+    with opening(server, context) as open_it:
         yield open_it
 
 
 @pytest.fixture(scope="module")
-def open_shared(server: Server, contexts: Contexts) -> Iterator[Any]:
+def open_shared(server: Server, context: BrowserContext) -> Iterator[Any]:
     """As `opening`, for pages that several tests of a module look at: a page takes longer to open than most tests to look."""
-    with opening(server, contexts) as open_it:
+    with opening(server, context) as open_it:
         yield open_it
 
 

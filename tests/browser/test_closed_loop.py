@@ -5,16 +5,29 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from playwright.sync_api import expect
+import pytest
+from playwright.sync_api import Page, expect
 
 from tests.browser.conftest import until
 
 QUICK = "?run.duration=2&gpr_online.training_size=40&gpr_online.depth=20"
 
 
-def test_controllers_side_by_side(open_page: Any, server: Any) -> None:
-    page = open_page(url=server.url + QUICK)
+@pytest.fixture(scope="module")
+def shared(open_shared: Any, server: Any) -> Page:
+    page = open_shared(url=server.url + QUICK)
     page.get_by_role("button", name="Closed loop", exact=True).click()
+    return page
+
+
+@pytest.fixture
+def page(shared: Page) -> Page:
+    """The page in a wide window."""
+    shared.set_viewport_size({"width": 1400, "height": 1000})
+    return shared
+
+
+def test_controllers_side_by_side(page: Page) -> None:
     expect(page.get_by_role("heading", name="Residual in closed loop")).to_be_visible()
     for name in ("integrator+gpr-online", "lqg-multirate-multi", "integrator", "none"):
         expect(page.locator(f'tr[data-controller="{name}"] td').first).to_have_text(re.compile(r"\d$"))
@@ -30,9 +43,7 @@ def test_controllers_side_by_side(open_page: Any, server: Any) -> None:
     until(page, "() => document.documentElement.scrollWidth <= 390")
 
 
-def test_an_uncertain_plant_is_asked_for(open_page: Any, server: Any) -> None:
-    page = open_page(url=server.url + QUICK)
-    page.get_by_role("button", name="Closed loop", exact=True).click()
+def test_an_uncertain_plant_is_asked_for(page: Page) -> None:
     page.get_by_role("button", name="Compute", exact=True).click()
     expect(page.get_by_role("button", name="Stop", exact=True)).to_be_enabled()
     worst = page.locator('tr[data-controller="integrator"] td').nth(3)

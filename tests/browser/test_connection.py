@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import BrowserContext, Page, expect
 
 from tests.browser.conftest import PATIENCE, QUICK, answered, finished, leave, until, with_seeds
 
@@ -154,9 +154,9 @@ LOST = """() => {
 
 
 @pytest.fixture(scope="module")
-def opened(contexts: Any, cable: Cable, host: Host) -> Iterator[Page]:
+def opened(context: BrowserContext, cable: Cable, host: Host) -> Iterator[Page]:
     """The page at the end of the cable, its first run over."""
-    page = contexts().new_page()
+    page = context.new_page()
     page.set_viewport_size({"width": 1400, "height": 1000})
     page.set_default_timeout(PATIENCE)
     page.add_init_script(f"({ALERTS})(), ({LOST})()")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -29,17 +30,31 @@ HOLD_BACK = """() => {
 """Has what the browser says wait until the test lets it go."""
 
 
-@pytest.fixture
-def page(open_page: Any, server: Any) -> Page:
+@pytest.fixture(scope="module")
+def shared(open_shared: Any, server: Any) -> Page:
     """A page whose handles are shown; its record is short, as every change runs it anew."""
-    page = open_page(url=server.url + QUICK)
+    page = open_shared(url=server.url + QUICK)
     (settle,) = re.findall(r"SETTLE = (\d+)", asset("handles.js"))
     page.evaluate(HOLD, int(settle))
     expect(page.locator(".seeds")).to_have_text("one record")  # what further seeds say of the errors would move the figures
     expect(page.get_by_role("slider", name="Peak 15", exact=True)).to_have_count(0)
     page.get_by_role("checkbox", name="Edit figure").check()
-    expect(predicted(page, "multirate-multi")).to_have_text("10.8")
     return page
+
+
+@pytest.fixture
+def page(shared: Page) -> Iterator[Page]:
+    """The page as it was opened; what a test has changed is undone."""
+    expect(predicted(shared, "multirate-multi")).to_have_text("10.8")
+    yield shared
+    shared.keyboard.press("Escape")
+    shared.get_by_role("button", name="Explore", exact=True).click()
+    undo = shared.get_by_role("button", name="Undo")
+    answered(shared)
+    while undo.is_enabled():
+        undo.click()
+        answered(shared)
+    finished(shared)
 
 
 def handle(page: Page, name: str) -> Locator:

@@ -113,7 +113,7 @@ def test_a_session_from_runs_to_a_file_and_back(open_page: Any, server: Any, tmp
     file = tmp_path / "mine.wfsobs-session"
     download.value.save_as(file)
 
-    page = open_page(url=f"{server.url}?run.duration=2&run.warm_up=0.5&turbulence.wind_speed=11")
+    page = open_page(url=f"{server.url}{QUICK}&turbulence.wind_speed=11")
     expect(page.get_by_role("textbox", name="m/s")).to_have_value("11")
     (tmp_path / "none.wfsobs-session").write_bytes(file.read_bytes()[:500])
     page.get_by_label("Record file").set_input_files(tmp_path / "none.wfsobs-session")

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import BrowserContext, Page, expect
 
-from tests.browser.conftest import PATIENCE, Contexts, leave
+from tests.browser.conftest import PATIENCE, leave
 
 FLAGS = ["--public", "--runs", "1", "--max-duration", "100", "--lifetime", "5"]
 """Runs of a page that is gone stop with its session, and only then the next one begins."""
@@ -32,8 +32,8 @@ def serve(make_server: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     assert server.errors(0) == []
 
 
-def new_page(contexts: Contexts, serve: Any, query: str) -> Page:
-    page = contexts().new_page()
+def new_page(context: BrowserContext, serve: Any, query: str) -> Page:
+    page = context.new_page()
     page.set_viewport_size({"width": 1400, "height": 1000})
     page.set_default_timeout(PATIENCE)
     page.goto(serve.url + query)
@@ -41,12 +41,12 @@ def new_page(contexts: Contexts, serve: Any, query: str) -> Page:
 
 
 @pytest.fixture
-def visit(contexts: Contexts, serve: Any) -> Iterator[Callable[..., Page]]:
+def visit(context: BrowserContext, serve: Any) -> Iterator[Callable[..., Page]]:
     """A function that opens the page for one more visitor: every page has a session of its own."""
     opened: list[Page] = []
 
     def open_it(query: str = "") -> Page:
-        opened.append(new_page(contexts, serve, query))
+        opened.append(new_page(context, serve, query))
         return opened[-1]
 
     yield open_it
@@ -92,9 +92,9 @@ def test_visitors_wait_in_line_with_every_kind_of_work_and_a_click_goes_first(vi
 
 
 @pytest.fixture(scope="module")
-def limited(contexts: Contexts, serve: Any) -> Iterator[Page]:
+def limited(context: BrowserContext, serve: Any) -> Iterator[Page]:
     """A page whose link has more than the limits, for the tests below."""
-    page = new_page(contexts, serve, "?run.duration=101&turbulence.wind_speed=21")
+    page = new_page(context, serve, "?run.duration=101&turbulence.wind_speed=21")
     status(page, "Done in")
     yield page
     leave(page)
