@@ -40,7 +40,8 @@ def controls(make_store: Any, loop: Any) -> Controls:
 
 
 def open_all(controls: Controls) -> None:
-    controls.accordion.active = list(range(len(controls.topics)))
+    for name in controls.topics:
+        controls.topic_list.open(name)
 
 
 def field_of(controls: Controls, path: str) -> Any:
@@ -100,7 +101,7 @@ def test_what_matters_most_stands_first(controls: Controls) -> None:
 
 def test_topics_are_filled_when_opened(controls: Controls) -> None:
     assert "loop.gain" not in controls.fields
-    controls.accordion.active = [*controls.accordion.active, list(controls.topics).index("loop")]
+    controls.topic_list.open("loop")
     assert "loop.gain" in controls.fields
 
 

@@ -11,7 +11,7 @@ from playwright.sync_api import Browser, Page, expect
 from tests.browser.conftest import PATIENCE, QUICK, finished, until
 from wfsobs.observers import OBSERVERS
 
-TOPICS_AT = """() => [...(window.Bokeh?.index?.query((it) => it.model.data?._names && it.model.data.active) ?? [])]
+TOPICS_AT = """() => [...(window.Bokeh?.index?.query((it) => it.model.class_name === "Headings") ?? [])]
     .map((it) => it.el.getBoundingClientRect().top).find((top) => top > 0)"""
 """Where the topics of the drawer begin."""
 
@@ -200,3 +200,23 @@ def test_a_heading_says_what_differs(phone: Page) -> None:
     page.get_by_role("textbox", name="m/s").fill("20")
     page.get_by_role("textbox", name="m/s").press("Enter")
     expect(page.get_by_role("button", name=re.compile("Turbulence · 1 changed"))).to_be_visible()
+
+
+def test_topics_open_below_their_names_by_keyboard(phone: Page) -> None:
+    """What is opened above another moves that; a name keeps the focus, and Tab leads from it to its first field."""
+    fields = {"loop": "Integrator gain g", "telescope": "Aperture diameter D [m]"}
+    for topic, field in fields.items():
+        heading = phone.locator(f"[data-key={topic}]")
+        heading.focus()
+        phone.keyboard.press("Enter")
+        expect(heading).to_have_attribute("aria-expanded", "true")
+        expect(phone.get_by_role("textbox", name=field)).to_be_visible()
+        expect(heading).to_be_focused()
+        phone.keyboard.press("Tab")
+        expect(phone.locator("[data-key]:focus")).to_have_count(0)
+    for topic, field in fields.items():
+        heading = phone.locator(f"[data-key={topic}]")
+        heading.focus()
+        phone.keyboard.press("Enter")
+        expect(phone.get_by_role("textbox", name=field)).to_have_count(0)
+        expect(heading).to_be_focused()

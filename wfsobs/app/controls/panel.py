@@ -14,6 +14,7 @@ import param
 
 from wfsobs.app.controls.fields import ROOM, TAG, Field, RowEditor, idle_html, make_field
 from wfsobs.app.controls.names import preset_line, preset_title, setting_name
+from wfsobs.app.controls.topics import TopicList
 from wfsobs.app.display import label_of
 from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.store import Store
@@ -204,17 +205,11 @@ class Controls:
         self._before: RunResults | None = None
         self._changed_part: Field | RowEditor | None = None
         self.topics: Final = _names()
-        self.rooms: Final = {name: pn.Column(**WIDE) for name in self.topics}
-        self.titles = dict(self.topics)
-        self.accordion: Final = pmui.Accordion(
-            *((title, self.rooms[name]) for name, title in self.topics.items()),
-            title_variant="body2",
-            variant="outlined",
-            disable_gutters=True,
-            dynamic=True,
-            sizing_mode="stretch_width",
-            margin=(8, 0),
-        )
+        self.rooms: Final = {
+            name: pn.Column(sizing_mode="stretch_width", margin=(4, 8, 12, 8), styles={"font-size": "14px"})
+            for name in self.topics
+        }
+        self.topic_list: Final = TopicList(self.topics, self.open_topic)
         self._watch()
         self._refresh_run()
         self._refresh_preset()
@@ -232,7 +227,7 @@ class Controls:
             pn.Row(self.undo, self.redo, self.reset, min_height=43, **WIDE),
             *first,
             self.search,
-            self.accordion,
+            self.topic_list.view,
             sizing_mode="stretch_width",
             margin=(8, 14),
         )
@@ -243,20 +238,20 @@ class Controls:
 
     def open_setting(self, path: str) -> None:
         """Open the topic of a setting."""
-        index = list(self.topics).index(topic_of(path))
-        if path not in AT_HAND and index not in self.accordion.active:
-            self.accordion.active = [*self.accordion.active, index]
+        if path not in AT_HAND:
+            self.topic_list.open(topic_of(path))
 
-    def open_topic(self, name: str) -> None:
-        """Fill a topic with its fields, the first time it is opened."""
+    def open_topic(self, name: str) -> pn.Column:
+        """Return a topic's room, filled with its fields the first time it is opened."""
         column = self.rooms[name]
         if len(column):
-            return
+            return column
         own = [path for path, _ in self.store.scenario.lists() if topic_of(path) == name and path not in AT_HAND]
         views = [*((path, self._part(path).view) for path in own), *self._fields_of(name)]
         self.parts += views
         self._refresh_parts()
         column[:] = [view for _, view in views]
+        return column
 
     def take(self, change: dict[str, Any]) -> None:
         """Make a change of the visitor's that did not arrive: {setting, value} of a box, {setting, message} of a table.
@@ -321,7 +316,6 @@ class Controls:
 
     def _watch(self) -> None:
         self.preset.param.watch(self._on_choice, "value")
-        self.accordion.param.watch(self._on_open, "active")
         self.store.param.watch(self._refresh_preset, ["preset", "can_undo", "can_redo"])
         self.store.param.watch(once(self._count_changes, AFTERWARDS_MS), ["scenario", "preset"])
         self.store.param.watch(self._refresh_parts, ["scenario", "source"])
@@ -335,11 +329,6 @@ class Controls:
         if event.new != self.store.preset:
             self.store.choose(event.new)
 
-    def _on_open(self, event: Any) -> None:
-        names = list(self.topics)
-        for index in event.new:
-            self.open_topic(names[index])
-
     def _refresh_preset(self, *_: object) -> None:
         self.preset.value = self.store.preset
         self.undo.disabled, self.redo.disabled = not self.store.can_undo, not self.store.can_redo
@@ -351,11 +340,9 @@ class Controls:
         self.preset.helper_text = told
         self.reset.disabled = not changed
         count = Counter(map(topic_of, changed))
-        titles = {name: title + (f" · {count[name]} changed" if count[name] else "") for name, title in self.topics.items()}
-        if titles != self.titles:
-            self.titles = titles
-            # All at once: Bokeh looks through the whole page for each.
-            self.accordion[:] = [(title, self.rooms[name]) for name, title in titles.items()]
+        self.topic_list.rename(
+            {name: title + (f" · {count[name]} changed" if count[name] else "") for name, title in self.topics.items()}
+        )
 
     def _show_effect(self, event: Any) -> None:
         """Say below the one setting that changed what came of it."""
