@@ -34,10 +34,10 @@ class TestSearch:
         assert "kalman.vibration_rms" not in controls.fields
         search._handle_msg({"path": "kalman.vibration_rms"})
         assert "kalman.vibration_rms" in controls.fields
-        assert controls.topic_list.opened == ["kalman"]
+        assert controls.topic_list.open_topics == ["kalman"]
         search._handle_msg({"path": "no.such"})
         search._handle_msg({"path": "turbulence.wind_speed"})
-        assert controls.topic_list.opened == ["kalman"], "nothing to open: unknown, or above the topics"
+        assert controls.topic_list.open_topics == ["kalman"], "nothing to open: unknown, or above the topics"
 
 
 class TestHeadings:

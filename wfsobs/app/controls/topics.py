@@ -27,7 +27,7 @@ class TopicList:
     def __init__(self, titles: Mapping[str, str], room_of: Callable[[str], pn.Column]):
         """Show all closed. titles : topic -> title;  room_of : gives the contents of a topic that is opened."""
         self.titles = dict(titles)
-        self.opened: list[str] = []
+        self.open_topics: list[str] = []
         self.view: Final = pn.Column(sizing_mode="stretch_width", margin=(8, 0))
         self._room_of = room_of
         self._headings: list[Headings] = []
@@ -35,7 +35,7 @@ class TopicList:
 
     def open(self, name: str) -> None:
         """Open a topic, unless it is."""
-        if name not in self.opened:
+        if name not in self.open_topics:
             self._toggle({"key": name})
 
     def rename(self, titles: Mapping[str, str]) -> None:
@@ -47,7 +47,7 @@ class TopicList:
     def _toggle(self, message: Mapping[str, Any]) -> None:
         name = message.get("key")
         if name in self.titles:
-            self.opened = [*self.opened, name] if name not in self.opened else [it for it in self.opened if it != name]
+            self.open_topics = [*self.open_topics, name] if name not in self.open_topics else [it for it in self.open_topics if it != name]
             self._draw()
 
     def _draw(self) -> None:
@@ -55,13 +55,13 @@ class TopicList:
         pieces: list[list[str]] = [[]]
         for name in self.titles:
             pieces[-1].append(name)
-            if name in self.opened:
+            if name in self.open_topics:
                 pieces.append([])
         pieces = [piece for piece in pieces if piece]
         self._headings += [Headings(self._toggle, **WIDE) for _ in pieces[len(self._headings) :]]
         parts: list[Any] = []
         for piece, headings in zip(pieces, self._headings, strict=False):
-            is_open = piece[-1] in self.opened
+            is_open = piece[-1] in self.open_topics
             headings.html = render(
                 "topics.html", titles={name: self.titles[name] for name in piece}, opened=piece[-1] if is_open else ""
             )
