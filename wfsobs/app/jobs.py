@@ -186,7 +186,7 @@ REST = 1.0
 
 
 class JobQueue:
-    """Threads of their own for as many jobs at once as there are workers, and the results kept of jobs that have a key.
+    """Threads of their own, as many as jobs may be done at once, and the results kept of jobs that have a key.
 
     Clicks go before sweeps, and both before what is done in idle time, which gives way to them. Then turns are taken: the first
     job of every owner before the second of anybody, whoever comes later beginning with the turn that is being done, and within a
@@ -203,9 +203,7 @@ class JobQueue:
         self._turn = 0  # the latest that has begun
         self._last_answer = -math.inf  # when something was last handed over, which is to be drawn
         self._change = threading.Condition()
-        self.workers: int = workers
-        # One more: a request need not wait for a job in idle time to give way.
-        self._threads = [threading.Thread(target=self._work, name=f"wfsobs-work-{i}", daemon=True) for i in range(workers + 1)]
+        self._threads = [threading.Thread(target=self._work, name=f"wfsobs-work-{i}", daemon=True) for i in range(workers)]
         for thread in self._threads:
             thread.start()
 
@@ -259,6 +257,11 @@ class JobQueue:
         if job in self._waiting:
             self._waiting.remove(job)
             self._tell_places()
+
+    @property
+    def workers(self) -> int:
+        """Jobs that may be done at once."""
+        return len(self._threads)
 
     @property
     def length(self) -> int:
@@ -331,9 +334,8 @@ class JobQueue:
         return sorted(self._waiting, key=place)
 
     def _has_room(self, job: Job) -> bool:
-        """Whether a job may begin, beside others that do not give way to it; one place is kept for those that come to an end."""
-        beside = [other for other in self._running if job.priority == IDLE_TIME or other.priority != IDLE_TIME]
-        return len(beside) < self.workers and (not job.endless or sum(other.endless for other in beside) < self.workers - 1)
+        """Whether a job may begin: one place is kept for those that come to an end."""
+        return not job.endless or sum(other.endless for other in self._running) < len(self._threads) - 1
 
     @property
     def _requests(self) -> list[Job]:
@@ -345,9 +347,9 @@ class JobQueue:
         return bool(self._requests)
 
     def _tell_places(self) -> None:
-        """Tell their places to the jobs that wait; a free thread takes those that need not."""
-        for place, job in enumerate(self._line(), 1):
-            if len(self._running) == len(self._threads) or not self._has_room(job):
+        """Tell the waiting jobs their places; a free thread takes the next job at once."""
+        if len(self._running) >= len(self._threads):
+            for place, job in enumerate(self._line(), 1):
                 job.tell_place(place)
 
 
