@@ -205,10 +205,7 @@ class Controls:
         self._before: RunResults | None = None
         self._changed_part: Field | RowEditor | None = None
         self.topics: Final = _names()
-        self.rooms: Final = {
-            name: pn.Column(sizing_mode="stretch_width", margin=(4, 8, 12, 8), styles={"font-size": "14px"})
-            for name in self.topics
-        }
+        self.rooms: Final = {name: pn.Column(sizing_mode="stretch_width", margin=(4, 8, 12, 8)) for name in self.topics}
         self.topic_list: Final = TopicList(self.topics, self.open_topic)
         self._watch()
         self._refresh_run()
@@ -296,7 +293,7 @@ class Controls:
             *_, above, _name = setting.split(".")
             if above != heading:
                 heading = above
-                pane = html(margin=(8, 0, 0, 0))
+                pane = html(margin=(8, 0, 0, 0), styles={"font-size": "13px"})
                 self.headings[f"{name}.{above}"] = escape(str(group.settings()[above].label)), pane
                 views.append((f"{name}.{above}", pane))
             views.append((setting, self._part(setting).view))

@@ -47,7 +47,8 @@ class TopicList:
     def _toggle(self, message: Mapping[str, Any]) -> None:
         name = message.get("key")
         if name in self.titles:
-            self.open_topics = [*self.open_topics, name] if name not in self.open_topics else [it for it in self.open_topics if it != name]
+            others = [it for it in self.open_topics if it != name]
+            self.open_topics = others if name in self.open_topics else [*others, name]
             self._draw()
 
     def _draw(self) -> None:
