@@ -367,7 +367,7 @@ class RowEditor:
         if why != self.idle:
             self.idle = why
             name = f"<b>{escape(self.label)}</b>{idle_html(why)}"
-            self.view[:] = [html(name, margin=(8, 0))] if why else [self.table]
+            self.view[:] = [html(name, margin=(8, 0), styles={"font-size": "13px"})] if why else [self.table]
 
     def handle(self, msg: dict[str, Any]) -> None:
         """Do what a message of the table says."""
