@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from wfsobs.app.controls.panel import settings_found
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.scenario import Scenario
@@ -41,6 +43,22 @@ class TestSearch:
 
 
 class TestHeadings:
+    def test_what_no_heading_says_opens_nothing(self, dashboard: Dashboard) -> None:
+        topics = dashboard.controls.topic_list
+        (headings,) = topics.view
+        for message in ({}, {"key": "no.such"}, {"key": ["kalman"]}, {"key": None, "action": "toggle"}):
+            headings._handle_msg(message)
+        assert topics.open_topics == [] and topics.view.objects == [headings]
+        for name in ("run", "kalman"):
+            headings._handle_msg({"action": "toggle", "key": name})
+        assert [type(part).__name__ for part in topics.view] == ["Headings", "Column", "Headings", "Column", "Headings"]
+        assert re.findall(r'data-key="(\w+)" aria-expanded="true"', "".join(it.html for it in topics.view[::2])) == [
+            "kalman",
+            "run",
+        ]
+        headings._handle_msg({"action": "toggle", "key": "run"})
+        assert topics.open_topics == ["kalman"] and len(topics.view) == 3
+
     def test_they_count_what_differs_from_the_preset(self, dashboard: Dashboard) -> None:
         dashboard.store.choose("paper")
         plain = titles(dashboard)

@@ -45,7 +45,7 @@ class TopicList:
             self._draw()
 
     def _toggle(self, message: Mapping[str, Any]) -> None:
-        name = message.get("key")
+        name = str(message.get("key"))
         if name in self.titles:
             others = [it for it in self.open_topics if it != name]
             self.open_topics = others if name in self.open_topics else [*others, name]
