@@ -3,6 +3,7 @@
 import csv
 
 import numpy as np
+import pyarrow.compute as pc
 import pytest
 from click.testing import CliRunner
 
@@ -11,6 +12,7 @@ from wfsobs.campaign.run import run_rows
 from wfsobs.campaign.selection import cells_where, condition, plan_axes
 from wfsobs.campaign.store import open_folder, read_results, write_batch
 from wfsobs.cli import main
+from wfsobs.cli.campaign import summary_table
 from wfsobs.settings.errors import SettingError
 
 PLAN = """
@@ -102,7 +104,7 @@ def table(*arguments):
     return CliRunner().invoke(main, ["campaign", "table", *map(str, arguments)])
 
 
-def test_rows_are_those_of_some_scenarios_a_target_and_a_mode(folder):
+def test_rows_are_those_of_some_scenarios_a_target_and_a_mode(folder, plan):
     found = table(folder, "--only", "turbulence.wind_speed=20", "--target", "vibration", "--mode", "tilt", "--csv")
     rows = [(int(r["cell"]), r["name"], float(r["rms_nm"])) for r in csv.DictReader(found.stdout.splitlines())]
     wanted = [
@@ -115,6 +117,10 @@ def test_rows_are_those_of_some_scenarios_a_target_and_a_mode(folder):
     groups = [f"{target:10} │ {mode}" for target in ("turbulence", "vibration", "total") for mode in ("tip", "tilt")]
     places = [said.index(group) for group in groups]
     assert places == sorted(places), "in the order of the dashboard"
+    rows = read_results(folder)
+    other = rows.set_column(rows.column_names.index("mode"), "mode", pc.replace_substring(rows["mode"], "tilt", "astigmatism"))
+    table_of_others = summary_table(plan, other, "")
+    assert [m for m in table_of_others.columns[3].cells if m][:2] == ["tip", "astigmatism"], "modes of other scenarios come last"
     short = table(folder, "--only", "scenario=other", "--mode", "tip").stdout
     assert "other" in short and "the one" not in short and "tilt" not in short
 

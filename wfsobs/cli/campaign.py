@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from wfsobs.campaign.compare import QUANTILES, compare
+from wfsobs.campaign.compare import QUANTILES, Comparison, compare
 from wfsobs.campaign.follow import CampaignFolder
 from wfsobs.campaign.plan import Campaign, load_plan
 from wfsobs.campaign.pools import DaskCluster, Processes, usable_processors
@@ -90,8 +90,14 @@ def summary_table(plan: Campaign, rows: object, title: str) -> Table:
     texts, numbers = ("Scenario", "Settings", "Target", "Mode", "Name"), ("rms, nm", SPREAD, "above the best, nm", "seeds")
     caption = "+-: interval of 95 % of the paired difference from the best; ~: not significant"
     out = new_table(texts, numbers, no_wrap=False, title=title, caption=caption)
+    targets, modes = (*SCORED, "residual"), [m.name for m in plan.cells[0].scenario().modes]
+
+    def place(one: Comparison) -> tuple[int, int, int, str]:
+        """Order scenarios, targets and modes as the dashboard does; modes that the first scenario has not come last."""
+        return one.cell, targets.index(one.target), modes.index(one.mode) if one.mode in modes else len(modes), one.mode
+
     before = None
-    for one in sorted(compare(rows), key=lambda it: (it.cell, *_place(plan, it.target, it.mode))):
+    for one in sorted(compare(rows), key=place):
         key = (one.cell, one.target, one.mode)
         settings = ", ".join(f"{path.split('.')[-1]} = {value}" for path, value in plan.cells[one.cell].changes.items())
         new = key != before
@@ -109,11 +115,6 @@ def summary_table(plan: Campaign, rows: object, title: str) -> Table:
         )
         before = key
     return out
-
-
-def _place(plan: Campaign, target: str, mode: str) -> tuple[int, int]:
-    """Return the place of a target and a mode in a table: turbulence first, modes as in the scenario."""
-    return (*SCORED, "residual").index(target), [m.name for m in plan.cells[0].scenario().modes].index(mode)
 
 
 def failure_lines(failures: Mapping[tuple[str, str], int]) -> list[str]:
@@ -144,7 +145,7 @@ def print_together(folder: Path, only: Sequence[str], target: str | None, mode: 
     check_known("target", target, sorted({key[0] for key in state.errors}))
     check_known("mode", mode, sorted({key[1] for key in state.errors}))
     keys = [key for key in state.errors if target in (None, key[0]) and mode in (None, key[1])]
-    rows = [row for key in sorted(keys, key=lambda it: _place(state.plan, *it)) for row in standings(state, *key, cells)]
+    rows = [row for key in keys for row in standings(state, *key, cells)]
     if as_csv:
         out = csv.writer(sys.stdout, lineterminator="\n")
         out.writerow([field.name for field in fields(TogetherRow)])

@@ -132,7 +132,7 @@ apart may well be different."""
 def above_bound(rms: float, interval: Sequence[float] | None, bound: float | None) -> float | None:
     """Return by which share an error is above the bound of what the observer measures, 0 where they are equal.
 
-    With the bound in the error's interval they are, but if that reaches further than EQUAL to either side nobody knows: NaN.
+    With the bound in the error's interval they are, unless that reaches further than EQUAL to either side: then NaN, not known.
     None without a bound.
 
     >>> above_bound(9.7, (9.2, 10.2), 10.0), round(above_bound(11.0, (10.5, 11.5), 10.0), 6), above_bound(9.7, None, None)
