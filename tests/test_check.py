@@ -55,6 +55,25 @@ def test_a_vibration_that_comes_for_a_while_is_found_where_it_is(section: int) -
     assert ratio == pytest.approx(1.0 + 12.5 / 0.256, rel=0.15)  # 128 bins: 9 % and their mean
 
 
+@pytest.mark.parametrize("gone", [slice(4000, 4300), slice(3000, 6000), slice(0, 500)])
+def test_missing_frames_are_no_change(gone: slice) -> None:
+    """Sections in which many are missing are not compared; of 100 records one has a change by chance."""
+    found = []
+    for seed in range(100):
+        z = disturbance(8000, np.random.default_rng(seed))
+        z[gone] = np.nan
+        found += find_changes(z, DT)
+    assert len(found) <= binom.isf(1e-4, 100, LEVEL)
+
+
+def test_a_change_beside_missing_frames_is_found_where_it_is() -> None:
+    z = disturbance(8000, np.random.default_rng(1))
+    z[:2500] = np.nan
+    z[5000:6000] += 5.0 * np.sin(2.0 * pi * 150.0 * DT * np.arange(1000))
+    ((_, _, where, _),) = find_changes(z, DT)
+    assert where == 5
+
+
 @pytest.fixture(scope="module")
 def record() -> Record:
     return simulate(PRESETS["paper"]().replace({"run.duration": 5.0, "sensors.lgs_low_frequency_rms": 0.0}))

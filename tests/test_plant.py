@@ -189,7 +189,7 @@ def test_signals_that_tell_nothing_of_a_plant_are_named() -> None:
         (y, 0.0 * u, "the commands of tip and tilt do not move"),
         (y, u * tip, "the commands of tilt do not move"),
         (0.0 * y + 0.1, u, "the measurements of tip and tilt do not move"),
-        (gone, u, "the measurements of tip and tilt do not move"),
+        (gone, u, "tip: 100% of the frames are missing, or follow a lost command; at most 20%"),
         (y * tip, u, "the measurements of tilt do not move"),
         (y @ same, u, "the measurements of tip and tilt are the same"),
         (frozen, u, "of tip and tilt stay the same for 500 frames from frame 1500 on: leave out what is not measured"),
@@ -206,6 +206,7 @@ def test_bad_samples_and_other_units_do_not_matter() -> None:
     y[rng.choice(len(y), 100, replace=False)] = np.nan
     (found,) = identify_plant(Record(y, 1e3 * record.u, DT))
     assert right(found.common_delay, 2.4) and right(found.common_gain, 1e-3)
+    assert found.own_share < 1e-6, "lines over missing samples are no probe"
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from wfsobs.closed_loop.design import design
 from wfsobs.control.integrator import best_gain, gain_from_telemetry, highest_stable_gain
 from wfsobs.control.mirror import Mirror
 from wfsobs.prior import Spectra
-from wfsobs.record import delay_signal
+from wfsobs.record import RecordError, delay_signal
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.typing import Array
 
@@ -73,13 +73,31 @@ def test_it_is_that_of_the_true_spectra_within_its_deviation() -> None:
     assert 0.7 < np.sqrt(np.square(deviations).mean()) / gains.std() < 1.3
 
 
-def test_missing_samples_hardly_matter() -> None:
+@pytest.mark.parametrize("gone", [0.01, 0.1, 0.19, "a burst", "the end"])
+def test_missing_samples_hardly_matter(gone: float | str) -> None:
     rng = np.random.default_rng(5)
     z = disturbance(rng, 20_000) + NOISE * rng.standard_normal(20_000)
     whole = gain_from_telemetry(z, Mirror())
-    z[rng.random(z.size) < 0.01] = np.nan
+    spans = {"a burst": slice(9_000, 10_000), "the end": slice(16_500, None)}
+    z[rng.random(z.size) < gone if isinstance(gone, float) else spans[gone]] = np.nan
     holey = gain_from_telemetry(z, Mirror())
     assert abs(holey.gain - whole.gain) < 3.0 * whole.deviation
+    assert holey.deviation > 0.8 * whole.deviation, "no better known"
+    # the mean of 16,500 squares of a slow process is not that of 20,000
+    assert holey.measured_rms == pytest.approx(whole.measured_rms, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("z", "line"),
+    [
+        (np.sin(np.arange(999.0)), "999 of 999 samples are measured, a gain needs 1000, and 80%"),
+        (np.where(np.arange(3_000) % 3, np.nan, 1.0), "1000 of 3000 samples are measured, a gain needs 1000, and 80%"),
+        (np.full(2_000, 3.0), "the measurements do not move: every gain is as good as another"),
+    ],
+)
+def test_records_that_have_no_gain(z: Array, line: str) -> None:
+    with pytest.raises(RecordError, match=f"^{line}$"):
+        gain_from_telemetry(z, Mirror())
 
 
 def test_the_command(tmp_path: Path) -> None:

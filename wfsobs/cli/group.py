@@ -67,7 +67,7 @@ class Commands(click.Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the list of commands, without importing them."""
-        lines = {name: f"Of the package {point.module.partition('.')[0]}." for name, point in _entries().items()}
+        lines = {name: _package_line(point) for name, point in _entries().items()}
         with formatter.section("Commands"):
             formatter.write_dl(sorted((lines | {name: text for name, (_, text) in COMMANDS.items()}).items()))
 
@@ -90,6 +90,12 @@ class Commands(click.Group):
 def _entries() -> dict[str, EntryPoint]:
     """Return the commands of installed packages by name."""
     return {point.name: point for point in entry_points(group=ENTRY_POINTS)}
+
+
+def _package_line(point: EntryPoint) -> str:
+    """Return what the package of a command says of itself, or else its name."""
+    about = point.dist and point.dist.metadata["Summary"]
+    return f"{about}." if about else f"Of the package {point.module.partition('.')[0]}."
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "show_default": True})

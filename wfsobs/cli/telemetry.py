@@ -207,7 +207,10 @@ def gain(
     laws = design(scenario, ["integrator"]).laws["integrator"] if prior else ()
     rows = []
     for mode, name in enumerate(m.name for m in modes_up_to(HIGHEST_ORDER)[: record.n_modes]):
-        found = gain_from_telemetry(record.z[record.delay :, mode], mirror, leak)
+        try:
+            found = gain_from_telemetry(record.z[record.delay :, mode], mirror, leak)
+        except RecordError as error:
+            raise RecordError(f"{record_file}: {name}: {error}") from None
         left = float(np.sqrt(np.nanmean(np.square(record.y_lgs[:, mode]))))
         law = laws[mode].law if laws else None
         rows.append({"mode": name, **asdict(found), "recorded_rms": left, "from_spectra": law.gain if law else None})

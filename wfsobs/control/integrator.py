@@ -21,7 +21,7 @@ from wfsobs.control.margins import residual_density
 from wfsobs.control.mirror import Law, Mirror
 from wfsobs.observers.stepping import Gain, GainCycle
 from wfsobs.prior import Spectra
-from wfsobs.record import hold_last
+from wfsobs.record import RecordError
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.typing import Array
 
@@ -118,6 +118,9 @@ BLOCKS = 16
 START = 0.05
 """Share of the record that is left out for the integrators to settle."""
 
+SHORTEST, LEAST = 1000, 0.8
+"""Minimum of measured samples, and of their share: with more lines over missing ones the gain is off by some 5 %."""
+
 
 @dataclass(frozen=True)
 class TelemetryGain:
@@ -145,18 +148,29 @@ def gain_from_telemetry(z: Array, mirror: Mirror, leak: float = 1.0) -> Telemetr
     Parameters
     ----------
     z : Array
-        Pseudo-open-loop measurement, (n_steps,) [um]; a missing sample (NaN) repeats the last one.
+        Pseudo-open-loop measurement, (n_steps,) [um]. Integrators see a straight line over missing samples (NaN), which do not
+        count in what they leave.
     mirror : Mirror
         Its delay; limits are not regarded.
     leak : float
         Leak of the integrator.
+
+    Raises
+    ------
+    RecordError
+        Too few samples are measured, or they do not move.
     """
-    z = hold_last(z[:, None])[:, 0]
+    measured = np.flatnonzero(~np.isnan(z))
+    if measured.size < max(SHORTEST, LEAST * z.size):
+        raise RecordError(f"{measured.size} of {z.size} samples are measured, a gain needs {SHORTEST}, and {LEAST:.0%}")
+    if not np.ptp(z[measured]) > 0.0:
+        raise RecordError("the measurements do not move: every gain is as good as another")
+    z = np.interp(np.arange(z.size), measured, z[measured])
     limit = highest_stable_gain(mirror, leak)
     gains = limit * np.arange(1, TRIED + 1) / (TRIED + 1)
-    start = int(START * z.size)
-    used = z.size - start - (z.size - start) % BLOCKS
-    power = np.stack([np.square(_left(z, gain, mirror, leak)[-used:]).reshape(BLOCKS, -1).mean(axis=1) for gain in gains])
+    used = measured[int(START * measured.size) :]
+    used = used[used.size % BLOCKS :]
+    power = np.stack([np.square(_left(z, gain, mirror, leak)[used]).reshape(BLOCKS, -1).mean(axis=1) for gain in gains])
     gain, variance = _least(gains, power.mean(axis=1))
     others = np.array([_least(gains, np.delete(power, block, axis=1).mean(axis=1))[0] for block in range(BLOCKS)])
     deviation = float(np.sqrt((BLOCKS - 1) * others.var()))

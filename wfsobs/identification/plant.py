@@ -43,6 +43,9 @@ from wfsobs.typing import Array
 SHORTEST, MOST_STEPS = 1000, 100_000
 """Minimum frames of a record; frames that are looked at, its first."""
 
+MOST_MISSING = 0.2
+"""Share of missing frames beyond which no plant is identified or excluded: where a third is missing a shorter delay seems likelier."""
+
 FROZEN = 100
 """Frames in a row with the same measurement that are taken for one that was not renewed."""
 
@@ -179,13 +182,16 @@ def identify_plant(record: Record, watch: Watch = QUIET) -> tuple[GroupPlant, ..
     Raises
     ------
     RecordError
-        The record is too short, or its commands or measurements do not move.
+        The record is too short, too much of a mode is missing, or its commands or measurements do not move.
     Cancelled
         `watch` asks to stop.
     """
     y, u = known_signals(record, MOST_STEPS)
     if len(y) < SHORTEST:
         raise RecordError(f"the record has {len(y)} frames, the plant needs {SHORTEST}")
+    for name, gone in zip(MODE_NAMES, np.isnan(y).mean(axis=0).tolist(), strict=False):
+        if gone > MOST_MISSING:
+            raise RecordError(f"{name}: {gone:.0%} of the frames are missing, or follow a lost command; at most {MOST_MISSING:.0%}")
     out = []
     groups = list(_groups(record.n_modes))
     for i, columns in enumerate(groups):
@@ -436,9 +442,6 @@ FORM = 10.0
 
 REVERSED = 0.5
 """Share of what is new in the commands that the measurements do not explain, beyond which their signs say nothing."""
-
-MOST_MISSING = 0.2
-"""Share of missing frames beyond which nothing is excluded: where a third is missing a shorter delay seems likelier."""
 
 NEAR = (0.3, 1.7)
 """Gains between which a plant is near a stated one."""

@@ -24,6 +24,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.fft import rfft
 from scipy.stats import chi2
 
@@ -86,6 +87,9 @@ LONGEST = 6
 ORDER, SPAN, DEGREE = 16, 12, 4
 """Of the first guess: frames of the past that predict a measurement, and frames after it over which the response of a disturbance
 is a polynomial of this degree, which follows lines up to about a tenth of the rate."""
+
+ENOUGH = 4
+"""Predictions per coefficient."""
 
 PEAKS, MOST_PEAKS, LOWEST = 10, 40, 5.0
 """Maximum number of resonances per mode, while a maximum is looked for and then; their minimum frequency [Hz]."""
@@ -357,11 +361,17 @@ def _means(x: Array, cells: Cells) -> Array:
     return np.add.reduceat(x, _edges(cells)) / cells.count
 
 
-def prediction_errors(y: Array, u: Array) -> tuple[Array, Array]:
-    """Return what is new in measurements and commands, (n, ...) each, from their ORDER th sample on: not told by their past."""
+def prediction_errors(y: Array, u: Array, known: Array | None = None) -> tuple[Array, Array]:
+    """Return what is new in measurements and commands, (n, ...) each, from their ORDER th sample on: not told by their past.
+
+    known : which of these samples it is told of, all by default; zero at the others
+    """
     n = len(y) - ORDER
     past = np.column_stack([x[ORDER - i : ORDER - i + n] for x in (y, u) for i in range(1, ORDER + 1)])
-    new_y, new_u = (x[ORDER:] - past @ np.linalg.lstsq(past, x[ORDER:], rcond=1e-10)[0] for x in (y, u))
+    rows = np.arange(n) if known is None else np.flatnonzero(known)
+    new_y, new_u = np.zeros_like(y[ORDER:]), np.zeros_like(u[ORDER:])
+    for x, new in ((y, new_y), (u, new_u)):
+        new[rows] = x[ORDER:][rows] - past[rows] @ np.linalg.lstsq(past[rows], x[ORDER:][rows], rcond=1e-10)[0]
     return new_y, new_u
 
 
@@ -377,12 +387,16 @@ def guess_plant(data: PlantLikelihood) -> tuple[Array, float, Array]:
     not follow from them, those of the strongest response to it; the gain is 1 or, where that is far
     off, as of other units, the one that makes the response of the disturbance smoothest: with w[k] the error of the prediction of
     y[k] from the past, h[i] = cov(y[k+i], w[k]) / var(w) and g[i] the same of u, that response is h[i] - gain R g[i - delay].
+
+    What is new is known where nothing of ORDER + 1 frames is missing; where that is hardly ever so no share is known, and it is 0.
     """
     y, u, k, n = data.filled_y, data.u[0], data.k, data.n - ORDER
-    w, v = prediction_errors(y, u)
+    known = sliding_window_view(~np.isnan(data.y).any(axis=1), ORDER + 1).all(axis=1)
+    is_enough = np.count_nonzero(known) >= ENOUGH * 2 * k * ORDER
+    w, v = prediction_errors(y, u, known if is_enough else None)
     turn = -np.linalg.lstsq(w, v, rcond=None)[0]
     own = v + w @ turn
-    excited = float(np.sum(own**2) / max(np.sum(v**2), 1e-300))
+    excited = float(np.sum(own**2) / max(np.sum(v**2), 1e-300)) if is_enough else 0.0
     source, basis = (w if excited < 0.5 else own)[: n - SPAN], smooth_basis()
     inverse = np.linalg.inv(source.T @ source)
     h, g = (np.array([x[ORDER + i : ORDER + i + len(source)].T @ source @ inverse for i in range(SPAN + 1)]) for x in (y, u))

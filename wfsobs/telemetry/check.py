@@ -40,6 +40,9 @@ CORRELATED = 35.0 / 18.0
 LEVEL = 0.01
 """Probability of a change found anywhere where there is none."""
 
+UNEVEN = 0.05
+"""How much more of a section than of the best one may be missing where they are compared, as a share of it."""
+
 OUTLYING = 0.01
 """Share of outlying or missing samples that is worth a look."""
 
@@ -278,25 +281,36 @@ def _is_off(n: PlantNumber, right: float, subject: str) -> bool:
 
 def _stationarity(record: Record) -> Iterator[Remark]:
     begin = record.delay + (BLOCK if record.gate else 0)  # the first ones all pass a gate
-    z = hold_last(record.without_outliers.z[begin:])
+    z = record.without_outliers.z[begin:]
     length = len(z) // SECTIONS
     if length < 8 * FEWEST_BINS:
         yield Remark("stationarity", "undecided", f"{record.n_steps} frames are too few to compare {SECTIONS} sections")
         return
-    columns = [(name, column) for name, column in zip(MODE_NAMES, z.T, strict=False) if np.ptp(column) > 0.0]
+    columns = [(name, x) for name, x in zip(MODE_NAMES, z.T, strict=False) if np.fmax.reduce(x) > np.fmin.reduce(x)]
+    least = min((sections_compared(x).size for _, x in columns), default=0)
+    if least < 2:
+        yield Remark("stationarity", "undecided", "too much is missing to compare sections")
+        return
     changes = [(name, *change) for name, column in columns for change in find_changes(column, record.dt)]
     for name, low, high, section, ratio in changes:
         start, end = ((begin + part * length) * record.dt for part in (section, section + 1))
         where = f"{name}, {low:.3g} to {high:.3g} Hz: from {start:.3g} to {end:.3g} s {ratio:.2g} times the power of the rest"
         yield Remark("stationarity", "note", where)
     if not changes:
-        yield Remark("stationarity", "ok", f"the spectra of {SECTIONS} sections differ no more than those of one process")
+        text = f"the spectra of {least} sections differ no more than those of one process"
+        yield Remark("stationarity", "ok", text + "; the others miss too many frames" * (least < SECTIONS))
+
+
+def sections_compared(z: Array) -> Array:
+    """Return the sections of z (n,) that miss about as little as the one that misses least: what is held has less power."""
+    gone = np.isnan(z[: len(z) // SECTIONS * SECTIONS]).reshape(SECTIONS, -1).mean(axis=1)
+    return np.flatnonzero((gone <= gone.min() + UNEVEN) & (gone < 1.0))
 
 
 def find_changes(z: Array, dt: float) -> list[tuple[float, float, int, float]]:
     """Return the bands of z (n,) whose power in a section differs from that of the others, the least likely section of each.
 
-    The power of a band is a sum of exponential variates, one per independent bin, and counts as chi-squared of as many degrees of
+    Only `sections_compared` are. The power of a band is a sum of exponential variates, one per independent bin, and counts as chi-squared of as many degrees of
     freedom as its mean and its variance give; that of a section over that of the others then has Fisher's law.
 
     Returns
@@ -304,8 +318,9 @@ def find_changes(z: Array, dt: float) -> list[tuple[float, float, int, float]]:
     list of tuple
         (low [Hz], high [Hz], section, power over the mean power of the other sections).
     """
-    length = len(z) // SECTIONS
-    parts = detrend(z[: SECTIONS * length].reshape(SECTIONS, length), axis=1)
+    length, compared = len(z) // SECTIONS, sections_compared(z)
+    n = compared.size
+    parts = detrend(hold_last(z[:, None])[: SECTIONS * length].reshape(SECTIONS, length)[compared], axis=1)
     power = np.abs(rfft(parts * np.hanning(length + 2)[1:-1], axis=1)) ** 2
     half = length // 2
     edges = [FEWEST_BINS << i for i in range(half.bit_length()) if FEWEST_BINS << i <= half - FEWEST_BINS] + [half]
@@ -315,12 +330,15 @@ def find_changes(z: Array, dt: float) -> list[tuple[float, float, int, float]]:
         mean = band.mean(axis=0)
         freedom = max(mean.sum() ** 2 / (mean**2).sum() / CORRELATED, 1.0)
         total = band.sum(axis=1)
-        ratio = total / np.maximum((total.sum() - total) / (SECTIONS - 1), 1e-300)
-        law = fisher(2.0 * freedom, 2.0 * (SECTIONS - 1) * freedom)
+        others = (total.sum() - total) / (n - 1)
+        if not others.min() > 0.0:  # numbers without noise
+            continue
+        ratio = total / others
+        law = fisher(2.0 * freedom, 2.0 * (n - 1) * freedom)
         tails = 2.0 * np.minimum(law.sf(ratio), law.cdf(ratio))
         worst = int(np.argmin(tails))
-        if tails[worst] < LEVEL / (SECTIONS * (len(edges) - 1)):
-            out.append((low / (length * dt), high / (length * dt), worst, float(ratio[worst])))
+        if tails[worst] < LEVEL / (n * (len(edges) - 1)):
+            out.append((low / (length * dt), high / (length * dt), int(compared[worst]), float(ratio[worst])))
     return out
 
 
@@ -338,8 +356,8 @@ def _residual(result: Identification) -> Iterator[Remark]:
 
 def _corrections(reading: Reading, plant: Sequence[GroupPlant]) -> dict[str, str]:
     out = {}
-    if reading.units and set(reading.units) != {"um"}:
-        out["unit"] = "|".join(reading.units)
+    if len(reading.units) == 1 and "um" not in reading.units:  # of several the user has to choose
+        (out["unit"],) = reading.units
     if any(sign_of(group) == -1 for group in plant):
         out["command-sign"] = f"{-reading.sign:+d}"
     delays = [known_numbers(group, "delay") for group in plant]
