@@ -44,7 +44,7 @@ SHORTEST, MOST_STEPS = 1000, 100_000
 """Minimum frames of a record; frames that are looked at, its first."""
 
 MOST_MISSING = 0.2
-"""Share of missing frames beyond which no plant is identified or excluded: where a third is missing a shorter delay seems likelier."""
+"""Share of missing frames beyond which no plant is identified or excluded: of a third a shorter delay seems likelier."""
 
 FROZEN = 100
 """Frames in a row with the same measurement that are taken for one that was not renewed."""
@@ -191,7 +191,8 @@ def identify_plant(record: Record, watch: Watch = QUIET) -> tuple[GroupPlant, ..
         raise RecordError(f"the record has {len(y)} frames, the plant needs {SHORTEST}")
     for name, gone in zip(MODE_NAMES, np.isnan(y).mean(axis=0).tolist(), strict=False):
         if gone > MOST_MISSING:
-            raise RecordError(f"{name}: {gone:.0%} of the frames are missing, or follow a lost command; at most {MOST_MISSING:.0%}")
+            what = "of the frames are missing, or follow a lost command"
+            raise RecordError(f"{name}: {gone:.0%} {what}; at most {MOST_MISSING:.0%}")
     out = []
     groups = list(_groups(record.n_modes))
     for i, columns in enumerate(groups):

@@ -388,7 +388,7 @@ def guess_plant(data: PlantLikelihood) -> tuple[Array, float, Array]:
     off, as of other units, the one that makes the response of the disturbance smoothest: with w[k] the error of the prediction of
     y[k] from the past, h[i] = cov(y[k+i], w[k]) / var(w) and g[i] the same of u, that response is h[i] - gain R g[i - delay].
 
-    What is new is known where nothing of ORDER + 1 frames is missing; where that is hardly ever so no share is known, and it is 0.
+    What is new is known where none of ORDER + 1 frames is missing; where that is hardly ever so no share is known: 0.
     """
     y, u, k, n = data.filled_y, data.u[0], data.k, data.n - ORDER
     known = sliding_window_view(~np.isnan(data.y).any(axis=1), ORDER + 1).all(axis=1)

@@ -310,8 +310,9 @@ def sections_compared(z: Array) -> Array:
 def find_changes(z: Array, dt: float) -> list[tuple[float, float, int, float]]:
     """Return the bands of z (n,) whose power in a section differs from that of the others, the least likely section of each.
 
-    Only `sections_compared` are. The power of a band is a sum of exponential variates, one per independent bin, and counts as chi-squared of as many degrees of
-    freedom as its mean and its variance give; that of a section over that of the others then has Fisher's law.
+    Only `sections_compared` are. The power of a band is a sum of exponential variates, one per independent bin, and counts as
+    chi-squared of as many degrees of freedom as its mean and its variance give; that of a section over that of the others then
+    has Fisher's law.
 
     Returns
     -------
