@@ -148,6 +148,31 @@ def test_a_stopped_campaign_finishes_its_batches_and_resumes(plan, undisturbed, 
     assert campaign("table", tmp_path, "--csv").stdout == campaign("table", undisturbed, "--csv").stdout
 
 
+def test_a_second_interrupt_ends_a_campaign_whose_workers_do_not_answer(plan, tmp_path):
+    process, workers = start_short(plan, tmp_path)
+    for worker in workers:
+        worker.suspend()
+    process.send_signal(signal.SIGINT)
+    time.sleep(0.5)  # of two signals at once one is lost
+    while process.poll() is None:
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.2)
+    assert b"Aborted!" in process.communicate()[1]
+    assert psutil.wait_procs(workers, timeout=60)[1] == []
+
+
+def test_scenarios_of_the_same_settings_are_all_told(tmp_path):
+    text = TINY.format(seeds=2).partition("[grid]")[0]
+    plan = tmp_path / "twins.toml"
+    plan.write_text(text + '[[scenario]]\nname = "a"\n[[scenario]]\nname = "b"\n', encoding="utf-8")
+    out = tmp_path / "out"
+    campaign("run", plan, "--out", out, "--workers", 1)
+    rows = [line.split(",") for line in campaign("table", out, "--csv").stdout.splitlines()[1:]]
+    cells = [row[1] for row in rows]
+    assert cells.count("0") == cells.count("1") == len(rows) // 2 > 0
+    assert "kf-lgs" in campaign("table", out, "--only", "scenario=b").stdout
+
+
 def test_more_seeds_continue_and_another_plan_is_refused(tmp_path):
     small, large, other = (tmp_path / f"{name}.toml" for name in ("small", "large", "other"))
     small.write_text(TINY.format(seeds=2), encoding="utf-8")

@@ -1,10 +1,24 @@
 """Files of results."""
 
+from dataclasses import replace
+
 import numpy as np
 import pyarrow as pa
 import pytest
 
-from wfsobs.campaign.store import ROWS, batch_files, read_results, schema, write_batch
+from wfsobs.campaign import store
+from wfsobs.campaign.plan import parse_plan
+from wfsobs.campaign.store import (
+    ROWS,
+    batch_files,
+    finished_runs,
+    present_rows,
+    read_results,
+    row_key,
+    scenario_digest,
+    schema,
+    write_batch,
+)
 
 HERE = {"host": "here", "process": 1, "written": 0.0}
 
@@ -52,6 +66,29 @@ def test_a_file_cut_off_is_left_out_and_nothing_is_half_written(folder, monkeypa
     with pytest.raises(OSError, match="No space left"):
         write_batch(folder, [row("c")], HERE)
     assert len(list((folder / ROWS).iterdir())) == 2
+
+
+def test_rows_of_another_version_or_of_other_seeds_are_not_those_of_a_plan(folder, monkeypatch):
+    plan = replace(parse_plan('seeds = 2\nobservers = ["kf-lgs"]\n', folder), observers=("kf-lgs", "theirs"))
+
+    def rows():
+        digest = scenario_digest(plan.cells[0].scenario())
+        return [
+            row(row_key(digest, seed, name), float(store.PHYSICS_VERSION), seed=seed, name=name)
+            for seed in (1, 2, 3)
+            for name in ("kf-lgs", "theirs")
+        ]
+
+    with monkeypatch.context() as patched:
+        patched.setattr(store, "PHYSICS_VERSION", 0)
+        write_batch(folder, rows(), HERE)
+    old = present_rows(plan, read_results(folder))
+    assert sorted(old["seed"].to_pylist()) == [1, 1, 2, 2] and set(old["rms_nm"].to_pylist()) == {0.0}
+    assert finished_runs(plan, folder).sum() == 0
+    write_batch(folder, rows(), HERE)
+    new = present_rows(plan, read_results(folder))
+    assert sorted(new["seed"].to_pylist()) == [1, 1, 2, 2] and set(new["rms_nm"].to_pylist()) == {float(store.PHYSICS_VERSION)}
+    assert finished_runs(plan, folder).all(), "an observer that is not installed has no version"
 
 
 def test_an_empty_folder_has_an_empty_table(folder):

@@ -1,6 +1,8 @@
 """The live loop: blocks without a seam, a ring, and numbers that are those of the recording."""
 
 import json
+import os
+import signal
 import subprocess
 import sys
 
@@ -11,6 +13,7 @@ from scipy.signal import lfilter
 
 import wfsobs
 from wfsobs.cli import main
+from wfsobs.live.follow import follow
 from wfsobs.live.ring import CAPACITY, Ring
 from wfsobs.live.simulated import Integrator, endless_blocks
 from wfsobs.observers import OBSERVERS
@@ -141,6 +144,19 @@ def test_live_numbers_are_those_of_the_recording(session):
             live = result["observers"][name]["errors_nm"][s.target][s.mode]
             # frame by frame and at once are one algorithm; commands of the recording are summed in another order
             assert live == pytest.approx(s.rms * 1e3, rel=1e-6), s
+
+
+def test_what_was_sent_is_saved_when_the_command_is_told_to_end(monkeypatch, tmp_path):
+    def told(scenario, n_frames, observers, **options):
+        follow(scenario, 50, observers, **options)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr("wfsobs.cli.live.follow", told)
+    before = signal.getsignal(signal.SIGTERM)
+    options = ["--headless", "--observer", "kf-lgs", "--record", str(tmp_path / "night.npz")]
+    assert CliRunner().invoke(main, ["live", *options]).exit_code == 128 + signal.SIGTERM
+    assert wfsobs.load(tmp_path / "night.npz").n_steps == 50
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 @pytest.mark.parametrize(

@@ -48,18 +48,17 @@ class Processes:
         return self._count
 
     def executor(self) -> Executor:
-        """Return a fresh executor; what is left of a broken one is killed, since workers do not end by a signal to terminate."""
-        if self._executor is not None:
-            for process in list((self._executor._processes or {}).values()):
-                process.kill()
-        self.close()
+        """Return a fresh executor; what is left of a broken one is killed."""
+        self.close(at_once=True)
         os.environ["OPENBLAS_NUM_THREADS"] = "1"  # inherited by the processes, and read when they import numpy
         self._executor = ProcessPoolExecutor(self._count, mp_context=get_context("spawn"), initializer=_start_worker)
         return self._executor
 
-    def close(self) -> None:
-        """End the processes."""
+    def close(self, at_once: bool = False) -> None:
+        """End the processes, when they have finished unless at once: they do not end by a signal to terminate."""
         if self._executor is not None:
+            for process in list((self._executor._processes or {}).values()) if at_once else ():
+                process.kill()
             self._executor.shutdown(wait=True, cancel_futures=True)
 
 
@@ -140,8 +139,8 @@ class DaskCluster:
         except (OSError, ValueError, TimeoutError) as error:
             raise SettingError(f"--scheduler {self.address}: no scheduler answers ({error})") from None
 
-    def close(self) -> None:
-        """End the connection; the workers stay."""
+    def close(self, at_once: bool = False) -> None:
+        """End the connection, which nothing waits for; the workers stay."""
         if self._client is not None:
             self._client.close(timeout=5)
             self._client = None

@@ -20,7 +20,7 @@ from scipy.stats import rankdata, studentized_range
 
 from wfsobs.campaign.compare import LEVEL, Comparison, compare, comparison_groups, each_group
 from wfsobs.campaign.plan import Campaign
-from wfsobs.campaign.store import finished_runs, folder_plan, read_results
+from wfsobs.campaign.store import finished_runs, folder_plan, present_rows, read_results
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import NOT_OBSERVERS
 from wfsobs.files import write_text
@@ -208,7 +208,8 @@ def write_report(folder: Path, path: Path) -> None:
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    plan, table = folder_plan(folder), read_results(folder)
+    plan = folder_plan(folder)
+    table = present_rows(plan, read_results(folder))
     comparisons = compare(table)
     groups = comparison_groups(comparisons)
     stable = first_places(table, np.random.default_rng(0))

@@ -19,7 +19,16 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from wfsobs.campaign.compare import compare, comparison_groups
 from wfsobs.campaign.plan import Campaign, Cell, Stop
 from wfsobs.campaign.pools import Workers
-from wfsobs.campaign.store import BatchIndex, finished_runs, open_folder, remove_leftovers, row_key, scenario_digest, write_batch
+from wfsobs.campaign.store import (
+    BatchIndex,
+    finished_runs,
+    open_folder,
+    present_rows,
+    remove_leftovers,
+    row_key,
+    scenario_digest,
+    write_batch,
+)
 from wfsobs.closed_loop.design import Design, design
 from wfsobs.closed_loop.rows import rows as loop_rows
 from wfsobs.closed_loop.run import closed_loop
@@ -290,6 +299,9 @@ def run_campaign(
             _drive(_Batches(plan, todo, str(folder)), workers, progress, report, must_stop)
             if plan.stop is None or shard != (1, 1):  # shares decide when all of them have ended
                 return progress
+    except KeyboardInterrupt:
+        workers.close(at_once=True)
+        raise
     finally:
         workers.close()
 
@@ -325,7 +337,7 @@ def wanted_seeds(plan: Campaign, complete: Array, rows: BatchIndex) -> Array:
     for start in range(0, len(wanted), size):
         cells = range(start, min(start + size, len(wanted)))
         if complete[cells, : plan.stop.looks[0]].all(axis=1).any():
-            wanted[cells] = _wanted_of(plan, plan.stop, cells, complete[cells], rows.read(cells))
+            wanted[cells] = _wanted_of(plan, plan.stop, cells, complete[cells], present_rows(plan, rows.read(cells)))
     return wanted
 
 

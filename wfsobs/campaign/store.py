@@ -60,17 +60,22 @@ def row_key(digest: str, seed: int, name: str) -> str:
     return hashlib.sha256(f"{digest} {seed} {name} {package_version(name)}".encode()).hexdigest()
 
 
+UNKNOWN = "not installed"
+
+
 @cache
 def package_version(name: str) -> str:
-    """Return the package of an observer or a controller and its version; that of wfsobs for bounds.
+    """Return the package of an observer or a controller and its version; that of wfsobs for bounds, or UNKNOWN.
 
     >>> package_version("kf-lgs").split()[0]
     'wfsobs'
     """
     if name in NOT_OBSERVERS:
         return f"wfsobs {__version__}"
-    entry = OBSERVERS.get(name)
-    function = entry.run if entry is not None else CONTROLLERS[name].law or CONTROLLERS[name].step_law
+    entry, controller = OBSERVERS.get(name), CONTROLLERS.get(name)
+    if entry is None and controller is None:
+        return UNKNOWN
+    function = entry.run if entry is not None else controller and (controller.law or controller.step_law)
     home = getattr(function, "__module__", "wfsobs").partition(".")[0]
     package = sys.modules.get(home)
     return f"{home} {getattr(package, '__version__', None) or _distribution_version(home)}"
@@ -107,7 +112,8 @@ RESULTS = {
 PROVENANCE = {"step_us": "float64", "kernel": "string", "host": "string", "process": "int64", "written": "float64"}
 """Columns that say where and how a row was made."""
 
-ORDER = ("key", "target", "mode")
+ORDER = ("key", "cell", "target", "mode")
+"""Two scenarios of one plan may have the same settings, and then have the same keys."""
 
 
 def need_pyarrow() -> None:
@@ -167,7 +173,7 @@ def read_batches(folder: Path, columns: Iterable[str]) -> Iterator[pyarrow.Table
 
 
 def read_results(folder: Path) -> pyarrow.Table:
-    """Return all rows without PROVENANCE, each once, sorted by key, target and mode.
+    """Return all rows without PROVENANCE, each once, sorted by key, scenario, target and mode.
 
     Rows that were computed twice (by a worker that was taken for dead) have one key, and the first counts.
     """
@@ -184,6 +190,20 @@ def _each_once(tables: Sequence[pyarrow.Table], columns: Sequence[str]) -> pyarr
     keys = [table[name].to_numpy() for name in ORDER]
     again = np.logical_and.reduce([k[1:] == k[:-1] for k in keys])
     return table.filter(pa.array(np.concatenate([[True], ~again])))
+
+
+def present_rows(plan: Campaign, table: pyarrow.Table) -> pyarrow.Table:
+    """Return the rows of a plan's own seeds, without those of earlier settings or versions where there are present ones."""
+    import pyarrow.compute as pc
+
+    table = table.filter(pc.field("seed").isin([*plan.seeds]) & (pc.field("cell") < len(plan.cells)))
+    run = ["cell", "seed", "name"]
+    several = table.group_by(run).aggregate([("key", "distinct")]).filter(pc.list_value_length(pc.field("key_distinct")) > 1)
+    digests, stale = dict[int, str](), set[str]()
+    for cell, seed, name, keys in zip(*(several[c].to_pylist() for c in (*run, "key_distinct")), strict=True):
+        present = row_key(_digest(plan, cell, digests), seed, name)
+        stale |= {*keys} - {present if present in keys else min(keys)}
+    return table.filter(~pc.field("key").isin(sorted(stale))) if stale else table
 
 
 class BatchIndex:
@@ -298,7 +318,7 @@ def folder_plan(folder: Path) -> Campaign:
 def finished_runs(plan: Campaign, folder: Path) -> Array:
     """Return which runs have all their rows, bool (n_cells, n_seeds).
 
-    A row counts if its key is that of the present settings and versions.
+    A row counts if its key is that of the present settings and versions; of what is not installed every row does.
     """
     names = (*plan.observers, *plan.controllers)
     seen = np.zeros((len(plan.cells), len(plan.seeds), len(names)), dtype=bool)
@@ -307,7 +327,7 @@ def finished_runs(plan: Campaign, folder: Path) -> Array:
         for key, cell, seed, name in zip(*(table[c].to_pylist() for c in ("key", "cell", "seed", "name")), strict=True):
             if cell >= len(plan.cells) or seed not in plan.seeds or name not in names:
                 continue
-            if key == row_key(_digest(plan, cell, digests), seed, name):
+            if package_version(name) == UNKNOWN or key == row_key(_digest(plan, cell, digests), seed, name):
                 seen[cell, plan.seeds.index(seed), names.index(name)] = True
     return np.all(seen, axis=2)
 

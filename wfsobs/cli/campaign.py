@@ -28,7 +28,7 @@ from wfsobs.campaign.run import BATCH, run_campaign, run_cost, run_rows
 from wfsobs.campaign.run import Progress as State
 from wfsobs.campaign.selection import cells_where
 from wfsobs.campaign.standings import TogetherRow, standings
-from wfsobs.campaign.store import RESULTS, add_settings, finished_runs, folder_plan, need_pyarrow, read_results
+from wfsobs.campaign.store import RESULTS, add_settings, finished_runs, folder_plan, need_pyarrow, present_rows, read_results
 from wfsobs.cli.options import json_option
 from wfsobs.cli.show import new_table, print_json, print_note, show_table
 from wfsobs.evaluation.rows import NOT_OBSERVERS
@@ -366,7 +366,7 @@ def print_table(
     if together:
         print_together(Path(folder), only, target, mode, as_csv)
         return
-    rows = select_rows(plan, read_results(Path(folder)), only, target, mode)
+    rows = select_rows(plan, present_rows(plan, read_results(Path(folder))), only, target, mode)
     if parquet:
         import pyarrow.parquet as pq
 

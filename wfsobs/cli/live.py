@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import signal
+import sys
 from dataclasses import replace
 from os import cpu_count
+from types import FrameType
 
 import click
 import numpy as np
@@ -169,12 +172,17 @@ def _say(line: str) -> None:
     print_note(f"live: {line}")
 
 
+def _end(number: int, _frame: FrameType | None) -> None:
+    sys.exit(128 + number)
+
+
 def _run_headless(order: LiveOrder, seconds: float, as_json: bool) -> None:
     kept: list[LiveFrame] = []
     source, scenario = order.source, order.scenario
     n_frames = max(1, round(seconds / source.sampling.dt * order.speed))
     if isinstance(source, Replay):
         n_frames = min(n_frames, source.record.n_steps)
+    before = signal.signal(signal.SIGTERM, _end)
     try:
         with progress_bar("frames") as watch:
             result = follow(
@@ -189,6 +197,7 @@ def _run_headless(order: LiveOrder, seconds: float, as_json: bool) -> None:
                 log_file=order.log_file,
             )
     finally:  # what has been sent is there, whatever has ended it
+        signal.signal(signal.SIGTERM, before)
         if kept:
             frames = LiveFrame(*(np.array(part) for part in zip(*kept, strict=True)))
             is_simulated = isinstance(source, SimulatedLoop)
