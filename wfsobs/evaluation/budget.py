@@ -37,10 +37,12 @@ from wfsobs.evaluation.scores import Score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Observer
 from wfsobs.observers.estimates import TOTAL
+from wfsobs.observers.kalman.mode_filter import lgs_mean
 from wfsobs.observers.kalman.multirate import beam_model, estimated_cycle
-from wfsobs.observers.kalman.single import MIN_NOISE, steady_filter
+from wfsobs.observers.kalman.single import MIN_NOISE, steady_mode
+from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.observers.step import Estimator
-from wfsobs.prior import Beams, Line, Lines
+from wfsobs.prior import Beams, LgsStars, Line, Lines, Prior
 from wfsobs.priors_from.scenario import beams_of, modelled_turbulence, observer_settings, prior_of, vibration_continuum
 from wfsobs.progress import QUIET, Watch, detach_watch
 from wfsobs.record import Measurements, Record, delay_signal, frame_mean
@@ -174,7 +176,11 @@ def error_budget(
     True
     """
     scenario, record = result.scenario, result.record.without_outliers
-    if record.turbulence is None or record.vibration is None or record.n_steps != scenario.n_steps:
+    if (
+        record.turbulence is None
+        or record.vibration is None
+        or (record.n_steps, record.n_modes) != (scenario.n_steps, len(scenario.modes))
+    ):
         raise ValueError("error budget: takes a record that was simulated from its scenario")
     if scenario.vibration.source == "psd":
         raise ValueError("error budget: vibration.source = psd is a table, not lines that a model could have")
@@ -232,9 +238,9 @@ class _Parts:
         return measure_closed_loop(self.scenario, OpenLoop(seen.lgs.take(modes, 1), seen.ngs.take(modes, 1), seen.stars))
 
     def _follow_signal(self, lines: ModeLines, mode: int, sensors: tuple[str, ...]) -> Estimates:
-        seen = self.sources(lines)[SIGNAL].measurement
-        signal = OpenLoop(np.nan_to_num(seen.lgs), np.nan_to_num(seen.ngs))
-        return with_total(follow_signal(self.scenario.before_events, mode, lines[mode], sensors, signal))
+        before, signal = self.scenario.before_events, self.measurements(lines, (SIGNAL,), (mode,))
+        stars = prior_of(before, self.record, (LgsStars,), modes=(mode,))
+        return with_total(follow_signal(before, mode, lines[mode], sensors, signal, stars))
 
 
 def _terms(observer: Observer, of: _Parts, values: Estimates, scores: Iterable[Score], watch: Watch) -> list[dict[str, float]]:
@@ -400,7 +406,7 @@ def shapley_shares(
 
 
 def follow_signal(
-    scenario: Scenario, mode: int, given_lines: Sequence[float], sensors: Sequence[str], open_loop: OpenLoop
+    scenario: Scenario, mode: int, given_lines: Sequence[float], sensors: Sequence[str], signal: Measurements, stars: Prior
 ) -> dict[str, Array]:
     """Run the Kalman filter of the right model on the noiseless measurements of one mode.
 
@@ -414,8 +420,10 @@ def follow_signal(
         Lines [Hz] in the model.
     sensors : sequence of str
         Sensors in use, of "lgs" and "ngs".
-    open_loop : OpenLoop
-        What the sensors measure of turbulence and lines; steps without a frame count as zero.
+    signal : Measurements
+        What the sensors measure of turbulence and lines, of this mode alone; NaN where a frame is missing.
+    stars : Prior
+        The LGS of this mode alone.
 
     Returns
     -------
@@ -430,17 +438,17 @@ def follow_signal(
     noise, both = max(lgs_noise_rms(scenario, mode), MIN_NOISE), set(sensors) == {"lgs", "ngs"}
     beams = true_beams(scenario, mode) if both else Beams(true_turbulence(scenario, mode))
     if not (vibration or beams.common or beams.target):
-        return {target: np.zeros(len(open_loop.lgs)) for target in TARGETS}
+        return {target: np.zeros(len(signal.y_lgs)) for target in TARGETS}
     model = beam_model(beams, vibration)
     if "ngs" not in sensors:
-        out = steady_filter(model, noise)[0].run(open_loop.lgs[:, None, mode, None])[:, :, 0]
+        kalman = steady_mode(model, noise, lgs_mean(stars, 0))
     else:
         ngs_noise = max(noise_rms(scenario, "ngs")[mode], MIN_NOISE)
         cycle = estimated_cycle(model, scenario.sensors.exposure_ratio, noise, ngs_noise, beams.lgs)
         used = np.array([[float(both)], [1.0]])
-        kalman = cycle._replace(steps=[(A, used * C, Q, R) for A, C, Q, R in cycle.steps]).filter()
-        out = kalman.gains.recursion(kalman.rows(TARGETS)).run(np.column_stack([open_loop.lgs[:, mode], open_loop.ngs[:, mode]]))
-    return {target: out[:, i] for i, target in enumerate(TARGETS)}
+        kalman = cycle._replace(steps=[(A, used * C, Q, R) for A, C, Q, R in cycle.steps]).filter_of(stars, 0)
+    found = KalmanEstimator([kalman]).run(signal, QUIET)
+    return {target: found[target][:, 0] for target in TARGETS}
 
 
 def true_beams(scenario: Scenario, mode: int) -> Beams:
