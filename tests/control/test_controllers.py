@@ -300,6 +300,16 @@ def test_an_unstable_loop_is_said_to_be_one(changes: dict[str, Any]) -> None:
             assert one.stable == (True, True) and one.residual is not None and not one.note
 
 
+def test_the_filter_of_every_peak_takes_no_settings_of_those_of_one() -> None:
+    """As its observer: noises are those of the prior, and the slow error of the LGS is in the model."""
+    others = {"multirate.measurement_noise": "manual", "multirate.lgs_noise": 1.0, "multirate.model_lgs_error": False}
+    gains = [
+        [mode.law.gains.steps[-1].L for mode in design(scenario, ["lqg-multirate-multi"]).laws["lqg-multirate-multi"] if mode.law]
+        for scenario in (MATCHED, MATCHED.replace(others))
+    ]
+    assert len(gains[0]) == 2 and np.array_equal(*gains)
+
+
 def test_what_cannot_run_says_why() -> None:
     both = {"multirate.measurement_noise": "manual", "multirate.lgs_noise": 0.04, "multirate.ngs_noise": 0.001}
     (one,) = run(QUICK | both, ("lqg-multirate",)).outcomes

@@ -55,7 +55,7 @@ def model_of(name: str, scenario: Scenario, record: Record, mode: int) -> Model:
         model = sampled_model(kernels_of(prior.lines[mode], scenario.gp), prior.lines[mode].dt)
         found = optimal_model(scenario.multirate, prior, mode, RATIO, measured_late(model))
     elif name == "multirate-multi":
-        found = every_peak_model(scenario.multirate, scenario.multipeak, prior, mode, RATIO)
+        found = every_peak_model(scenario.multipeak, prior, mode, RATIO)
     else:
         found = optimal_model(scenario.multirate, prior, mode, RATIO)
     return Model(found.steps, found.filter().rows(TARGETS))

@@ -198,7 +198,8 @@ def present_rows(plan: Campaign, table: pyarrow.Table) -> pyarrow.Table:
 
     table = table.filter(pc.field("seed").isin([*plan.seeds]) & (pc.field("cell") < len(plan.cells)))
     run = ["cell", "seed", "name"]
-    several = table.group_by(run).aggregate([("key", "distinct")]).filter(pc.list_value_length(pc.field("key_distinct")) > 1)
+    keys_of = table.group_by(run).aggregate([("key", "distinct"), ("key", "count_distinct")])
+    several = keys_of.filter(pc.field("key_count_distinct") > 1)
     digests, stale = dict[int, str](), set[str]()
     for cell, seed, name, keys in zip(*(several[c].to_pylist() for c in (*run, "key_distinct")), strict=True):
         present = row_key(_digest(plan, cell, digests), seed, name)

@@ -80,7 +80,7 @@ def lqg_multirate_optimal(prior: Prior, mode: int, plant: Plant, settings: Any) 
 def lqg_multirate_multi(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With the optimal multi-rate filter and every peak of the vibration in its model."""
     prior = _with_caution(prior, settings)
-    cycle = every_peak_model(settings.multirate, settings.multipeak, prior, mode, plant.ratio)
+    cycle = every_peak_model(settings.multipeak, prior, mode, plant.ratio)
     return _law(cycle.filter_of(prior, mode), plant.mirror)
 
 

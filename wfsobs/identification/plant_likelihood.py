@@ -391,7 +391,7 @@ def guess_plant(data: PlantLikelihood) -> tuple[Array, float, Array]:
     What is new is known where none of ORDER + 1 frames is missing; where that is hardly ever so no share is known: 0.
     """
     y, u, k, n = data.filled_y, data.u[0], data.k, data.n - ORDER
-    known = sliding_window_view(~np.isnan(data.y).any(axis=1), ORDER + 1).all(axis=1)
+    known: Array = sliding_window_view(~np.isnan(data.y).any(axis=1), ORDER + 1).all(axis=1)
     is_enough = np.count_nonzero(known) >= ENOUGH * 2 * k * ORDER
     w, v = prediction_errors(y, u, known if is_enough else None)
     turn = -np.linalg.lstsq(w, v, rcond=None)[0]

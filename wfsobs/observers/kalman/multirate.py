@@ -287,12 +287,11 @@ MULTIRATE_OPTIMAL = Observer(
 )
 
 
-def every_peak_model(rates: MultiRate, peaks: MultiPeak, prior: Prior, mode: int, ratio: int) -> Cycle:
+def every_peak_model(peaks: MultiPeak, prior: Prior, mode: int, ratio: int) -> Cycle:
     """Return the cycle of one mode with every peak of the vibration in its model."""
-    beams = prior.beams[mode]
-    error = beams.lgs if rates.model_lgs_error else ()
-    noises = multirate_noise(rates, prior.noise_of(mode))
-    return estimated_cycle(beam_model(beams, prior.lines[mode].vibration(peaks.line_width)), ratio, *noises, error)
+    beams, noise = prior.beams[mode], prior.noise_of(mode)
+    model = beam_model(beams, prior.lines[mode].vibration(peaks.line_width))
+    return estimated_cycle(model, ratio, noise.lgs_noise, noise.ngs_noise, beams.lgs)
 
 
 def beam_model(beams: Beams, vibration: Sequence[Ar2]) -> DisturbanceModel:
@@ -320,6 +319,6 @@ MULTIRATE_MULTI = Observer(
         ("multipeak.turbulence_order", "kalman.turbulence_rms"),
     ),
     look=Look("Multi-rate multi-peak", "#AB64CF", "#F26FF3", (16, 3, 3, 3)),
-    step=partial(optimal_filters, partial(every_peak_model, MultiRate())),
+    step=partial(optimal_filters, every_peak_model),
     counts=vibration_used,
 )
