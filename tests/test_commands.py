@@ -1,5 +1,6 @@
 """Commands of installed packages: by entry points; the command line names what is not there."""
 
+from collections.abc import Iterator
 from importlib.metadata import EntryPoint
 
 import click
@@ -41,3 +42,20 @@ def test_what_is_not_there_is_named(points: list[EntryPoint], name: str, line: s
     points.append(EntryPoint("hello", "no.such:hello", group.ENTRY_POINTS))
     result = CliRunner().invoke(group.main, [name])
     assert result.exit_code == 2 and result.output.splitlines()[-1] == line
+
+
+def test_no_option_takes_what_is_no_finite_number() -> None:
+    def options(command: click.Command, ctx: click.Context) -> Iterator[click.Option]:
+        if isinstance(command, click.Group):
+            for name in command.list_commands(ctx):
+                if (one := command.get_command(ctx, name)) is not None:
+                    yield from options(one, ctx)
+        yield from (it for it in command.params if isinstance(it, click.Option))
+
+    ctx = click.Context(group.main)
+    found = [it for it in options(group.main, ctx) if isinstance(it.type, (click.FloatRange, click.types.FloatParamType))]
+    assert len(found) > 30
+    for option in found:
+        for text in ("nan", "inf"):
+            with pytest.raises(click.BadParameter):
+                option.type.convert(text, option, ctx)

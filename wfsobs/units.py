@@ -14,10 +14,22 @@ import re
 LENGTHS = {"um": 1.0, "nm": 1e-3, "m": 1e6}
 """Micrometres per unit."""
 
-ANGLES = {"rad": 1.0, "arcsec": math.radians(1.0 / 3600.0), "mas": math.radians(1.0 / 3.6e6)}
+ARCSECOND = math.radians(1.0 / 3600.0)
+
+ANGLES = {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "nrad": 1e-9, "arcsec": ARCSECOND, "mas": 1e-3 * ARCSECOND}
 """Radians per unit."""
 
-SECONDS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "d": 86400.0}
+SECONDS = {
+    name: seconds
+    for names, seconds in (
+        ("s sec secs second seconds", 1.0),
+        ("ms msec millisecond milliseconds", 1e-3),
+        ("us µs \u03bcs usec microsecond microseconds", 1e-6),
+        ("ns nsec nanosecond nanoseconds", 1e-9),
+        ("d day days", 86400.0),
+    )
+    for name in names.split()
+}
 """Seconds per unit of time."""
 
 DAYS = ("mjd", "jd")
@@ -26,7 +38,15 @@ DAYS = ("mjd", "jd")
 UNITS = ("um", "nm", "mas", "arcsec", "rad")
 """Units that a user can give for a file."""
 
-_SYNONYMS = {"µm": "um", "micron": "um", "microns": "um", "\u03bcm": "um", "meter": "m", "arcseconds": "arcsec", "radian": "rad"}
+_SYNONYMS = {
+    **dict.fromkeys(("µm", "\u03bcm", "micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"), "um"),
+    **dict.fromkeys(("meter", "meters", "metre", "metres"), "m"),
+    **dict.fromkeys(("nanometer", "nanometers", "nanometre", "nanometres"), "nm"),
+    **dict.fromkeys(("radian", "radians"), "rad"),
+    **dict.fromkeys(("µrad", "\u03bcrad", "microradian", "microradians"), "urad"),
+    **dict.fromkeys(("arcsecond", "arcseconds"), "arcsec"),
+    **dict.fromkeys(("milliarcsec", "milliarcsecond", "milliarcseconds"), "mas"),
+}
 
 
 _ENDING = re.compile(r"[_ \[(]+(?P<unit>[A-Za-zµμ]+)[\])]?$")
@@ -68,6 +88,21 @@ def split_unit(heading: str, beside: str = "") -> tuple[str, str]:
     ending = _parse_any(match["unit"]) if match else ""
     name = heading[: match.start()] if match and ending else heading
     return name, _parse_any(beside.strip()) or ending
+
+
+def stated_unit(heading: str, beside: str = "") -> str:
+    """Return the unit of a heading as `split_unit`, or what is written beside it or in brackets, of whatever else it is.
+
+    >>> stated_unit("t_ms"), stated_unit("slope [V]"), stated_unit("slope (x)"), stated_unit("slope", "pixel")
+    ('ms', 'V', '', 'pixel')
+    """
+    match = _ENDING.search(heading)
+    bracketed = match["unit"] if match and heading[-1] in ")]" and match["unit"].lower() not in AXIS_NAMES else ""
+    return split_unit(heading, beside)[1] or beside.strip() or bracketed
+
+
+AXIS_NAMES = ("x", "y", "tip", "tilt")
+"""What also stands in brackets."""
 
 
 def _parse_any(text: str) -> str:

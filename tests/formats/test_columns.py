@@ -5,8 +5,10 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -301,6 +303,71 @@ def test_a_micro_sign_of_an_old_code_page() -> None:
     content = table([name.replace("nm", "µm") for name in OWN], TIME, *Y.T, *U.T)
     record = read_record(io.BytesIO(content.decode().encode("latin-1")), "a.csv")
     np.testing.assert_allclose(record.y_lgs, Y, rtol=1e-12)
+
+
+def in_hdf5(names: tuple[str, str], unit: str = "nm", clock: str = "s", factor: float = 1.0) -> io.BytesIO:
+    out = io.BytesIO()
+    with h5py.File(out, "w") as file:
+        for name, values, of in (
+            *((name, x, unit) for name, x in zip(names, (Y, U), strict=True)),
+            ("time", factor * TIME, clock),
+        ):
+            file[name] = values
+            file[name].attrs["units"] = of
+    return out
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"), [("milliseconds", 1e3), ("MSEC", 1e3), ("usec", 1e6), ("seconds since 2026-01-01", 1.0), ("", 1.0)]
+)
+def test_units_of_a_clock_in_other_words(unit: str, factor: float) -> None:
+    assert read_record(in_hdf5(("y_lgs", "u"), "nm", unit, factor), "a.h5").dt == pytest.approx(0.002, rel=1e-9)
+
+
+@pytest.mark.parametrize("names", [("y_lgs", "u"), ("slopes", "cmds")])
+def test_what_is_no_unit_is_refused_unless_one_is_stated(names: tuple[str, str]) -> None:
+    roles = {} if names[0] == "y_lgs" else dict(zip(("y_lgs", "u"), names, strict=True))
+    way = DeclaredFormat(columns=roles)
+    with pytest.raises(RecordError, match=r"(y_lgs|u) is in 'pixel', which is no unit of a wavefront: state one of um, nm, mas"):
+        read_record(in_hdf5(names, "pixel"), "a.h5", declaration=way)
+    is_as_clean(read_record(in_hdf5(names, "pixel"), "a.h5", declaration=replace(way, unit="nm")), "unit nm")
+    with pytest.raises(RecordError, match=r"time is in 'cycles', which is no unit of time; it takes s, ms, us, ns or d"):
+        read_record(in_hdf5(names, "nm", "cycles"), "a.h5", declaration=way)
+    # 1 urad on 8 m are 2 um
+    found = read_record(in_hdf5(names, "microradians"), "a.h5", declaration=way)
+    np.testing.assert_allclose(found.y_lgs, 2.0 * Y, rtol=1e-12)
+
+
+@pytest.mark.parametrize("unit", [" nm", "_nm", " [nm]", "[nm]", " (nm)"])
+def test_units_of_modes_however_they_stand_behind_them(unit: str) -> None:
+    names = ["time_s", *(f"{signal}/{mode}{unit}" for signal in ("y_lgs", "u") for mode in ("tilt", "tip"))]
+    is_as_clean(read_record(io.BytesIO(table(names, TIME, *Y.T[::-1], *U.T[::-1])), "a.csv"), "unit nm")
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.1])
+def test_missing_numbers_of_scaled_integers(scale: float) -> None:
+    raw = np.round(Y / scale).astype(np.int16)
+    raw[7] = -32768
+    columns = [fits.Column(name, "2I", unit="nm", array=raw, null=-32768) for name in ("Y_LGS", "U")]
+    hdu = fits.BinTableHDU.from_columns(columns)
+    hdu.header["DT"] = 1e-3
+    if scale != 1.0:
+        hdu.header["TSCAL1"] = hdu.header["TSCAL2"] = scale
+    hdu.writeto(file := io.BytesIO())
+    record = read_record(io.BytesIO(file.getvalue()), "a.fits")
+    assert np.flatnonzero(np.isnan(record.y_lgs).any(axis=1)).tolist() == [7] == np.flatnonzero(np.isnan(record.u[:, 0])).tolist()
+
+
+def test_numbers_given_for_every_row() -> None:
+    arrays = {"y_lgs": Y, "u": U, "unit": "nm"}
+    np.savez(file := io.BytesIO(), **arrays, dt=np.full(N, 0.002))
+    is_as_clean(read_record(file, "a.npz"), "unit nm")
+    np.savez(file := io.BytesIO(), **arrays, dt=np.append(np.full(N - 1, 0.002), 0.003))
+    with pytest.raises(RecordError, match=rf"dt holds {N} numbers that differ; it takes one"):
+        read_record(file, "a.npz")
+    np.savez(file := io.BytesIO(), y_lgs=1.0, u=1.0, dt=0.002)
+    with pytest.raises(RecordError, match=r"y_lgs has shape \(1, 1\); it takes"):
+        read_record(file, "a.npz")
 
 
 def test_tip_comes_first_in_whatever_order_the_columns_are() -> None:

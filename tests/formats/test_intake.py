@@ -266,7 +266,7 @@ CSV = [
     ("timestamp,y_lgs/tip_um,u/tip_um\n1,2,3\n2,3,3\n", "has no dt and no time; .*suggest: --column 'time=timestamp'"),
     ("y_lgs/tip_um,y_lgs/tip_nm,u/tip_um\n1,2,3\n", "two columns are named y_lgs/tip"),
     ("y_lgs/tip_um,y_lgs/tilt_nm,u/tip_um,u/tilt_um\n1,2,3,4\n", "y_lgs is in um and in nm"),
-    ("y_lgs/tip_V,u/tip_um\n1,2\n", "y_lgs is in 'V', which is no unit"),
+    ("y_lgs/tip_V,u/tip_um\n1,2\n2,1\n", "y_lgs is in 'V', which is no unit"),
     ("y_lgs/tip_um,y_lgs/tilt_um,u/tip_um\n1,2,3\n", "u has the modes tip; y_lgs has tip, tilt"),
     ("# dt: fast\ny_lgs/tip_um,u/tip_um\n1,2\n", "line 1: dt takes a number, not 'fast'"),
     ("", "holds no table"),

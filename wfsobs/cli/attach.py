@@ -10,7 +10,16 @@ import click
 import numpy as np
 from click.core import ParameterSource
 
-from wfsobs.cli.options import POSITIVE, json_option, ngs_options, ngs_wiring, scenario_options, stream_elements, told_scenario
+from wfsobs.cli.options import (
+    POSITIVE,
+    FiniteRange,
+    json_option,
+    ngs_options,
+    ngs_wiring,
+    scenario_options,
+    stream_elements,
+    told_scenario,
+)
 from wfsobs.cli.show import print_json, print_note
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.supervisor import SupervisedController, Supervision
@@ -52,12 +61,12 @@ OBSERVERS_ALONE = ("name", "shadow", "commands", "delay", "fallback")
 )
 @click.option(
     "--command-delay",
-    type=click.FloatRange(1, 50),
+    type=FiniteRange(1, 50),
     default=DELAY,
     metavar="N",
     help="Frames from a command to the first measurement that sees it, such as 1.5.",
 )
-@click.option("--command-gain", type=float, default=1.0, metavar="G", help="What the mirror does of them.")
+@click.option("--command-gain", type=FiniteRange(-1e12, 1e12), default=1.0, metavar="G", help="What the mirror does of them.")
 @click.option("--out", "sink", metavar="STREAM", help="Where what is sent goes, made if there is none; or tcp://*:port.")
 @click.option("--shadow", is_flag=True, help="Write nothing.")
 @click.option("--prior", metavar="FOUND.toml", help="Prior of the observer: the file of `wfsobs identify --out`.")
@@ -72,7 +81,7 @@ OBSERVERS_ALONE = ("name", "shadow", "commands", "delay", "fallback")
 @click.option("--unit", type=click.Choice(UNITS), default="um", help="Unit of the streams.")
 @click.option(
     "--delay",
-    type=click.FloatRange(1, 100),
+    type=FiniteRange(1, 100),
     default=1.0,
     metavar="D",
     help="Frames from the newest measurement to the one that the estimate is for.",
@@ -80,11 +89,11 @@ OBSERVERS_ALONE = ("name", "shadow", "commands", "delay", "fallback")
 @click.option("--fallback", type=click.Choice(["zero", "hold"]), default="zero", help="Output in place of an estimate.")
 @click.option(
     "--limit",
-    type=click.FloatRange(0, 1e12, min_open=True),
+    type=FiniteRange(0, 1e12, min_open=True),
     metavar="X",
     help=f"Magnitude that nothing sent may exceed; by default {LIMIT:g} times the rms of a measurement by the prior.",
 )
-@click.option("--stuck", type=click.FloatRange(1e-3, 60), default=STUCK, metavar="S", help="Time without a frame.")
+@click.option("--stuck", type=FiniteRange(1e-3, 60), default=STUCK, metavar="S", help="Time without a frame.")
 @click.option(
     "--semaphore",
     type=click.IntRange(0),

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from wfsobs.bench import tasks
 from wfsobs.bench.measure import SHARE, RealTime, Row, machine, measure_realtime
-from wfsobs.cli.options import json_option, scenario_options
+from wfsobs.cli.options import FiniteRange, json_option, scenario_options
 from wfsobs.cli.show import new_table, print_json, print_note, progress_bar, show_table
 from wfsobs.observers.step import StepError
 from wfsobs.scenario import Scenario
@@ -81,7 +81,7 @@ def _cell(name: str, value: float | None) -> str:
 @click.command(name="rt-check")
 @scenario_options
 @click.option("--observer", "name", default="kf-multi", metavar="ID", help="Observer or controller that runs.")
-@click.option("--seconds", type=click.FloatRange(0.01, 3600), default=5.0, metavar="S", help="Duration.")
+@click.option("--seconds", type=FiniteRange(0.01, 3600), default=5.0, metavar="S", help="Duration.")
 @json_option()
 def rt_check(scenario: Scenario, name: str, seconds: float, as_json: bool) -> None:
     """Tell what this machine can hold: how late a loop at the LGS rate wakes, and what a step takes in it."""

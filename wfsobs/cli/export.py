@@ -6,6 +6,7 @@ import click
 
 from wfsobs.campaign.sweep import MOST_SEEDS
 from wfsobs.cli.options import (
+    FiniteRange,
     load_declared,
     needing,
     observer_option,
@@ -74,8 +75,8 @@ def export(
 @training_options
 @click.option("--out", required=True, metavar="FILE", help="File to write: .pdf, .svg, .pgf, .png or .html.")
 @click.option("--record", "record_file", metavar="RECORD", help="Draw from a record of your own, not from a simulation.")
-@click.option("--width", type=click.FloatRange(40, 400), default=88.0, metavar="MM", help="One column; 180 are two.")
-@click.option("--height", type=click.FloatRange(20, 1000), metavar="MM", help="By default 40 for each plot, and legends.")
+@click.option("--width", type=FiniteRange(40, 400), default=88.0, metavar="MM", help="One column; 180 are two.")
+@click.option("--height", type=FiniteRange(20, 1000), metavar="MM", help="By default 40 for each plot, and legends.")
 def figure(
     name: str,
     scenario: Scenario,

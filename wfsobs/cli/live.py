@@ -12,6 +12,7 @@ import click
 import numpy as np
 
 from wfsobs.cli.options import (
+    FiniteRange,
     controller_option,
     json_option,
     load_declared,
@@ -61,13 +62,13 @@ from wfsobs.units import micrometres_per
 @observer_option
 @controller_option("Run this controller alone beside it; can be repeated.")
 @click.option("--no-controllers", is_flag=True, help="Run no controller beside it.")
-@click.option("--speed", type=click.FloatRange(0.1, 20), default=1.0, metavar="X", help="1 is real time.")
+@click.option("--speed", type=FiniteRange(0.1, 20), default=1.0, metavar="X", help="1 is real time.")
 @click.option("--record", "record_file", metavar="RECORD", help="Also save what was sent, in the format of its ending.")
 @click.option("--log", "log_file", metavar="FILE", help="Append what happens and alarms, a line each.")
 @click.option("--port", type=click.IntRange(0, 65535), default=5006, help="Port of the page; 0 for a free one.")
 @click.option("--open", "open_browser", is_flag=True, help="Open a browser.")
 @click.option("--headless", is_flag=True, help="Run without a page, for --seconds, and print a table.")
-@click.option("--seconds", type=click.FloatRange(0.01, 86_400), default=10.0, metavar="N", help="Duration.")
+@click.option("--seconds", type=FiniteRange(0.01, 86_400), default=10.0, metavar="N", help="Duration.")
 @json_option("Print one JSON object instead of a table.")
 def live(
     scenario: Scenario,

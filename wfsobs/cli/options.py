@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import wraps
-from math import erfc, sqrt
+from math import erfc, isfinite, sqrt
 from typing import Any
 
 import click
@@ -24,7 +24,18 @@ from wfsobs.telemetry.intake import LONGEST_DELAY, DeclaredFormat
 from wfsobs.telemetry.records import open_record, read_loop_matrix, read_with_delay
 from wfsobs.units import UNITS, micrometres_per
 
-POSITIVE = click.FloatRange(0, min_open=True)
+
+class FiniteRange(click.FloatRange):
+    """Type of options that take a number within a range: of no range does `nan` lie outside."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the number. Raises BadParameter."""
+        if not isfinite(number := super().convert(value, param, ctx)):
+            self.fail(f"{number} is no finite number", param, ctx)
+        return number
+
+
+POSITIVE = FiniteRange(0, min_open=True)
 """Type of options that take a number above 0."""
 
 
@@ -63,13 +74,13 @@ def uncertainty_options(command: Callable) -> Callable:
     def with_uncertainty(*, delay: float, gain: float, rotation: float, resonance: float, **values: Any) -> Any:
         return command(uncertainty=Uncertainty(delay, gain, rotation, resonance), **values)
 
-    below_1 = click.FloatRange(0, 1, max_open=True)
+    below_1 = FiniteRange(0, 1, max_open=True)
     return add_options(
         with_uncertainty,
         click.option("--resonance", type=below_1, default=0.1, help="Of `plant.resonance`."),
-        click.option("--rotation", type=click.FloatRange(0, 180), default=10.0, help="Of the rotation [deg]."),
+        click.option("--rotation", type=FiniteRange(0, 180), default=10.0, help="Of the rotation [deg]."),
         click.option("--gain", type=below_1, default=0.2, help="Of the gain."),
-        click.option("--delay", type=click.FloatRange(0), default=0.5, help="Largest error of the delay [frames]."),
+        click.option("--delay", type=FiniteRange(0), default=0.5, help="Largest error of the delay [frames]."),
     )
 
 
@@ -194,7 +205,7 @@ def record_options(command: Callable) -> Callable:
         click.option("--command-gain", metavar="G[,G]", help="What the mirror does of a command, one or per mode; by default 1."),
         click.option(
             "--command-delay",
-            type=click.FloatRange(1, LONGEST_DELAY),
+            type=FiniteRange(1, LONGEST_DELAY),
             metavar="N",
             help=f"Steps from a command to the first measurement that sees it, such as 1.5; by default {DELAY}.",
         ),

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from wfsobs.cli.options import POSITIVE, needing
+from wfsobs.cli.options import POSITIVE, FiniteRange, needing
 
 ORIGIN = re.compile(r"https?://(\*\.)?[\w.-]+(:\d+|:\*)?|https?://\[[\da-f:]+\](:\d+)?", re.ASCII | re.IGNORECASE)
 
@@ -59,7 +59,7 @@ def _check_embedders(_context: click.Context, _option: click.Parameter, origins:
 @click.option("--cache-mb", type=click.IntRange(0), default=256, metavar="MB", help="Size of the cache of results.")
 @click.option(
     "--lifetime",
-    type=click.FloatRange(0.1),
+    type=FiniteRange(0.1),
     default=60.0,
     metavar="S",
     help="Time to keep the settings of a page that has lost its connection.",

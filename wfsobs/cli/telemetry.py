@@ -12,6 +12,7 @@ from rich.text import Text
 
 from wfsobs.cli.options import (
     POSITIVE,
+    FiniteRange,
     controller_option,
     json_option,
     load_declared,
@@ -132,7 +133,7 @@ def observe(
 @record_command
 @click.option(
     "--level",
-    type=click.FloatRange(0, 0.5, min_open=True),
+    type=FiniteRange(0, 0.5, min_open=True),
     default=LEVEL,
     metavar="P",
     help="Probability of finding any peak where there is none.",
@@ -273,10 +274,10 @@ def promise(
 
 @click.command()
 @scenario_options
-@click.option("--seconds", type=click.FloatRange(1.0, 1e4), default=20.0, help="How long it lasts.")
-@click.option("--delay", type=click.FloatRange(1e-4, 1.0), default=0.03, help="Error of the delay, frames.")
-@click.option("--gain", type=click.FloatRange(1e-4, 1.0), default=0.02, help="Error of the gain.")
-@click.option("--rotation", type=click.FloatRange(1e-3, 90.0), default=1.0, help="Error of it, degrees.")
+@click.option("--seconds", type=FiniteRange(1.0, 1e4), default=20.0, help="How long it lasts.")
+@click.option("--delay", type=FiniteRange(1e-4, 1.0), default=0.03, help="Error of the delay, frames.")
+@click.option("--gain", type=FiniteRange(1e-4, 1.0), default=0.02, help="Error of the gain.")
+@click.option("--rotation", type=FiniteRange(1e-3, 90.0), default=1.0, help="Error of it, degrees.")
 @click.option("--out", metavar="PROBE.npz", help="Save its commands, `probe` (steps, modes) [um], with `dt` [s].")
 @json_option("Print JSON instead of a line.")
 def probe(scenario: Scenario, seconds: float, delay: float, gain: float, rotation: float, out: str | None, as_json: bool) -> None:

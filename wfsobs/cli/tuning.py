@@ -8,7 +8,15 @@ import click
 import numpy as np
 from rich.table import Table
 
-from wfsobs.cli.options import POSITIVE, json_option, load_declared, record_options, scenario_options, uncertainty_options
+from wfsobs.cli.options import (
+    POSITIVE,
+    FiniteRange,
+    json_option,
+    load_declared,
+    record_options,
+    scenario_options,
+    uncertainty_options,
+)
 from wfsobs.cli.show import new_table, print_json, progress_bar, show_table
 from wfsobs.closed_loop.envelope import Uncertainty
 from wfsobs.control.controllers import CONTROLLERS
@@ -86,7 +94,7 @@ LINEAR = [c.id for c in CONTROLLERS.values() if c.tunable.usual]
 )
 @click.option(
     "--loss",
-    type=click.FloatRange(0),
+    type=FiniteRange(0),
     default=EnvelopeGoal.loss,
     help="How much more --envelope may leave at the nominal plant.",
 )

@@ -361,14 +361,14 @@ def _means(x: Array, cells: Cells) -> Array:
     return np.add.reduceat(x, _edges(cells)) / cells.count
 
 
-def prediction_errors(y: Array, u: Array, known: Array | None = None) -> tuple[Array, Array]:
+def prediction_errors(y: Array, u: Array, rows: Array | None = None) -> tuple[Array, Array]:
     """Return what is new in measurements and commands, (n, ...) each, from their ORDER th sample on: not told by their past.
 
-    known : which of these samples it is told of, all by default; zero at the others
+    rows : which of these samples it is told of, bool (n - ORDER,), all by default; zero at the others
     """
     n = len(y) - ORDER
     past = np.column_stack([x[ORDER - i : ORDER - i + n] for x in (y, u) for i in range(1, ORDER + 1)])
-    rows = np.arange(n) if known is None else np.flatnonzero(known)
+    rows = np.arange(n) if rows is None else np.flatnonzero(rows)
     new_y, new_u = np.zeros_like(y[ORDER:]), np.zeros_like(u[ORDER:])
     for x, new in ((y, new_y), (u, new_u)):
         new[rows] = x[ORDER:][rows] - past[rows] @ np.linalg.lstsq(past[rows], x[ORDER:][rows], rcond=1e-10)[0]
@@ -391,7 +391,7 @@ def guess_plant(data: PlantLikelihood) -> tuple[Array, float, Array]:
     What is new is known where none of ORDER + 1 frames is missing; where that is hardly ever so no share is known: 0.
     """
     y, u, k, n = data.filled_y, data.u[0], data.k, data.n - ORDER
-    known: Array = sliding_window_view(~np.isnan(data.y).any(axis=1), ORDER + 1).all(axis=1)
+    known = np.asarray(sliding_window_view(~np.isnan(data.y).any(axis=1), ORDER + 1).all(axis=1))
     is_enough = np.count_nonzero(known) >= ENOUGH * 2 * k * ORDER
     w, v = prediction_errors(y, u, known if is_enough else None)
     turn = -np.linalg.lstsq(w, v, rcond=None)[0]

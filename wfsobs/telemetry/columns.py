@@ -27,7 +27,7 @@ from wfsobs.telemetry.formats.contents import (
     parse_heading,
 )
 from wfsobs.typing import Array
-from wfsobs.units import SECONDS, split_unit
+from wfsobs.units import SECONDS, split_unit, stated_unit
 
 SIGNALS = {
     "y_lgs": "measurement",
@@ -85,8 +85,7 @@ def to_contents(file: FileColumns, roles: Mapping[str, str]) -> Contents:
                 f"it has {', '.join([*file.columns][:20])}" if file.columns else "columns of its format have names of their own"
             )
             raise RecordError(f"has no column {name[:80]!r}; {there}")
-        unit = split_unit(name, file.units.get(name, ""))[1]
-        found[role] = file.columns[name], unit if (unit in SECONDS) == (role == TIME) else ""
+        found[role] = file.columns[name], "" if role == FRAME else stated_unit(name, file.units.get(name, ""))
     unused = []
     for name, values in file.columns.items():
         role, unit = parse_heading(name, file.units.get(name, "")) or ("", "")

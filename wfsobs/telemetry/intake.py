@@ -21,7 +21,7 @@ from wfsobs.telemetry.bridged import without_bridged
 from wfsobs.telemetry.columns import LoopMatrix, apply_matrices
 from wfsobs.telemetry.formats.contents import APART, FAST, FRAME, LARGEST, NGS, SIGNALS, STARS, TIME, TRAINING, Contents
 from wfsobs.typing import Array
-from wfsobs.units import ANGLES, SECONDS, micrometres_per, parse_unit
+from wfsobs.units import ANGLES, SECONDS, UNITS, micrometres_per, parse_unit
 
 MOST_NAMED = 5
 """Maximum columns that are named as not used."""
@@ -105,8 +105,11 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
     modes = apply_matrices(signals, declaration.reconstructor, declaration.command_modes)
     if declaration.reconstructor and not declaration.reconstructor.keeps_unit:
         contents.units.pop("y_lgs", None)
+    if declaration.command_modes and parse_unit(contents.units.get("u", "um")) is None:  # of actuators
+        del contents.units["u"]
     if declaration.open_loop:
         signals["u"] = np.zeros_like(signals["y_lgs"])
+        contents.units.pop("u", None)
     n, n_modes = signals["y_lgs"].shape
     if not 1 <= n_modes <= most or n < 2:
         order = order_of(n_modes) if n_modes > most else None
@@ -182,7 +185,10 @@ def _into_micrometres(
         if (unit := parse_unit(str(arrays["unit"]))) is None:
             raise RecordError(f"unit is {str(arrays['unit'])[:40]!r}, which is no unit of a wavefront")
         own = dict.fromkeys(signals, unit) | own
+    own = {name: unit for name, unit in own.items() if parse_unit(unit) or declaration.unit is None}
     for name, unit in own.items():
+        if parse_unit(unit) is None:
+            raise RecordError(f"{name} is in {unit[:40]!r}, which is no unit of a wavefront: state one of {', '.join(UNITS)}")
         if declaration.unit is not None and unit != declaration.unit:
             raise RecordError(f"{name} is in {unit}, but {declaration.unit} is stated")
     known = sorted({own[name] for name in signals if name in own})

@@ -49,7 +49,7 @@ NUMBERS = ("dt", "ratio", "delay", "command_sign")
 TEXTS = ("unit", "origin", "scenario")
 NAMES = (*SIGNALS, *CLOCKS, STARS, APART, *NUMBERS, *TEXTS)
 
-COLUMN = re.compile(r"(?:truth/)?(?P<array>[a-z_]+)/(?P<mode>[A-Za-z0-9 -]+?)(?:_(?P<unit>[A-Za-zµμ]+))?$")
+COLUMN = re.compile(r"(?:truth/)?(?P<array>[a-z_]+)/(?P<mode>[A-Za-z0-9 -]+?)(?:(?:_| ?[\[(])(?P<unit>[A-Za-zµμ]+)[\])]?)?$")
 """Name of a column of one mode, such as y_lgs/tip_um."""
 
 MOST_COLUMNS = 20_000
@@ -81,10 +81,8 @@ class Contents:
     hint: str = ""
 
     def state_unit(self, name: str, text: str) -> None:
-        """Note the unit of a signal. Raises RecordError for an unknown one, or one that differs from that of its other modes."""
-        unit = parse_unit(text)
-        if unit is None:
-            raise RecordError(f"{name} is in {text!r}, which is no unit of a wavefront")
+        """Note the unit of a signal, whatever it is. Raises RecordError where it differs from that of its other modes."""
+        unit = parse_unit(text) or text.strip()
         if self.units.setdefault(name, unit) != unit:
             raise RecordError(f"{name} is in {self.units[name]} and in {unit}")
 
@@ -136,20 +134,24 @@ class FileColumns:
             self.leave(name, f"{name} holds {KINDS.get(values.dtype.kind, values.dtype)}, not numbers")
         elif not values.size:
             self.leave(name, f"{name} is empty")
-        elif values.size == 1 and known in (*NUMBERS, *TEXTS):
-            self.contents.arrays[known] = values.reshape(())
+        elif known in (*NUMBERS, *TEXTS):
+            if values.size > 1 and not (values == values.flat[0]).all():
+                raise RecordError(f"{known} holds {values.size} numbers that differ; it takes one")
+            self.contents.arrays[known] = values.flat[0].reshape(())
         elif values.size == 1 and known not in NAMES and not parse_heading(name):
             self.numbers[name] = float(values.item())
         else:
             self._add_numbers(name, values, unit)
 
     def _add_numbers(self, name: str, values: Array, unit: str) -> None:
+        values = np.atleast_1d(values)
         known, longest = name.lower(), int(np.argmax(values.shape))
         rows = np.moveaxis(values, longest, 0).reshape(values.shape[longest], -1)
         if known in self.contents.arrays:
             raise RecordError(f"two parts are named {known}")
         if known in CLOCKS:
-            self.contents.arrays[known] = values.reshape(rows.shape if rows.shape[1] > 1 else -1) * SECONDS.get(unit.strip(), 1.0)
+            self.contents.arrays[known] = values.reshape(rows.shape if rows.shape[1] > 1 else -1)
+            self.contents.arrays[known] = self.contents.arrays[known] * seconds_per(known, unit)
         elif known in SIGNALS:
             self.contents.arrays[known] = values if values.ndim == 2 else rows
             if unit:
@@ -235,15 +237,29 @@ def parse_cell(text: str) -> float:
 def parse_heading(heading: str, beside: str = "") -> tuple[str, str] | None:
     """Return the role and the unit of a column named as in a record, None of any other; beside : its unit, if not in its name.
 
-    >>> parse_heading("y_lgs/tip_um"), parse_heading("time [ms]"), parse_heading("flux")
-    (('y_lgs/tip', 'um'), ('time', 'ms'), None)
+    >>> parse_heading("y_lgs/tip_um"), parse_heading("u/tip nm"), parse_heading("time [ms]"), parse_heading("flux")
+    (('y_lgs/tip', 'um'), ('u/tip', 'nm'), ('time', 'ms'), None)
     """
     match = COLUMN.fullmatch(heading)
     if match and match["array"] in SIGNALS:
-        return f"{match['array']}/{match['mode']}", match["unit"] or beside.strip()
+        mode, unit = (match["mode"], match["unit"]) if match["unit"] else split_unit(match["mode"])  # "tip nm", too
+        return f"{match['array']}/{mode}", unit or beside.strip()
     name, unit = split_unit(heading, beside)
     name = TIME if name.lower() in DAYS else name.lower()
     return (name, unit) if name in CLOCKS else None
+
+
+def seconds_per(name: str, unit: str) -> float:
+    """Return the seconds per unit of a clock, 1 where none is stated. Raises RecordError.
+
+    >>> seconds_per("time", "Milliseconds since the start"), seconds_per("time", "")
+    (0.001, 1.0)
+    """
+    words = unit.split() or ["s"]
+    seconds = SECONDS.get(words[0]) or SECONDS.get(words[0].lower())
+    if seconds is None:
+        raise RecordError(f"{name} is in {unit[:40]!r}, which is no unit of time; it takes s, ms, us, ns or d")
+    return seconds
 
 
 def from_columns(columns: Mapping[str, tuple[Array, str]]) -> Contents:
@@ -257,7 +273,7 @@ def from_columns(columns: Mapping[str, tuple[Array, str]]) -> Contents:
     for role, (values, unit) in columns.items():
         name, _, mode = role.partition("/")
         if not mode:
-            contents.arrays[name] = values * SECONDS.get(unit, 1.0)
+            contents.arrays[name] = values * (seconds_per(name, unit) if name in CLOCKS else 1.0)
             continue
         found.setdefault(name, {})[mode] = values
         if unit:

@@ -91,7 +91,10 @@ def tables_and_images(hdus: HDUList) -> FileColumns:
                 if "P" in column.format or "Q" in column.format:
                     out.leave(name, f"{name} is a column of rows of unlike lengths")
                 else:
-                    out.add(name, _native(data[column.name], column.null), column.unit or "")
+                    values = _native(data[column.name], None)
+                    if column.null is not None and values.dtype.kind == "f":  # of the integers as they are stored
+                        values[np.asarray(data.view(np.ndarray)[column.name]) == column.null] = np.nan
+                    out.add(name, values, column.unit or "")
         elif data is not None:
             unit = str(hdu.header.get("BUNIT", ""))
             out.add(hdu.name or f"image {number}", _native(data, hdu.header.get("BLANK")), unit)
