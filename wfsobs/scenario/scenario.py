@@ -174,6 +174,8 @@ class Scenario(Group):
             for kind in ("lgs", "ngs"):
                 fit_lenslets(self.sensors.lenslets, kind, self.telescope.diameter, self.telescope.radial_order)
         self._validate_events()
+        if self.plant.start >= self.run.duration:
+            raise SettingError(f"plant.start = {self.plant.start:g}: must be below run.duration = {self.run.duration:g} s")
         least = self.control.delay + self.plant.delay_error - self.plant.delay_jitter
         if least < 1.0:
             raise SettingError(
