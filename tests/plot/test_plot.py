@@ -71,7 +71,7 @@ def sweep_over(*axes: str) -> SweepResults:
 
 @pytest.fixture(scope="module")
 def sweep() -> SweepResults:
-    return sweep_over("turbulence.wind_speed=5:20:3")
+    return sweep_over("turbulence.wind_speed=20,5,12.5")
 
 
 @pytest.fixture(scope="module")
@@ -325,10 +325,12 @@ def test_the_model_is_drawn_over_what_was_measured(found: Identification, result
 
 
 def test_a_sweep_is_drawn_with_its_own_numbers(sweep: SweepResults, field: SweepResults) -> None:
-    line = curves(sweep.plot.errors(target="turbulence"))["LGS KF"]
-    errors = [sweep.error(i, ("kf-lgs", "turbulence", "tip")) for i in range(3)]
-    np.testing.assert_array_equal(line.dimension_values(0), [5.0, 12.5, 20.0])
-    np.testing.assert_array_equal(line.dimension_values(1), [1e3 * error[0] for error in errors if error])
+    """From the least value to the highest, in whatever order they are given."""
+    figure = sweep.plot.errors(target="turbulence")
+    errors = [sweep.error(i, ("kf-lgs", "turbulence", "tip")) for i in (1, 2, 0)]
+    for drawn in (curves(figure)["LGS KF"], figure.traverse(lambda x: x, [hv.Spread])[0]):
+        np.testing.assert_array_equal(drawn.dimension_values(0), [5.0, 12.5, 20.0])
+        np.testing.assert_array_equal(drawn.dimension_values(1), [1e3 * error[0] for error in errors if error])
     (names,) = field.plot.errors().traverse(lambda x: x, [hv.Labels])
     best = [field.winner(i, "vibration", "tip") for i in range(4)]
     assert {text.split("\n")[0] for text in names.dimension_values("best")} == {look(it.name).label for it in best if it}
