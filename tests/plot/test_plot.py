@@ -363,6 +363,16 @@ def test_a_paper_figure_is_the_result(of_paper: wfsobs.Result) -> None:
     np.testing.assert_array_equal(lines["Filtered vibration, open loop"].dimension_values(1), estimate.values[first:last, 0])
 
 
+def test_plots_of_the_paper_that_a_record_has_nothing_for_are_left_out(record: wfsobs.Record) -> None:
+    """The one of tilt of a record of one mode, spectra of ten samples after the warm-up."""
+    tip = wfsobs.Record(y_lgs=record.y_lgs[:, :1], u=record.u[:, :1], dt=record.dt)
+    for name, of, scenario, count in (
+        ("paper-5", tip, SCENARIO, 1),
+        ("paper-6", record, SCENARIO.replace({"run.warm_up": 2.99}), 2),
+    ):
+        assert len(draw_paper_figure(name, wfsobs.observe(of, scenario, observers=["kf-lgs"]))) == count
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NUMBERS)
 @pytest.mark.parametrize("suffix", ["pdf", "svg", "png", "pgf", "html"])
