@@ -536,6 +536,13 @@ def test_arrays_of_a_sweep(field: SweepResults) -> None:
             assert known == tuple(float(here[name]) for name in ("rms", "low", "high"))
 
 
+def test_arrays_of_a_sweep_over_lists_have_them_as_text() -> None:
+    swept, key = sweep_over("vibration.peaks=[{frequency=20}],[{frequency=30}]"), ("kf-lgs", "vibration", "tip")
+    where = {"vibration.peaks": "[{frequency = 30}]", **dict(zip(("observer", "target", "mode"), key, strict=True))}
+    here = swept.to_xarray().sel(where)
+    assert swept.error(1, key) == tuple(float(here[name]) for name in ("rms", "low", "high"))
+
+
 def test_an_identification_is_a_table(found: Identification) -> None:
     frame = found.to_dataframe()
     peaks = frame[(frame["mode"] == "tip") & frame["what"].isin(["line", "resonance"])]
