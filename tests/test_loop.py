@@ -159,6 +159,9 @@ def test_the_training_record_starts_with_the_loop_settled() -> None:
     assert np.sqrt(np.mean(np.square(y))) < 0.5
 
 
-def test_an_impossible_scenario_is_refused_before_any_work() -> None:
-    with pytest.raises(SettingError, match=r"^run\.warm_up"):
-        simulate(scenario({"run.warm_up": 1.5}))
+@pytest.mark.parametrize("warm_up", [1.5, 1.4996, 1.4995])
+def test_an_impossible_scenario_is_refused_before_any_work(warm_up: float) -> None:
+    """At 1 kHz the last two round to all 1500 steps."""
+    scenario({"run.warm_up": 1.4994}).validate()
+    with pytest.raises(SettingError, match=rf"^run\.warm_up = {warm_up:g}: must be below run\.duration = 1\.5 s by a step"):
+        simulate(scenario({"run.warm_up": warm_up}))

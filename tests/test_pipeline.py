@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -16,8 +17,8 @@ from wfsobs.evaluation.result import Failure
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, BOUNDS, COMMON_BOUNDS, LOOP, PREDICTION, RESIDUAL, SCORED
 from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import TARGETS
-from wfsobs.observers.estimates import Estimate
+from wfsobs.observers.base import TARGETS, Observer
+from wfsobs.observers.estimates import Estimate, Estimates
 from wfsobs.pipeline import as_stated
 from wfsobs.progress import Cancelled, Watch
 from wfsobs.signal.spectrum import rms
@@ -295,3 +296,24 @@ def test_an_observer_that_cannot_work_is_left_out_with_its_reason() -> None:
     result = run(s)
     assert [f.observer for f in result.failures] == ["multirate", "gpr-online"]
     assert all(isinstance(f, Failure) and "\n" not in f.reason and len(f.reason) < 250 for f in result.failures)
+
+
+@pytest.mark.parametrize(
+    ("make", "reason"),
+    [
+        (lambda z: {"vibration": z[:, 0]}, r"vibration takes an array of the shape \(800, 2\), .* not \(800,\)"),
+        (lambda z: {"vibration": z[:-1]}, r"not \(799, 2\)"),
+        (lambda z: {"vibration": z.tolist()}, "not list"),
+        (lambda z: Estimates({"vibration": z}, {"vibration": z[0]}), r"sd of vibration takes .* not \(2,\)"),
+        (lambda z: {"turbulence": z}, "returns no vibration"),
+        (lambda z: None, "returns NoneType, not a dictionary"),
+    ],
+)
+def test_what_is_no_estimate_is_one_line_and_the_others_keep_theirs(
+    make: Any, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mine = Observer("mine", "Mine", ("vibration",), lambda measurements, *_: make(measurements.z))
+    monkeypatch.setitem(OBSERVERS, "mine", mine)
+    result = run(scenario(), observers=["mine", "zero"])
+    assert [f.observer for f in result.failures] == ["mine"] and re.match(f"mine left out: .*{reason}", result.failures[0].reason)
+    assert {e.observer for e in result.estimates} == {"zero"}

@@ -10,6 +10,7 @@ import numpy as np
 import panel as pn
 import pytest
 
+from wfsobs import Record, observe
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.pages import figures as figures_page
 from wfsobs.app.pages.figures import Figures
@@ -17,7 +18,7 @@ from wfsobs.app.pages.pages import AWAY, EXPLORE, FIGURES, MODEL
 from wfsobs.app.pages.parts import example
 from wfsobs.app.render import matrix, short, tex
 from wfsobs.app.style import look
-from wfsobs.app.work import TRUTH
+from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.description import describe
 from wfsobs.plot.paper import PSD_TOP_HZ
 from wfsobs.scenario import Scenario
@@ -133,6 +134,14 @@ class TestFigures:
         dashboard.store.change("vibration.source", "none")
         loop.finish(dashboard.store)
         assert dashboard.store.run.state == "done"
+
+    def test_of_one_mode(self, figures: Figures, dashboard: Dashboard) -> None:
+        record = dashboard.store.run.result.result.record
+        tip = Record(y_lgs=record.y_lgs[:, :1], u=record.u[:, :1], dt=record.dt)
+        result = RunResults(observe(tip, dashboard.store.scenario, observers=["kf-lgs"]))
+        for sheet in figures.sheets:
+            sheet.draw(result, dashboard.display)
+        assert [plot.figure.visible for plot in figures.sheets[2].plots] == [True, False]
 
 
 class TestModel:

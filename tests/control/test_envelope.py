@@ -90,6 +90,9 @@ def test_what_is_not_linear_is_left_out_and_says_so(result: PlantEnvelope) -> No
     for of in (plant_envelope, tuned_envelope):
         with pytest.raises(SettingError, match=r"controllers: an envelope takes integrator, .*, not none"):
             of(MATCHED, controllers=["none"])
+    for points in (0, -3):
+        with pytest.raises(SettingError, match=rf"points = {points}: takes a whole number from 1"):
+            plant_envelope(MATCHED, controllers=NAMES, points=points)
     with pytest.raises(SettingError, match=r"delay: 1.2 - 0.5 frames are below 1"):
         plant_envelope(MATCHED.replace({"control.delay": 1.2}), controllers=NAMES)
 

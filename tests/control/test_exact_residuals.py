@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +12,7 @@ from tests.records import MATCHED
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.exact_residuals import exact_residuals
 from wfsobs.closed_loop.run import closed_loop
+from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.bound import bound_rms
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
@@ -61,10 +65,12 @@ def test_ut4_with_two_frames_is_near_the_bound() -> None:
         assert 1.0 < found.rms / bound_rms(s, mode, 1, information="both")["total"] < 1.05
 
 
-def test_what_has_none_says_so() -> None:
+def test_what_has_none_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match="none: the exact residual is that of a stable linear law"):
         exact_residuals("none", MATCHED)
-    with pytest.raises(ValueError, match="integrator\\+gpr-online: the exact"):
-        exact_residuals("integrator+gpr-online", MATCHED)
+    monkeypatch.setitem(CONTROLLERS, "mine", replace(CONTROLLERS["integrator+gpr-online"], id="mine"))
+    for name in ("integrator+gpr-online", "mine"):
+        with pytest.raises(ValueError, match=rf"{re.escape(name)}: the exact"):
+            exact_residuals(name, MATCHED)
     with pytest.raises(ValueError, match="not known"):
         exact_residuals("integrator", PRESETS["lost-frames"]())

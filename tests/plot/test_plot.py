@@ -71,7 +71,7 @@ def sweep_over(*axes: str) -> SweepResults:
 
 @pytest.fixture(scope="module")
 def sweep() -> SweepResults:
-    return sweep_over("turbulence.wind_speed=5:20:3")
+    return sweep_over("turbulence.wind_speed=20,5,12.5")
 
 
 @pytest.fixture(scope="module")
@@ -325,10 +325,12 @@ def test_the_model_is_drawn_over_what_was_measured(found: Identification, result
 
 
 def test_a_sweep_is_drawn_with_its_own_numbers(sweep: SweepResults, field: SweepResults) -> None:
-    line = curves(sweep.plot.errors(target="turbulence"))["LGS KF"]
-    errors = [sweep.error(i, ("kf-lgs", "turbulence", "tip")) for i in range(3)]
-    np.testing.assert_array_equal(line.dimension_values(0), [5.0, 12.5, 20.0])
-    np.testing.assert_array_equal(line.dimension_values(1), [1e3 * error[0] for error in errors if error])
+    """From the least value to the highest, in whatever order they are given."""
+    figure = sweep.plot.errors(target="turbulence")
+    errors = [sweep.error(i, ("kf-lgs", "turbulence", "tip")) for i in (1, 2, 0)]
+    for drawn in (curves(figure)["LGS KF"], figure.traverse(lambda x: x, [hv.Spread])[0]):
+        np.testing.assert_array_equal(drawn.dimension_values(0), [5.0, 12.5, 20.0])
+        np.testing.assert_array_equal(drawn.dimension_values(1), [1e3 * error[0] for error in errors if error])
     (names,) = field.plot.errors().traverse(lambda x: x, [hv.Labels])
     best = [field.winner(i, "vibration", "tip") for i in range(4)]
     assert {text.split("\n")[0] for text in names.dimension_values("best")} == {look(it.name).label for it in best if it}
@@ -359,6 +361,16 @@ def test_a_paper_figure_is_the_result(of_paper: wfsobs.Result) -> None:
     lines = curves(zoomed)
     assert lines.keys() == {"Filtered vibration, open loop", "Real vibration"}
     np.testing.assert_array_equal(lines["Filtered vibration, open loop"].dimension_values(1), estimate.values[first:last, 0])
+
+
+def test_plots_of_the_paper_that_a_record_has_nothing_for_are_left_out(record: wfsobs.Record) -> None:
+    """The one of tilt of a record of one mode, spectra of ten samples after the warm-up."""
+    tip = wfsobs.Record(y_lgs=record.y_lgs[:, :1], u=record.u[:, :1], dt=record.dt)
+    for name, of, scenario, count in (
+        ("paper-5", tip, SCENARIO, 1),
+        ("paper-6", record, SCENARIO.replace({"run.warm_up": 2.99}), 2),
+    ):
+        assert len(draw_paper_figure(name, wfsobs.observe(of, scenario, observers=["kf-lgs"]))) == count
 
 
 @pytest.mark.slow
@@ -522,6 +534,13 @@ def test_arrays_of_a_sweep(field: SweepResults) -> None:
             known = field.error(cell, key)
             here = data.sel({**changes, **dict(zip(("observer", "target", "mode"), key, strict=True))})
             assert known == tuple(float(here[name]) for name in ("rms", "low", "high"))
+
+
+def test_arrays_of_a_sweep_over_lists_have_them_as_text() -> None:
+    swept, key = sweep_over("vibration.peaks=[{frequency=20}],[{frequency=30}]"), ("kf-lgs", "vibration", "tip")
+    where = {"vibration.peaks": "[{frequency = 30}]", **dict(zip(("observer", "target", "mode"), key, strict=True))}
+    here = swept.to_xarray().sel(where)
+    assert swept.error(1, key) == tuple(float(here[name]) for name in ("rms", "low", "high"))
 
 
 def test_an_identification_is_a_table(found: Identification) -> None:

@@ -28,6 +28,7 @@ from wfsobs.pipeline import observe
 from wfsobs.priors_from.scenario import common_observers
 from wfsobs.progress import QUIET, Watch
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.configfile import format_value
 from wfsobs.scenario.grid import Variation, parse_variation
 from wfsobs.scenario.idle import idle_settings, why_idle_at
 from wfsobs.settings.errors import SettingError
@@ -518,13 +519,15 @@ class SweepResults:
     def to_xarray(self) -> xarray.Dataset:
         """Return mean errors `rms` and the ends `low` and `high` of their intervals [um], as `error` does, as labelled arrays.
 
-        Dimensions are the settings, observer, target and mode; NaN is not known. Raises ImportError without xarray.
+        Dimensions are the settings, observer, target and mode; values that are lists are text, NaN is not known. Raises
+        ImportError without xarray.
         """
         known = self.known_keys()
         labels = [list(dict.fromkeys(key[i] for key in known)) for i in range(3)]
-        dims = {axis.path: list(axis.values) for axis in self.sweep.axes} | dict(
-            zip(("observer", "target", "mode"), labels, strict=True)
-        )
+        dims = {
+            axis.path: [format_value(value) if isinstance(value, (dict, list)) else value for value in axis.values]
+            for axis in self.sweep.axes
+        } | dict(zip(("observer", "target", "mode"), labels, strict=True))
         values = np.full((len(self.sweep.cells), *map(len, labels), 3), np.nan)
         for cell in range(len(self.sweep.cells)):
             for key in known:

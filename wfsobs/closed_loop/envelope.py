@@ -289,7 +289,8 @@ def plant_envelope(
     Raises
     ------
     SettingError
-        The spectra are not known, the plant is not linear, a delay would be below one frame, or a controller is unknown.
+        There are no points, the spectra are not known, the plant is not linear, a delay would be below one frame, or a
+        controller is unknown.
     Cancelled
         `watch` asks to stop.
 
@@ -348,6 +349,8 @@ def uncertain_plants(
 ) -> tuple[dict[str, Array], dict[str, Array], Plants]:
     """Return errors at the points and at the corners, as `error_samples`, and the plants. Raises SettingError."""
     base = full_plant_of(scenario)
+    if points < 1:
+        raise SettingError(f"points = {points}: takes a whole number from 1")
     if not base.time_invariant:
         raise SettingError("plant: an envelope is by theory, for a plant that is linear and the same at every step")
     if base.delay - uncertainty.delay < 1.0:
@@ -404,7 +407,7 @@ def error_samples(uncertainty: Uncertainty, base: TruePlant, points: int) -> tup
         del most["rotation"]
     if base.resonance:
         most["resonance"] = uncertainty.resonance
-    power = ceil(log2(max(points, 1)))
+    power = ceil(log2(points))
     cube = Sobol(len(most), scramble=False).random_base2(power)[:points] + 0.5 ** (power + 1)  # in the middle of the cells
     corners = np.array(list(product((-1.0, 1.0), repeat=len(most))))
     by = list(enumerate(most.items()))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from wfsobs.closed_loop.design import design
+from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.mirror import Law, Mirror
 from wfsobs.evaluation.bound import PeriodicError
 from wfsobs.evaluation.exact_errors import variance_of
@@ -46,7 +47,7 @@ def exact_residuals(controller: str, scenario: Scenario) -> list[PeriodicError]:
         raise ValueError("the exact residual is that of a plant without errors")
     out = []
     for mode, found in enumerate(plan.laws[controller]):
-        if found.law is None or not found.stable or controller.startswith("integrator+"):
+        if found.law is None or not found.stable or CONTROLLERS[controller].predict is not None:
             raise ValueError(f"{controller}: the exact residual is that of a stable linear law: {found.note or 'it has none'}")
         spectra = true_spectra(scenario, mode)
         ratio = spectra.ngs.ratio

@@ -194,8 +194,8 @@ def bound(scenario: Scenario, *, information: str = "lgs", ahead: float = 0, mod
     Raises
     ------
     ValueError
-        The spectra of the scenario are not known, or there is no such information in it: its modes are independent ("modes",
-        "both-modes"), or all LGS see the same ("asterism").
+        The spectra of the scenario are not known, it has no such mode, or there is no such information in it: its modes are
+        independent ("modes", "both-modes"), or all LGS see the same ("asterism").
 
     Notes
     -----
@@ -217,7 +217,12 @@ def bound(scenario: Scenario, *, information: str = "lgs", ahead: float = 0, mod
         raise ValueError(f"information = {information!r}: takes one of {', '.join(INFORMATION)}")
     if not has_known_spectra(scenario):
         raise ValueError("no bound: the spectra of this scenario are not known, or events change them")
-    row, chosen = INFORMATION[information], range(len(scenario.modes)) if modes is None else modes
+    every = range(len(scenario.modes))
+    row, chosen = INFORMATION[information], every if modes is None else modes
+    if wrong := [mode for mode in chosen if mode not in every]:
+        raise ValueError(f"modes: takes indices from 0 to {every[-1]}, not {wrong[0]}")
+    if ahead < 0:
+        raise ValueError(f"ahead = {ahead:g}: takes 0 steps or more")
     if row in ALONE:
         found = _least_together(scenario.replace({"run.seed": 0}), row, ahead)
         return [dict(found[mode]) for mode in chosen]

@@ -6,9 +6,11 @@ the prior that it asked for and its own settings: the truth is out of reach.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from wfsobs.observers.estimates import TARGETS as TARGETS
 from wfsobs.observers.estimates import TURBULENCE as TURBULENCE
@@ -188,7 +190,7 @@ class Observer:
         else:
             given = fill_missing(measurements, prior, getattr(settings, "line_width", LINE_WIDTH))
         found = self.run(given, prior, settings, watch) if self.run else run_design(self, given, prior, settings, watch)
-        return found if isinstance(found, Estimates) else Estimates(found)
+        return check_estimates(found, self.targets, measurements.y_lgs.shape)
 
     def design(
         self,
@@ -247,6 +249,20 @@ class Observer:
     def needs_text(self, *, source: PriorSource = TRUE) -> str:
         """Return what it has to be told beside measurements, for people; source : where its prior comes from."""
         return ", ".join(words_for(self.prior, source=source)) or NOTHING
+
+
+def check_estimates(estimates: object, targets: tuple[str, ...], shape: tuple[int, ...]) -> Estimates:
+    """Return what an observer found, arrays of this shape, (n_steps, n_modes). Raises ValueError."""
+    if not isinstance(estimates, Mapping):
+        raise ValueError(f"returns {type(estimates).__name__}, not a dictionary of arrays")
+    if missing := [target for target in targets if target not in estimates]:
+        raise ValueError(f"returns no {', '.join(missing)}")
+    out = estimates if isinstance(estimates, Estimates) else Estimates(estimates)
+    for name, values in [*((target, out[target]) for target in targets), *((f"sd of {of}", x) for of, x in out.sd.items())]:
+        if not isinstance(values, np.ndarray) or values.shape != shape:
+            kind = getattr(values, "shape", type(values).__name__)
+            raise ValueError(f"{name} takes an array of the shape {shape}, (n_steps, n_modes), not {kind}")
+    return out
 
 
 def run_design(observer: Observer, measurements: Measurements, prior: Prior, settings: Any, watch: Watch) -> Estimates:

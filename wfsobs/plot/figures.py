@@ -268,7 +268,7 @@ class SweepPlots:
             cells = [(at, self.results.error(i, key)) for i, at in enumerate(places)]
             points = np.array([(value, *(NM * e for e in error)) for value, error in cells if error is not None])
             if key[0] != NO_ESTIMATE and len(points):
-                at, mean, low, high = points.T
+                at, mean, low, high = points[points[:, 0].argsort()].T
                 band = hv.Spread((at, mean, mean - low, high - mean), x, [y, "below", "above"])
                 colour = look(key[0]).light
                 style(band, alpha=0.15, color=colour, show_legend=False, bokeh={}, matplotlib={"facecolor": colour})

@@ -138,11 +138,14 @@ class PlotLines:
 def drawn_lines(
     of: PaperFigure, plot: Plot, record: Record, warm_up: float, values: Callable[[str, str], Array | None]
 ) -> PlotLines:
-    """Return the lines of a plot; values : (name, target) -> (n_steps, n_modes) [um], None where there are none."""
+    """Return the lines of a plot, none of a mode that is not there or of a spectrum of too few samples.
+
+    values : (name, target) -> (n_steps, n_modes) [um], None where there are none
+    """
     lines, (first, last) = dict[str, tuple[Array, Array]](), samples_of(record, warm_up)[plot.window]
     for name in (*of.observers, TRUTH):
         x = values(name, of.target)
-        if x is None:
+        if x is None or plot.column >= record.n_modes:
             continue
         if not plot.is_spectrum:
             lines[name] = envelope_times(first, last, BINS, record.dt), envelope(x[first:last, plot.column], BINS)
@@ -175,7 +178,7 @@ def draw_paper_figure(name: str, result: Result) -> hv.Layout:
     Returns
     -------
     holoviews.Layout
-        Plots below each other, in micrometres, as the paper states its errors.
+        Plots below each other, in micrometres, as the paper states its errors; without those that have no line.
 
     Raises
     ------
@@ -187,10 +190,11 @@ def draw_paper_figure(name: str, result: Result) -> hv.Layout:
     known = [it for it in NUMBERS[name] if any(result.estimate(observer, it.target) for observer in it.observers)]
     if not known:
         raise RecordError(f"{name}: the record allows no estimate of {', '.join(observers_in(name))}")
-    return stack([_draw_plot(it, plot, result) for it in known for plot in it.plots])
+    drawn = [_draw_plot(it, plot, result) for it in known for plot in it.plots]
+    return stack([one for one in drawn if one is not None])
 
 
-def _draw_plot(of: PaperFigure, plot: Plot, result: Result) -> hv.Overlay:
+def _draw_plot(of: PaperFigure, plot: Plot, result: Result) -> hv.Overlay | None:
     from wfsobs.plot.elements import FREQUENCY, TIME, draw_line, overlay, quantity
 
     def values(name: str, target: str) -> Array | None:
@@ -198,6 +202,8 @@ def _draw_plot(of: PaperFigure, plot: Plot, result: Result) -> hv.Overlay:
         return result.record.truth(target) if name == TRUTH else estimate and estimate.values
 
     shown, drawn = drawn_lines(of, plot, result.record, result.scenario.run.warm_up, values), []
+    if not shown.lines:
+        return None
     label = plot.label if plot.is_spectrum else f"{of.target}, {plot.label}"
     y = quantity(f"{of.number} {plot.what} {plot.column}", plot.unit("µm"), label)
     for name, line in shown.lines.items():

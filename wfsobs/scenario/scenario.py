@@ -151,8 +151,10 @@ class Scenario(Group):
     def validate(self) -> None:
         """Check settings against each other: raise SettingError naming the settings and the limit."""
         nyquist = self.sensors.lgs_rate / 2
-        if self.run.warm_up >= self.run.duration:
-            raise SettingError(f"run.warm_up = {self.run.warm_up:g}: must be below run.duration = {self.run.duration:g} s")
+        if round(self.run.warm_up / self.dt) >= self.n_steps:  # rounded as where it is left out
+            raise SettingError(
+                f"run.warm_up = {self.run.warm_up:g}: must be below run.duration = {self.run.duration:g} s by a step"
+            )
         for i, peak in enumerate(self.vibration.peaks):
             if peak.frequency >= nyquist:
                 raise SettingError(
@@ -172,6 +174,8 @@ class Scenario(Group):
             for kind in ("lgs", "ngs"):
                 fit_lenslets(self.sensors.lenslets, kind, self.telescope.diameter, self.telescope.radial_order)
         self._validate_events()
+        if self.plant.start >= self.run.duration:
+            raise SettingError(f"plant.start = {self.plant.start:g}: must be below run.duration = {self.run.duration:g} s")
         least = self.control.delay + self.plant.delay_error - self.plant.delay_jitter
         if least < 1.0:
             raise SettingError(

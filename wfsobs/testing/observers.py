@@ -111,9 +111,7 @@ def _check_shapes(observer: Observer, estimates: Estimates, measurements: Measur
     for target in observer.targets:
         if target not in TARGETS:
             raise CheckError(f"{observer.id}: target {target!r} is none of {', '.join(TARGETS)}")
-        values = estimates.get(target)
-        if values is None:
-            raise CheckError(f"{observer.id}: returns no {target}")
+        values = estimates[target]
         check_numbers(observer.id, target, values, measurements.y_lgs.shape)
         if np.isinf(values).any():
             raise CheckError(f"{observer.id}: {target} is infinite; NaN stands for steps without an estimate")

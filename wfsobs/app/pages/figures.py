@@ -105,6 +105,7 @@ class _PlotLines(FigureLines):
     def draw(self, results: RunResults, display: Display) -> None:
         """Send every line in the colours of the paper."""
         record, warm_up = results.result.record, results.scenario.run.warm_up
+        self.figure.visible = self.plot.column < record.n_modes
         shown = drawn_lines(self.of, self.plot, record, warm_up, results.values)
         scale = display.scale(results.scenario) ** (1 + self.plot.is_spectrum)
         self.put({name: (x, scale * y) for name, (x, y) in shown.lines.items()})
