@@ -14,6 +14,7 @@ import zipfile
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from inspect import signature
 from math import inf
 from types import UnionType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
@@ -69,6 +70,9 @@ def read_as(kind: type[T], values: Any) -> T:
     if not isinstance(values, dict):
         raise SessionError(DAMAGED)
     hints = get_type_hints(kind)
+    for name, parameter in signature(kind).parameters.items():
+        if parameter.default is parameter.empty and name not in values:
+            raise SessionError(f"{name} is missing")
     return kind(**{name: get_value(values, name, hint) for name, hint in hints.items() if name in values})
 
 
@@ -76,12 +80,12 @@ def get_value(values: Mapping[str, Any], name: str, hint: Any) -> Any:
     """Return a value of one type and no other. Raises SessionError."""
     try:
         return _convert(values.get(name), hint)
-    except TypeError:
+    except (TypeError, OverflowError, UnicodeEncodeError):
         raise SessionError(f"{name} is missing or of the wrong kind") from None
 
 
 def _convert(value: Any, hint: Any) -> Any:
-    """Return a plain value as one of a type; JSON has a tuple as a list. Raises TypeError."""
+    """Return a plain value as one of a type; JSON has a tuple as a list. Raises TypeError, OverflowError, UnicodeEncodeError."""
     of = get_args(hint)
     if isinstance(hint, UnionType):
         return None if value is None else _convert(value, of[0])
@@ -91,8 +95,12 @@ def _convert(value: Any, hint: Any) -> Any:
         return tuple(_convert(item, of[0]) for item in value)
     if isinstance(value, dict) and get_origin(hint) is Mapping:
         return {_convert(key, of[0]): _convert(item, of[1]) for key, item in value.items()}
-    if type(value) not in ((int, float) if hint is float else (hint,)):
+    if hint is float and type(value) is int:
+        value = float(value)
+    if type(value) is not hint:
         raise TypeError
+    if isinstance(value, str):
+        value.encode()  # JSON may have half of a surrogate pair, a page may not
     return value
 
 
