@@ -189,6 +189,11 @@ def test_values_that_make_no_sense(change: Callable[[dict[str, Any]], Any], reas
     assert reason in one_line(changed(change))
 
 
+def test_scores_of_observers_that_are_not_here_are_left_out() -> None:
+    file = changed(lambda v: v["entries"][0]["scores"].append(v["entries"][0]["scores"][0] | {"observer": "moon"}))
+    assert read_session(file).entries[0].scores == session().entries[0].scores
+
+
 @pytest.mark.parametrize(
     "content",
     [b"", b"PK", packed("[" * 100_000), packed("{}"), packed("no JSON"), packed('{"version":' + "9" * 10_000 + "}")],

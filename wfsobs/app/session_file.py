@@ -24,7 +24,9 @@ from wfsobs.app.compared import DrawnLines
 from wfsobs.app.service import run_key
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, Step, record_key
 from wfsobs.app.work import RunResults
+from wfsobs.evaluation.rows import NOT_OBSERVERS
 from wfsobs.evaluation.scores import Calibration, Score
+from wfsobs.observers import OBSERVERS
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -394,10 +396,11 @@ def _entry(values: Any, records: _Records) -> HistoryEntry:
     if len(listed) > MOST_SCORES or bool(record and source) != isinstance(source, LoadedRecord):
         raise SessionError(DAMAGED)
     lost = bool(record) and source is None
+    scores = [read_as(Score, score) for score in listed]
     plain |= {
         "key": get_text(values, "key", 64) if lost else run_key(scenario, source),
         "name": " ".join(plain["name"][:LONGEST_NAME].split()) or "no name",
         "record": record,
-        "scores": tuple(read_as(Score, score) for score in listed),
+        "scores": tuple(score for score in scores if score.observer in (*OBSERVERS, *NOT_OBSERVERS)),  # others have no label here
     }
     return HistoryEntry(scenario=scenario, preset=preset, source=source, **plain)
