@@ -6,11 +6,13 @@ import click
 
 from wfsobs.campaign.sweep import MOST_SEEDS
 from wfsobs.cli.options import (
+    RECORD_OPTIONS,
     load_declared,
     needing,
     observer_option,
     preset_of_command,
     record_options,
+    refuse_options,
     scenario_options,
     told_scenario,
     training,
@@ -92,6 +94,8 @@ def figure(
     with needing("figure: needs", "plot"):
         from wfsobs.plot.elements import check_suffix, save_figure
     check_suffix(out)
+    if record_file is None:
+        refuse_options((*RECORD_OPTIONS, "train", "train_until"), "only with --record")
     names = observers_in(name)
     record = load_declared(record_file, scenario, declaration, sha256) if record_file else None
     with progress_bar() as watch:

@@ -8,7 +8,16 @@ import click
 import numpy as np
 from rich.table import Table
 
-from wfsobs.cli.options import POSITIVE, json_option, load_declared, record_options, scenario_options, uncertainty_options
+from wfsobs.cli.options import (
+    POSITIVE,
+    RECORD_OPTIONS,
+    json_option,
+    load_declared,
+    record_options,
+    refuse_options,
+    scenario_options,
+    uncertainty_options,
+)
 from wfsobs.cli.show import new_table, print_json, progress_bar, show_table
 from wfsobs.closed_loop.envelope import Uncertainty
 from wfsobs.control.controllers import CONTROLLERS
@@ -143,7 +152,9 @@ def tune(
         raise SettingError("give --observer, or --envelope and --controller")
     if not on_envelope and goal != EnvelopeGoal():
         raise SettingError("--delay, --gain, --rotation, --resonance, --by, --loss: only with --envelope")
-    if record_file is not None:
+    if record_file is None:
+        refuse_options(RECORD_OPTIONS, "only with --record")
+    else:
         if validation is not None:
             raise SettingError("--validation: only for simulated records, not with --record")
         record = load_declared(record_file, scenario, declaration, sha256)
