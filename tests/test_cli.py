@@ -171,6 +171,7 @@ def test_the_record_overrides_the_scenario(tmp_path):
         (["tune", "--observer", "kf-lgs", "--open-loop"], "--open-loop: only with --record"),
         (["figure", "paper-4", "--out", "f.pdf", "--train", "r.npz"], "--train: only with --record"),
         (["figure", "paper-4", "--out", "f.pdf", "--column", "u=c"], "--column: only with --record"),
+        (["figure", "paper-4", "--out", "no/such/f.pdf", "--record", "none.npz"], "no/such: No such file or directory"),
         (["live", "--headless", "--sha256", "ab"], "--sha256: only with --replay"),
         (["live", "--headless", "--unit", "nm"], "--unit: only with --replay or --in"),
         (["live", "--headless", "--modes", "0"], "--modes: only with --in"),

@@ -19,6 +19,7 @@ from wfsobs.cli.options import (
     training_options,
 )
 from wfsobs.cli.show import print_note, progress_bar, warn
+from wfsobs.files import check_writable
 from wfsobs.handover.write import FORMATS, write_design
 from wfsobs.pipeline import observe, run
 from wfsobs.plot.paper import NUMBERS, draw_paper_figure, observers_in
@@ -94,6 +95,7 @@ def figure(
     with needing("figure: needs", "plot"):
         from wfsobs.plot.elements import check_suffix, save_figure
     check_suffix(out)
+    check_writable(out)
     if record_file is None:
         refuse_options((*RECORD_OPTIONS, "train", "train_until"), "only with --record")
     names = observers_in(name)
