@@ -11,6 +11,8 @@ from click.testing import CliRunner
 import wfsobs
 from tests.records import ON_PAPER
 from wfsobs.cli import main
+from wfsobs.cli.options import RECORD_OPTIONS
+from wfsobs.cli.simulate import loop
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import configfile
@@ -163,6 +165,18 @@ def test_the_record_overrides_the_scenario(tmp_path):
         (["run", "--set", "run.warm_up=10"], "run.warm_up = 10: must be below run.duration"),
         (["run", "--seeds", "2", "--save", "x.npz"], "--save: saves one record"),
         (["run", *QUICK, "--save", "no/such/folder/x.npz"], "no/such/folder"),
+        (["run", "--psd-unit", "nm"], "--psd-unit: only with --vibration-psd"),
+        (["loop", "--command-delay", "2"], "--command-delay: only with --record"),
+        (["loop", "--train-until", "1"], "--train-until: only with --record"),
+        (["tune", "--observer", "kf-lgs", "--open-loop"], "--open-loop: only with --record"),
+        (["figure", "paper-4", "--out", "f.pdf", "--train", "r.npz"], "--train: only with --record"),
+        (["figure", "paper-4", "--out", "f.pdf", "--column", "u=c"], "--column: only with --record"),
+        (["figure", "paper-4", "--out", "no/such/f.pdf", "--record", "none.npz"], "no/such: No such file or directory"),
+        (["live", "--headless", "--sha256", "ab"], "--sha256: only with --replay"),
+        (["live", "--headless", "--unit", "nm"], "--unit: only with --replay or --in"),
+        (["live", "--headless", "--modes", "0"], "--modes: only with --in"),
+        (["attach", "--in", "s", "--shadow", "--command-gain", "2"], "--command-gain: only with --commands or --controller"),
+        (["attach", "--in", "s", "--shadow", "--ngs-lag", "2"], "--ngs-lag: only with --ngs"),
         (["observe", "none.npz"], "none.npz: cannot be read"),
         (["observe", "none.npz", "--prior", "none.toml"], "none.toml: cannot be read"),
         (["presets", "nope"], "preset = 'nope'"),
@@ -176,6 +190,13 @@ def test_errors_are_one_line_and_status_2(arguments, message, tmp_path, monkeypa
     assert result.stderr.count("\n") == 1
     assert result.stdout == ""
     assert not list(tmp_path.iterdir())
+
+
+def test_options_of_a_record_need_one_and_columns_of_a_settings_file_do_not(tmp_path):
+    assert set(RECORD_OPTIONS) <= {parameter.name for parameter in loop.params}
+    (tmp_path / "s.toml").write_text('[columns]\nu = "commands"\n')
+    done = call("loop", "--config", str(tmp_path / "s.toml"), "--set", "run.duration=1.2", "--controller", "integrator")
+    assert done.exit_code == 0, done.stderr
 
 
 @pytest.mark.slow

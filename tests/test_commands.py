@@ -1,5 +1,6 @@
 """Commands of installed packages: by entry points; the command line names what is not there."""
 
+import errno
 from collections.abc import Iterator
 from importlib.metadata import EntryPoint
 
@@ -28,6 +29,22 @@ def test_a_package_brings_a_command(points: list[EntryPoint], monkeypatch: pytes
     points.append(EntryPoint("hello", "somewhere.cli:hello", group.ENTRY_POINTS))
     assert CliRunner().invoke(group.main, ["hello"]).output == "hello\n"
     assert "Of the package somewhere." in CliRunner().invoke(group.main, ["--help"]).output
+
+
+@pytest.mark.parametrize(
+    ("name", "outcome"), [(None, (1, "")), ("pipe", (2, "wfsobs: pipe: Broken pipe\n"))], ids=["output", "file"]
+)
+def test_an_output_that_nobody_reads_any_more_is_no_error(
+    points: list[EntryPoint], monkeypatch: pytest.MonkeyPatch, name: str | None, outcome: tuple[int, str]
+) -> None:
+    @click.command()
+    def write() -> None:
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe", name)
+
+    monkeypatch.setattr(EntryPoint, "load", lambda _self: write)
+    points.append(EntryPoint("write", "somewhere.cli:write", group.ENTRY_POINTS))
+    done = CliRunner().invoke(group.main, ["write"])
+    assert (done.exit_code, done.output) == outcome
 
 
 @pytest.mark.parametrize(

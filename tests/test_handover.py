@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import re
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import IO
 
 import numpy as np
 import pytest
@@ -14,6 +18,8 @@ from click.testing import CliRunner
 from scipy.io import loadmat
 
 from wfsobs.cli import main
+from wfsobs.files import write_whole
+from wfsobs.handover import c99
 
 ROUNDING = 1e-12
 """Over the std of the commands: sums in another order."""
@@ -217,3 +223,20 @@ def test_c99_overwrites_nothing(tmp_path: Path) -> None:
     (tmp_path / "mine.c").write_text("")
     result = CliRunner().invoke(main, ["design", "--controller", "integrator", "--to", "c99", "--out", str(tmp_path)])
     assert result.exit_code == 2 and "takes a new or empty directory" in result.output
+
+
+@pytest.mark.parametrize("is_there", [False, True])
+def test_c99_leaves_nothing_half_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_there: bool) -> None:
+    def write_some(path: Path, write: Callable[[IO[bytes]], object]) -> None:
+        if path.name == "test.c":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        write_whole(path, write)
+
+    if is_there:
+        (tmp_path / "out").mkdir()
+    with monkeypatch.context() as patched:
+        patched.setattr(c99, "write_whole", write_some)
+        done = CliRunner().invoke(main, ["design", "--controller", "integrator", "--to", "c99", "--out", str(tmp_path / "out")])
+    assert done.exit_code == 2 and "No space left" in done.output
+    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")] == ["out"] * is_there
+    assert (write(tmp_path, "integrator", "c99") / "output.f64").exists()

@@ -176,11 +176,6 @@ def test_loop_counts_what_follows_the_training_data(night: Record, files: Path) 
             assert got[outcome.controller, mode] == pytest.approx(expected, rel=1e-9)
 
 
-def test_a_simulated_loop_has_its_own_training_data() -> None:
-    done = call("loop", "--train-until", "1")
-    assert done.exit_code == 2 and "only with --record" in done.stderr
-
-
 # ---------------------------------------------------------------------- a prior without a file
 
 

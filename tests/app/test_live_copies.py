@@ -159,8 +159,3 @@ def test_a_stream_by_its_address(served: Any) -> None:
     # as far as the source: there is no such stream here
     exec(code.partition("    loop = ")[0], made)
     assert made["source"] == first.source and made["scenario"] == paper()
-
-
-def test_what_is_said_of_a_record_needs_one() -> None:
-    done = CliRunner().invoke(main, ["live", "--sha256", "ab", "--headless"])
-    assert done.exit_code and "options of a record need --replay" in done.output

@@ -174,6 +174,9 @@ def packed(text: str, records: bytes = b"") -> bytes:
         (lambda v: v["entries"][0].update(time="now"), "result 1: time is missing or of the wrong kind"),
         (lambda v: v["entries"][0].update(star=1), "result 1: star is missing or of the wrong kind"),
         (lambda v: v["entries"][0]["scores"][0].update(rms=None), "result 1: rms is missing or of the wrong kind"),
+        (lambda v: v["entries"][0]["scores"][0].pop("lag"), "result 1: lag is missing"),
+        (lambda v: v["entries"][0]["scores"][0].update(rms=10**400), "result 1: rms is missing or of the wrong kind"),
+        (lambda v: v["entries"][0].update(name="\ud800"), "result 1: name is missing or of the wrong kind"),
         (lambda v: v["entries"][0]["scores"][0].update(interval=[1]), "result 1: interval is missing or of the wrong kind"),
         (lambda v: v["entries"][2]["source"].update(number=1), "result 3: one of its records is missing"),
         (lambda v: v["entries"][2]["source"].update(sha256="zz"), "result 3: a SHA-256 takes 64"),
@@ -184,6 +187,11 @@ def packed(text: str, records: bytes = b"") -> bytes:
 )
 def test_values_that_make_no_sense(change: Callable[[dict[str, Any]], Any], reason: str) -> None:
     assert reason in one_line(changed(change))
+
+
+def test_scores_of_observers_that_are_not_here_are_left_out() -> None:
+    file = changed(lambda v: v["entries"][0]["scores"].append(v["entries"][0]["scores"][0] | {"observer": "moon"}))
+    assert read_session(file).entries[0].scores == session().entries[0].scores
 
 
 @pytest.mark.parametrize(

@@ -52,11 +52,14 @@ def test_conditions_are_rows_with_all_their_numbers(tmp_path):
         (lambda p: sample({"method": "best", "between": {"a": [0, 1]}}), "sample.method = 'best': takes one of sobol"),
         (lambda p: sample({"points": 0, "between": {"a": [0, 1]}}), "sample.points = 0: takes a whole number from 1"),
         (lambda p: sample({"points": 4}), "sample.between: takes"),
+        (lambda p: sample({"between": 3}), "sample.between: takes"),
+        (lambda p: sample({"between": {"a": [0, 1]}, "log": [[1]]}), r"sample.log = \[\[1\]\]: takes a list of settings"),
         (lambda p: conditions({"file": "none.csv", "columns": {"a": "b"}}, p), "none.csv: cannot be read: No such file"),
         (
             lambda p: conditions({"file": "one.csv", "columns": {"a": "b"}}, p),
             "conditions.columns.a: .*one.csv has the columns x",
         ),
+        (lambda p: conditions({"file": "one.csv", "columns": {"x": 3}}, p), 'conditions.columns.x: takes "setting" or'),
         (lambda p: conditions({"file": "one.csv", "columns": {"x": "b"}}, p), "no row has a number in each of x"),
     ],
 )

@@ -273,8 +273,8 @@ def test_a_loop_in_shared_memory_is_closed_from_the_command_line(tmp_path: Path)
         (["--controller", "lqg"], "controller 'lqg': no such controller"),
         (["--controller", "lqg-multirate"], "takes an NGS"),
         (["--controller", "integrator+gpr-offline"], "learns from a record beforehand"),
-        (["--controller", "lqg-kf-lgs", "--shadow"], "--shadow applies to observers"),
-        (["--controller", "lqg-kf-lgs", "--delay", "2"], "--delay applies to observers"),
+        (["--controller", "lqg-kf-lgs", "--shadow"], "--shadow: applies to observers"),
+        (["--controller", "lqg-kf-lgs", "--delay", "2"], "--delay: applies to observers"),
         (["--controller", "lqg-kf-lgs", "--command-gain", "0"], "--command-gain 0"),
     ],
 )

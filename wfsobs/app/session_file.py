@@ -14,6 +14,7 @@ import zipfile
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from inspect import signature
 from math import inf
 from types import UnionType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
@@ -23,7 +24,9 @@ from wfsobs.app.compared import DrawnLines
 from wfsobs.app.service import run_key
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, Step, record_key
 from wfsobs.app.work import RunResults
+from wfsobs.evaluation.rows import NOT_OBSERVERS
 from wfsobs.evaluation.scores import Calibration, Score
+from wfsobs.observers import OBSERVERS
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -69,6 +72,9 @@ def read_as(kind: type[T], values: Any) -> T:
     if not isinstance(values, dict):
         raise SessionError(DAMAGED)
     hints = get_type_hints(kind)
+    for name, parameter in signature(kind).parameters.items():
+        if parameter.default is parameter.empty and name not in values:
+            raise SessionError(f"{name} is missing")
     return kind(**{name: get_value(values, name, hint) for name, hint in hints.items() if name in values})
 
 
@@ -76,12 +82,12 @@ def get_value(values: Mapping[str, Any], name: str, hint: Any) -> Any:
     """Return a value of one type and no other. Raises SessionError."""
     try:
         return _convert(values.get(name), hint)
-    except TypeError:
+    except (TypeError, OverflowError, UnicodeEncodeError):
         raise SessionError(f"{name} is missing or of the wrong kind") from None
 
 
 def _convert(value: Any, hint: Any) -> Any:
-    """Return a plain value as one of a type; JSON has a tuple as a list. Raises TypeError."""
+    """Return a plain value as one of a type; JSON has a tuple as a list. Raises TypeError, OverflowError, UnicodeEncodeError."""
     of = get_args(hint)
     if isinstance(hint, UnionType):
         return None if value is None else _convert(value, of[0])
@@ -91,8 +97,12 @@ def _convert(value: Any, hint: Any) -> Any:
         return tuple(_convert(item, of[0]) for item in value)
     if isinstance(value, dict) and get_origin(hint) is Mapping:
         return {_convert(key, of[0]): _convert(item, of[1]) for key, item in value.items()}
-    if type(value) not in ((int, float) if hint is float else (hint,)):
+    if hint is float and type(value) is int:
+        value = float(value)
+    if type(value) is not hint:
         raise TypeError
+    if isinstance(value, str):
+        value.encode()  # JSON may have half of a surrogate pair, a page may not
     return value
 
 
@@ -386,10 +396,11 @@ def _entry(values: Any, records: _Records) -> HistoryEntry:
     if len(listed) > MOST_SCORES or bool(record and source) != isinstance(source, LoadedRecord):
         raise SessionError(DAMAGED)
     lost = bool(record) and source is None
+    scores = [read_as(Score, score) for score in listed]
     plain |= {
         "key": get_text(values, "key", 64) if lost else run_key(scenario, source),
         "name": " ".join(plain["name"][:LONGEST_NAME].split()) or "no name",
         "record": record,
-        "scores": tuple(read_as(Score, score) for score in listed),
+        "scores": tuple(score for score in scores if score.observer in (*OBSERVERS, *NOT_OBSERVERS)),  # others have no label here
     }
     return HistoryEntry(scenario=scenario, preset=preset, source=source, **plain)

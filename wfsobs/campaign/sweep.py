@@ -103,7 +103,8 @@ def sample(table: Mapping[str, Any]) -> list[Changes]:
         return [{}]
     check_keys(table, "sample", "method", "points", "seed", "between", "log")
     method, points, seed = table.get("method", "sobol"), table.get("points", 16), table.get("seed", 1)
-    ranges, log = dict(leaves(table.get("between", {}))), table.get("log", [])
+    between, log = table.get("between"), table.get("log", [])
+    ranges = dict(leaves(between)) if isinstance(between, dict) else {}
     if method not in METHODS:
         raise SettingError(f"sample.method = {method!r}: takes one of {', '.join(METHODS)}")
     if not isinstance(points, int) or not 1 <= points <= MAX_POINTS:
@@ -112,7 +113,7 @@ def sample(table: Mapping[str, Any]) -> list[Changes]:
         raise SettingError(f"sample.seed = {seed!r}: takes a whole number from 0")
     if not ranges:
         raise SettingError("sample.between: takes {setting: [low, high]}")
-    if not isinstance(log, list) or not set(log) <= set(ranges):
+    if not isinstance(log, list) or not all(path in list(ranges) for path in log):
         raise SettingError(f"sample.log = {log!r}: takes a list of settings of sample.between")
     limits = [_limits(path, of, path in log) for path, of in ranges.items()]
     return [
@@ -188,7 +189,8 @@ def _point(row: Mapping[str, str], columns: Mapping[str, Any]) -> Changes | None
     """Return the settings of a row, None where a number is missing."""
     out: dict[str, Any] = {}
     for column, of in columns.items():
-        setting, factor = (of, 1.0) if isinstance(of, str) else (of.get("setting"), of.get("factor", 1.0))
+        told = of if isinstance(of, dict) else {"setting": of}
+        setting, factor = told.get("setting"), told.get("factor", 1.0)
         if not isinstance(setting, str) or not isinstance(factor, (int, float)):
             raise SettingError(f'conditions.columns.{column}: takes "setting" or {{setting = "...", factor = 1.0}}')
         try:

@@ -16,6 +16,7 @@ from wfsobs.cli.options import (
     json_option,
     ngs_options,
     ngs_wiring,
+    refuse_options,
     scenario_options,
     stream_elements,
     told_scenario,
@@ -130,7 +131,11 @@ def attach(
     if bool(sink) == shadow:
         raise SettingError("attach: takes --out STREAM, or --shadow to write nothing")
     if controller is not None:
-        _check_options(click.get_current_context())
+        refuse_options(OBSERVERS_ALONE, "applies to observers; leave it out beside --controller")
+    elif commands is None:
+        refuse_options(("command_delay", "command_gain"), "only with --commands or --controller")
+    if ngs is None:
+        refuse_options(("ngs_modes", "ngs_lag"), "only with --ngs")
     if limit is not None and np.isnan(limit):
         raise SettingError("--limit nan: takes a number above 0")
     scenario = told_scenario(prior, scenario)
@@ -192,14 +197,6 @@ def _open_sink(name: str, source: SharedImage | Subscription, *others: str | Non
     if isinstance(source, Subscription):
         return SharedImage.create(path, (source.n,), dtype=dtype)
     return SharedImage.create(path, source.header.shape, dtype=dtype, layout=source.header.layout)
-
-
-def _check_options(context: click.Context) -> None:
-    """Raise SettingError for an option beside --controller that applies to observers alone."""
-    for parameter in context.command.params:
-        is_given = context.get_parameter_source(parameter.name or "") is ParameterSource.COMMANDLINE
-        if is_given and parameter.name in OBSERVERS_ALONE:
-            raise SettingError(f"{parameter.opts[0]} applies to observers; leave it out beside --controller")
 
 
 def _check_kind(name: str, parts: tuple[Part, ...], has_ngs: bool, needs_ngs: bool) -> None:

@@ -6,18 +6,21 @@ import click
 
 from wfsobs.campaign.sweep import MOST_SEEDS
 from wfsobs.cli.options import (
+    RECORD_OPTIONS,
     FiniteRange,
     load_declared,
     needing,
     observer_option,
     preset_of_command,
     record_options,
+    refuse_options,
     scenario_options,
     told_scenario,
     training,
     training_options,
 )
 from wfsobs.cli.show import print_note, progress_bar, warn
+from wfsobs.files import check_writable
 from wfsobs.handover.write import FORMATS, write_design
 from wfsobs.pipeline import observe, run
 from wfsobs.plot.paper import NUMBERS, draw_paper_figure, observers_in
@@ -93,6 +96,9 @@ def figure(
     with needing("figure: needs", "plot"):
         from wfsobs.plot.elements import check_suffix, save_figure
     check_suffix(out)
+    check_writable(out)
+    if record_file is None:
+        refuse_options((*RECORD_OPTIONS, "train", "train_until"), "only with --record")
     names = observers_in(name)
     record = load_declared(record_file, scenario, declaration, sha256) if record_file else None
     with progress_bar() as watch:

@@ -83,6 +83,8 @@ class Commands(click.Group):
                 raise
             click.echo(f"wfsobs: {error}", err=True)
         except OSError as error:
+            if isinstance(error, BrokenPipeError) and error.filename is None:
+                raise  # whoever reads the output has enough of it: click ends without a word
             click.echo(f"wfsobs: {error.filename or 'file'}: {error.strerror or error}", err=True)
         ctx.exit(2)
 

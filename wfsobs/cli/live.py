@@ -12,6 +12,7 @@ import click
 import numpy as np
 
 from wfsobs.cli.options import (
+    RECORD_OPTIONS,
     FiniteRange,
     controller_option,
     json_option,
@@ -22,6 +23,7 @@ from wfsobs.cli.options import (
     observer_option,
     preset_of_command,
     record_options,
+    refuse_options,
     scenario_options,
     stream_elements,
 )
@@ -95,11 +97,10 @@ def live(
     """Run a loop by the clock, every observer beside it, frame by frame, and show it on a page (docs/live.md)."""
     if replay_file and stream:
         raise SettingError("live: --replay and --in are two sources, take one")
+    _check_options(replay_file, stream, ngs)
     for file in (record_file, log_file):
         if file:
             check_writable(file)
-    if not replay_file and (sha256 or replace(declaration, unit=None) != DeclaredFormat()):
-        raise SettingError("live: options of a record need --replay")
     source = _source(scenario, replay_file, stream, modes, declaration, sha256)
     if not isinstance(source, SimulatedLoop):
         scenario = scenario.before_events
@@ -136,6 +137,18 @@ def live(
     with needing("live: the page needs", "app"):
         from wfsobs.app import serve as server
     server.serve(server.Options(port=port, open_browser=open_browser, runs=max(2, cpu_count() or 1)), order)
+
+
+def _check_options(replay_file: str | None, stream: str | None, ngs: str | None) -> None:
+    """Raise SettingError for an option that needs another one."""
+    if not replay_file:
+        refuse_options([name for name in RECORD_OPTIONS if name != "unit"], "only with --replay")
+    if not stream:
+        refuse_options(("modes",), "only with --in")
+    if not replay_file and not stream:
+        refuse_options(("unit",), "only with --replay or --in")
+    if ngs is None:
+        refuse_options(("ngs_modes", "ngs_lag"), "only with --ngs")
 
 
 def _source(

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import fields
 from functools import wraps
 from math import erfc, isfinite, sqrt
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from wfsobs.cli.show import print_note
 from wfsobs.closed_loop.envelope import Uncertainty
@@ -37,6 +39,17 @@ class FiniteRange(click.FloatRange):
 
 POSITIVE = FiniteRange(0, min_open=True)
 """Type of options that take a number above 0."""
+
+RECORD_OPTIONS = (*(field.name for field in fields(DeclaredFormat)), "sha256")
+"""Parameters of the options of `record_options`."""
+
+
+def refuse_options(names: Container[str], reason: str) -> None:
+    """Raise SettingError where one of these parameters of the command is given on the command line."""
+    context = click.get_current_context()
+    for parameter in context.command.params:
+        if parameter.name in names and context.get_parameter_source(parameter.name) is ParameterSource.COMMANDLINE:
+            raise SettingError(f"{parameter.opts[0]}: {reason}")
 
 
 def add_options(command: Callable, *options: Callable) -> Callable:

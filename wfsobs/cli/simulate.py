@@ -12,11 +12,13 @@ from rich.table import Table
 
 from wfsobs.cli.options import (
     POSITIVE,
+    RECORD_OPTIONS,
     controller_option,
     json_option,
     load_declared,
     observer_option,
     record_options,
+    refuse_options,
     scenario_options,
     seeds_option,
     training,
@@ -158,7 +160,9 @@ def run(
         raise SettingError("--budget: is of one record, without --over-time; leave --seeds at 1")
     if unknown := set(budget_of) - set(OBSERVERS):
         raise SettingError(f"--budget-of {min(unknown)}: no such observer; there are {', '.join(OBSERVERS)}")
-    if vibration_psd is not None:
+    if vibration_psd is None:
+        refuse_options(("psd_unit",), "only with --vibration-psd")
+    else:
         table = load_psd(vibration_psd, psd_unit, scenario.telescope.diameter)
         scenario = scenario.replace({"vibration.source": "psd", "vibration.psd": table})
     results: list[Result] = []
@@ -223,9 +227,9 @@ def loop(
     record, start = None, 0.0
     if with_envelope and (as_json or record_file is not None):
         raise SettingError("--envelope: not with --json or --record; `wfsobs envelope --json` has the rows, of a scenario")
-    if record_file is None and (train is not None or train_until is not None):
-        raise SettingError("--train, --train-until: only with --record; a simulated record has its own training data")
-    if record_file is not None:
+    if record_file is None:
+        refuse_options((*RECORD_OPTIONS, "train", "train_until"), "only with --record")
+    else:
         if seeds > 1:
             raise SettingError("--seeds: only for simulated records, not with --record")
         record = load_declared(record_file, scenario, declaration, sha256)

@@ -10,10 +10,12 @@ from rich.table import Table
 
 from wfsobs.cli.options import (
     POSITIVE,
+    RECORD_OPTIONS,
     FiniteRange,
     json_option,
     load_declared,
     record_options,
+    refuse_options,
     scenario_options,
     uncertainty_options,
 )
@@ -151,7 +153,9 @@ def tune(
         raise SettingError("give --observer, or --envelope and --controller")
     if not on_envelope and goal != EnvelopeGoal():
         raise SettingError("--delay, --gain, --rotation, --resonance, --by, --loss: only with --envelope")
-    if record_file is not None:
+    if record_file is None:
+        refuse_options(RECORD_OPTIONS, "only with --record")
+    else:
         if validation is not None:
             raise SettingError("--validation: only for simulated records, not with --record")
         record = load_declared(record_file, scenario, declaration, sha256)

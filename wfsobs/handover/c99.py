@@ -220,14 +220,22 @@ def _fill(text: str, words: Mapping[str, str]) -> str:
 
 
 def write_c99(path: str | Path, design: LinearDesign, vectors: Vectors, gate_settings: GateSettings) -> None:
-    """Write the design to a new directory. Raises StepError where there is something of that name."""
+    """Write the design to a new or empty directory, whole or not at all. Raises StepError for another one, OSError."""
     path = Path(path)
     if path.exists() and not (path.is_dir() and not any(path.iterdir())):
         raise StepError(f"{path}: exists; c99 takes a new or empty directory")
-    path.mkdir(parents=True, exist_ok=True)
     contents = {name: text.encode() for name, text in source(design, gate_settings).items()}
     contents["input.f64"] = np.hstack([vectors.z, vectors.ngs]).astype("<f8").tobytes()
     contents["gate.f64"] = np.hstack([vectors.with_outliers, vectors.without_outliers]).astype("<f8").tobytes()
     contents["output.f64"] = vectors.u.astype("<f8").tobytes()
-    for name, data in contents.items():
-        write_whole(path / name, lambda file, data=data: file.write(data))
+    is_new = not path.exists()
+    path.mkdir(parents=True, exist_ok=True)
+    try:
+        for name, data in contents.items():
+            write_whole(path / name, lambda file, data=data: file.write(data))
+    except BaseException:  # the same command again takes no directory that has something in it
+        for name in contents:
+            (path / name).unlink(missing_ok=True)
+        if is_new:
+            path.rmdir()
+        raise

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from wfsobs_arena import trials
+from click.testing import CliRunner
+from wfsobs_arena import cli, trials
 from wfsobs_arena.cases import SimulatedCase, mean_square
 from wfsobs_arena.challengers import CHALLENGERS
 from wfsobs_arena.definition import Arena, add_records, load_arena
@@ -22,6 +23,7 @@ from wfsobs_arena.run import run_arena
 from wfsobs_arena.tracks import TRACKS
 from wfsobs_arena.trials import try_record
 
+from wfsobs.cli import main
 from wfsobs.prior import Prior
 from wfsobs.record import Record
 from wfsobs.settings.errors import SettingError
@@ -62,6 +64,31 @@ def test_an_entry_runs_once_and_stands_on_the_page(arena: Arena, tmp_path: Path,
     page = (tmp_path / "index.html").read_text()
     assert "Persistence" in page and f"{row['score']:.3f}" in page
     assert "http" not in page  # self-contained
+
+
+def test_tables_of_other_tracks_stay(arena: Arena, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    quick = load_arena(quick=True)
+    monkeypatch.setattr(cli, "run_arena", lambda *_, **__: [])
+
+    def page(track: str, label: str, version: int = quick.version) -> str:
+        table = {"id": track, "label": label, "help": "", "scenarios": [], "rows": []}
+        monkeypatch.setattr(cli, "load_arena", lambda **_: Arena(version, quick.cases, quick.rules))
+        monkeypatch.setattr(cli, "tables", lambda *_: tables(arena, []) | {"tracks": [table]})
+        chosen = ["--out", str(tmp_path), "--track", track, "--entry", "kf-lgs"]
+        assert CliRunner().invoke(main, ["arena", "run", *chosen], catch_exceptions=False).exit_code == 0
+        return (tmp_path / "index.html").read_text()
+
+    page("events", "first events")
+    page("turbulence", "the turbulence")
+    both = page("events", "second events")
+    assert both.index("the turbulence") < both.index("second events") and "first events" not in both
+    assert "the turbulence" not in page("events", "other events", quick.version + 1)
+
+
+@pytest.mark.parametrize("words", [["--track", "closed-loop", "--entry", "kf-lgs"], ["--track", "next", "--entry", "rls"]])
+def test_nothing_is_written_where_no_entry_takes_part(tmp_path: Path, words: list[str]) -> None:
+    done = CliRunner().invoke(main, ["arena", "run", "--out", str(tmp_path / "out"), *words])
+    assert done.exit_code == 2 and "no entry takes part" in done.stderr and not (tmp_path / "out").exists()
 
 
 def folder_of(place: Path) -> ArenaEntry:

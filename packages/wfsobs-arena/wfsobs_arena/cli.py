@@ -14,7 +14,7 @@ from wfsobs.telemetry.records import save_arrays
 from wfsobs_arena.definition import Arena, add_records, load_arena
 from wfsobs_arena.entries import find_entries
 from wfsobs_arena.results import tables, write_results
-from wfsobs_arena.run import run_arena
+from wfsobs_arena.run import cases_of, run_arena
 from wfsobs_arena.tracks import TRACKS
 
 TRACK = click.option(
@@ -64,13 +64,16 @@ def print_list(quick: bool, seeds: int | None) -> None:
 def run(
     out: str, entries: tuple[str, ...], files: tuple[str, ...], tracks: tuple[str, ...], seeds: int | None, quick: bool
 ) -> None:
-    """Run what is missing, and write results.json and index.html."""
-    found = add_records(load_arena(seeds=seeds, quick=quick), [Path(file) for file in files])
-    found = _select_tracks(found, tracks)
+    """Run what is missing, and write results.json and index.html; tables of other tracks that are there stay."""
+    whole, entrants = load_arena(seeds=seeds, quick=quick), find_entries(entries)
+    found = _select_tracks(add_records(whole, [Path(file) for file in files]), tracks)
+    if not any(cases_of(found, entry) for entry in entrants):
+        raise SettingError("arena run: no entry takes part in a track that is chosen; next takes records by --record")
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
-    outcomes = run_arena(found, find_entries(entries), folder, tell=lambda line: click.echo(f"wfsobs: {line}", err=True))
+    outcomes = run_arena(found, entrants, folder, tell=lambda line: click.echo(f"wfsobs: {line}", err=True))
     values = tables(found, outcomes)
+    values["digest"] = whole.digest  # whatever tracks are chosen: they share a page
     write_results(values, folder)
     for track in values["tracks"]:
         show_table(_table(track))

@@ -130,8 +130,23 @@ def source_of(entry_id: str) -> str:
     return CHALLENGERS[entry_id].source if entry_id in CHALLENGERS else ""
 
 
+def _add_known(values: Table, path: Path) -> Table:
+    """Return the results with the tables of other tracks in a file of the same arena and code; as they are without one."""
+    try:
+        known = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return values
+    if any(known.get(name) != values[name] for name in ("version", "digest", "physics", "wfsobs")):
+        return values
+    by_track = {table["id"]: table for table in (*known["tracks"], *values["tracks"])}
+    ranked = {row["entry"] for table in values["tracks"] for row in table["rows"]}
+    refused = {one["entry"]: one for one in (*known["refused"], *values["refused"]) if one["entry"] not in ranked}
+    return values | {"tracks": [by_track[name] for name in TRACKS if name in by_track], "refused": list(refused.values())}
+
+
 def write_results(values: Table, folder: Path) -> None:
-    """Write results.json and index.html. Raises OSError."""
+    """Write results.json and index.html, with the tables of other tracks that are there. Raises OSError."""
+    values = _add_known(values, folder / "results.json")
     text = json.dumps(values, indent=1) + "\n"
     write_whole(folder / "results.json", lambda file: file.write(text.encode()))
     environment = Environment(

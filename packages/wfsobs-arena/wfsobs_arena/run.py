@@ -90,7 +90,7 @@ def run_arena(
 
 def _run_entry(arena: Arena, entry: ArenaEntry, folder: Path, records: RecordCache, tell: Tell) -> EntryOutcome:
     folder.mkdir(parents=True, exist_ok=True)
-    cases = _cases_of(arena, entry)
+    cases = cases_of(arena, entry)
     trials: dict[tuple[str, str], list[Trial]] = {}
     with EntryProcess(entry, arena.rules.memory) as process:
         refusal = "" if entry.kind == FOLDER or not cases else _refusal(arena, entry, folder, process)
@@ -112,7 +112,7 @@ def _run_entry(arena: Arena, entry: ArenaEntry, folder: Path, records: RecordCac
     return EntryOutcome(entry, "", trials)
 
 
-def _cases_of(arena: Arena, entry: ArenaEntry) -> list[Case]:
+def cases_of(arena: Arena, entry: ArenaEntry) -> list[Case]:
     """Return the scenarios of the tracks that an entry takes part in; a folder does where it has a file of one of the records."""
     cases = [case for case in arena.cases if admits(TRACKS[case.track], entry)]
     if entry.kind != FOLDER:
