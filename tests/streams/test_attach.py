@@ -482,7 +482,6 @@ def test_a_semaphore_that_another_process_waits_for_is_left_to_it(tmp_path: Path
         (["--shadow", "--observer", "gpr-online"], "its windows hold commands"),
         (["--shadow", "--delay", "1.5", "--observer", "ridge"], "learns from a record beforehand"),
         (["--shadow", "--semaphore", "10"], "it has 0 to 9"),
-        (["--shadow", "--limit", "nan"], "--limit nan: takes a number above 0"),
     ],
 )
 def test_what_cannot_be_attached_is_said_in_one_line(tmp_path: Path, options: list[str], reason: str) -> None:

@@ -136,8 +136,6 @@ def attach(
         refuse_options(("command_delay", "command_gain"), "only with --commands or --controller")
     if ngs is None:
         refuse_options(("ngs_modes", "ngs_lag"), "only with --ngs")
-    if limit is not None and np.isnan(limit):
-        raise SettingError("--limit nan: takes a number above 0")
     scenario = told_scenario(prior, scenario)
     elements = stream_elements(modes, len(scenario.modes))
     is_told = click.get_current_context().get_parameter_source("command_delay") is ParameterSource.COMMANDLINE
