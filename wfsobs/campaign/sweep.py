@@ -521,8 +521,7 @@ class SweepResults:
     def to_xarray(self) -> xarray.Dataset:
         """Return mean errors `rms` and the ends `low` and `high` of their intervals [um], as `error` does, as labelled arrays.
 
-        Dimensions are the settings, observer, target and mode; values that are lists are text, NaN is not known. Raises
-        ImportError without xarray.
+        Dimensions are settings (lists as text), observer, target and mode; NaN is not known. Raises ImportError without xarray.
         """
         known = self.known_keys()
         labels = [list(dict.fromkeys(key[i] for key in known)) for i in range(3)]

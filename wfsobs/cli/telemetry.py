@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 
 import click
@@ -161,7 +163,7 @@ def identify(
     record = load_declared(record_file, scenario, declaration, sha256)
     if out:
         check_writable(out)
-    with progress_bar("sweeps") as watch:
+    with errors_of(record_file), progress_bar("sweeps") as watch:
         result = identify_record(record, level=level, lowest=lowest, watch=watch)
     if out:
         write_text(out, identified.identification_toml(result, result.scenario(as_stated(record, scenario))))
@@ -173,12 +175,21 @@ def identify(
         click.echo(line)
 
 
+@contextmanager
+def errors_of(what: str) -> Iterator[None]:
+    """Begin the line of a RecordError with what it is of."""
+    try:
+        yield
+    except RecordError as error:
+        raise RecordError(f"{what}: {error}") from None
+
+
 @record_command
 @json_option()
 def plant(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None, as_json: bool) -> None:
     """Identify what the commands of a closed loop do: delay, gain and rotation."""
     record = load_declared(record_file, scenario, declaration.as_commanded, sha256)
-    with progress_bar("groups of modes") as watch:
+    with errors_of(record_file), progress_bar("groups of modes") as watch:
         groups = identify_plant(record, watch)
     if as_json:
         print_json(plant_dict(groups))
@@ -208,10 +219,8 @@ def gain(
     laws = design(scenario, ["integrator"]).laws["integrator"] if prior else ()
     rows = []
     for mode, name in enumerate(m.name for m in modes_up_to(HIGHEST_ORDER)[: record.n_modes]):
-        try:
+        with errors_of(f"{record_file}: {name}"):
             found = gain_from_telemetry(record.z[record.delay :, mode], mirror, leak)
-        except RecordError as error:
-            raise RecordError(f"{record_file}: {name}: {error}") from None
         left = float(np.sqrt(np.nanmean(np.square(record.y_lgs[:, mode]))))
         law = laws[mode].law if laws else None
         rows.append({"mode": name, **asdict(found), "recorded_rms": left, "from_spectra": law.gain if law else None})
@@ -246,7 +255,7 @@ def promise(
     """State what controllers will leave of a loop, before one of them is switched on (docs/trust.md)."""
     record = load_declared(record_file, scenario, declaration.as_commanded, sha256)
     later = None if after is None else load_declared(after, scenario, declaration.as_commanded)
-    with progress_bar("controllers") as watch:
+    with errors_of(record_file), progress_bar("controllers") as watch:
         result = make_promise(record, scenario, controllers=controllers or None, watch=watch)
     found = None if later is None else result.left_in(later)
     if as_json:
@@ -309,11 +318,9 @@ COLOURS = {"ok": "green", "note": "yellow", "undecided": "yellow", "excluded": "
 def check(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None, as_json: bool) -> None:
     """Check a record: what was read, and what of it can be relied on."""
     with open_record(record_file, sha256) as (file, name):
-        try:
+        with errors_of(record_file):
             contents = read_contents(file, name, declaration.columns)
             record, raw = (to_record(contents, scenario, way) for way in (declaration, declaration.as_commanded))
-        except RecordError as error:
-            raise RecordError(f"{record_file}: {error}") from None
     reading = read_off(record, contents, declaration, scenario)
     with progress_bar("sweeps") as watch:
         result = check_record(record, reading, raw, watch)
