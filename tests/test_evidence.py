@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import binom, ttest_1samp, ttest_rel
 
-from wfsobs.evaluation.evidence import Evidence, columns_differ, gather_evidence, holm, means_differ
+from wfsobs.evaluation.evidence import Evidence, columns_differ, gather_evidence, holm, marks_of, means_differ
 from wfsobs.evaluation.rows import can_be_best
 from wfsobs.evaluation.scores import Score, batch_means
 from wfsobs.evaluation.verdict import verdict
@@ -98,6 +98,21 @@ def test_leaders_are_the_best_and_those_that_do_not_differ() -> None:
     # The one that looks ahead cannot be best, however small its error.
     assert found.leaders("vibration", "tip") == ("kf-multi", "ridge")
     assert gather_evidence([[score("kf-lgs", 1.0)]] * 2).leaders("vibration", "tip") == ()
+
+
+@pytest.mark.parametrize(
+    ("leaders", "marks"),
+    [
+        (("kf-multi",), {"kf-multi": "best"}),
+        (("kf-multi", "ridge", "kf-lgs"), {"kf-multi": "tied", "ridge": "tied"}),
+        (("kf-multi", "kf-lgs"), {"kf-multi": "smallest"}),
+        ((), {"kf-multi": "smallest"}),
+    ],
+)
+def test_equal_errors_are_close_as_well(leaders: tuple[str, ...], marks: dict[str, str]) -> None:
+    """The error of the third is 30 % larger, whatever few seeds can tell."""
+    errors = {"kf-lgs": (13.0, False), "butterworth-ol": (5.0, False), "ridge": (12.0, False), "kf-multi": (10.0, False)}
+    assert marks_of(errors, leaders) == marks
 
 
 def test_rows_that_are_missing_or_apart_in_a_seed_say_nothing() -> None:

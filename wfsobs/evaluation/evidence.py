@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtr, stdtrit
 
-from wfsobs.evaluation.rows import NO_ESTIMATE, can_be_best
+from wfsobs.evaluation.rows import EQUAL, NO_ESTIMATE, can_be_best
 from wfsobs.evaluation.scores import BOUNDS, Score, scatter_of_mean
 from wfsobs.observers import OBSERVERS
 from wfsobs.typing import Array
@@ -151,16 +151,20 @@ def rank_observers(errors: Mapping[str, float]) -> list[str]:
 
 
 def marks_of(errors: Mapping[str, tuple[float, bool]], leaders: Sequence[str]) -> dict[str, str]:
-    """Mark the best, which differs significantly from all others over the seeds, or those tied; of one record the smallest.
+    """Mark the best, which differs significantly from all others over the seeds, those equal to it, or the smallest alone.
+
+    Equal are errors that do not differ significantly and by no more than a share of EQUAL, as in the verdict.
 
     errors : observer -> error [um], and whether it stands apart, on samples of its own
     leaders : from `Evidence.leaders`; empty for one record
     Returns observer -> "best", "tied" or "smallest".
     """
-    if leaders:
-        return dict.fromkeys(leaders, "tied" if len(leaders) > 1 else "best")
     rivals = {name: rms for name, (rms, apart) in errors.items() if can_be_best(name, apart)}
-    return dict.fromkeys(rank_observers(rivals)[:1], "smallest")
+    first = rank_observers(rivals)[:1]
+    equal = [name for name in leaders if name in rivals and rivals[name] <= (1.0 + EQUAL) * rivals[first[0]]]
+    if len(equal) > 1:
+        return dict.fromkeys(equal, "tied")
+    return dict.fromkeys(first, "best" if len(leaders) == 1 else "smallest")
 
 
 def gather_evidence(seeds: Sequence[Iterable[Score]]) -> Evidence:
