@@ -46,7 +46,7 @@ run: $(RUN)  ## serve the dashboard on localhost:5006 (another port: make run PO
 test: setup  ## run all tests, then those in a browser
 	@status=0; \
 	$(BIN)/python -m pytest -n auto --dist worksteal || status=1; \
-	$(BIN)/python -m pytest -n $(BROWSERS) --dist loadfile tests/browser || status=1; \
+	$(BIN)/python -m pytest -n $(BROWSERS) --dist loadfile --no-loadscope-reorder tests/browser || status=1; \
 	exit $$status
 
 test-fast: $(TEST)  ## the quick tests alone: no dashboard, no report, none marked as slow

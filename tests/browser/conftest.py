@@ -70,10 +70,11 @@ expect.set_options(timeout=PATIENCE)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Leave the tests of this folder as long as one of them may wait, three times."""
+    """Leave the tests of this folder as long as one of them may wait, three times, and begin with the slow files."""
     for item in items:
         if item.path.parent == ROOT / "tests" / "browser":
             item.add_marker(pytest.mark.timeout(3 * PATIENCE / 1000))
+    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
 
 
 def carded(target: str) -> list[str]:

@@ -14,6 +14,8 @@ from playwright.sync_api import BrowserContext, Page, expect
 
 from tests.browser.conftest import PATIENCE, QUICK, answered, finished, leave, until, with_seeds
 
+pytestmark = pytest.mark.slow
+
 
 def hang_up(end: socket.socket) -> None:
     """Close the connection at once: `close` would wait for the thread that reads from it."""

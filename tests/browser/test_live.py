@@ -11,6 +11,8 @@ from playwright.sync_api import Locator, Page, expect
 
 from tests.browser.conftest import DONE, QUICK, SETTINGS, eventually, finished, until
 
+pytestmark = pytest.mark.slow
+
 LIVE = (
     f"{QUICK}&sensors.lgs_rate=250&view.page=live"
     "&view.live.observers=kf-multi,multirate-multi,gpr-online&view.live.controllers=integrator"

@@ -16,6 +16,8 @@ from playwright.sync_api import Page, expect
 
 from tests.browser.conftest import CHANGED, QUICK, answered, carded, until
 
+pytestmark = pytest.mark.slow
+
 ALLOWED: Mapping[str, tuple[str, int, str]] = MappingProxyType(
     {
         "aria-prohibited-attr": (

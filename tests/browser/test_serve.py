@@ -16,6 +16,8 @@ from playwright.sync_api import BrowserContext, Page, expect
 
 from tests.browser.conftest import PATIENCE, leave
 
+pytestmark = pytest.mark.slow
+
 FLAGS = ["--public", "--runs", "1", "--max-duration", "100", "--lifetime", "5"]
 """Runs of a page that is gone stop with its session, and only then the next one begins."""
 

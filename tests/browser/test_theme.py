@@ -19,6 +19,8 @@ from wfsobs.campaign.run import run_rows
 from wfsobs.campaign.store import open_folder, write_batch
 from wfsobs.evaluation.scores import BOUNDS
 
+pytestmark = pytest.mark.slow
+
 SHORT = {"run.duration": 1.0, "run.warm_up": 0.2, "gpr_online.training_size": 40, "gpr_offline.training_size": 40}
 PLAN = {
     "seeds": 2,
