@@ -334,7 +334,7 @@ def test_what_cannot_run_says_why() -> None:
     with pytest.raises(RecordError, match="another rate"):
         closed_loop(replace(record, dt=2e-3), plan)
     tip = {name: getattr(record, name)[:, :1] for name in ("y_lgs", "u", "y_ngs", "open_loop_y", "turbulence", "vibration")}
-    with pytest.raises(RecordError, match="has 1 modes, the controllers are for 2"):
+    with pytest.raises(RecordError, match="has 1 mode, the controllers are for 2"):
         closed_loop(replace(record, **tip), plan)  # type: ignore[arg-type]
     with pytest.raises(SettingError, match="'pid': no such controller"):
         design(MATCHED, ("pid",))

@@ -50,9 +50,9 @@ def data_csv(results: RunResults) -> bytes:
     _check(results)
     record = results.result.record
     # comments of the TOML text too, and what a record is read by
-    head = [f"# # dt: {record.dt!r}", *([f"# # ratio: {record.ratio}"] if record.ratio else [])]
+    head = [f"# # dt: {record.dt!r}", f"# # delay: {record.delay}", *([f"# # ratio: {record.ratio}"] if record.ratio else [])]
     signals = {f"truth/{target}": record.truth(target) for target in TARGETS}
-    signals |= {"y_lgs": record.y_lgs, "y_ngs": record.y_ngs, "u": record.u}
+    signals |= {"y_lgs": record.y_lgs, "y_ngs": record.y_ngs, "u": record.u, "open_loop_y": record.open_loop_y}
     return _csv(record, results.scenario, signals | _estimates(results), head)
 
 

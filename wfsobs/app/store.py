@@ -157,12 +157,18 @@ class Store(param.Parameterized):
         self.limits.check(scenario)
 
     def load(self, scenario: Scenario, preset: str | None = None, simulation: SimulatedRecord | None = None) -> None:
-        """Replace every setting and run; a loaded record stays. Raises SettingError where they do not go together.
+        """Replace every setting and run; a loaded record stays, with its rate, ratio and length. Raises SettingError.
 
         preset : the one that they are to be compared with from now on; as it was if not given
         """
-        kept = self.source if isinstance(self.source, LoadedRecord) else simulation
-        self.restore((scenario, preset or self.preset, kept))
+        if not isinstance(source := self.source, LoadedRecord):
+            self.restore((scenario, preset or self.preset, simulation))
+            return
+        fitted = fit_to_record(source.record, scenario)
+        if fitted.run.duration == scenario.run.duration:  # settings that were made for it
+            fitted = fitted.replace({path: scenario.lookup(path) for path in AFTER_FIT})
+        self.restore((fitted, preset or self.preset, source))
+        self._own = changed_settings(scenario, fitted)
 
     def replace(self, changes: Mapping[str, Any]) -> None:
         """Set several settings (dotted path -> value) in one step and run. Raises SettingError."""
@@ -186,10 +192,8 @@ class Store(param.Parameterized):
         scenario = fit_to_record(preview.record, before)
         if wanted is not None and wanted.sha256 == sha256:
             scenario = scenario.replace({path: before.lookup(path) for path in AFTER_FIT})
-        own = self._own if isinstance(self.source, LoadedRecord) else changed_settings(before, scenario)
         key, line = record_key(preview.record), preview.lines()[0]
         self.run_on(LoadedRecord(preview.record, preview.name, key, line, declaration, sha256), scenario)
-        self._own = own
 
     def simulate(self) -> None:
         """Go back to the simulation: of settings that were kept, or of these with its own rate, ratio and length."""
@@ -222,6 +226,8 @@ class Store(param.Parameterized):
         if step and not (unchanged and stays and preset == self.preset):
             self._past = _of_one_file([*self._past, self.step], source)[-STEPS_BACK:]
             self._future = []
+        if isinstance(source, LoadedRecord) and not isinstance(self.source, LoadedRecord):
+            self._own = changed_settings(self.scenario, fit_to_record(source.record, self.scenario))
         self._refusals = refusals
         errors = {path: reason for path, reason in self.errors.items() if path in refusals}
         with pn.io.hold(), batch_call_watchers(self):  # one message to the browser

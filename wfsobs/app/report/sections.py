@@ -192,10 +192,10 @@ FILE = "wfsobs.toml"
 def summary(report: Report, date: datetime) -> str:
     """Say in one line what this is."""
     base, count = report.base, len(changed_settings(report.base, reference_preset(report.preset)))
-    length = report.states[0].grid.n * report.states[0].grid.dt
+    grid = report.states[0].grid
     parts = [
         f"Preset {report.preset}" + (f", {count} setting{'s' * (count > 1)} changed" if count else ""),
-        f"{length:g} s at {base.sensors.lgs_rate:g} Hz",
+        f"{grid.n * grid.dt:g} s at {1.0 / grid.dt:.6g} Hz",
         "of a loaded record" if report.is_recorded else f"seed {base.run.seed}",
         *([f"{len(report.states)} variations"] if len(report.states) > 1 else []),
         f"made {date:%Y-%m-%d %H:%M %Z}".rstrip() + f" with wfsobs {__version__}",

@@ -353,7 +353,9 @@ class Table:
         )
         first, *more = WITHOUT_TRUTH.get(target, [target_title(target)])
         leaders = seeds.evidence.leaders(target, display.mode) if seeds.evidence else ()
-        why = "no error: it has no estimate" if shown and self.run.state == DONE else "not computed yet"
+        why = "not computed yet"
+        if shown and self.run.state == DONE:
+            why = "no error: it has no estimate" if scores else "no error: nothing is scored, all may be warm-up"
 
         def compared(name: str) -> list[str]:
             return [self._compared_cell(run, name, target, scores.get(name)) for run in display.compared_runs]

@@ -37,6 +37,7 @@ class ModeSwitch:
     def __init__(self, run: BackgroundTask, display: Display):
         self.run: Final = run
         self.display: Final = display
+        self._wanted = ""
         options = {_title(mode): mode.name for mode in TIP_TILT}
         self.buttons: Final = pmui.RadioButtonGroup(label="Mode", options=options, value=display.mode, **BUTTONS)
         self.list: Final = make_select("Mode", options, display.mode, 190, visible=False)
@@ -59,17 +60,23 @@ class ModeSwitch:
 
     def offer(self, modes: Sequence[Mode]) -> None:
         """Offer modes to choose from."""
-        if self.display.mode not in [mode.name for mode in modes]:
-            self.display.mode = modes[0].name
-        options = {_title(mode): mode.name for mode in modes}
+        options, names = {_title(mode): mode.name for mode in modes}, [mode.name for mode in modes]
+        chosen = next(name for name in (self._wanted, self.display.mode, *names) if name in names)
+        self._wanted = ""
         if list(self.list.options) != list(options):
-            self.list.param.update(options=options, value=self.display.mode)
+            few = {title: name for title, name in options.items() if name in names[: len(TIP_TILT)]}
+            self.buttons.param.update(options=few, value=chosen if chosen in few.values() else names[0])
+            self.list.param.update(options=options, value=chosen)
             self.list.visible = len(modes) > len(TIP_TILT)
             self.buttons.visible = not self.list.visible
+        self.display.mode = chosen
 
     def _follow(self, *_: object) -> None:
-        """Show the mode in the widgets."""
+        """Show the mode in the widgets; one that the run shown does not have (of an address) once there is one that has."""
         mode = self.display.mode
+        if mode not in self.list.options.values() and self.run.result is not None:
+            self._wanted, self.display.mode = mode, next(iter(self.list.options.values()))
+            return
         if mode in self.list.options.values():
             self.list.value = mode
         if mode in self.buttons.options.values():
