@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -200,7 +201,7 @@ def test_csv(shown: RunResults) -> None:
     columns = np.loadtxt(io.StringIO("\n".join(lines)), delimiter=",", unpack=True)
     table = dict(zip(names.split(","), columns, strict=True))
     record, estimate = shown.result.record, shown.result.estimate("gpr-online", "vibration")
-    assert estimate is not None and columns.shape == (1 + 2 * (5 + len(shown.result.estimates)), record.n_steps)
+    assert estimate is not None and columns.shape == (1 + 2 * (6 + len(shown.result.estimates)), record.n_steps)
     np.testing.assert_allclose(table["time_s"], np.arange(record.n_steps) * 1e-3, rtol=1e-8)
     for name, values in (
         ("truth/turbulence", record.turbulence),
@@ -216,6 +217,8 @@ def test_csv(shown: RunResults) -> None:
 
 def test_csv_is_a_record(shown: RunResults) -> None:
     """What was saved is observed again, to nine digits."""
+    later = replace(shown, result=replace(shown.result, record=replace(shown.result.record, delay=3)))
+    assert read_record(io.BytesIO(data_csv(later)), "wfsobs.csv").delay == 3
     record = read_record(io.BytesIO(data_csv(shown)), "wfsobs.csv")
     kept = shown.result.record
     assert (record.dt, record.ratio) == (kept.dt, kept.ratio)

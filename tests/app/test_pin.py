@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.render import change, hundredths, number
 from wfsobs.app.style import observers_of
 from wfsobs.app.work import TRUTH
+from wfsobs.evaluation.evidence import gather_evidence
 from wfsobs.evaluation.rows import group_by_knowledge
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario
@@ -46,6 +48,22 @@ class TestPin:
         html = pinned.explore.table.pane.html
         assert f'<td><span class="range">{change(before, now)} %</span> {number(1e3 * before)}</td>' in html
         assert ">A [nm]<" in html and "RMS error in Preset Paper" in html
+
+    def test_errors_are_compared_over_the_seeds_that_both_have(self, dashboard: Dashboard, loop: Any) -> None:
+        """A run beside itself has not changed, whatever the other seeds have."""
+        press(dashboard)
+        scores = dashboard.store.run.result.result.scores
+        others = [[replace(s, rms=factor * s.rms) for s in scores] for factor in (1.0, 2.0, 3.0)]
+        dashboard.explore.seeds.evidence = gather_evidence(others)
+        (run,) = dashboard.display.compared_runs
+        assert run.evidence is dashboard.explore.seeds.evidence and "+0.0 %" in dashboard.explore.table.pane.html
+        key = "kf-lgs", "vibration", "tip"
+        rms = find_score(scores, *key).rms
+        assert run.beside(scores, gather_evidence(others[:2]), key) == pytest.approx((1.5 * rms, 1.5 * rms))
+        assert run.beside(scores, None, key) == (rms, rms), "of one record beside one record"
+        other = [replace(s, rms=4.0 * s.rms) for s in scores]
+        dashboard.explore.seeds.evidence = gather_evidence([other, other, other])  # of another run, which is not shown yet
+        assert dashboard.display.compared_runs == [run]
 
     def test_the_cards_have_value_beside_value(self, pinned: Dashboard) -> None:
         (kept,), shown = pinned.display.compared_runs, pinned.store.run.result

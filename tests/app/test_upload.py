@@ -19,7 +19,7 @@ from wfsobs.app.session_file import LARGEST
 from wfsobs.app.upload import SILENT
 from wfsobs.pipeline import observe
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.presets import paper
+from wfsobs.scenario.presets import PRESETS, paper
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.formats import format_of
 from wfsobs.telemetry.records import TEMPLATE, read_record, record_arrays
@@ -109,6 +109,41 @@ def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: 
     loop.finish(dashboard.store)
     assert dashboard.store.run.result.result.record.turbulence is not None and dashboard.upload.picker.source_title == ""
     assert not any(len(source.data["xs"]) for source in faint), "and none beside errors"
+
+
+def test_a_preset_beside_a_record_keeps_its_rate_and_length(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
+    """And what the simulation had comes back, of the preset, and of a record that the history gave back."""
+    previewed(dashboard, loop, file_of(short))
+    dashboard.upload.confirm()
+    loop.finish(dashboard.store)
+    key = dashboard.history.current
+    dashboard.store.choose("ut4")
+    it = dashboard.store.scenario
+    assert (it.sensors.lgs_rate, it.run.duration, dashboard.store.preset) == (500.0, 1.5, "ut4") and it.run.warm_up < 1.5
+    dashboard.store.simulate()
+    assert dashboard.store.scenario == PRESETS["ut4"]()
+    dashboard.store.choose("paper")
+    dashboard.store.change("run.duration", 3.0)
+    dashboard.history.restore(key)
+    assert dashboard.store.scenario.run.duration == 1.5
+    dashboard.store.simulate()
+    assert dashboard.store.scenario.run.duration == 3.0 and dashboard.store.scenario.sensors.lgs_rate == 1000.0
+
+
+def test_a_record_of_one_mode_offers_no_other(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
+    dashboard.display.mode = "tilt"
+    record = simulate(short.replace({"run.seed": 9}))
+    np.savez(file := io.BytesIO(), y_lgs=record.y_lgs[:, :1], u=record.u[:, :1], dt=record.dt)
+    previewed(dashboard, loop, file.getvalue(), "one.npz")
+    assert "1 mode, read" in dashboard.upload.content.text.html
+    dashboard.upload.confirm()
+    loop.finish(dashboard.store)
+    assert dashboard.display.mode == "tip" and dashboard.modes.buttons.options == {"Tip": "tip"}
+    dashboard.actions.handle({"action": "view", "query": "view.mode=tilt"})  # back in the browser
+    assert dashboard.display.mode == "tip" == dashboard.modes.buttons.value
+    dashboard.store.simulate()
+    loop.finish(dashboard.store)
+    assert dashboard.display.mode == "tilt" == dashboard.modes.buttons.value
 
 
 def test_settings_change_what_runs_on_the_record(dashboard: Dashboard, loop: Any, short: Scenario) -> None:

@@ -180,9 +180,10 @@ class Actions:
         if shown is None or self.toolbar.reporting:
             return
         command = to_command(shown.scenario, preset, shown.source) if shown.is_recorded else ""
+        evidence = self._seeds.evidence
         job = Job(
             "report",
-            partial(make, shown, preset, command=command, **self.pages.shown_beside(shown.result), evidence=self._seeds.evidence),
+            partial(make, shown, preset, command=command, **self.pages.shown_beside(shown.result, evidence), evidence=evidence),
             time_limit=LIMIT,
             refusal=ReportError,
         )

@@ -14,6 +14,7 @@ from wfsobs.app.render import NOTHING, change, number
 from wfsobs.app.sources import LoadedRecord, Step, give_same_record
 from wfsobs.app.style import observers_of
 from wfsobs.app.work import TRUTH, Key, RunResults, SignalAndError
+from wfsobs.evaluation.evidence import Evidence
 from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.rows import row_label, target_title
 from wfsobs.evaluation.scores import Score
@@ -136,6 +137,7 @@ class ComparedRun:
 
     key   : of its entry in the history;  letter : what it is called in cards, figures and the table
     lines : what is drawn; None while its traces are being made again
+    evidence : its errors over several seeds, where they are known
     """
 
     key: str
@@ -144,6 +146,23 @@ class ComparedRun:
     scenario: Scenario
     scores: tuple[Score, ...]
     lines: DrawnLines | None = None
+    evidence: Evidence | None = None
+
+    def beside(
+        self, scores: Iterable[Score], evidence: Evidence | None, key: tuple[str, str, str], of: str = "rms"
+    ) -> tuple[float | None, float | None]:
+        """Return the error here and in the result of these scores [um], None where there is none.
+
+        Both are means over the seeds that both have, so that one can be compared with the other.
+
+        evidence : errors of that result over its seeds;  key : observer, target, mode;  of : "rms" or "truth_rms" of a score
+        """
+        old, new = ((it.errors if of == "rms" else it.truths).get(key) if it else None for it in (self.evidence, evidence))
+        if old is not None and new is not None:
+            n = min(old.size, new.size)
+            return float(old[:n].mean()), float(new[:n].mean())
+        here, there = (find_score(it, *key) for it in (self.scores, scores))
+        return here and getattr(here, of), there and getattr(there, of)
 
 
 def find_score(scores: Iterable[Score], observer: str, target: str, mode: str) -> Score | None:
@@ -172,16 +191,20 @@ def _thin(values: Array) -> NDArray[np.float32]:
     return np.column_stack([envelope(column, KEPT) for column in values.T]).astype(np.float32)
 
 
-def comparison_of(runs: Sequence[ComparedRun], result: Result) -> dict[str, Any] | None:
-    """Return what a report has of compared runs: their names, and a table per target and mode [nm]; None where there are none."""
+def comparison_of(runs: Sequence[ComparedRun], result: Result, evidence: Evidence | None) -> dict[str, Any] | None:
+    """Return what a report has of compared runs: their names, and a table per target and mode [nm]; None where there are none.
+
+    evidence : errors of the result over several seeds
+    """
     if not runs:
         return None
     groups: dict[tuple[str, str], list[list[str]]] = {}
     for now in result.scores:
-        before = [find_score(run.scores, now.observer, now.target, now.mode) for run in runs]
-        if any(before):
-            cells = [NOTHING if s is None else f"{number(1e3 * s.rms)} ({change(s.rms, now.rms)} %)" for s in before]
-            groups.setdefault((now.target, now.mode), []).append([row_label(now.observer), number(1e3 * now.rms), *cells])
+        pairs = [run.beside(result.scores, evidence, (now.observer, now.target, now.mode)) for run in runs]
+        if any(before is not None for before, _ in pairs):
+            cells = [NOTHING if old is None else f"{number(1e3 * old)} ({change(old, new)} %)" for old, new in pairs]
+            rms = (evidence.over_seeds(now) if evidence else now).rms
+            groups.setdefault((now.target, now.mode), []).append([row_label(now.observer), number(1e3 * rms), *cells])
     return {
         "runs": [[run.letter, run.name] for run in runs],
         "columns": ["Observer", "shown [nm]", *(f"{run.letter} [nm]" for run in runs)],

@@ -36,7 +36,7 @@ from wfsobs.app.sources import Step
 from wfsobs.app.store import Store
 from wfsobs.app.style import NO_ROOM, HtmlComponent, look, script, sheets
 from wfsobs.app.work import RunResults
-from wfsobs.evaluation.evidence import rank_observers
+from wfsobs.evaluation.evidence import Evidence, rank_observers
 from wfsobs.evaluation.rows import can_be_best
 from wfsobs.evaluation.scores import PREDICTION
 from wfsobs.observers.base import TARGETS
@@ -182,7 +182,7 @@ class History(param.Parameterized):
 
     def content(self) -> SessionContent:
         """Return what a file of the session holds."""
-        entries = [replace(entry, results=None) for entry in self.entries]
+        entries = [replace(entry, results=None, evidence=None) for entry in self.entries]
         return SessionContent(entries, self.store.step, self._query, [run.key for run in self.display.compared_runs])
 
     def open(self, content: SessionContent, name: str) -> None:
@@ -221,11 +221,21 @@ class History(param.Parameterized):
             letter = next(letter for letter in LETTERS if letter not in [run.letter for run in runs])
             shown = self.store.run.result if entry.key == self.current else None
             results = entry.results or shown
-            run = ComparedRun(
-                entry.key, letter, entry.name, entry.scenario, entry.scores, thin_lines(results) if results else None
-            )
+            lines = thin_lines(results) if results else None
+            run = ComparedRun(entry.key, letter, entry.name, entry.scenario, entry.scores, lines, entry.evidence)
             runs = sorted([*runs, run], key=lambda it: it.letter)
         self._show_runs(runs)
+
+    def note_evidence(self, evidence: Evidence | None) -> None:
+        """Keep errors over several seeds with the entry that is shown, if they are of it."""
+        entry = self.find(self.current)
+        if evidence is None or entry is None or not all(score in entry.scores for score in evidence.record.values()):
+            return
+        entry.evidence = evidence
+        if any(run.key == entry.key for run in self.display.compared_runs):
+            self.display.compared_runs = [
+                replace(run, evidence=evidence) if run.key == entry.key else run for run in self.display.compared_runs
+            ]
 
     def compare_none(self) -> None:
         """Compare nothing any more."""

@@ -24,6 +24,7 @@ from wfsobs.app.compared import DrawnLines
 from wfsobs.app.service import run_key
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, Step, record_key
 from wfsobs.app.work import RunResults
+from wfsobs.evaluation.evidence import Evidence
 from wfsobs.evaluation.rows import NOT_OBSERVERS
 from wfsobs.evaluation.scores import Calibration, Score
 from wfsobs.observers import OBSERVERS
@@ -138,6 +139,7 @@ class HistoryEntry:
     view    : the page's view when it was last shown, as a query
     own_name : whether a visitor gave it its name
     results : with traces, as long as they are held
+    evidence : errors over several seeds, where they have been known; not in a file
     """
 
     key: str
@@ -152,6 +154,7 @@ class HistoryEntry:
     view: str = ""
     own_name: bool = False
     results: RunResults | None = field(default=None, repr=False)
+    evidence: Evidence | None = field(default=None, repr=False)
 
     @property
     def is_restorable(self) -> bool:

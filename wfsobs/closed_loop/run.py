@@ -88,9 +88,8 @@ def each_outcome(
     if as_stated(record, plan.scenario) is not plan.scenario:
         raise RecordError("the record was made with another rate or exposure ratio than the controllers")
     if record.n_modes != len(plan.scenario.modes):
-        raise RecordError(
-            f"the record has {record.n_modes} mode{'s' * (record.n_modes > 1)}, the controllers are for {len(plan.scenario.modes)}"
-        )
+        modes = f"{record.n_modes} mode" + "s" * (record.n_modes > 1)
+        raise RecordError(f"the record has {modes}, the controllers are for {len(plan.scenario.modes)}")
     for name, designed in plan.laws.items():
         if controllers is None or name in controllers:
             watch.check()

@@ -26,7 +26,7 @@ from wfsobs.app.pages.parts import (
     zoom_buttons,
 )
 from wfsobs.app.render import macro
-from wfsobs.app.style import sheets
+from wfsobs.app.style import sheets, watch
 from wfsobs.app.views.errors import MainLines, Strip, Table, VerdictLine
 from wfsobs.app.views.plots import MODEL, PEAKS, call
 from wfsobs.app.views.spectrum_editor import Frames, SpectrumEditor
@@ -71,6 +71,7 @@ class Explore(Page):
         self.editors: dict[str, SpectrumEditor] = {}
         self.sections: Final = pn.Column(self._section(TARGETS[0]), **WIDE, stylesheets=[GAP])
         display.param.watch(self._edit, "editing")
+        watch(lambda *_: history.note_evidence(seeds.evidence), (seeds, "evidence"), (history, "current"))
 
     def view(self) -> pn.Column:
         """Return the contents of the page: what is seen first, until it is completed."""

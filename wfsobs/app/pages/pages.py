@@ -28,6 +28,7 @@ from wfsobs.app.store import Store
 from wfsobs.app.style import HEARD, PRIMARY, observers_of
 from wfsobs.app.views.plots import on_settle
 from wfsobs.app.work import TRUTH
+from wfsobs.evaluation.evidence import Evidence
 from wfsobs.evaluation.result import Result
 from wfsobs.observers.base import TARGETS
 
@@ -114,11 +115,14 @@ class Pages(param.Parameterized):
         assert isinstance(page, IdentifyPage)
         return page
 
-    def shown_beside(self, result: Result) -> dict[str, Any]:
-        """Return what a report has of the last sweep, and of the runs that a result is compared with; None for nothing."""
+    def shown_beside(self, result: Result, evidence: Evidence | None) -> dict[str, Any]:
+        """Return what a report has of the last sweep, and of the runs that a result is compared with; None for nothing.
+
+        evidence : errors of the result over several seeds
+        """
         page = self.by_name.get(SWEEP)
         sweep = report_part(page.results) if isinstance(page, SweepPage) and page.results else None
-        return {"sweep": sweep, "comparison": comparison_of(self.display.compared_runs, result)}
+        return {"sweep": sweep, "comparison": comparison_of(self.display.compared_runs, result, evidence)}
 
     def _page_of(self, name: str) -> Page:
         """Return a page, made where it has not been opened before."""

@@ -322,7 +322,7 @@ class Table:
         """Heading -> explanation."""
         unit = self.display.unit_label
         compared = {
-            f"{run.letter} [{unit}]": f"RMS error in {run.name}, and the change from there to the result shown"
+            f"{run.letter} [{unit}]": f"RMS error in {run.name}, and the change from there, over the seeds that both have"
             for run in self.display.compared_runs
         }
         return score_columns(unit, _base(self._targets()[0]), compared)
@@ -370,10 +370,11 @@ class Table:
 
     def _compared_cell(self, run: ComparedRun, name: str, target: str, score: Score | None) -> str:
         """Write the error in a compared run, and the change from there."""
-        if (before := find_score(run.scores, name, target, self.display.mode)) is None:
+        key = name, target, self.display.mode
+        before, now = run.beside([score] if score else [], self.seeds.evidence, key)
+        if before is None:
             return missing(f"{run.name} does not have it")
-        scale = self.display.scale(run.scenario)
-        return macro("change", change(before.rms, score.rms if score else None)) + number(before.rms * scale)
+        return macro("change", change(before, now)) + number(before * self.display.scale(run.scenario))
 
 
 HEADS = {"note": RELATIVE, "change": "Change", "bar": "Error budget"}
@@ -508,25 +509,23 @@ class Strip:
         """Write letter, value and change from there in per cent of every compared run."""
         scores = results.result.scores if results else ()
         has_truth = any(s.target == self.target for s in scores)
-        now = self._rms(scores, name, has_truth)
         rows = []
         for run in self.display.compared_runs:
-            before = self._rms(run.scores, name, has_truth)
+            before, now = run.beside(scores, self.seeds.evidence, *self._compared_number(scores, name, has_truth))
             known = before is not None
             value = number(before * self.display.scale(run.scenario) if known else None)
             rows.append([run.letter, value, f"{change(before, now)} %" if known else ""])
         return rows
 
-    def _rms(self, scores: Sequence[Score], name: str, has_truth: bool) -> float | None:
-        """Find the error of an observer, or the rms of the truth [um]; None if there is none.
+    def _compared_number(self, scores: Sequence[Score], name: str, has_truth: bool) -> tuple[tuple[str, str, str], str]:
+        """Return what of which score is compared: the error of an observer, or the rms of the truth.
 
         has_truth : otherwise the error of the next measurement, and the residual of the recorded loop
         """
+        mode = self.display.mode
         if name == TRUTH and has_truth:
-            return next((s.truth_rms for s in self._comparable(scores)), None)
-        of = (LOOP, RESIDUAL) if name == TRUTH else (name, self.target if has_truth else PREDICTION)
-        score = find_score(scores, *of, self.display.mode)
-        return score.rms if score else None
+            return (next((s.observer for s in self._comparable(scores)), ""), self.target, mode), "truth_rms"
+        return ((LOOP, RESIDUAL) if name == TRUTH else (name, self.target if has_truth else PREDICTION)) + (mode,), "rms"
 
     def _comparable(self, scores: Iterable[Score]) -> list[Score]:
         return [s for s in scores if (s.target, s.mode) == (self.target, self.display.mode) and not s.apart]
