@@ -37,7 +37,7 @@ class ModeSwitch:
     def __init__(self, run: BackgroundTask, display: Display):
         self.run: Final = run
         self.display: Final = display
-        self._wanted = ""
+        self._mode_to_show = ""
         options = {_title(mode): mode.name for mode in TIP_TILT}
         self.buttons: Final = pmui.RadioButtonGroup(label="Mode", options=options, value=display.mode, **BUTTONS)
         self.list: Final = make_select("Mode", options, display.mode, 190, visible=False)
@@ -61,8 +61,8 @@ class ModeSwitch:
     def offer(self, modes: Sequence[Mode]) -> None:
         """Offer modes to choose from."""
         options, names = {_title(mode): mode.name for mode in modes}, [mode.name for mode in modes]
-        chosen = next(name for name in (self._wanted, self.display.mode, *names) if name in names)
-        self._wanted = ""
+        chosen = next(name for name in (self._mode_to_show, self.display.mode, *names) if name in names)
+        self._mode_to_show = ""
         if list(self.list.options) != list(options):
             few = {title: name for title, name in options.items() if name in names[: len(TIP_TILT)]}
             self.buttons.param.update(options=few, value=chosen if chosen in few.values() else names[0])
@@ -75,7 +75,7 @@ class ModeSwitch:
         """Show the mode in the widgets; one that the run shown does not have (of an address) once there is one that has."""
         mode = self.display.mode
         if mode not in self.list.options.values() and self.run.result is not None:
-            self._wanted, self.display.mode = mode, next(iter(self.list.options.values()))
+            self._mode_to_show, self.display.mode = mode, next(iter(self.list.options.values()))
             return
         if mode in self.list.options.values():
             self.list.value = mode
