@@ -15,6 +15,7 @@ from click.testing import CliRunner
 from tests.records import ON_PAPER
 from wfsobs.cli import main
 from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import run_design
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.pipeline import observe, run
 from wfsobs.priors_from.scenario import kalman_model, measurement_noise
@@ -210,6 +211,19 @@ def test_a_start_that_fails_is_no_end() -> None:
     assert "fails" in tuning_toml(tuned) and tuning_dict(tuned)["before"]["test_rms_um"] is None
     with pytest.raises(RecordError, match="depth"):
         tune(s.replace({"gpr_online.training_size": 1500}), "gpr-online", ["gpr_online.depth"], evaluations=6)
+
+
+def test_steps_without_an_estimate_in_between_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    kf = OBSERVERS["kf-lgs"]
+
+    def with_a_hole(*given: Any) -> Any:
+        found = run_design(kf, *given)
+        for values in found.values():
+            values[3900:3910] = np.nan
+        return found
+
+    monkeypatch.setitem(OBSERVERS, "kf-lgs", replace(kf, run=with_a_hole))
+    assert tune(short(), "kf-lgs", evaluations=1).before.validation is not None
 
 
 @pytest.mark.parametrize("observer", ["gpr-offline", "gpr-online"])

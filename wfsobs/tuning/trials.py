@@ -268,8 +268,8 @@ class RecordTrials(Trials):
         """Return the errors on the validation record."""
         record = self.records.validation
         estimates = self._estimates(record, scenario)
-        silent = np.logical_or.reduce([np.isnan(e.values).any(axis=1) for e in estimates])[:-1]  # a reference lacks the last
-        begins = (silent.size - int(np.argmax(silent[::-1]))) * record.dt if silent.any() else 0.0
+        known = ~np.isnan([e.values for e in estimates]).any(axis=(0, 2))
+        begins = (int(np.argmax(known)) if known.any() else record.n_steps) * record.dt
         if not self.history and begins <= LATEST * record.n_steps * record.dt:
             self.warm_up = max(self.warm_up, begins)
         if begins > self.warm_up:
