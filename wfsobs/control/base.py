@@ -26,9 +26,10 @@ from wfsobs.observers.base import NOT_TUNED, NOTHING, PLAIN, Look, Tunable
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
 from wfsobs.observers.step import StepError, each_frame
-from wfsobs.prior import TRUE, Bands, Part, Prior, PriorSource, ask_nothing, asks_for, words_for
+from wfsobs.prior import PARTS, TRUE, Bands, Part, Prior, PriorSource, ask_nothing, asks_for, words_for
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, Sampling, hold_last
+from wfsobs.registry import check_tuple
 from wfsobs.settings import Section
 from wfsobs.signal.gate import GateSettings
 from wfsobs.typing import Array
@@ -112,6 +113,10 @@ class Controller:
     def __post_init__(self) -> None:
         if self.predict is not None and not asks_for(Bands, self.prior):
             raise ValueError(f"controller {self.id!r}: with a prediction it needs Bands in its prior")
+
+    def check_fields(self) -> None:
+        """Raise ValueError, one line, where a field has a value that it does not take."""
+        check_tuple("prior", self.prior, PARTS)
 
     @property
     def is_linear(self) -> bool:
