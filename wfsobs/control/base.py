@@ -148,7 +148,14 @@ class Controller:
 
     def laws(self, prior: Prior, plant: Plant, settings: Settings, n_modes: int) -> tuple[Law, ...]:
         """One law per mode, none for control by nothing. Raises ValueError saying why there is none."""
-        return () if self.law is None else tuple(self.law(prior, mode, plant, settings) for mode in range(n_modes))
+        return () if self.law is None else tuple(self.law_of(prior, mode, plant, settings) for mode in range(n_modes))
+
+    def law_of(self, prior: Prior, mode: int, plant: Plant, settings: Settings) -> Law:
+        """Return the law of one mode. Raises ValueError saying why there is none."""
+        law = None if self.law is None else self.law(prior, mode, plant, settings)
+        if not isinstance(law, Law):
+            raise ValueError(f"law takes a wfsobs.control.mirror.Law, not a {type(law).__name__}")
+        return law
 
     def design(
         self, prior: Prior, plant: Plant, settings: Settings, sampling: Sampling, gate: GateSettings | None = None

@@ -274,6 +274,9 @@ def check_estimates(estimates: object, targets: tuple[str, ...], shape: tuple[in
         if not isinstance(values, np.ndarray) or values.shape != shape:
             kind = getattr(values, "shape", type(values).__name__)
             raise ValueError(f"{name} takes an array of the shape {shape}, (n_steps, n_modes), not {kind}")
+        if values.dtype.kind not in "fiu" or np.isinf(values).any():
+            kind = "infinite ones" if values.dtype.kind == "f" else values.dtype.name
+            raise ValueError(f"{name} takes real numbers, NaN where there is none, not {kind}")
     return out
 
 
