@@ -27,7 +27,7 @@ from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.sensor_noise import noise_covariance
 from wfsobs.tuning import Evaluation, tune
-from wfsobs.tuning.records import NEXT, REFERENCE, TRUTH, cut_record, piece, simulate_records, space, stream
+from wfsobs.tuning.records import NEXT, REFERENCE, TRUTH, cut_record, piece, reference, simulate_records, space, stream
 from wfsobs.tuning.report import tuning_dict, tuning_toml
 
 pytestmark = pytest.mark.slow
@@ -179,6 +179,17 @@ def test_telemetry_is_judged_by_what_there_is() -> None:
     for observer in ("kf-ngs", "multirate-optimal"):
         with pytest.raises(RecordError, match="without truth"):
             tune(short(), observer, record=record)
+
+
+@pytest.mark.parametrize("has_twin", [True, False])
+def test_the_reference_has_no_step_whose_measurement_is_missing(has_twin: bool) -> None:
+    """That of the next frame."""
+    record = simulate(short())
+    assert record.open_loop_y is not None
+    y, twin = record.y_lgs.copy(), record.open_loop_y.copy()
+    y[1000], twin[1000] = np.nan, np.nan
+    gap = replace(record, y_lgs=y, open_loop_y=twin if has_twin else None)
+    assert np.flatnonzero(np.isnan(reference(gap, short())).any(axis=1)).tolist() == [999, record.n_steps - 1]
 
 
 @pytest.mark.parametrize("observer", ["kf-lgs", "ridge"])
