@@ -11,13 +11,16 @@ from typing import Any
 import pytest
 
 import wfsobs
+from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import BUILT_IN, OBSERVERS
 from wfsobs.observers.base import Observer
+from wfsobs.prior import Model
 from wfsobs.registry import RegistrationError, Registry, sections
 from wfsobs.scenario import Scenario
 from wfsobs.settings import Group, Real, Section
 
 ZERO = OBSERVERS["zero"]
+WORD: Any = ("Model",)
 
 
 class Own(Group):
@@ -57,6 +60,19 @@ def mine(**changes: Any) -> Observer:
         (mine(settings=Own), "observer 'mine': settings takes a Section of a Group, not the class Own"),
         (mine(settings="nothing"), "observer 'mine': settings 'nothing': no scenario has such a group"),
         (mine(settings=Section("own", "Own", Endless)), "settings own.speed: a number takes bounds, lowest and highest"),
+        (mine(targets="turbulence"), "observer 'mine': targets = 'turbulence': takes a tuple out of turbulence, vibration"),
+        (mine(targets=("foo",)), "observer 'mine': targets = ('foo',): takes a tuple out of turbulence, vibration"),
+        (mine(targets=()), "observer 'mine': targets = (): takes one at least, of turbulence, vibration"),
+        (mine(needs="y_ngs"), "observer 'mine': needs = 'y_ngs': takes a tuple out of y_lgs, u, dt, y_ngs, "),
+        (mine(needs=("foo",)), "observer 'mine': needs = ('foo',): takes a tuple out of y_lgs, "),
+        (mine(sensors=("foo",)), "observer 'mine': sensors = ('foo',): takes a tuple out of lgs, ngs"),
+        (mine(prior=Model), "observer 'mine': prior = <class 'wfsobs.prior.Model'>: takes a tuple out of Model, "),
+        (mine(prior=WORD), "observer 'mine': prior = ('Model',): takes a tuple out of Model, "),
+        (mine(run=None, step=None), "observer 'mine': has neither a run nor a step"),
+        (
+            replace(CONTROLLERS["none"], id="mine", label="Mine", prior=WORD),
+            "controller 'mine': prior = ('Model',): takes a tuple out of Model, ",
+        ),
         (Observer, "register: takes an Observer or a Controller, not the class Observer"),
         (len, "register: takes an Observer or a Controller, not a builtin_function_or_method"),
     ],

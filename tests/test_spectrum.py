@@ -9,7 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import kstest
 
-from wfsobs.signal.spectrum import bin_edges, bin_frequencies, gaussian_signal, random_phase_signal, resonance_power, table_power
+from wfsobs.signal.spectrum import (
+    bin_edges,
+    bin_frequencies,
+    gaussian_signal,
+    psd,
+    random_phase_signal,
+    resonance_power,
+    table_power,
+)
 
 EXAMPLES = settings(max_examples=25, deadline=None, derandomize=True)
 EPS = np.finfo(float).eps
@@ -119,6 +127,18 @@ def test_gaussian_amplitudes_are_independent_normal_numbers() -> None:
 def test_power_must_have_one_entry_per_bin(size: int) -> None:
     with pytest.raises(ValueError, match="one entry per DFT bin, 6"):
         random_phase_signal(np.ones(size), 10, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("dt", [0, -1e-3, np.nan])
+def test_a_spectrum_needs_a_time_step(dt: float) -> None:
+    with pytest.raises(ValueError, match=r"^dt = .*: takes a time step above 0 s$"):
+        psd(np.ones(100), dt)
+
+
+@pytest.mark.parametrize("resolution", [0.0, -1.0, np.nan, 2001.0])
+def test_a_spectrum_needs_a_resolution_that_has_a_window(resolution: float) -> None:
+    with pytest.raises(ValueError, match=r"^resolution = .*: takes more than 0 Hz, and no more than 1 / dt = 1000 Hz$"):
+        psd(np.ones(100), 1e-3, resolution=resolution)
 
 
 # ---------------------------------------------------------------------- tables

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+import wfsobs
 from wfsobs.cli import main
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.run import closed_loop
@@ -19,7 +20,8 @@ from wfsobs.identification import Identification, identify
 from wfsobs.identification.report import identification_toml
 from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import observe
-from wfsobs.prior import Lines
+from wfsobs.prior import Bands, Lines
+from wfsobs.priors_from import scenario as from_scenario
 from wfsobs.priors_from.identification import prior_of, told_by
 from wfsobs.priors_from.training import training_of, with_training
 from wfsobs.record import Record, Training
@@ -27,6 +29,7 @@ from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.records import save_record
+from wfsobs.testing.common import run_steps
 
 LEARN = ("gpr-offline", "ridge", "ridge-30")
 SMALL: dict[str, Any] = {
@@ -106,6 +109,23 @@ def test_missing_samples_of_training_data_are_held(night: Record, other: Record)
     expected = other.z[99, 0] + other.u[98:101, 0]
     np.testing.assert_allclose(training.y_lgs[100:103, 0], expected, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(training.y_lgs[103:], other.y_lgs[103:])
+
+
+@pytest.mark.parametrize("name", LEARN)
+def test_a_design_is_trained_without_gaps_by_either_kind_of_data(name: str, night: Record, other: Record) -> None:
+    """Oracle: a record as training data, whose gaps are held."""
+    y = other.y_lgs.copy()
+    y[20] = np.nan
+    raw = Training(y, other.u, other.open_loop_y)
+    bands = from_scenario.prior_of(S, night, (Bands,))
+    designs = [
+        wfsobs.design(name, prior, scenario=S, sampling=night.sampling, train=train)
+        for prior, train in ((S, replace(other, y_lgs=y)), (S, raw), (replace(bands, training=raw), None))
+    ]
+    got = [run_steps(observer, night.measurements())["vibration"] for observer in designs]
+    assert np.isfinite(got[0][-500:]).all()
+    for other_way in got[1:]:
+        np.testing.assert_array_equal(other_way, got[0])
 
 
 def call(*arguments: object) -> Any:

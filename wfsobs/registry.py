@@ -52,6 +52,10 @@ class Entry(Protocol):
         """Label for people."""
         ...
 
+    def check_fields(self) -> None:
+        """Raise ValueError, one line, where a field has a value that it does not take."""
+        ...
+
 
 E = TypeVar("E", bound=Entry)
 
@@ -142,6 +146,10 @@ class Registry(MutableMapping[str, E]):
             raise RegistrationError(f"{where}: the id is taken, by a row of the tables")
         if entry.label in (other.label for other in self._entries.values()):
             raise RegistrationError(f"{where}: the label {entry.label!r} is taken")
+        try:
+            entry.check_fields()
+        except ValueError as error:
+            raise RegistrationError(f"{where}: {error}") from None
         _check_settings(entry, where)
 
     def check_ids(self, ids: Iterable[str]) -> None:
@@ -172,6 +180,14 @@ class Registry(MutableMapping[str, E]):
     def __len__(self) -> int:
         self.complete()
         return len(self._entries)
+
+
+def check_tuple(name: str, value: object, choices: Iterable[Any]) -> None:
+    """Raise ValueError where the field `name` of an entry is no tuple out of some choices."""
+    choices = list(choices)
+    if not isinstance(value, tuple) or any(one not in choices for one in value):
+        words = ", ".join(getattr(one, "__name__", one) for one in choices)
+        raise ValueError(f"{name} = {value!r}: takes a tuple out of {words}")
 
 
 def sections() -> Mapping[str, Section]:

@@ -118,8 +118,9 @@ def prior_in(
     """Return these parts of what is told, for the modes of the loop."""
     prior = source if isinstance(source, Prior) else prior_of(source.before_events, None, parts)
     prior = _of_modes(prior, name, sampling.n_modes)
-    if Training in parts and prior.training is None:
-        prior = replace(prior, training=_training(scenario, train))
+    if Training in parts:
+        given = train if prior.training is None else prior.training
+        prior = replace(prior, training=_training(scenario, given, sampling))
     where = {**SHARED, Spectra: "spectra"}  # the parts whose absence has no reason of its own
     del where[LgsStars]  # known where the number of LGS changes
     for field in (where[part] for part in parts if part in where):
@@ -161,11 +162,12 @@ def _of_modes(prior: Prior, name: str, n: int) -> Prior:
     return replace(prior, flow=flow, asterism=asterism, **{part: given[:n] for part, given in parts.items()})
 
 
-def _training(scenario: Scenario, train: Record | Training | None) -> Training:
+def _training(scenario: Scenario, train: Record | Training | None, sampling: Sampling) -> Training:
+    """Return training data without gaps."""
     if train is None:
         made = simulate(scenario).training
         assert made is not None
         return made
     if isinstance(train, Training):
-        return train
+        train = Record(train.y_lgs, train.u, sampling.dt, open_loop_y=train.open_loop_y, delay=sampling.delay)
     return as_training(train)

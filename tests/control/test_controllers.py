@@ -310,6 +310,15 @@ def test_the_filter_of_every_peak_takes_no_settings_of_those_of_one() -> None:
     assert len(gains[0]) == 2 and np.array_equal(*gains)
 
 
+def test_a_controller_without_a_law_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_law(*_: Any) -> Any:
+        return None
+
+    monkeypatch.setitem(CONTROLLERS, "integrator", replace(CONTROLLERS["integrator"], law=no_law))
+    (one,) = run(QUICK, ("integrator",)).outcomes
+    assert one.residual is None and one.note == "law takes a wfsobs.control.mirror.Law, not a NoneType"
+
+
 def test_what_cannot_run_says_why() -> None:
     both = {"multirate.measurement_noise": "manual", "multirate.lgs_noise": 0.04, "multirate.ngs_noise": 0.001}
     (one,) = run(QUICK | both, ("lqg-multirate",)).outcomes

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.linalg import sqrtm
@@ -119,6 +121,21 @@ def test_what_cannot_be_fitted_is_refused_in_one_line() -> None:
     found = wfsobs.fit_kernels(record, turbulence=[AIR], vibration=[QuasiPeriodic(0.05, 0.02, 0.5, 1.0, 1)])
     with pytest.raises(ValueError, match="observers take"):
         found.scenario()
+
+
+@pytest.mark.parametrize(
+    ("start", "line"),
+    [
+        ({"turbulence": [Matern(0.0, 0.05)]}, r"turbulence\.0\.rms = 0\.0: takes a number above 0 to start from"),
+        ({"vibration": [LINE, Sho(0.05, -250.0, 0.06)]}, r"vibration\.1\.omega = -250\.0: takes a number above 0"),
+        ({"turbulence": [AIR], "noise": 0.0}, r"noise = 0\.0: takes a number above 0 to start from"),
+        ({"turbulence": AIR}, r"turbulence: takes a sequence of kernels, not a Matern"),
+        ({"background": [3]}, r"background\.0: takes a kernel, not a int"),
+    ],
+)
+def test_a_search_that_cannot_start_is_refused_in_one_line(start: dict[str, Any], line: str) -> None:
+    with pytest.raises(ValueError, match=f"^{line}"):
+        wfsobs.fit_kernels(drawn(AIR, 150, 1, 5), **start)
 
 
 def test_a_search_that_ends_short_of_the_maximum_states_no_deviation(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.lib.stride_tricks import sliding_window_view
@@ -12,11 +15,22 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from wfsobs.observers.gpr.kernels import SquaredExponential
 from wfsobs.observers.gpr.offline import training_targets
 from wfsobs.priors_from.scenario import bands_of
+from wfsobs.priors_from.training import training_of
+from wfsobs.record import Training
 from wfsobs.scenario.presets import PRESETS
+from wfsobs.signal.gate import GateSettings
 from wfsobs.simulation.loop import simulate
 from wfsobs.tuning.trials import likelihood, log_marginal_likelihood
 
 pytestmark = pytest.mark.slow
+
+SMALL: dict[str, Any] = {
+    "run.duration": 2.0,
+    "gpr_offline.training_size": 120,
+    "gpr_offline.depth": 30,
+    "gpr_online.training_size": 60,
+    "gpr_online.depth": 30,
+}
 
 
 def windows(signals: np.ndarray, depth: int, first: int, m: int) -> np.ndarray:
@@ -45,10 +59,8 @@ def test_it_is_the_log_density_of_the_targets(kernel: SquaredExponential) -> Non
 
 def test_of_the_offline_gpr_it_is_that_of_scikit_learn() -> None:
     s = PRESETS["paper"]().replace(
-        {
-            "run.duration": 2.0,
-            "gpr_offline.training_size": 120,
-            "gpr_offline.depth": 30,
+        SMALL
+        | {
             "gpr_offline.inputs": "z",
             "gpr_offline.length_scale": 5.0,
             "gpr_offline.signal_std": 0.05,
@@ -67,6 +79,20 @@ def test_of_the_offline_gpr_it_is_that_of_scikit_learn() -> None:
         X, f = windows(z[:, [mode]], g.depth, g.depth - 1, g.training_size), targets[g.depth - 1 :][: g.training_size, mode]
         fitted = GaussianProcessRegressor(kernel, alpha=0.0).fit(X, f)
         assert got[mode] == pytest.approx(fitted.log_marginal_likelihood(), rel=1e-9)
+
+
+@pytest.mark.parametrize(("missing", "outlier"), [(np.nan, 0.0), (0.0, 3.0)], ids=["lost", "outliers"])
+@pytest.mark.parametrize("observer", ["gpr-offline", "gpr-online"])
+def test_it_is_that_of_the_training_data_that_observers_receive(observer: str, missing: float, outlier: float) -> None:
+    s = PRESETS["paper"]().replace(SMALL | {"gpr_online.inputs_filter": "standardised"})
+    record = simulate(s)
+    assert record.training is not None and record.training.open_loop_y is not None
+    y, twin = record.training.y_lgs.copy(), record.training.open_loop_y.copy()
+    for signal in (y, twin):
+        signal[60:62] += missing + outlier
+    raw = replace(record, training=Training(y, record.training.u, twin), gate=GateSettings() if outlier else None)
+    got = likelihood(observer, raw, s)
+    assert got is not None and got == likelihood(observer, replace(raw, training=training_of(raw), gate=None), s)
 
 
 def test_none_for_what_is_no_gpr_and_for_a_record_too_short() -> None:

@@ -15,6 +15,7 @@ from click.testing import CliRunner
 from tests.records import ON_PAPER
 from wfsobs.cli import main
 from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import run_design
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.pipeline import observe, run
 from wfsobs.priors_from.scenario import kalman_model, measurement_noise
@@ -26,7 +27,7 @@ from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.sensor_noise import noise_covariance
 from wfsobs.tuning import Evaluation, tune
-from wfsobs.tuning.records import NEXT, REFERENCE, TRUTH, cut_record, piece, simulate_records, space, stream
+from wfsobs.tuning.records import NEXT, REFERENCE, TRUTH, cut_record, piece, reference, simulate_records, space, stream
 from wfsobs.tuning.report import tuning_dict, tuning_toml
 
 pytestmark = pytest.mark.slow
@@ -180,6 +181,17 @@ def test_telemetry_is_judged_by_what_there_is() -> None:
             tune(short(), observer, record=record)
 
 
+@pytest.mark.parametrize("has_twin", [True, False])
+def test_the_reference_has_no_step_whose_measurement_is_missing(has_twin: bool) -> None:
+    """That of the next frame."""
+    record = simulate(short())
+    assert record.open_loop_y is not None
+    y, twin = record.y_lgs.copy(), record.open_loop_y.copy()
+    y[1000], twin[1000] = np.nan, np.nan
+    gap = replace(record, y_lgs=y, open_loop_y=twin if has_twin else None)
+    assert np.flatnonzero(np.isnan(reference(gap, short())).any(axis=1)).tolist() == [999, record.n_steps - 1]
+
+
 @pytest.mark.parametrize("observer", ["kf-lgs", "ridge"])
 def test_a_record_too_short_says_how_long_it_has_to_be(observer: str) -> None:
     record, s = telemetry(), short()
@@ -210,6 +222,19 @@ def test_a_start_that_fails_is_no_end() -> None:
     assert "fails" in tuning_toml(tuned) and tuning_dict(tuned)["before"]["test_rms_um"] is None
     with pytest.raises(RecordError, match="depth"):
         tune(s.replace({"gpr_online.training_size": 1500}), "gpr-online", ["gpr_online.depth"], evaluations=6)
+
+
+def test_steps_without_an_estimate_in_between_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    kf = OBSERVERS["kf-lgs"]
+
+    def with_a_hole(*given: Any) -> Any:
+        found = run_design(kf, *given)
+        for values in found.values():
+            values[3900:3910] = np.nan
+        return found
+
+    monkeypatch.setitem(OBSERVERS, "kf-lgs", replace(kf, run=with_a_hole))
+    assert tune(short(), "kf-lgs", evaluations=1).before.validation is not None
 
 
 @pytest.mark.parametrize("observer", ["gpr-offline", "gpr-online"])

@@ -145,7 +145,7 @@ def _of_mode(
     if controller.law is None:
         return LawDesign(None, True)
     try:
-        law = controller.law(prior, mode, plant, settings)
+        law = controller.law_of(prior, mode, plant, settings)
     except UnstableCycle as error:
         return LawDesign(None, False, note=str(error))
     except ValueError as error:

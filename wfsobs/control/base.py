@@ -26,9 +26,10 @@ from wfsobs.observers.base import NOT_TUNED, NOTHING, PLAIN, Look, Tunable
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
 from wfsobs.observers.step import StepError, each_frame
-from wfsobs.prior import TRUE, Bands, Part, Prior, PriorSource, ask_nothing, asks_for, words_for
+from wfsobs.prior import PARTS, TRUE, Bands, Part, Prior, PriorSource, ask_nothing, asks_for, words_for
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, Sampling, hold_last
+from wfsobs.registry import check_tuple
 from wfsobs.settings import Section
 from wfsobs.signal.gate import GateSettings
 from wfsobs.typing import Array
@@ -113,6 +114,10 @@ class Controller:
         if self.predict is not None and not asks_for(Bands, self.prior):
             raise ValueError(f"controller {self.id!r}: with a prediction it needs Bands in its prior")
 
+    def check_fields(self) -> None:
+        """Raise ValueError, one line, where a field has a value that it does not take."""
+        check_tuple("prior", self.prior, PARTS)
+
     @property
     def is_linear(self) -> bool:
         """Whether it has a linear law alone."""
@@ -143,7 +148,14 @@ class Controller:
 
     def laws(self, prior: Prior, plant: Plant, settings: Settings, n_modes: int) -> tuple[Law, ...]:
         """One law per mode, none for control by nothing. Raises ValueError saying why there is none."""
-        return () if self.law is None else tuple(self.law(prior, mode, plant, settings) for mode in range(n_modes))
+        return () if self.law is None else tuple(self.law_of(prior, mode, plant, settings) for mode in range(n_modes))
+
+    def law_of(self, prior: Prior, mode: int, plant: Plant, settings: Settings) -> Law:
+        """Return the law of one mode. Raises ValueError saying why there is none."""
+        law = None if self.law is None else self.law(prior, mode, plant, settings)
+        if not isinstance(law, Law):
+            raise ValueError(f"law takes a wfsobs.control.mirror.Law, not a {type(law).__name__}")
+        return law
 
     def design(
         self, prior: Prior, plant: Plant, settings: Settings, sampling: Sampling, gate: GateSettings | None = None

@@ -6,9 +6,9 @@ missing samples left out. Standard deviations are those of the curvature there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
-from math import exp, nan, pi, sqrt
+from math import exp, inf, nan, pi, sqrt
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from wfsobs.observers.gp.kernels import Kernel, Matern, Sho, SquaredExponentialI
 from wfsobs.prior import Line, Lines
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
+from wfsobs.registry import kind_of
 from wfsobs.sensors.modes import MODE_NAMES
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.typing import Array
@@ -148,7 +149,7 @@ def fit_kernels(
     RecordError
         The record is too short or infinite.
     ValueError
-        There is no kernel, or one that cannot be fitted.
+        There is no kernel, or one that cannot be fitted, or the search would start from a number that is not above 0.
     Cancelled
         `watch` asks to stop.
     """
@@ -156,7 +157,9 @@ def fit_kernels(
     if np.isfinite(z).sum(axis=0).min(initial=len(z)) < SHORTEST:
         raise RecordError(f"a mode has fewer than {SHORTEST} samples")
     names = MODE_NAMES[: z.shape[1]]
-    parts = {"turbulence": tuple(turbulence), "vibration": tuple(vibration), "background": tuple(background)}
+    parts = {"turbulence": turbulence, "vibration": vibration, "background": background}
+    parts = {part: _kernels(part, kernels) for part, kernels in parts.items()}
+    _check_start("noise", noise)
     fits = []
     for i, name in enumerate(names):
         watch.step(i / len(names))
@@ -170,6 +173,24 @@ def fitted_numbers(kernel: Kernel) -> list[str]:
     if not found:
         raise ValueError(f"{type(kernel).__name__} cannot be fitted; a sum is given as a sequence of its parts")
     return found
+
+
+def _kernels(part: str, kernels: Iterable[Kernel]) -> tuple[Kernel, ...]:
+    """Return the kernels of a part. Raises ValueError, one line, where the search cannot start from them."""
+    if not isinstance(kernels, Iterable):
+        raise ValueError(f"{part}: takes a sequence of kernels, not {kind_of(kernels)}")
+    kernels = tuple(kernels)
+    for i, kernel in enumerate(kernels):
+        if isinstance(kernel, type) or not hasattr(kernel, "state_space"):
+            raise ValueError(f"{part}.{i}: takes a kernel, not {kind_of(kernel)}")
+        for name in fitted_numbers(kernel):
+            _check_start(f"{part}.{i}.{name}", getattr(kernel, name))
+    return kernels
+
+
+def _check_start(name: str, value: Any) -> None:
+    if not isinstance(value, (int, float, np.integer, np.floating)) or not 0.0 < value < inf:
+        raise ValueError(f"{name} = {value}: takes a number above 0 to start from")
 
 
 def _fit_mode(name: str, parts: dict[str, tuple[Kernel, ...]], noise: float, dt: float, z: Array, watch: Watch) -> KernelFit:

@@ -7,7 +7,7 @@ the prior that it asked for and its own settings: the truth is out of reach.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,9 +18,10 @@ from wfsobs.observers.estimates import VIBRATION as VIBRATION
 from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
 from wfsobs.observers.step import MakeEstimator, StepError, StepObserver, run_frames
-from wfsobs.prior import TRUE, Part, Prior, PriorSource, ask_nothing, words_for
+from wfsobs.prior import PARTS, TRUE, Part, Prior, PriorSource, ask_nothing, words_for
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Measurements, Record, Sampling, hold_last
+from wfsobs.record import SENSORS, Measurements, Record, Sampling, hold_last
+from wfsobs.registry import check_tuple
 from wfsobs.settings import Group, Section
 from wfsobs.signal.gate import GateSettings
 from wfsobs.typing import Array
@@ -144,6 +145,17 @@ class Observer:
     step: MakeEstimator | None = None
     counts: Callable[[Prior, Any], Any] | None = None
 
+    def check_fields(self) -> None:
+        """Raise ValueError, one line, where a field has a value that it does not take."""
+        check_tuple("targets", self.targets, TARGETS)
+        check_tuple("needs", self.needs, (field.name for field in fields(Record)))
+        check_tuple("sensors", self.sensors, SENSORS)
+        check_tuple("prior", self.prior, PARTS)
+        if not self.targets:
+            raise ValueError(f"targets = (): takes one at least, of {', '.join(TARGETS)}")
+        if self.run is None and self.step is None:
+            raise ValueError("has neither a run nor a step")
+
     def parts(self, settings: Any) -> tuple[Part, ...]:
         """Return what it needs beside measurements for these settings."""
         return (*self.prior, *self.asks(settings))
@@ -262,6 +274,9 @@ def check_estimates(estimates: object, targets: tuple[str, ...], shape: tuple[in
         if not isinstance(values, np.ndarray) or values.shape != shape:
             kind = getattr(values, "shape", type(values).__name__)
             raise ValueError(f"{name} takes an array of the shape {shape}, (n_steps, n_modes), not {kind}")
+        if values.dtype.kind not in "fiu" or np.isinf(values).any():
+            kind = "infinite ones" if values.dtype.kind == "f" else values.dtype.name
+            raise ValueError(f"{name} takes real numbers, NaN where there is none, not {kind}")
     return out
 
 

@@ -334,6 +334,8 @@ _WORDS: dict[Part, tuple[str, ...]] = {
     Training: ("training data",),
 }
 """Part -> what it is called in the column "Prior knowledge", by the source of the prior."""
+PARTS: tuple[Part, ...] = tuple(_WORDS)
+"""All of them."""
 
 
 def words_for(parts: Iterable[Part], *, source: PriorSource = TRUE) -> tuple[str, ...]:

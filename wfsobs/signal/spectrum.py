@@ -181,7 +181,16 @@ def psd(x: ArrayLike, dt: float, *, resolution: float = 0.5) -> tuple[Array, Arr
         Frequencies [Hz].
     density : Array
         One-sided density [unit^2/Hz], a column per signal.
+
+    Raises
+    ------
+    ValueError
+        There is no such time step, or no window of such a resolution.
     """
+    if not 0.0 < dt < np.inf:
+        raise ValueError(f"dt = {dt:g}: takes a time step above 0 s")
+    if not 0.0 < resolution <= 1.0 / dt:
+        raise ValueError(f"resolution = {resolution:g}: takes more than 0 Hz, and no more than 1 / dt = {1.0 / dt:g} Hz")
     x = np.asarray(x, dtype=float)
     window = min(round(1.0 / (resolution * dt)), len(x))
     frequency, density = welch(x, fs=1.0 / dt, nperseg=window, axis=0, detrend="constant")

@@ -350,7 +350,10 @@ def piece(record: Record, start: int, stop: int) -> Record:
 
 
 def reference(record: Record, scenario: Scenario) -> Array:
-    """Return the zero-phase Butterworth reference of a record, (n_steps, n_modes) [um], NaN where a measurement is missing."""
-    whole = fill_missing(record.without_outliers, prior_of(scenario, record, (Model,)))
-    twin = whole.z if whole.open_loop_y is None else whole.open_loop_y
-    return np.where(np.isnan(record.z), np.nan, open_loop_reference(bands_of(scenario), twin, record.dt))
+    """Return the zero-phase Butterworth reference of a record, (n_steps, n_modes) [um], NaN where its measurement is missing."""
+    seen = record.without_outliers
+    whole = fill_missing(seen, prior_of(scenario, record, (Model,)))
+    gaps, twin = (x.z if x.open_loop_y is None else x.open_loop_y for x in (seen, whole))
+    out = open_loop_reference(bands_of(scenario), twin, record.dt)
+    out[:-1][np.isnan(gaps[1:])] = np.nan  # the measurement of step k + 1 sees step k
+    return out

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf, isfinite
 from typing import Any
 
@@ -36,6 +36,7 @@ from wfsobs.observers.gpr.online import kernel_of, online_targets
 from wfsobs.observers.missing import fill_missing
 from wfsobs.prior import Bands
 from wfsobs.priors_from.scenario import bands_of, prior_of
+from wfsobs.priors_from.training import training_of
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError, pseudo_open_loop
 from wfsobs.scenario import Scenario
@@ -136,6 +137,7 @@ def likelihood(observer: str, record: Record, scenario: Scenario, watch: Watch =
         return None
     try:
         whole = fill_missing(record.without_outliers, prior_of(scenario, record, (Bands,)))
+        whole = replace(whole, training=training_of(record))  # what observers are trained on
         return tuple(_of_mode(observer, whole, scenario, mode, watch) for mode in range(record.n_modes))
     except ValueError:
         return None
@@ -266,8 +268,8 @@ class RecordTrials(Trials):
         """Return the errors on the validation record."""
         record = self.records.validation
         estimates = self._estimates(record, scenario)
-        silent = np.logical_or.reduce([np.isnan(e.values).any(axis=1) for e in estimates])[:-1]  # a reference lacks the last
-        begins = (silent.size - int(np.argmax(silent[::-1]))) * record.dt if silent.any() else 0.0
+        known = ~np.isnan([e.values for e in estimates]).any(axis=(0, 2))
+        begins = (int(np.argmax(known)) if known.any() else record.n_steps) * record.dt
         if not self.history and begins <= LATEST * record.n_steps * record.dt:
             self.warm_up = max(self.warm_up, begins)
         if begins > self.warm_up:
