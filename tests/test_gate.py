@@ -123,6 +123,43 @@ def test_a_clean_start_is_no_outlier() -> None:
         assert gate.outliers.tolist() == [0, 0], seed
 
 
+@pytest.fixture(scope="module")
+def paper() -> Sequence[Record]:
+    settings = wfsobs.PRESETS["paper"]().replace({"run.duration": 3.0})
+    return [wfsobs.simulate(settings.replace({"run.seed": seed})) for seed in range(6)]
+
+
+@pytest.mark.parametrize(("start", "stop"), [(0, 300), (20, 200), (60, 300), (100, 330), (128, 300), (180, 256)])
+def test_a_clean_record_with_an_early_gap_loses_nothing(paper: Sequence[Record], start: int, stop: int) -> None:
+    """Samples that are missing count for no fit; outliers of 40 sigma after it are found all the same."""
+    for record in paper:
+        z = record.z[record.delay :].copy()
+        z[start:stop] = np.nan
+        gate = OutlierGate(2, REJECT)
+        gate.check_all(z)
+        assert gate.outliers.tolist() == [0, 0]
+        hit = np.arange(1000, 2900, 100)
+        z[hit] += 40.0 * NOISE
+        gate = OutlierGate(2, REJECT)
+        assert np.isnan(gate.check_all(z)[hit]).all()
+        assert (gate.outliers - len(hit)).max() <= 4, "of 1 % outliers the level is the lowest: 1 of noise is expected"
+
+
+def test_samples_until_the_first_fit_are_counted_for_every_mode() -> None:
+    """A gap delays the first fit of its mode alone, and one after that does not delay what has been."""
+    z = np.random.default_rng(8).standard_normal((10 * BLOCK, 3))
+    z[20:200, 0] = np.nan
+    z[5 * BLOCK : 7 * BLOCK, 1] = np.nan
+    gate, held = OutlierGate(3, REJECT), np.eye(ORDER)[-1]
+    gate.check_all(z[: 2 * BLOCK])
+    assert (gate.save()["weights"] == held).all(axis=1).tolist() == [True, False, False]
+    gate.check_all(z[2 * BLOCK :])
+    assert not (gate.save()["weights"] == held).all(axis=1).any()
+    lacking, none, total = gate.save()["rows"]
+    assert (none, total) == (10 * BLOCK, 10 * BLOCK)
+    assert 180 <= 10 * BLOCK - lacking <= 180 + OPEN + 10, "those missing, those that settle, and a few outliers"
+
+
 @pytest.mark.parametrize("size", [5.0, 20.0, 1000.0])
 def test_a_jump_is_followed_within_twenty_samples(size: float) -> None:
     z = np.random.default_rng(6).standard_normal((4000, 3))

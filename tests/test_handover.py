@@ -20,6 +20,7 @@ from scipy.io import loadmat
 from wfsobs.cli import main
 from wfsobs.files import write_whole
 from wfsobs.handover import c99
+from wfsobs.signal.gate import GateSettings, OutlierGate
 
 ROUNDING = 1e-12
 """Over the std of the commands: sums in another order."""
@@ -39,6 +40,16 @@ def vectors(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def make(path: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(["make", "-C", str(path), "test"], capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize(("start", "stop"), [(0, 150), (0, 300), (20, 200), (130, 2000)])
+def test_the_gate_in_c99_is_that_of_python_after_an_early_gap(tmp_path: Path, start: int, stop: int) -> None:
+    path = write(tmp_path, "integrator", "c99")
+    z = np.fromfile(path / "gate.f64", "<f8").reshape(-1, 4)[:, :2]
+    z[start:stop] = np.nan
+    np.hstack([z, OutlierGate(2, GateSettings()).check_all(z)]).tofile(path / "gate.f64")
+    done = make(path)
+    assert done.returncode == 0 and done.stdout.count("equal") == 2, done.stdout + done.stderr
 
 
 @pytest.mark.slow

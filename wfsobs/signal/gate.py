@@ -26,8 +26,8 @@ from wfsobs.typing import Array
 ORDER = 64
 """Past samples that predict the next one."""
 BLOCK = 128
-"""Samples between two fits; in the first block all pass, in the second the last sample is the prediction: one block has too few
-samples for a fit of so many weights, which would reject a clean record's turbulence."""
+"""Samples between two fits; in the first block all pass, and until two, rounded, are measured the last sample is the prediction:
+fewer are too few for a fit of so many weights, which would reject a clean record's turbulence."""
 MEMORY = 64
 """Blocks after which a sample has 1/e of its weight in the fit."""
 FORGET = 0.1
@@ -40,9 +40,9 @@ not known well enough."""
 OPEN = 20
 """Samples that pass then, while the deviation is doubled."""
 EARLY = 1.0
-"""Relative increase of the level, times the square of the number of blocks: a fit to few samples predicts badly."""
+"""Relative increase of the level, times the square of the number of blocks fitted to: a fit to few samples predicts badly."""
 EARLIEST = 3.0
-"""Relative increase of the level until the second fit: the first one has hardly more samples than weights."""
+"""Relative increase of the level until the first fit."""
 PACE = 0.125
 """Weight of a block in the deviation, by its median, and in the part of samples that are outliers."""
 USUAL, RAREST, START = 1e-2, 5e-5, 1e-3
@@ -104,6 +104,7 @@ class OutlierGate:
         self._part, self._outliers_before = np.full(n, START), np.zeros(n, dtype=int)  # of outliers; those before this block
         self._past = np.zeros((n, ORDER + BLOCK))  # ORDER samples before this block, and its own, less the offset
         self._normal = np.zeros((n, ORDER + 1, ORDER + 1))
+        self._rows = np.zeros(n, dtype=int)  # samples fitted to until the first fit, then all
         self._weights = np.zeros((n, ORDER))  # of the oldest sample first
         self._weights[:, -1] = 1.0  # until there is a fit the last one is held
         self._deviation, self._out_count, self._open = np.full(n, np.inf), np.zeros(n), np.zeros(n, dtype=int)
@@ -167,8 +168,13 @@ class OutlierGate:
 
     def _limit(self) -> Array:
         rarity = (USUAL / np.clip(self._part, RAREST, USUAL)) ** RARITY
-        blocks = self.count // BLOCK
-        return self.settings.level * rarity * (1.0 + (EARLY / blocks**2 if blocks > 1 else EARLIEST)) * self._deviation
+        blocks = self._blocks()
+        early = np.where(blocks > 1, EARLY / np.maximum(blocks, 1) ** 2, EARLIEST)
+        return self.settings.level * rarity * (1.0 + early) * self._deviation
+
+    def _blocks(self) -> Array:
+        """Return the blocks that the weights are fitted to, rounded: what is missing before the first fit is none of them."""
+        return (self._rows + BLOCK // 2) // BLOCK
 
     def _count(self, is_outlier: Array) -> None:
         """Count a sample, and open the gate where outliers last.
@@ -221,11 +227,12 @@ class OutlierGate:
             self._clean(mode)
         rows = sliding_window_view(self._past, ORDER + 1, axis=1) * self._is_usual[:, :, None]
         self._normal = (1.0 - 1.0 / MEMORY) * self._normal + rows.swapaxes(1, 2) @ rows
+        self._rows = self._rows + np.where(self._blocks() > 1, BLOCK, self._is_usual.sum(axis=1))
         square, cross = self._normal[:, :-1, :-1], self._normal[:, :-1, -1:]
         trace = np.trace(square, axis1=1, axis2=2)
         diagonal = np.where(trace > 0.0, RIDGE * trace, 1.0)[:, None, None] * np.eye(ORDER)
         fitted = np.linalg.solve(square + diagonal, cross)[:, :, 0]
-        self._weights = np.where((trace > 0.0)[:, None] & (self.count > BLOCK), fitted, self._weights)
+        self._weights = np.where(((trace > 0.0) & (self._blocks() > 1))[:, None], fitted, self._weights)
         self._past = np.concatenate([self._past[:, BLOCK:], np.zeros((self._n_modes, BLOCK))], axis=1)
 
     def _clean(self, mode: int) -> None:
@@ -256,6 +263,7 @@ STATE = (
     "_offset",
     "_past",
     "_normal",
+    "_rows",
     "_weights",
     "_deviation",
     "_out_count",

@@ -53,14 +53,15 @@ static void fit_deviation(wfsobs_gate *g, mode *m)
         }
 }
 
-/* Take the outliers of this block into the level, which is higher where they are rare. */
-static void fit_level(mode *m)
+/* Take the outliers of this block into the level, which is higher where they are rare, and after a fit to few blocks. */
+static void fit_level(mode *m, double blocks)
 {
     double part;
     m->part += pace * ((double)(m->outliers - m->counted) / BLOCK - m->part);
     m->counted = m->outliers;
     part = m->part > usual_part ? usual_part : m->part < least_part ? least_part : m->part;
     m->level = WFSOBS_LEVEL * square_root(square_root(square_root(square_root(usual_part / part))));
+    m->level *= 1 + (blocks > 1 ? early / (blocks * blocks) : earliest);
 }
 
 /* Add a sample and those before it to the normal equations. */
@@ -118,10 +119,24 @@ static void count_outlier(wfsobs_gate *g, mode *m, int is_outlier, int k)
     }
 }
 
+/* Blocks that the weights are fitted to, rounded: what is missing before the first fit is none of them. */
+static unsigned long blocks_of(const mode *m) { return (m->rows + BLOCK / 2) / BLOCK; }
+
+/* Fit the deviation, the level and the weights after the last sample of a block. */
+static void fit(wfsobs_gate *g, mode *m)
+{
+    const int was_known = m->is_known, was_fitted = blocks_of(m) > 1;
+    fit_deviation(g, m);
+    for (int k = 0; !was_known && k < BLOCK; k++) add_row(m, k); /* what is far out is known now */
+    for (int k = 0; k < BLOCK; k++) m->rows += was_fitted || m->usual[k];
+    fit_level(m, (double)blocks_of(m));
+    if (blocks_of(m) > 1) fit_weights(g, m); /* fewer have too few samples for them */
+    for (int i = 0; i < ORDER; i++) m->past[i] = m->past[BLOCK + i];
+}
+
 void wfsobs_gate_check(wfsobs_gate *g, wfsobs_real *z)
 {
     const int k = (int)(g->call % BLOCK);
-    const unsigned long blocks = g->call / BLOCK;
     for (int i = 0; i < WFSOBS_MODES; i++) {
         mode *m = g->modes + i;
         double limit, error, expected = 0;
@@ -131,7 +146,7 @@ void wfsobs_gate_check(wfsobs_gate *g, wfsobs_real *z)
             for (int j = 0; j < ORDER; j++) expected += m->weights[j] * m->past[k + j];
         else
             expected = m->past[k + ORDER - 1];
-        limit = m->level * (1 + (blocks > 1 ? early / ((double)blocks * (double)blocks) : earliest)) * m->deviation;
+        limit = m->level * m->deviation;
         error = is_there ? (double)z[i] - m->offset - expected : 0;
         if (m->settling > 0) m->settling--;
         if (is_there && m->gap >= RUN) m->open = m->settling = OPEN; /* after a gap the prediction is worth little */
@@ -145,15 +160,9 @@ void wfsobs_gate_check(wfsobs_gate *g, wfsobs_real *z)
             z[i] = none / none;
         }
         count_outlier(g, m, is_outlier, k);
-        for (int j = 0; blocks && k == 0 && j < (ORDER + 1) * (ORDER + 1); j++) m->normal[j] *= memory;
-        if (blocks) add_row(m, k);
-        if (k == BLOCK - 1) {
-            fit_level(m);
-            fit_deviation(g, m);
-            for (int j = 0; !blocks && j < BLOCK; j++) add_row(m, j); /* of the first block what is far out is known now */
-            if (blocks) fit_weights(g, m); /* one block has too few samples for them */
-            for (int j = 0; j < ORDER; j++) m->past[j] = m->past[BLOCK + j];
-        }
+        for (int j = 0; k == 0 && j < (ORDER + 1) * (ORDER + 1); j++) m->normal[j] *= memory;
+        if (m->is_known) add_row(m, k);
+        if (k == BLOCK - 1) fit(g, m);
     }
     g->call++;
 }

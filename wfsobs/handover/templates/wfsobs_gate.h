@@ -14,7 +14,7 @@
 
 /* The state of one mode, and of a gate; all zero is before the first call. */
 struct wfsobs_gate_mode {
-    unsigned long outliers, counted; /* so far, and before this block */
+    unsigned long outliers, counted, rows; /* so far, and before this block; samples fitted to until the first fit, then all */
     int is_known, is_fitted, open, gap, settling, usual[WFSOBS_BLOCK];
     double part, level, offset, deviation, lasting, weights[WFSOBS_ORDER], errors[WFSOBS_BLOCK];
     double past[WFSOBS_ORDER + WFSOBS_BLOCK], normal[(WFSOBS_ORDER + 1) * (WFSOBS_ORDER + 1)];
