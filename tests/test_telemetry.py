@@ -74,7 +74,7 @@ WRONG = [
     (lambda a: a | {"u": a["u"].astype(str)}, "u holds text, not numbers"),
     (lambda a: a | {"dt": np.array(-1.0)}, "dt takes one number above 0, not -1"),
     (lambda a: a | {"dt": np.array(np.nan)}, "dt takes one number above 0, not nan"),
-    (lambda a: a | {"dt": np.ones(2)}, "which column is the time"),
+    (lambda a: a | {"dt": np.array([1e-3, 2e-3])}, "dt holds 2 numbers that differ; it takes one"),
     (lambda a: a | {"ratio": np.array(2.5)}, "ratio takes a whole number, not 2.5"),
     (lambda a: a | {"ratio": np.array(4)}, r"y_ngs has a frame at step 5; with ratio = 4 frames are at"),
     (lambda a: changed(a, "y_ngs", 7, 0.0), "y_ngs has a frame at step 7; with ratio = 5"),
