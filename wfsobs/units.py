@@ -91,18 +91,18 @@ def split_unit(heading: str, beside: str = "") -> tuple[str, str]:
 
 
 def stated_unit(heading: str, beside: str = "") -> str:
-    """Return the unit of a heading as `split_unit`, or what is written beside it or in brackets, of whatever else it is.
+    """Return the unit of a heading as `split_unit` does; where that knows none, the text beside the heading or in brackets.
 
     >>> stated_unit("t_ms"), stated_unit("slope [V]"), stated_unit("slope (x)"), stated_unit("slope", "pixel")
     ('ms', 'V', '', 'pixel')
     """
     match = _ENDING.search(heading)
-    bracketed = match["unit"] if match and heading[-1] in ")]" and match["unit"].lower() not in AXIS_NAMES else ""
+    bracketed = match["unit"] if match and heading[-1] in ")]" and match["unit"].lower() not in NO_UNITS else ""
     return split_unit(heading, beside)[1] or beside.strip() or bracketed
 
 
-AXIS_NAMES = ("x", "y", "tip", "tilt")
-"""What also stands in brackets."""
+NO_UNITS = frozenset("x y tip tilt lgs ngs wfs dm ttm utc tai gps unix rel abs".split())
+"""Words in brackets that name an axis, a part of the loop or a time scale."""
 
 
 def _parse_any(text: str) -> str:

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
@@ -153,10 +154,13 @@ def test_a_second_interrupt_ends_a_campaign_whose_workers_do_not_answer(plan, tm
     for worker in workers:
         worker.suspend()
     process.send_signal(signal.SIGINT)
-    time.sleep(0.5)  # of two signals at once one is lost
-    while process.poll() is None:
+    ended = False
+    while not ended:  # of two signals at once one is lost
+        time.sleep(1.0)
         process.send_signal(signal.SIGINT)
-        time.sleep(0.2)
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(20)
+            ended = True
     assert b"Aborted!" in process.communicate()[1]
     assert psutil.wait_procs(workers, timeout=60)[1] == []
 

@@ -227,7 +227,7 @@ class History(param.Parameterized):
         self._show_runs(runs)
 
     def note_evidence(self, evidence: Evidence | None) -> None:
-        """Keep errors over several seeds with the entry that is shown, if they are of it."""
+        """Attach errors over several seeds to the entry that is shown; those of another result are ignored."""
         entry = self.find(self.current)
         if evidence is None or entry is None or not all(score in entry.scores for score in evidence.record.values()):
             return

@@ -197,6 +197,7 @@ class CampaignFolder:
             if plan_time != self._plan_time:  # it may have been given more seeds
                 self._plan, self._plan_time, self._state = folder_plan(self.folder), plan_time, None
             fresh = [path for path in batch_files(self.folder) if path not in self._read_paths]
+            fresh.sort(key=lambda path: path.stat().st_mtime)  # of rows of two versions the newer ones count
             for i, path in enumerate(fresh):
                 watch.step(i / len(fresh))
                 self._take(path)

@@ -55,7 +55,7 @@ class Processes:
         return self._executor
 
     def close(self, at_once: bool = False) -> None:
-        """End the processes, when they have finished unless at once: they do not end by a signal to terminate."""
+        """End the processes after their batches, or at once by SIGKILL, as they ignore SIGTERM."""
         if self._executor is not None:
             for process in list((self._executor._processes or {}).values()) if at_once else ():
                 process.kill()
@@ -140,7 +140,7 @@ class DaskCluster:
             raise SettingError(f"--scheduler {self.address}: no scheduler answers ({error})") from None
 
     def close(self, at_once: bool = False) -> None:
-        """End the connection, which nothing waits for; the workers stay."""
+        """End the connection, which waits for nothing in either case; the workers stay."""
         if self._client is not None:
             self._client.close(timeout=5)
             self._client = None

@@ -61,6 +61,7 @@ def row_key(digest: str, seed: int, name: str) -> str:
 
 
 UNKNOWN = "not installed"
+"""In place of the version of an observer or a controller of another package."""
 
 
 @cache

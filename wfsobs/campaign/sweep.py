@@ -189,8 +189,8 @@ def _point(row: Mapping[str, str], columns: Mapping[str, Any]) -> Changes | None
     """Return the settings of a row, None where a number is missing."""
     out: dict[str, Any] = {}
     for column, of in columns.items():
-        told = of if isinstance(of, dict) else {"setting": of}
-        setting, factor = told.get("setting"), told.get("factor", 1.0)
+        fields = of if isinstance(of, dict) else {"setting": of}
+        setting, factor = fields.get("setting"), fields.get("factor", 1.0)
         if not isinstance(setting, str) or not isinstance(factor, (int, float)):
             raise SettingError(f'conditions.columns.{column}: takes "setting" or {{setting = "...", factor = 1.0}}')
         try:

@@ -28,7 +28,7 @@ from wfsobs.units import UNITS, micrometres_per
 
 
 class FiniteRange(click.FloatRange):
-    """Type of options that take a number within a range: of no range does `nan` lie outside."""
+    """Type of options that take a finite number within a range; a `click.FloatRange` lets `nan` pass."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the number. Raises BadParameter."""

@@ -177,7 +177,7 @@ def identify(
 
 @contextmanager
 def errors_of(what: str) -> Iterator[None]:
-    """Begin the line of a RecordError with what it is of."""
+    """Prefix the message of a RecordError, such as with the name of a file."""
     try:
         yield
     except RecordError as error:

@@ -335,7 +335,7 @@ _WORDS: dict[Part, tuple[str, ...]] = {
 }
 """Part -> what it is called in the column "Prior knowledge", by the source of the prior."""
 PARTS: tuple[Part, ...] = tuple(_WORDS)
-"""All of them."""
+"""Every part of a prior."""
 
 
 def words_for(parts: Iterable[Part], *, source: PriorSource = TRUE) -> tuple[str, ...]:

@@ -110,6 +110,7 @@ class OutlierGate:
         self._deviation, self._out_count, self._open = np.full(n, np.inf), np.zeros(n), np.zeros(n, dtype=int)
         self._gap, self._settling = np.zeros(n, dtype=int), np.zeros(n, dtype=int)  # samples missing in a row; left after a gap
         self._errors, self._is_usual = np.zeros((n, BLOCK)), np.zeros((n, BLOCK), dtype=bool)
+        self._level: Array = self._find_level()
 
     def check(self, z: Array, *, settles: bool = True) -> Array:
         """Return z (n_modes,) [um] with outliers NaN, or clipped; NaN is missing. settles : or else `settle` has to follow."""
@@ -165,12 +166,17 @@ class OutlierGate:
         for name in STATE:
             setattr(self, name, np.array(state[name.lstrip("_")]))
         self.count = int(self.count)
+        self._level = self._find_level()
 
     def _limit(self) -> Array:
+        return self._level * self._deviation
+
+    def _find_level(self) -> Array:
+        """Return the limit over the deviation, (n_modes,), which stays from one fit to the next."""
         rarity = (USUAL / np.clip(self._part, RAREST, USUAL)) ** RARITY
         blocks = self._blocks()
         early = np.where(blocks > 1, EARLY / np.maximum(blocks, 1) ** 2, EARLIEST)
-        return self.settings.level * rarity * (1.0 + early) * self._deviation
+        return self.settings.level * rarity * (1.0 + early)
 
     def _blocks(self) -> Array:
         """Return the blocks that the weights are fitted to, rounded: what is missing before the first fit is none of them."""
@@ -234,6 +240,7 @@ class OutlierGate:
         fitted = np.linalg.solve(square + diagonal, cross)[:, :, 0]
         self._weights = np.where(((trace > 0.0) & (self._blocks() > 1))[:, None], fitted, self._weights)
         self._past = np.concatenate([self._past[:, BLOCK:], np.zeros((self._n_modes, BLOCK))], axis=1)
+        self._level = self._find_level()
 
     def _clean(self, mode: int) -> None:
         """Keep what is far out of the first block, in which all pass, out of the fit."""

@@ -150,8 +150,7 @@ class FileColumns:
         if known in self.contents.arrays:
             raise RecordError(f"two parts are named {known}")
         if known in CLOCKS:
-            self.contents.arrays[known] = values.reshape(rows.shape if rows.shape[1] > 1 else -1)
-            self.contents.arrays[known] = self.contents.arrays[known] * seconds_per(known, unit)
+            self.contents.arrays[known] = values.reshape(rows.shape if rows.shape[1] > 1 else -1) * seconds_per(known, unit)
         elif known in SIGNALS:
             self.contents.arrays[known] = values if values.ndim == 2 else rows
             if unit:
@@ -273,7 +272,7 @@ def from_columns(columns: Mapping[str, tuple[Array, str]]) -> Contents:
     for role, (values, unit) in columns.items():
         name, _, mode = role.partition("/")
         if not mode:
-            contents.arrays[name] = values * (seconds_per(name, unit) if name in CLOCKS else 1.0)
+            contents.arrays[name] = values * seconds_per(name, unit)  # a counter has no unit
             continue
         found.setdefault(name, {})[mode] = values
         if unit:

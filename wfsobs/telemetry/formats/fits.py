@@ -91,25 +91,23 @@ def tables_and_images(hdus: HDUList) -> FileColumns:
                 if "P" in column.format or "Q" in column.format:
                     out.leave(name, f"{name} is a column of rows of unlike lengths")
                 else:
-                    values = _native(data[column.name], None)
-                    if column.null is not None and values.dtype.kind == "f":  # of the integers as they are stored
-                        values[np.asarray(data.view(np.ndarray)[column.name]) == column.null] = np.nan
-                    out.add(name, values, column.unit or "")
+                    raw = data.view(np.ndarray)[column.name]
+                    out.add(name, _native(data[column.name], raw, column.null), column.unit or "")
         elif data is not None:
             unit = str(hdu.header.get("BUNIT", ""))
-            out.add(hdu.name or f"image {number}", _native(data, hdu.header.get("BLANK")), unit)
+            out.add(hdu.name or f"image {number}", _native(data, data, hdu.header.get("BLANK")), unit)
         for key in filter(is_rate, hdu.header):
             out.add(key, hdu.header[key])
     return out
 
 
-def _native(data: Any, blank: int | None) -> Array:
-    """Return numbers in native byte order, integers scaled as the header says; the integer `blank` is a missing one."""
+def _native(data: Any, raw: Any, blank: int | None) -> Array:
+    """Return numbers in native byte order, scaled as the header says, NaN where the stored integer is `blank`."""
     if np.asarray(data).dtype.kind not in "fiu":
         return np.asarray(data)
     out = np.array(data, dtype=np.float64)
-    if blank is not None and np.asarray(data).dtype.kind in "iu":
-        out[np.asarray(data) == blank] = np.nan
+    if blank is not None and np.asarray(raw).dtype.kind in "iu":
+        out[np.asarray(raw) == blank] = np.nan
     return out
 
 
