@@ -1,5 +1,7 @@
 """Following a campaign: the arrays say what the comparison of all rows says, and what comes later is added."""
 
+import os
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from wfsobs.campaign.follow import CampaignFolder
 from wfsobs.campaign.plan import parse_plan
 from wfsobs.campaign.run import run_rows
 from wfsobs.campaign.selection import MOST_VALUES, plan_axes
-from wfsobs.campaign.store import open_folder, read_results, write_batch
+from wfsobs.campaign.store import batch_files, open_folder, read_batch, read_results, write_batch
 from wfsobs.settings.errors import SettingError
 
 PLAN = """
@@ -61,6 +63,19 @@ def test_what_is_followed_is_what_is_compared(plan, tmp_path, monkeypatch):
         if one.difference is not None:
             assert mine.above * best.rms == pytest.approx(one.difference, rel=1e-9)
             assert 0.5 * (mine.high - mine.low) * best.rms == pytest.approx(one.half_width, rel=1e-9)
+
+
+@pytest.mark.parametrize("newest", [0, 1])
+def test_of_rows_of_two_versions_the_newer_ones_count(tmp_path, newest):
+    plan = parse_plan('seeds = 1\nobservers = ["kf-lgs"]\n', tmp_path)
+    open_folder(plan, tmp_path)
+    row = {"cell": 0, "scenario": "paper", "seed": 1, "name": "kf-lgs", "target": "total", "mode": "tip", "apart": False}
+    for rms in (1.0, 2.0):
+        write_batch(tmp_path, [{**row, "key": f"{rms}", "rms_nm": rms}], {"host": "", "process": 1, "written": 1.0})
+    files = batch_files(tmp_path)
+    os.utime(files[newest], (2e9, 2e9))
+    expected = read_batch(files[newest], ["rms_nm"])["rms_nm"].to_pylist()
+    assert CampaignFolder(tmp_path).read().errors["total", "tip"].values.ravel().tolist() == expected
 
 
 def test_scenarios_that_fail_are_counted(tmp_path):
