@@ -52,7 +52,7 @@ def page(shared: Page) -> Iterator[Page]:
     undo = shared.get_by_role("button", name="Undo")
     answered(shared)
     while undo.is_enabled():
-        undo.click()
+        undo.dispatch_event("click")  # the button may be shown as enabled a moment longer than it is; then this does nothing
         answered(shared)
     finished(shared)
 
