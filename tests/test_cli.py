@@ -174,6 +174,8 @@ def test_the_record_overrides_the_scenario(tmp_path):
         (["figure", "paper-4", "--out", "no/such/f.pdf", "--record", "none.npz"], "no/such: No such file or directory"),
         (["live", "--headless", "--sha256", "ab"], "--sha256: only with --replay"),
         (["live", "--headless", "--unit", "nm"], "--unit: only with --replay or --in"),
+        (["live", "--headless", "--port", "0"], "--port: there is no page with --headless"),
+        (["live", "--seconds", "3"], "--seconds: only with --headless"),
         (["live", "--headless", "--modes", "0"], "--modes: only with --in"),
         (["attach", "--in", "s", "--shadow", "--command-gain", "2"], "--command-gain: only with --commands or --controller"),
         (["attach", "--in", "s", "--shadow", "--ngs-lag", "2"], "--ngs-lag: only with --ngs"),

@@ -97,7 +97,7 @@ def live(
     """Run a loop by the clock, every observer beside it, frame by frame, and show it on a page (docs/live.md)."""
     if replay_file and stream:
         raise SettingError("live: --replay and --in are two sources, take one")
-    _check_options(replay_file, stream, ngs)
+    _check_options(replay_file, stream, ngs, headless)
     for file in (record_file, log_file):
         if file:
             check_writable(file)
@@ -139,8 +139,12 @@ def live(
     server.serve(server.Options(port=port, open_browser=open_browser, runs=max(2, cpu_count() or 1)), order)
 
 
-def _check_options(replay_file: str | None, stream: str | None, ngs: str | None) -> None:
-    """Raise SettingError for an option that needs another one."""
+def _check_options(replay_file: str | None, stream: str | None, ngs: str | None, headless: bool) -> None:
+    """Raise SettingError for an option that needs another one, or does nothing beside another one."""
+    if headless:
+        refuse_options(("port", "open_browser"), "there is no page with --headless")
+    else:
+        refuse_options(("seconds", "as_json"), "only with --headless")
     if not replay_file:
         refuse_options([name for name in RECORD_OPTIONS if name != "unit"], "only with --replay")
     if not stream:

@@ -83,6 +83,8 @@ def test_tables_of_other_tracks_stay(arena: Arena, tmp_path: Path, monkeypatch: 
     both = page("events", "second events")
     assert both.index("the turbulence") < both.index("second events") and "first events" not in both
     assert "the turbulence" not in page("events", "other events", quick.version + 1)
+    (tmp_path / "results.json").write_text("[]")
+    assert "the turbulence" in page("turbulence", "the turbulence")
 
 
 @pytest.mark.parametrize("words", [["--track", "closed-loop", "--entry", "kf-lgs"], ["--track", "next", "--entry", "rls"]])

@@ -136,7 +136,7 @@ def _add_known(values: Table, path: Path) -> Table:
         known = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return values
-    if any(known.get(name) != values[name] for name in ("version", "digest", "physics", "wfsobs")):
+    if not isinstance(known, dict) or any(known.get(name) != values[name] for name in ("version", "digest", "physics", "wfsobs")):
         return values
     by_track = {table["id"]: table for table in (*known["tracks"], *values["tracks"])}
     ranked = {row["entry"] for table in values["tracks"] for row in table["rows"]}
