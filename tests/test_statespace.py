@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
-from wfsobs.signal.statespace import disturbance_model, paper_matrices, sample_ar3
+from wfsobs.signal.statespace import disturbance_model, paper_matrices, sample_ar3, third_order_model
 
 TURBULENCE, VIBRATION = Ar2(7.0686, 0.9, 0.5, 1e-3), Ar2(298.4, 0.03, 0.015, 1e-3)
 
@@ -79,6 +81,18 @@ def test_a_model_is_the_sum_of_its_processes(n_turbulence: int, n_vibration: int
     assert np.allclose(model.pairs @ model.Q @ model.pairs.T, drive, rtol=1e-9, atol=1e-12 * drive.max())
     # variance one, uncorrelated: the stationary covariance is the identity
     assert np.allclose(model.A @ model.A.T + model.Q, np.eye(len(state)), atol=1e-13)
+
+
+@settings(max_examples=30)
+@given(log_omega=st.floats(-7.0, 0.4), log_corner=st.floats(-7.0, 0.7), n=st.integers(1, 700))
+def test_samples_of_third_order_are_those_of_its_model(log_omega: float, log_corner: float, n: int) -> None:
+    p = Ar3(10.0**log_omega, 0.9, 10.0**log_corner, 0.5, 1.0)
+    model, rng = third_order_model(p), np.random.default_rng(3)
+    x, steps = rng.standard_normal(3), []
+    for v in rng.standard_normal(n):
+        steps.append(model.now @ x)
+        x = model.A @ x + model.Q[:, 0] / np.sqrt(model.Q[0, 0]) * v
+    assert sample_ar3(p, n, np.random.default_rng(3)) == pytest.approx(np.array(steps), abs=1e-12)
 
 
 @pytest.mark.slow

@@ -29,8 +29,8 @@ from wfsobs.signal.whittle import negative_log_likelihood, whittle_fit
 from wfsobs.signal.wiener import circle_mean
 from wfsobs.typing import Array
 
-SLOWEST = 3e-3
-"""Minimum corner of a fitted process, over the sampling rate: slower ones lose digits and gain nothing in a filter."""
+SLOWEST = 1e-6
+"""Minimum corner of a fitted process, over the sampling rate: 0.1 m/s on 39 m at 10 kHz."""
 TOLERANCE = 1e-3
 """Distance of a fit from its minimum, in standard deviations of its parameters."""
 STEPS = 100
@@ -76,31 +76,35 @@ class Ar3:
         return np.array([pair, pair.conjugate(), self.corner * self.dt])
 
     @property
-    def unit_drive_variance(self) -> float:
-        """Variance of the drive for which the process has the variance 1.
+    def lattice(self) -> tuple[Array, Array]:
+        """Partial autocorrelations k_1, k_2, k_3, all between -1 and 1, and sqrt(1 - k_i^2), both (3,).
 
-        The product of 1 - p_i p_j over i <= j, divided by 1 + e_2 - e_1 e_3 - e_3^2 with e_i the elementary symmetric polynomials
-        of the poles: one over the sum of squares of the impulse response. Grouped so that nothing cancels when it is slow.
+        With e_i the elementary symmetric polynomials of the poles, D = 1 + e_2 - e_1 e_3 - e_3^2 and P the product of 1 - p_i p_j
+        over i < j,
+
+            1 - k_1 = (1 + e_3) prod (1 - p_i) / D,    1 + k_1 = (1 - e_3) prod (1 + p_i) / D,
+            1 - k_2 = D / (1 - e_3^2),    1 + k_2 = P / (1 - e_3^2),    k_3 = e_3,
+
+        which is the step-down recursion in products: nothing cancels when the process is slow.
         """
         x, y, z = self.damping * self.omega * self.dt, sqrt(1.0 - self.damping**2) * self.omega * self.dt, self.corner * self.dt
-        pairs = expm1(-2.0 * x) * expm1(-2.0 * z) * _distance(2.0 * x, 2.0 * y) * _distance(x + z, y)
         total = 2.0 * x + z
-        return -pairs / (expm1(-2.0 * total) + 2.0 * cos(y) * exp(x - total) * expm1(-2.0 * x) + exp(z - total) * expm1(-2.0 * z))
+        squares = -expm1(-2.0 * z) * _distance(2.0 * x, 2.0 * y)
+        pairs = -expm1(-2.0 * x) * _distance(x + z, y)
+        last = -expm1(-2.0 * total)
+        D = last - 2.0 * cos(y) * exp(x - total) * expm1(-2.0 * x) - exp(z - total) * expm1(-2.0 * z)
+        k = np.array([1.0 + (1.0 + exp(-total)) * expm1(-z) * _distance(x, y) / D, pairs / last - 1.0, exp(-total)])
+        return k, np.array([sqrt(squares * last) / D, sqrt(D * pairs) / last, sqrt(last)])
+
+    @property
+    def unit_drive_variance(self) -> float:
+        """Variance of the drive for which the process has the variance 1."""
+        return float(np.prod(self.lattice[1]) ** 2)
 
     @property
     def drive_variance(self) -> float:
         """Variance of the drive for which the process has the variance rms^2."""
         return self.rms**2 * self.unit_drive_variance
-
-    @property
-    def reflections(self) -> Array:
-        """Partial autocorrelations k_1, k_2, k_3, all between -1 and 1, by the step-down recursion."""
-        a = -np.poly(self.poles).real[1:]  # phi[k] = a_1 phi[k-1] + ...
-        out = np.zeros(a.size)
-        while a.size:
-            k = out[a.size - 1] = a[-1]
-            a = (a[:-1] + k * a[-2::-1]) / (1.0 - k**2)
-        return out
 
     def psd(self, frequency: Array) -> Array:
         """Return the one-sided power spectral density [unit^2/Hz] at `frequency` [Hz]."""

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter, lfiltic
+from scipy.linalg import toeplitz
 
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
@@ -24,6 +24,9 @@ from wfsobs.typing import Array
 
 MIN_MODEL_DAMPING = 1e-4
 """Minimum damping of a modelled process: a line of damping 0 would put an estimator pole on the unit circle."""
+
+BLOCK = 256
+"""Steps of a third-order process that are drawn at once."""
 
 
 @dataclass(frozen=True)
@@ -92,8 +95,7 @@ def third_order_model(p: Ar3) -> ProcessModel:
     rows (the normalised lattice of Gray and Markel, IEEE Trans. ASSP 23, 268, 1975), so the state keeps its variance
     whatever the rounding of the k_i.
     """
-    k1, k2, k3 = p.reflections
-    s1, s2, s3 = np.sqrt(1.0 - p.reflections**2)
+    (k1, k2, k3), (s1, s2, s3) = p.lattice
     drive = np.array([s1 * s2 * s3, -k1 * s2 * s3, -k2 * s3])
     return ProcessModel(
         A=np.array([[k1, k2 * s1, k3 * s1 * s2], [s1, -k1 * k2, -k1 * k3 * s2], [0.0, s2, -k2 * k3]]),
@@ -104,16 +106,23 @@ def third_order_model(p: Ar3) -> ProcessModel:
 
 
 def sample_ar3(p: Ar3, n: int, rng: np.random.Generator) -> Array:
-    """Draw `n` steps of a third-order process, stationary from the first, (n,)."""
-    model, denominator = third_order_model(p), np.poly(p.poles).real
-    drive = model.Q[:, 0] / np.sqrt(model.Q[0, 0])
-    x, first = rng.standard_normal(3), []
-    for v in rng.standard_normal(3):  # of variance one and uncorrelated, as the state is
-        first.append(float(x[0]))
-        x = model.A @ x + drive * v
-    gain = [drive[0]]
-    rest, _ = lfilter(gain, denominator, rng.standard_normal(max(n - 3, 0)), zi=lfiltic(gain, denominator, first[::-1]))
-    return p.rms * np.concatenate([first, rest])[:n]
+    """Draw `n` steps of a third-order process, stationary from the first, (n,).
+
+    By its state, block by block: in a difference equation a slow process loses the sum of its coefficients, of order (w T)^3.
+    """
+    model = third_order_model(p)
+    A, drive, x = model.A, model.Q[:, 0] / np.sqrt(model.Q[0, 0]), rng.standard_normal(3)
+    v = np.zeros((-(-n // BLOCK), BLOCK))
+    v.flat[:n] = rng.standard_normal(n)
+    powers = [np.eye(3)]
+    for _ in range(BLOCK):
+        powers.append(A @ powers[-1])
+    free, forced = np.array(powers)[:, 0], np.array(powers) @ drive
+    out = v @ toeplitz(np.zeros(BLOCK), np.append(0.0, forced[: BLOCK - 1, 0]))
+    for block, kicks in zip(out, v @ forced[BLOCK - 1 :: -1], strict=True):
+        block += free[:BLOCK] @ x
+        x = powers[-1] @ x + kicks
+    return p.rms * out.ravel()[:n]
 
 
 def disturbance_model(turbulence: Sequence[Ar2 | Ar3], vibration: Sequence[Ar2 | Ar3]) -> DisturbanceModel:
