@@ -156,7 +156,7 @@ def test_every_observer_runs_on_a_record_with_gaps_nearly_as_well() -> None:
 def test_filled_samples_count_in_no_prediction_score() -> None:
     """Numbers in place of the gaps would change the scores; only what was measured counts."""
     s = scenario()
-    record = replace(gappy(), turbulence=None, vibration=None, u=WHOLE.u)
+    record = replace(gappy(), turbulence=None, vibration=None, u=WHOLE.u, y_ngs=None, ratio=None)
     result = observe(record, s, observers=["kf-lgs", "zero"])
     start = round(s.run.warm_up / record.dt)
     for mode, name in enumerate(("tip", "tilt")):

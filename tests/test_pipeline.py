@@ -157,15 +157,45 @@ def test_a_record_without_truth_is_scored_by_prediction_and_residual() -> None:
         ("zero", PREDICTION),
         (LOOP, RESIDUAL),
     }
-    z, start = record.z, round(scenario().run.warm_up / record.dt)
+    start = round(scenario().run.warm_up / record.dt)
     for mode, name in enumerate(("tip", "tilt")):
         found = {s.observer: s for s in result.scores if s.mode == name}
         values = [result.estimate("kf-lgs", target).values[:, mode] for target in TARGETS]
-        error = [z[k + 1, mode] - values[0][k] - values[1][k] for k in range(start, record.n_steps - 1)]
-        assert found["kf-lgs"].rms == pytest.approx(np.sqrt(np.mean(np.square(error))), rel=1e-12)
-        assert found["zero"].rms == found["zero"].truth_rms == pytest.approx(rms(z[start + 1 :, mode]), rel=1e-12)
+        n, total = record.ratio, values[0] + values[1]
+        frames = [k for k in range(start + 1, record.n_steps) if k % n == 0]
+        error = [record.z_ngs[k, mode] - np.mean(total[k - n : k]) for k in frames]
+        assert found["kf-lgs"].rms == pytest.approx(rms(np.array(error)), rel=1e-12)
+        assert found["zero"].rms == found["zero"].truth_rms == pytest.approx(rms(record.z_ngs[frames, mode]), rel=1e-12)
         assert found[LOOP].rms == pytest.approx(rms(record.y_lgs[start + 1 :, mode]), rel=1e-12)
         assert found["kf-lgs"].normalised_rms == pytest.approx(found["kf-lgs"].rms / found["zero"].rms, rel=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["paper", "ut4"])
+def test_without_truth_observers_rank_as_by_the_truth(preset: str) -> None:
+    """The slow error of the LGS, in z, makes the best observer the worst by z."""
+    s = PRESETS[preset]().replace({"run.duration": 8.0})
+    names = ["kf-lgs", "kf-multi", "multirate-optimal", "multirate-multi"]
+    known = observe(record := simulate(s), s, observers=names)
+    alone = observe(replace(record, turbulence=None, vibration=None), s, observers=names)
+    for mode in ("tip", "tilt"):
+        true = {x.observer: x.rms for x in known.scores if x.observer in names and (x.target, x.mode) == ("total", mode)}
+        told = {x.observer: x.rms for x in alone.scores if x.observer in names and (x.target, x.mode) == (PREDICTION, mode)}
+        assert min(told, key=told.__getitem__) == min(true, key=true.__getitem__) == "multirate-multi"
+        both, single = ["multirate-optimal", "multirate-multi"], ["kf-lgs", "kf-multi"]
+        assert max(told[name] for name in both) < 0.6 * min(told[name] for name in single)
+
+
+def test_without_ngs_or_with_most_frames_lost_the_next_lgs_measurement_counts() -> None:
+    record = replace(simulate(scenario()), turbulence=None, vibration=None)
+    assert record.y_ngs is not None and record.ratio is not None
+    y_ngs, n, start = record.y_ngs.copy(), record.ratio, round(scenario().run.warm_up / record.dt)
+    y_ngs[: int(0.6 * record.n_steps)] = np.nan
+    for one in (replace(record, y_ngs=None, ratio=None), replace(record, y_ngs=y_ngs)):
+        result = observe(one, scenario(), observers=["kf-lgs"])
+        total = result.estimate("kf-lgs", "turbulence").values + result.estimate("kf-lgs", "vibration").values
+        (row,) = (s for s in result.scores if s.observer == "kf-lgs" and s.mode == "tip")
+        assert row.rms == pytest.approx(rms((record.z[start + 1 :] - total[start:-1])[:, 0]), rel=1e-12), n
 
 
 @pytest.mark.slow

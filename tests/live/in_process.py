@@ -49,7 +49,7 @@ class LoopInProcess:
         return first, self.ring.read_frames(first, stop)
 
     def views(self, seconds):
-        return [(read_view(self.ring, [self.traces], self.sampling.dt, seconds), self.board.active())]
+        return [(read_view(self.ring, [self.traces], self.sampling, seconds), self.board.active())]
 
     def release(self):
         for shared in (self.ring, self.traces, self.board):

@@ -144,11 +144,13 @@ def test_without_a_truth_the_next_measurement_is_stated() -> None:
     """By who estimates the whole disturbance; in the row, and there the rms of what is stated is that of the errors to 5 %."""
     scenario = wfsobs.PRESETS["paper"]().replace({"run.duration": 20.0, "vibration.source": "ar2"})
     record = replace(wfsobs.simulate(scenario), turbulence=None, vibration=None)
-    found = wfsobs.observe(record, scenario, observers=["kf-multi", "multirate", "ridge"])
+    by_frames = wfsobs.observe(record, scenario, observers=["kf-multi", "multirate", "ridge"])
+    assert all(s.calibration is None for s in by_frames.scores)  # of the mean over a frame nothing is stated
+    found = wfsobs.observe(replace(record, y_ngs=None, ratio=None), scenario, observers=["kf-multi", "ridge"])
     (row,) = (s for s in found.scores if s.observer == "kf-multi" and s.mode == "tip")
     assert row.target == "next z" and row.calibration is not None
     assert row.calibration.sd == pytest.approx(row.rms, rel=0.05)
-    assert not [s for s in found.scores if s.observer in ("multirate", "ridge")]
+    assert not [s for s in (*by_frames.scores, *found.scores) if s.observer in ("multirate", "ridge")]
 
 
 KERNEL = SquaredExponential(1.0, 2.0, 0.1)

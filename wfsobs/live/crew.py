@@ -173,7 +173,8 @@ class ObserverCrew(Crew[StepObserver, Follower]):
         slots = self._row[2:].reshape(n, slot_width(m))
         self._times, self._estimates = slots[:, 0], slots[:, 1:].reshape(n, len(TARGETS), m)  # views of the row
         self._rows, self._truth, self._waits = np.empty((COUNTED, *slots.shape)), np.empty((COUNTED, len(TRUTHS), m)), 0
-        self._next, self._running = np.full((n, m), np.nan), np.empty(0, dtype=np.intp)
+        self._past, self._running = np.full((self.ratio, n, m), np.nan), np.empty(0, dtype=np.intp)
+        self._has_ngs = sampling.ratio is not None
 
     def take(self, frame: LiveFrame, number: int) -> Array:
         """Have every observer take a frame; return the row of their estimates. `settle` follows once that is written."""
@@ -188,7 +189,7 @@ class ObserverCrew(Crew[StepObserver, Follower]):
             self._times[follower.slot], before = now - before, now
         self._row[:2] = number, before - float(frame.due)
         self._rows[self._waits].reshape(-1)[:], truth = self._row[2:], self._truth[self._waits]
-        truth[0], truth[1], truth[2] = frame.turbulence, frame.vibration, frame.z
+        truth[0], truth[1], truth[2] = frame.turbulence, frame.vibration, frame.ngs if self._has_ngs else frame.z
         self._waits += 1
         return self._row
 
@@ -224,10 +225,12 @@ class ObserverCrew(Crew[StepObserver, Follower]):
         n, running = len(truth), self._running
         out = np.empty((n, len(running), len(SCORED), truth.shape[2]))
         np.subtract(estimates, truth[:, None, :2], out=out[:, :, :2])
-        expected = np.concatenate((self._next[None, running], estimates.sum(axis=2)))  # of each measurement from the frame before
-        np.subtract(expected[:-1], truth[:, 2, None], out=out[:, :, 2])
+        totals = np.concatenate((self._past[:, running], estimates.sum(axis=2)))
+        # A measurement is the mean over as many frames before: one of the LGS, `ratio` of the NGS, which has no slow error.
+        expected = sum((totals[i : i + n] for i in range(1, self.ratio)), totals[:n]) / self.ratio
+        np.subtract(expected, truth[:, 2, None], out=out[:, :, 2])
         np.add(out[:, :, 0], out[:, :, 1], out=out[:, :, 3])
-        self._next[running] = expected[-1]
+        self._past[:, running] = totals[n:]
         for at, follower in enumerate(self._active.values()):
             out[: max(0, n - max(0, follower.observer.frame - self._warm_up)), at] = np.nan
         return out
@@ -237,7 +240,7 @@ class ObserverCrew(Crew[StepObserver, Follower]):
         self.count()
         self._board.losses[self._place] += count
         self._board.progress[self._place] += count
-        self._next[:] = np.nan
+        self._past[:] = np.nan
         for follower in self._active.values():
             follower.observer.reset()
 
@@ -247,7 +250,7 @@ class ObserverCrew(Crew[StepObserver, Follower]):
         super().follow(command, number)
 
     def _clear(self, name: str, member: Follower) -> None:
-        self._estimates[member.slot] = self._times[member.slot] = self._next[member.slot] = np.nan
+        self._estimates[member.slot] = self._times[member.slot] = self._past[:, member.slot] = np.nan
         self._board[name].since[0] = -1
         self._list_running()
 
@@ -261,7 +264,7 @@ class ObserverCrew(Crew[StepObserver, Follower]):
         counts, slot = self._board[name], SLOTS.index(name)
         counts.clear()
         counts.since[0] = number
-        self._next[slot] = np.nan
+        self._past[:, slot] = np.nan
         self._active[name] = Follower(design, slot, self._estimates[slot])
         self._active = {slot: self._active[slot] for slot in SLOTS if slot in self._active}
         self._list_running()

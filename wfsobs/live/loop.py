@@ -23,7 +23,7 @@ from wfsobs.live.programme import Programme, scenario_on
 from wfsobs.live.recording import Recorder
 from wfsobs.live.ring import LiveFrame
 from wfsobs.live.source import ALARM, FAILURE, SIMULATION, STREAM, LiveEvent, LiveSource
-from wfsobs.live.view import LiveView, SharedView, read_view
+from wfsobs.live.view import LiveView, SharedView, read_view, rms_of_known
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.record import Record, Sampling
@@ -176,7 +176,7 @@ class Alarms:
     def judge(self, second: LiveView, observers: Sequence[str]) -> None:
         """Judge what observers of both targets have expected of a second of frames."""
         for name in observers:
-            self._judge("error of {}", float(np.sqrt(np.mean(second.rms(name, NEXT) ** 2))), name)
+            self._judge("error of {}", float(np.sqrt(np.mean(rms_of_known(second.error(name, NEXT)) ** 2))), name)
 
     def compare(self, finding: Finding) -> None:
         """Judge an identification against those before."""
@@ -446,7 +446,7 @@ class LiveLoop:
 
     def view(self, seconds: float) -> LiveView:
         """Return the last so many seconds of frames and estimates."""
-        return read_view(self.feed.ring, self._processes.traces(), self.sampling.dt, seconds)
+        return read_view(self.feed.ring, self._processes.traces(), self.sampling, seconds)
 
     def control_view(self, seconds: float) -> ControlView | None:
         """Return what the controllers leave of the last so many seconds that they have taken; None before the first one."""

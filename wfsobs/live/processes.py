@@ -254,9 +254,9 @@ class LiveProcesses:
 
     def views(self, seconds: float) -> list[tuple[LiveView, list[str]]]:
         """Return the last so many seconds that each process of observers has taken, and the ids of its observers that run."""
-        ring, dt, running = self.feed.ring, self._site.sampling.dt, self.board.active()
+        ring, sampling, running = self.feed.ring, self._site.sampling, self.board.active()
         crews = [(crew, [name for name in running if crew_of(name) == place]) for place, crew in list(self.crews.items())]
-        return [(read_view(ring, [crew.rows], dt, seconds), names) for crew, names in crews if names]
+        return [(read_view(ring, [crew.rows], sampling, seconds), names) for crew, names in crews if names]
 
     def control_view(self, seconds: float) -> ControlView | None:
         """Return what the controllers leave of the last so many seconds that they have taken; None before the first one."""

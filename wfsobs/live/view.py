@@ -13,6 +13,7 @@ from wfsobs.live.board import NEXT, SLOTS, slot_width
 from wfsobs.live.ring import LiveFrame, Ring, Rows, merged_rows
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import TOTAL
+from wfsobs.record import Sampling, frame_mean
 from wfsobs.typing import Array
 
 SHARED = 0.16
@@ -31,12 +32,15 @@ class LiveView:
         Time between two [s].
     frames : LiveFrame
         Each part (n, n_modes) [um].
+    ratio : int or None
+        Frames per NGS frame; None without NGS.
     """
 
     first: int
     dt: float
     frames: LiveFrame
     _traces: Array
+    ratio: int | None = None
     _results: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
 
     def once(self, key: Any, make: Callable[[], Any]) -> Any:
@@ -87,8 +91,16 @@ class LiveView:
         return self.estimate(observer, target) - self.truth(target)
 
     def rms(self, observer: str, target: str) -> Array:
-        """Return the rms error, (n_modes,) [um]; NaN where there is none."""
-        return self.once(("rms", observer, target), lambda: rms_of_known(self.error(observer, target)))
+        """Return the rms error, (n_modes,) [um]; NaN where there is none. With NGS, that of the next NGS frame for NEXT."""
+        of = self._error_of_frames if target == NEXT and self.ratio else self.error
+        return self.once(("rms", observer, target), lambda: rms_of_known(of(observer, target)))
+
+    def _error_of_frames(self, observer: str, _next: str) -> Array:
+        """Return the mean estimate over each NGS frame less its measurement, which has no slow error of the LGS; NaN between."""
+        n = self.ratio or 1
+        out = frame_mean(self.estimate(observer, TOTAL), n) - self.frames.ngs
+        out[:n] = np.nan
+        return out
 
     def _of(self, observer: str) -> Array:
         width = slot_width(self.n_modes)
@@ -111,10 +123,10 @@ class SharedView:
         return self._views[seconds]
 
 
-def read_view(ring: Ring, traces: list[Rows], dt: float, seconds: float) -> LiveView:
+def read_view(ring: Ring, traces: list[Rows], sampling: Sampling, seconds: float) -> LiveView:
     """Return the last so many seconds that all observers have taken."""
-    first, stop = last_frames(min(rows.count for rows in traces), dt, seconds)
-    return LiveView(first, dt, ring.read_frames(first, stop), merged_rows(traces, first, stop))
+    first, stop = last_frames(min(rows.count for rows in traces), sampling.dt, seconds)
+    return LiveView(first, sampling.dt, ring.read_frames(first, stop), merged_rows(traces, first, stop), sampling.ratio)
 
 
 def last_frames(count: int, dt: float, seconds: float) -> tuple[int, int]:
