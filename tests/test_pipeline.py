@@ -238,6 +238,13 @@ def test_the_record_overrides_the_scenario_where_it_states_something() -> None:
     assert as_stated(without_ngs, scenario()).sensors.exposure_ratio == scenario().sensors.exposure_ratio
 
 
+def test_observers_are_one_text_or_any_of_them() -> None:
+    for chosen in ("zero", iter(["zero"]), {"zero": 1}.keys()):
+        assert {s.observer for s in run(scenario(), observers=chosen).scores} >= {"zero"}  # type: ignore[arg-type]
+    with pytest.raises(SettingError, match="observer 'nul': no such observer"):
+        run(scenario(), observers=(name for name in ["zero", "nul"]))  # type: ignore[arg-type]
+
+
 def test_a_record_of_more_modes_than_the_settings_have() -> None:
     three = np.random.default_rng(1).standard_normal((1000, 3))
     result = observe(Record(three, 0.0 * three, 1e-3), scenario(), observers="kf-lgs")

@@ -188,6 +188,8 @@ def test_the_loop_is_closed_on_what_is_simulated() -> None:
     for one, other in zip(found.outcomes, expected.outcomes, strict=True):
         assert one.controller == other.controller
         np.testing.assert_array_equal(one.residual, other.residual)
+    found = wfsobs.close_loop(scenario, controllers=iter(chosen))  # type: ignore[arg-type]
+    assert [outcome.controller for outcome in found.outcomes] == chosen
 
 
 def test_a_report_is_written(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimate, Estimates
 from wfsobs.priors_from.scenario import PriorParts, arguments, prior_and_settings, usual_observers
 from wfsobs.progress import QUIET, Watch, detach_watch
 from wfsobs.record import Record
+from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.idle import used_settings
 from wfsobs.settings.tree import Plain
@@ -37,7 +38,7 @@ def each_estimate(
     memo       : estimates that are known by what they depend on; they come first, without a run
     """
     scenario = scenario.before_events  # no observer is told
-    observers = [observers] if isinstance(observers, str) else observers
+    observers = name_list(observers)
     OBSERVERS.check_ids(observers or ())
     names_of = usual_observers(scenario, record) if observers is None else dict.fromkeys(observers)
     chosen = [OBSERVERS[name] for name in names_of]

@@ -182,6 +182,11 @@ class Registry(MutableMapping[str, E]):
         return len(self._entries)
 
 
+def name_list(names: str | Iterable[str] | None) -> list[str] | None:
+    """Return names as a list, a text as one name, and None as None."""
+    return names if names is None else [names] if isinstance(names, str) else list(names)
+
+
 def check_tuple(name: str, value: object, choices: Iterable[Any]) -> None:
     """Raise ValueError where the field `name` of an entry is no tuple out of some choices."""
     choices = list(choices)

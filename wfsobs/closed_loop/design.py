@@ -18,6 +18,7 @@ from wfsobs.observers.kalman.multirate import UnstableCycle
 from wfsobs.prior import Prior, Spectra
 from wfsobs.priors_from.controllers import own_settings, plant_of, prior_for, supervision_of, true_plant_of
 from wfsobs.priors_from.scenario import told_spectra
+from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, true_spectra
 
@@ -121,7 +122,7 @@ def design_mode(controller: str, scenario: Scenario, mode: int, spectra: Spectra
 
 def select_controllers(controllers: Sequence[str] | None) -> list[Controller]:
     """Return the controllers of these ids, in the order of the registry; all for None. Raises SettingError."""
-    controllers = [controllers] if isinstance(controllers, str) else controllers
+    controllers = name_list(controllers)
     CONTROLLERS.check_ids(controllers or ())
     return [c for c in CONTROLLERS.values() if controllers is None or c.id in controllers]
 
