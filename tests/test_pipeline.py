@@ -324,6 +324,10 @@ def test_an_observer_that_cannot_work_is_left_out_with_its_reason() -> None:
     assert all(isinstance(f, Failure) and "\n" not in f.reason and len(f.reason) < 250 for f in result.failures)
 
 
+def raise_error(error: Exception) -> None:
+    raise error
+
+
 @pytest.mark.parametrize(
     ("make", "reason"),
     [
@@ -336,6 +340,12 @@ def test_an_observer_that_cannot_work_is_left_out_with_its_reason() -> None:
         (lambda z: {"vibration": np.full_like(z, np.inf)}, "not infinite ones"),
         (lambda z: {"turbulence": z}, "returns no vibration"),
         (lambda z: None, "returns NoneType, not a dictionary"),
+        (lambda z: {"vibration": np.full_like(z, np.nan)}, "vibration is NaN in every step$"),
+        (lambda z: {"vibration": np.ma.masked_array(z, z > 0)}, "vibration takes NaN where there is no number, not a mask$"),
+        (lambda z: Estimates({"vibration": z}, {"vibration": z * 0 - 1}), "sd of vibration takes numbers from 0, not negative"),
+        (lambda z: raise_error(ValueError()), "ValueError$"),
+        (lambda z: raise_error(ValueError("singular\n  matrix")), "singular matrix$"),
+        (lambda z: raise_error(np.linalg.LinAlgError("singular")), "singular$"),
     ],
 )
 def test_what_is_no_estimate_is_one_line_and_the_others_keep_theirs(

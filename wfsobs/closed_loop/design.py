@@ -20,6 +20,7 @@ from wfsobs.priors_from.controllers import own_settings, plant_of, prior_for, su
 from wfsobs.priors_from.scenario import told_spectra
 from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
+from wfsobs.settings.errors import error_line
 from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, true_spectra
 
 
@@ -135,7 +136,7 @@ def _design_one(
     try:
         prior = prior_for(controller, scenario, spectra)
     except ValueError as error:
-        return tuple(LawDesign(None, None, note=str(error)) for _ in modes), Prior()
+        return tuple(LawDesign(None, None, note=error_line(error)) for _ in modes), Prior()
     designed = (_of_mode(controller, prior, mode, plant, settings, spectra[mode] if spectra else None) for mode in modes)
     return tuple(designed), replace(prior, spectra=())
 
@@ -148,9 +149,9 @@ def _of_mode(
     try:
         law = controller.law_of(prior, mode, plant, settings)
     except UnstableCycle as error:
-        return LawDesign(None, False, note=str(error))
+        return LawDesign(None, False, note=error_line(error))
     except ValueError as error:
-        return LawDesign(None, None, note=str(error))
+        return LawDesign(None, None, note=error_line(error))
     stable, mirror = law.stable, plant.mirror
     if not stable or controller.predict is not None or not law.time_invariant:
         return LawDesign(law, stable)

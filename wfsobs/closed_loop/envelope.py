@@ -31,7 +31,7 @@ from wfsobs.priors_from.scenario import told_spectra
 from wfsobs.progress import QUIET, Watch
 from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.errors import SettingError, error_line
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, true_spectra
 from wfsobs.typing import Array
@@ -322,7 +322,7 @@ def plant_envelope(
             else:
                 spreads[name] = spread_of(name, scenario, plants, spectra, watch)
         except ValueError as error:
-            notes[name] = str(error)
+            notes[name] = error_line(error)
         watch.step((i + 1) / len(names))
         if on_spread:
             on_spread(found())

@@ -277,6 +277,10 @@ def check_estimates(estimates: object, targets: tuple[str, ...], shape: tuple[in
         if values.dtype.kind not in "fiu" or np.isinf(values).any():
             kind = "infinite ones" if values.dtype.kind == "f" else values.dtype.name
             raise ValueError(f"{name} takes real numbers, NaN where there is none, not {kind}")
+        if isinstance(values, np.ma.MaskedArray):
+            raise ValueError(f"{name} takes NaN where there is no number, not a mask")
+        if name not in targets and (values < 0).any():
+            raise ValueError(f"{name} takes numbers from 0, not negative ones")
     return out
 
 
