@@ -231,6 +231,13 @@ def requirements() -> dict[str, Requirement]:
     return {it.name: it for it in map(Requirement, lines) if it.name != "wfsobs"}
 
 
+def test_the_page_of_installation_names_every_extra_but_that_of_the_tests() -> None:
+    root = Path(__file__).parents[1]
+    extras = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    page = (root / "docs" / "installation.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE)) == extras.keys() - {"test"}
+
+
 def test_every_range_of_versions_has_a_ceiling() -> None:
     assert [str(it) for it in requirements().values() if not any(part.operator == "<" for part in it.specifier)] == []
 
