@@ -268,6 +268,13 @@ def test_the_record_overrides_the_scenario_where_it_states_something() -> None:
     assert as_stated(without_ngs, scenario()).sensors.exposure_ratio == scenario().sensors.exposure_ratio
 
 
+def test_observers_are_one_text_or_any_of_them() -> None:
+    for chosen in ("zero", iter(["zero"]), {"zero": 1}.keys()):
+        assert {s.observer for s in run(scenario(), observers=chosen).scores} >= {"zero"}  # type: ignore[arg-type]
+    with pytest.raises(SettingError, match="observer 'nul': no such observer"):
+        run(scenario(), observers=(name for name in ["zero", "nul"]))  # type: ignore[arg-type]
+
+
 def test_a_record_of_more_modes_than_the_settings_have() -> None:
     three = np.random.default_rng(1).standard_normal((1000, 3))
     result = observe(Record(three, 0.0 * three, 1e-3), scenario(), observers="kf-lgs")
@@ -298,6 +305,19 @@ def test_a_record_of_numbers_of_any_kind(kind: Any) -> None:
         ({"dt": "1 ms"}, r"dt takes a time step \[s\], not '1 ms'"),
         ({"delay": 1.5}, "delay takes a whole number of steps from 1, not 1.5"),
         ({"delay": 0}, "delay takes a whole number of steps from 1, not 0"),
+        ({"delay": "2"}, "delay takes a whole number of steps from 1, not '2'"),
+        ({"delay": None}, "delay takes a whole number of steps from 1, not None"),
+        ({"delay": np.nan}, "delay takes a whole number of steps from 1, not nan"),
+        ({"delay": True}, "delay takes a whole number of steps from 1, not True"),
+        ({"ratio": 2.5}, "ratio takes a whole number of steps from 1, not 2.5"),
+        ({"ratio": 0}, "ratio takes a whole number of steps from 1, not 0"),
+        ({"ratio": [5, [5]]}, r"ratio takes a whole number of steps from 1, not \[5, \[5\]\]"),
+        ({"lgs_stars": np.ones(8, int)}, r"lgs_stars takes 9 whole numbers from 0, not int64 of shape \(8,\)"),
+        ({"lgs_stars": np.full(9, 1.5)}, r"lgs_stars takes 9 whole numbers from 0, not float64 of shape \(9,\)"),
+        ({"lgs_stars": np.full(9, -1)}, r"lgs_stars takes 9 whole numbers from 0, not int64 of shape \(9,\)"),
+        ({"y_stars": np.zeros((9, 2))}, r"y_stars has shape \(9, 2\); expected \(9, n_lgs, 2\)"),
+        ({"y_stars": np.zeros((9, 3, 1))}, r"y_stars has shape \(9, 3, 1\); expected \(9, n_lgs, 2\)"),
+        ({"y_stars": np.full((9, 3, 2), np.inf)}, "y_stars holds infinite numbers; a missing sample is NaN"),
     ],
 )
 def test_what_is_no_record_is_one_line(change: dict[str, Any], line: str) -> None:
@@ -305,6 +325,12 @@ def test_what_is_no_record_is_one_line(change: dict[str, Any], line: str) -> Non
     assert Record(**good).dt == 1e-3
     with pytest.raises(RecordError, match=f"^{line}$"):
         Record(**(good | change))
+
+
+def test_whole_numbers_of_any_kind_are_whole_numbers() -> None:
+    record = Record(np.zeros((9, 2)), np.zeros((9, 2)), 1e-3, ratio=5.0, delay=np.array(2.0), lgs_stars=[3.0] * 9)  # type: ignore[arg-type]
+    assert (record.ratio, record.delay) == (5, 2) and type(record.ratio) is type(record.delay) is int
+    assert record.lgs_stars is not None and record.lgs_stars.dtype == int
 
 
 def test_a_record_too_slow_for_the_settings_is_refused() -> None:
@@ -328,6 +354,10 @@ def test_an_observer_that_cannot_work_is_left_out_with_its_reason() -> None:
     assert all(isinstance(f, Failure) and "\n" not in f.reason and len(f.reason) < 250 for f in result.failures)
 
 
+def raise_error(error: Exception) -> None:
+    raise error
+
+
 @pytest.mark.parametrize(
     ("make", "reason"),
     [
@@ -340,6 +370,12 @@ def test_an_observer_that_cannot_work_is_left_out_with_its_reason() -> None:
         (lambda z: {"vibration": np.full_like(z, np.inf)}, "not infinite ones"),
         (lambda z: {"turbulence": z}, "returns no vibration"),
         (lambda z: None, "returns NoneType, not a dictionary"),
+        (lambda z: {"vibration": np.full_like(z, np.nan)}, "vibration is NaN in every step$"),
+        (lambda z: {"vibration": np.ma.masked_array(z, z > 0)}, "vibration takes NaN where there is no number, not a mask$"),
+        (lambda z: Estimates({"vibration": z}, {"vibration": z * 0 - 1}), "sd of vibration takes numbers from 0, not negative"),
+        (lambda z: raise_error(ValueError()), "ValueError$"),
+        (lambda z: raise_error(ValueError("singular\n  matrix")), "singular matrix$"),
+        (lambda z: raise_error(np.linalg.LinAlgError("singular")), "singular$"),
     ],
 )
 def test_what_is_no_estimate_is_one_line_and_the_others_keep_theirs(

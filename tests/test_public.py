@@ -188,6 +188,8 @@ def test_the_loop_is_closed_on_what_is_simulated() -> None:
     for one, other in zip(found.outcomes, expected.outcomes, strict=True):
         assert one.controller == other.controller
         np.testing.assert_array_equal(one.residual, other.residual)
+    found = wfsobs.close_loop(scenario, controllers=iter(chosen))  # type: ignore[arg-type]
+    assert [outcome.controller for outcome in found.outcomes] == chosen
 
 
 def test_a_report_is_written(tmp_path: Path) -> None:
@@ -227,6 +229,13 @@ def requirements() -> dict[str, Requirement]:
         *(line for extra in extras.values() for line in extra),
     ]
     return {it.name: it for it in map(Requirement, lines) if it.name != "wfsobs"}
+
+
+def test_the_page_of_installation_names_every_extra_but_that_of_the_tests() -> None:
+    root = Path(__file__).parents[1]
+    extras = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    page = (root / "docs" / "installation.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE)) == extras.keys() - {"test"}
 
 
 def test_every_range_of_versions_has_a_ceiling() -> None:

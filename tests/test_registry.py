@@ -13,7 +13,7 @@ import pytest
 import wfsobs
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import BUILT_IN, OBSERVERS
-from wfsobs.observers.base import Observer
+from wfsobs.observers.base import Look, Observer, Tunable
 from wfsobs.prior import Model
 from wfsobs.registry import RegistrationError, Registry, sections
 from wfsobs.scenario import Scenario
@@ -69,6 +69,22 @@ def mine(**changes: Any) -> Observer:
         (mine(prior=Model), "observer 'mine': prior = <class 'wfsobs.prior.Model'>: takes a tuple out of Model, "),
         (mine(prior=WORD), "observer 'mine': prior = ('Model',): takes a tuple out of Model, "),
         (mine(run=None, step=None), "observer 'mine': has neither a run nor a step"),
+        (mine(run=5), "observer 'mine': run = 5: takes a function"),
+        (mine(step="later"), "observer 'mine': step = 'later': takes a function"),
+        (mine(targets=("vibration", "vibration")), "targets = ('vibration', 'vibration'): takes each of them once"),
+        (mine(label=" "), "observer 'mine': label = ' ': takes a text"),
+        (mine(weight=0), "observer 'mine': weight = 0: takes a number above 0"),
+        (mine(weight=float("inf")), "observer 'mine': weight = inf: takes a number above 0"),
+        (mine(weight="1"), "observer 'mine': weight = '1': takes a number above 0"),
+        (mine(look=Look(light="nocolour")), "observer 'mine': look.light = 'nocolour': takes a colour such as '#8A4B00'"),
+        (mine(look="red"), "observer 'mine': look = 'red': takes a Look"),
+        (mine(tunable=Tunable(("nothing.speed",))), "observer 'mine': tunable 'nothing.speed': no scenario has such a setting"),
+        (mine(tunable=Tunable((), ("kalman",))), "observer 'mine': tunable 'kalman': no scenario has such a setting"),
+        (
+            mine(settings=Section("own", "Own", Own), tunable=Tunable(("own.speed", "own.pace"))),
+            "observer 'mine': tunable 'own.pace': no scenario has such a setting",
+        ),
+        (replace(CONTROLLERS["none"], id="mine", label="Mine", weight=-1.0), "controller 'mine': weight = -1.0: takes a number"),
         (
             replace(CONTROLLERS["none"], id="mine", label="Mine", prior=WORD),
             "controller 'mine': prior = ('Model',): takes a tuple out of Model, ",

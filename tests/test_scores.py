@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs.evaluation.error_spectra import cumulative_rms, scored_samples
-from wfsobs.evaluation.scores import lag, supervised_scores, unsupervised_scores
+from wfsobs.evaluation.scores import lag, score, supervised_scores, unsupervised_scores
 from wfsobs.observers.estimates import TOTAL, Estimate
 from wfsobs.record import Record
 from wfsobs.signal.ar2 import Ar2
@@ -81,6 +81,14 @@ def test_no_truth_no_score_and_zero_truth_no_ratio() -> None:
     assert supervised_scores(record(turbulence=np.ones((1000, 2))), [estimate], 0.0, NAMES) == []
     found = supervised_scores(record(vibration=np.zeros((1000, 2))), [estimate], 0.0, NAMES)
     assert [(s.rms, s.truth_rms, s.normalised_rms, s.lag) for s in found] == [(1.0, 0.0, None, None)] * 2
+
+
+@pytest.mark.parametrize("truth", [None, np.zeros((50, 2))], ids=["measured", "simulated"])
+@pytest.mark.parametrize("names", [["tip"], ["tip", "tilt", "defocus"], []], ids=len)
+def test_there_are_as_many_names_as_modes(names: list[str], truth: np.ndarray | None) -> None:
+    record = Record(np.zeros((50, 2)), np.zeros((50, 2)), 1e-3, turbulence=truth)
+    with pytest.raises(ValueError, match=rf"^mode_names takes 2 names, one per mode of the record, not {len(names)}$"):
+        score(record, [], mode_names=names)
 
 
 def test_nothing_left_to_score_gives_no_row() -> None:

@@ -24,7 +24,7 @@ from wfsobs.prior import Bands, Lines
 from wfsobs.priors_from import scenario as from_scenario
 from wfsobs.priors_from.identification import prior_of, told_by
 from wfsobs.priors_from.training import training_of, with_training
-from wfsobs.record import Record, Training
+from wfsobs.record import Record, RecordError, Training
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
@@ -126,6 +126,35 @@ def test_a_design_is_trained_without_gaps_by_either_kind_of_data(name: str, nigh
     assert np.isfinite(got[0][-500:]).all()
     for other_way in got[1:]:
         np.testing.assert_array_equal(other_way, got[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda x: x[:, :1], "the training data has 1 modes, the record 2"),
+        (lambda x: np.hstack([x, x[:, :1]]), "the training data has 3 modes, the record 2"),
+        (lambda x: x * [np.nan, 1.0], "the training data holds no measurement of mode 0"),
+    ],
+    ids=["fewer", "more", "missing"],
+)
+def test_training_data_that_do_not_fit_are_one_line_whoever_brings_them(
+    change: Any, reason: str, night: Record, other: Record
+) -> None:
+    raw = Training(*(change(x) for x in (other.y_lgs, other.u, other.open_loop_y)))
+    wrong = Record(raw.y_lgs, np.nan_to_num(raw.u), night.dt, open_loop_y=raw.open_loop_y)
+    result = observe(replace(night, training=raw), S, observers=(*LEARN, "zero"))
+    assert {f.reason for f in result.failures} == {f"{name} left out: {reason}" for name in LEARN}
+    assert {e.observer for e in result.estimates} == {"zero"}
+    with pytest.raises(RecordError, match=f"^{reason}$"):
+        observe(night, S, observers=LEARN, train=wrong)
+    with pytest.raises(RecordError, match=f"^{reason}$"):
+        training_of(replace(night, training=raw))
+
+
+@pytest.mark.parametrize("train", [True, np.True_, "0.8", [0.8]], ids=str)
+def test_what_is_no_duration_is_one_line(train: Any, night: Record) -> None:
+    with pytest.raises(RecordError, match=r"^train takes a record, or a duration \[s\], not .*$"):
+        observe(night, S, observers=("zero",), train=train)
 
 
 def call(*arguments: object) -> Any:

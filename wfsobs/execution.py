@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from time import perf_counter
 
+import numpy as np
+
 from wfsobs.dependence import RecordMemo
 from wfsobs.evaluation.result import Failure
 from wfsobs.observers import OBSERVERS
@@ -14,8 +16,10 @@ from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimate, Estimates
 from wfsobs.priors_from.scenario import PriorParts, arguments, prior_and_settings, usual_observers
 from wfsobs.progress import QUIET, Watch, detach_watch
 from wfsobs.record import Record
+from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.idle import used_settings
+from wfsobs.settings.errors import error_line
 from wfsobs.settings.tree import Plain
 from wfsobs.typing import Array
 
@@ -37,7 +41,7 @@ def each_estimate(
     memo       : estimates that are known by what they depend on; they come first, without a run
     """
     scenario = scenario.before_events  # no observer is told
-    observers = [observers] if isinstance(observers, str) else observers
+    observers = name_list(observers)
     OBSERVERS.check_ids(observers or ())
     names_of = usual_observers(scenario, record) if observers is None else dict.fromkeys(observers)
     chosen = [OBSERVERS[name] for name in names_of]
@@ -113,8 +117,11 @@ def _one(observer: Observer, record: Record, scenario: Scenario, watch: Watch, p
         start = perf_counter()
         with detach_watch(watch) as alone:
             values = observer.estimate(*given, alone)
+        for target in observer.targets:
+            if np.isnan(values[target]).all():
+                raise ValueError(f"{target} is NaN in every step")
     except ValueError as error:
-        return [Failure(observer.id, f"{observer.id} left out: {error}")]
+        return [Failure(observer.id, f"{observer.id} left out: {error_line(error)}")]
     seconds = (perf_counter() - start) / max(record.n_steps * record.n_modes, 1)
     of_sum = {name: values.sd[name] for name in (TOTAL, NEXT_Z) if name in values.sd}
     return [Estimate(observer.id, target, values[target], seconds, values.sd.get(target), of_sum) for target in observer.targets]

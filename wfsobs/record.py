@@ -8,9 +8,10 @@ from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from wfsobs.notebook import PlotAccessor, html_table, import_extra
+from wfsobs.settings.errors import shorten
 from wfsobs.signal.gate import GateSettings, OutlierGate, frame_mean_of, let_through
 from wfsobs.typing import Array
 
@@ -177,19 +178,27 @@ class Record(Signals):
 
     def __post_init__(self) -> None:
         """Take lists, tables and numbers of any kind. Raises RecordError where they are no record."""
-        for name in ("y_lgs", "u", "y_ngs", "open_loop_y", "turbulence", "vibration"):
+        for name in ("y_lgs", "u", "y_ngs", "open_loop_y", "turbulence", "vibration", "y_stars"):
             if (values := getattr(self, name)) is not None:
-                object.__setattr__(self, name, _numbers(name, values))
-                if (shape := getattr(self, name).shape) != self.y_lgs.shape:
-                    raise RecordError(f"{name} has shape {shape}; expected {self.y_lgs.shape}, that of y_lgs")
+                object.__setattr__(self, name, numbers := _numbers(name, values))
+                if self.y_lgs.ndim != 2:
+                    raise RecordError(f"y_lgs has shape {self.y_lgs.shape}; expected (n_steps, n_modes)")
+                if name != "y_stars" and numbers.shape != self.y_lgs.shape:
+                    raise RecordError(f"{name} has shape {numbers.shape}; expected {self.y_lgs.shape}, that of y_lgs")
+        if self.y_stars is not None and (self.y_stars.ndim != 3 or self.y_stars.shape[::2] != self.y_lgs.shape):
+            raise RecordError(f"y_stars has shape {self.y_stars.shape}; expected ({self.n_steps}, n_lgs, {self.n_modes})")
+        if self.lgs_stars is not None:
+            object.__setattr__(self, "lgs_stars", star_counts(self.lgs_stars, self.n_steps))
         try:
             object.__setattr__(self, "dt", float(self.dt))
         except (TypeError, ValueError):
             raise RecordError(f"dt takes a time step [s], not {self.dt!r}") from None
         if not 0.0 < self.dt < np.inf:
             raise RecordError(f"dt takes a time step above 0 s, not {self.dt:g}")
-        if self.delay < 1 or self.delay % 1:
-            raise RecordError(f"delay takes a whole number of steps from 1, not {self.delay:g}")
+        for name in ("delay",) if self.ratio is None else ("delay", "ratio"):
+            if not (whole := as_whole(getattr(self, name))):
+                raise RecordError(f"{name} takes a whole number of steps from 1, not {shorten(getattr(self, name))}")
+            object.__setattr__(self, name, whole)
 
     def __repr__(self) -> str:
         return f"Record({', '.join(f'{what} {value}' for what, value in self._summary())})"
@@ -302,11 +311,26 @@ def _numbers(name: str, values: ArrayLike) -> Array:
         out = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
         raise RecordError(f"{name} holds no numbers, or rows of unlike lengths") from None
-    if out.ndim != 2:
-        raise RecordError(f"{name} has shape {out.shape}; expected (n_steps, n_modes)")
     if np.isinf(out).any():
         raise RecordError(f"{name} holds infinite numbers; a missing sample is NaN")
     return out
+
+
+def star_counts(counts: ArrayLike, n_steps: int) -> NDArray[np.int_]:
+    """Return the number of LGS in every step as integers. Raises RecordError."""
+    raw = np.asarray(counts)
+    is_count = raw.dtype.kind in "fiu" and raw.shape == (n_steps,) and np.isfinite(raw).all()
+    if not is_count or not ((raw >= 0) & (raw % 1 == 0)).all():
+        raise RecordError(f"lgs_stars takes {n_steps} whole numbers from 0, not {raw.dtype} of shape {raw.shape}")
+    return raw.astype(int, copy=False)
+
+
+def as_whole(value: object) -> int:
+    """Return a whole number from 1 as an int, 0 for anything else."""
+    value = value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+        return 0
+    return int(value) if 1 <= value < np.inf and value % 1 == 0 else 0
 
 
 def _copy(x: Array | None) -> Array | None:

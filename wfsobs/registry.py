@@ -10,6 +10,7 @@ import logging
 import re
 from collections.abc import Iterable, Iterator, Mapping, MutableMapping
 from importlib.metadata import EntryPoint, entry_points
+from math import inf
 from threading import RLock
 from typing import Any, Protocol, TypeVar
 
@@ -140,6 +141,8 @@ class Registry(MutableMapping[str, E]):
         where = f"{self._word} {entry.id!r}"
         if not isinstance(entry.id, str) or not ID.fullmatch(entry.id):
             raise RegistrationError(f"{where}: an id takes lower-case letters, digits and hyphens between them")
+        if not isinstance(entry.label, str) or not entry.label.strip():
+            raise RegistrationError(f"{where}: label = {entry.label!r}: takes a text")
         if entry.id in self._entries:
             raise RegistrationError(f"{where}: the id is taken, by {self._entries[entry.id].label}")
         if entry.id in self.reserved_ids:
@@ -182,12 +185,25 @@ class Registry(MutableMapping[str, E]):
         return len(self._entries)
 
 
+def name_list(names: str | Iterable[str] | None) -> list[str] | None:
+    """Return names as a list, a text as one name, and None as None."""
+    return names if names is None else [names] if isinstance(names, str) else list(names)
+
+
 def check_tuple(name: str, value: object, choices: Iterable[Any]) -> None:
     """Raise ValueError where the field `name` of an entry is no tuple out of some choices."""
     choices = list(choices)
     if not isinstance(value, tuple) or any(one not in choices for one in value):
         words = ", ".join(getattr(one, "__name__", one) for one in choices)
         raise ValueError(f"{name} = {value!r}: takes a tuple out of {words}")
+    if len(set(value)) < len(value):
+        raise ValueError(f"{name} = {value!r}: takes each of them once")
+
+
+def check_weight(weight: object) -> None:
+    """Raise ValueError where the weight of an entry is no number above 0."""
+    if not isinstance(weight, (int, float)) or not 0.0 < weight < inf:
+        raise ValueError(f"weight = {weight!r}: takes a number above 0")
 
 
 def sections() -> Mapping[str, Section]:
@@ -231,6 +247,17 @@ def _check_settings(entry: Entry, where: str) -> None:
             low, high = getattr(p, "bounds", None) or (None, None)
             if isinstance(p, param.Number) and (low is None or high is None):
                 raise RegistrationError(f"{where}: settings {own.name}.{name}: a number takes bounds, lowest and highest")
+    _check_tunable(entry, where)
+
+
+def _check_tunable(entry: Entry, where: str) -> None:
+    """Raise RegistrationError where what can be tuned is no setting; those of a scenario count once that is imported."""
+    own = {part.name: part.group for part in _settings(entry) if isinstance(part, Section)}
+    known = {f"{name}.{path}" for name, group in own.items() for path, _, _ in group().walk()}
+    known |= {path for tree in _TREES for path, _, _ in tree().walk()}
+    for path in (path for part in getattr(entry, "tunable", ()) for path in part):
+        if path not in known and (_TREES or path.partition(".")[0] in own):
+            raise RegistrationError(f"{where}: tunable {path!r}: no scenario has such a setting")
 
 
 def kind_of(value: Any) -> str:

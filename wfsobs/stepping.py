@@ -14,7 +14,7 @@ from wfsobs.priors_from.controllers import own_settings, plant_of
 from wfsobs.priors_from.identification import told_by
 from wfsobs.priors_from.scenario import SHARED, as_sampled, observer_settings, prior_of
 from wfsobs.priors_from.training import as_training
-from wfsobs.record import Record, Sampling
+from wfsobs.record import Record, Sampling, as_whole
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 from wfsobs.signal.gate import GateSettings
@@ -84,8 +84,7 @@ def design(
         known = ", ".join([*OBSERVERS, *CONTROLLERS])
         raise SettingError(f"design {name!r}: no such observer or controller; there are {known}")
     settings = scenario or (prior if isinstance(prior, Scenario) else Scenario())
-    sampling = sampling or _sampling(prior, settings)
-    _check_sampling(name, sampling)
+    sampling = _whole_sampling(name, sampling or _sampling(prior, settings))
     if not horizon >= 0.0:
         raise StepError(f"{name}: horizon = {horizon:g}: takes 0 frames or more")
     if not isinstance(prior, (Prior, Scenario)) and len(prior.modes) < sampling.n_modes:
@@ -131,10 +130,13 @@ def prior_in(
     return prior
 
 
-def _check_sampling(name: str, sampling: Sampling) -> None:
+def _whole_sampling(name: str, sampling: Sampling) -> Sampling:
+    """Return a sampling whose numbers of modes and steps are integers. Raises StepError."""
     n_modes, dt, ratio, delay = sampling
-    if not (n_modes >= 1 and 0.0 < dt < inf and (ratio is None or ratio >= 1) and delay >= 1):
-        raise StepError(f"{name}: {sampling}: takes 1 mode at least, dt above 0, and a ratio and a delay of 1 at least")
+    whole = as_whole(n_modes), None if ratio is None else as_whole(ratio), as_whole(delay)
+    if 0 in whole or not 0.0 < dt < inf:
+        raise StepError(f"{name}: {sampling}: takes whole numbers of modes, ratio and delay from 1, and dt above 0")
+    return Sampling(whole[0], dt, whole[1], whole[2])
 
 
 def _sampling(prior: Prior | Identification | Scenario, scenario: Scenario) -> Sampling:

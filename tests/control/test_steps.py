@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from wfsobs import PRESETS
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.mirror import Law
 from wfsobs.control.step import LinearLaws
+from wfsobs.control.supervisor import SupervisedController
 from wfsobs.observers.step import StepError
 from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
 from wfsobs.record import Record
@@ -119,3 +121,27 @@ def test_wrong_input_is_one_line_and_takes_no_frame() -> None:
         controller.take_over(wfsobs.design("integrator", PRESETS["paper"]()))
     with pytest.raises(StepError, match="state is that of another design"):
         controller.load_state_dict(wfsobs.design("integrator", PRESETS["paper"]()).state_dict())
+
+
+@pytest.mark.parametrize(
+    ("sent", "line"),
+    [
+        (np.zeros(3), r"lqg-kf-multi: amend: command takes the shape \(2,\), one number per mode, not \(3,\)"),
+        (0.1, r"lqg-kf-multi: amend: command takes the shape \(2,\), one number per mode, not \(\)"),
+        ([np.inf, 0.0], "lqg-kf-multi: amend: command is infinite in frame 0; .*"),
+        ([0.0, np.nan], "lqg-kf-multi: amend: command has NaN; takes what the mirror was sent, finite numbers"),
+        ("ab", "lqg-kf-multi: amend: command takes real numbers, not text"),
+    ],
+)
+@pytest.mark.parametrize("wrap", [lambda controller: controller, SupervisedController], ids=["alone", "supervised"])
+def test_what_no_mirror_was_sent_is_one_line_and_changes_nothing(wrap: Any, sent: Any, line: str) -> None:
+    controller, other = (wrap(wfsobs.design("lqg-kf-multi", PRESETS["paper"]())) for _ in range(2))
+    for one in (controller, other):
+        one.update([0.1, 0.2])
+    with pytest.raises(StepError, match=f"^{line}$"):
+        controller.amend(sent)
+    for _ in range(3):
+        np.testing.assert_array_equal(controller.update([0.1, 0.2]), other.update([0.1, 0.2]))
+    controller.amend([0.0, 0.1])
+    other.amend(np.array([0.0, 0.1]))
+    np.testing.assert_array_equal(controller.update([0.1, 0.2]), other.update([0.1, 0.2]))

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import pytest
 
 from wfsobs.control.lqg import lqg_multirate_multi
 from wfsobs.execution import run_observer
 from wfsobs.observers.base import TARGETS
 from wfsobs.prior import Beams, Lines, Model
 from wfsobs.priors_from.controllers import plant_of
-from wfsobs.priors_from.scenario import prior_of
+from wfsobs.priors_from.scenario import one_process, prior_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
@@ -49,3 +52,15 @@ def test_it_predicts_what_its_controller_commands() -> None:
         commands.append(-sum(observer.predict(1, target)[0][0] for target in TARGETS))
     # two ways to run the same recursion: rounding alone
     np.testing.assert_allclose(law.run(z), commands, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("name", ["multirate-multi", "lqg-multirate-multi"])
+@pytest.mark.parametrize("changes", [{"turbulence.source": "none"}, {"turbulence.rms": 0.0}], ids=["none", "rms"])
+def test_without_turbulence_its_model_is_the_process_set_by_hand(changes: dict[str, Any], name: str) -> None:
+    """There is no spectrum that a model of third order could be fitted to."""
+    scenario = PRESETS["paper"]().replace({"multipeak.turbulence_order": 3, "run.duration": 2.0, **changes})
+    prior = prior_of(scenario, None, (Lines, Beams))
+    for mode in range(2):
+        process = one_process(scenario, mode, scenario.dt)
+        assert process.rms > 0 and prior.lines[mode].turbulence == prior.beams[mode].common == (process,)
+    design(name, scenario).update([0.1, np.nan])

@@ -289,8 +289,20 @@ def test_a_prior_that_lacks_something_is_one_line(name: str) -> None:
     assert refusal(name, Prior(), scenario=scenario).startswith(f"{name}: the prior has no ") == bool(parts)
     of_modes = {part for part in parts if not issubclass(part, Bands)}
     assert ("modes, the loop has 5" in refusal(name, scenario, sampling=known._replace(n_modes=5))) == bool(of_modes)
-    for wrong in ({"n_modes": 0}, {"dt": 0.0}, {"dt": np.nan}, {"ratio": 0}, {"delay": 0}):
-        assert "takes 1 mode at least" in refusal(name, scenario, sampling=known._replace(**wrong))
+    for wrong in (
+        {"n_modes": 0},
+        {"n_modes": 1.5},
+        {"dt": 0.0},
+        {"dt": np.nan},
+        {"ratio": 0},
+        {"ratio": 2.5},
+        {"delay": 0},
+        {"delay": 1.5},
+        {"delay": "2"},
+    ):
+        assert "takes whole numbers of modes, ratio and delay from 1" in refusal(name, scenario, sampling=known._replace(**wrong))
+    whole = wfsobs.design(name, scenario, sampling=known._replace(delay=2.0)).sampling  # type: ignore[arg-type]
+    assert whole == known and type(whole.delay) is int
 
 
 @pytest.mark.parametrize("name", ["kf-multi", "lqg-kf-multi"])

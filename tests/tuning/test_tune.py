@@ -81,6 +81,11 @@ def test_what_cannot_be_tuned_is_refused(observer: str, names: list[str] | None,
         tune(short(), observer, names)
 
 
+def test_names_are_one_text_or_any_of_them() -> None:
+    for names in ("kalman.damping", ["kalman.damping"], iter(["kalman.damping"])):
+        assert [axis.path for axis in space(short(), "kf-lgs", names).axes] == ["kalman.damping"]  # type: ignore[arg-type]
+
+
 def test_every_evaluation_is_told_until_it_is_cancelled() -> None:
     seen: list[Evaluation] = []
     fractions: list[float] = []

@@ -18,7 +18,9 @@ from wfsobs.observers.kalman.multirate import UnstableCycle
 from wfsobs.prior import Prior, Spectra
 from wfsobs.priors_from.controllers import own_settings, plant_of, prior_for, supervision_of, true_plant_of
 from wfsobs.priors_from.scenario import told_spectra
+from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
+from wfsobs.settings.errors import error_line
 from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, true_spectra
 
 
@@ -121,7 +123,7 @@ def design_mode(controller: str, scenario: Scenario, mode: int, spectra: Spectra
 
 def select_controllers(controllers: Sequence[str] | None) -> list[Controller]:
     """Return the controllers of these ids, in the order of the registry; all for None. Raises SettingError."""
-    controllers = [controllers] if isinstance(controllers, str) else controllers
+    controllers = name_list(controllers)
     CONTROLLERS.check_ids(controllers or ())
     return [c for c in CONTROLLERS.values() if controllers is None or c.id in controllers]
 
@@ -134,7 +136,7 @@ def _design_one(
     try:
         prior = prior_for(controller, scenario, spectra)
     except ValueError as error:
-        return tuple(LawDesign(None, None, note=str(error)) for _ in modes), Prior()
+        return tuple(LawDesign(None, None, note=error_line(error)) for _ in modes), Prior()
     designed = (_of_mode(controller, prior, mode, plant, settings, spectra[mode] if spectra else None) for mode in modes)
     return tuple(designed), replace(prior, spectra=())
 
@@ -147,9 +149,9 @@ def _of_mode(
     try:
         law = controller.law_of(prior, mode, plant, settings)
     except UnstableCycle as error:
-        return LawDesign(None, False, note=str(error))
+        return LawDesign(None, False, note=error_line(error))
     except ValueError as error:
-        return LawDesign(None, None, note=str(error))
+        return LawDesign(None, None, note=error_line(error))
     stable, mirror = law.stable, plant.mirror
     if not stable or controller.predict is not None or not law.time_invariant:
         return LawDesign(law, stable)

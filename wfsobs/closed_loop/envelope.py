@@ -29,8 +29,9 @@ from wfsobs.notebook import PlotAccessor, import_extra
 from wfsobs.priors_from.controllers import full_plant_of, own_settings, plant_of, prior_for
 from wfsobs.priors_from.scenario import told_spectra
 from wfsobs.progress import QUIET, Watch
+from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.errors import SettingError, error_line
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, true_spectra
 from wfsobs.typing import Array
@@ -321,7 +322,7 @@ def plant_envelope(
             else:
                 spreads[name] = spread_of(name, scenario, plants, spectra, watch)
         except ValueError as error:
-            notes[name] = str(error)
+            notes[name] = error_line(error)
         watch.step((i + 1) / len(names))
         if on_spread:
             on_spread(found())
@@ -330,6 +331,7 @@ def plant_envelope(
 
 def with_laws(controllers: Sequence[str] | None) -> list[str]:
     """Return those of some controllers, by default of all, that have linear laws. Raises SettingError for none."""
+    controllers = name_list(controllers)
     out = [c.id for c in select_controllers(controllers) if c.law is not None]
     if not out:
         linear = [c.id for c in CONTROLLERS.values() if c.law is not None and c.is_quick]

@@ -30,6 +30,7 @@ from wfsobs.pipeline import as_stated
 from wfsobs.prior import Line, Lines
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError, hold_last
+from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.simulation.loop import simulate
@@ -179,8 +180,8 @@ def make_promise(
         return out.replace({"vibration.source": "ar2"}) if out.vibration.source == "peaks" else out  # no cut-off
 
     told = of(found)
-    names = None if controllers is None else [INTEGRATOR, *(name for name in controllers if name != INTEGRATOR)]
-    plan = design(told, names)
+    names = name_list(controllers)
+    plan = design(told, None if names is None else [INTEGRATOR, *names])
     length = min(record.n_steps, MOST_STEPS // SECTIONS)
     model = simulate(told.replace({"run.duration": (SECTIONS * length + START) * record.dt, "run.seed": seed}))
     inverse = np.linalg.inv(likeliest.matrix)

@@ -26,6 +26,7 @@ from wfsobs.progress import QUIET, Watch, detach_watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.idle import used_settings
+from wfsobs.settings.errors import error_line
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
 
@@ -150,7 +151,7 @@ def _outcome(
                 if isinstance(acting, SupervisedController):
                     alarms = tuple((frame * record.dt, reason) for frame, reason in acting.alarms)
     except ValueError as error:
-        return Outcome(controller.id, tuple(None for _ in stable), note=str(error))
+        return Outcome(controller.id, tuple(None for _ in stable), note=error_line(error))
     if not np.isfinite(correction).all():
         frame = int(np.argmin(np.isfinite(correction).all(axis=1)))
         return Outcome(controller.id, tuple(False for _ in stable), note=f"the loop diverges: frame {frame}")

@@ -22,14 +22,14 @@ import numpy as np
 from wfsobs.control.integrator import limited_integrator
 from wfsobs.control.mirror import Law, Mirror, Plant
 from wfsobs.control.step import KalmanLaws, MakeStepLaw, StepController, StepPredict, VibrationAhead, step_law, take_missing
-from wfsobs.observers.base import NOT_TUNED, NOTHING, PLAIN, Look, Tunable
+from wfsobs.observers.base import NOT_TUNED, NOTHING, PLAIN, Look, Tunable, check_look
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
 from wfsobs.observers.step import StepError, each_frame
 from wfsobs.prior import PARTS, TRUE, Bands, Part, Prior, PriorSource, ask_nothing, asks_for, words_for
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, Sampling, hold_last
-from wfsobs.registry import check_tuple
+from wfsobs.registry import check_tuple, check_weight
 from wfsobs.settings import Section
 from wfsobs.signal.gate import GateSettings
 from wfsobs.typing import Array
@@ -117,6 +117,8 @@ class Controller:
     def check_fields(self) -> None:
         """Raise ValueError, one line, where a field has a value that it does not take."""
         check_tuple("prior", self.prior, PARTS)
+        check_weight(self.weight)
+        check_look(self.look)
 
     @property
     def is_linear(self) -> bool:

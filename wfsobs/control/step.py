@@ -17,7 +17,7 @@ from wfsobs.control.mirror import Law, Mirror, Plant
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.observers.missing import Bridge
-from wfsobs.observers.step import Estimator, StepBase, StepError, each_frame, take_state
+from wfsobs.observers.step import Estimator, StepBase, StepError, check_frame, each_frame, take_state
 from wfsobs.observers.stepping import FilterBank, StateArrays, Stateful
 from wfsobs.prior import Bands, Prior
 from wfsobs.progress import Watch
@@ -306,8 +306,14 @@ class StepController(StepBase):
         """
         return self._take(z, ngs, stars, "z", is_open=True)
 
-    def amend(self, command: Array) -> None:
-        """Take what the mirror was sent, (n_modes,) [um], where that is another command than the one of the last frame."""
+    def amend(self, command: ArrayLike) -> None:
+        """Take what the mirror was sent, (n_modes,) [um], where that is another command than the one of the last frame.
+
+        Raises StepError for a wrong shape, or a number that is infinite or NaN: the command of the frame then stays.
+        """
+        command, is_known = check_frame(self.id, command, "amend: command", self.sampling.n_modes, self.frame - 1)
+        if not is_known:
+            raise StepError(f"{self.id}: amend: command has NaN; takes what the mirror was sent, finite numbers")
         if self.law is not None:
             self.law.amend(command - self._commands[0])
         self._commands[0] = command

@@ -227,10 +227,10 @@ class SupervisedController(StateArrays):
         self.amend(u)
         return u
 
-    def amend(self, command: Array) -> None:
-        """Replace the command of the last frame by that which the mirror was sent, (n_modes,) [um]."""
+    def amend(self, command: ArrayLike) -> None:
+        """Replace the command of the last frame by that which the mirror was sent, (n_modes,) [um]. Raises StepError."""
         self.controller.amend(command)
-        self._command = command.copy()
+        self._command = np.array(command, dtype=float)
 
     def _follow_ngs(self, y: Array, ngs: Array | None) -> None:
         """Learn what the LGS have more than an NGS frame over its exposure, where none of it is missing."""

@@ -46,6 +46,7 @@ from wfsobs.prior import Beams, LgsStars, Line, Lines, Prior
 from wfsobs.priors_from.scenario import beams_of, modelled_turbulence, observer_settings, prior_of, vibration_continuum
 from wfsobs.progress import QUIET, Watch, detach_watch
 from wfsobs.record import Measurements, Record, delay_signal, frame_mean
+from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
@@ -175,7 +176,7 @@ def error_budget(
     >>> abs(sum(budget.terms.values()) / budget.total - 1.0) < 1e-9
     True
     """
-    scenario, record = result.scenario, result.record.without_outliers
+    scenario, record, observers = result.scenario, result.record.without_outliers, name_list(observers)
     if (
         record.turbulence is None
         or record.vibration is None

@@ -194,8 +194,15 @@ def score(
     -------
     list of Score
         One per estimate and mode, and one of the sum of both estimates of an observer.
+
+    Raises
+    ------
+    ValueError
+        There are not as many names as modes.
     """
     names = list(MODE_NAMES[: record.n_modes] if mode_names is None else mode_names)
+    if len(names) != record.n_modes:
+        raise ValueError(f"mode_names takes {record.n_modes} names, one per mode of the record, not {len(names)}")
     known = record.turbulence is not None or record.vibration is not None
     if known:
         return supervised_scores(record, estimates, warm_up, names, derive or make_anew)

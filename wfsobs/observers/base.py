@@ -6,6 +6,7 @@ the prior that it asked for and its own settings: the truth is out of reach.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, fields, replace
 from typing import Any, NamedTuple
@@ -21,7 +22,7 @@ from wfsobs.observers.step import MakeEstimator, StepError, StepObserver, run_fr
 from wfsobs.prior import PARTS, TRUE, Part, Prior, PriorSource, ask_nothing, words_for
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import SENSORS, Measurements, Record, Sampling, hold_last
-from wfsobs.registry import check_tuple
+from wfsobs.registry import check_tuple, check_weight
 from wfsobs.settings import Group, Section
 from wfsobs.signal.gate import GateSettings
 from wfsobs.typing import Array
@@ -53,7 +54,7 @@ class Look:
     label : str
         Name in legends, where the full one is too long; empty for the full one.
     light, dark : str
-        Colour in light and dark mode.
+        Colour in light and dark mode, #rrggbb.
     dash : tuple of int
         Pattern, empty for solid [px].
     width : float
@@ -69,6 +70,18 @@ class Look:
     def colour(self, dark: bool) -> str:
         """Return the colour for the mode."""
         return self.dark if dark else self.light
+
+
+COLOUR = re.compile(r"#[0-9A-Fa-f]{6}")
+
+
+def check_look(look: object) -> None:
+    """Raise ValueError where there is no look, or one without colours."""
+    if not isinstance(look, Look):
+        raise ValueError(f"look = {look!r}: takes a Look")
+    for name, colour in (("light", look.light), ("dark", look.dark)):
+        if not COLOUR.fullmatch(str(colour)):
+            raise ValueError(f"look.{name} = {colour!r}: takes a colour such as '#8A4B00'")
 
 
 PLAIN = Look(dash=(4, 2))
@@ -155,6 +168,11 @@ class Observer:
             raise ValueError(f"targets = (): takes one at least, of {', '.join(TARGETS)}")
         if self.run is None and self.step is None:
             raise ValueError("has neither a run nor a step")
+        for name, of in (("run", self.run), ("step", self.step)):
+            if of is not None and not callable(of):
+                raise ValueError(f"{name} = {of!r}: takes a function")
+        check_weight(self.weight)
+        check_look(self.look)
 
     def parts(self, settings: Any) -> tuple[Part, ...]:
         """Return what it needs beside measurements for these settings."""
@@ -277,6 +295,10 @@ def check_estimates(estimates: object, targets: tuple[str, ...], shape: tuple[in
         if values.dtype.kind not in "fiu" or np.isinf(values).any():
             kind = "infinite ones" if values.dtype.kind == "f" else values.dtype.name
             raise ValueError(f"{name} takes real numbers, NaN where there is none, not {kind}")
+        if isinstance(values, np.ma.MaskedArray):
+            raise ValueError(f"{name} takes NaN where there is no number, not a mask")
+        if name not in targets and (values < 0).any():
+            raise ValueError(f"{name} takes numbers from 0, not negative ones")
     return out
 
 

@@ -186,9 +186,8 @@ def modelled_turbulence(
     spectrum : that of the turbulence in the LGS (`lgs_turbulence_spectrum`), where already computed
     fits : those of similar scenarios, to start from
     """
-    process = one_process(scenario, mode, dt)
-    if not _is_third_order(scenario, process):
-        return process
+    if not _is_third_order(scenario, mode, dt):
+        return one_process(scenario, mode, dt)
     return _fit_seen(scenario, mode, dt) if spectrum is None else _fit_third_order(scenario, mode, dt, spectrum, fits)
 
 
@@ -219,11 +218,10 @@ def beams_of(
     """
     dt = dt or scenario.dt
     line_gain = float(lgs_weights(scenario)[mode, :, mode].sum())
-    process = one_process(scenario, mode, dt)
-    if scenario.turbulence.source == "processes" or not _is_third_order(scenario, process):
+    if scenario.turbulence.source == "processes" or not _is_third_order(scenario, mode, dt):
         return Beams(lines_turbulence(scenario, mode, dt), lgs=(lgs_error_of(scenario, mode, dt).process,), line_gain=line_gain)
     found = _shared_turbulence(scenario, mode, dt) if spectra is None else _fit_shared(scenario, mode, dt, spectra, fits)
-    factor = process.rms / turbulence_process(scenario, mode, dt).rms  # where the strength is set by hand
+    factor = one_process(scenario, mode, dt).rms / turbulence_process(scenario, mode, dt).rms  # where the strength is set by hand
     common, target, lgs = (tuple(replace(p, rms=factor * p.rms) for p in part) for part in found[1:])
     return Beams(common, target, lgs, found.gain, line_gain)
 
@@ -242,8 +240,8 @@ def _fit_shared(
     return fit_shared_process(spectra.own, spectra.measurement, np.real(spectra.cross), noise**2, start, fits)
 
 
-def _is_third_order(scenario: Scenario, process: Ar2) -> bool:
-    return scenario.multipeak.turbulence_order == 3 and process.rms > 0
+def _is_third_order(scenario: Scenario, mode: int, dt: float) -> bool:
+    return scenario.multipeak.turbulence_order == 3 and turbulence_process(scenario, mode, dt).rms > 0
 
 
 def _third_order(process: Ar2) -> Ar3:

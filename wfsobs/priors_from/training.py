@@ -11,6 +11,7 @@ from wfsobs.observers.missing import fill_missing
 from wfsobs.prior import Prior
 from wfsobs.record import Record, RecordError, Training
 from wfsobs.scenario import Scenario
+from wfsobs.settings.errors import shorten
 
 SAME_RATE = 1e-6
 """Relative difference of two rates that is none: time stamps are rounded."""
@@ -36,8 +37,8 @@ def with_training(record: Record, train: Record | float, scenario: Scenario) -> 
     Raises
     ------
     RecordError
-        The other record has another rate, number of modes or delay, is the record itself, or either has too few samples or an
-        impossible duration.
+        The other record has another rate, number of modes or delay, is the record itself, or either has too few samples, none of
+        a mode, or an impossible duration.
     """
     part = training_part(record, train, scenario)
     return replace(record, training=Training(part.y_lgs, part.u, part.open_loop_y).copy())
@@ -46,20 +47,31 @@ def with_training(record: Record, train: Record | float, scenario: Scenario) -> 
 def training_of(record: Record, modes: Sequence[int] | None = None) -> Training | None:
     """Return the training data of a record as observers receive them: by its gate, missing samples bridged by the last value.
 
-    modes : of these alone
+    modes : of these alone. Raises RecordError for data that do not fit the record.
     """
-    return None if record.training_record is None else as_training(record.training_record).copy(modes)
+    if record.training_record is None:
+        return None
+    _check_fit(record, record.training_record)
+    return as_training(record.training_record).copy(modes)
 
 
 def as_training(record: Record) -> Training:
-    """Return a record as training data, without outliers, missing samples bridged by the last value."""
+    """Return a record as training data, without outliers, missing samples bridged by the last value.
+
+    Raises RecordError where a mode has no measurement.
+    """
+    _check_modes(record)
     whole = fill_missing(record.without_outliers, Prior())
     return Training(whole.y_lgs, whole.u, whole.open_loop_y).copy()
 
 
 def training_part(record: Record, train: Record | float, scenario: Scenario) -> Record:
     """Return the training data of `with_training` as a record. Raises RecordError as that does."""
-    other = _other(record, train) if isinstance(train, Record) else _first(record, train)
+    other = train if isinstance(train, Record) else _first(record, train)
+    _check_fit(record, other)
+    _check_modes(other)
+    if other.y_lgs.shape == record.y_lgs.shape and np.array_equal(other.y_lgs, record.y_lgs, equal_nan=True):
+        raise RecordError("the training data is the record itself: training and test must differ; train on the first part of it")
     g = scenario.gpr_offline
     if other.n_steps < (needed := g.depth + g.training_size):
         raise RecordError(f"the training data has {other.n_steps} steps; gpr_offline.depth + training_size need {needed}")
@@ -71,21 +83,26 @@ def trained_until(train: Record | float | None) -> float:
     return 0.0 if train is None or isinstance(train, Record) else train
 
 
-def _other(record: Record, train: Record) -> Record:
-    if abs(train.dt / record.dt - 1.0) > SAME_RATE:
-        raise RecordError(f"the training data has a rate of {1 / train.dt:g} Hz, the record {1 / record.dt:g} Hz")
-    for what in ("n_modes", "delay"):
-        theirs, ours = getattr(train, what), getattr(record, what)
+def _check_fit(record: Record, other: Record) -> None:
+    """Raise RecordError for training data of another rate, number of modes or delay."""
+    if abs(other.dt / record.dt - 1.0) > SAME_RATE:
+        raise RecordError(f"the training data has a rate of {1 / other.dt:g} Hz, the record {1 / record.dt:g} Hz")
+    for what, word in (("n_modes", "modes"), ("delay", "steps of delay")):
+        theirs, ours = getattr(other, what), getattr(record, what)
         if theirs != ours:
-            word = "modes" if what == "n_modes" else "steps of delay"
             raise RecordError(f"the training data has {theirs} {word}, the record {ours}")
-    if train.y_lgs.shape == record.y_lgs.shape and np.array_equal(train.y_lgs, record.y_lgs, equal_nan=True):
-        raise RecordError("the training data is the record itself: training and test must differ; train on the first part of it")
-    return train
+
+
+def _check_modes(other: Record) -> None:
+    """Raise RecordError for training data without a measurement of a mode."""
+    if (is_lost := np.isnan(other.y_lgs).all(axis=0)).any():
+        raise RecordError(f"the training data holds no measurement of mode {is_lost.argmax()}")
 
 
 def _first(record: Record, seconds: float) -> Record:
     length = record.n_steps * record.dt
+    if isinstance(seconds, bool) or not isinstance(seconds, (int, float, np.integer, np.floating)):
+        raise RecordError(f"train takes a record, or a duration [s], not {shorten(seconds)}")
     if not 0.0 < seconds < length:
         raise RecordError(f"the first {seconds:g} s as training data: takes more than 0 and less than the record's {length:g} s")
     end = round(seconds / record.dt)

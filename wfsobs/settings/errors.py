@@ -1,4 +1,4 @@
-"""The error of a setting, and values shortened for its one line."""
+"""The error of a setting, and values and errors shortened for one line."""
 
 from __future__ import annotations
 
@@ -19,3 +19,9 @@ def shorten(value: Any, most: int = 80) -> str:
     """Return a value in at most `most` characters."""
     text = _WORDS.repr(value)
     return text if len(text) <= most else text[: most - 3] + "..."
+
+
+def error_line(error: BaseException) -> str:
+    """Return an error in one line; an error of the code has its type."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, (ValueError, AssertionError)) and text else f"{type(error).__name__}: {text}".strip(": ")

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from wfsobs.record import DELAY, Record, RecordError, Training
+from wfsobs.record import DELAY, Record, RecordError, Training, star_counts
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import order_of
 from wfsobs.telemetry.bridged import without_bridged
@@ -130,7 +130,7 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
     for name in {"u", "training_u"} & signals.keys():
         signals[name] *= sign
     if STARS in arrays:
-        signals[STARS] = _star_counts(arrays[STARS], n)
+        signals[STARS] = star_counts(arrays[STARS], n).astype(np.float64)[:, None]
     dt, ratio, timing = _apply_timestamps(signals, contents, declaration)
     mirror += _apply_mirror(signals, delay, declaration)
     mirror += [f"{' and '.join(swapped)} with a row per mode"] if swapped else []
@@ -160,13 +160,6 @@ def _signal(name: str, raw: Array) -> Array:
         most = f" up to {LARGEST:g}, NaN where one is missing" if np.isfinite(out[row, column]) else ""
         raise RecordError(f"{name} is {out[row, column]} at step {row}, mode {column}; it takes finite numbers{most}")
     return out
-
-
-def _star_counts(raw: Array, n: int) -> Array:
-    """Return how many LGS there are as a column, (n, 1)."""
-    if raw.dtype.kind not in "fiu" or raw.shape != (n,) or not (np.isfinite(raw) & (raw >= 0) & (raw == np.round(raw))).all():
-        raise RecordError(f"{STARS} takes {n} whole numbers from 0, not {raw.dtype} of shape {raw.shape}")
-    return raw.astype(np.float64)[:, None]
 
 
 def _stars_apart(raw: Array, n: int, n_modes: int) -> Array:

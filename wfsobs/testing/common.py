@@ -17,6 +17,7 @@ from wfsobs.observers.step import StepObserver, frames_of
 from wfsobs.prior import Prior
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, hold_last
+from wfsobs.settings.errors import error_line
 from wfsobs.typing import Array
 
 R = TypeVar("R")
@@ -49,12 +50,6 @@ def report_errors(name: str, watch: Watch, what: str = "cannot run") -> Iterator
         raise
     except (Exception, SystemExit) as error:
         raise CheckError(f"{name}: {what}: {error_line(error)}") from error
-
-
-def error_line(error: BaseException) -> str:
-    """Return an error in one line; an error of the code has its type."""
-    text = " ".join(str(error).split())
-    return text if isinstance(error, (ValueError, AssertionError)) and text else f"{type(error).__name__}: {text}".strip(": ")
 
 
 def check_numbers(name: str, what: str, values: Any, shape: tuple[int, ...]) -> None:

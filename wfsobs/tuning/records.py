@@ -30,6 +30,7 @@ from wfsobs.priors_from.controllers import plant_of
 from wfsobs.priors_from.scenario import bands_of, measurement_noise, observer_settings, prior_of, told_spectra
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError, Training, delay_signal, frame_mean
+from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.disturbance import vibration_lines, vibration_variance
@@ -109,7 +110,7 @@ def space(
     known = of[name].tunable
     if not known.usual:
         raise SettingError(f"{kind} {name!r}: has no settings to tune")
-    chosen = tuple(known.usual if names is None else names)
+    chosen = tuple(known.usual if names is None else name_list(names) or ())
     if not chosen:
         raise SettingError("names: takes one setting or more")
     for i, path in enumerate(chosen):

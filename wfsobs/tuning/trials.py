@@ -40,7 +40,7 @@ from wfsobs.priors_from.training import training_of
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError, pseudo_open_loop
 from wfsobs.scenario import Scenario
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.errors import SettingError, error_line
 from wfsobs.tuning.records import Records, Space
 from wfsobs.typing import Array
 
@@ -239,7 +239,7 @@ class Trials(ABC):
         try:
             errors = self.errors_of(self.scenario.replace(changes))
         except ValueError as error:
-            reason = str(error)
+            reason = error_line(error)
         done = Evaluation(changes, errors, reason)
         self.history.append(done)
         if self.on_evaluation:

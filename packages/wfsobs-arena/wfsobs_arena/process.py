@@ -23,8 +23,8 @@ from wfsobs.observers.base import Observer
 from wfsobs.observers.estimates import NEXT_Z, TOTAL
 from wfsobs.progress import Watch
 from wfsobs.scenario.presets import PRESETS
+from wfsobs.settings.errors import error_line
 from wfsobs.testing import QUICK, CheckError, check_controller, check_observer
-from wfsobs.testing.common import error_line
 from wfsobs.typing import Array
 from wfsobs_arena.entries import ArenaEntry, load_object
 

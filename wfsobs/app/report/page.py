@@ -64,6 +64,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, VIBRATION
 from wfsobs.pipeline import run
 from wfsobs.progress import QUIET, Watch
+from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.grid import Variation, scenarios
 from wfsobs.sensors.modes import TIP_TILT
@@ -364,7 +365,7 @@ def export(
     Cancelled
         `watch` asks to stop.
     """
-    chosen = scenarios(scenario, vary)
+    chosen, observers = scenarios(scenario, vary), name_list(observers)
     check_writable(path)
     kept = []
     for i, one in enumerate(chosen):
