@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from wfsobs import PRESETS, simulate
-from wfsobs.priors_from.scenario import usual_observers
+from wfsobs.priors_from.scenario import model_of, usual_observers
 from wfsobs.record import Record, Training
 from wfsobs.scenario import Scenario
+from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.testing import QUICK
 
 ON_PAPER = usual_observers(PRESETS["paper"]())
@@ -34,6 +35,11 @@ MATCHED = Scenario().replace(
     }
 )
 """Its truth is the model of `multirate-optimal` and, with its one line, of `multirate-multi`."""
+
+
+def kalman_model(scenario: Scenario, mode: int, dt: float) -> DisturbanceModel:
+    """Return the state-space model of the turbulence and the one vibration peak that a scenario tells."""
+    return model_of(scenario, mode, dt).disturbance()
 
 
 def recorded(scenario: Scenario) -> Record:

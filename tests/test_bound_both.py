@@ -10,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import cholesky, solve_triangular, toeplitz
 
+from tests.records import kalman_model
 from wfsobs.evaluation.bound import bound_rms, least_errors_of_both, record_bounds
 from wfsobs.evaluation.rows import can_be_best
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, COMMON_BOUNDS, SCORED
 from wfsobs.observers.kalman.multirate import optimal_cycle
-from wfsobs.priors_from.scenario import kalman_model, measurement_noise
+from wfsobs.priors_from.scenario import measurement_noise
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.riccati import periodic_steady_state

@@ -13,13 +13,13 @@ from click.testing import CliRunner
 from scipy.linalg import solve_discrete_lyapunov
 
 import wfsobs
+from tests.records import kalman_model
 from wfsobs.cli import main
 from wfsobs.evaluation.budget import AVERAGED, TERMS, Budget, error_budget, shapley_shares, split_lines, split_record
 from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.pipeline import run
-from wfsobs.priors_from.scenario import kalman_model
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.ar2 import Ar2

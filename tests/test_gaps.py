@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.records import ON_PAPER
+from tests.records import ON_PAPER, kalman_model
 from wfsobs import PRESETS, observe, simulate
 from wfsobs.evaluation.scores import PREDICTION, RESIDUAL
 from wfsobs.execution import each_estimate, run_observer
@@ -15,7 +15,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.missing import fill_missing
 from wfsobs.prior import Lines, Model, Prior
-from wfsobs.priors_from.scenario import kalman_model, measurement_noise, prior_of
+from wfsobs.priors_from.scenario import measurement_noise, prior_of
 from wfsobs.record import Record, hold_last, pseudo_open_loop
 from wfsobs.scenario import Scenario
 from wfsobs.signal.riccati import steady_state

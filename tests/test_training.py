@@ -20,9 +20,9 @@ from wfsobs.identification import Identification, identify
 from wfsobs.identification.report import identification_toml
 from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import observe
-from wfsobs.prior import Bands, Lines
+from wfsobs.prior import Bands, Lines, Model
 from wfsobs.priors_from import scenario as from_scenario
-from wfsobs.priors_from.identification import prior_of, told_by
+from wfsobs.priors_from.identification import told_by
 from wfsobs.priors_from.training import training_of, with_training
 from wfsobs.record import Record, RecordError, Training
 from wfsobs.scenario import Scenario, configfile
@@ -250,15 +250,23 @@ def test_no_scenario_is_needed(night: Record, found: Identification) -> None:
         np.testing.assert_array_equal(got, by_default[name])
 
 
+def numbers_in(part: Any) -> Any:
+    return part if isinstance(part, tuple) else vars(part).values()
+
+
 def test_the_parts_are_those_that_were_found(night: Record, found: Identification) -> None:
-    prior = prior_of(found)
-    assert prior.lines == tuple(mode.prior for mode in found.modes) and prior.training is None and prior.spectra == ()
+    prior = from_scenario.prior_of(told_by(found, Scenario()), None, (Model, Lines, Bands))
+    assert prior.training is None and prior.spectra == ()
     assert len(prior.model) == 2 and prior.bands is not None
+    for lines, mode in zip(prior.lines, found.modes, strict=True):
+        for part in ("turbulence", "lines", "continuum"):
+            for got, want in zip(getattr(lines, part), getattr(mode.prior, part), strict=True):
+                assert [*numbers_in(got)] == pytest.approx([*numbers_in(want)], rel=1e-9)
     for model, mode in zip(prior.model, found.modes, strict=True):
         strongest = max(mode.peaks, key=lambda p: p.rms.value)
         assert model.lgs_noise == pytest.approx(mode.noise.value, rel=1e-12)
         assert model.vibration.omega == pytest.approx(2 * np.pi * strongest.frequency.value, rel=1e-12)
-    direct = OBSERVERS["kf-multi"].estimate(night.measurements(), prior_of(found, (Lines,)), Scenario().multipeak)
+    direct = OBSERVERS["kf-multi"].estimate(night.measurements(), replace(prior, model=(), bands=None), Scenario().multipeak)
     expected = values(observe(night, observers=("kf-multi",), prior=found))
     for target, got in direct.items():
         np.testing.assert_allclose(got, expected[f"kf-multi/{target}"], rtol=0, atol=1e-9 * float(np.std(got)))

@@ -8,9 +8,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import solve_toeplitz
 
+from tests.records import kalman_model
 from wfsobs.evaluation.bound import bound_rms, least_errors
 from wfsobs.observers.base import TARGETS
-from wfsobs.priors_from.scenario import kalman_model, measurement_noise
+from wfsobs.priors_from.scenario import measurement_noise
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.ar2 import Ar2, turbulence_corner

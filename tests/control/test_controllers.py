@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.records import kalman_model
 from wfsobs.closed_loop.design import Design, design
 from wfsobs.closed_loop.rows import ClosedLoop, Outcome, residual_rms, strehl
 from wfsobs.closed_loop.run import closed_loop
@@ -20,7 +21,7 @@ from wfsobs.control.mirror import Mirror
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers.baselines import online_reference
 from wfsobs.priors_from.controllers import controller_arguments, own_settings
-from wfsobs.priors_from.scenario import bands_of, kalman_model, measurement_noise, modelled_processes, spectra_of
+from wfsobs.priors_from.scenario import bands_of, measurement_noise, modelled_processes, spectra_of
 from wfsobs.progress import QUIET
 from wfsobs.record import Record, RecordError, Training, delay_signal
 from wfsobs.scenario import Scenario

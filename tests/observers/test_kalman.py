@@ -10,12 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.records import kalman_model
 from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.kalman.single import between_frames, steady_filter
-from wfsobs.priors_from.scenario import arguments, kalman_model, measurement_noise, modelled_processes
+from wfsobs.priors_from.scenario import arguments, measurement_noise, modelled_processes
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS

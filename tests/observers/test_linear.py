@@ -11,8 +11,9 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from wfsobs.evaluation.bound import bound_rms
 from wfsobs.execution import run_observer
+from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.observers.ridge import TAPS, fit, predict
-from wfsobs.priors_from.scenario import lines_of, modelled_processes, modelled_turbulence, multi_model, predicted_rms
+from wfsobs.priors_from.scenario import lines_of, measurement_noise, modelled_processes, modelled_turbulence
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -164,9 +165,11 @@ def lines(scenario: Scenario, count: int) -> Scenario:
 
 def test_where_the_truth_is_its_model_the_filter_reaches_the_bound() -> None:
     s = lines(small({"run.duration": 4.0}), 4)
-    model = multi_model(s, 0, s.dt)
+    model = lines_of(s, 0).disturbance(s.multipeak.line_width)
     assert model.A.shape == (10, 10)
-    assert predicted_rms(s, 0) == pytest.approx(bound_rms(s, 0, ahead=1)["total"], rel=1e-4)
+    row = np.sum(list(model.outputs.values()), axis=0)
+    predicted = np.sqrt(row @ steady_filter(model, measurement_noise(s, 0)[0])[1].P @ row)
+    assert predicted == pytest.approx(bound_rms(s, 0, ahead=1)["total"], rel=1e-4)
     errors = []
     for seed in range(12):
         record = simulate(s.replace({"run.seed": seed}))
@@ -236,4 +239,4 @@ def test_a_table_of_a_spectrum_is_a_continuum() -> None:
     )
     told = lines_of(s, 0)
     assert told.lines == () and sum(p.rms**2 for p in told.continuum) == pytest.approx(49e-6, rel=0.1)
-    assert len(multi_model(s, 0, s.dt).A) == 2 * (len(told.turbulence) + len(told.continuum))
+    assert len(told.disturbance(s.multipeak.line_width).A) == 2 * (len(told.turbulence) + len(told.continuum))

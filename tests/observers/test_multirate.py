@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.records import kalman_model
 from wfsobs.execution import run_observer
 from wfsobs.observers.kalman.multirate import UnstableCycle, multirate_filter, multirate_noise
 from wfsobs.pipeline import run
-from wfsobs.priors_from.scenario import kalman_model, model_of, modelled_processes
+from wfsobs.priors_from.scenario import model_of, modelled_processes
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS

@@ -7,10 +7,11 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
+from tests.records import kalman_model
 from wfsobs.execution import run_observer
 from wfsobs.observers.kalman.multirate import optimal_cycle, optimal_filter, optimal_model
 from wfsobs.prior import LgsError, Model, Prior
-from wfsobs.priors_from.scenario import kalman_model, lgs_error_of, model_of, modelled_processes, prior_of
+from wfsobs.priors_from.scenario import lgs_error_of, model_of, modelled_processes, prior_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
 from wfsobs.signal.ar2 import Ar2

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import wfsobs
-from tests.records import ON_PAPER, short, third_of_pairs
+from tests.records import ON_PAPER, kalman_model, short, third_of_pairs
 from wfsobs import PRESETS
 from wfsobs.control.controllers import CONTROLLERS, gpr_offline_ahead, gpr_online_ahead
 from wfsobs.control.mirror import Mirror, Plant
@@ -24,7 +24,7 @@ from wfsobs.observers.missing import fill_missing
 from wfsobs.observers.step import StepError
 from wfsobs.prior import Bands, Lines, Model, Prior, Training
 from wfsobs.priors_from.controllers import own_settings
-from wfsobs.priors_from.scenario import arguments, has_prior, kalman_model, measurement_noise, observer_settings, prior_of
+from wfsobs.priors_from.scenario import arguments, has_prior, measurement_noise, observer_settings, prior_of
 from wfsobs.progress import QUIET
 from wfsobs.record import Record, Sampling, hold_last, pseudo_open_loop
 from wfsobs.scenario import Scenario

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from tests.records import ON_PAPER
+from tests.records import ON_PAPER, kalman_model
 from wfsobs.cli import main
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import run_design
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.pipeline import observe, run
-from wfsobs.priors_from.scenario import kalman_model, measurement_noise
+from wfsobs.priors_from.scenario import measurement_noise
 from wfsobs.progress import QUIET, Cancelled, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario, configfile

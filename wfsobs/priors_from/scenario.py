@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from math import sqrt
 from types import MappingProxyType
 from typing import Any, TypeVar
 
@@ -20,7 +19,7 @@ import numpy as np
 
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
-from wfsobs.observers.kalman.single import MIN_NOISE, steady_filter
+from wfsobs.observers.kalman.single import MIN_NOISE
 from wfsobs.prior import (
     Asterism,
     Bands,
@@ -50,7 +49,7 @@ from wfsobs.scenario.measured_spectra import ALL, LINES
 from wfsobs.settings.group import Group
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3, Ar3Fits, SharedProcess, fit_shared_process
-from wfsobs.signal.statespace import MIN_MODEL_DAMPING, DisturbanceModel
+from wfsobs.signal.statespace import MIN_MODEL_DAMPING
 from wfsobs.simulation.disturbance import vibration_lines, vibration_power, vibration_variance
 from wfsobs.simulation.flow_spectra import TurbulenceSpectra, star_basis
 from wfsobs.simulation.guide_stars import lgs_error_process, lgs_error_variance, lgs_noise_rms, lgs_weights, stars_differ
@@ -424,11 +423,6 @@ def modelled_peak(scenario: Scenario, mode: int) -> tuple[float, float]:
     return frequency, damping
 
 
-def kalman_model(scenario: Scenario, mode: int, dt: float) -> DisturbanceModel:
-    """Return the state-space model of the two processes."""
-    return model_of(scenario, mode, dt).disturbance()
-
-
 # ---------------------------------------------------------------------- every line
 
 
@@ -445,19 +439,6 @@ def lines_of(scenario: Scenario, mode: int, dt: float | None = None, turbulence:
         tuple(Line(*line) for line in vibration_lines(scenario, mode)),
         tuple(process.at(dt) for process in vibration_continuum(scenario, mode)),
     )
-
-
-def multi_model(scenario: Scenario, mode: int, dt: float) -> DisturbanceModel:
-    """Return the state-space model of the whole vibration."""
-    return lines_of(scenario, mode, dt).disturbance(scenario.multipeak.line_width)
-
-
-def predicted_rms(scenario: Scenario, mode: int) -> float:
-    """Return the predicted error of the multi-peak filter for the next phi_dist, rms [um]."""
-    model = multi_model(scenario, mode, scenario.dt)
-    row = np.sum(list(model.outputs.values()), axis=0)
-    _, steady = steady_filter(model, measurement_noise(scenario, mode)[0])
-    return sqrt(float(row @ steady.P @ row))
 
 
 def as_sampled(scenario: Scenario, sampling: Sampling) -> Scenario:

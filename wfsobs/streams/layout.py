@@ -99,7 +99,7 @@ def new_semaphore() -> bytes:
     return memory.raw
 
 
-VERSION, NAME, AXES, COUNT_OF_ELEMENTS, DATATYPE, IMAGE_TYPE, TIMES = 0, 32, 112, 128, 136, 144, 152
+VERSION, NAME, AXES, COUNT_OF_ELEMENTS, DATATYPE, TIMES = 0, 32, 112, 128, 136, 152
 """Offsets that both layouts have; the times are those of creation, last access, acquisition and writing."""
 
 LONGEST_NAME = 79
