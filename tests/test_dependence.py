@@ -28,7 +28,7 @@ from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.errors import SettingError
 from wfsobs.settings.parameters import Reals
 from wfsobs.simulation.loop import record_settings, simulate, training_settings
-from wfsobs.testing.common import QUICK
+from wfsobs.testing import QUICK
 
 BASE = PRESETS["paper"]().replace({**QUICK, "run.duration": 0.6})
 

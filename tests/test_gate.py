@@ -21,7 +21,7 @@ from wfsobs.priors_from.controllers import controller_arguments, own_settings, p
 from wfsobs.priors_from.scenario import arguments
 from wfsobs.record import Record
 from wfsobs.signal.gate import BLOCK, MEMORY, OPEN, ORDER, RAREST, RARITY, RUN, USUAL, GateSettings, OutlierGate
-from wfsobs.testing.common import run_loop, run_steps
+from wfsobs.testing import run_loop, run_steps
 from wfsobs.typing import Array
 
 REJECT, CLIP = GateSettings(), GateSettings(action="clip")

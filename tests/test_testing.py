@@ -18,8 +18,7 @@ from wfsobs.prior import Prior
 from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import Measurements, Record
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.testing import QUICK, CheckError, check_observer
-from wfsobs.testing.common import arrays_of, changed_after, steps_to_check
+from wfsobs.testing import QUICK, CheckError, arrays_of, changed_after, check_observer, steps_to_check
 
 CALLS: list[int] = []
 SHORTER = PRESETS["paper"]().replace({**QUICK, "run.duration": 0.8})

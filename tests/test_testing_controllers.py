@@ -166,7 +166,7 @@ def test_what_finds_the_truth_some_other_way_is_seen_in_a_fresh_process(predict:
 
 def test_the_truth_in_an_argument_would_be_found(monkeypatch: pytest.MonkeyPatch) -> None:
     """The door itself, left open: measurements that are the record."""
-    from wfsobs.testing import controllers as module
+    from wfsobs import testing as module
 
     real = module.controller_arguments
     monkeypatch.setattr(module, "controller_arguments", lambda c, record, *rest: (record, real(c, record, *rest)[1]))

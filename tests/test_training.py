@@ -29,7 +29,7 @@ from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.records import save_record
-from wfsobs.testing.common import run_steps
+from wfsobs.testing import run_steps
 
 LEARN = ("gpr-offline", "ridge", "ridge-30")
 SMALL: dict[str, Any] = {

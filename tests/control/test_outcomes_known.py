@@ -15,7 +15,7 @@ from wfsobs.dependence import Memo
 from wfsobs.record import Record
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
-from wfsobs.testing.common import QUICK
+from wfsobs.testing import QUICK
 
 BASE = PRESETS["paper"]().replace({**QUICK, "run.duration": 0.8})
 GPR = {"integrator+gpr-offline", "integrator+gpr-online"}

@@ -21,7 +21,7 @@ from wfsobs.priors_from.controllers import controller_arguments, own_settings, p
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.periodic import PeriodicFilter
-from wfsobs.testing.common import run_loop
+from wfsobs.testing import run_loop
 
 ROUNDING, GPR = 1e-12, 1e-9
 """Differences over the std of the commands: sums in another order; the kernel's condition number makes more of them in a GPR."""

@@ -32,8 +32,7 @@ from wfsobs.simulation.guide_stars import lgs_weights
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.synthesis import line_width
 from wfsobs.telemetry.records import load_record, save_record
-from wfsobs.testing import check_observer
-from wfsobs.testing.common import step_difference
+from wfsobs.testing import check_observer, step_difference
 
 STARS = wfsobs.PRESETS["paper"]().replace(
     {

@@ -21,7 +21,7 @@ from wfsobs.priors_from.scenario import arguments, observer_settings, prior_of
 from wfsobs.record import Measurements, Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.riccati import Step
-from wfsobs.testing.common import run_steps
+from wfsobs.testing import run_steps
 from wfsobs.typing import Array
 
 FILTERS = [name for name in WITH_MODEL if name != "kf-ngs"]

@@ -22,8 +22,7 @@ from wfsobs.priors_from.scenario import arguments, prior_of, usual_observers
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.mode_spectra import combined_spectra
-from wfsobs.testing import check_observer
-from wfsobs.testing.common import step_difference
+from wfsobs.testing import check_observer, step_difference
 
 OBSERVER = OBSERVERS["multirate-coupled"]
 LONG = SHAKEN.replace({"telescope.radial_order": 1, "run.duration": 160.0})

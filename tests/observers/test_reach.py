@@ -19,7 +19,7 @@ from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
-from wfsobs.testing.controllers import SEED, given_away, walk_references
+from wfsobs.testing import SEED, given_away, walk_references
 
 
 def scenario(inputs_filter: str = "raw") -> Scenario:

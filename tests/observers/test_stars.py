@@ -27,7 +27,7 @@ from wfsobs.signal.statespace import disturbance_model
 from wfsobs.simulation.guide_stars import low_frequency_process
 from wfsobs.simulation.sensor_noise import noise_rms
 from wfsobs.telemetry.records import load_record, save_record
-from wfsobs.testing.common import run_loop, run_steps
+from wfsobs.testing import run_loop, run_steps
 from wfsobs.typing import Array
 
 pytestmark = pytest.mark.slow

@@ -30,7 +30,7 @@ from wfsobs.record import Record, Sampling, hold_last, pseudo_open_loop
 from wfsobs.scenario import Scenario
 from wfsobs.signal.joint_states import RIDGE
 from wfsobs.signal.riccati import steady_state
-from wfsobs.testing.common import run_steps, step_difference
+from wfsobs.testing import run_steps, step_difference
 
 STEPS = [name for name, observer in OBSERVERS.items() if observer.step is not None]
 
