@@ -63,33 +63,18 @@ class Mirror:
         """P, from a command to the measurement, at omega [rad per step]; same shape."""
         return np.exp(-1j * np.multiply.outer(omega, np.arange(self.taps.size))) @ self.taps
 
-    def clip_command(self, command: float, last: float) -> float:
-        """Return the command nearest to `command` within the limits after `last` [um]."""
-        near = min(max(command, last - self.slew), last + self.slew)
-        return min(max(near, -self.stroke), self.stroke)
-
     def clip_commands(self, u: Array, last: Array) -> Array:
         """Return the commands of all modes nearest to u (n_modes,) within the limits after `last` [um]."""
         return np.clip(np.clip(u, last - self.slew, last + self.slew), -self.stroke, self.stroke) if self.has_limits else u
 
     def within(self, u: Array) -> bool:
-        """Whether commands u (n_steps,) [um], from rest, keep the limits."""
-        return bool(np.abs(u).max() <= self.stroke and np.abs(np.diff(u, prepend=0.0)).max() <= self.slew)
+        """Whether commands u (n_steps, ...) [um], from rest, keep the limits."""
+        return bool(np.abs(u).max() <= self.stroke and np.abs(np.diff(u, axis=0, prepend=0.0)).max() <= self.slew)
 
     def at_limit(self, u: Array) -> Array:
         """Whether taken commands u (n_steps, ...) [um], from rest, are at a limit; same shape."""
         near = 1.0 - 1e-12
         return (np.abs(u) >= near * self.stroke) | (np.abs(np.diff(u, axis=0, prepend=0.0)) >= near * self.slew)
-
-    def follow(self, u: Array) -> Array:
-        """Return the commands (n_steps,) [um] that the mirror takes for the wanted ones, from rest."""
-        if self.within(u):
-            return u
-        out, last = [], 0.0
-        for wanted in u.tolist():
-            last = self.clip_command(wanted, last)
-            out.append(last)
-        return np.array(out)
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,10 @@ from wfsobs.control.mirror import Law, Mirror, Plant
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.observers.missing import Bridge
-from wfsobs.observers.step import Estimator, StepBase, StepError, each_frame, take_state
+from wfsobs.observers.step import Estimator, StepBase, StepError, take_state
 from wfsobs.observers.stepping import FilterBank, StateArrays, Stateful
 from wfsobs.prior import Bands, Prior
-from wfsobs.progress import Watch
-from wfsobs.record import Measurements, Sampling
+from wfsobs.record import Sampling
 from wfsobs.signal.bandpass import bandpass_bank, bank_recursion
 from wfsobs.signal.gate import GateSettings
 from wfsobs.signal.periodic import Recursion
@@ -109,11 +108,6 @@ class KalmanLaws(StepLaw):
         """Return the commands of the estimates."""
         self.filters.advance(z, ngs, None)
         return np.sum(self._rows * self.filters.bank.x, axis=1) + forward
-
-    def run(self, measurements: Measurements, watch: Watch) -> Array:
-        """Return the commands over a record with gaps, (n_steps, n_modes) [um]. Raises Cancelled."""
-        none = np.zeros(len(self.laws))
-        return np.array([self.command(z, ngs, none) for z, ngs, _ in each_frame(self.filters, measurements, watch)])
 
     def take_over(self, old: Any) -> None:
         """Go on where the disturbance is in the old filters' states."""
