@@ -87,8 +87,7 @@ def lqg_multirate_multi(prior: Prior, mode: int, plant: Plant, settings: Any) ->
 def _law(mode_filter: ModeFilter, mirror: Mirror) -> Law:
     """Return the law that commands against what a filter predicts. Raises RiccatiError."""
     row = command_rows(mode_filter.cycle[0][0], mode_filter.rows(TARGETS).sum(axis=0), mirror)
-    law = mode_filter.gains.recursion(row)
-    return Law(law.cycle, first=law.first, gains=mode_filter.gains, row=row[0], filter=mode_filter)
+    return Law(mode_filter.gains.recursion(row), gains=mode_filter.gains, row=row[0], filter=mode_filter)
 
 
 def lqg_kf_adaptive(prior: Prior, plant: Plant, settings: Any, sampling: Sampling) -> PredictionLaws:

@@ -26,7 +26,7 @@ from scipy.signal import lfilter
 
 from wfsobs.observers.kalman.mode_filter import ModeFilter
 from wfsobs.observers.stepping import GainCycle
-from wfsobs.signal.periodic import FilterStep, PeriodicFilter, Recursion
+from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
 
@@ -90,9 +90,8 @@ class Plant:
 class Law:
     """A linear law of one mode.
 
-    cycle : the filter from z (LGS, or LGS and NGS) to u
+    cycle : the filter from z (LGS, or LGS and NGS) to u, with a step 0 that is not one of the cycle where there is one
     gain, leak : of an integrator
-    first : step 0, where it is not one of the cycle
     gains, row : the same filter as an observer: u[k] = row x_hat[k]; None where it is not known as one
     filter : the Kalman filter that this observer is, to which a missing measurement is none; None where it is no such filter
     """
@@ -100,14 +99,13 @@ class Law:
     cycle: PeriodicFilter
     gain: float | None = None
     leak: float = 1.0
-    first: FilterStep | None = None
     gains: GainCycle | None = None
     row: Array | None = None
     filter: ModeFilter | None = None
 
     def run(self, z: Array) -> Array:
         """Return the commands (n_steps,) [um] of measurements z (n_steps, n_inputs) [um]."""
-        return Recursion(self.cycle.steps, self.first).run(z[:, : self.cycle.steps[0][1].shape[1]])[:, 0]
+        return self.cycle.run(z[:, : self.cycle.steps[0][1].shape[1]])[:, 0]
 
     @property
     def poles(self) -> Complex:

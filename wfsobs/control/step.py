@@ -23,7 +23,6 @@ from wfsobs.prior import Bands, Prior
 from wfsobs.record import Sampling
 from wfsobs.signal.bandpass import bandpass_bank, bank_recursion
 from wfsobs.signal.gate import GateSettings
-from wfsobs.signal.periodic import Recursion
 from wfsobs.typing import Array
 
 StepPredict = Callable[[Prior, Plant, Any, Sampling], Estimator]
@@ -65,7 +64,7 @@ class LinearLaws(StepLaw):
 
     def __init__(self, laws: Sequence[Law]):
         self.laws: tuple[Law, ...] = tuple(laws)
-        self.bank: FilterBank = FilterBank([Recursion(law.cycle.steps, law.first) for law in laws])
+        self.bank: FilterBank = FilterBank([law.cycle for law in laws])
         self._v = np.zeros((len(laws), laws[0].cycle.steps[0][1].shape[1]))
         self.mark_start()
 

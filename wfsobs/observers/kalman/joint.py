@@ -534,7 +534,7 @@ def _outputs(one: Beginning, y: Array, weights: Array, *, since: int = 0) -> Arr
         return np.empty((0, weights.shape[1]))
     F, G = one.filter.F, one.filter.G[:, None]
     steps = [(F, G, W @ F, W @ G) for W in weights]
-    return PeriodicFilter(steps).run(y[:, None, None], one.first[:, None] * y[0], since=since)[:, :, 0]
+    return PeriodicFilter(steps).run(y[:, None], one.first * y[0], since=since)
 
 
 class AsterismEstimator(JointEstimator):

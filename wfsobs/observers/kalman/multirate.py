@@ -44,7 +44,7 @@ from wfsobs.settings.group import UsedWhen
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.gap_gains import ONE, SensorMean
-from wfsobs.signal.periodic import Recursion
+from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.riccati import SteadyState, Step, periodic_steady_state, posteriors_of_gains, steady_state
 from wfsobs.signal.statespace import DisturbanceModel, blocks_along_diagonal, disturbance_model
 from wfsobs.typing import Array
@@ -126,7 +126,7 @@ def multirate_gains(model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_n
 
 def multirate_filter(
     model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float, outputs: Array | None = None
-) -> Recursion:
+) -> PeriodicFilter:
     """Return the filter of `multirate_gains`, whose step 0 has no NGS frame; its cycle begins at k = 1, the frame last.
 
     outputs : rows of the state x_hat[k] to return, (p, n); every target by default. Raises UnstableCycle.
@@ -219,7 +219,7 @@ def optimal_gains(cycle: list[Step]) -> tuple[GainCycle, list[SteadyState]]:
     return GainCycle(steps, Gain(A, alone, L)), states
 
 
-def optimal_filter(cycle: list[Step], outputs: Array) -> tuple[Recursion, list[SteadyState]]:
+def optimal_filter(cycle: list[Step], outputs: Array) -> tuple[PeriodicFilter, list[SteadyState]]:
     """Return the filter of `optimal_gains` and the covariances; outputs (p, n_states) rows of the state."""
     gains, states = optimal_gains(cycle)
     return gains.recursion(outputs), states
