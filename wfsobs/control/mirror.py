@@ -21,11 +21,11 @@ from dataclasses import dataclass
 from math import inf
 
 import numpy as np
-from scipy.linalg import schur
 from scipy.signal import lfilter
 
 from wfsobs.observers.kalman.mode_filter import ModeFilter
 from wfsobs.observers.stepping import GainCycle
+from wfsobs.signal.joint_states import StateFilter
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
@@ -125,19 +125,4 @@ class Law:
     def response(self, omega: Array) -> Complex:
         """F = -u / z at omega (n,) [rad per step], (n,); of time-invariant laws."""
         F, G, H, J = self.cycle.steps[0]
-        return -transfer(F, G[:, 0], H[0], float(J[0, 0]), np.exp(1j * omega))
-
-
-def transfer(F: Array, G: Array, H: Array, J: float, z: Complex) -> Complex:
-    """Return H (z I - F)^-1 G + J at all z (n,) at once.
-
-    By the triangular form of F, since nearly equal poles have no well-defined eigenvectors.
-    """
-    if not len(F):
-        return np.full(z.shape, complex(J))
-    T, Q = schur(F.astype(complex), output="complex")
-    b = Q.conj().T @ G
-    x = np.empty((len(F), z.size), dtype=complex)
-    for i in reversed(range(len(F))):
-        x[i] = (b[i] + T[i, i + 1 :] @ x[i + 1 :]) / (z - T[i, i])
-    return (H @ Q) @ x + J
+        return -(H[0] @ StateFilter(F, G[:, 0]).response(omega) * np.exp(-1j * omega) + J[0, 0])
