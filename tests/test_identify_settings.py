@@ -116,7 +116,7 @@ def test_the_file_predicts_a_new_record_as_what_was_found_does(found: Identifica
     for i, mode in enumerate(found.modes):
         model = mode.prior.disturbance(saved.multipeak.line_width)
         kalman, _ = steady_filter(model, mode.prior.noise, np.sum(list(model.outputs.values()), axis=0)[None])
-        expected = kalman.run(test.z[:, None, i, None])[:, 0, 0]
+        expected = kalman.run(test.z[:, [i]])[:, 0]
         values = sum(e.values[:, i] for e in result.estimates)
         assert np.max(np.abs(values - expected)) < 1e-10 * np.std(expected)  # rounding through the Riccati equation
 

@@ -169,7 +169,7 @@ def all_peaks() -> None:
                 if p.rms[mode] > 0
             ]
             kalman, _ = steady_filter(disturbance_model([turbulence], peaks), measurement_noise(scenario, mode)[0])
-            columns.append(kalman.run(record.z[:, None, mode, None])[:, :, 0])
+            columns.append(kalman.run(record.z[:, [mode]]))
         start = round(scenario.run.warm_up / record.dt)
         error = (by_target(columns)["vibration"] - record.vibration)[start:]
         for mode, name in enumerate(found):

@@ -9,10 +9,10 @@ import wfsobs
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import controller_needs
 from wfsobs.closed_loop.run import closed_loop
-from wfsobs.control.integrator import limited_integrator
+from wfsobs.control.integrator import integrator_law
 from wfsobs.control.mirror import Mirror
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.step import each_frame
+from wfsobs.observers.step import frames_of
 from wfsobs.record import Record
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.spectrum import rms
@@ -35,7 +35,7 @@ def predictions(name: str, record: Record) -> Array:
     observer = wfsobs.design(name, SHORT)
     uses_ngs = "y_ngs" in OBSERVERS[name].needs
     out = []
-    for z, ngs, _ in each_frame(observer, record.measurements(), wfsobs.progress.QUIET):
+    for z, ngs, *_ in frames_of(record.measurements()):
         observer.update(z, ngs if uses_ngs else None)
         sums = [sum(observer.predict(k, target)[0] for target in ("turbulence", "vibration")) for k in (1, 2)]
         out.append(-(0.6 * sums[0] + 0.4 * sums[1]))
@@ -49,7 +49,7 @@ def test_it_is_an_integrator_and_then_minus_the_prediction_of_its_observer(name:
     ahead = predictions(name.removeprefix("lqg-"), record)
     known = ~np.isnan(ahead)
     assert not known[:999].any() and known[FIRST:].all()
-    first = [limited_integrator(Mirror(2.4), 0.2, 1.0, z, np.zeros(len(z)))[0] for z in record.z.T]
+    first = [integrator_law(Mirror(2.4), 0.2, 1.0).run(z[:, None]) for z in record.z.T]
     expected = np.where(known, ahead, np.column_stack(first))
     # z is rounded to 1e-9 um, and a model found in it is as far off as its sensitivity to that
     np.testing.assert_allclose(outcome.u, expected, rtol=0, atol=1e-5 * rms(expected))

@@ -153,7 +153,7 @@ def test_it_finds_the_best_filter_of_a_process() -> None:
     z = z[1:] + NOISE * rng.standard_normal(28_000)
     truth = vibration[1:]
     found = learn(z[:8000], DT, 300, 20, 5.0, nothing_learnt(300))
-    x = PeriodicFilter([found.whitener]).run((z - found.mean)[:, None, None])[:, 0, 0]
+    x = PeriodicFilter([found.whitener]).run((z - found.mean)[:, None])[:, 0]
     errors = (np.convolve(x, found.weights)[: len(z)] - truth)[8000:]
     model = disturbance_model([TURBULENCE], [LINE])
     P = steady_state(model.A, model.C, model.Q, np.array(NOISE**2)).posterior
@@ -278,8 +278,8 @@ def test_between_two_times_of_learning_it_is_a_fixed_filter_of_whitened_measurem
     for now in range(s.first, len(z), s.interval):
         start, stop = max(now - s.longest, 0), min(now + s.interval, len(z))
         last = learn(z[start:now], record.dt, s.depth, a.peak_count, a.lowest, last)
-        x = PeriodicFilter([last.whitener]).run((z[start:stop] - last.mean)[:, None, None], since=now - start - s.depth + 1)
-        want[delay + now : delay + stop] = np.convolve(x[:, 0, 0], last.weights, "valid")
+        x = PeriodicFilter([last.whitener]).run((z[start:stop] - last.mean)[:, None], since=now - start - s.depth + 1)
+        want[delay + now : delay + stop] = np.convolve(x[:, 0], last.weights, "valid")
     assert np.nanstd(want) > 1e-3, "the vibration of the paper has 10 nm"
     # sums in another order, and the condition of the kernel
     np.testing.assert_allclose(got, want, rtol=0.0, atol=1e-9 * np.nanstd(want))

@@ -240,7 +240,7 @@ def test_innovations_of_the_matched_filter_are_white() -> None:
     record = simulate(s)
     model, noise = kalman_model(s, 0, record.dt), measurement_noise(s, 0)[0]
     kalman, steady = steady_filter(model, noise, np.eye(4))
-    filtered = kalman.run(record.z[:, None, 0, None])[:, :, 0]
+    filtered = kalman.run(record.z[:, [0]])
     innovation = (record.z[1:, 0] - filtered[:-1] @ model.A.T @ model.C)[1000:]
     n = innovation.size
     expected = model.C @ steady.P @ model.C + noise**2

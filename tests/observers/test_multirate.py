@@ -115,7 +115,7 @@ def test_two_stable_gains_can_make_an_unstable_cycle() -> None:
     assert "40 nm" in message and "1 nm" in message and "\n" not in message
     assert f"{radius(0.040, 0.001):.3g}" in message
     stable = multirate_filter(paper_model(), 5, 0.020, 0.001)
-    found = np.abs(np.linalg.eigvals(stable.cycle.cycle_matrix())).max()
+    found = np.abs(np.linalg.eigvals(stable.cycle_matrix())).max()
     assert found == pytest.approx(radius(0.020, 0.001), rel=1e-9)
 
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wfsobs.control.lqg import lqg_multirate_multi
+from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.execution import run_observer
 from wfsobs.observers.base import TARGETS
 from wfsobs.prior import Beams, Lines, Model
-from wfsobs.priors_from.controllers import plant_of
+from wfsobs.priors_from.controllers import own_settings, plant_of
 from wfsobs.priors_from.scenario import one_process, prior_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -43,7 +43,10 @@ def test_it_predicts_what_its_controller_commands() -> None:
     record = simulate(scenario)
     assert record.y_ngs is not None
     z = np.column_stack([record.z[:, 0], np.nan_to_num(record.z_ngs[:, 0])])
-    law = lqg_multirate_multi(prior_of(scenario, record, (Model, Lines, Beams)), 0, plant_of(scenario), scenario)
+    prior = prior_of(scenario, record, (Model, Lines, Beams))
+    law = CONTROLLERS["lqg-multirate-multi"].law_of(
+        prior, 0, plant_of(scenario), own_settings(CONTROLLERS["lqg-multirate-multi"], scenario)
+    )
     observer = design("multirate-multi", scenario)
     commands = []
     for k, row in enumerate(record.z):

@@ -15,6 +15,7 @@ from wfsobs.priors_from.scenario import lgs_error_of, model_of, modelled_process
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
 from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.riccati import periodic_steady_state, steady_state
 from wfsobs.signal.statespace import disturbance_model, process_model
 from wfsobs.simulation.loop import simulate
@@ -60,10 +61,10 @@ def run_cycle(cycle, z, outputs):
     """(estimates, innovations over their predicted std) of the filter of a cycle on measurements from k = 1 on."""
     filters, states = optimal_filter(cycle, outputs)
     n = len(z)
-    estimates = filters.cycle.run(z[:, :, None])[:, :, 0]
+    estimates = PeriodicFilter(filters.steps).run(z)
     # Innovations need the predicted state: the same filter with the identity as output, one step back.
     everything = np.eye(len(cycle[0][0]))
-    whole = optimal_filter(cycle, everything)[0].cycle.run(z[:, :, None])[:, :, 0]
+    whole = PeriodicFilter(optimal_filter(cycle, everything)[0].steps).run(z)
     phase = np.arange(n) % len(cycle)
     A = np.array([step[0] for step in cycle])
     predicted = np.vstack([np.zeros(whole.shape[1]), np.einsum("kij,kj->ki", A[phase], whole)[:-1]])

@@ -108,7 +108,7 @@ def test_the_predictor_form_is_one_step_behind(case: tuple[Scenario, Record]) ->
         x = A @ x + B * record.u[k, 0] + K * (record.y_lgs[k, 0] - C @ x)
         printed[k + 1] = x[0], x[2]
     filtered = steady_filter(model, 0.02 / np.sqrt(2), model.pairs)[0]
-    states = filtered.run(record.z[:, None, 0, None])[:, :, 0]
+    states = filtered.run(record.z[:, [0]])
     assert np.abs(states @ A[:4, :4].T[:, [0, 2]] - printed[1:]).max() < 1e-10
     assert np.trace(steady.posterior) < np.trace(steady.P)
 

@@ -217,7 +217,7 @@ def kalman_record(sizes: Sizes) -> Iterator[Row]:
         sizes,
         "kalman-record",
         problem,
-        lambda: ours.run(pseudo_open_loop(y, u)[:, None, None])[:, :, 0],
+        lambda: ours.run(pseudo_open_loop(y, u)[:, None]),
         textbook.kalman_loop,
         loop,
     )

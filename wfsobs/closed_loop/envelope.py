@@ -8,7 +8,6 @@ controllers are simulated, at fewer points.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import product
 from math import ceil, inf, log2
@@ -32,6 +31,7 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError, error_line
+from wfsobs.signal.joint_states import in_two_threads
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, true_spectra
 from wfsobs.typing import Array
@@ -46,9 +46,6 @@ BINS = 16
 
 AT_ONCE = 2**21
 """Numbers in the largest array of a block of plants."""
-
-BOTH = 2
-"""Blocks at work at the same time; numpy lets go of the interpreter's lock in them."""
 
 
 @dataclass(frozen=True)
@@ -462,6 +459,5 @@ def residuals(
             left = of.residual(Q, response, matrix, weights)
             return np.where(stable[:, None], np.sqrt(np.maximum(left, 0.0)), inf)
 
-        with ThreadPoolExecutor(BOTH) as pool:
-            out[:, columns] = np.concatenate(list(pool.map(one, parts)))
+        out[:, columns] = np.concatenate(in_two_threads(one, parts))
     return out

@@ -140,14 +140,13 @@ def _outcome(
         with detach_watch(watch) as alone:
             supervision, alarms = supervision_of(controller, plan.scenario), None
             if plan.true is None and supervision is None:
-                u, limited = controller.commands(laws, measured, prior, plan.plant, settings, alone)
+                u, _ = controller.commands(laws, measured, prior, plan.plant, settings, alone)
                 correction = plan.mirror.correction(u)
             else:
                 stepper = controller.assemble(laws, prior, plan.plant, settings, measured.sampling)
                 acting = stepper if supervision is None else SupervisedController(stepper, supervision)
                 true = plan.true or full_plant_of(plan.scenario)
                 u, correction = drive(acting, measured, true, _plant_generator(plan.scenario), alone)
-                limited = None
                 if isinstance(acting, SupervisedController):
                     alarms = tuple((frame * record.dt, reason) for frame, reason in acting.alarms)
     except ValueError as error:
@@ -156,7 +155,7 @@ def _outcome(
         frame = int(np.argmin(np.isfinite(correction).all(axis=1)))
         return Outcome(controller.id, tuple(False for _ in stable), note=f"the loop diverges: frame {frame}")
     start = round(plan.start / record.dt)
-    limited = plan.mirror.at_limit(u) if limited is None else limited
+    limited = plan.mirror.at_limit(u)
     residual = disturbance + correction
     return Outcome(
         controller.id,

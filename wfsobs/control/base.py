@@ -19,13 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from wfsobs.control.integrator import limited_integrator
-from wfsobs.control.mirror import Law, Mirror, Plant
-from wfsobs.control.step import KalmanLaws, MakeStepLaw, StepController, StepPredict, VibrationAhead, step_law, take_missing
+from wfsobs.control.mirror import Law, Plant
+from wfsobs.control.step import MakeStepLaw, StepController, StepLaw, StepPredict, VibrationAhead, step_law, take_missing
 from wfsobs.observers.base import NOT_TUNED, NOTHING, PLAIN, Look, Tunable, check_look
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
-from wfsobs.observers.step import StepError, each_frame
+from wfsobs.observers.step import StepError, frames_of
 from wfsobs.prior import PARTS, TRUE, Bands, Part, Prior, PriorSource, ask_nothing, asks_for, words_for
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, Sampling, hold_last
@@ -211,8 +210,13 @@ class Controller:
             ahead = VibrationAhead(self.step_predict(prior, plant, settings, sampling), prior.bands, sampling)
         if not self._takes_missing(laws):
             beside = bridges(prior, sampling.n_modes, sampling.dt, sampling.ratio, _line_width(settings))
-        own = self.step_law(prior, plant, settings, sampling) if self.step_law else step_law(laws, plant.mirror)
+        own = self._step_law(laws, prior, plant, settings, sampling)
         return StepController(self.id, plant, sampling, own, ahead, self.ngs, beside, gate)
+
+    def _step_law(
+        self, laws: Sequence[Law], prior: Prior, plant: Plant, settings: Settings, sampling: Sampling
+    ) -> StepLaw | None:
+        return self.step_law(prior, plant, settings, sampling) if self.step_law else step_law(laws, plant.mirror)
 
     def commands(
         self,
@@ -230,19 +234,13 @@ class Controller:
         """
         if self.ngs and measurements.y_ngs is None:
             raise RecordError("the record has no NGS measurement")
-        if self.step_law is not None:
-            stepper = self.assemble(laws, prior, plant, settings, measurements.sampling)
-            frames = each_frame(stepper, replace(measurements, u=hold_last(measurements.u)), watch)
-            u = np.array([stepper.update_open_loop(z, ngs if self.ngs else None) for z, ngs, _ in frames])
-            return u, plant.mirror.at_limit(u)
-        takes_missing = self._takes_missing(laws)
-        if takes_missing:
+        if self._takes_missing(laws):
             measurements = replace(measurements, u=hold_last(measurements.u))
         else:
             measurements = fill_missing(measurements, prior, _line_width(settings))
         z, n = measurements.z, measurements.ratio
         forward = np.zeros_like(z)
-        if self.law is None:
+        if self.is_idle:
             return forward, forward > 0.0
         if self.predict is not None:
             assert prior.bands is not None
@@ -253,14 +251,20 @@ class Controller:
             forward = -np.where(known, ahead, 0.0)
             z = z - np.where(known, online_reference(prior.bands, z, measurements.dt), 0.0)
         lost = np.isnan(z).any() or (self.ngs and n is not None and np.isnan(measurements.z_ngs[n::n]).any())
-        if takes_missing and (lost or measurements.lgs_stars is not None):
-            wanted = KalmanLaws(laws).run(measurements, watch)
-        else:
+        if self.step_law is None and not (lost or (take_missing(laws) and measurements.lgs_stars is not None)):
             inputs = np.stack([z, np.nan_to_num(measurements.z_ngs)], axis=1) if self.ngs else z[:, None]
-            wanted = np.column_stack([law.run(inputs[:, :, mode]) for mode, law in enumerate(laws)]) + forward
-        columns = zip(laws, wanted.T, z.T, forward.T, strict=True)
-        modes = [_limit_commands(plant.mirror, *of_mode) for of_mode in columns]
-        return np.column_stack([u for u, _ in modes]), np.column_stack([u != wanted for u, wanted in modes])
+            u = np.column_stack([law.run(inputs[:, :, mode]) for mode, law in enumerate(laws)]) + forward
+            if plant.mirror.within(u):
+                return u, np.zeros(u.shape, dtype=bool)
+        own = self._step_law(laws, prior, plant, settings, measurements.sampling)
+        assert own is not None
+        u, last = np.empty_like(z), np.zeros(z.shape[1])
+        for k, frame in enumerate(frames_of(measurements, watch)):
+            own.see_stars(frame.stars)
+            wanted = own.command(z[k], frame.ngs if self.ngs else None, forward[k])
+            last = u[k] = plant.mirror.clip_commands(wanted, last)
+            own.tell(last, forward[k])
+        return u, plant.mirror.at_limit(u)
 
     def _takes_missing(self, laws: Sequence[Law]) -> bool:
         return self.step_law is not None or (self.predict is None and take_missing(laws))
@@ -268,10 +272,3 @@ class Controller:
 
 def _line_width(settings: Settings) -> float:
     return getattr(getattr(settings, "multipeak", None), "line_width", LINE_WIDTH)
-
-
-def _limit_commands(mirror: Mirror, law: Law, commands: Array, z: Array, forward: Array) -> tuple[Array, Array]:
-    """(commands that the mirror takes, commands wanted) of one mode, (n_steps,); z, forward : what they are made of."""
-    if law.gain is None or mirror.within(commands):
-        return mirror.follow(commands), commands
-    return limited_integrator(mirror, law.gain, law.leak, z, forward)

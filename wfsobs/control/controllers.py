@@ -7,28 +7,21 @@ step j is phi_vib[j+1]; the Butterworth bank on z says so at step j + 2, one ste
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, TypeVar
 
 from wfsobs import registry
 from wfsobs.control.base import Controller
 from wfsobs.control.h2 import h2_fir
 from wfsobs.control.integrator import best_gain, integrator_law
-from wfsobs.control.lqg import (
-    lqg_kf_adaptive,
-    lqg_kf_lgs,
-    lqg_kf_multi,
-    lqg_multirate,
-    lqg_multirate_adaptive,
-    lqg_multirate_multi,
-    lqg_multirate_optimal,
-)
+from wfsobs.control.lqg import lqg, lqg_adaptive
 from wfsobs.control.mirror import Law, Plant
 from wfsobs.observers.base import VIBRATION, Look, Tunable
 from wfsobs.observers.gpr.offline import OfflineEstimator, OfflineGpr, trained_estimator
 from wfsobs.observers.gpr.online import OnlineEstimator, OnlineGpr, learning_estimator
-from wfsobs.observers.kalman.adaptive import KF_ADAPTIVE, MULTIRATE_ADAPTIVE
-from wfsobs.observers.kalman.multirate import TUNABLE, matched_noise
-from wfsobs.observers.kalman.single import MODEL
+from wfsobs.observers.kalman.adaptive import KF_ADAPTIVE, MULTIRATE_ADAPTIVE, kf_adaptive, multirate_adaptive
+from wfsobs.observers.kalman.multirate import TUNABLE, matched_noise, multirate_mode, optimal_mode, optimal_mode_of_peaks
+from wfsobs.observers.kalman.single import MODEL, every_peak_filter, one_peak_filter
 from wfsobs.observers.kalman.window_model import window_lengths
 from wfsobs.prior import (
     Bands,
@@ -165,7 +158,7 @@ CONTROLLERS = Registry(
         Controller(
             "lqg-kf-lgs",
             "LQG, LGS KF",
-            lqg_kf_lgs,
+            partial(lqg, one_peak_filter, ""),
             help="minus what the LGS Kalman filter predicts",
             prior=(LgsModel, LgsStars),
             settings=("control",),
@@ -175,7 +168,7 @@ CONTROLLERS = Registry(
         Controller(
             "lqg-kf-multi",
             "LQG, multi-peak KF",
-            lqg_kf_multi,
+            partial(lqg, every_peak_filter, "multipeak"),
             help="minus what the Kalman filter of every peak predicts",
             prior=(Lines, LgsStars),
             settings=("control", "multipeak"),
@@ -195,7 +188,7 @@ CONTROLLERS = Registry(
         Controller(
             "lqg-multirate",
             "LQG, multi-rate KF",
-            lqg_multirate,
+            partial(lqg, multirate_mode, "multirate"),
             help="minus what the paper's multi-rate filter predicts",
             prior=(NoiselessModel, LgsStars),
             asks=_matched_noise,
@@ -207,7 +200,7 @@ CONTROLLERS = Registry(
         Controller(
             "lqg-multirate-optimal",
             "LQG, optimal multi-rate KF",
-            lqg_multirate_optimal,
+            partial(lqg, optimal_mode, "multirate"),
             help="minus what the optimal multi-rate filter predicts",
             prior=(NoiselessModel, LgsError, LgsStars),
             asks=_matched_noise,
@@ -219,7 +212,7 @@ CONTROLLERS = Registry(
         Controller(
             "lqg-multirate-multi",
             "LQG, multi-rate multi-peak KF",
-            lqg_multirate_multi,
+            partial(lqg, optimal_mode_of_peaks, "multipeak"),
             help="minus what the optimal multi-rate filter of every peak predicts",
             prior=(Noise, LgsStars, Lines, Beams),
             settings=("control", "multipeak"),
@@ -230,7 +223,7 @@ CONTROLLERS = Registry(
         Controller(
             "lqg-kf-adaptive",
             "LQG, adaptive KF",
-            step_law=lqg_kf_adaptive,
+            step_law=partial(lqg_adaptive, kf_adaptive),
             help="minus what a filter predicts whose model is identified anew as the loop runs; at first an integrator",
             settings=("control", "adaptive"),
             weight=20.0,
@@ -242,7 +235,7 @@ CONTROLLERS = Registry(
         Controller(
             "lqg-multirate-adaptive",
             "LQG, adaptive multi-rate KF",
-            step_law=lqg_multirate_adaptive,
+            step_law=partial(lqg_adaptive, multirate_adaptive),
             help="the same with a filter of both sensors",
             settings=("control", "adaptive"),
             ngs=True,

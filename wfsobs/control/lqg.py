@@ -21,10 +21,8 @@ from wfsobs.control.integrator import integrator_law
 from wfsobs.control.mirror import Law, Mirror, Plant
 from wfsobs.control.step import Integrators, PredictionLaws
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.kalman.adaptive import AdaptiveEstimator, kf_adaptive, multirate_adaptive
-from wfsobs.observers.kalman.mode_filter import ModeFilter
-from wfsobs.observers.kalman.multirate import every_peak_model, multirate_mode, optimal_model
-from wfsobs.observers.kalman.single import every_peak_filter, one_peak_filter
+from wfsobs.observers.kalman.step import MakeFilter
+from wfsobs.observers.step import MakeEstimator
 from wfsobs.prior import Noise, Prior
 from wfsobs.record import Sampling
 from wfsobs.typing import Array
@@ -56,51 +54,15 @@ def _with_caution(prior: Prior, settings: Any) -> Prior:
     )
 
 
-def lqg_kf_lgs(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
-    """With the model of the LGS Kalman filter: turbulence and one vibration peak."""
-    return _law(one_peak_filter(_with_caution(prior, settings), mode), plant.mirror)
+def lqg(make: MakeFilter, group: str, prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
+    """Return the law that commands against what a filter predicts; group : its settings, "" for none. Raises ValueError."""
+    one = make(getattr(settings, group, None), _with_caution(prior, settings), mode, plant.ratio)
+    row = command_rows(one.cycle[0][0], one.rows(TARGETS).sum(axis=0), plant.mirror)
+    return Law(one.gains.recursion(row), gains=one.gains, row=row[0], filter=one)
 
 
-def lqg_kf_multi(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
-    """With every peak of the vibration in the model."""
-    return _law(every_peak_filter(_with_caution(prior, settings), mode, settings.multipeak), plant.mirror)
-
-
-def lqg_multirate(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
-    """With the paper's multi-rate filter. Raises UnstableCycle."""
-    return _law(multirate_mode(settings.multirate, _with_caution(prior, settings), mode, plant.ratio), plant.mirror)
-
-
-def lqg_multirate_optimal(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
-    """With the optimal multi-rate filter."""
-    prior = _with_caution(prior, settings)
-    return _law(optimal_model(settings.multirate, prior, mode, plant.ratio).filter_of(prior, mode), plant.mirror)
-
-
-def lqg_multirate_multi(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
-    """With the optimal multi-rate filter and every peak of the vibration in its model."""
-    prior = _with_caution(prior, settings)
-    cycle = every_peak_model(settings.multipeak, prior, mode, plant.ratio)
-    return _law(cycle.filter_of(prior, mode), plant.mirror)
-
-
-def _law(mode_filter: ModeFilter, mirror: Mirror) -> Law:
-    """Return the law that commands against what a filter predicts. Raises RiccatiError."""
-    row = command_rows(mode_filter.cycle[0][0], mode_filter.rows(TARGETS).sum(axis=0), mirror)
-    law = mode_filter.gains.recursion(row)
-    return Law(law.cycle, first=law.first, gains=mode_filter.gains, row=row[0], filter=mode_filter)
-
-
-def lqg_kf_adaptive(prior: Prior, plant: Plant, settings: Any, sampling: Sampling) -> PredictionLaws:
-    """With the adaptive filter of the LGS. Raises RecordError for a window of too few samples."""
-    return _adaptive(kf_adaptive(prior, settings.adaptive, sampling, 0.0), plant, settings)
-
-
-def lqg_multirate_adaptive(prior: Prior, plant: Plant, settings: Any, sampling: Sampling) -> PredictionLaws:
-    """With the adaptive filter of both sensors. Raises RecordError for a window of too few samples."""
-    return _adaptive(multirate_adaptive(prior, settings.adaptive, sampling, 0.0), plant, settings)
-
-
-def _adaptive(estimator: AdaptiveEstimator, plant: Plant, settings: Any) -> PredictionLaws:
+def lqg_adaptive(make: MakeEstimator, prior: Prior, plant: Plant, settings: Any, sampling: Sampling) -> PredictionLaws:
+    """Return the laws of an adaptive filter, at first of integrators. Raises RecordError for a window of too few samples."""
     first = integrator_law(plant.mirror, settings.control.fallback_gain, settings.control.leak)
-    return PredictionLaws(estimator, Integrators([first] * estimator.sampling.n_modes, plant.mirror), plant.mirror)
+    integrators = Integrators([first] * sampling.n_modes, plant.mirror)
+    return PredictionLaws(make(prior, settings.adaptive, sampling, 0.0), integrators, plant.mirror)

@@ -21,12 +21,12 @@ from dataclasses import dataclass
 from math import inf
 
 import numpy as np
-from scipy.linalg import schur
 from scipy.signal import lfilter
 
 from wfsobs.observers.kalman.mode_filter import ModeFilter
 from wfsobs.observers.stepping import GainCycle
-from wfsobs.signal.periodic import FilterStep, PeriodicFilter, Recursion
+from wfsobs.signal.joint_states import StateFilter
+from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
 
@@ -63,33 +63,18 @@ class Mirror:
         """P, from a command to the measurement, at omega [rad per step]; same shape."""
         return np.exp(-1j * np.multiply.outer(omega, np.arange(self.taps.size))) @ self.taps
 
-    def clip_command(self, command: float, last: float) -> float:
-        """Return the command nearest to `command` within the limits after `last` [um]."""
-        near = min(max(command, last - self.slew), last + self.slew)
-        return min(max(near, -self.stroke), self.stroke)
-
     def clip_commands(self, u: Array, last: Array) -> Array:
         """Return the commands of all modes nearest to u (n_modes,) within the limits after `last` [um]."""
         return np.clip(np.clip(u, last - self.slew, last + self.slew), -self.stroke, self.stroke) if self.has_limits else u
 
     def within(self, u: Array) -> bool:
-        """Whether commands u (n_steps,) [um], from rest, keep the limits."""
-        return bool(np.abs(u).max() <= self.stroke and np.abs(np.diff(u, prepend=0.0)).max() <= self.slew)
+        """Whether commands u (n_steps, ...) [um], from rest, keep the limits."""
+        return bool(np.abs(u).max() <= self.stroke and np.abs(np.diff(u, axis=0, prepend=0.0)).max() <= self.slew)
 
     def at_limit(self, u: Array) -> Array:
         """Whether taken commands u (n_steps, ...) [um], from rest, are at a limit; same shape."""
         near = 1.0 - 1e-12
         return (np.abs(u) >= near * self.stroke) | (np.abs(np.diff(u, axis=0, prepend=0.0)) >= near * self.slew)
-
-    def follow(self, u: Array) -> Array:
-        """Return the commands (n_steps,) [um] that the mirror takes for the wanted ones, from rest."""
-        if self.within(u):
-            return u
-        out, last = [], 0.0
-        for wanted in u.tolist():
-            last = self.clip_command(wanted, last)
-            out.append(last)
-        return np.array(out)
 
 
 @dataclass(frozen=True)
@@ -105,9 +90,8 @@ class Plant:
 class Law:
     """A linear law of one mode.
 
-    cycle : the filter from z (LGS, or LGS and NGS) to u
+    cycle : the filter from z (LGS, or LGS and NGS) to u, with a step 0 that is not one of the cycle where there is one
     gain, leak : of an integrator
-    first : step 0, where it is not one of the cycle
     gains, row : the same filter as an observer: u[k] = row x_hat[k]; None where it is not known as one
     filter : the Kalman filter that this observer is, to which a missing measurement is none; None where it is no such filter
     """
@@ -115,14 +99,13 @@ class Law:
     cycle: PeriodicFilter
     gain: float | None = None
     leak: float = 1.0
-    first: FilterStep | None = None
     gains: GainCycle | None = None
     row: Array | None = None
     filter: ModeFilter | None = None
 
     def run(self, z: Array) -> Array:
         """Return the commands (n_steps,) [um] of measurements z (n_steps, n_inputs) [um]."""
-        return Recursion(self.cycle.steps, self.first).run(z[:, : self.cycle.steps[0][1].shape[1]])[:, 0]
+        return self.cycle.run(z[:, : self.cycle.steps[0][1].shape[1]])[:, 0]
 
     @property
     def poles(self) -> Complex:
@@ -142,19 +125,4 @@ class Law:
     def response(self, omega: Array) -> Complex:
         """F = -u / z at omega (n,) [rad per step], (n,); of time-invariant laws."""
         F, G, H, J = self.cycle.steps[0]
-        return -transfer(F, G[:, 0], H[0], float(J[0, 0]), np.exp(1j * omega))
-
-
-def transfer(F: Array, G: Array, H: Array, J: float, z: Complex) -> Complex:
-    """Return H (z I - F)^-1 G + J at all z (n,) at once.
-
-    By the triangular form of F, since nearly equal poles have no well-defined eigenvectors.
-    """
-    if not len(F):
-        return np.full(z.shape, complex(J))
-    T, Q = schur(F.astype(complex), output="complex")
-    b = Q.conj().T @ G
-    x = np.empty((len(F), z.size), dtype=complex)
-    for i in reversed(range(len(F))):
-        x[i] = (b[i] + T[i, i + 1 :] @ x[i + 1 :]) / (z - T[i, i])
-    return (H @ Q) @ x + J
+        return -(H[0] @ StateFilter(F, G[:, 0]).response(omega) * np.exp(-1j * omega) + J[0, 0])

@@ -277,7 +277,7 @@ def _images_of(law: Law, omega: Array) -> tuple[Complex, Complex]:
 def _steps(law: Law) -> Sequence[FilterStep]:
     """Return the steps of a cycle, the one with the NGS frame first."""
     steps = law.cycle.steps
-    return steps if law.first is None else [steps[-1], *steps[:-1]]
+    return steps if law.cycle.first is None else [steps[-1], *steps[:-1]]
 
 
 def weigh(spectra: SensorSpectra, of: Loops) -> Weights:

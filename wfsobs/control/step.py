@@ -17,14 +17,12 @@ from wfsobs.control.mirror import Law, Mirror, Plant
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.observers.missing import Bridge
-from wfsobs.observers.step import Estimator, StepBase, StepError, check_frame, each_frame, take_state
+from wfsobs.observers.step import Estimator, StepBase, StepError, check_frame, take_state
 from wfsobs.observers.stepping import FilterBank, StateArrays, Stateful
 from wfsobs.prior import Bands, Prior
-from wfsobs.progress import Watch
-from wfsobs.record import Measurements, Sampling
+from wfsobs.record import Sampling
 from wfsobs.signal.bandpass import bandpass_bank, bank_recursion
 from wfsobs.signal.gate import GateSettings
-from wfsobs.signal.periodic import Recursion
 from wfsobs.typing import Array
 
 StepPredict = Callable[[Prior, Plant, Any, Sampling], Estimator]
@@ -66,7 +64,7 @@ class LinearLaws(StepLaw):
 
     def __init__(self, laws: Sequence[Law]):
         self.laws: tuple[Law, ...] = tuple(laws)
-        self.bank: FilterBank = FilterBank([Recursion(law.cycle.steps, law.first) for law in laws])
+        self.bank: FilterBank = FilterBank([law.cycle for law in laws])
         self._v = np.zeros((len(laws), laws[0].cycle.steps[0][1].shape[1]))
         self.mark_start()
 
@@ -109,11 +107,6 @@ class KalmanLaws(StepLaw):
         """Return the commands of the estimates."""
         self.filters.advance(z, ngs, None)
         return np.sum(self._rows * self.filters.bank.x, axis=1) + forward
-
-    def run(self, measurements: Measurements, watch: Watch) -> Array:
-        """Return the commands over a record with gaps, (n_steps, n_modes) [um]. Raises Cancelled."""
-        none = np.zeros(len(self.laws))
-        return np.array([self.command(z, ngs, none) for z, ngs, _ in each_frame(self.filters, measurements, watch)])
 
     def take_over(self, old: Any) -> None:
         """Go on where the disturbance is in the old filters' states."""

@@ -31,7 +31,6 @@ which for f = 1 is what one frame more costs (inner-outer factorisation of the m
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from math import inf, log, pi
@@ -62,7 +61,7 @@ from wfsobs.prior import Asterism, Flow, FlowOfBoth, Lines
 from wfsobs.priors_from.scenario import has_prior, prior_of
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.signal.joint_states import running_means
+from wfsobs.signal.joint_states import in_two_threads, running_means
 from wfsobs.signal.sensor_array import FastSensors, SlowSensor, SlowTarget, variance_from_frames, variance_from_sensors
 from wfsobs.signal.spectrum import rms
 from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean, degrees_of_freedom, explained_variance
@@ -488,8 +487,7 @@ def _least_of_modes(scenario: Scenario, n_modes: int, n_steps: int) -> list[dict
         rows = (*COMMON_BOUNDS, BOUND_STARS) if stars_differ(scenario, mode) else COMMON_BOUNDS
         return _least_of_mode(scenario, mode, rows, n_steps=n_steps)
 
-    with ThreadPoolExecutor(2) as pool:
-        return list(pool.map(of_mode, range(n_modes)))
+    return in_two_threads(of_mode, range(n_modes))
 
 
 def bound_scores(bounds: Sequence[Bound], record: Record, scores: Sequence[Score], warm_up: float) -> list[Score]:

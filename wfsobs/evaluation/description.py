@@ -117,10 +117,10 @@ def describe(scenario: Scenario, mode: int) -> Description:
 
     def optimal() -> PeriodicFilter:
         steps = optimal_model(own, Prior((prior,), (lgs_error_of(scenario, mode),)), 0, ratio).steps
-        return optimal_filter(steps, np.pad(model.pairs, ((0, 0), (0, len(steps[0][0]) - len(model.A)))))[0].cycle
+        return optimal_filter(steps, np.pad(model.pairs, ((0, 0), (0, len(steps[0][0]) - len(model.A)))))[0]
 
     def multirate() -> PeriodicFilter:
-        return multirate_filter(model, ratio, *multirate_noise(own, prior), model.pairs).cycle
+        return multirate_filter(model, ratio, *multirate_noise(own, prior), model.pairs)
 
     filters = {
         "kf-lgs": _facts(dt, dt, lambda: steady_filter(model, prior.lgs_noise, model.pairs)[0], ["LGS"]),

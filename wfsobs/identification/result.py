@@ -191,7 +191,7 @@ def innovations(z: Array, spectrum: Spectrum) -> Array:
         return z[settle:]
     model = disturbance_model(list(spectrum.processes[:1]), list(spectrum.processes[1:]))
     kalman, _ = steady_filter(model, max(spectrum.noise, MIN_NOISE * float(np.std(z))), (model.C @ model.A)[None])
-    predicted = kalman.run(z[:, None, None])[:, 0, 0]  # C A x_hat[k], what z[k+1] should be
+    predicted = kalman.run(z[:, None])[:, 0]  # C A x_hat[k], what z[k+1] should be
     return (z[1:] - predicted[:-1])[settle:]
 
 

@@ -132,26 +132,19 @@ def frames_of(measurements: Measurements, watch: Watch = QUIET, steps: Iterable[
         )
 
 
-def each_frame(estimator: Any, measurements: Measurements, watch: Watch) -> Iterator[tuple[Array, Array | None, Array]]:
-    """Yield z, NGS frame and u of `frames_of`.
+def run_frames(estimator: Any, targets: Sequence[str], measurements: Measurements, watch: Watch) -> Estimates:
+    """Run an estimator over a record frame by frame, for all modes at the same time.
 
     Filters that take the number of LGS, or every LGS by itself, are given these before the frame.
     """
-    see_stars, see_each = getattr(estimator, "see_stars", None), getattr(estimator, "see_each", None)
-    for z, ngs, u, stars, each in frames_of(measurements, watch):
-        if stars is not None and see_stars is not None:
-            see_stars(stars)
-        if each is not None and see_each is not None:
-            see_each(each)
-        yield z, ngs, u
-
-
-def run_frames(estimator: Any, targets: Sequence[str], measurements: Measurements, watch: Watch) -> Estimates:
-    """Run an estimator over a record frame by frame, for all modes at the same time."""
     values, sd = [], []
-    estimate = getattr(estimator, "estimate", None)
-    for frame in each_frame(estimator, measurements, watch):
-        estimator.advance(*frame)
+    see_stars, see_each, estimate = (getattr(estimator, name, None) for name in ("see_stars", "see_each", "estimate"))
+    for frame in frames_of(measurements, watch):
+        if frame.stars is not None and see_stars is not None:
+            see_stars(frame.stars)
+        if frame.each is not None and see_each is not None:
+            see_each(frame.each)
+        estimator.advance(frame.z, frame.ngs, frame.u)
         now, spread = estimate() if estimate else np.array([estimator.predict(0.0, one) for one in targets]).swapaxes(0, 1)
         values.append(now)
         sd.append(spread)

@@ -13,12 +13,12 @@ A Kalman filter is kept in the state after the measurement, which holds every pr
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from wfsobs.signal.periodic import FilterStep, PeriodicFilter, Recursion
+from wfsobs.signal.periodic import FilterStep, PeriodicFilter
 from wfsobs.typing import Array
 
 Saved = dict[str, Array]
@@ -155,13 +155,13 @@ class GainCycle:
 
     def filter(self, outputs: Array) -> PeriodicFilter:
         """Return the filter of the steps that repeat, with these outputs (p, n) of x_hat[k]."""
-        return self.recursion(outputs).cycle
+        return PeriodicFilter([step.filter_step(outputs) for step in self.steps])
 
-    def recursion(self, outputs: Array) -> Recursion:
+    def recursion(self, outputs: Array) -> PeriodicFilter:
         """Return the filter with these outputs (p, n) of x_hat[k]."""
-        return Recursion([step.filter_step(outputs) for step in self.steps], self.first and self.first.filter_step(outputs))
+        return replace(self.filter(outputs), first=self.first and self.first.filter_step(outputs))
 
-    def estimator(self) -> Recursion:
+    def estimator(self) -> PeriodicFilter:
         """Return the recursion of x_hat, which is its state after a step; it has no outputs of its own."""
         n, m = self.steps[0].L.shape
         nothing = np.zeros((0, n)), np.zeros((0, m))
@@ -170,7 +170,7 @@ class GainCycle:
             for step, before in zip(self.steps, [self.steps[-1], *self.steps[:-1]], strict=True)
         ]
         first = None if self.first is None else (np.zeros((n, n)), self.first.L, *nothing)
-        return Recursion(maps, first)
+        return PeriodicFilter(maps, first)
 
 
 class FilterBank:
@@ -193,7 +193,7 @@ class FilterBank:
     x: Array
     v: Array
 
-    def __init__(self, modes: Sequence[Recursion]):
+    def __init__(self, modes: Sequence[PeriodicFilter]):
         first = modes[0].first is not None
         cycles = [[*([] if mode.first is None else [mode.first]), *mode.steps] for mode in modes]
         n = max(steps[0][0].shape[0] for steps in cycles)

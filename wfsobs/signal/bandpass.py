@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.signal import butter, sosfilt
 
-from wfsobs.signal.periodic import Recursion
+from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.typing import Array
 
 
@@ -59,12 +59,12 @@ def filter_zero_phase(bank: Sequence[Array], x: Array) -> Array:
     return out
 
 
-def bank_recursion(bank: Sequence[Array]) -> Recursion:
+def bank_recursion(bank: Sequence[Array]) -> PeriodicFilter:
     """Return `filter_causal` of one signal as a recursion."""
     systems = [sos2ss(sos) for sos in bank]
     A = block_diag(*(A for A, *_ in systems))
     b, c = (np.concatenate([system[i] for system in systems]) for i in (1, 2))
-    return Recursion([(A, b[:, None], c[None], np.array([[sum(d for *_, d in systems)]]))])
+    return PeriodicFilter([(A, b[:, None], c[None], np.array([[sum(d for *_, d in systems)]]))])
 
 
 def sos2ss(sos: Array) -> tuple[Array, Array, Array, float]:

@@ -126,7 +126,7 @@ def test_one_hypothesis_is_the_kalman_filter_and_so_are_equal_ones() -> None:
     z = rng.standard_normal(4000).cumsum() * 0.005
     own = model.disturbance()
     steady, states = steady_filter(own, model.lgs_noise)
-    expected = steady.run(z[:, None, None])[:, :, 0]
+    expected = steady.run(z[:, None])
     one = to_pairs(own)
     rows = one.output_rows(TARGETS)
     single = run_mixture(z, [one], model.lgs_noise, 1.0, rows)

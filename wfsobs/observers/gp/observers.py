@@ -22,13 +22,12 @@ from scipy.linalg import block_diag
 
 from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
 from wfsobs.observers.gp.kernels import Kernel, Matern, Poles, Sho, SquaredExponentialInTime, Sum
-from wfsobs.observers.kalman.mode_filter import lgs_mean
-from wfsobs.observers.kalman.multirate import Cycle, MultiRate, optimal_filters, optimal_model
+from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean
+from wfsobs.observers.kalman.multirate import MultiRate, optimal_model
 from wfsobs.observers.kalman.single import NGS, steady_mode
-from wfsobs.observers.kalman.step import KalmanEstimator
+from wfsobs.observers.kalman.step import kalman_filters
 from wfsobs.observers.missing import LINE_WIDTH
 from wfsobs.prior import LgsError, LgsStars, Lines, Noise, Prior
-from wfsobs.record import Sampling
 from wfsobs.settings import Group, Real, Section
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
@@ -118,20 +117,19 @@ def measured_late(model: DisturbanceModel) -> DisturbanceModel:
     return DisturbanceModel(A, np.eye(n + 1)[-1], block_diag(model.Q, [[0.0]]), outputs, np.pad(model.pairs, ((0, 0), (0, 1))))
 
 
-def gp_lgs(prior: Prior, settings: GaussianProcess, _sampling: Sampling, _horizon: float) -> KalmanEstimator:
-    """Return the regressions of all modes on the LGS measurement, at every fast step."""
-    models = [sampled_model(kernels_of(lines, settings), lines.dt) for lines in prior.lines]
-    found = enumerate(zip(models, prior.lines, strict=True))
-    return KalmanEstimator(
-        [steady_mode(model, lines.noise, lgs_mean(prior, mode), measured_late(model)) for mode, (model, lines) in found]
-    )
-
-
-def cycle_of(settings: GaussianProcess, prior: Prior, mode: int, ratio: int) -> Cycle:
-    """Return the cycle of one mode on both sensors."""
+def on_lgs(settings: GaussianProcess, prior: Prior, mode: int, _ratio: int | None) -> ModeFilter:
+    """Return the regression of a mode on the LGS measurement, at every fast step."""
     lines = prior.lines[mode]
     model = sampled_model(kernels_of(lines, settings), lines.dt)
-    return optimal_model(MultiRate(), prior, mode, ratio, measured_late(model))._replace(model=model)
+    return steady_mode(model, lines.noise, lgs_mean(prior, mode), measured_late(model))
+
+
+def on_both(settings: GaussianProcess, prior: Prior, mode: int, ratio: int) -> ModeFilter:
+    """Return the regression of a mode on both sensors."""
+    lines = prior.lines[mode]
+    model = sampled_model(kernels_of(lines, settings), lines.dt)
+    cycle = optimal_model(MultiRate(), prior, mode, ratio, measured_late(model))
+    return cycle._replace(model=model).filter_of(prior, mode)
 
 
 GP_LGS = Observer(
@@ -146,7 +144,7 @@ GP_LGS = Observer(
     takes_missing=True,
     tunable=Tunable(("gp.background_rms", "gp.background_scale"), ("kalman.lgs_noise", "kalman.turbulence_rms")),
     look=Look("GP in time", "#478B83", "#8EFAF0", (6, 2, 2, 2)),
-    step=gp_lgs,
+    step=partial(kalman_filters, on_lgs),
 )
 
 GP_BOTH = Observer(
@@ -163,5 +161,5 @@ GP_BOTH = Observer(
     sensors=("lgs", "ngs"),
     tunable=Tunable(("gp.background_rms", "gp.background_scale"), ("kalman.lgs_noise", "kalman.ngs_noise")),
     look=Look("GP, both", "#55A17F", "#03E49C", (6, 2, 2, 2, 2, 2)),
-    step=partial(optimal_filters, cycle_of),
+    step=partial(kalman_filters, on_both),
 )

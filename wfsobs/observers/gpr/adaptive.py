@@ -56,7 +56,7 @@ from wfsobs.observers.stepping import FilterBank, SampleHistory, Saved
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, RecordError, Sampling
-from wfsobs.signal.periodic import FilterStep, PeriodicFilter, Recursion
+from wfsobs.signal.periodic import FilterStep, PeriodicFilter
 from wfsobs.signal.riccati import lyapunov, steady_state
 from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
 from wfsobs.spectral.model import Spectrum
@@ -80,8 +80,8 @@ class Smoother(NamedTuple):
 
     def run(self, z: Array) -> Array:
         """Return the target at every step of z (n,), given all of z, (n,)."""
-        expected, target = self.forward.run(z[:, None, None])[:, :, 0].T
-        return target + self.backward.run((z - expected)[::-1, None, None])[::-1, 0, 0]
+        expected, target = self.forward.run(z[:, None]).T
+        return target + self.backward.run((z - expected)[::-1, None])[::-1, 0]
 
 
 def smoother(model: DisturbanceModel, target: str, noise: float) -> Smoother:
@@ -150,7 +150,7 @@ def learn(z: Array, dt: float, depth: int, most: int, lowest: float, last: Learn
             if not lines.resonances:
                 return Learnt(fit, mean, np.zeros(depth), float(np.sqrt(missed)))
             target = smoother(disturbance_model(lines.continuum, lines.resonances), VIBRATION, max(lines.noise, MIN_NOISE))
-            x = PeriodicFilter([whitener_of(fit)]).run(z[:, None, None])[:, 0, 0]
+            x = PeriodicFilter([whitener_of(fit)]).run(z[:, None])[:, 0]
             first = SETTLED * depth
             found = fit_bands(x, target.run(z)[first + horizon :], first, weight_covariance(lines, depth))
             sd = np.sqrt(target.variance + found.noise**2 + found.spread**2 + missed)
@@ -295,7 +295,7 @@ class AdaptiveGprEstimator(HeldEstimate):
             raise StepError(f"gpr-adaptive: {horizon} frames ahead: takes less than an eighth of adaptive.window")
         n = sampling.n_modes
         none = np.zeros((ORDER, ORDER)), np.zeros((ORDER, 1)), np.zeros((1, ORDER)), np.zeros((1, 1))
-        self._filters = FilterBank([Recursion([none])] * n)  # the whiteners
+        self._filters = FilterBank([PeriodicFilter([none])] * n)  # the whiteners
         self._samples, self._recent = SampleHistory(n, self.schedule.longest), SampleHistory(n, self.schedule.depth)  # whitened
         self._weights, self._means, self._sds = np.zeros((n, self.schedule.depth)), np.zeros(n), np.zeros(n)
         self.count, self._pending = 0, False
@@ -359,7 +359,7 @@ class AdaptiveGprEstimator(HeldEstimate):
         """Take the whitener of a mode through its window z (n,) from rest; return its last outputs, (depth,)."""
         F, G, H, J = self.learnt[mode].whitener
         whitener = PeriodicFilter([(F, G, np.vstack([H, F]), np.vstack([J, G]))])
-        out = whitener.run(z[:, None, None], since=len(z) - self.schedule.depth)[:, :, 0]
+        out = whitener.run(z[:, None], since=len(z) - self.schedule.depth)
         self._filters.x[mode] = 0.0
         self._filters.x[mode, : len(F)] = out[-1, 1:]
         return out[:, 0]

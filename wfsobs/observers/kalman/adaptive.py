@@ -145,8 +145,7 @@ class ModeWindow:
         gains, tail = kalman.modes[0].gains, v[len(v) - min(TAIL // self._frame * self._frame, len(whole) - self._frame) :]
         lost = bool(np.isnan(tail).any())
         since = len(whole) - 1 - lost * len(tail)
-        states = gains.filter(np.eye(len(gains.steps[0].A))).run((whole - self.means)[: since + 1, :, None], since=since)
-        kalman.bank.x[0] = states[0, :, 0]
+        (kalman.bank.x[0],) = gains.filter(np.eye(len(gains.steps[0].A))).run((whole - self.means)[: since + 1], since=since)
         for row in tail - self.means if lost else ():
             kalman.advance(row[:1], row[1:], None)
 
@@ -200,7 +199,7 @@ class ModeWindow:
         assert one is not None
         A, C, _, _ = one.cycle[0]
         rows, moved = one.rows(TARGETS), v - self.means
-        found = one.gains.filter(np.vstack([rows, C[0] @ A])).run(moved[:, :, None], since=size - 1)[:, :, 0]
+        found = one.gains.filter(np.vstack([rows, C[0] @ A])).run(moved, since=size - 1)
         phase = np.arange(size - 1, len(v)) % len(one.cycle)
         surprise = (moved[size:, 0] - found[:-1, 2]) ** 2 / np.array(one.innovation_variances())[phase[1:]]
         sums = np.vstack([rows, rows.sum(axis=0)])

@@ -32,7 +32,7 @@ from scipy.linalg import block_diag
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Look, Observer
 from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimates, by_name
 from wfsobs.observers.kalman.mode_filter import ModeFilter
-from wfsobs.observers.kalman.single import NGS, PEAKS, TUNABLE_PEAKS, MultiPeak, independent_filters, steady_mode, vibration_used
+from wfsobs.observers.kalman.single import NGS, PEAKS, TUNABLE_PEAKS, MultiPeak, every_peak_filter, steady_mode, vibration_used
 from wfsobs.observers.kalman.step import carry_state, matrix_power
 from wfsobs.observers.step import Estimator, StepError, run_frames
 from wfsobs.prior import Asterism, FlowOfBoth, Lines, Prior
@@ -120,7 +120,8 @@ class AsterismModel:
         self._again = partial(AsterismModel, prior, settings, ratio, means, frame_means)
         self.basis, self.ratio, self._asterism = asterism.basis, asterism.ratio, asterism
         self._age, self._steps = age, range(age, age + asterism.ratio)
-        self.fast: list[Beginning] = [begin_with_means(one, means) for one in independent_filters(prior, settings)]
+        independent = (every_peak_filter(settings, prior, mode) for mode in range(len(prior.lines)))
+        self.fast: list[Beginning] = [begin_with_means(one, means) for one in independent]
         self._peaks = line_models(prior, settings)
         self.has_frames: bool = len(asterism.measurement) > self.n_stars
         if self.has_frames:
@@ -534,7 +535,7 @@ def _outputs(one: Beginning, y: Array, weights: Array, *, since: int = 0) -> Arr
         return np.empty((0, weights.shape[1]))
     F, G = one.filter.F, one.filter.G[:, None]
     steps = [(F, G, W @ F, W @ G) for W in weights]
-    return PeriodicFilter(steps).run(y[:, None, None], one.first[:, None] * y[0], since=since)[:, :, 0]
+    return PeriodicFilter(steps).run(y[:, None], one.first * y[0], since=since)
 
 
 class AsterismEstimator(JointEstimator):

@@ -23,11 +23,11 @@ independent processes: in both, in the target's alone, in that of the LGS alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import param
@@ -35,16 +35,15 @@ import param
 from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
 from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean
 from wfsobs.observers.kalman.single import MODEL, NGS, PEAKS, MultiPeak, vibration_used
-from wfsobs.observers.kalman.step import KalmanEstimator
+from wfsobs.observers.kalman.step import kalman_filters
 from wfsobs.observers.stepping import Gain, GainCycle
 from wfsobs.prior import Beams, LgsError, LgsStars, Lines, Model, Noise, NoiselessModel, Part, Prior
-from wfsobs.record import Sampling
 from wfsobs.settings import Group, Real, Section
 from wfsobs.settings.group import UsedWhen
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.gap_gains import ONE, SensorMean
-from wfsobs.signal.periodic import Recursion
+from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.riccati import SteadyState, Step, periodic_steady_state, posteriors_of_gains, steady_state
 from wfsobs.signal.statespace import DisturbanceModel, blocks_along_diagonal, disturbance_model
 from wfsobs.typing import Array
@@ -126,7 +125,7 @@ def multirate_gains(model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_n
 
 def multirate_filter(
     model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float, outputs: Array | None = None
-) -> Recursion:
+) -> PeriodicFilter:
     """Return the filter of `multirate_gains`, whose step 0 has no NGS frame; its cycle begins at k = 1, the frame last.
 
     outputs : rows of the state x_hat[k] to return, (p, n); every target by default. Raises UnstableCycle.
@@ -136,7 +135,7 @@ def multirate_filter(
 
 
 def multirate_mode(settings: MultiRate, prior: Prior, mode: int, ratio: int) -> ModeFilter:
-    """Return the filter of a mode; near gaps it has more gains than two: those of the covariance as it is there.
+    """Return the paper's filter of a mode; near gaps it has more gains than two: those of the covariance as it is there.
 
     Raises UnstableCycle.
     """
@@ -153,12 +152,6 @@ def noise_used(prior: Prior, settings: MultiRate) -> list[tuple[float, float]]:
     return [multirate_noise(settings, prior.noise_of(mode)) for mode in range(len(prior.model))]
 
 
-def multirate(prior: Prior, settings: MultiRate, sampling: Sampling, _horizon: float) -> KalmanEstimator:
-    """Return the paper's multi-rate filters of all modes, for turbulence."""
-    assert sampling.ratio is not None
-    return KalmanEstimator([multirate_mode(settings, prior, mode, sampling.ratio) for mode in range(len(prior.model))])
-
-
 MULTIRATE = Observer(
     "multirate",
     "Multi-rate KF",
@@ -173,7 +166,7 @@ MULTIRATE = Observer(
     sensors=("lgs", "ngs"),
     tunable=TUNABLE,
     look=Look("Multi-rate KF", "#E31FFF", "#7E75C8", (10, 2, 2, 2)),
-    step=multirate,
+    step=partial(kalman_filters, multirate_mode),
     counts=noise_used,
 )
 
@@ -219,7 +212,7 @@ def optimal_gains(cycle: list[Step]) -> tuple[GainCycle, list[SteadyState]]:
     return GainCycle(steps, Gain(A, alone, L)), states
 
 
-def optimal_filter(cycle: list[Step], outputs: Array) -> tuple[Recursion, list[SteadyState]]:
+def optimal_filter(cycle: list[Step], outputs: Array) -> tuple[PeriodicFilter, list[SteadyState]]:
     """Return the filter of `optimal_gains` and the covariances; outputs (p, n_states) rows of the state."""
     gains, states = optimal_gains(cycle)
     return gains.recursion(outputs), states
@@ -260,13 +253,9 @@ def estimated_cycle(
     return Cycle(optimal_cycle(model, ratio, lgs_noise, ngs_noise, lgs_error), model, bool(lgs_error))
 
 
-def optimal_filters(
-    cycle_of: Callable[[Any, Prior, int, int], Cycle], prior: Prior, settings: Any, sampling: Sampling, _horizon: float
-) -> KalmanEstimator:
-    """Return the optimal filters of all modes; cycle_of : (settings, prior, mode, ratio) -> the cycle of that mode."""
-    assert sampling.ratio is not None
-    found = [cycle_of(settings, prior, mode, sampling.ratio) for mode in range(sampling.n_modes)]
-    return KalmanEstimator([one.filter_of(prior, mode) for mode, one in enumerate(found)])
+def optimal_mode(settings: MultiRate, prior: Prior, mode: int, ratio: int) -> ModeFilter:
+    """Return the optimal filter of a mode with one peak."""
+    return optimal_model(settings, prior, mode, ratio).filter_of(prior, mode)
 
 
 MULTIRATE_OPTIMAL = Observer(
@@ -283,7 +272,7 @@ MULTIRATE_OPTIMAL = Observer(
     sensors=("lgs", "ngs"),
     tunable=TUNABLE,
     look=Look("Opt. multi-rate", "#5718C1", "#B848F9", (3, 2)),
-    step=partial(optimal_filters, optimal_model),
+    step=partial(kalman_filters, optimal_mode),
 )
 
 
@@ -292,6 +281,11 @@ def every_peak_model(peaks: MultiPeak, prior: Prior, mode: int, ratio: int) -> C
     beams, noise = prior.beams[mode], prior.noise_of(mode)
     model = beam_model(beams, prior.lines[mode].vibration(peaks.line_width))
     return estimated_cycle(model, ratio, noise.lgs_noise, noise.ngs_noise, beams.lgs)
+
+
+def optimal_mode_of_peaks(peaks: MultiPeak, prior: Prior, mode: int, ratio: int) -> ModeFilter:
+    """Return the optimal filter of a mode with every peak."""
+    return every_peak_model(peaks, prior, mode, ratio).filter_of(prior, mode)
 
 
 def beam_model(beams: Beams, vibration: Sequence[Ar2]) -> DisturbanceModel:
@@ -319,6 +313,6 @@ MULTIRATE_MULTI = Observer(
         ("multipeak.turbulence_order", "kalman.turbulence_rms"),
     ),
     look=Look("Multi-rate multi-peak", "#AB64CF", "#F26FF3", (16, 3, 3, 3)),
-    step=partial(optimal_filters, every_peak_model),
+    step=partial(kalman_filters, optimal_mode_of_peaks),
     counts=vibration_used,
 )

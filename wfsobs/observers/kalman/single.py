@@ -19,7 +19,7 @@ import numpy as np
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
 from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean
-from wfsobs.observers.kalman.step import FrameErrors, FrameEstimator, KalmanEstimator
+from wfsobs.observers.kalman.step import FrameErrors, FrameEstimator, kalman_filters
 from wfsobs.observers.stepping import Gain, GainCycle
 from wfsobs.prior import LgsModel, LgsStars, Lines, Model, NgsModel, Prior
 from wfsobs.record import Sampling
@@ -62,13 +62,8 @@ def steady_filter(model: DisturbanceModel, noise: float, outputs: Array | None =
     return gains.filter(model.output_rows(TARGETS) if outputs is None else outputs), steady
 
 
-def kf_lgs(prior: Prior, _settings: None, _sampling: Sampling, _horizon: float) -> KalmanEstimator:
-    """Return the Kalman filters of all modes on the LGS measurement, at every fast step."""
-    return KalmanEstimator([one_peak_filter(prior, mode) for mode in range(len(prior.model))])
-
-
-def one_peak_filter(prior: Prior, mode: int) -> ModeFilter:
-    """Return the steady-state filter of a mode with one peak."""
+def one_peak_filter(_settings: None, prior: Prior, mode: int, _ratio: int | None) -> ModeFilter:
+    """Return the Kalman filter of a mode on the LGS measurement, at every fast step, with one peak."""
     one = prior.model[mode]
     return steady_mode(one.disturbance(), one.lgs_noise, lgs_mean(prior, mode))
 
@@ -146,7 +141,7 @@ KF_LGS = Observer(
     # The gain depends on the ratios of turbulence, vibration and noise. Turbulence tuned for vibration would be no turbulence.
     tunable=Tunable((*MODEL[:2], "kalman.vibration_rms"), ("kalman.turbulence_rms", "kalman.lgs_noise")),
     look=Look("LGS KF", "#FF6600", "#FF8533"),
-    step=kf_lgs,
+    step=partial(kalman_filters, one_peak_filter),
 )
 
 KF_NGS = Observer(
@@ -185,13 +180,8 @@ class MultiPeak(Group):
     )
 
 
-def independent_filters(prior: Prior, settings: MultiPeak) -> list[ModeFilter]:
-    """Return the steady-state filters of all modes, each of its own."""
-    return [every_peak_filter(prior, mode, settings) for mode in range(len(prior.lines))]
-
-
-def every_peak_filter(prior: Prior, mode: int, settings: MultiPeak) -> ModeFilter:
-    """Return the steady-state filter of a mode with every peak."""
+def every_peak_filter(settings: MultiPeak, prior: Prior, mode: int, _ratio: int | None = None) -> ModeFilter:
+    """Return the Kalman filter of a mode on the LGS measurement, at every fast step, with every peak."""
     one = prior.lines[mode]
     return steady_mode(one.disturbance(settings.line_width), one.noise, lgs_mean(prior, mode))
 
@@ -199,11 +189,6 @@ def every_peak_filter(prior: Prior, mode: int, settings: MultiPeak) -> ModeFilte
 def vibration_used(prior: Prior, settings: MultiPeak) -> list[list[Ar2]]:
     """Return the vibration of every mode as it is modelled: a minimum below the width of every line is none."""
     return [one.vibration(settings.line_width) for one in prior.lines]
-
-
-def kf_multi(prior: Prior, settings: MultiPeak, _sampling: Sampling, _horizon: float) -> KalmanEstimator:
-    """Return the Kalman filters of all modes with every peak, on the LGS measurement at every fast step."""
-    return KalmanEstimator(independent_filters(prior, settings))
 
 
 PEAKS = Section("multipeak", "Multi-peak Kalman filter", MultiPeak)
@@ -219,6 +204,6 @@ KF_MULTI = Observer(
     takes_missing=True,
     tunable=TUNABLE_PEAKS,
     look=Look("Multi-peak", "#AE7D40", "#BA6A26", (14, 3)),
-    step=kf_multi,
+    step=partial(kalman_filters, every_peak_filter),
     counts=vibration_used,
 )

@@ -20,8 +20,9 @@ from wfsobs.observers.estimates import TARGETS, Estimates, by_name
 from wfsobs.observers.kalman.mode_filter import ModeFilter, StatedErrors
 from wfsobs.observers.step import Estimator, StepError, run_frames, whole_frames
 from wfsobs.observers.stepping import FilterBank, Gain, GainCycle, Saved
+from wfsobs.prior import Prior
 from wfsobs.progress import Watch
-from wfsobs.record import Measurements
+from wfsobs.record import Measurements, Sampling
 from wfsobs.signal.gap_gains import GapGains, GapStep, SensorMean
 from wfsobs.signal.riccati import lyapunov
 from wfsobs.signal.statespace import DisturbanceModel
@@ -302,6 +303,15 @@ class KalmanEstimator(LinearEstimator):
             others = old.bank.x[mode, len(was.model.A) :]
             if rest.shape == others.shape:
                 rest[...] = others
+
+
+MakeFilter = Callable[[Any, Prior, int, Any], ModeFilter]
+"""(settings, prior, mode, ratio) -> the filter of that mode; ratio : None where there are no NGS frames."""
+
+
+def kalman_filters(make: MakeFilter, prior: Prior, settings: Any, sampling: Sampling, _horizon: float) -> KalmanEstimator:
+    """Return the filters of all modes, each by itself. Raises ValueError where one has none."""
+    return KalmanEstimator([make(settings, prior, mode, sampling.ratio) for mode in range(sampling.n_modes)])
 
 
 class FrameEstimator(LinearEstimator):
