@@ -76,7 +76,7 @@ def mine(**changes: Any) -> Observer:
         (mine(weight=0), "observer 'mine': weight = 0: takes a number above 0"),
         (mine(weight=float("inf")), "observer 'mine': weight = inf: takes a number above 0"),
         (mine(weight="1"), "observer 'mine': weight = '1': takes a number above 0"),
-        (mine(look=Look(light="nocolour")), "observer 'mine': look.light = 'nocolour': takes a colour such as '#8A4B00'"),
+        (mine(look=Look(light="#8A4B")), "observer 'mine': look.light = '#8A4B': takes #rrggbb or a name of CSS"),
         (mine(look="red"), "observer 'mine': look = 'red': takes a Look"),
         (mine(tunable=Tunable(("nothing.speed",))), "observer 'mine': tunable 'nothing.speed': no scenario has such a setting"),
         (mine(tunable=Tunable((), ("kalman",))), "observer 'mine': tunable 'kalman': no scenario has such a setting"),
