@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 
@@ -174,6 +175,16 @@ def test_what_was_sent_is_saved_when_the_command_is_told_to_end(monkeypatch, tmp
 def test_what_cannot_run_is_one_line(arguments, line):
     done = CliRunner().invoke(main, ["live", "--seconds", "1", *arguments])
     assert done.exit_code == 2 and line in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_a_port_in_use_is_one_line_and_no_loop_begins():
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        command = [sys.executable, "-m", "wfsobs", "live", "--port", str(port)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    lines = done.stderr.splitlines()
+    assert (done.returncode, lines[-1]) == (2, f"wfsobs: localhost:{port}: Address already in use")
+    assert not [line for line in lines[:-1] if " INFO " not in line or "live" in line]
 
 
 def test_without_a_page_what_happens_and_alarms_go_to_a_log(tmp_path):
