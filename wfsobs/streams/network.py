@@ -125,6 +125,12 @@ class Subscription:
         self._receive()
         return self._waiting[0][2] if self._waiting else self._time
 
+    def catch_up(self) -> int:
+        """Take all that has come; return the counter before that of the frame that is read next."""
+        while self._receive():
+            pass
+        return self._waiting[0][0] - 1 if self._waiting else self._newest
+
     def wait(self, after: int, seconds: float, semaphore: object = None) -> bool:
         """Wait for a frame, at most so long [s]; return whether there is one. All that have come are new, whatever `after` is."""
         until = time.monotonic() + seconds
@@ -174,14 +180,16 @@ class Subscription:
             self._socket.disconnect(self.path)
         self._socket.connect(self.path)
 
-    def _receive(self) -> None:
-        """Take the messages that have come."""
+    def _receive(self) -> bool:
+        """Take the messages that have come; return whether there may be more."""
         import zmq
 
+        is_empty = False
         for _ in range(MOST):
             try:
                 parts = self._socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
+                is_empty = True
                 break
             self._alive = time.monotonic()
             try:
@@ -192,6 +200,7 @@ class Subscription:
                     self._say(f"{self.path}: a message is no frame: {error}; it and others are counted")
         if len(self._waiting) > BURST:
             self._waiting = deque([self._waiting[-1]])
+        return not is_empty
 
     def _accept(self, parts: list[bytes]) -> None:
         count, values, sent = parse_frame(parts)
