@@ -143,11 +143,14 @@ def _check_options(replay_file: str | None, stream: str | None, ngs: str | None,
     """Raise SettingError for an option that needs another one, or does nothing beside another one."""
     if headless:
         refuse_options(("port", "open_browser"), "there is no page with --headless")
+        refuse_options(("controllers", "no_controllers"), "only with a page")
     else:
         refuse_options(("seconds", "as_json"), "only with --headless")
     if not replay_file:
         refuse_options([name for name in RECORD_OPTIONS if name != "unit"], "only with --replay")
-    if not stream:
+    if stream:
+        refuse_options(("speed",), "only of a simulation or a record")
+    else:
         refuse_options(("modes",), "only with --in")
     if not replay_file and not stream:
         refuse_options(("unit",), "only with --replay or --in")
