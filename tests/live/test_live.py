@@ -160,6 +160,26 @@ def test_what_was_sent_is_saved_when_the_command_is_told_to_end(monkeypatch, tmp
     assert signal.getsignal(signal.SIGTERM) == before
 
 
+def test_without_a_truth_the_table_has_the_error_of_the_next_measurement(monkeypatch, tmp_path):
+    row = {"p50_us": 12.1, "p99_9_us": 41.0, "late": 0, "next_nm": {"tip": 30.0, "tilt": 40.0}}
+    rows = {"kf-lgs": row | {"rms_nm": None}, "zero": row | {"rms_nm": 7.0, "next_nm": {"tip": None, "tilt": None}}}
+    result = {"frames": 200, "lost": 0, "late_share": 0.0, "observers": rows}
+    monkeypatch.setattr("wfsobs.cli.live.follow", lambda *_, **__: result)
+    record = wfsobs.simulate(paper().replace({"run.duration": 2.0}))
+    save_record(tmp_path / "whole.npz", record)
+    save_record(tmp_path / "bare.npz", wfsobs.Record(record.y_lgs, record.u, record.dt))
+
+    def table(name):
+        done = CliRunner().invoke(main, ["live", "--headless", "--replay", str(tmp_path / name)])
+        assert done.exit_code == 0, done.output
+        return [[cell.strip() for cell in line.split("│")[1:3]] for line in done.stdout.splitlines() if "│" in line], done.stdout
+
+    rows, text = table("bare.npz")
+    assert rows == [["kf-lgs", f"{np.sqrt((30.0**2 + 40.0**2) / 2):.2f}"], ["zero", "-"]] and "next, nm" in text
+    rows, text = table("whole.npz")
+    assert rows == [["kf-lgs", "-"], ["zero", "7.00"]] and "rms, nm" in text
+
+
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
