@@ -1,5 +1,6 @@
 """The live loop: blocks without a seam, a ring, and numbers that are those of the recording."""
 
+import itertools
 import json
 import os
 import signal
@@ -178,6 +179,25 @@ def test_without_a_truth_the_table_has_the_error_of_the_next_measurement(monkeyp
     assert rows == [["kf-lgs", f"{np.sqrt((30.0**2 + 40.0**2) / 2):.2f}"], ["zero", "-"]] and "next, nm" in text
     rows, text = table("whole.npz")
     assert rows == [["kf-lgs", "-"], ["zero", "7.00"]] and "rms, nm" in text
+
+
+def test_ctrl_c_ends_it_with_the_numbers_of_what_ran(monkeypatch, tmp_path):
+    def interrupted(*arguments, keep, **options):
+        def keep_some(frame):
+            keep(frame)
+            if next(number) == 50:
+                raise KeyboardInterrupt
+
+        number = itertools.count(1)
+        return follow(*arguments, keep=keep_some, **options)
+
+    monkeypatch.setattr("wfsobs.cli.live.follow", interrupted)
+    options = ["--headless", "--seconds", "600", "--observer", "kf-lgs", "--json", "--record", str(tmp_path / "night.npz")]
+    done = CliRunner().invoke(main, ["live", *options])
+    assert done.exit_code == 0, done.output
+    result = json.loads(done.stdout)
+    assert result["frames"] >= 50 and result["lost"] == 0 and result["observers"]["kf-lgs"]["p50_us"] > 0
+    assert wfsobs.load(tmp_path / "night.npz").n_steps == 50
 
 
 @pytest.mark.parametrize(
