@@ -497,6 +497,10 @@ def test_a_semaphore_that_another_process_waits_for_is_left_to_it(tmp_path: Path
     ("options", "reason"),
     [
         ([], "takes --out STREAM, or --shadow"),
+        (["--out", "OUT", "--modes", "0,5"], "mode 5: a frame has 2 numbers, 0 to 1"),
+        (["--out", "OUT", "--observer", "ridge"], "learns from a record beforehand"),
+        (["--out", "OUT", "--controller", "lqg-kf-multi", "--command-gain", "0"], "the mirror does nothing"),
+        (["--out", "OUT", "--semaphore", "10"], "it has 0 to 9"),
         (["--out", "IN"], "is a stream that is read"),
         (["--shadow", "--modes", "0,0"], "different whole numbers"),
         (["--shadow", "--modes", "0,5"], "mode 5: a frame has 2 numbers, 0 to 1"),
@@ -511,9 +515,11 @@ def test_a_semaphore_that_another_process_waits_for_is_left_to_it(tmp_path: Path
 )
 def test_what_cannot_be_attached_is_said_in_one_line(tmp_path: Path, options: list[str], reason: str) -> None:
     source = SharedImage.create(tmp_path / "in.im.shm", (2,))
-    options = [source.path if option == "IN" else option for option in options]
+    places = {"IN": source.path, "OUT": str(tmp_path / "out.im.shm")}
+    options = [places.get(option, option) for option in options]
     done = CliRunner().invoke(main, ["attach", "--in", source.path, "--seconds", "0.1", *options])
     assert done.exit_code == 2 and reason in done.output and done.output.count("\n") == 1, done.output
+    assert [path.name for path in tmp_path.iterdir()] == ["in.im.shm"], "no stream is made"
 
 
 def test_no_stream_is_said_in_one_line(tmp_path: Path) -> None:

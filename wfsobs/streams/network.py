@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, NoReturn, Self
 
 import numpy as np
 
@@ -155,12 +155,11 @@ class Subscription:
         """Return this stream."""
         return self
 
-    def claim(self, number: int) -> int:
+    def claim(self, number: int) -> NoReturn:
         """Raise StreamError."""
         raise StreamError(f"{self.path}: semaphore {number}: a stream of the network has none")
 
-    def semaphore(self, number: int) -> None:
-        """Return None."""
+    semaphore = claim
 
     def release(self, number: int) -> None:
         """Do nothing."""
