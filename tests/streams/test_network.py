@@ -299,6 +299,8 @@ def newest(source: Subscription, is_wanted: Callable[[np.ndarray], bool]) -> tup
         (["--in", "tcp://nowhere", "--shadow"], "tcp://nowhere: Invalid argument"),
         (["--in", "SHM", "--shadow", "--ngs", "tcp://nowhere", "--observer", "gp-both"], "tcp://nowhere: Invalid argument"),
         (["--in", "SHM", "--out", "tcp://nowhere"], "tcp://nowhere: Invalid argument"),
+        (["--in", "tcp://localhost:65536", "--shadow"], "tcp://localhost:65536: takes a port up to 65535"),
+        (["--in", "SHM", "--out", "tcp://*:70000"], "tcp://*:70000: takes a port up to 65535"),
     ],
 )
 def test_what_cannot_be_attached_is_said_in_one_line(tmp_path: Path, options: list[str], reason: str) -> None:

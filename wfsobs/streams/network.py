@@ -56,6 +56,7 @@ FIRST = 10.0
 """Longest wait for a first frame, which says how long frames are [s]."""
 BURST = 10
 """Frames that may wait to be taken one by one; of more, the newest alone is."""
+LARGEST_PORT = 65535
 MOST = 1000
 """Messages that are looked at in a row."""
 
@@ -255,6 +256,9 @@ class Publication:
 def _open_socket(path: str, kind: str) -> zmq.Socket[bytes]:
     """Return a socket in a context of its own: SUB connected, PUB bound."""
     zmq = _zmq(path)
+    port = path.rpartition(":")[2]
+    if port.isdecimal() and int(port) > LARGEST_PORT:  # ZeroMQ would take another one
+        raise StreamError(f"{path}: takes a port up to {LARGEST_PORT}")
     socket = zmq.Context().socket(getattr(zmq, kind))
     try:
         if kind == "PUB":
