@@ -3,6 +3,7 @@
 import errno
 from collections.abc import Iterator
 from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import click
 import pytest
@@ -32,14 +33,22 @@ def test_a_package_brings_a_command(points: list[EntryPoint], monkeypatch: pytes
 
 
 @pytest.mark.parametrize(
-    ("name", "outcome"), [(None, (1, "")), ("pipe", (2, "wfsobs: pipe: Broken pipe\n"))], ids=["output", "file"]
+    ("error", "outcome"),
+    [
+        (BrokenPipeError(errno.EPIPE, "Broken pipe"), (1, "")),
+        (BrokenPipeError(errno.EPIPE, "Broken pipe", "pipe"), (2, "wfsobs: pipe: Broken pipe\n")),
+        (OSError(errno.EACCES, "Permission denied", Path("night.npz")), (2, "wfsobs: night.npz: Permission denied\n")),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), (2, "wfsobs: Cannot allocate memory\n")),
+        (OSError("no more"), (2, "wfsobs: no more\n")),
+    ],
+    ids=["output that nobody reads", "pipe", "file", "no file", "no number"],
 )
-def test_an_output_that_nobody_reads_any_more_is_no_error(
-    points: list[EntryPoint], monkeypatch: pytest.MonkeyPatch, name: str | None, outcome: tuple[int, str]
+def test_an_error_of_the_system_is_one_line_unless_nobody_reads_the_output(
+    points: list[EntryPoint], monkeypatch: pytest.MonkeyPatch, error: OSError, outcome: tuple[int, str]
 ) -> None:
     @click.command()
     def write() -> None:
-        raise BrokenPipeError(errno.EPIPE, "Broken pipe", name)
+        raise error
 
     monkeypatch.setattr(EntryPoint, "load", lambda _self: write)
     points.append(EntryPoint("write", "somewhere.cli:write", group.ENTRY_POINTS))

@@ -74,6 +74,17 @@ def _told(record: wfsobs.Record) -> LoopPredictor:
     return predictor
 
 
+def test_with_a_prior_a_history_changes_nothing(record: wfsobs.Record, found: str) -> None:
+    """The observer goes on from the last measurement, whatever came before."""
+    one, other = (LoopPredictor(3, HORIZON, modes=[0, 2], prior=found) for _ in range(2))
+    z = np.hstack([record.z, record.z[:, :1]])
+    for predictor in (one, other):
+        predictions(predictor, z[1000:1500])
+    one.fit(z[:1000])
+    np.testing.assert_array_equal(one.predict(), other.predict())
+    np.testing.assert_array_equal(predictions(one, z[1500:1600]), predictions(other, z[1500:1600]))
+
+
 def test_other_modes_keep_their_last_measurement(record: wfsobs.Record, found: str) -> None:
     z = np.hstack([record.z[:50, :1], 1e3 * record.z[:50], record.z[:50, 1:]])
     predictor, plain = LoopPredictor(4, HORIZON, modes=[0, 3], prior=found), LoopPredictor(2, HORIZON, prior=found)

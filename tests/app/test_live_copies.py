@@ -7,6 +7,7 @@ import json
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +83,8 @@ def test_the_command_in_a_shell(
     command, scenario = dashboard.actions.toolbar.command, dashboard.store.scenario
     order = served(command)
     assert of(order)[1:] == (scenario, ("kf-multi", "gp-both"), ("integrator",), 2.0) and order.source == SimulatedLoop(scenario)
-    told = json.loads(in_shell(f"{command} --headless --seconds 0.5 --json --record shell.npz").splitlines()[-1])
+    alone = command.replace(" --controller integrator", "")  # controllers run with a page
+    told = json.loads(in_shell(f"{alone} --headless --seconds 0.5 --json --record shell.npz").splitlines()[-1])
     assert list(told["observers"]) == CHOSEN["running"] and told["frames"] + told["lost"] == 1000  # twice as fast
     made = script(tmp_path, shown_by(dashboard.actions.toolbar.python))
     assert made.splitlines()[-1] == "2.0 ['integrator'] True"
@@ -140,7 +142,8 @@ def test_a_record_by_its_name_and_hash(short: Scenario, tmp_path: Path, monkeypa
     order = served(command)
     assert isinstance(order.source, Replay) and order.controllers == () and order.speed == 5.0
     np.testing.assert_array_equal(order.source.record.z, record.z)
-    told = json.loads(in_shell(f"{command} --headless --json").splitlines()[-1])
+    alone = command.replace(" --no-controllers", "")
+    told = json.loads(in_shell(f"{alone} --headless --json").splitlines()[-1])
     assert told["frames"] + told["lost"] == record.n_steps and list(told["observers"]) == ["kf-multi"]
     lines = script(tmp_path, to_python(short, "paper", loaded, task)).splitlines()
     assert [line.split()[:2] for line in lines] == [["kf-multi", "turbulence"], ["kf-multi", "vibration"]]
@@ -151,8 +154,8 @@ def test_a_record_by_its_name_and_hash(short: Scenario, tmp_path: Path, monkeypa
 
 def test_a_stream_by_its_address(served: Any) -> None:
     said = "wfsobs live --in /dev/shm/modes.im.shm --modes 1,0 --unit nm --ngs /dev/shm/slow.im.shm --ngs-modes 0,2 --ngs-lag 3"
-    first = served(f"{said} --observer kf-multi --controller integrator --speed 0.5")
-    task = CopiedTask(LIVE_TASK, {"order": first})
+    first = served(f"{said} --observer kf-multi --controller integrator")
+    task = CopiedTask(LIVE_TASK, {"order": replace(first, speed=0.5)})  # a speed that a link has left on the page
     assert of(served(to_command(first.scenario, first.preset, None, task))) == of(first)
     code = to_python(first.scenario, first.preset, None, task)
     made: dict[str, Any] = {"__name__": "__main__"}

@@ -126,6 +126,16 @@ def test_a_scheduler_without_workers_is_told_and_waited_for(cluster, tmp_path):
     assert not list(out.glob("rows/.*"))
 
 
+@pytest.mark.parametrize("address", ["localhost", "head:8786", "tcp://head", "smoke://head:8786", ""])
+def test_an_address_that_is_none_is_refused_at_once(address, monkeypatch):
+    from wfsobs.campaign import pools
+    from wfsobs.settings.errors import SettingError
+
+    monkeypatch.setattr("distributed.Client", lambda *_, **__: pytest.fail("a client is made"))
+    with pytest.raises(SettingError, match=f"^--scheduler {address}: takes an address with a port, such as tcp://head:8786$"):
+        pools.DaskCluster(address)
+
+
 def test_without_a_scheduler_there_is_one_line(tmp_path, monkeypatch):
     from wfsobs.campaign import pools
     from wfsobs.settings.errors import SettingError

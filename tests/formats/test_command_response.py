@@ -231,7 +231,7 @@ def test_every_way_in_refuses_a_wrong_sign_unless_it_is_trusted(tmp_path: Path) 
         ["observe", "RECORD", "--json"],
         ["identify", "RECORD"],
         ["loop", "--controller", "integrator", "--record", "RECORD"],
-        ["live", "--headless", "--seconds", "0.2", "--observer", "zero", "--no-controllers", "--replay", "RECORD"],
+        ["live", "--headless", "--seconds", "0.2", "--observer", "zero", "--replay", "RECORD"],
     ):
         words = [str(wrong) if word == "RECORD" else word for word in words]
         done = CliRunner().invoke(main, words)

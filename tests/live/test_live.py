@@ -1,8 +1,10 @@
 """The live loop: blocks without a seam, a ring, and numbers that are those of the recording."""
 
+import itertools
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 
@@ -159,6 +161,45 @@ def test_what_was_sent_is_saved_when_the_command_is_told_to_end(monkeypatch, tmp
     assert signal.getsignal(signal.SIGTERM) == before
 
 
+def test_without_a_truth_the_table_has_the_error_of_the_next_measurement(monkeypatch, tmp_path):
+    row = {"p50_us": 12.1, "p99_9_us": 41.0, "late": 0, "next_nm": {"tip": 30.0, "tilt": 40.0}}
+    rows = {"kf-lgs": row | {"rms_nm": None}, "zero": row | {"rms_nm": 7.0, "next_nm": {"tip": None, "tilt": None}}}
+    result = {"frames": 200, "lost": 0, "late_share": 0.0, "observers": rows}
+    monkeypatch.setattr("wfsobs.cli.live.follow", lambda *_, **__: result)
+    record = wfsobs.simulate(paper().replace({"run.duration": 2.0}))
+    save_record(tmp_path / "whole.npz", record)
+    save_record(tmp_path / "bare.npz", wfsobs.Record(record.y_lgs, record.u, record.dt))
+
+    def table(name):
+        done = CliRunner().invoke(main, ["live", "--headless", "--replay", str(tmp_path / name)])
+        assert done.exit_code == 0, done.output
+        return [[cell.strip() for cell in line.split("│")[1:3]] for line in done.stdout.splitlines() if "│" in line], done.stdout
+
+    rows, text = table("bare.npz")
+    assert rows == [["kf-lgs", f"{np.sqrt((30.0**2 + 40.0**2) / 2):.2f}"], ["zero", "-"]] and "next, nm" in text
+    rows, text = table("whole.npz")
+    assert rows == [["kf-lgs", "-"], ["zero", "7.00"]] and "rms, nm" in text
+
+
+def test_ctrl_c_ends_it_with_the_numbers_of_what_ran(monkeypatch, tmp_path):
+    def interrupted(*arguments, keep, **options):
+        def keep_some(frame):
+            keep(frame)
+            if next(number) == 50:
+                raise KeyboardInterrupt
+
+        number = itertools.count(1)
+        return follow(*arguments, keep=keep_some, **options)
+
+    monkeypatch.setattr("wfsobs.cli.live.follow", interrupted)
+    options = ["--headless", "--seconds", "600", "--observer", "kf-lgs", "--json", "--record", str(tmp_path / "night.npz")]
+    done = CliRunner().invoke(main, ["live", *options])
+    assert done.exit_code == 0, done.output
+    result = json.loads(done.stdout)
+    assert result["frames"] >= 50 and result["lost"] == 0 and result["observers"]["kf-lgs"]["p50_us"] > 0
+    assert wfsobs.load(tmp_path / "night.npz").n_steps == 50
+
+
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
@@ -174,6 +215,16 @@ def test_what_was_sent_is_saved_when_the_command_is_told_to_end(monkeypatch, tmp
 def test_what_cannot_run_is_one_line(arguments, line):
     done = CliRunner().invoke(main, ["live", "--seconds", "1", *arguments])
     assert done.exit_code == 2 and line in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_a_port_in_use_is_one_line_and_no_loop_begins():
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        command = [sys.executable, "-m", "wfsobs", "live", "--port", str(port)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    lines = done.stderr.splitlines()
+    assert (done.returncode, lines[-1]) == (2, f"wfsobs: localhost:{port}: Address already in use")
+    assert not [line for line in lines[:-1] if " INFO " not in line or "live" in line]
 
 
 def test_without_a_page_what_happens_and_alarms_go_to_a_log(tmp_path):

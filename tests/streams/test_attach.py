@@ -25,6 +25,7 @@ from wfsobs.observers.step import StepObserver
 from wfsobs.signal.gate import RUN, GateSettings
 from wfsobs.stepping import design
 from wfsobs.streams.attach import Attachment, CommandStream
+from wfsobs.streams.follower import Tally
 from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.shared_image import SharedImage
 from wfsobs.streams.wiring import Fallback, NgsWiring, Safety, Wiring
@@ -208,6 +209,30 @@ class Streams:
         found = self.sink.read()
         assert found is not None
         return found[1]
+
+
+def test_what_comes_while_the_observer_is_designed_is_not_missing(tmp_path: Path) -> None:
+    """The newest frame is answered first, as the loop may wait for that; the next one that is left out is missing."""
+    said: list[str] = []
+    z = measurements(60)
+    streams = Streams(tmp_path, said)
+    for row in z[:50]:
+        streams.source.write(row)
+    streams.attachment.run(ENOUGH, stop=lambda: streams.sink.count > 0)
+    assert streams.attachment.summary()["missing"] == 0 and streams.attachment.summary()["frames"] == 1
+    for row in z[50:52]:
+        streams.source.write(row)
+    streams.attachment._take(0.0)
+    assert streams.attachment.summary()["missing"] == 1 and not said
+
+
+def test_the_rate_counts_from_the_first_frame_on() -> None:
+    """A gap before it is of no known length of time; missing frames after it were sent."""
+    tally = Tally(1 / 500)
+    for k in (0, *range(5, 501)):
+        tally.add(100 + k / 500, 100 + k / 500, {0: 400, 5: 4}.get(k, 0), np.zeros(1), np.zeros(1))
+    assert tally.rate == pytest.approx(500) and not tally.find_rate_error()
+    assert tally.summary()["missing"] == 404
 
 
 def test_missing_and_unreadable_measurements_are_missing(tmp_path: Path) -> None:
@@ -472,6 +497,10 @@ def test_a_semaphore_that_another_process_waits_for_is_left_to_it(tmp_path: Path
     ("options", "reason"),
     [
         ([], "takes --out STREAM, or --shadow"),
+        (["--out", "OUT", "--modes", "0,5"], "mode 5: a frame has 2 numbers, 0 to 1"),
+        (["--out", "OUT", "--observer", "ridge"], "learns from a record beforehand"),
+        (["--out", "OUT", "--controller", "lqg-kf-multi", "--command-gain", "0"], "the mirror does nothing"),
+        (["--out", "OUT", "--semaphore", "10"], "it has 0 to 9"),
         (["--out", "IN"], "is a stream that is read"),
         (["--shadow", "--modes", "0,0"], "different whole numbers"),
         (["--shadow", "--modes", "0,5"], "mode 5: a frame has 2 numbers, 0 to 1"),
@@ -486,9 +515,11 @@ def test_a_semaphore_that_another_process_waits_for_is_left_to_it(tmp_path: Path
 )
 def test_what_cannot_be_attached_is_said_in_one_line(tmp_path: Path, options: list[str], reason: str) -> None:
     source = SharedImage.create(tmp_path / "in.im.shm", (2,))
-    options = [source.path if option == "IN" else option for option in options]
+    places = {"IN": source.path, "OUT": str(tmp_path / "out.im.shm")}
+    options = [places.get(option, option) for option in options]
     done = CliRunner().invoke(main, ["attach", "--in", source.path, "--seconds", "0.1", *options])
     assert done.exit_code == 2 and reason in done.output and done.output.count("\n") == 1, done.output
+    assert [path.name for path in tmp_path.iterdir()] == ["in.im.shm"], "no stream is made"
 
 
 def test_no_stream_is_said_in_one_line(tmp_path: Path) -> None:

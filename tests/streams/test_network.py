@@ -216,9 +216,30 @@ def test_frames_that_wait_are_taken_one_by_one_or_the_newest_alone(n: int, taken
         found: list[int] = []
         for k in range(1, n + 1):  # as they come, without a look between them
             accept([json.dumps({**GOOD, "frame": k}).encode(), bytes(16)])
+        assert source.catch_up() == taken[0] - 1
         while (frame := source.read()) is not None:
             found.append(frame[0])
+        assert source.catch_up() == n
     assert found == taken
+
+
+def test_all_that_has_come_meanwhile_is_taken_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of more messages than one look takes, the newest frame is read next."""
+    monkeypatch.setattr(network, "MOST", 2)
+    monkeypatch.setattr(network, "BURST", 1)
+    with closing(Loop()) as loop, subscribed(loop, lambda _: None) as source:
+        parts = [[json.dumps({**GOOD, "frame": k}).encode(), bytes(16)] for k in range(1, 8)]
+
+        def receive(_flags: int) -> list[bytes]:
+            if not parts:
+                raise zmq.Again
+            return parts.pop(0)
+
+        socket, source._socket = source._socket, type("Socket", (), {"recv_multipart": staticmethod(receive)})  # pyright: ignore[reportAttributeAccessIssue]
+        assert source.catch_up() == 6
+        frame = source.read()
+        source._socket = socket
+    assert frame is not None and frame[0] == 7
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
@@ -278,6 +299,8 @@ def newest(source: Subscription, is_wanted: Callable[[np.ndarray], bool]) -> tup
         (["--in", "tcp://nowhere", "--shadow"], "tcp://nowhere: Invalid argument"),
         (["--in", "SHM", "--shadow", "--ngs", "tcp://nowhere", "--observer", "gp-both"], "tcp://nowhere: Invalid argument"),
         (["--in", "SHM", "--out", "tcp://nowhere"], "tcp://nowhere: Invalid argument"),
+        (["--in", "tcp://localhost:65536", "--shadow"], "tcp://localhost:65536: takes a port up to 65535"),
+        (["--in", "SHM", "--out", "tcp://*:70000"], "tcp://*:70000: takes a port up to 65535"),
     ],
 )
 def test_what_cannot_be_attached_is_said_in_one_line(tmp_path: Path, options: list[str], reason: str) -> None:

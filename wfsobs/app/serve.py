@@ -372,7 +372,7 @@ PAINTS = -5
 
 
 def serve(options: Options, live: LiveOrder | None = None) -> None:
-    """Serve the dashboard at http://address:port/prefix until SIGINT or SIGTERM. Raises OSError, SettingError.
+    """Serve the dashboard at http://address:port/prefix until SIGINT or SIGTERM. Raises SettingError.
 
     live : a loop that runs until then, and that every page opens with; where it cannot go on the server ends with exit status 2
     """
@@ -390,9 +390,9 @@ def serve(options: Options, live: LiveOrder | None = None) -> None:
         status = 2
         loop.add_callback(loop.stop)
 
+    server = make_server(options, service, is_warm=live is None)
     if live is not None:
         share_loop(live, service, fail)
-    server = make_server(options, service)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: loop.add_callback_from_signal(loop.stop))
     event(
@@ -459,10 +459,13 @@ def new_page(service: Service, session: Session | None = None) -> Any:
     return session_page(lambda post: Dashboard(post, session))
 
 
-def make_server(options: Options, service: Service) -> Server:
-    """Make a server that listens but has not started. A page is made and dropped first: its imports take longer than the page."""
+def make_server(options: Options, service: Service, *, is_warm: bool = True) -> Server:
+    """Make a server that listens but has not started. Raises SettingError where it cannot listen.
+
+    is_warm : whether a page is made and dropped first, as its imports take longer than the page; one of a live loop needs the
+        event loop to run
+    """
     secret = generate_secret_key()
-    is_warm = service.live is None  # a page of a live loop needs the event loop to run
     warm = iter([Session(service)] if is_warm else [])
     applications: Any = build_applications({"/": lambda: new_page(service, next(warm, None))}, title="wfsobs")
     ready = NextPage(service, options.prefix, secret.encode(), TOKEN, options.lifetime)
@@ -494,6 +497,8 @@ def make_server(options: Options, service: Service) -> Server:
             extra_patterns=[("/liveness", Liveness, {"service": service})],
             transforms=[partial(SecurityHeaders, options.embedders)],
         )
+    except OSError as error:
+        raise SettingError(f"{options.address}:{options.port}: {error.strerror or error}") from None
     finally:
         per_app_patterns[:] = routes
 

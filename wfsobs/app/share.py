@@ -25,6 +25,7 @@ from wfsobs.app.session_file import SHA256, SessionError, read_declaration
 from wfsobs.app.sources import LoadedRecord, NamedRecord, SimulatedRecord, Source
 from wfsobs.app.store import FIRST_PRESET
 from wfsobs.live.loop import LiveOrder
+from wfsobs.live.source import STREAM
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.configfile import from_toml, parse_toml, reference_preset, to_toml
 from wfsobs.scenario.presets import PRESETS
@@ -391,7 +392,7 @@ def _live_command(scenario: Scenario, preset: str, source: Source | None, order:
     words = ["--replay", as_path(source.name), *stated_options(source)] if record else [*order.options]
     words += [word for name in order.observers for word in ("--observer", name)]
     words += [word for name in order.controllers for word in ("--controller", name)] or ["--no-controllers"]
-    words += [] if order.speed == 1.0 else ["--speed", f"{order.speed:g}"]
+    words += [] if order.speed == 1.0 or order.source.name == STREAM else ["--speed", f"{order.speed:g}"]
     return shlex.join(["wfsobs", "live", *words, *given_options(scenario, preset, FILE)])
 
 

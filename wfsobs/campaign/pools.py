@@ -89,7 +89,7 @@ class DaskCluster:
     Raises
     ------
     SettingError
-        distributed is not installed, or there is no scheduler.
+        distributed is not installed, the address is none, or there is no scheduler.
     """
 
     address: str
@@ -97,8 +97,13 @@ class DaskCluster:
     def __init__(self, address: str, tell: Callable[[str], None] = lambda _line: None):
         try:
             import distributed
+            from distributed.comm.addressing import get_address_host_port
         except ImportError:
             raise SettingError('--scheduler: needs dask: pip install "wfsobs[dask]"') from None
+        try:
+            get_address_host_port(address, strict=True)
+        except ValueError:  # a client would try it for a minute
+            raise SettingError(f"--scheduler {address}: takes an address with a port, such as tcp://head:8786") from None
         # What they say of a scheduler that is gone is told here; the last one of callbacks that find its client closed.
         for name in ("distributed", "distributed.client", "tornado.application"):
             logging.getLogger(name).setLevel(logging.CRITICAL)

@@ -39,7 +39,7 @@ from wfsobs.streams.layout import StreamError
 from wfsobs.streams.network import Publication, Subscription, is_address
 from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.shared_image import SharedImage, stream_path
-from wfsobs.streams.wiring import LIMIT, STUCK, Fallback, Safety, Wiring
+from wfsobs.streams.wiring import LIMIT, STUCK, Fallback, Safety, Wiring, check_elements
 from wfsobs.units import UNITS, micrometres_per
 
 OBSERVERS_ALONE = ("name", "shadow", "commands", "delay", "fallback")
@@ -143,7 +143,9 @@ def attach(
     per_unit = micrometres_per(unit, scenario.telescope.diameter)
     try:
         given = _open_source(source)
-        taken = None if sink is None else _open_sink(sink, given, ngs, commands)
+        check_elements(given, elements)
+        if semaphore is not None:
+            given.semaphore(semaphore)  # refused before --out is made
         spread = _spread(controller or name, scenario, len(elements))
         warm_up = max(round(scenario.run.warm_up / scenario.dt), 1)
         limits = Safety(fallback, None if limit is None else limit * per_unit, calm=warm_up)
@@ -158,9 +160,11 @@ def attach(
         attachment: StreamFollower
         if controller is None:
             observer = _design(name, scenario, len(elements), delay - 1, ngs is not None)
+            taken = _open_sink(sink, given, ngs, commands)
             attachment = Attachment(given, taken, observer, wiring, _say, second, third)
         else:
             law = _supervise(controller, scenario, wiring, command_gain, ngs is not None)
+            taken = _open_sink(sink, given, ngs, commands)
             attachment = ControllerAttachment(given, taken, law, command_gain, _sent_last(taken, wiring), wiring, _say, second)
         with _stop_signals() as stop:
             attachment.run(seconds or np.inf, report=_say, stop=stop)
@@ -181,7 +185,10 @@ def _open_source(name: str) -> SharedImage | Subscription:
     return click.get_current_context().with_resource(closing(Subscription(name, _say)))
 
 
-def _open_sink(name: str, source: SharedImage | Subscription, *others: str | None) -> SharedImage | Publication:
+def _open_sink(name: str | None, source: SharedImage | Subscription, *others: str | None) -> SharedImage | Publication | None:
+    """Open the stream that is written, and make it where there is none; None for none."""
+    if name is None:
+        return None
     dtype = source.header.dtype.name if isinstance(source, SharedImage) else source.dtype
     if is_address(name):
         made = click.get_current_context().with_resource(closing(Publication(name, source.n, dtype)))

@@ -85,7 +85,7 @@ class Commands(click.Group):
         except OSError as error:
             if isinstance(error, BrokenPipeError) and error.filename is None:
                 raise  # whoever reads the output has enough of it: click ends without a word
-            click.echo(f"wfsobs: {error.filename or 'file'}: {error.strerror or error}", err=True)
+            click.echo(": ".join(str(word) for word in ("wfsobs", error.filename, error.strerror or error) if word), err=True)
         ctx.exit(2)
 
 

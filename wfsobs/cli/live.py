@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+from collections.abc import Iterable
 from dataclasses import replace
 from os import cpu_count
 from types import FrameType
@@ -143,11 +144,14 @@ def _check_options(replay_file: str | None, stream: str | None, ngs: str | None,
     """Raise SettingError for an option that needs another one, or does nothing beside another one."""
     if headless:
         refuse_options(("port", "open_browser"), "there is no page with --headless")
+        refuse_options(("controllers", "no_controllers"), "only with a page")
     else:
         refuse_options(("seconds", "as_json"), "only with --headless")
     if not replay_file:
         refuse_options([name for name in RECORD_OPTIONS if name != "unit"], "only with --replay")
-    if not stream:
+    if stream:
+        refuse_options(("speed",), "only of a simulation or a record")
+    else:
         refuse_options(("modes",), "only with --in")
     if not replay_file and not stream:
         refuse_options(("unit",), "only with --replay or --in")
@@ -224,12 +228,17 @@ def _run_headless(order: LiveOrder, seconds: float, as_json: bool) -> None:
     if as_json:
         print_json(result)
         return
+    error = ("rms" if source.has_truth else "next") + ", nm"
     title = f"{result['frames']} frames, {result['lost']} lost, {result['late_share']:.2%} more than 1 ms late"
-    table = new_table(("Observer",), ("rms, nm", "step p50, us", "p99.9, us", "longer than a frame"), no_wrap=False, title=title)
+    table = new_table(("Observer",), (error, "step p50, us", "p99.9, us", "longer than a frame"), no_wrap=False, title=title)
     for name, row in result["observers"].items():
-        cells = (
-            "-" if x is None else f"{x:.{digits}f}"
-            for x, digits in ((row["rms_nm"], 2), (row["p50_us"], 0), (row["p99_9_us"], 0))
-        )
+        rms = row["rms_nm"] if source.has_truth else _rms(row["next_nm"].values())
+        cells = ("-" if x is None else f"{x:.{digits}f}" for x, digits in ((rms, 2), (row["p50_us"], 0), (row["p99_9_us"], 0)))
         table.add_row(name, *cells, str(row["late"]))
     show_table(table)
+
+
+def _rms(values: Iterable[float | None]) -> float | None:
+    """Return the rms over the values that are known; None without one."""
+    known = [x for x in values if x is not None]
+    return float(np.sqrt(np.mean(np.square(known)))) if known else None

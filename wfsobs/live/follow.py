@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from math import isfinite
 from time import sleep
 from typing import Any
@@ -35,7 +36,7 @@ def follow(
     say: Callable[[str], None] = lambda _: None,
     log_file: str = "",
 ) -> dict[str, Any]:
-    """Let observers follow a source in real time.
+    """Let observers follow a source in real time, until Ctrl+C at most.
 
     Parameters
     ----------
@@ -80,14 +81,15 @@ def follow(
     try:
         _await_observers(loop)
         loop.play()
-        _drain(loop, n_frames, keep, report, say)
+        with suppress(KeyboardInterrupt):  # what has run counts
+            _drain(loop, n_frames, keep, report, say)
     finally:
         loop.stop()
     board, delivery = loop.board, loop.delivery
     modes = [mode.name for mode in scenario.modes][: source.sampling.n_modes]
     return {
         "frames": delivery.frames,
-        "lost": n_frames - delivery.frames,
+        "lost": delivery.losses,
         "late_share": delivery.late_share,
         "late_share_sent": delivery.late_share_sent,
         "observers": {name: _row(board[name], OBSERVERS[name].targets, modes) for name in chosen},

@@ -293,7 +293,8 @@ class LoopPredictor:
     def fit(self, pol_history: ArrayLike) -> LoopPredictor:
         """Identify a history of pseudo-open-loop modes, (n, num_modes) in units of the loop, and design the observer.
 
-        With a prior from a file the history is not used. Raises PredictorError, and RecordError where it is too short.
+        With a prior from a file, which a second sensor needs, the history is not used: the observer goes on. Raises
+        PredictorError, and RecordError where it is too short.
         """
         history = np.asarray(pol_history, dtype=float)
         if history.ndim == 1:
@@ -309,8 +310,8 @@ class LoopPredictor:
             self._scale, self._is_told = SIZE / size, False
             record = Record(self._scale * z, np.zeros_like(z), 1.0 / self._rate)
             self._put_in(self._design(identify(record), record))
-        for row in history:
-            self._take(row, None)
+            for row in history:
+                self._take(row, None)
         self.fitted: bool = True
         return self
 

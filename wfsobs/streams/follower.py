@@ -96,6 +96,7 @@ class Tally:
         self._dt, self._last = dt, None
         self._second, self._all = _Span(), _Span()
         self._first: float | None = None
+        self._since_first = 0
         self._is_off_rate = False
 
     def add(self, arrival: float, end: float, missing: int, z: Array, error: Array, is_out: bool = False) -> None:
@@ -123,14 +124,18 @@ class Tally:
             span.latencies.add(end - arrival)
             span.errors.add(errors)
             span.sizes.add(sizes)
-        self._first, self._last = self._first or arrival, arrival
+        if self._first is None:
+            self._first = arrival
+        else:
+            self._since_first += 1 + missing
+        self._last = arrival
 
     @property
     def rate(self) -> float | None:
-        """Frames per second that were sent, missing ones too [Hz]."""
+        """Frames per second that were sent since the first one, missing ones too [Hz]."""
         if self._first is None or self._last is None or self._last <= self._first:
             return None
-        return (self._all.frames - 1 + self._all.missing) / (self._last - self._first)
+        return self._since_first / (self._last - self._first)
 
     def find_rate_error(self) -> str:
         """Return once that the loop runs at another rate than the observer is designed for; "" at other times."""
@@ -262,6 +267,7 @@ class StreamFollower(ABC):
         self._claim()
         gc.collect()
         gc.freeze()
+        self._count = self._source.catch_up()
         self._alive = now = monotonic()
         end, spoken = now + seconds, now + 1.0
         try:

@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, NoReturn, Self
 
 import numpy as np
 
@@ -56,6 +56,7 @@ FIRST = 10.0
 """Longest wait for a first frame, which says how long frames are [s]."""
 BURST = 10
 """Frames that may wait to be taken one by one; of more, the newest alone is."""
+LARGEST_PORT = 65535
 MOST = 1000
 """Messages that are looked at in a row."""
 
@@ -125,6 +126,12 @@ class Subscription:
         self._receive()
         return self._waiting[0][2] if self._waiting else self._time
 
+    def catch_up(self) -> int:
+        """Take all that has come; return the counter before that of the frame that is read next."""
+        while self._receive():
+            pass
+        return self._waiting[0][0] - 1 if self._waiting else self._newest
+
     def wait(self, after: int, seconds: float, semaphore: object = None) -> bool:
         """Wait for a frame, at most so long [s]; return whether there is one. All that have come are new, whatever `after` is."""
         until = time.monotonic() + seconds
@@ -149,12 +156,11 @@ class Subscription:
         """Return this stream."""
         return self
 
-    def claim(self, number: int) -> int:
+    def claim(self, number: int) -> NoReturn:
         """Raise StreamError."""
         raise StreamError(f"{self.path}: semaphore {number}: a stream of the network has none")
 
-    def semaphore(self, number: int) -> None:
-        """Return None."""
+    semaphore = claim
 
     def release(self, number: int) -> None:
         """Do nothing."""
@@ -174,14 +180,16 @@ class Subscription:
             self._socket.disconnect(self.path)
         self._socket.connect(self.path)
 
-    def _receive(self) -> None:
-        """Take the messages that have come."""
+    def _receive(self) -> bool:
+        """Take the messages that have come; return whether there may be more."""
         import zmq
 
+        is_empty = False
         for _ in range(MOST):
             try:
                 parts = self._socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
+                is_empty = True
                 break
             self._alive = time.monotonic()
             try:
@@ -192,6 +200,7 @@ class Subscription:
                     self._say(f"{self.path}: a message is no frame: {error}; it and others are counted")
         if len(self._waiting) > BURST:
             self._waiting = deque([self._waiting[-1]])
+        return not is_empty
 
     def _accept(self, parts: list[bytes]) -> None:
         count, values, sent = parse_frame(parts)
@@ -247,6 +256,9 @@ class Publication:
 def _open_socket(path: str, kind: str) -> zmq.Socket[bytes]:
     """Return a socket in a context of its own: SUB connected, PUB bound."""
     zmq = _zmq(path)
+    port = path.rpartition(":")[2]
+    if port.isdecimal() and int(port) > LARGEST_PORT:  # ZeroMQ would take another one
+        raise StreamError(f"{path}: takes a port up to {LARGEST_PORT}")
     socket = zmq.Context().socket(getattr(zmq, kind))
     try:
         if kind == "PUB":

@@ -200,6 +200,10 @@ class SharedImage:
         if self._readers is not None:
             self._readers[number] = 0
 
+    def catch_up(self) -> int:
+        """Return the counter before that of the frame that is read next: none that came before that is missing."""
+        return self.first if self.count == self.first else self.count - 1
+
     def wait(self, after: int, seconds: float, semaphore: Semaphore | None = None) -> bool:
         """Wait until the counter is another than `after`, at most so long [s]; return whether it is."""
         until = time.monotonic() + seconds

@@ -87,10 +87,25 @@ def test_tables_of_other_tracks_stay(arena: Arena, tmp_path: Path, monkeypatch: 
     assert "the turbulence" in page("turbulence", "the turbulence")
 
 
-@pytest.mark.parametrize("words", [["--track", "closed-loop", "--entry", "kf-lgs"], ["--track", "next", "--entry", "rls"]])
-def test_nothing_is_written_where_no_entry_takes_part(tmp_path: Path, words: list[str]) -> None:
-    done = CliRunner().invoke(main, ["arena", "run", "--out", str(tmp_path / "out"), *words])
-    assert done.exit_code == 2 and "no entry takes part" in done.stderr and not (tmp_path / "out").exists()
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["run", "--track", "closed-loop", "--entry", "kf-lgs"], "arena run: in no track that is chosen: kf-lgs;"),
+        (["run", "--track", "next", "--entry", "rls"], "arena run: in no track that is chosen: rls;"),
+        (["run", "--track", "next"], "arena run: in no track that is chosen: every entry;"),
+        (
+            ["run", "--track", "vibration", "--entry", "kf-lgs", "--entry", "integrator", "--entry", "multirate"],
+            "arena run: in no track that is chosen: integrator, multirate;",
+        ),
+        (["records", "--track", "closed-loop", "--track", "next"], "arena records: there are none of closed-loop, next:"),
+    ],
+)
+def test_nothing_is_written_where_nobody_takes_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], reason: str
+) -> None:
+    monkeypatch.setattr(cli, "run_arena", lambda *_, **__: pytest.fail("runs"))
+    done = CliRunner().invoke(main, ["arena", *words, "--out", str(tmp_path / "out")])
+    assert done.exit_code == 2 and reason in done.stderr and done.stderr.count("\n") == 1 and not (tmp_path / "out").exists()
 
 
 def folder_of(place: Path) -> ArenaEntry:

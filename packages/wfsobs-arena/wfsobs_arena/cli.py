@@ -67,8 +67,10 @@ def run(
     """Run what is missing, and write results.json and index.html; tables of other tracks that are there stay."""
     whole, entrants = load_arena(seeds=seeds, quick=quick), find_entries(entries)
     found = _select_tracks(add_records(whole, [Path(file) for file in files]), tracks)
-    if not any(cases_of(found, entry) for entry in entrants):
-        raise SettingError("arena run: no entry takes part in a track that is chosen; next takes records by --record")
+    idle = [entry.id for entry in entrants if not cases_of(found, entry)]
+    if idle and (entries or len(idle) == len(entrants)):
+        who = ", ".join(idle) if entries else "every entry"
+        raise SettingError(f"arena run: in no track that is chosen: {who}; next takes records by --record")
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     outcomes = run_arena(found, entrants, folder, tell=lambda line: click.echo(f"wfsobs: {line}", err=True))
@@ -89,15 +91,18 @@ def run(
 @QUICK
 def records(out: str, tracks: tuple[str, ...], seeds: int | None, quick: bool) -> None:
     """Write the measurements of the records, RECORD.npz, for entries by a folder of estimates."""
+    cases = _select_tracks(load_arena(seeds=seeds, quick=quick), tracks).cases
+    asked = [case for case in cases if not TRACKS[case.track].is_loop]
+    if not asked:
+        raise SettingError(f"arena records: there are none of {', '.join(tracks)}: no folder of estimates takes part there")
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
-    for case in _select_tracks(load_arena(seeds=seeds, quick=quick), tracks).cases:
-        if not TRACKS[case.track].is_loop:
-            for seed in case.seeds:
-                seen = vars(case.record(seed).measurements()).items()
-                known = {name: np.asarray(value) for name, value in seen if value is not None}
-                named = {"track": np.array(case.track), "scenario": np.array(case.name), "unit": np.array("um")}
-                save_arrays(folder / f"{case.record_id(seed)}.npz", known | named)
+    for case in asked:
+        for seed in case.seeds:
+            seen = vars(case.record(seed).measurements()).items()
+            known = {name: np.asarray(value) for name, value in seen if value is not None}
+            named = {"track": np.array(case.track), "scenario": np.array(case.name), "unit": np.array("um")}
+            save_arrays(folder / f"{case.record_id(seed)}.npz", known | named)
 
 
 def _select_tracks(whole: Arena, tracks: tuple[str, ...]) -> Arena:
