@@ -361,6 +361,18 @@ def frame_mean(x: Array, n: int) -> Array:
     return total / n
 
 
+def fuse_frames(z: Array, z_ngs: Array, n: int) -> Array:
+    """Return z (n_steps, n_modes) with the mean of every NGS frame from the NGS, and NaN where there is no whole frame [um].
+
+    z_ngs : at the steps k at which a frame of n steps has come, the mean over z[k-n+1] ... z[k] but for noise; else NaN
+    """
+    out, ends = np.full_like(z, np.nan), np.flatnonzero(~np.isnan(z_ngs).all(axis=1))
+    ends = ends[ends >= n - 1]
+    rows = ends[:, None] + np.arange(1 - n, 1)
+    out[rows] = z[rows] + (z_ngs[ends] - frame_mean_of(z[rows]))[:, None]
+    return out
+
+
 def hold_last(x: Array) -> Array:
     """Return x (n, n_columns) with every NaN replaced by the last number before it in its column, zero where there is none."""
     gone = np.isnan(x)

@@ -17,7 +17,7 @@ from scipy.special import ndtr, ndtri, stdtrit
 
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimate
-from wfsobs.record import Record, delay_signal, frame_mean
+from wfsobs.record import Record, fuse_frames
 from wfsobs.sensors.modes import MODE_NAMES
 from wfsobs.signal.spectrum import rms
 from wfsobs.typing import Array
@@ -265,38 +265,37 @@ def _score_error(
 
 
 def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: float, mode_names: list[str]) -> list[Score]:
-    """Score estimates without truth, on common samples as well; truth_rms is the rms of the measurement throughout.
+    """Score estimates without truth, on common samples as well; truth_rms is the rms of z throughout.
 
-    - PREDICTION: rms of the next measurement less its prediction, noise of the measurement included. Only an observer that
-      estimates both turbulence and vibration predicts it; the others have no such score. Missing samples and outliers do not
-      count. Without NGS it is z[k+1] - phi_hat[k], since z[k+1] = phi_dist[k] + noise and phi_hat[k] knows y up to k. With at
-      least half of the NGS frames it is z_ngs[k] less the mean of phi_hat over the frame, of which no observer states a
-      deviation: z has the slow error of the LGS in it, which the better observer leaves out.
+    - PREDICTION: rms of z[k+1] - phi_hat[k], one step ahead, since z[k+1] = phi_dist[k] + noise and phi_hat[k] knows y up to
+      k. The noise of the measurement is included. Only an observer that estimates both turbulence and vibration predicts
+      z; the others have no such score. Missing samples and outliers do not count. In a mode with at least half of its NGS
+      frames, z has the mean over each frame from the NGS, as z of the LGS has their slow error in it, which the better
+      observer leaves out; of that no observer states a deviation.
     - RESIDUAL: rms of y_lgs, the residual of the recorded loop.
     """
-    out, both, of = list[Score](), totals(estimates), record.without_outliers
-    after, z, ratio = np.arange(record.n_steps) > round(warm_up / record.dt), of.z, record.ratio
-    seen, n, by_frames = z, 1, False
-    if ratio is not None and of.y_ngs is not None and np.mean(~np.isnan(of.z_ngs[ratio::ratio])) >= SHARE:
-        seen, n, by_frames = of.z_ngs, ratio, True
+    out, both, of, n = list[Score](), totals(estimates), record.without_outliers, record.ratio
+    after, whole = np.arange(record.n_steps) > round(warm_up / record.dt), of.z
+    is_fused = np.zeros(record.n_modes, dtype=bool)
+    if n is not None and of.y_ngs is not None and after[n::n].any():
+        is_fused = np.mean(~np.isnan(of.z_ngs[n::n][after[n::n]]), axis=0) >= SHARE
+        whole = np.where(is_fused, fuse_frames(whole, of.z_ngs, n), whole)
     for mode, name in enumerate(mode_names):
-        truth, left = seen[:, mode], of.y_lgs[:, mode]
-        measured = after & ~np.isnan(truth)
-        if not rms(truth[measured]) > 0:
+        z, left = whole[:, mode], of.y_lgs[:, mode]
+        measured = after & ~np.isnan(z)
+        if not rms(z[measured]) > 0:
             continue
-        errors = [truth - frame_mean(e.values[:, mode], n) for e in both]
+        errors = [z - _later(e.values[:, mode]) for e in both]
         scored = common_samples([measured & ~np.isnan(error) for error in errors])
         for e, error, (samples, apart) in zip(both, errors, scored, strict=True):
             if samples.any():
-                sd = None if by_frames else e.sd_of_sum.get(PREDICTION)
-                stated = None if sd is None else delay_signal(sd[:, mode], 1)
+                sd = None if is_fused[mode] else e.sd_of_sum.get(PREDICTION)
+                stated = None if sd is None else _later(sd[:, mode])
                 key = e.observer, PREDICTION, name
-                out.append(_score_error(key, error, truth, record.dt, samples, apart, e.seconds_per_step, stated))
-        samples = after & ~np.isnan(z[:, mode])
-        if not by_frames:
-            samples = next((s for s, apart in scored if not apart and s.any()), measured)
-        if (samples := samples & ~np.isnan(left)).any():
-            out.append(_score_error((LOOP, RESIDUAL, name), left, z[:, mode], record.dt, samples))
+                out.append(_score_error(key, error, z, record.dt, samples, apart, e.seconds_per_step, stated))
+        samples = next((s for s, apart in scored if not apart and s.any()), measured) & ~np.isnan(left)
+        if samples.any():
+            out.append(_score_error((LOOP, RESIDUAL, name), left, z, record.dt, samples))
     return out
 
 
@@ -316,6 +315,11 @@ def totals(estimates: Sequence[Estimate]) -> list[Estimate]:
         for parts in whole.values()
         if {e.target for e in parts} == set(TARGETS)
     ]
+
+
+def _later(x: Array) -> Array:
+    """Return x one step later, NaN first."""
+    return np.concatenate([[np.nan], x[:-1]])
 
 
 def common_samples(samples: Sequence[Array]) -> list[tuple[Array, bool]]:

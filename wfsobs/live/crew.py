@@ -23,15 +23,15 @@ from wfsobs.live.source import ALARM, Command, LiveEvent, enter_process, receive
 from wfsobs.live.view import rms_of_known
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.step import StepError, StepObserver
-from wfsobs.record import Sampling
+from wfsobs.record import Sampling, fuse_frames
 from wfsobs.streams.follower import EDGES
 from wfsobs.typing import Array
 
 D = TypeVar("D")
 M = TypeVar("M")
 
-TRUTHS = (*TARGETS, NEXT)
-"""What errors are against; that of both targets together is the sum of theirs."""
+TRUTHS = (*TARGETS, NEXT, "ngs")
+"""What errors are against: that of both targets together is the sum of theirs, that of the next measurement is from both."""
 ROOM = 1 << 14
 """Rows of estimates or residuals that are kept: a quarter of a minute at 1 kHz."""
 COUNTED = 64
@@ -173,8 +173,8 @@ class ObserverCrew(Crew[StepObserver, Follower]):
         slots = self._row[2:].reshape(n, slot_width(m))
         self._times, self._estimates = slots[:, 0], slots[:, 1:].reshape(n, len(TARGETS), m)  # views of the row
         self._rows, self._truth, self._waits = np.empty((COUNTED, *slots.shape)), np.empty((COUNTED, len(TRUTHS), m)), 0
-        self._past, self._running = np.full((self.ratio, n, m), np.nan), np.empty(0, dtype=np.intp)
-        self._has_ngs = sampling.ratio is not None
+        self._running, self._has_ngs = np.empty(0, dtype=np.intp), sampling.ratio is not None
+        self._past, self._past_z = np.full((self.ratio, n, m), np.nan), np.full((self.ratio - 1, m), np.nan)
 
     def take(self, frame: LiveFrame, number: int) -> Array:
         """Have every observer take a frame; return the row of their estimates. `settle` follows once that is written."""
@@ -189,7 +189,7 @@ class ObserverCrew(Crew[StepObserver, Follower]):
             self._times[follower.slot], before = now - before, now
         self._row[:2] = number, before - float(frame.due)
         self._rows[self._waits].reshape(-1)[:], truth = self._row[2:], self._truth[self._waits]
-        truth[0], truth[1], truth[2] = frame.turbulence, frame.vibration, frame.ngs if self._has_ngs else frame.z
+        truth[0], truth[1], truth[2], truth[3] = frame.turbulence, frame.vibration, frame.z, frame.ngs
         self._waits += 1
         return self._row
 
@@ -221,18 +221,22 @@ class ObserverCrew(Crew[StepObserver, Follower]):
         board.samples[running] += is_known.sum(axis=0)
 
     def _errors(self, estimates: Array, truth: Array) -> Array:
-        """Return the errors of consecutive frames, NaN during a warm-up, (n, running observers, len(SCORED), n_modes) [um]."""
-        n, running = len(truth), self._running
-        out = np.empty((n, len(running), len(SCORED), truth.shape[2]))
-        np.subtract(estimates, truth[:, None, :2], out=out[:, :, :2])
+        """Return errors, NaN during a warm-up, (at least n, running observers, len(SCORED), n_modes) [um].
+
+        Those of the next measurement that an NGS frame tells are of the frames before, too.
+        """
+        before, running = len(self._past_z), self._running
         totals = np.concatenate((self._past[:, running], estimates.sum(axis=2)))
-        # A measurement is the mean over as many frames before: one of the LGS, `ratio` of the NGS, which has no slow error.
-        expected = sum((totals[i : i + n] for i in range(1, self.ratio)), totals[:n]) / self.ratio
-        np.subtract(expected, truth[:, 2, None], out=out[:, :, 2])
+        z = np.concatenate((self._past_z, truth[:, 2]))
+        out = np.full((len(z), len(running), len(SCORED), truth.shape[2]), np.nan)
+        np.subtract(estimates, truth[:, None, :2], out=out[before:, :, :2])
+        frames = np.concatenate((np.full_like(self._past_z, np.nan), truth[:, 3]))
+        seen = fuse_frames(z, frames, self.ratio) if self._has_ngs else z
+        np.subtract(totals[:-1], seen[:, None], out=out[:, :, 2])
         np.add(out[:, :, 0], out[:, :, 1], out=out[:, :, 3])
-        self._past[:, running] = totals[n:]
+        self._past[:, running], self._past_z = totals[len(truth) :], z[len(truth) :]
         for at, follower in enumerate(self._active.values()):
-            out[: max(0, n - max(0, follower.observer.frame - self._warm_up)), at] = np.nan
+            out[: max(0, len(z) - max(0, follower.observer.frame - self._warm_up)), at] = np.nan
         return out
 
     def lose(self, count: int) -> None:
@@ -240,7 +244,7 @@ class ObserverCrew(Crew[StepObserver, Follower]):
         self.count()
         self._board.losses[self._place] += count
         self._board.progress[self._place] += count
-        self._past[:] = np.nan
+        self._past[:] = self._past_z[:] = np.nan
         for follower in self._active.values():
             follower.observer.reset()
 

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from wfsobs.evaluation.scores import SHARE
 from wfsobs.live.board import NEXT, SLOTS, slot_width
 from wfsobs.live.ring import LiveFrame, Ring, Rows, merged_rows
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import TOTAL
-from wfsobs.record import Sampling, frame_mean
+from wfsobs.record import Sampling, fuse_frames
 from wfsobs.typing import Array
 
 SHARED = 0.16
@@ -91,16 +92,18 @@ class LiveView:
         return self.estimate(observer, target) - self.truth(target)
 
     def rms(self, observer: str, target: str) -> Array:
-        """Return the rms error, (n_modes,) [um]; NaN where there is none. With NGS, that of the next NGS frame for NEXT."""
-        of = self._error_of_frames if target == NEXT and self.ratio else self.error
-        return self.once(("rms", observer, target), lambda: rms_of_known(of(observer, target)))
+        """Return the rms error, (n_modes,) [um]; NaN where there is none.
 
-    def _error_of_frames(self, observer: str, _next: str) -> Array:
-        """Return the mean estimate over each NGS frame less its measurement, which has no slow error of the LGS; NaN between."""
-        n = self.ratio or 1
-        out = frame_mean(self.estimate(observer, TOTAL), n) - self.frames.ngs
-        out[:n] = np.nan
-        return out
+        That of the next measurement is told by the NGS where at least half of its frames are there.
+        """
+        return self.once(("rms", observer, target), lambda: rms_of_known(self.estimate(observer, target) - self._judge(target)))
+
+    def _judge(self, target: str) -> Array:
+        """Return what an error is against, (n, n_modes) [um]."""
+        truth, n = self.truth(target), self.ratio
+        if target != NEXT or n is None or np.mean(~np.isnan(self.frames.ngs).all(axis=1)) < SHARE / n:
+            return truth
+        return self.once("judge", lambda: fuse_frames(truth, self.frames.ngs, n))
 
     def _of(self, observer: str) -> Array:
         width = slot_width(self.n_modes)

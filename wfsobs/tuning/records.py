@@ -207,7 +207,7 @@ GAP = 1.0
 SHORTEST = 1.0
 """What is left of validation and test after the warm-up, at least [s]."""
 
-TRUTH, NEXT, REFERENCE = "the truth", "the next measurement", "the zero-phase Butterworth reference"
+TRUTH, NEXT, REFERENCE = "the truth", "the next measurement of the LGS", "the zero-phase Butterworth reference"
 """What an estimate is compared with."""
 WORST, P95 = "the worst plant", "95 % of the plants"
 """Where a controller is scored."""

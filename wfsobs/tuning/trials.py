@@ -306,6 +306,7 @@ class RecordTrials(Trials):
         """Over the steps after the warm-up [s] that have an estimate. Raises RecordError where there is none."""
         names = [m.name for m in scenario.modes][: record.n_modes]
         if target == PREDICTION:
+            record = replace(record, y_ngs=None, ratio=None)  # the observer has the LGS alone, and no part in their slow error
             scores = [s for s in unsupervised_scores(record, estimates, warm_up, names) if s.observer == self.observer]
         else:
             scores = supervised_scores(record, [e for e in estimates if e.target == target], warm_up, names)
