@@ -17,7 +17,6 @@ from wfsobs.app import downloads
 from wfsobs.app.actions import LARGEST, Actions
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.downloads import TooLarge, data_csv, data_npz
-from wfsobs.app.report.page import ReportError
 from wfsobs.app.share import to_query
 from wfsobs.app.work import RunResults, compute
 from wfsobs.cli import main
@@ -146,12 +145,13 @@ def test_a_report_is_made_aside_of_what_is_shown_one_at_a_time(
 
 
 @pytest.mark.parametrize(
-    ("error", "line"), [(ReportError("no room"), "Report: no room"), (KeyError("x"), "Report: KeyError: 'x'")]
+    ("error", "line"), [(ValueError("no room"), "Report: no room"), (KeyError("x"), "Report: KeyError: 'x'")]
 )
 def test_a_report_that_fails_is_one_line(
     actions: Actions,
     loop: Any,
     monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
     error: Exception,
     line: str,
 ) -> None:
@@ -162,6 +162,7 @@ def test_a_report_that_fails_is_one_line(
     actions.handle({"action": "report"})
     loop.until(lambda: actions.toolbar.notes)
     assert actions.toolbar.notes == [line] and not actions.toolbar.reporting
+    assert ("Traceback" in caplog.text) == isinstance(error, KeyError), "the log says more of what nobody expected"
     assert not actions.sent  # type: ignore[attr-defined]
 
 

@@ -118,7 +118,7 @@ class TestChoice:
 
     def test_a_link_that_says_it_of_one_target_leaves_the_main_ones_of_the_other(self, dashboard: Dashboard) -> None:
         run, display = Run(), Display()
-        MainLines(display, run).choose("vibration", ["truth"])  # type: ignore[arg-type]
+        MainLines(display, run).choices["vibration"].choose(["truth"])  # type: ignore[arg-type]
         run.result = dashboard.store.run.result
         assert display.hidden_lines["vibration"] == ["truth"]
         assert display.hidden_lines["turbulence"] == others_of(run.result.result.scores, "turbulence")
@@ -132,7 +132,7 @@ class TestChoice:
         assert display.hidden_lines["turbulence"] == others_of(few, "turbulence") != others_of(whole.result.scores, "turbulence")
         run.result = whole
         run.state = DONE
-        assert lines.choices() == {}
+        assert not any(choice.is_chosen for choice in lines.choices.values())
         for target in TARGETS:
             assert display.hidden_lines[target] == others_of(whole.result.scores, target)
 
@@ -198,12 +198,12 @@ class TestNamesAndGrey:
         main = dashboard.display.named_lines["vibration"]
         other = next(name for name in observers_of("vibration") if name not in main)
         lines = dashboard.explore.traces.traces["vibration"].lines
-        dashboard.explore.lines.choose("vibration", [])
+        dashboard.explore.lines.choices["vibration"].choose([])
         assert [name for name, line in lines.items() if not line.recedes] == [TRUTH, *main]
         grey = lines[other].renderer
         assert grey is not None and grey.glyph.line_color == GREY[False] and grey.tags == [look(other).light]
         few = [*main[: MOST_COLOURED - 2], other]
-        dashboard.explore.lines.choose("vibration", [name for name in observers_of("vibration") if name not in few])
+        dashboard.explore.lines.choices["vibration"].choose([name for name in observers_of("vibration") if name not in few])
         assert not any(line.recedes for line in lines.values()) and grey.glyph.line_color == look(other).light
 
     def test_the_effect_of_a_change_stands_below_its_setting(self, dashboard: Dashboard, loop: Any) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from wfsobs.app.display import AT_LIMIT
 from wfsobs.app.render import number
-from wfsobs.app.report.data import Report, State, pack, state_of, unpack
+from wfsobs.app.report.data import Report, State, state_of
 from wfsobs.app.report.page import page
 from wfsobs.app.report.sections import budget_state_table
 from wfsobs.evaluation.budget import TERMS, error_budget
@@ -27,7 +27,7 @@ MADE = datetime(2026, 1, 2, tzinfo=UTC)
 
 
 def test_every_linear_observer_has_its_terms_in_the_page(result: Result, short: Scenario, parse: Any) -> None:
-    it = parse(page(unpack(pack(Report("paper", short, (), (state_of(result),)))), MADE))
+    it = parse(page(Report("paper", short, (), (state_of(result),)), MADE))
     tip, tilt, table = (t for t in it.tables if t[0][:2] == ["Observer", "Parts"])
     main = {row_label(name) for names in state_of(result).main.values() for name in names}
     for mode, few in (("tip", tip), ("tilt", tilt)):  # beside the verdict those that it names
@@ -86,7 +86,7 @@ def test_errors_have_the_interval_over_seeds_and_the_best_is_significant(short: 
     names = ("kf-lgs", "kf-multi", "ridge-30")
     of = [run(short.replace({"run.seed": seed}), observers=names) for seed in (1, 2, 3, 4)]
     evidence = gather_evidence([result.scores for result in of])
-    report = unpack(pack(Report("paper", short, (), (state_of(of[0], evidence=evidence),))))
+    report = Report("paper", short, (), (state_of(of[0], evidence=evidence),))
     it = parse(page(report, MADE))
     table = next(t for t in it.tables if "RMS error [nm]" in t[0])
     start = next(i for i, row in enumerate(table) if row[0].startswith("Vibration, tilt"))

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from wfsobs.app.compared import ComparedRun, comparison_of
-from wfsobs.app.report.data import Report, pack, state_of, unpack
+from wfsobs.app.report.data import Report, state_of
 from wfsobs.app.report.page import page
 from wfsobs.evaluation.result import Result
 
@@ -22,7 +22,7 @@ def test_errors_and_changes_of_every_run(result: Result, parse: Any) -> None:
         ComparedRun("2", "C", "Seed 7", result.scenario, few),
     ]
     report = Report("paper", result.scenario, (), (state_of(result),), comparison=comparison_of(runs, result, None))
-    text = page(unpack(pack(report)), datetime(2026, 1, 2, tzinfo=UTC))
+    text = page(report, datetime(2026, 1, 2, tzinfo=UTC))
     assert "<strong>A</strong> Wind &lt;20 m/s&gt;" in text and "<strong>C</strong> Seed 7" in text
     tables = [table for table in parse(text).tables if table[0] == ["Observer", "shown [nm]", "A [nm]", "C [nm]"]]
     assert len(tables) == len({(s.target, s.mode) for s in result.scores})
@@ -36,5 +36,5 @@ def test_errors_and_changes_of_every_run(result: Result, parse: Any) -> None:
 
 def test_without_any_there_is_no_section(result: Result) -> None:
     assert comparison_of([], result, None) is None
-    text = page(unpack(pack(Report("paper", result.scenario, (), (state_of(result),)))), datetime(2026, 1, 2, tzinfo=UTC))
+    text = page(Report("paper", result.scenario, (), (state_of(result),)), datetime(2026, 1, 2, tzinfo=UTC))
     assert "Compared runs" not in text

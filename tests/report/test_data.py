@@ -11,14 +11,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tests.report.levels import read_levels
-from wfsobs.app.report.data import Grid, Report, bins_for, pack, state_of, unpack, window_of
+from wfsobs.app.report.data import Grid, bins_for, state_of, window_of
 from wfsobs.app.report.page import DECADES, LEVELS, STEP, Pool, encode
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.error_spectra import cumulative_rms
 from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.rows import score_rows
-from wfsobs.scenario import Scenario
-from wfsobs.scenario.grid import Variation
 from wfsobs.signal.spectrum import psd
 
 
@@ -116,18 +114,6 @@ def test_an_unfinished_observer_is_named(result: Result) -> None:
     done = {name: tuple(it for it in getattr(result, name) if it.observer != "gpr-online") for name in ("estimates", "scores")}
     part = replace(result, **done)
     assert state_of(part).reasons == ("gpr-online left out: not finished when the report was made",)
-
-
-def test_to_another_process_and_back(result: Result, short: Scenario) -> None:
-    state = state_of(result)
-    report = Report("paper", short, (Variation("loop.gain", (0.3, 0.2)),), (state, replace(state, reasons=("why",))), True)
-    again = unpack(pack(report))
-    assert again.base == short and again.variations == report.variations and again.preset == "paper"
-    assert again.start == 0 and again.is_recorded
-    for ours, theirs in zip(report.states, again.states, strict=True):
-        assert (theirs.rows, theirs.reasons, theirs.grid, theirs.scenario) == (ours.rows, ours.reasons, ours.grid, ours.scenario)
-        assert theirs.lines.keys() == ours.lines.keys()
-        assert all(np.array_equal(theirs.lines[name], line, equal_nan=True) for name, line in ours.lines.items())
 
 
 def test_the_window_is_told_where_all_states_share_it(result: Result) -> None:

@@ -1,4 +1,4 @@
-"""The closed loop in a report: the rows of `wfsobs loop`, whatever process makes the page."""
+"""The closed loop in a report: the rows of `wfsobs loop`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 import pytest
 
 from wfsobs.app.render import number
-from wfsobs.app.report.data import Report, pack, state_of, unpack
+from wfsobs.app.report.data import Report, state_of
 from wfsobs.app.report.page import page
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label
 from wfsobs.control.controllers import CONTROLLERS
@@ -33,7 +33,7 @@ def test_rows_of_the_controllers_that_take_a_moment(report: Report) -> None:
 
 
 def test_they_stand_in_the_page_best_first(report: Report) -> None:
-    text = page(unpack(pack(report)), MADE)
+    text = page(report, MADE)
     section = text[text.index("<h2>Closed loop</h2>") : text.index("<h2>Scenario</h2>")]
     tip, tilt = section.split('<tbody data-mode="')[1:]
     for mode, body in (("tip", tip), ("tilt", tilt)):

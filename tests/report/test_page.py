@@ -20,9 +20,10 @@ from tests.report.levels import read_levels
 from wfsobs import __version__
 from wfsobs.app.display import AT_LIMIT
 from wfsobs.app.render import hundredths, number
-from wfsobs.app.report.data import Grid, Report, pack, state_of, unpack
+from wfsobs.app.report.data import Grid, Report, state_of
 from wfsobs.app.report.page import page
-from wfsobs.app.report.sections import FILE, LONGEST, command_of
+from wfsobs.app.report.sections import command_of
+from wfsobs.app.share import FILE, LONGEST
 from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.rows import TIME, is_non_causal, row_label, scored_interval, target_title
 from wfsobs.observers import OBSERVERS
@@ -210,7 +211,7 @@ def test_a_loaded_record_promises_no_simulation(result: Result, parse: Any) -> N
     assert "of a loaded record" in said and f"wfsobs observe RECORD --config {FILE}" in said and "wfsobs export" not in said
     command = "wfsobs observe night.csv --preset paper --sha256 0a1b"
     named = Report("paper", result.scenario, (), (state,), is_recorded=True, command=command)
-    said = parse(page(unpack(pack(named)), MADE)).text
+    said = parse(page(named, MADE)).text
     assert command in said and "RECORD" not in said and "saved as" not in said
     assert {row["target"] for row in state.rows} == {"next z", "residual y"}
     assert "Next measurement, tip" in said

@@ -11,7 +11,7 @@ from bokeh.document import Document
 from scipy import stats
 
 from wfsobs.app.pages.sweep_views import report_part
-from wfsobs.app.report.data import Report, pack, state_of, unpack
+from wfsobs.app.report.data import Report, state_of
 from wfsobs.app.report.page import page
 from wfsobs.campaign.sweep import SweepResults, parse_axis, plan_sweep
 from wfsobs.evaluation.result import Result
@@ -33,7 +33,7 @@ def results(short: Scenario) -> SweepResults:
 
 def test_maps_and_table(results: SweepResults, result: Result, parse: Any) -> None:
     report = Report("paper", result.scenario, (), (state_of(result),), sweep=report_part(results))
-    text = page(unpack(pack(report)), datetime(2026, 1, 2, tzinfo=UTC))
+    text = page(report, datetime(2026, 1, 2, tzinfo=UTC))
     it = parse(text)
     cells = [attributes for tag, attributes in it.tags if tag == "td" and "data-state" in attributes]
     assert [c["data-state"] for c in cells] == ["open", "waiting", "decided", "open"], "5 at the bottom, 10 above it"
@@ -45,7 +45,7 @@ def test_maps_and_table(results: SweepResults, result: Result, parse: Any) -> No
     assert best[2:7] == ["vibration", "tip", "Multi-peak KF", "4", f"{mean:.1f}"]
     low, high = (float(x) for x in best[7].split(" – "))
     assert low < mean < high and low + high == pytest.approx(2 * mean, abs=0.11), "rounded to 0.05 each"
-    without = page(unpack(pack(Report("paper", result.scenario, (), (state_of(result),)))), datetime(2026, 1, 2, tzinfo=UTC))
+    without = page(Report("paper", result.scenario, (), (state_of(result),)), datetime(2026, 1, 2, tzinfo=UTC))
     assert "Best observers" not in without
 
 
@@ -60,7 +60,7 @@ def test_lines_over_one_setting(short: Scenario, result: Result, parse: Any, val
         bound = Score("bound", "vibration", "tip", 2e-3, 0.02, None, None, 0.0)
         results = results.add(speeds.index(speed), [score, bound])
     report = Report("paper", result.scenario, (), (state_of(result),), sweep=report_part(results))
-    it = parse(page(unpack(pack(report)), datetime(2026, 1, 2, tzinfo=UTC)))
+    it = parse(page(report, datetime(2026, 1, 2, tzinfo=UTC)))
     assert "Error over Wind speed V₀, vibration, tip" in it.text
     figures = it.data("figures")
     drawn = [name for name in figures["roots"].values() if name.startswith("part-")]
@@ -82,5 +82,5 @@ def test_lines_over_one_setting(short: Scenario, result: Result, parse: Any, val
 
 def test_no_lines_over_two_settings(results: SweepResults, result: Result, parse: Any) -> None:
     report = Report("paper", result.scenario, (), (state_of(result),), sweep=report_part(results))
-    it = parse(page(unpack(pack(report)), datetime(2026, 1, 2, tzinfo=UTC)))
+    it = parse(page(report, datetime(2026, 1, 2, tzinfo=UTC)))
     assert not any(name.startswith("part-") for name in it.data("figures")["roots"].values())

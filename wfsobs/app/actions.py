@@ -14,7 +14,7 @@ from wfsobs.app.idle_work import SeedRuns
 from wfsobs.app.jobs import DONE, FAILED, RUNNING, Job
 from wfsobs.app.pages.pages import ViewState
 from wfsobs.app.render import render
-from wfsobs.app.report.page import LIMIT, ReportError, make
+from wfsobs.app.report.page import make
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.session_file import SessionError, read_session
 from wfsobs.app.share import FILE, Link, from_file, from_query, name_record, to_command, to_file, to_python, to_query
@@ -181,12 +181,8 @@ class Actions:
             return
         command = to_command(shown.scenario, preset, shown.source) if shown.is_recorded else ""
         evidence = self._seeds.evidence
-        job = Job(
-            "report",
-            partial(make, shown, preset, command=command, **self.pages.shown_beside(shown.result, evidence), evidence=evidence),
-            time_limit=LIMIT,
-            refusal=ReportError,
-        )
+        beside = self.pages.shown_beside(shown.result, evidence)
+        job = Job("report", partial(make, shown, preset, command=command, evidence=evidence, **beside))
         self._start("report", "Report", job, partial(self.toolbar.save, REPORT, "text/html"))
 
     def _start(self, which: str, name: str, job: Job, then: Callable[[Any], None]) -> None:

@@ -23,7 +23,6 @@ from wfsobs.app.pages.parts import (
     SMALL_LABEL,
     TALL,
     WIDE,
-    LinkedLines,
     Page,
     Starter,
     box,
@@ -52,6 +51,7 @@ from wfsobs.app.views.plots import (
     on_settle,
     set_ends,
 )
+from wfsobs.app.views.switches import LineChoice
 from wfsobs.closed_loop.envelope import POINTS, PlantEnvelope, Uncertainty
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label, loop_verdict, no_theory
 from wfsobs.control.controllers import CONTROLLERS
@@ -425,14 +425,8 @@ class ClosedLoopPage(Page):
         self.table: Final = html()
         self.margins: Final = html()
         self.cards: Final = Cards("controllers")
-        self.cards.on_main, self._main, self._is_chosen = self._show_main, list[str](), False
-        self.link = LinkedLines(
-            "hide",
-            CONTROLLERS,
-            lambda: self.cards.hidden_lines if self._is_chosen else None,
-            self._hide,
-            lambda act: self.cards.param.watch(act, "hidden_lines"),
-        )
+        self.link = self.lines = LineChoice("hide", CONTROLLERS)
+        self.lines.tie(self.cards)
         self.trace: Final = Trace(FIRST_S)
         self.zoom: Final = Trace(ZOOM_S)
         self.spectrum: Final = LoopSpectrum()
@@ -450,7 +444,7 @@ class ClosedLoopPage(Page):
         self.work.param.watch(self.redraw, "result")
         self.run.param.watch(self.follow, ["result", "state"])
         display.param.watch(self._restyle, "dark")
-        self.cards.param.watch(self._choose, "hidden_lines")
+        self.lines.watch(self._restyle)
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""
@@ -516,8 +510,7 @@ class ClosedLoopPage(Page):
         self._verdict = loop_verdict(shown.result, self.display.mode)
         for drawn in self._figures:
             drawn.draw(shown, self.display)
-        if not self._is_chosen:
-            self._show_main()
+        self.lines.offer([place.observer for place in self._verdict.named_places] if self._verdict else CONTROLLERS)
         self._restyle()
         if self.editor is not None:
             self.editor.follow()
@@ -525,36 +518,17 @@ class ClosedLoopPage(Page):
     def _restyle(self, *_: object) -> None:
         with pn.io.hold():
             for drawn in self._figures:
-                drawn.restyle(self.display.dark, self.cards.hidden_lines)
+                drawn.restyle(self.display.dark, self.lines.hidden_lines)
             for drawn in (self.trace, self.zoom, self.spectrum):
-                drawn.fit(self.cards.hidden_lines)
+                drawn.fit(self.lines.hidden_lines)
             if self.results is not None:
                 envelope = self.uncertain.finding
                 known = envelope if self.uncertain.complete else None
                 self.verdict.html = loop_verdict_html(self.results, self._verdict, self.display, known)
                 self.table.html = loop_html(self.results, self.display, envelope)
-                self.uncertain.draw(self.cards.hidden_lines)
+                self.uncertain.draw(self.lines.hidden_lines)
                 self.margins.html = margins_html(self.results, self.display)
                 self.cards.show(self._items(self.results))
-
-    def _choose(self, *_: object) -> None:
-        """Keep to the lines that a visitor has chosen."""
-        self._is_chosen = self.cards.hidden_lines != self._main
-        self._restyle()
-
-    def _hide(self, names: list[str] | None) -> None:
-        if names is None:
-            self._show_main()
-        else:
-            self.cards.hidden_lines = names
-
-    def _show_main(self) -> None:
-        """Show the few lines that matter: of those that the verdict names."""
-        if self.results is None:
-            return
-        main = [place.observer for place in self._verdict.named_places] if self._verdict else [*CONTROLLERS]
-        self._main = [name for name in CONTROLLERS if name not in main]
-        self.cards.hidden_lines = self._main
 
     def _items(self, results: LoopResults) -> list[dict[str, Any]]:
         """Describe a card per controller."""
@@ -564,7 +538,7 @@ class ClosedLoopPage(Page):
         out = []
         for name in CONTROLLERS:
             row = left.get(name)
-            fields: dict[str, Any] = {"main": name not in self._main}
+            fields: dict[str, Any] = {"main": name not in (self.lines.minor or ())}
             if row is None:
                 note = f"left out, {seconds(name, results.result.scenario):.0f} s" if results.complete else "computing …"
             elif row["residual_rms_nm"] is None:

@@ -113,8 +113,6 @@ class Explore(Page):
         call(self.traces.traces[target].figure, f"{target.capitalize()} time trace")
         call(self.spectra.spectra[target].figure, f"{target.capitalize()} spectrum")
         cards = self.strips[target].cards
-        cards.param.watch(lambda event: self._hide(target, event.new), "hidden_lines")
-        cards.on_main = lambda: self.lines.reset(target)
         cards.on_all = self.budgets.ask_for_all
         marks = MARKS if target == VIBRATION else ""
         traces = pn.Column(caption("Time trace"), self.traces.pane(target), **TALL)
@@ -144,7 +142,3 @@ class Explore(Page):
                 fig = self.spectra.spectra[target].figure
                 self.editors[target] = SpectrumEditor(target, fig, self.seeds.store, self.display, frames, theory)
                 room.append(self.editors[target].layer)
-
-    def _hide(self, target: str, names: list[str]) -> None:
-        if names != self.display.hidden_lines.get(target, []):
-            self.lines.choose(target, names)

@@ -20,17 +20,16 @@ from wfsobs.app.pages.explore import Explore
 from wfsobs.app.pages.figures import Figures, ModelPage
 from wfsobs.app.pages.identify import IdentifyPage, Suggestion
 from wfsobs.app.pages.live import LivePage
-from wfsobs.app.pages.parts import WIDE, LinkedFields, LinkedLines, LinkPart, Page, not_known
+from wfsobs.app.pages.parts import WIDE, LinkedFields, LinkPart, Page
 from wfsobs.app.pages.sweep import SweepPage
 from wfsobs.app.pages.sweep_views import report_part
 from wfsobs.app.pages.tune import TunePage
 from wfsobs.app.store import Store
-from wfsobs.app.style import HEARD, PRIMARY, observers_of
+from wfsobs.app.style import HEARD, PRIMARY
 from wfsobs.app.views.plots import on_settle
-from wfsobs.app.work import TRUTH
+from wfsobs.app.views.switches import not_known
 from wfsobs.evaluation.evidence import Evidence
 from wfsobs.evaluation.result import Result
-from wfsobs.observers.base import TARGETS
 
 EXPLORE, IDENTIFY, TUNE, SWEEP, LOOP, LIVE = "explore", "identify", "tune", "sweep", "loop", "live"
 CAMPAIGN, FIGURES, MODEL = "campaign", "figures", "model"
@@ -147,7 +146,7 @@ PREFIX = "view."
 SWITCHES = ("mode", "unit", "show", "spectrum")
 """Switches of the display, by their names there."""
 
-PAGE, WINDOW, HIDE, SEEDS, THEME = "page", "window", "hide.", "seeds", "theme"
+PAGE, WINDOW, SEEDS, THEME = "page", "window", "seeds", "theme"
 MOST = 50
 """Fields of a query that are read."""
 
@@ -161,28 +160,15 @@ class ViewState(param.Parameterized):
         super().__init__()
         self.display = display
         self.pages = pages
-        self.lines: Final = explore.lines
         self.traces: Final = explore.traces
         switches = LinkedFields({PAGE: (pages, "current")} | {name: (display, name) for name in SWITCHES})
         switches.fresh[PAGE] = EXPLORE
-        lines = [self._lines_of(target) for target in TARGETS]
-        self._parts: list[LinkPart] = [switches, *lines, LinkedFields({SEEDS: (seeds, "count")})]
+        self._parts: list[LinkPart] = [switches, *explore.lines.choices.values(), LinkedFields({SEEDS: (seeds, "count")})]
         self._theme, self._known_pages = "", set[str]()
         for part in self._parts:
             part.watch(self._refresh)
         pages.param.watch(self._turn, "current")
         on_settle([self.traces.x_range], self._refresh)
-
-    def _lines_of(self, target: str) -> LinkedLines:
-        def hide(names: list[str] | None) -> None:
-            if names is None:
-                self.lines.reset(target)
-            else:
-                self.lines.choose(target, names)
-
-        known, display = (TRUTH, *observers_of(target)), self.display
-        hidden = lambda: self.lines.choices().get(target)  # noqa: E731
-        return LinkedLines(HIDE + target, known, hidden, hide, lambda act: display.param.watch(act, "hidden_lines"))
 
     def choose_theme(self, dark: bool) -> None:
         """Keep the theme that the visitor has chosen."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
 from html import escape
 from typing import Any, Final
@@ -24,6 +24,7 @@ from wfsobs.app.share import EXPLORED, CopiedTask
 from wfsobs.app.store import Store
 from wfsobs.app.style import WIDE, HtmlText, bare, html, make_button, sheets, swatch
 from wfsobs.app.views.plots import call
+from wfsobs.app.views.switches import LineChoice, not_known
 from wfsobs.app.work import RunResults
 from wfsobs.settings.errors import SettingError
 from wfsobs.settings.parameters import hint
@@ -129,59 +130,8 @@ class LinkedFields:
         return []
 
 
-class LinkedLines:
-    """The lines that a visitor has hidden.
-
-    Parameters
-    ----------
-    name : str
-        In an address.
-    lines : Collection
-        Names of all lines.
-    choice : callable
-        Returns the names of those hidden, None where a fresh page's are.
-    hide : callable
-        Hides lines; for None those of a fresh page.
-    watch : callable
-        Has a function called when other lines are hidden.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        lines: Collection[str],
-        choice: Callable[[], Iterable[str] | None],
-        hide: Callable[[list[str] | None], object],
-        watch: Callable[[Callable[..., object]], object],
-    ):
-        self.names = [name]
-        self._lines = lines
-        self._choice = choice
-        self._hide = hide
-        self.watch = watch
-
-    def texts(self) -> dict[str, str]:
-        """Return the lines that are hidden, where a visitor has chosen."""
-        hidden = self._choice()
-        return {} if hidden is None else dict.fromkeys(self.names, ",".join(hidden))
-
-    def open(self, texts: Mapping[str, str]) -> list[str]:
-        """Hide lines."""
-        (own,) = self.names
-        text = texts.get(own)
-        names = text.split(",") if text else []
-        self._hide(None if text is None else [name for name in names if name in self._lines])
-        refused = [f"{own} = {name[:80]}: no line of that name" for name in names if name not in self._lines]
-        return [*not_known(name for name in texts if name != own), *refused]
-
-
-LinkPart = LinkedFields | LinkedLines
+LinkPart = LinkedFields | LineChoice
 """A part of a view as texts by name."""
-
-
-def not_known(names: Iterable[str]) -> list[str]:
-    """Return a line for each name that a page has nothing of."""
-    return [f"{name}: there is no such part of a view" for name in names]
 
 
 def _text(value: Any) -> str:

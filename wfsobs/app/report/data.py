@@ -1,11 +1,9 @@
-"""What a report holds: the rows of every state, its lines as few points, and both on their way to another process."""
+"""What a report holds: the rows of every state, and its lines as few points."""
 
 from __future__ import annotations
 
-import io
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass, field
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
@@ -30,7 +28,6 @@ from wfsobs.observers.base import TARGETS
 from wfsobs.priors_from.scenario import usual_observers
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.configfile import from_toml, to_toml
 from wfsobs.scenario.grid import Variation
 from wfsobs.signal.envelope import envelope, envelope_times
 from wfsobs.typing import Array
@@ -285,45 +282,3 @@ def window_of(states: Sequence[State]) -> tuple[float, float] | None:
     if any((a.n, a.dt) != (b.n, b.dt) for a, b in pairwise(grids)):
         return None
     return grids[0].first * grids[0].dt, (grids[0].last - 1) * grids[0].dt
-
-
-# -------------------------------------------------------------------------------------------- to another process
-
-
-OF_REPORT = ("preset", "is_recorded", "command", "sweep", "comparison")
-OF_STATE = ("rows", "reasons", "loop", "budgets", "seeds", "verdicts", "main")
-"""Fields of a report and of a state that are plain values."""
-
-
-def pack(report: Report) -> bytes:
-    """Write a report as a file of plain arrays and text."""
-    words = {
-        **{name: getattr(report, name) for name in OF_REPORT},
-        "base": to_toml(report.base),
-        "variations": [[v.path, v.values] for v in report.variations],
-        "states": [
-            {**{name: getattr(s, name) for name in OF_STATE}, "scenario": to_toml(s.scenario), "grid": astuple(s.grid)}
-            for s in report.states
-        ],
-    }
-    arrays = {f"{i}/{name}": line for i, s in enumerate(report.states) for name, line in s.lines.items()}
-    file = io.BytesIO()
-    np.savez(file, allow_pickle=False, words=np.array(json.dumps(words)), **arrays)
-    return file.getvalue()
-
-
-def unpack(content: bytes) -> Report:
-    """Read the report that `pack` wrote."""
-    with np.load(io.BytesIO(content), allow_pickle=False) as file:
-        words = json.loads(str(file["words"]))
-        lines: list[dict[str, Floats]] = [{} for _ in words["states"]]
-        for key in file.files:
-            number, slash, name = key.partition("/")
-            if slash:
-                lines[int(number)][name] = file[key]
-    states = [
-        State(**s | {"scenario": from_toml(s["scenario"]), "grid": Grid(*s["grid"]), "reasons": tuple(s["reasons"]), "lines": of})
-        for s, of in zip(words["states"], lines, strict=True)
-    ]
-    variations = tuple(Variation(path, tuple(values)) for path, values in words["variations"])
-    return Report(**words | {"base": from_toml(words["base"]), "variations": variations, "states": tuple(states)})

@@ -7,15 +7,10 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import logging
-import os
-import subprocess
-import sys
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -39,7 +34,7 @@ from wfsobs.app.display import NO_ANGLE, UNITS, per_micrometre
 from wfsobs.app.glossary import sentence_on
 from wfsobs.app.pages.sweep_views import SweepLines
 from wfsobs.app.render import render
-from wfsobs.app.report.data import Report, State, pack, state_of, unpack, window_of
+from wfsobs.app.report.data import Report, State, state_of, window_of
 from wfsobs.app.report.sections import (
     budget_key,
     budget_state_table,
@@ -381,22 +376,6 @@ def export(
     write_whole(path, lambda file: file.write(content))
 
 
-# ---------------------------------------------------------------------------------------------- of the dashboard
-
-
-log = logging.getLogger(__name__)
-
-LIMIT = 240.0
-"""The most that waiting for others, and then the making, may take [s]; long enough for a machine that is busy otherwise."""
-
-POLL = 0.1
-"""How often it is looked whether anybody still wants it [s]."""
-
-
-class ReportError(Exception):
-    """Why there is no report, in one line."""
-
-
 def make(
     results: RunResults,
     preset: str,
@@ -407,55 +386,12 @@ def make(
     evidence: Evidence | None = None,
     comparison: Mapping[str, Any] | None = None,
 ) -> bytes:
-    """Make the file of the results shown; blocks, so call it in a job. Raises ReportError, Cancelled.
+    """Make the file of the results shown; takes a second or two, so call it in a job. Raises Cancelled.
 
     command : what makes the estimates again, of a record that is not the simulation of the settings; sweep, comparison : what
     `Report` has of a sweep and of compared runs; evidence : what further seeds say
     """
     state = state_of(results.result, is_simulated=not results.is_recorded, evidence=evidence)
-    content = pack(Report(preset, results.scenario, (), (state,), results.is_recorded, command, sweep, comparison))
-    root = str(Path(__file__).parents[3])
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))}
-    # A file, not a pipe: what a pipe has not taken when `communicate` times out is never sent.
-    with TemporaryFile() as packet:
-        packet.write(content)
-        packet.seek(0)
-        with subprocess.Popen(
-            [sys.executable, "-m", "wfsobs.app.report.page"],
-            env=environment,
-            stdin=packet,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-        ) as process:
-            made, said = _output(process, watch)
-    if process.returncode:
-        log.error("the report could not be made:\n%s", said.decode(errors="replace"))
-        raise ReportError("it could not be made; the server's log has the details")
-    return made
-
-
-def _output(process: subprocess.Popen[bytes], watch: Watch) -> tuple[bytes, bytes]:
-    """Wait for a process and return its standard output and error; kill it where the report is no longer wanted."""
-    try:
-        while True:
-            try:
-                return process.communicate(timeout=POLL)
-            except subprocess.TimeoutExpired:
-                watch.check()
-    except BaseException:
-        process.kill()
-        raise
-
-
-# ---------------------------------------------------------------------- `python -m wfsobs.app.report.page`
-
-
-def main() -> None:
-    """Write the page of a packed report on standard input; behind all else in priority: a report can wait."""
-    os.nice(10)
-    report = unpack(sys.stdin.buffer.read())
-    sys.stdout.buffer.write(page(report, datetime.now().astimezone()).encode())
-
-
-if __name__ == "__main__":
-    main()
+    watch.check()
+    report = Report(preset, results.scenario, (), (state,), results.is_recorded, command, sweep, comparison)
+    return page(report, datetime.now().astimezone()).encode()

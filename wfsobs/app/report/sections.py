@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from datetime import datetime
 from functools import partial
 from itertools import groupby, product
@@ -16,6 +16,7 @@ from wfsobs.app.controls.names import setting_label, value_of
 from wfsobs.app.display import score_columns
 from wfsobs.app.render import NOTHING, number
 from wfsobs.app.report.data import Report, State, window_of
+from wfsobs.app.share import FILE, given_options, to_file
 from wfsobs.app.style import BOUND_MARKS, TERM_COLOURS
 from wfsobs.app.views.errors import ScoreWriter
 from wfsobs.bench.measure import machine
@@ -24,7 +25,7 @@ from wfsobs.evaluation.budget import TERMS
 from wfsobs.evaluation.rows import Row, row_label, target_title
 from wfsobs.evaluation.scores import BOUND, RESIDUAL
 from wfsobs.prior import GIVEN, IDENTIFIED, TRUE
-from wfsobs.scenario.configfile import changed_settings, format_value, reference_preset, to_toml
+from wfsobs.scenario.configfile import changed_settings, reference_preset
 from wfsobs.version import __version__
 
 
@@ -183,12 +184,6 @@ def _loop_row(row: Row) -> dict[str, Any]:
 # --------------------------------------------------------------------------------------------------------- words
 
 
-LONGEST = 8000
-"""Characters of a command line; settings that need more go by file."""
-
-FILE = "wfsobs.toml"
-
-
 def summary(report: Report, date: datetime) -> str:
     """Say in one line what this is."""
     base, count = report.base, len(changed_settings(report.base, reference_preset(report.preset)))
@@ -224,7 +219,7 @@ def scenario_values(report: Report) -> dict[str, Any]:
     """Collect what differs from the preset, every setting, and how settings are written."""
     preset = reference_preset(report.preset)
     before = changed_settings(preset, report.base)
-    toml = f'preset = "{report.preset}"\n{to_toml(report.base)}'
+    toml = to_file(report.base, report.preset)
     return {
         "changed": {path: (before[path], value) for path, value in changed_settings(report.base, preset).items()},
         "label": partial(setting_label, report.base),
@@ -276,18 +271,7 @@ def command_of(report: Report) -> tuple[str, bool]:
     if report.is_recorded:
         command = report.command or f"wfsobs observe RECORD --config {FILE}"
         return command, f"--config {FILE}" in command
-    changed = changed_settings(report.base, reference_preset(report.preset))
-    seeds = n_seeds(report)
-    ends = [*_words("--vary", report.variations), *(["--seeds", str(seeds)] if seeds > 1 else [])]
-    command = _command(
-        ["--preset", report.preset, *_words("--set", (f"{k}={format_value(v)}" for k, v in changed.items())), *ends]
-    )
-    return (command, False) if len(command) <= LONGEST else (_command(["--config", FILE, *ends]), True)
-
-
-def _command(words: Sequence[str]) -> str:
-    return shlex.join(["wfsobs", "export", "report.html", *words])
-
-
-def _words(option: str, values: Iterable[object]) -> list[str]:
-    return [word for value in values for word in (option, str(value))]
+    given, seeds = given_options(report.base, report.preset, FILE), n_seeds(report)
+    varied = [word for variation in report.variations for word in ("--vary", str(variation))]
+    words = [*given, *varied, *(["--seeds", str(seeds)] if seeds > 1 else [])]
+    return shlex.join(["wfsobs", "export", "report.html", *words]), FILE in given

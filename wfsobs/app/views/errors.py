@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 import param
 from markupsafe import Markup
+from param.parameterized import batch_call_watchers
 
 from wfsobs.app.compared import ComparedRun, find_score
 from wfsobs.app.display import AT_LIMIT, IN_MOST, Display, over, score_columns
@@ -20,6 +21,7 @@ from wfsobs.app.jobs import DONE, RUNNING
 from wfsobs.app.render import NOTHING, Row, change, hundredths, macro, missing, number, render, table, with_decimals_of
 from wfsobs.app.service import IDLE
 from wfsobs.app.style import TERM_COLOURS, WIDE, HtmlComponent, follow_html, look, observers_of, script, sheets, swatch, watch
+from wfsobs.app.views.switches import LineChoice
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.budget import TERMS as BUDGET_TERMS
 from wfsobs.evaluation.evidence import Evidence, gather_evidence, marks_of, rank_observers
@@ -109,44 +111,30 @@ class MainLines:
         self.run: Final = seeds.run
         self.display = display
         self.seeds: Final = seeds
-        self._chosen_targets: set[str] = set()
+        self.choices: Final = {target: LineChoice(f"hide.{target}", (TRUTH, *observers_of(target))) for target in TARGETS}
+        for choice in self.choices.values():
+            choice.watch(self._show)
         self.run.param.watch(self._on_results, ["result", "state"])  # the last result may come before the run is over
         watch(self._follow, (display, "mode"), (seeds, "evidence"))
-
-    def choose(self, target: str, hidden_names: list[str]) -> None:
-        """Hide these lines and no others from now on."""
-        self._chosen_targets.add(target)
-        self.display.hidden_lines = {**self.display.hidden_lines, target: list(hidden_names)}
-
-    def choices(self) -> dict[str, list[str]]:
-        """Return the hidden lines of the targets where the visitor has chosen."""
-        return {target: self.display.hidden_lines.get(target, []) for target in TARGETS if target in self._chosen_targets}
 
     def names(self, target: str) -> list[str]:
         """List the observers of a target that matter (`main_observers`)."""
         results, evidence = self.run.result, self.seeds.evidence
         return main_observers(results.result.scores if results else (), target, self.display.mode, evidence)
 
-    def reset(self, target: str) -> None:
-        """Show those that matter again."""
-        self._chosen_targets.discard(target)
-        self._follow()
-
     def _on_results(self, *_: object) -> None:
-        if self.run.state != RUNNING or not self.display.hidden_lines.keys() >= set(TARGETS):  # a link may say it of one
+        if self.run.state != RUNNING or any(choice.minor is None for choice in self.choices.values()):
             self._follow()
 
     def _follow(self, *_: object) -> None:
-        results = self.run.result
-        if results is None:
-            return
-        hidden, named = dict(self.display.hidden_lines), {}
-        for target in TARGETS:
-            named[target] = self.names(target)
-            if target not in self._chosen_targets:
-                hidden[target] = [name for name in observers_of(target) if name not in named[target]]
-        if (hidden, named) != (self.display.hidden_lines, self.display.named_lines):
-            self.display.param.update(hidden_lines=hidden, named_lines=named)
+        if self.run.result is not None:
+            with batch_call_watchers(self.display):
+                self.display.named_lines = {target: self.names(target) for target in TARGETS}
+                for target, choice in self.choices.items():
+                    choice.offer((TRUTH, *self.display.named_lines[target]))
+
+    def _show(self, *_: object) -> None:
+        self.display.hidden_lines = {target: choice.hidden_lines for target, choice in self.choices.items()}
 
 
 NO_TRUTH = "The record has no truth: figures show estimates, and RMS errors are those of predicting the next measurement."
@@ -461,10 +449,10 @@ class Strip:
         self._now: tuple[RunResults | None, Evidence] = None, gather_evidence([])
         self._before = self._now
         self.cards: Final = Cards()
+        lines.choices[target].tie(self.cards)
         self._refresh()
         watch(self._follow, (run, ["result", "state"]), (seeds, "evidence"))
         watch(self._refresh, (budgets, "by_observer"), (display, ["mode", "unit", "dark", "compared_runs"]))
-        display.param.watch(self._hide, "hidden_lines")
 
     def _follow(self, *_: object) -> None:
         """Keep what was shown before, so that the change from there can be shown."""
@@ -489,9 +477,6 @@ class Strip:
         limit = [("currentColor", LIMIT)] * any(item["limit"] for item in items)
         legend = [(TERM_COLOURS[name], label) for name, label in BUDGET_TERMS.items() if name in terms]
         self.cards.show(items, heads, legend + limit)
-
-    def _hide(self, *_: object) -> None:
-        self.cards.hidden_lines = self.display.hidden_lines.get(self.target, [])
 
     def items(self) -> list[dict[str, Any]]:
         """Describe the cards."""

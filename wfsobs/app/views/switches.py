@@ -1,11 +1,13 @@
-"""Switches beside the page's figures: mode, unit, seeds, and the run that others are compared with."""
+"""Switches beside the page's figures: mode, unit, lines, seeds, and the run that others are compared with."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, Final
 
 import panel_material_ui as pmui
+import param
 from markupsafe import Markup
 
 from wfsobs.app.compared import ComparedRun, name_of_difference
@@ -106,6 +108,69 @@ def _title(mode: Mode) -> str:
     """Write a mode's name in a list, with the short one of the axes."""
     short = short_name(mode)
     return mode.name[0].upper() + mode.name[1:] + (f" ({short})" if short != mode.name else "")
+
+
+class LineChoice(param.Parameterized):
+    """The lines that are hidden: those that do not matter, until a visitor chooses others. A part of a view as texts by name.
+
+    Attributes
+    ----------
+    names : list of str
+        In an address.
+    minor : list of str or None
+        Lines that do not matter; None until it is known.
+    is_chosen : bool
+        Whether a visitor has chosen.
+    """
+
+    hidden_lines: param.List[list[str]] = param.List([], item_type=str, doc="Names of the lines that are hidden.")
+
+    def __init__(self, name: str, lines: Collection[str]):
+        """Hide none yet. name : in an address;  lines : names of all."""
+        super().__init__()
+        self.names: Final = [name]
+        self._lines = lines
+        self.minor: list[str] | None = None
+        self.is_chosen: bool = False
+
+    def offer(self, main: Collection[str]) -> None:
+        """Show these alone, which matter, unless a visitor has chosen."""
+        self.minor = [name for name in self._lines if name not in main]
+        if not self.is_chosen:
+            self.hidden_lines = self.minor
+
+    def choose(self, names: list[str] | None) -> None:
+        """Hide these from now on; for None those that do not matter."""
+        self.is_chosen = names not in (None, self.minor)
+        self.hidden_lines = (self.minor or []) if names is None else names
+
+    def tie(self, cards: Any) -> None:
+        """Keep the rows of a legend (`Cards`) in step."""
+        cards.on_main = partial(self.choose, None)
+        cards.param.watch(lambda event: event.new == self.hidden_lines or self.choose(event.new), "hidden_lines")
+        self.watch(lambda event: setattr(cards, "hidden_lines", event.new))
+
+    def texts(self) -> dict[str, str]:
+        """Return the lines that are hidden, where a visitor has chosen."""
+        return dict.fromkeys(self.names, ",".join(self.hidden_lines)) if self.is_chosen else {}
+
+    def open(self, texts: Mapping[str, str]) -> list[str]:
+        """Hide lines; return a line for each that is refused."""
+        (own,) = self.names
+        text = texts.get(own)
+        names = text.split(",") if text else []
+        self.choose(None if text is None else [name for name in names if name in self._lines])
+        refused = [f"{own} = {name[:80]}: no line of that name" for name in names if name not in self._lines]
+        return [*not_known(name for name in texts if name != own), *refused]
+
+    def watch(self, act: Callable[..., object]) -> None:
+        """Call a function when other lines are hidden."""
+        self.param.watch(act, "hidden_lines")
+
+
+def not_known(names: Iterable[str]) -> list[str]:
+    """Return a line for each name that a page has nothing of."""
+    return [f"{name}: there is no such part of a view" for name in names]
 
 
 NO_STEPPERS = ".MuiIconButton-root { display: none !important; }"
