@@ -134,7 +134,7 @@ class Report:
     preset : what the settings are compared with; base : the settings that were varied; is_recorded : whether on a record
     that was loaded or kept, not simulated from the settings; command : what makes the estimates of such a record again;
     sweep : maps of the last sweep, a title, axes, and cells row by row, and its rows; comparison : the runs that the one shown is
-    compared with, and a table per target and mode
+    compared with, and a table per target and mode; observers : those that were chosen, none where all usual ones ran
     """
 
     preset: str
@@ -145,6 +145,7 @@ class Report:
     command: str = ""
     sweep: Mapping[str, Any] | None = None
     comparison: Mapping[str, Any] | None = None
+    observers: Sequence[str] = ()
 
     @property
     def start(self) -> int:

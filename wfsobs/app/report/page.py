@@ -372,7 +372,8 @@ def export(
             on_result(of[0])
         evidence = gather_evidence([result.scores for result in of]) if seeds > 1 else None
         kept.append(state_of(of[0], len(chosen), evidence=evidence, observers=observers))
-    content = page(Report(preset, scenario, tuple(vary), tuple(kept)), datetime.now().astimezone()).encode()
+    report = Report(preset, scenario, tuple(vary), tuple(kept), observers=observers or ())
+    content = page(report, datetime.now().astimezone()).encode()
     write_whole(path, lambda file: file.write(content))
 
 

@@ -272,6 +272,7 @@ def command_of(report: Report) -> tuple[str, bool]:
         command = report.command or f"wfsobs observe RECORD --config {FILE}"
         return command, f"--config {FILE}" in command
     given, seeds = given_options(report.base, report.preset, FILE), n_seeds(report)
+    chosen = [word for name in report.observers for word in ("--observer", name)]
     varied = [word for variation in report.variations for word in ("--vary", str(variation))]
-    words = [*given, *varied, *(["--seeds", str(seeds)] if seeds > 1 else [])]
+    words = [*given, *chosen, *varied, *(["--seeds", str(seeds)] if seeds > 1 else [])]
     return shlex.join(["wfsobs", "export", "report.html", *words]), FILE in given
