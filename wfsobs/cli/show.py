@@ -302,7 +302,8 @@ def show_verdicts(
     known = [*explain_harm(result), *budgets] if is_simulated else []
     simulation = result.scenario if is_simulated else None
     given = result.scenario, result.record, result.estimates, result.scores
-    found = (verdict(*given, *key, simulation=simulation, budgets=known, evidence=evidence) for key in of)
+    more = {"simulation": simulation, "budgets": known, "evidence": evidence, "source": result.prior_source}
+    found = (verdict(*given, *key, **more) for key in of)
     for it in found:
         if it is not None:
             click.echo("\n" + "\n".join(f"{'  ' * bool(i)}{line}" for i, line in enumerate(it.sentences())))

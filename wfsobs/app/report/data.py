@@ -198,6 +198,7 @@ def state_of(
     rows = score_rows(scores, scenario.run.seed, source=result.prior_source)
     budgets, simulation = (list_budgets(result), scenario) if is_simulated else ([], None)
     of = scenario, record, result.estimates, result.scores
+    known = {"simulation": simulation, "evidence": evidence, "budgets": budgets, "source": result.prior_source}
     return State(
         scenario,
         rows,
@@ -211,7 +212,7 @@ def state_of(
             (target, mode, found.sentences())
             for target in TARGETS
             for mode in names
-            if (found := verdict(*of, target, mode, simulation=simulation, evidence=evidence, budgets=budgets)) is not None
+            if (found := verdict(*of, target, mode, **known)) is not None
         ],
         {target: main_observers(result.scores, target, names[0], evidence) for target in TARGETS},
     )

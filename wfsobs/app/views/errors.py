@@ -180,6 +180,7 @@ class VerdictLine:
             simulation=results.simulation,
             evidence=self.budgets.seeds.evidence,
             budgets=[budget for of in self.budgets.by_observer.values() for budget in of],
+            source=it.prior_source,
         )
         if found is None:
             return title, "" if has_truth else NO_TRUTH
