@@ -13,7 +13,6 @@ import panel_material_ui as pmui
 import param
 
 from wfsobs.app.controls.fields import ROOM, TAG, Field, RowEditor, idle_html, make_field
-from wfsobs.app.controls.names import preset_line, preset_title, setting_name
 from wfsobs.app.controls.topics import TopicList
 from wfsobs.app.display import label_of
 from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING
@@ -24,6 +23,7 @@ from wfsobs.app.work import RunResults
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings
 from wfsobs.scenario.idle import idle_settings
+from wfsobs.scenario.names import preset_line, preset_title, setting_name
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.group import Group
 

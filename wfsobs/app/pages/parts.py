@@ -13,7 +13,6 @@ import panel_material_ui as pmui
 from bokeh.plotting import figure
 
 from wfsobs.app.controls.fields import parse_number
-from wfsobs.app.controls.names import name_settings
 from wfsobs.app.controls.panel import Status
 from wfsobs.app.display import Display
 from wfsobs.app.downloads import Save
@@ -26,6 +25,7 @@ from wfsobs.app.style import WIDE, HtmlText, bare, html, make_button, sheets, sw
 from wfsobs.app.views.plots import call
 from wfsobs.app.views.switches import LineChoice, not_known
 from wfsobs.app.work import RunResults
+from wfsobs.scenario.names import name_settings
 from wfsobs.settings.errors import SettingError
 from wfsobs.settings.parameters import hint
 

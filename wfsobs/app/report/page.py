@@ -29,7 +29,6 @@ from bokeh.util.paths import bokehjs_path
 from markupsafe import Markup
 from numpy.typing import ArrayLike
 
-from wfsobs.app.controls.names import setting_label, value_of
 from wfsobs.app.display import NO_ANGLE, UNITS, per_micrometre
 from wfsobs.app.glossary import sentence_on
 from wfsobs.app.pages.sweep_views import SweepLines
@@ -61,6 +60,7 @@ from wfsobs.pipeline import run
 from wfsobs.progress import QUIET, Watch
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.grid import Variation, scenarios
+from wfsobs.scenario.names import setting_label, value_of
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.version import __version__
 

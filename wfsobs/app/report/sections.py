@@ -12,7 +12,6 @@ from typing import Any
 
 from markupsafe import Markup
 
-from wfsobs.app.controls.names import setting_label, value_of
 from wfsobs.app.display import score_columns
 from wfsobs.app.render import NOTHING, number
 from wfsobs.app.report.data import Report, State, window_of
@@ -26,6 +25,7 @@ from wfsobs.evaluation.rows import Row, row_label, target_title
 from wfsobs.evaluation.scores import BOUND, RESIDUAL
 from wfsobs.prior import GIVEN, IDENTIFIED, TRUE
 from wfsobs.scenario.configfile import changed_settings, reference_preset
+from wfsobs.scenario.names import setting_label, value_of
 from wfsobs.version import __version__
 
 
