@@ -78,7 +78,7 @@ def main_observers(scores: Iterable[Score], target: str, mode: str, evidence: Ev
 def effect_line(display: Display, before: RunResults, now: RunResults) -> str:
     """Write the change of the record's error of the best observer without prior knowledge, for the target with the largest.
 
-    Empty where it did not change, or where either run has no such error.
+    It names mode and unit, since it stays when others are shown. Empty where it did not change, or where a run has no such error.
     """
     found: list[tuple[float, str]] = []
     scale = display.scale(now.scenario)
@@ -96,7 +96,7 @@ def effect_line(display: Display, before: RunResults, now: RunResults) -> str:
         best = next((name for name in rank_observers(new) if name in old and name in observers_of(target)), None)
         if best is not None and new[best] != old[best]:
             errors = f"{number(scale * old[best])} → {number(scale * new[best])} {display.unit_label}"
-            line = f"{target.capitalize()}, {look(best).label}: {errors} on this record"
+            line = f"{errors}: {target}, {display.mode_label}, {look(best).label}"
             found.append((abs(np.log(new[best] / old[best])), line))
     return max(found)[1] if found else ""
 
