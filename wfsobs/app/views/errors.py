@@ -471,7 +471,7 @@ class Strip:
         items = self.items()
         unit, shown = self.display.unit_label, self.run.result
         error = "RMS error" if shown is None or shown.values(TRUTH, self.target) is not None else "Prediction error"
-        terms = {part[3] for item in items if item["main"] for part in item["parts"] if part[1] >= LEAST}
+        terms = {part[3] for item in items for part in item["parts"] if part[1] >= LEAST}
         heads = HEADS | {"value": f"{error} [{unit}]"}
         heads["change"] *= any(item["change"] for item in items)
         heads["bar"] *= bool(terms)
