@@ -84,7 +84,7 @@ def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: 
     cards = dashboard.explore.strips["vibration"].items()
     notes, values = ({card["name"]: card[key] for card in cards} for key in ("note", "value"))
     found = {s.observer: number(1e3 * s.rms) for s in expected.scores if s.mode == "tip"}
-    assert cards[0]["label"] == "Recorded loop" and re.fullmatch(r"\d\.\d+", notes["truth"]) and values["truth"] == found["loop"]
+    assert "truth" not in values and found["loop"] not in values.values(), "what the recorded loop left is no prediction error"
     assert values["kf-lgs"] == found["kf-lgs"] and values["gpr-online"] == "–"
     dashboard.history.compare(dashboard.history.current)
     pinned = dashboard.explore.table.html()

@@ -26,8 +26,8 @@ from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.budget import TERMS as BUDGET_TERMS
 from wfsobs.evaluation.evidence import Evidence, gather_evidence, marks_of, rank_observers
 from wfsobs.evaluation.result import Failure
+from wfsobs.evaluation.rows import NOTHING as NO_KNOWLEDGE
 from wfsobs.evaluation.rows import (
-    NOT_OBSERVERS,
     PEAKS,
     TIME,
     above_bound,
@@ -43,7 +43,6 @@ from wfsobs.evaluation.rows import (
     target_title,
     uncertainty_text,
 )
-from wfsobs.evaluation.rows import NOTHING as NO_KNOWLEDGE
 from wfsobs.evaluation.rows import Row as ScoreRow
 from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS, LOOP, PREDICTION, RESIDUAL, SCORED, Score
 from wfsobs.evaluation.verdict import verdict
@@ -488,7 +487,7 @@ class Strip:
         if shown is None:
             cards = [self._card(TRUTH, ""), *map(self._card_without, names)]
         else:
-            cards = [self._truth(shown), *(self._observer(name, shown) for name in names)]
+            cards = [*self._truth(shown), *(self._observer(name, shown) for name in names)]
         return [card | {"compared": self._compared_rows(card["name"], shown), "main": card["name"] in main} for card in cards]
 
     def _compared_rows(self, name: str, results: RunResults | None) -> list[list[str]]:
@@ -506,24 +505,23 @@ class Strip:
     def _compared_number(self, scores: Sequence[Score], name: str, has_truth: bool) -> tuple[tuple[str, str, str], str]:
         """Return what of which score is compared: the error of an observer, or the rms of the truth.
 
-        has_truth : otherwise the error of the next measurement, and the residual of the recorded loop
+        has_truth : otherwise the error of the next measurement
         """
         mode = self.display.mode
         if name == TRUTH and has_truth:
             return (next((s.observer for s in self._comparable(scores)), ""), self.target, mode), "truth_rms"
-        return ((LOOP, RESIDUAL) if name == TRUTH else (name, self.target if has_truth else PREDICTION)) + (mode,), "rms"
+        return (name, self.target if has_truth else PREDICTION, mode), "rms"
 
     def _comparable(self, scores: Iterable[Score]) -> list[Score]:
         return [s for s in scores if (s.target, s.mode) == (self.target, self.display.mode) and not s.apart]
 
-    def _truth(self, results: RunResults) -> dict[str, Any]:
+    def _truth(self, results: RunResults) -> list[dict[str, Any]]:
+        if results.values(TRUTH, self.target) is None:
+            return []
         for score in self._comparable(results.result.scores):
             size = self.seeds.over_seeds(score).truth_rms * self.display.scale(results.scenario)
-            return self._card(TRUTH, "rms", value=number(size))
-        left = find_score(results.result.scores, LOOP, RESIDUAL, self.display.mode)
-        # the recorded loop's residual, in the place of the truth, which has no line either
-        of_loop = {"label": NOT_OBSERVERS[LOOP], "colour": "transparent"}
-        return self._error_card(TRUTH, left, results) | of_loop if left else self._card(TRUTH, "")
+            return [self._card(TRUTH, "rms", value=number(size))]
+        return [self._card(TRUTH, "")]
 
     def _observer(self, name: str, results: RunResults) -> dict[str, Any]:
         scores, mode = results.result.scores, self.display.mode
