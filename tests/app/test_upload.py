@@ -82,6 +82,7 @@ def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: 
         dashboard.explore.spectra.spectra["vibration"].marks["peaks"].data_source.data["x"] == []
     )  # of the settings, not of the record
     cards = dashboard.explore.strips["vibration"].items()
+    assert ">peaks<" not in dashboard.explore.rooms["vibration"][0].html
     notes, values = ({card["name"]: card[key] for card in cards} for key in ("note", "value"))
     found = {s.observer: number(1e3 * s.rms) for s in expected.scores if s.mode == "tip"}
     assert "truth" not in values and found["loop"] not in values.values(), "what the recorded loop left is no prediction error"

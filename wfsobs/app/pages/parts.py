@@ -347,9 +347,14 @@ HALVES = grid_style("minmax(0, 1fr) minmax(0, 1fr)")
 """Two figures beside each other."""
 
 
-def caption(words: str, marks: str = "") -> HtmlText:
-    """Make what stands above a figure. marks : HTML behind it."""
-    return bare(f'<div class="caption above">{escape(words)}{marks}</div>')
+def caption_html(words: str, marks: str = "") -> str:
+    """Write what stands above a figure. marks : HTML behind it."""
+    return f'<div class="caption above">{escape(words)}{marks}</div>'
+
+
+def caption(words: str) -> HtmlText:
+    """Make what stands above a figure."""
+    return bare(caption_html(words))
 
 
 def tick(display: Display, name: str, **options: Any) -> pmui.Checkbox:

@@ -89,7 +89,7 @@ def page(report: Report, date: datetime) -> str:
         lines=_lines(report),
         main=report.states[report.start].main,
         about=sentence_on,
-        marks=(PEAKS, MODEL),
+        marks=(PEAKS if any(map(_drawn_peaks, report.states)) else "", MODEL),
         shades=SHADES,
         targets=TARGETS,
         modes={name: name[0].upper() + name[1:] for name in _modes(report)},
@@ -189,9 +189,14 @@ def _state(state: State, pool: Pool) -> dict[str, Any]:
         "warm_up": scenario.run.warm_up,
         "lines": lines,
         "axes": {name: pool.add(axis.astype("<f4").tobytes()) for name, axis in axes.items()},
-        "peaks": peak_marks(scenario),
+        "peaks": _drawn_peaks(state),
         "model": [model_mark(scenario)],
     }
+
+
+def _drawn_peaks(state: State) -> list[tuple[float, str]]:
+    """List the marked peaks; none of a record without truth, whose peaks are not those of the settings."""
+    return peak_marks(state.scenario) if any(name.startswith(f"signal/{VIBRATION}/{TRUTH}/") for name in state.lines) else []
 
 
 # ------------------------------------------------------------------------------------------------------- figures
