@@ -110,7 +110,7 @@ def test_a_loaded_record_is_cut(page: TunePage, dashboard: Dashboard, loop: Any,
     dashboard.store.run_on(LoadedRecord(record, "night.npz", "key"), dashboard.store.scenario.replace({"run.duration": 9.0}))
     loop.finish(dashboard.store)
     found = tuned(page, loop)
-    assert "RMS one-step prediction error of z on the validation record" in page.table.html
+    assert "RMS prediction error of the next measurement on the validation record" in page.table.html
     assert page.figure.figure.yaxis.axis_label == "prediction error, validation [nm]" and "RMS error" not in page.table.html
     again = tune(dashboard.store.scenario, "kf-lgs", evaluations=8, record=record)
     assert found.target == "next z" and found.history == again.history

@@ -206,14 +206,14 @@ GAP = 1.0
 SHORTEST = 1.0
 """What is left of validation and test after the warm-up, at least [s]."""
 
-TRUTH, NEXT, REFERENCE = "the truth", "the next measurement of the LGS", "the zero-phase Butterworth reference"
+TRUTH, NEXT, REFERENCE = "the truth", "the next measurement", "the zero-phase Butterworth reference"
 """What an estimate is compared with."""
 WORST, P95 = "the worst plant", "95 % of the plants"
 """Where a controller is scored."""
 
 MEASURES = {
     TRUTH: "RMS error",
-    NEXT: "RMS one-step prediction error of z",
+    NEXT: "RMS prediction error of the next measurement",
     REFERENCE: "RMS distance to the zero-phase Butterworth reference",
     WORST: "Largest RMS of the plants",
     P95: "RMS that 95 % of the plants do not exceed",
@@ -275,7 +275,7 @@ def simulate_records(scenario: Scenario, space: Space, target: str, duration: fl
 def judged_by(record: Record, observer: str, target: str) -> tuple[str, str]:
     """Return the target of the errors on a record, and what stands for the truth where the record has none.
 
-    An observer of turbulence and vibration together is scored by its prediction of the next z of the LGS, which has all their
+    An observer of turbulence and vibration together is scored by its prediction of the next measurement, which has all their
     errors; one of vibration alone by the zero-phase Butterworth reference of the piece. Raises RecordError for one that is
     better than the LGS, and for one of turbulence alone.
     """

@@ -176,7 +176,7 @@ def _row(section: str, name: str, before: float | str | None, after: float | str
 INTRO = (
     "Searches the settings of one observer for the smallest RMS error on a validation record, which is neither the training nor "
     "the test record, and scores the settings before and after on the test record, which the search never uses. Records are "
-    "simulated from the settings; a loaded record is cut into pieces. Without truth, tuning minimises the one-step prediction "
+    "simulated from the settings; a loaded record is cut into pieces. Without truth, tuning minimises the prediction "
     "error, or the distance to a Butterworth reference. “Use it” takes the tuned settings into the drawer."
 )
 EARLIER = "The settings in the drawer have changed since this tuning."

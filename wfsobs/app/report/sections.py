@@ -22,7 +22,7 @@ from wfsobs.bench.measure import machine
 from wfsobs.closed_loop.rows import NOT_APPLICABLE, label
 from wfsobs.evaluation.budget import TERMS
 from wfsobs.evaluation.rows import Row, row_label, target_title
-from wfsobs.evaluation.scores import BOUND, RESIDUAL
+from wfsobs.evaluation.scores import BOUND, OF_STAR, RESIDUAL
 from wfsobs.prior import GIVEN, IDENTIFIED, TRUE
 from wfsobs.scenario.configfile import changed_settings, reference_preset
 from wfsobs.scenario.names import setting_label, value_of
@@ -243,6 +243,7 @@ def meaning_values(report: Report) -> dict[str, Any]:
     return {
         "warm_up": f"{report.base.run.warm_up:g}",
         "truthless": any(row["target"] == RESIDUAL for row in rows),
+        "of_star": OF_STAR,
         "bounded": any(row["observer"] == BOUND for row in rows),
         "seeds": n_seeds(report),
         "budgeted": any(state.budgets for state in report.states),

@@ -44,7 +44,7 @@ from wfsobs.evaluation.rows import (
     uncertainty_text,
 )
 from wfsobs.evaluation.rows import Row as ScoreRow
-from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS, LOOP, PREDICTION, RESIDUAL, SCORED, Score
+from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS, LOOP, OF_STAR, PREDICTION, RESIDUAL, SCORED, Score
 from wfsobs.evaluation.verdict import verdict
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
@@ -136,7 +136,7 @@ class MainLines:
         self.display.hidden_lines = {target: choice.hidden_lines for target, choice in self.choices.items()}
 
 
-NO_TRUTH = "The record has no truth: figures show estimates, and RMS errors are those of predicting the next measurement."
+NO_TRUTH = f"The record has no truth: figures show estimates, and errors are those of predicting the next measurement, {OF_STAR}."
 
 
 class VerdictLine:
@@ -202,7 +202,7 @@ def lines_of_failures(failures: Iterable[Failure]) -> list[str]:
 
 
 WITHOUT_TRUTH = {
-    PREDICTION: ("Next measurement z", "one step ahead: the record has no truth"),
+    PREDICTION: (target_title(PREDICTION), OF_STAR),
     RESIDUAL: ("Residual", "what the recorded loop left"),
 }
 """Target of a record without truth -> what stands before the mode in its title, and behind it."""
@@ -276,7 +276,7 @@ class ScoreWriter:
             _or_why(None if lag is None else 1e3 * lag, "a limit has none" if is_bound else no_lag),
             _or_why(time, "nothing is computed"),
             _or_why(None if time is None else 1e-6 * time / self.dt, "nothing is computed"),
-            missing("it predicts no sigma") if sd is None else self.length(sd),
+            missing("it predicts no sigma of this error") if sd is None else self.length(sd),
         ]
 
 
