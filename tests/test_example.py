@@ -97,7 +97,7 @@ def test_its_controller_closes_the_loop(python: Run) -> None:
 
 
 DASHBOARD = """
-from wfsobs.app.controls.names import setting_name
+from wfsobs.scenario.names import setting_name
 from wfsobs.app.controls.panel import Controls
 from wfsobs.app.share import to_command, to_python
 from wfsobs.app.limits import NONE

@@ -98,11 +98,13 @@ def test_a_record_without_truth_has_a_verdict_on_the_next_measurement() -> None:
     simulated = run(SCENARIOS["paper"].replace({"run.duration": 4.0}), observers=("kf-lgs", "kf-multi", "persistence"))
     record = replace(simulated.record, turbulence=None, vibration=None)
     result = observe(record, SCENARIOS["paper"], observers=("kf-lgs", "kf-multi", "persistence"))
-    found = verdict(result.scenario, record, result.estimates, result.scores, PREDICTION, "tip")
+    found = verdict(result.scenario, record, result.estimates, result.scores, PREDICTION, "tip", source=result.prior_source)
     scores = {s.observer: s.rms for s in result.scores if (s.target, s.mode) == (PREDICTION, "tip")}
     assert found is not None and not found.harms
     assert found.best.observer == min((n for n in scores if n in OBSERVERS), key=scores.__getitem__)
-    assert found.sentences()[0].startswith(f"{target_title(PREDICTION)}, tip. ")
+    said = found.sentences()[0]
+    assert said.startswith(f"{target_title(PREDICTION)}, tip. ")
+    assert "With given peak frequencies: Multi-peak KF " in said, "as the table of such a record calls them"
 
 
 def test_who_does_harm_is_named_with_where_its_error_lies(result: Result) -> None:

@@ -94,6 +94,19 @@ def test_a_negative_term_has_no_piece_and_is_told(page: Page, loop: Any) -> None
     ]
 
 
+def test_the_legend_has_the_causes_of_every_row_and_the_scale_holds_the_limit(page: Page, loop: Any) -> None:
+    page.store.start()
+    loop.finish(page.store)
+    score = next(
+        s for s in page.store.run.result.result.scores if (s.observer, s.target, s.mode) == ("ridge", "vibration", "tip")
+    )
+    limit = 2.0 * score.rms
+    page.budgets.by_observer = {"ridge": [Budget("ridge", "vibration", "tip", 5.0, dict.fromkeys(TERMS, 1.0), limit**2)]}
+    assert not page.row("ridge")["main"]
+    assert [label for _, label in page.strip.cards.legend] == [*TERMS.values(), "limit"]
+    assert f'data-size="{1e3 * limit}"' in page.strip.cards.html, "of the longer of both: the mark stands inside its column"
+
+
 def test_those_that_are_not_linear_have_budgets_if_they_are_main_ones_or_all_are_asked_for(page: Page, loop: Any) -> None:
     page.store.start()
     loop.until(lambda: "gpr-online" in page.budgets.by_observer and page.budgets.task.state == "done")

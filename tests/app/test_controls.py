@@ -9,13 +9,13 @@ import param
 import pytest
 
 from wfsobs.app.controls.fields import SliderField, parse_number
-from wfsobs.app.controls.names import setting_name
 from wfsobs.app.controls.panel import AT_HAND, Controls, status_of
 from wfsobs.app.display import label_of
 from wfsobs.app.work import RunResults
 from wfsobs.evaluation.result import Result
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.names import setting_name
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.units import unit_text
 

@@ -212,13 +212,13 @@ class TestNamesAndGrey:
         dashboard.store.change("turbulence.wind_speed", 25.0)
         loop.finish(dashboard.store)
         html = dashboard.controls.fields["turbulence.wind_speed"].view[-1].html
-        target, old, new = re.fullmatch(r"(\w+), .*: ([\d.]+) → ([\d.]+) nm on this record", html).groups()
+        old, new, target = re.search(r">([\d.]+) → ([\d.]+) nm: (\w+), tip, ", html).groups()
         after = dashboard.store.run.result.result.scores
         pairs = {
             (number(1e3 * a.rms), number(1e3 * b.rms))
             for a in before
             for b in after
-            if (a.observer, a.target, a.mode) == (b.observer, b.target, b.mode) == (b.observer, target.lower(), "tip")
+            if (a.observer, a.target, a.mode) == (b.observer, b.target, b.mode) == (b.observer, target, "tip")
             and a.observer in OBSERVERS
             and prior_knowledge(a.observer) == NOTHING
         }

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wfsobs.app.controls.names import setting_name
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.limits import Limits
@@ -23,6 +22,7 @@ from wfsobs.app.sources import LoadedRecord
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings
+from wfsobs.scenario.names import setting_name
 from wfsobs.simulation.loop import simulate
 from wfsobs.tuning import Evaluation, TuningResult, tune
 from wfsobs.tuning.report import best_so_far

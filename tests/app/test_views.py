@@ -188,6 +188,8 @@ class TestSpectra:
         view = dashboard.explore.spectra.spectra["vibration"]
         peaks = [p.frequency for p in dashboard.store.scenario.vibration.peaks]
         assert view.marks["peaks"].data_source.data["x"] == peaks
+        legend = dashboard.explore.rooms["vibration"][0]
+        assert ">peaks<" in legend.html
         assert view.marks["model"].data_source.data["x"] == [dashboard.store.scenario.kalman.frequency]
         dashboard.store.change("vibration.cutoff", 20)
         loop.finish(dashboard.store)
@@ -195,6 +197,7 @@ class TestSpectra:
         dashboard.store.change("vibration.source", "none")
         loop.finish(dashboard.store)
         assert view.marks["peaks"].data_source.data["x"] == []
+        assert ">peaks<" not in legend.html
 
     def test_axes(self, dashboard: Dashboard) -> None:
         assert dashboard.explore.spectra.x_range.start == pytest.approx(0.667, abs=0.01)

@@ -53,6 +53,17 @@ def test_first_places_are_shares_of_samples():
     assert shares == first_places(table, np.random.default_rng(1))[0, "vibration", "tip"]
 
 
+def test_the_maps_of_a_report_name_settings_with_their_units(tmp_path):
+    grid = "[grid]\nturbulence.wind_speed = [5, 10]\nsensors.exposure_ratio = [2, 5]\n"
+    plan = parse_plan(f'name = "Small"\nseeds = 2\nobservers = {NAMES}\n{grid}'.replace("'", '"'), tmp_path)
+    open_folder(plan, tmp_path)
+    write_batch(tmp_path, results(4, 2, np.random.default_rng(2)), {"host": "h", "process": 1, "written": 0.0})
+    write_report(tmp_path, tmp_path / "report.html")
+    maps, _, _ = (tmp_path / "report.html").read_text(encoding="utf-8").partition("<h2>Ranks")
+    assert re.search(r'text-anchor="middle">Wind speed V₀ \[m/s\]<', maps) and ">Exposure ratio n<" in maps
+    assert "Wind speed V₀ [m/s] = 5" in maps and "turbulence.wind_speed" not in maps
+
+
 @pytest.mark.slow
 def test_a_report_of_1e5_rows_is_one_file_below_ten_megabytes(tmp_path):
     grid = "[grid]\nturbulence.wind_speed = [5, 10, 15, 20, 25]\nsensors.exposure_ratio = [2, 5, 10, 20, 40]\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,8 @@ def test_every_state_has_the_numbers_of_its_own_run(tmp_path: Path, parse: Any) 
     assert [p.name for p in tmp_path.iterdir()] == ["r.html"]
     parsed = parse(path.read_text(encoding="utf-8"))
     assert "left out" not in parsed.text, "of observers that were not to run"
+    again = f"{shlex.join(FEW)} --vary turbulence.wind_speed=8,20"
+    assert again in parsed.text, "other observers would have other samples in common"
     states = parsed.data("rows")
     alone = [
         json.loads(

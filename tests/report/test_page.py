@@ -211,7 +211,9 @@ def test_a_loaded_record_promises_no_simulation(result: Result, parse: Any) -> N
     assert "of a loaded record" in said and f"wfsobs observe RECORD --config {FILE}" in said and "wfsobs export" not in said
     command = "wfsobs observe night.csv --preset paper --sha256 0a1b"
     named = Report("paper", result.scenario, (), (state,), is_recorded=True, command=command)
-    said = parse(page(named, MADE)).text
+    it = parse(page(named, MADE))
+    said = it.text
+    assert "peakspeak in the Kalman filters" not in said and it.data("data")["states"][0]["peaks"] == []
     assert command in said and "RECORD" not in said and "saved as" not in said
     assert {row["target"] for row in state.rows} == {"next z", "residual y"}
     assert "Next measurement, tip" in said

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wfsobs.app.controls.names import preset_title, setting_name, value_of
 from wfsobs.app.render import NOTHING, change, number
 from wfsobs.app.sources import LoadedRecord, Step, give_same_record
 from wfsobs.app.style import observers_of
@@ -21,6 +20,7 @@ from wfsobs.evaluation.scores import Score
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings, reference_preset
+from wfsobs.scenario.names import preset_title, setting_name, value_of
 from wfsobs.signal.envelope import envelope, envelope_times
 from wfsobs.typing import Array
 from wfsobs.units import unit_text

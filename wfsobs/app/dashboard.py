@@ -13,7 +13,6 @@ import param
 from panel.util.parameters import edit_readonly
 
 from wfsobs.app.actions import Actions
-from wfsobs.app.controls.names import name_settings
 from wfsobs.app.controls.panel import Controls, waiting_text
 from wfsobs.app.display import Display
 from wfsobs.app.glossary import Help
@@ -30,6 +29,7 @@ from wfsobs.app.upload import Upload
 from wfsobs.app.views.errors import effect_line
 from wfsobs.app.views.switches import ModeSwitch, UnitSwitch
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.names import name_settings
 
 MOST = 1000
 """Changes that are taken at once."""

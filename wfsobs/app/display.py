@@ -10,6 +10,7 @@ import param
 from wfsobs.app.compared import ComparedRun, DrawnLines
 from wfsobs.app.glossary import LAG, REAL_TIME, RELATIVE, RMS_ERROR, STATED, TERMS
 from wfsobs.evaluation.error_spectra import cumulative_rms
+from wfsobs.evaluation.scores import OF_STAR
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import HIGHEST_ORDER, TIP_TILT, Mode, modes_up_to
 from wfsobs.settings.parameters import unit_of
@@ -61,12 +62,12 @@ def score_columns(unit: str, base: str = "truth", compared_columns: Mapping[str,
     base        : what an error is divided by: "truth", or "z" for a record without truth
     compared_columns : columns that go beside the error
     """
-    of_z = "Of the prediction of z one step ahead, or residual of the recorded loop"
+    of_z = f"Of predicting the next measurement, {OF_STAR}; or residual of the recorded loop"
     return {
         "Observer": "",
         f"RMS error [{unit}]": TERMS[RMS_ERROR] if base == "truth" else of_z,
         **compared_columns,
-        "Relative error": TERMS[RELATIVE] if base == "truth" else "Error over RMS of z; above 1 worse than zero",
+        "Relative error": TERMS[RELATIVE] if base == "truth" else "Error over RMS of what is measured; above 1 worse than zero",
         "Lag [ms]": TERMS[LAG],
         "Time per step [µs]": "Computing time per step and mode",
         "Real-time factor": TERMS[REAL_TIME],

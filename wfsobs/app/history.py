@@ -14,7 +14,6 @@ from typing import Any, Final
 import param
 
 from wfsobs.app.compared import LETTERS, ComparedRun, name_of_change, thin_lines
-from wfsobs.app.controls.names import name_settings
 from wfsobs.app.display import Display
 from wfsobs.app.downloads import Save, TooLarge
 from wfsobs.app.jobs import DONE, FAILED
@@ -40,6 +39,7 @@ from wfsobs.evaluation.evidence import Evidence, rank_observers
 from wfsobs.evaluation.rows import can_be_best
 from wfsobs.evaluation.scores import PREDICTION
 from wfsobs.observers.base import TARGETS
+from wfsobs.scenario.names import name_settings
 from wfsobs.settings.errors import SettingError
 
 AFTER_DRAWING = 1

@@ -19,7 +19,6 @@ import param
 from bokeh.models import ColumnDataSource
 
 from wfsobs.app.actions import Actions
-from wfsobs.app.controls.names import name_settings
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs import CANCELLED, FAILED, RUNNING, Job
 from wfsobs.app.pages.parts import read_number
@@ -32,6 +31,7 @@ from wfsobs.app.style import WIDE, HtmlComponent, html, make_button, make_select
 from wfsobs.app.views.plots import new_spectrum, send
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.names import name_settings
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.settings.errors import SettingError
 from wfsobs.telemetry.columns import ROLES

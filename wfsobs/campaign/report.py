@@ -25,6 +25,7 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import NOT_OBSERVERS
 from wfsobs.files import write_text
 from wfsobs.observers import OBSERVERS
+from wfsobs.scenario.names import setting_label
 
 if TYPE_CHECKING:
     import pyarrow
@@ -256,11 +257,12 @@ def _maps(plan: Campaign, comparisons: Sequence[Comparison]) -> list[Map]:
         paths = [p for p in plan.axes if all(isinstance(c.get(p), (int, float)) for c in changes.values())][:2]
         paths = [p for p in paths if len({c[p] for c in changes.values()}) > 1]
         if paths:
-            out.append(_map(name, cells, changes, paths))
+            out.append(_map(plan, name, cells, changes, paths))
     return out
 
 
 def _map(
+    plan: Campaign,
     name: str,
     cells: Mapping[tuple[int, str, str], Sequence[Comparison]],
     changes: Mapping[int, Mapping[str, Any]],
@@ -271,6 +273,8 @@ def _map(
     ys = ys if len(paths) > 1 else [0.0]
     wide, high = (WIDTH - LEFT - 10) / len(xs), (HEIGHT - TOP - 40) / len(ys)
     squares, winners = [], dict[str, str]()
+    first = plan.cells[next(iter(changes))].scenario()
+    labels = [setting_label(first, path) for path in paths]
     for (cell, target, mode), rows in cells.items():
         best = next((r for r in rows if r.is_best), None)
         if best is None:
@@ -282,7 +286,8 @@ def _map(
         text = f"{name_label(best.name)}, {best.rms:.1f} nm, {margin:.0%} before the next" + (
             ", another is not significantly worse" if tie else ""
         )
-        text += f"; {', '.join(f'{p} = {_short(changes[cell][p])}' for p in paths)}; {target}, {mode}"
+        values = (f"{label} = {_short(changes[cell][p])}" for label, p in zip(labels, paths, strict=True))
+        text += f"; {', '.join(values)}; {target}, {mode}"
         winners[best.name] = name_label(best.name)
         opacity = 0.25 + 0.75 * min(1.0, margin / FULL_MARGIN)
         top = TOP + (len(ys) - 1 - j) * high
@@ -290,8 +295,8 @@ def _map(
     target, mode = next(iter(cells))[1:]
     return Map(
         f"{target}, {mode}: {name}",
-        paths[0],
-        paths[1] if len(paths) > 1 else "",
+        labels[0],
+        labels[1] if len(paths) > 1 else "",
         [(LEFT + (i + 0.5) * wide, _short(x)) for i, x in enumerate(xs) if i % max(1, len(xs) // 8) == 0],
         [
             (TOP + (len(ys) - 0.5 - j) * high, _short(y))

@@ -164,7 +164,7 @@ def score_table(rows: Sequence[Row]) -> Table:
     """
     several = len({r["seed"] for r in rows}) > 1
     unknown = any(r["target"] == RESIDUAL for r in rows)
-    title, base = ("One-step prediction error of z, and residual,", "z") if unknown else ("RMS error", "truth")
+    title, base = ("Error of the next measurement, and residual,", "z") if unknown else ("RMS error", "truth")
     groups = grouped_rows(rows, "target", "mode", "observer")
     bounds = {key: same[-1]["rms_um"] for key, same in groups.items() if key[2] in NOT_OBSERVERS}
     bounded = ("to limit",) if any(own_bound(r["observer"]) in {name for *_, name in bounds} for r in rows) else ()
@@ -302,7 +302,8 @@ def show_verdicts(
     known = [*explain_harm(result), *budgets] if is_simulated else []
     simulation = result.scenario if is_simulated else None
     given = result.scenario, result.record, result.estimates, result.scores
-    found = (verdict(*given, *key, simulation=simulation, budgets=known, evidence=evidence) for key in of)
+    more = {"simulation": simulation, "budgets": known, "evidence": evidence, "source": result.prior_source}
+    found = (verdict(*given, *key, **more) for key in of)
     for it in found:
         if it is not None:
             click.echo("\n" + "\n".join(f"{'  ' * bool(i)}{line}" for i, line in enumerate(it.sentences())))

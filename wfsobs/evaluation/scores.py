@@ -98,6 +98,9 @@ COMMON_BOUNDS = (BOUND, BOUND_BOTH)
 BOUNDS = (*COMMON_BOUNDS, BOUND_STARS, BOUND_MODES, BOUND_BOTH_MODES, BOUND_ASTERISM)
 """The bounds, in the order of tables."""
 
+OF_STAR = "with the mean over each NGS frame from the NGS where the record has one"
+"""Which measurement observers predict where there is no truth."""
+
 SHARE = 0.5
 """Minimum share of the samples after the warm-up that observers in a table have in common; those that leave fewer stand apart."""
 

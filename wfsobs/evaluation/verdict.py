@@ -41,6 +41,7 @@ from wfsobs.evaluation.scores import (
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import Estimate
+from wfsobs.prior import TRUE, PriorSource
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.spectrum import psd
@@ -165,6 +166,7 @@ class Verdict:
     lines  : how many lines the vibration has; 0 where that is not known
     harms  : observers that are worse than no estimate, the worst first
     seeds  : over how many records of the scenario
+    source : where the prior of the observers comes from
     """
 
     target: str
@@ -173,6 +175,7 @@ class Verdict:
     lines: int
     harms: tuple[Harm, ...]
     seeds: int = 1
+    source: PriorSource = TRUE
 
     @property
     def best(self) -> Contender:
@@ -211,6 +214,8 @@ class Verdict:
             words, heading = [place.with_error(scale, unit)], HEADINGS[place.knowledge]
             if place.knowledge == PEAKS and place.n_peaks < self.lines:
                 heading = f"With {place.n_peaks} of {self.lines} peak frequencies known"
+            elif place.knowledge == PEAKS and self.source != TRUE:
+                heading = f"With {self.source} peak frequencies"
             if place is not self.best:
                 words += ["statistically equal to the best"] * place.is_tie
             else:
@@ -265,6 +270,7 @@ def verdict(
     simulation: Scenario | None = None,
     evidence: Evidence | None = None,
     budgets: Sequence[Budget] = (),
+    source: PriorSource = TRUE,
 ) -> Verdict | None:
     """Return the verdict on one target and mode, None where nothing can be compared or there is no truth.
 
@@ -274,6 +280,7 @@ def verdict(
     simulation : what the record was made from, so that the lines of the vibration are known
     evidence   : errors over several seeds, on which the verdict then rests; where the errors lie is that of the record
     budgets    : error budgets of the record, from which it is said why an observer does harm (`explain_harm`)
+    source     : where the prior of the observers comes from
     """
     found, truth = evidence or gather_evidence([scores]), None if target == PREDICTION else record.truth(target)
     ranked = found.ranking(target, mode)
@@ -294,7 +301,7 @@ def verdict(
         terms, total = (explained[name].terms, explained[name].total) if name in explained else ({"": 0.0}, 1.0)
         cause = max(terms, key=terms.__getitem__)
         harms.append(Harm(places[name], worse, *shares, cause, terms[cause] / total))
-    return Verdict(target, mode, tuple(places.values()), len(lines), tuple(harms), found.n_seeds)
+    return Verdict(target, mode, tuple(places.values()), len(lines), tuple(harms), found.n_seeds, source)
 
 
 def contenders(

@@ -18,11 +18,11 @@ import panel_material_ui as pmui
 import param
 from bokeh.models import CustomJSTickFormatter
 
-from wfsobs.app.controls.names import column_of, name_settings
 from wfsobs.app.display import label_of
 from wfsobs.app.render import render
 from wfsobs.app.store import Store
 from wfsobs.app.style import WIDE, HtmlComponent, html, script, sheets
+from wfsobs.scenario.names import column_of, name_settings
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.settings.group import Group
 from wfsobs.settings.parameters import Reals

@@ -12,8 +12,7 @@ import panel as pn
 import panel_material_ui as pmui
 import param
 
-from wfsobs.app.controls.fields import ROOM, TAG, Field, RowEditor, idle_html, make_field
-from wfsobs.app.controls.names import preset_line, preset_title, setting_name
+from wfsobs.app.controls.fields import NUMBER_WIDTH, ROOM, TAG, Field, RowEditor, SliderField, idle_html, make_field
 from wfsobs.app.controls.topics import TopicList
 from wfsobs.app.display import label_of
 from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING
@@ -24,6 +23,7 @@ from wfsobs.app.work import RunResults
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings
 from wfsobs.scenario.idle import idle_settings
+from wfsobs.scenario.names import preset_line, preset_title, setting_name
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.group import Group
 
@@ -157,15 +157,10 @@ TWO_LINES = """
 """What is below must not move under the pointer with every change."""
 
 
-EFFECT = {
-    "position": "absolute",
-    "bottom": "-6px",
-    "left": "0",
-    "font-size": "12px",
-    "line-height": "14px",
-    "pointer-events": "none",
-}
-"""In the gap below a setting: what a change has done takes no room of its own."""
+EFFECT = "div { font-size: 12px; line-height: 14px; white-space: nowrap; overflow: hidden; text-overflow: ellipsis; }"
+
+IN_GAP = {"position": "absolute", "bottom": "-6px", "max-width": f"calc(100% - {NUMBER_WIDTH + 8}px)"}
+"""Below a slider, beside its number: what a change has done takes no room there, and what is below does not move."""
 
 
 class Controls:
@@ -201,7 +196,7 @@ class Controls:
         self.status: Final = Status(sizing_mode="stretch_width", max_width=200, margin=0, stylesheets=[STATUS_ON_BAR])
         self.search: Final = Search(self.open_setting, sizing_mode="stretch_width", margin=(8, 0, 4, 0))
         self.effect_of: Callable[[RunResults, RunResults], str] = lambda _before, _now: ""
-        self._effect = html(styles=EFFECT)
+        self._effect = html(stylesheets=[EFFECT])
         self._before: RunResults | None = None
         self._changed_part: Field | RowEditor | None = None
         self.topics: Final = _names()
@@ -349,7 +344,10 @@ class Controls:
         before, self._before = self._before, now
         changed = [*changed_settings(now.scenario, before.scenario)] if before else []
         part = (self.fields.get(changed[0]) or self.lists.get(changed[0])) if len(changed) == 1 else None
-        self._effect.html = self.effect_of(before, now) if before and part else ""
+        line = self.effect_of(before, now) if before and part else ""
+        self._effect.param.update(
+            html=f'<div title="{line}">{line}</div>' if line else "", styles=IN_GAP if isinstance(part, SliderField) else {}
+        )
         for at in (it for it in {self._changed_part, part} if it is not None):
             at.view[:] = [*(it for it in at.view if it is not self._effect), *([self._effect] if at is part else [])]
         self._changed_part = part

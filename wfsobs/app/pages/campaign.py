@@ -11,7 +11,6 @@ import numpy as np
 import panel as pn
 import panel_material_ui as pmui
 
-from wfsobs.app.controls.names import setting_label, value_of
 from wfsobs.app.controls.panel import Status
 from wfsobs.app.display import Display
 from wfsobs.app.jobs import BATCH, FAILED, RUNNING, Job, Work
@@ -31,6 +30,7 @@ from wfsobs.campaign.standings import UNTESTED, TogetherRow, standings
 from wfsobs.evaluation.rows import target_title
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.names import setting_label, value_of
 from wfsobs.settings.errors import SettingError
 from wfsobs.typing import Array
 

@@ -21,17 +21,18 @@ from wfsobs.app.pages.parts import (
     Page,
     box,
     caption,
+    caption_html,
     grid_style,
     tick,
     zoom_buttons,
 )
 from wfsobs.app.render import macro
-from wfsobs.app.style import sheets, watch
+from wfsobs.app.style import follow_html, sheets, watch
 from wfsobs.app.views.errors import MainLines, Strip, Table, VerdictLine
 from wfsobs.app.views.plots import MODEL, PEAKS, call
 from wfsobs.app.views.spectrum_editor import Frames, SpectrumEditor
 from wfsobs.app.views.switches import Pinning, SeedSwitch, group
-from wfsobs.app.views.traces import SpectraFigures, Stretch, Traces
+from wfsobs.app.views.traces import SpectraFigures, Stretch, Traces, drawn_peaks
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.error_spectra import Theory
 from wfsobs.observers.base import TARGETS, VIBRATION
@@ -44,7 +45,6 @@ SWITCHES = """
 @media (min-width: 600.05px) and (min-height: 560.05px) { :host { flex-wrap: wrap; max-width: 100%; } }
 """
 ZOOMS: Mapping[str, float | None] = {"All": None, "2 s": 2.0, "0.2 s": 0.2}
-MARKS = macro("marks", PEAKS, MODEL)
 
 
 class Explore(Page):
@@ -114,14 +114,18 @@ class Explore(Page):
         call(self.spectra.spectra[target].figure, f"{target.capitalize()} spectrum")
         cards = self.strips[target].cards
         cards.on_all = self.budgets.ask_for_all
-        marks = MARKS if target == VIBRATION else ""
+        above = follow_html(self._above_spectrum, (self.run, "result")) if target == VIBRATION else caption("Spectrum")
         traces = pn.Column(caption("Time trace"), self.traces.pane(target), **TALL)
-        self.rooms[target] = pn.Column(caption("Spectrum", marks), self.spectra.pane(target), **TALL)
+        self.rooms[target] = pn.Column(above, self.spectra.pane(target), **TALL)
         figures = pn.Column(traces, self.rooms[target], **WIDE, stylesheets=[HALVES])
         window = [self._tick("window_spectra")] if target == TARGETS[0] else []
         below = pn.Row(self.stretches[target].pane, *window, **WIDE, stylesheets=[WRAPPED])
         head = pn.Column(self.verdicts[target].pane, cards, **WIDE, stylesheets=[HEAD, BELOW_FIGURES])
         return pn.Column(head, figures, below, **WIDE, stylesheets=sheets("box"))
+
+    def _above_spectrum(self) -> str:
+        shown = self.run.result
+        return caption_html("Spectrum", macro("marks", PEAKS if shown is None or drawn_peaks(shown) else "", MODEL))
 
     def complete(self) -> None:
         """Put what is further down below the first target."""

@@ -13,7 +13,6 @@ import panel_material_ui as pmui
 from bokeh.plotting import figure
 
 from wfsobs.app.controls.fields import parse_number
-from wfsobs.app.controls.names import name_settings
 from wfsobs.app.controls.panel import Status
 from wfsobs.app.display import Display
 from wfsobs.app.downloads import Save
@@ -26,6 +25,7 @@ from wfsobs.app.style import WIDE, HtmlText, bare, html, make_button, sheets, sw
 from wfsobs.app.views.plots import call
 from wfsobs.app.views.switches import LineChoice, not_known
 from wfsobs.app.work import RunResults
+from wfsobs.scenario.names import name_settings
 from wfsobs.settings.errors import SettingError
 from wfsobs.settings.parameters import hint
 
@@ -347,9 +347,14 @@ HALVES = grid_style("minmax(0, 1fr) minmax(0, 1fr)")
 """Two figures beside each other."""
 
 
-def caption(words: str, marks: str = "") -> HtmlText:
-    """Make what stands above a figure. marks : HTML behind it."""
-    return bare(f'<div class="caption above">{escape(words)}{marks}</div>')
+def caption_html(words: str, marks: str = "") -> str:
+    """Write what stands above a figure. marks : HTML behind it."""
+    return f'<div class="caption above">{escape(words)}{marks}</div>'
+
+
+def caption(words: str) -> HtmlText:
+    """Make what stands above a figure."""
+    return bare(caption_html(words))
 
 
 def tick(display: Display, name: str, **options: Any) -> pmui.Checkbox:

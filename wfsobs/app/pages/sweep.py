@@ -14,7 +14,6 @@ import panel_material_ui as pmui
 import param
 
 from wfsobs.app.cache import key_of
-from wfsobs.app.controls.names import name_settings, setting_label
 from wfsobs.app.display import Display
 from wfsobs.app.downloads import table_csv
 from wfsobs.app.idle_work import SeedScores
@@ -57,6 +56,7 @@ from wfsobs.priors_from.scenario import quick_observers
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.grid import Variation
+from wfsobs.scenario.names import name_settings, setting_label
 from wfsobs.settings.errors import SettingError
 
 

@@ -10,7 +10,6 @@ from bokeh.colors import RGB
 from bokeh.models import ColumnDataSource, FixedTicker
 from bokeh.plotting import figure
 
-from wfsobs.app.controls.names import setting_label, setting_name, value_of
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.render import number
 from wfsobs.app.style import look, observers_of
@@ -20,6 +19,7 @@ from wfsobs.evaluation.evidence import FEWEST
 from wfsobs.evaluation.rows import row_label
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH
 from wfsobs.evaluation.verdict import sentence_of_several
+from wfsobs.scenario.names import setting_label, setting_name, value_of
 from wfsobs.typing import Array
 
 APART = 0.12

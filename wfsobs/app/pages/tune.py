@@ -15,7 +15,6 @@ from bokeh.models import ColumnDataSource, DataRange1d
 from markupsafe import Markup
 
 from wfsobs.app.controls.fields import parse_number
-from wfsobs.app.controls.names import setting_name
 from wfsobs.app.display import NO_ANGLE, UNITS, Display, per_micrometre
 from wfsobs.app.downloads import table_csv
 from wfsobs.app.jobs import INTERVAL, RUNNING, Tell
@@ -48,6 +47,7 @@ from wfsobs.observers.base import VIBRATION
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings
+from wfsobs.scenario.names import setting_name
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.tuning import Evaluation, TuningResult, tune
 from wfsobs.tuning.records import MEASURES, NEXT, REFERENCE, TRUTH, judged_by

@@ -134,7 +134,7 @@ class Report:
     preset : what the settings are compared with; base : the settings that were varied; is_recorded : whether on a record
     that was loaded or kept, not simulated from the settings; command : what makes the estimates of such a record again;
     sweep : maps of the last sweep, a title, axes, and cells row by row, and its rows; comparison : the runs that the one shown is
-    compared with, and a table per target and mode
+    compared with, and a table per target and mode; observers : those that were chosen, none where all usual ones ran
     """
 
     preset: str
@@ -145,6 +145,7 @@ class Report:
     command: str = ""
     sweep: Mapping[str, Any] | None = None
     comparison: Mapping[str, Any] | None = None
+    observers: Sequence[str] = ()
 
     @property
     def start(self) -> int:
@@ -197,6 +198,7 @@ def state_of(
     rows = score_rows(scores, scenario.run.seed, source=result.prior_source)
     budgets, simulation = (list_budgets(result), scenario) if is_simulated else ([], None)
     of = scenario, record, result.estimates, result.scores
+    known = {"simulation": simulation, "evidence": evidence, "budgets": budgets, "source": result.prior_source}
     return State(
         scenario,
         rows,
@@ -210,7 +212,7 @@ def state_of(
             (target, mode, found.sentences())
             for target in TARGETS
             for mode in names
-            if (found := verdict(*of, target, mode, simulation=simulation, evidence=evidence, budgets=budgets)) is not None
+            if (found := verdict(*of, target, mode, **known)) is not None
         ],
         {target: main_observers(result.scores, target, names[0], evidence) for target in TARGETS},
     )

@@ -29,7 +29,6 @@ from bokeh.util.paths import bokehjs_path
 from markupsafe import Markup
 from numpy.typing import ArrayLike
 
-from wfsobs.app.controls.names import setting_label, value_of
 from wfsobs.app.display import NO_ANGLE, UNITS, per_micrometre
 from wfsobs.app.glossary import sentence_on
 from wfsobs.app.pages.sweep_views import SweepLines
@@ -62,6 +61,7 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.grid import Variation, scenarios
+from wfsobs.scenario.names import setting_label, value_of
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.version import __version__
 
@@ -90,7 +90,7 @@ def page(report: Report, date: datetime) -> str:
         lines=_lines(report),
         main=report.states[report.start].main,
         about=sentence_on,
-        marks=(PEAKS, MODEL),
+        marks=(PEAKS if any(map(_drawn_peaks, report.states)) else "", MODEL),
         shades=SHADES,
         targets=TARGETS,
         modes={name: name[0].upper() + name[1:] for name in _modes(report)},
@@ -190,9 +190,14 @@ def _state(state: State, pool: Pool) -> dict[str, Any]:
         "warm_up": scenario.run.warm_up,
         "lines": lines,
         "axes": {name: pool.add(axis.astype("<f4").tobytes()) for name, axis in axes.items()},
-        "peaks": peak_marks(scenario),
+        "peaks": _drawn_peaks(state),
         "model": [model_mark(scenario)],
     }
+
+
+def _drawn_peaks(state: State) -> list[tuple[float, str]]:
+    """List the marked peaks; none of a record without truth, whose peaks are not those of the settings."""
+    return peak_marks(state.scenario) if any(name.startswith(f"signal/{VIBRATION}/{TRUTH}/") for name in state.lines) else []
 
 
 # ------------------------------------------------------------------------------------------------------- figures
@@ -373,7 +378,8 @@ def export(
             on_result(of[0])
         evidence = gather_evidence([result.scores for result in of]) if seeds > 1 else None
         kept.append(state_of(of[0], len(chosen), evidence=evidence, observers=observers))
-    content = page(Report(preset, scenario, tuple(vary), tuple(kept)), datetime.now().astimezone()).encode()
+    report = Report(preset, scenario, tuple(vary), tuple(kept), observers=observers or ())
+    content = page(report, datetime.now().astimezone()).encode()
     write_whole(path, lambda file: file.write(content))
 
 

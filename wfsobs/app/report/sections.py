@@ -12,7 +12,6 @@ from typing import Any
 
 from markupsafe import Markup
 
-from wfsobs.app.controls.names import setting_label, value_of
 from wfsobs.app.display import score_columns
 from wfsobs.app.render import NOTHING, number
 from wfsobs.app.report.data import Report, State, window_of
@@ -23,9 +22,10 @@ from wfsobs.bench.measure import machine
 from wfsobs.closed_loop.rows import NOT_APPLICABLE, label
 from wfsobs.evaluation.budget import TERMS
 from wfsobs.evaluation.rows import Row, row_label, target_title
-from wfsobs.evaluation.scores import BOUND, RESIDUAL
+from wfsobs.evaluation.scores import BOUND, OF_STAR, RESIDUAL
 from wfsobs.prior import GIVEN, IDENTIFIED, TRUE
 from wfsobs.scenario.configfile import changed_settings, reference_preset
+from wfsobs.scenario.names import setting_label, value_of
 from wfsobs.version import __version__
 
 
@@ -243,6 +243,7 @@ def meaning_values(report: Report) -> dict[str, Any]:
     return {
         "warm_up": f"{report.base.run.warm_up:g}",
         "truthless": any(row["target"] == RESIDUAL for row in rows),
+        "of_star": OF_STAR,
         "bounded": any(row["observer"] == BOUND for row in rows),
         "seeds": n_seeds(report),
         "budgeted": any(state.budgets for state in report.states),
@@ -272,6 +273,7 @@ def command_of(report: Report) -> tuple[str, bool]:
         command = report.command or f"wfsobs observe RECORD --config {FILE}"
         return command, f"--config {FILE}" in command
     given, seeds = given_options(report.base, report.preset, FILE), n_seeds(report)
+    chosen = [word for name in report.observers for word in ("--observer", name)]
     varied = [word for variation in report.variations for word in ("--vary", str(variation))]
-    words = [*given, *varied, *(["--seeds", str(seeds)] if seeds > 1 else [])]
+    words = [*given, *chosen, *varied, *(["--seeds", str(seeds)] if seeds > 1 else [])]
     return shlex.join(["wfsobs", "export", "report.html", *words]), FILE in given

@@ -26,8 +26,8 @@ from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.budget import TERMS as BUDGET_TERMS
 from wfsobs.evaluation.evidence import Evidence, gather_evidence, marks_of, rank_observers
 from wfsobs.evaluation.result import Failure
+from wfsobs.evaluation.rows import NOTHING as NO_KNOWLEDGE
 from wfsobs.evaluation.rows import (
-    NOT_OBSERVERS,
     PEAKS,
     TIME,
     above_bound,
@@ -43,9 +43,8 @@ from wfsobs.evaluation.rows import (
     target_title,
     uncertainty_text,
 )
-from wfsobs.evaluation.rows import NOTHING as NO_KNOWLEDGE
 from wfsobs.evaluation.rows import Row as ScoreRow
-from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS, LOOP, PREDICTION, RESIDUAL, SCORED, Score
+from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS, LOOP, OF_STAR, PREDICTION, RESIDUAL, SCORED, Score
 from wfsobs.evaluation.verdict import verdict
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
@@ -78,7 +77,7 @@ def main_observers(scores: Iterable[Score], target: str, mode: str, evidence: Ev
 def effect_line(display: Display, before: RunResults, now: RunResults) -> str:
     """Write the change of the record's error of the best observer without prior knowledge, for the target with the largest.
 
-    Empty where it did not change, or where either run has no such error.
+    It names mode and unit, since it stays when others are shown. Empty where it did not change, or where a run has no such error.
     """
     found: list[tuple[float, str]] = []
     scale = display.scale(now.scenario)
@@ -96,7 +95,7 @@ def effect_line(display: Display, before: RunResults, now: RunResults) -> str:
         best = next((name for name in rank_observers(new) if name in old and name in observers_of(target)), None)
         if best is not None and new[best] != old[best]:
             errors = f"{number(scale * old[best])} → {number(scale * new[best])} {display.unit_label}"
-            line = f"{target.capitalize()}, {look(best).label}: {errors} on this record"
+            line = f"{errors}: {target}, {display.mode_label}, {look(best).label}"
             found.append((abs(np.log(new[best] / old[best])), line))
     return max(found)[1] if found else ""
 
@@ -137,7 +136,7 @@ class MainLines:
         self.display.hidden_lines = {target: choice.hidden_lines for target, choice in self.choices.items()}
 
 
-NO_TRUTH = "The record has no truth: figures show estimates, and RMS errors are those of predicting the next measurement."
+NO_TRUTH = f"The record has no truth: figures show estimates, and errors are those of predicting the next measurement, {OF_STAR}."
 
 
 class VerdictLine:
@@ -180,6 +179,7 @@ class VerdictLine:
             simulation=results.simulation,
             evidence=self.budgets.seeds.evidence,
             budgets=[budget for of in self.budgets.by_observer.values() for budget in of],
+            source=it.prior_source,
         )
         if found is None:
             return title, "" if has_truth else NO_TRUTH
@@ -202,7 +202,7 @@ def lines_of_failures(failures: Iterable[Failure]) -> list[str]:
 
 
 WITHOUT_TRUTH = {
-    PREDICTION: ("Next measurement z", "one step ahead: the record has no truth"),
+    PREDICTION: (target_title(PREDICTION), OF_STAR),
     RESIDUAL: ("Residual", "what the recorded loop left"),
 }
 """Target of a record without truth -> what stands before the mode in its title, and behind it."""
@@ -276,7 +276,7 @@ class ScoreWriter:
             _or_why(None if lag is None else 1e3 * lag, "a limit has none" if is_bound else no_lag),
             _or_why(time, "nothing is computed"),
             _or_why(None if time is None else 1e-6 * time / self.dt, "nothing is computed"),
-            missing("it predicts no sigma") if sd is None else self.length(sd),
+            missing("it predicts no sigma of this error") if sd is None else self.length(sd),
         ]
 
 
@@ -470,7 +470,7 @@ class Strip:
         items = self.items()
         unit, shown = self.display.unit_label, self.run.result
         error = "RMS error" if shown is None or shown.values(TRUTH, self.target) is not None else "Prediction error"
-        terms = {part[3] for item in items if item["main"] for part in item["parts"] if part[1] >= LEAST}
+        terms = {part[3] for item in items for part in item["parts"] if part[1] >= LEAST}
         heads = HEADS | {"value": f"{error} [{unit}]"}
         heads["change"] *= any(item["change"] for item in items)
         heads["bar"] *= bool(terms)
@@ -487,7 +487,7 @@ class Strip:
         if shown is None:
             cards = [self._card(TRUTH, ""), *map(self._card_without, names)]
         else:
-            cards = [self._truth(shown), *(self._observer(name, shown) for name in names)]
+            cards = [*self._truth(shown), *(self._observer(name, shown) for name in names)]
         return [card | {"compared": self._compared_rows(card["name"], shown), "main": card["name"] in main} for card in cards]
 
     def _compared_rows(self, name: str, results: RunResults | None) -> list[list[str]]:
@@ -505,24 +505,23 @@ class Strip:
     def _compared_number(self, scores: Sequence[Score], name: str, has_truth: bool) -> tuple[tuple[str, str, str], str]:
         """Return what of which score is compared: the error of an observer, or the rms of the truth.
 
-        has_truth : otherwise the error of the next measurement, and the residual of the recorded loop
+        has_truth : otherwise the error of the next measurement
         """
         mode = self.display.mode
         if name == TRUTH and has_truth:
             return (next((s.observer for s in self._comparable(scores)), ""), self.target, mode), "truth_rms"
-        return ((LOOP, RESIDUAL) if name == TRUTH else (name, self.target if has_truth else PREDICTION)) + (mode,), "rms"
+        return (name, self.target if has_truth else PREDICTION, mode), "rms"
 
     def _comparable(self, scores: Iterable[Score]) -> list[Score]:
         return [s for s in scores if (s.target, s.mode) == (self.target, self.display.mode) and not s.apart]
 
-    def _truth(self, results: RunResults) -> dict[str, Any]:
+    def _truth(self, results: RunResults) -> list[dict[str, Any]]:
+        if results.values(TRUTH, self.target) is None:
+            return []
         for score in self._comparable(results.result.scores):
             size = self.seeds.over_seeds(score).truth_rms * self.display.scale(results.scenario)
-            return self._card(TRUTH, "rms", value=number(size))
-        left = find_score(results.result.scores, LOOP, RESIDUAL, self.display.mode)
-        # the recorded loop's residual, in the place of the truth, which has no line either
-        of_loop = {"label": NOT_OBSERVERS[LOOP], "colour": "transparent"}
-        return self._error_card(TRUTH, left, results) | of_loop if left else self._card(TRUTH, "")
+            return [self._card(TRUTH, "rms", value=number(size))]
+        return [self._card(TRUTH, "")]
 
     def _observer(self, name: str, results: RunResults) -> dict[str, Any]:
         scores, mode = results.result.scores, self.display.mode

@@ -201,10 +201,14 @@ class _Spectrum(TargetFigure):
             self.figure.y_range.update(start=max(low / room, high * 10.0**-decades), end=high * room)
 
     def _draw_marks(self, results: RunResults) -> None:
-        simulated = results.result.record.vibration is not None  # peaks of the settings are not those of a record
-        found = {"peaks": peak_marks(results.scenario) if simulated else [], "model": [model_mark(results.scenario)]}
+        found = {"peaks": drawn_peaks(results), "model": [model_mark(results.scenario)]}
         for name, marks in found.items():
             send(self.marks[name].data_source, {"x": [x for x, _ in marks], "text": [text for _, text in marks]})
+
+
+def drawn_peaks(results: RunResults) -> list[tuple[float, str]]:
+    """List the marked peaks; none of a record without truth, whose peaks are not those of the settings."""
+    return peak_marks(results.scenario) if results.result.record.vibration is not None else []
 
 
 def window_spectra(results: RunResults, start: float, end: float) -> dict[Key, SignalAndError]:

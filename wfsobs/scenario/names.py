@@ -1,4 +1,4 @@
-"""What settings are called on the page, where messages have their paths."""
+"""What settings are called on pages and in reports, where messages have their paths."""
 
 from __future__ import annotations
 
