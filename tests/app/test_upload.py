@@ -72,7 +72,7 @@ def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: 
         (s.observer, s.target, s.mode, s.rms) for s in expected.scores
     ]
     table = dashboard.explore.table.html()
-    assert "Next measurement, tip, of the NGS where the record has one, else of the LGS" in table
+    assert "Next measurement, tip, with the mean over each NGS frame from the NGS where the record has one" in table
     assert "Residual, tip, what the recorded loop left" in table
     assert "nan" not in table
     line = dashboard.explore.traces.traces["vibration"].source.data

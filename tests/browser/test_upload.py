@@ -45,7 +45,7 @@ def test_a_record_is_previewed_used_and_taken_back(page: Page, tmp_path: Path) -
     expect(page.get_by_text("Record night.csv: 7000 steps")).to_be_visible()
     switch, back = page.get_by_role("button", name="Tilt", exact=True).first, page.locator("button[data-do=simulate]")
     until(page, ABOVE, arg=[switch.element_handle(), back.element_handle()])
-    expect(page.get_by_role("row", name=re.compile("^Next measurement, tip, of the NGS where"))).to_be_visible()
+    expect(page.get_by_role("row", name=re.compile("^Next measurement, tip, with the mean over"))).to_be_visible()
     expect(page.get_by_role("row", name=re.compile("^Residual, tip, what the recorded loop left"))).to_be_visible()
     page.get_by_role("button", name="Back to the simulation").click()
     expect(page.get_by_text(re.compile(r"^Turbulence, tip, [\d.]+ to"))).to_be_visible()
