@@ -102,9 +102,13 @@ def test_a_first_step_of_its_own_comes_before_the_cycle() -> None:
     rng = np.random.default_rng(7)
     first, *steps = random_steps(rng, 6, 4, 2, 3, 0.9)
     v = rng.standard_normal((200, 2))
-    _, G, _, J = first
-    wanted = np.vstack([J @ v[0], plain(steps, v[1:], G @ v[0])])
-    assert np.allclose(PeriodicFilter(steps, first).run(v), wanted, rtol=0, atol=1e-12 * np.abs(wanted).max())
+    F, G, H, J = first
+    for x0 in (None, rng.standard_normal(4)):
+        x = np.zeros(4) if x0 is None else x0
+        wanted = np.vstack([H @ x + J @ v[0], plain(steps, v[1:], F @ x + G @ v[0])])
+        for since in (0, 1, 2, 150, 199):
+            got = PeriodicFilter(steps, first).run(v, x0, since=since)
+            assert np.allclose(got, wanted[since:], rtol=0, atol=1e-12 * np.abs(wanted).max())
 
 
 @pytest.mark.parametrize("n_steps", [0, 1, 2])

@@ -292,6 +292,15 @@ def test_observers_are_one_text_or_any_of_them() -> None:
         run(scenario(), observers=(name for name in ["zero", "nul"]))  # type: ignore[arg-type]
 
 
+def test_a_star_that_is_lost_throughout_is_said_to_be_the_likely_reason() -> None:
+    record = simulate(scenario())
+    assert record.y_ngs is not None
+    lost = replace(record, y_ngs=np.full_like(record.y_ngs, np.nan))
+    reason = "multirate-adaptive left out: turbulence is NaN in every step, perhaps for too few measurements of the LGS or NGS"
+    result = observe(lost, scenario({"adaptive.window": 0.25}), observers=["multirate-adaptive"])
+    assert [f.reason for f in result.failures] == [reason]
+
+
 def test_a_record_of_more_modes_than_the_settings_have() -> None:
     three = np.random.default_rng(1).standard_normal((1000, 3))
     result = observe(Record(three, 0.0 * three, 1e-3), scenario(), observers="kf-lgs")
@@ -387,7 +396,7 @@ def raise_error(error: Exception) -> None:
         (lambda z: {"vibration": np.full_like(z, np.inf)}, "not infinite ones"),
         (lambda z: {"turbulence": z}, "returns no vibration"),
         (lambda z: None, "returns NoneType, not a dictionary"),
-        (lambda z: {"vibration": np.full_like(z, np.nan)}, "vibration is NaN in every step$"),
+        (lambda z: {"vibration": np.full_like(z, np.nan)}, "vibration is NaN in every step, perhaps for too few"),
         (lambda z: {"vibration": np.ma.masked_array(z, z > 0)}, "vibration takes NaN where there is no number, not a mask$"),
         (lambda z: Estimates({"vibration": z}, {"vibration": z * 0 - 1}), "sd of vibration takes numbers from 0, not negative"),
         (lambda z: raise_error(ValueError()), "ValueError$"),

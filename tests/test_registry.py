@@ -8,6 +8,7 @@ import threading
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 import wfsobs
@@ -76,7 +77,7 @@ def mine(**changes: Any) -> Observer:
         (mine(weight=0), "observer 'mine': weight = 0: takes a number above 0"),
         (mine(weight=float("inf")), "observer 'mine': weight = inf: takes a number above 0"),
         (mine(weight="1"), "observer 'mine': weight = '1': takes a number above 0"),
-        (mine(look=Look(light="#8A4B")), "observer 'mine': look.light = '#8A4B': takes #rrggbb or a name of CSS"),
+        (mine(look=Look(light="#8A4BC")), "observer 'mine': look.light = '#8A4BC': takes a colour of CSS, such as"),
         (mine(look="red"), "observer 'mine': look = 'red': takes a Look"),
         (mine(tunable=Tunable(("nothing.speed",))), "observer 'mine': tunable 'nothing.speed': no scenario has such a setting"),
         (mine(tunable=Tunable((), ("kalman",))), "observer 'mine': tunable 'kalman': no scenario has such a setting"),
@@ -99,6 +100,16 @@ def test_what_is_refused(entry: Any, reason: str) -> None:
         wfsobs.register(entry)
     assert reason in str(error.value) and "\n" not in str(error.value)
     assert (list(OBSERVERS), dict(sections())) == before
+
+
+@pytest.mark.parametrize("colour", ["#f60", "#f60c", "#ff6600", "#ff6600cc", "rgb(255, 102, 0)", "rgba(255,102,0,.5)", "tomato"])
+def test_any_colour_of_css_is_taken(colour: str) -> None:
+    mine(look=Look(light=colour, dark=colour)).check_fields()
+
+
+@pytest.mark.parametrize("weight", [2, 0.5, np.int64(3), np.float32(3.0)], ids=repr)
+def test_any_number_above_0_is_a_weight(weight: Any) -> None:
+    mine(weight=weight).check_fields()
 
 
 def test_the_same_again_changes_nothing() -> None:

@@ -176,5 +176,10 @@ def test_it_is_asked_before_every_run_whether_to_stop() -> None:
         check_observer(observer(run), alone=False, watch=Watch(is_cancelled=lambda: True))
 
 
+@pytest.mark.parametrize("more", ["text", 3, np.full((1500, 2), np.nan)], ids=["text", "number", "nan"])
+def test_what_is_returned_beside_the_targets_is_not_looked_at(more: Any) -> None:
+    check_observer(observer(lambda measured, *_: {VIBRATION: measured.z, "more": more}), alone=False)
+
+
 def test_a_reference_may_look_ahead() -> None:
     check_observer(replace(observer(mean_of_three), causal=False), alone=False)

@@ -151,6 +151,20 @@ def test_training_data_that_do_not_fit_are_one_line_whoever_brings_them(
         training_of(replace(night, training=raw))
 
 
+@pytest.mark.parametrize("first", [True, False], ids=["first seconds", "another record"])
+def test_a_mode_that_the_record_never_measures_needs_no_training_data(first: bool, night: Record, other: Record) -> None:
+    """The other mode is estimated as without it; one that is lost in the training data alone is refused."""
+    dead = replace(night, y_lgs=night.y_lgs * [1.0, np.nan])
+    train = 0.8 if first else replace(other, y_lgs=other.y_lgs * [1.0, np.nan])
+    expected, got = (values(observe(r, S, observers=("ridge", "kf-lgs"), train=0.8 if first else other)) for r in (night, dead))
+    for name, estimate in got.items():
+        np.testing.assert_allclose(estimate[:, 0], expected[name][:, 0], rtol=0, atol=1e-12)
+    assert values(observe(dead, S, observers=("ridge",), train=train)).keys() == {"ridge/vibration"}
+    lost = replace(night, y_lgs=np.where(np.arange(night.n_steps)[:, None] < 900, night.y_lgs * [1.0, np.nan], night.y_lgs))
+    with pytest.raises(RecordError, match=r"^the training data holds no measurement of mode 1$"):
+        observe(lost if first else night, S, observers=("ridge",), train=train)
+
+
 @pytest.mark.parametrize("train", [True, np.True_, "0.8", [0.8]], ids=str)
 def test_what_is_no_duration_is_one_line(train: Any, night: Record) -> None:
     with pytest.raises(RecordError, match=r"^train takes a record, or a duration \[s\], not .*$"):

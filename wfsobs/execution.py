@@ -119,7 +119,8 @@ def _one(observer: Observer, record: Record, scenario: Scenario, watch: Watch, p
             values = observer.estimate(*given, alone)
         for target in observer.targets:
             if np.isnan(values[target]).all():
-                raise ValueError(f"{target} is NaN in every step")
+                sensors = " or ".join(sensor.upper() for sensor in observer.sensors)
+                raise ValueError(f"{target} is NaN in every step, perhaps for too few measurements of the {sensors}")
     except ValueError as error:
         return [Failure(observer.id, f"{observer.id} left out: {error_line(error)}")]
     seconds = (perf_counter() - start) / max(record.n_steps * record.n_modes, 1)

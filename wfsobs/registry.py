@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, MutableMapping
 from importlib.metadata import EntryPoint, entry_points
 from math import inf
+from numbers import Real
 from threading import RLock
 from typing import Any, Protocol, TypeVar
 
@@ -202,7 +203,7 @@ def check_tuple(name: str, value: object, choices: Iterable[Any]) -> None:
 
 def check_weight(weight: object) -> None:
     """Raise ValueError where the weight of an entry is no number above 0."""
-    if not isinstance(weight, (int, float)) or not 0.0 < weight < inf:
+    if not isinstance(weight, Real) or not 0.0 < float(weight) < inf:
         raise ValueError(f"weight = {weight!r}: takes a number above 0")
 
 

@@ -300,7 +300,7 @@ def check_observer(observer: Observer, scenario: Scenario | None = None, alone: 
     record = simulate(s)
     if missing := observer.missing(record):
         raise CheckError(f"{observer.id}: needs {', '.join(missing)}, which no record has")
-    runs = Runs(observer.id, watch, observer.estimate, partial(_check_estimates, observer))
+    runs = Runs(observer.id, watch, partial(_estimate_targets, observer), partial(_check_estimates, observer))
     given = arguments(observer, record, s)
     base = runs.run(*given)
     if empty := [target for target in observer.targets if np.isnan(base[target]).all()]:
@@ -314,6 +314,12 @@ def check_observer(observer: Observer, scenario: Scenario | None = None, alone: 
     check_steps(observer, *given, watch=watch)
     if alone:
         runs.check_alone(again, base)
+
+
+def _estimate_targets(observer: Observer, *given: Any) -> Estimates:
+    """Return what an observer estimates of its targets, without what else it returns."""
+    found = observer.estimate(*given)
+    return {target: found[target] for target in observer.targets}
 
 
 def _check_estimates(observer: Observer, found: Estimates, measurements: Measurements, _then: str) -> None:

@@ -53,7 +53,7 @@ def squares(result: Result) -> dict[Key, float]:
 
 def ratios(result: Result) -> dict[tuple[str, str], float]:
     """Return the rms of innovations over what each filter states of them, by observer and mode."""
-    blind = replace(result.record, turbulence=None, vibration=None)
+    blind = replace(result.record, turbulence=None, vibration=None, y_ngs=None, ratio=None)  # with an NGS there is none
     scores = score(blind, result.estimates, warm_up=UT4.run.warm_up)
     return {(s.observer, s.mode): s.rms / s.calibration.sd for s in scores if s.target == PREDICTION and s.calibration}
 

@@ -222,6 +222,18 @@ def test_limits_that_are_never_reached_change_nothing_and_others_do(controller: 
     assert (max(tight.limited_share) > 0.0) == (controller != "none")
 
 
+@pytest.mark.parametrize("controller", ["integrator", "lqg-kf-lgs", "lqg-multirate-multi", "integrator+gpr-offline"])
+def test_at_a_limit_a_whole_record_is_still_one_filter(controller: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands frame by frame take five times as long."""
+
+    def refuse(*_arguments: Any) -> None:
+        raise AssertionError("it runs frame by frame")
+
+    monkeypatch.setattr("wfsobs.control.base.step_law", refuse)
+    got = outcome(run(QUICK | {"control.stroke": 0.3, "control.rate": 0.05}, (controller,)), controller)
+    assert got.u is not None and np.abs(got.u).max() <= 0.3 and min(got.limited_share) > 0.01
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("controller", list(CONTROLLERS))
 def test_a_command_knows_nothing_of_what_comes_later(controller: str) -> None:

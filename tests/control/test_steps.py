@@ -96,6 +96,26 @@ def test_a_design_takes_over_without_a_bump(name: str) -> None:
     assert np.abs(got - want).max() < 0.05 * np.abs(cold - want).max()
 
 
+def test_a_limit_stops_an_integrator_beside_a_filter_in_another_mode() -> None:
+    """Its commands are those beside another integrator, over the record and frame by frame, from a saved state too."""
+    record, scenario = with_gaps("paper")
+    integrator, settings = CONTROLLERS["integrator"], own_settings(CONTROLLERS["integrator"], scenario)
+    plant = plant_of(scenario.replace({"control.stroke": 0.1, "control.rate": 20.0}))
+    measured, prior = controller_arguments(integrator, record, settings, prior_for(integrator, scenario))
+    laws = integrator.laws(prior, plant, settings, record.n_modes)
+    mixed = (laws[0], replace(laws[1], gain=None))
+    want, limited = integrator.commands(laws, measured, prior, plant, settings)
+    got, _ = integrator.commands(mixed, measured, prior, plant, settings)
+    assert limited[:, 0].mean() > 0.1
+    np.testing.assert_allclose(got[:, 0], want[:, 0], rtol=0, atol=1e-14)
+    steps, other, broken = (integrator.assemble(mixed, prior, plant, settings, record.sampling) for _ in range(3))
+    np.testing.assert_allclose(run_loop(steps, measured), got, rtol=0, atol=1e-12)
+    other.load_state_dict(steps.state_dict())
+    broken.take_over(steps)
+    commands = [controller.update(np.array([0.01, 0.02])) for controller in (steps, other, broken)]
+    np.testing.assert_array_equal(commands[1:], [commands[0]] * 2)
+
+
 def test_filters_of_a_longer_cycle_are_not_taken_over() -> None:
     """Their place in the cycle may be beyond the shorter one's."""
     step = np.eye(1), np.ones((1, 1)), np.ones((1, 1)), np.zeros((1, 1))

@@ -19,7 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from wfsobs.control.mirror import Law, Plant
+from wfsobs.control.integrator import limited_integrator
+from wfsobs.control.mirror import Law, Mirror, Plant
 from wfsobs.control.step import MakeStepLaw, StepController, StepLaw, StepPredict, VibrationAhead, step_law, take_missing
 from wfsobs.observers.base import NOT_TUNED, NOTHING, PLAIN, Look, Tunable, check_look
 from wfsobs.observers.baselines import online_reference
@@ -253,18 +254,20 @@ class Controller:
         lost = np.isnan(z).any() or (self.ngs and n is not None and np.isnan(measurements.z_ngs[n::n]).any())
         if self.step_law is None and not (lost or (take_missing(laws) and measurements.lgs_stars is not None)):
             inputs = np.stack([z, np.nan_to_num(measurements.z_ngs)], axis=1) if self.ngs else z[:, None]
-            u = np.column_stack([law.run(inputs[:, :, mode]) for mode, law in enumerate(laws)]) + forward
-            if plant.mirror.within(u):
-                return u, np.zeros(u.shape, dtype=bool)
+            asked = np.column_stack([law.run(inputs[:, :, mode]) for mode, law in enumerate(laws)]) + forward
+            columns = zip(laws, asked.T, z.T, forward.T, strict=True)
+            taken, wanted = zip(*(_limit_commands(plant.mirror, *of_mode) for of_mode in columns), strict=True)
+            u = np.column_stack(taken)
+            return u, u != np.column_stack(wanted)
         own = self._step_law(laws, prior, plant, settings, measurements.sampling)
         assert own is not None
-        u, last = np.empty_like(z), np.zeros(z.shape[1])
+        u, wanted, last = np.empty_like(z), np.empty_like(z), np.zeros(z.shape[1])
         for k, frame in enumerate(frames_of(measurements, watch)):
             own.see_stars(frame.stars)
-            wanted = own.command(z[k], frame.ngs if self.ngs else None, forward[k])
-            last = u[k] = plant.mirror.clip_commands(wanted, last)
+            wanted[k] = own.command(z[k], frame.ngs if self.ngs else None, forward[k])
+            last = u[k] = plant.mirror.clip_commands(wanted[k], last)
             own.tell(last, forward[k])
-        return u, plant.mirror.at_limit(u)
+        return u, u != wanted
 
     def _takes_missing(self, laws: Sequence[Law]) -> bool:
         return self.step_law is not None or (self.predict is None and take_missing(laws))
@@ -272,3 +275,12 @@ class Controller:
 
 def _line_width(settings: Settings) -> float:
     return getattr(getattr(settings, "multipeak", None), "line_width", LINE_WIDTH)
+
+
+def _limit_commands(mirror: Mirror, law: Law, asked: Array, z: Array, forward: Array) -> tuple[Array, Array]:
+    """(commands that the mirror takes, commands wanted) of one mode, (n_steps,); asked : those wanted without limits."""
+    if mirror.within(asked):
+        return asked, asked
+    if law.gain is None:  # it has no feedback of a limit
+        return mirror.follow(asked), asked
+    return limited_integrator(mirror, law.gain, law.leak, z, forward)

@@ -92,6 +92,23 @@ def _bin_spectra(spectra: Spectra) -> tuple[Array, Array, Array, Array, Array]:
     return mean(omega), total, mean(spectra.disturbance), mean(spectra.cross), mean(spectra.measurement)
 
 
+def limited_integrator(mirror: Mirror, gain: float, leak: float, z: Array, forward: Array) -> tuple[Array, Array]:
+    """Commands (n_steps,) of an integrator on z (n_steps,) plus `forward` (n_steps,), that a mirror with limits took; and wanted.
+
+    Anti-windup: the integrator goes on from what the mirror took, less `forward`.
+    """
+    taps = mirror.taps[1:].tolist()
+    own = [0.0] * len(taps)  # the integrator's part of the last commands, newest first
+    taken, wanted, last = [], [], 0.0
+    for measured, ahead in zip(z.tolist(), forward.tolist(), strict=True):
+        y = measured + sum(tap * u for tap, u in zip(taps, own, strict=True))
+        wanted.append(leak * own[0] - gain * y + ahead)
+        last = mirror.clip_command(wanted[-1], last)
+        taken.append(last)
+        own = [last - ahead, *own[:-1]]
+    return np.array(taken), np.array(wanted)
+
+
 TRIED = 80
 """Gains up to the limit of stability; a parabola through the best three refines them."""
 

@@ -67,6 +67,18 @@ class Mirror:
         """Return the commands of all modes nearest to u (n_modes,) within the limits after `last` [um]."""
         return np.clip(np.clip(u, last - self.slew, last + self.slew), -self.stroke, self.stroke) if self.has_limits else u
 
+    def clip_command(self, command: float, last: float) -> float:
+        """Return `clip_commands` of one mode."""
+        return min(max(min(max(command, last - self.slew), last + self.slew), -self.stroke), self.stroke)
+
+    def follow(self, u: Array) -> Array:
+        """Return the commands (n_steps,) [um] that the mirror takes for the wanted ones of one mode, from rest."""
+        out, last = [], 0.0
+        for wanted in u.tolist():
+            last = self.clip_command(wanted, last)
+            out.append(last)
+        return np.array(out)
+
     def within(self, u: Array) -> bool:
         """Whether commands u (n_steps, ...) [um], from rest, keep the limits."""
         return bool(np.abs(u).max() <= self.stroke and np.abs(np.diff(u, axis=0, prepend=0.0)).max() <= self.slew)

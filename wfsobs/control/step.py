@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -141,6 +142,38 @@ class Integrators(StepLaw):
         self._own[0] += difference
 
 
+class MixedLaws(StepLaw):
+    """Integrators in some modes, which a limit of the mirror stops, and filters of z in the others."""
+
+    state_names: tuple[str, ...] = ("filters", "integrators")
+
+    def __init__(self, laws: Sequence[Law], mirror: Mirror):
+        self._integrates = np.array([law.gain is not None for law in laws])
+        self.filters = LinearLaws(laws)
+        self.integrators = Integrators([law if law.gain is not None else replace(law, gain=0.0) for law in laws], mirror)
+        self.mark_start()
+
+    def command(self, z: Array, ngs: Array | None, forward: Array) -> Array:
+        """Return the commands of each mode's own law."""
+        of_filters = self.filters.command(z, ngs, forward)
+        return np.where(self._integrates, self.integrators.command(z, ngs, forward), of_filters)
+
+    def tell(self, command: Array, forward: Array) -> None:
+        """Have the integrators go on from what the mirror took."""
+        self.integrators.tell(command, forward)
+
+    def amend(self, difference: Array) -> None:
+        """Go on from a command that differs by this from the one told last."""
+        self.integrators.amend(difference)
+
+    def take_over(self, old: Any) -> None:
+        """Go on from laws of the same kinds."""
+        if not isinstance(old, MixedLaws) or not np.array_equal(old._integrates, self._integrates):
+            raise StepError("the laws are of another kind")
+        self.filters.take_over(old.filters)
+        self.integrators.take_over(old.integrators)
+
+
 class PredictionLaws(StepLaw):
     """Minus what an observer predicts that needs time until it does; until then integrators."""
 
@@ -182,9 +215,10 @@ def step_law(laws: Sequence[Law], mirror: Mirror) -> StepLaw | None:
     """Return the laws of all modes, one frame at a time; None for no laws."""
     if take_missing(laws):
         return KalmanLaws(laws)
-    if any(one.gain is None for one in laws):
-        return LinearLaws(laws)
-    return Integrators(laws, mirror) if laws else None
+    if all(one.gain is not None for one in laws):
+        return Integrators(laws, mirror) if laws else None
+    is_mixed = mirror.has_limits and any(one.gain is not None for one in laws)
+    return MixedLaws(laws, mirror) if is_mixed else LinearLaws(laws)
 
 
 class VibrationAhead:

@@ -54,7 +54,7 @@ class Look:
     label : str
         Name in legends, where the full one is too long; empty for the full one.
     light, dark : str
-        Colour in light and dark mode, #rrggbb or a name of CSS.
+        Colour of CSS in light and dark mode, such as #rrggbb or a name.
     dash : tuple of int
         Pattern, empty for solid [px].
     width : float
@@ -72,7 +72,7 @@ class Look:
         return self.dark if dark else self.light
 
 
-COLOUR = re.compile(r"#[0-9A-Fa-f]{6}|[A-Za-z]+")
+COLOUR = re.compile(r"#([0-9A-Fa-f]{3,4}|[0-9A-Fa-f]{6}|[0-9A-Fa-f]{8})|rgba?\([0-9., ]+\)|[A-Za-z]+")
 
 
 def check_look(look: object) -> None:
@@ -81,7 +81,7 @@ def check_look(look: object) -> None:
         raise ValueError(f"look = {look!r}: takes a Look")
     for name, colour in (("light", look.light), ("dark", look.dark)):
         if not COLOUR.fullmatch(str(colour)):
-            raise ValueError(f"look.{name} = {colour!r}: takes #rrggbb or a name of CSS")
+            raise ValueError(f"look.{name} = {colour!r}: takes a colour of CSS, such as #rrggbb or a name")
 
 
 PLAIN = Look(dash=(4, 2))

@@ -38,7 +38,7 @@ def with_training(record: Record, train: Record | float, scenario: Scenario) -> 
     ------
     RecordError
         The other record has another rate, number of modes or delay, is the record itself, or either has too few samples, none of
-        a mode, or an impossible duration.
+        a mode that the record measures, or an impossible duration.
     """
     part = training_part(record, train, scenario)
     return replace(record, training=Training(part.y_lgs, part.u, part.open_loop_y).copy())
@@ -52,7 +52,8 @@ def training_of(record: Record, modes: Sequence[int] | None = None) -> Training 
     if record.training_record is None:
         return None
     _check_fit(record, record.training_record)
-    return as_training(record.training_record).copy(modes)
+    _check_modes(record.training_record, record)
+    return _bridged(record.training_record).copy(modes)
 
 
 def as_training(record: Record) -> Training:
@@ -61,6 +62,10 @@ def as_training(record: Record) -> Training:
     Raises RecordError where a mode has no measurement.
     """
     _check_modes(record)
+    return _bridged(record)
+
+
+def _bridged(record: Record) -> Training:
     whole = fill_missing(record.without_outliers, Prior())
     return Training(whole.y_lgs, whole.u, whole.open_loop_y).copy()
 
@@ -69,7 +74,7 @@ def training_part(record: Record, train: Record | float, scenario: Scenario) -> 
     """Return the training data of `with_training` as a record. Raises RecordError as that does."""
     other = train if isinstance(train, Record) else _first(record, train)
     _check_fit(record, other)
-    _check_modes(other)
+    _check_modes(other, record)
     if other.y_lgs.shape == record.y_lgs.shape and np.array_equal(other.y_lgs, record.y_lgs, equal_nan=True):
         raise RecordError("the training data is the record itself: training and test must differ; train on the first part of it")
     g = scenario.gpr_offline
@@ -93,9 +98,12 @@ def _check_fit(record: Record, other: Record) -> None:
             raise RecordError(f"the training data has {theirs} {word}, the record {ours}")
 
 
-def _check_modes(other: Record) -> None:
-    """Raise RecordError for training data without a measurement of a mode."""
-    if (is_lost := np.isnan(other.y_lgs).all(axis=0)).any():
+def _check_modes(other: Record, record: Record | None = None) -> None:
+    """Raise RecordError for training data without a measurement of a mode; record : of the modes that it measures alone."""
+    is_lost = np.isnan(other.y_lgs).all(axis=0)
+    if record is not None:
+        is_lost &= ~np.isnan(record.y_lgs).all(axis=0)
+    if is_lost.any():
         raise RecordError(f"the training data holds no measurement of mode {is_lost.argmax()}")
 
 

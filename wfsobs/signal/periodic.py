@@ -53,9 +53,9 @@ class PeriodicFilter:
         v : Array
             Inputs, (n_steps, m).
         x0 : Array, optional
-            Initial state of the cycle, (n,); zero by default.
+            State before the first of these inputs, (n,); zero by default.
         since : int
-            First step of the cycle whose outputs are wanted.
+            First step whose outputs are wanted.
 
         Returns
         -------
@@ -63,8 +63,10 @@ class PeriodicFilter:
             Outputs e, (n_steps - since, p).
         """
         if self.first is not None:
-            _, G, _, J = self.first
-            return np.vstack([J @ v[0], PeriodicFilter(self.steps).run(v[1:], G @ v[0])])
+            F, G, H, J = self.first
+            x, after = np.zeros(F.shape[1]) if x0 is None else x0, G @ v[0]
+            later = PeriodicFilter(self.steps).run(v[1:], F @ x + after, since=max(since - 1, 0))
+            return later if since > 0 else np.vstack([H @ x + J @ v[0], later])
         n_steps, cycle = len(v), len(self.steps)
         length = cycle * max(1, round(BLOCK / cycle))
         F, G, H, J = self.lift(length)
