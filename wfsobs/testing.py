@@ -165,27 +165,27 @@ class Runs(NamedTuple):
             if not np.allclose(got[name][:stop], values[:stop], rtol=0.0, atol=bound, equal_nan=True):
                 raise CheckError(f"{self.name}: {what} ({name})")
 
-    def check_twice(self, given: Sequence[Any], base: Estimates) -> None:
+    def check_twice(self, inputs: Sequence[Any], base: Estimates) -> None:
         """Check that equal arguments give an equal result."""
         what = "run twice on the same measurements it gives two results: it keeps something between runs, or draws random numbers"
-        self.compare(self.run(*given), base, what, exact=True)
+        self.compare(self.run(*inputs), base, what, exact=True)
 
-    def check_causal(self, given: Sequence[Any], base: Estimates, commands_from: int = 1) -> None:
+    def check_causal(self, inputs: Sequence[Any], base: Estimates, commands_from: int = 1) -> None:
         """Check that what is measured after a step, of commands so many steps after it, changes nothing up to the step."""
-        measured, *rest = given
+        measured, *rest = inputs
         for k in steps_to_check(measured.n_steps):
             what = f"looks ahead: measurements after step {k} change what it gives at that step or an earlier one"
             later = changed_after(measured, k, commands_from=commands_from)
             self.compare(self.run(later, *rest), base, what, stop=k + 1)
 
-    def check_alone(self, given: Sequence[Any], base: Estimates) -> None:
+    def check_alone(self, inputs: Sequence[Any], base: Estimates) -> None:
         """Check that the result is the same in a process that is started for it and receives the arguments alone."""
         with (
             report_errors(self.name, self.watch, "cannot run in a fresh process"),
             ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool,
         ):
-            there = pool.submit(self.work, *given).result()
-        self.check(there, given[0], "")
+            there = pool.submit(self.work, *inputs).result()
+        self.check(there, inputs[0], "")
         what = "in a fresh process, with measurements and prior alone, it gives another result: it uses more than it is given"
         self.compare(there, base, what)
 
@@ -316,18 +316,18 @@ def check_observer(observer: Observer, scenario: Scenario | None = None, alone: 
         runs.check_alone(again, base)
 
 
-def _estimate_targets(observer: Observer, *given: Any) -> Estimates:
+def _estimate_targets(observer: Observer, *inputs: Any) -> Estimates:
     """Return what an observer estimates of its targets, without what else it returns."""
-    found = observer.estimate(*given)
+    found = observer.estimate(*inputs)
     return {target: found[target] for target in observer.targets}
 
 
-def _check_estimates(observer: Observer, found: Estimates, measurements: Measurements, _then: str) -> None:
+def _check_estimates(observer: Observer, estimates: Estimates, measurements: Measurements, _then: str) -> None:
     for target in observer.targets:
         if target not in TARGETS:
             raise CheckError(f"{observer.id}: target {target!r} is none of {', '.join(TARGETS)}")
-        check_numbers(observer.id, target, found[target], measurements.y_lgs.shape)
-        if np.isinf(found[target]).any():
+        check_numbers(observer.id, target, estimates[target], measurements.y_lgs.shape)
+        if np.isinf(estimates[target]).any():
             raise CheckError(f"{observer.id}: {target} is infinite; NaN stands for steps without an estimate")
 
 
@@ -338,9 +338,9 @@ def _check_untouched(observer: Observer, measurements: Measurements, fresh: Meas
             raise CheckError(f"{observer.id}: changes its measurements ({name})")
 
 
-def _check_recovery(runs: Runs, measured: Measurements, *others: Any) -> None:
-    for target, values in runs.run(with_gap(measured), *others).items():
-        if np.isnan(values[measured.n_steps // 2 + 1 :]).all():
+def _check_recovery(runs: Runs, measurements: Measurements, *others: Any) -> None:
+    for target, values in runs.run(with_gap(measurements), *others).items():
+        if np.isnan(values[measurements.n_steps // 2 + 1 :]).all():
             raise CheckError(f"{runs.name}: {target} does not recover after missing samples")
 
 
@@ -449,8 +449,8 @@ def _inputs(controller: Controller, record: Record, scenario: Scenario) -> Contr
     return ControllerInputs(measured, prior, plant_of(scenario), settings)
 
 
-def _laws(controller: Controller, measured: Measurements, prior: Prior, plant: Plant, settings: Settings) -> tuple[Law, ...]:
-    return controller.laws(prior, plant, settings, measured.n_modes)
+def _laws(controller: Controller, measurements: Measurements, prior: Prior, plant: Plant, settings: Settings) -> tuple[Law, ...]:
+    return controller.laws(prior, plant, settings, measurements.n_modes)
 
 
 def _stable_laws(controller: Controller, inputs: ControllerInputs, watch: Watch) -> tuple[Law, ...]:
@@ -465,8 +465,8 @@ def _commands(controller: Controller, *inputs: Any) -> Estimates:
     return {"command": controller.commands(_laws(controller, *inputs), *inputs)[0]}
 
 
-def _check_commands(name: str, found: Estimates, measurements: Measurements, then: str) -> None:
-    check_numbers(name, "its command", u := found["command"], measurements.y_lgs.shape)
+def _check_commands(name: str, outputs: Estimates, measurements: Measurements, then: str) -> None:
+    check_numbers(name, "its command", u := outputs["command"], measurements.y_lgs.shape)
     if not np.isfinite(u).all():
         raise CheckError(f"{name}: a command is NaN or infinite{then}")
 

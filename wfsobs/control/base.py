@@ -277,10 +277,10 @@ def _line_width(settings: Settings) -> float:
     return getattr(getattr(settings, "multipeak", None), "line_width", LINE_WIDTH)
 
 
-def _limit_commands(mirror: Mirror, law: Law, asked: Array, z: Array, forward: Array) -> tuple[Array, Array]:
-    """(commands that the mirror takes, commands wanted) of one mode, (n_steps,); asked : those wanted without limits."""
-    if mirror.within(asked):
-        return asked, asked
+def _limit_commands(mirror: Mirror, law: Law, u: Array, z: Array, forward: Array) -> tuple[Array, Array]:
+    """(commands that the mirror takes, commands wanted) of one mode, (n_steps,); u : those wanted without limits."""
+    if mirror.within(u):
+        return u, u
     if law.gain is None:  # it has no feedback of a limit
-        return mirror.follow(asked), asked
+        return mirror.follow(u), u
     return limited_integrator(mirror, law.gain, law.leak, z, forward)

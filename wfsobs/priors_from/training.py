@@ -53,7 +53,7 @@ def training_of(record: Record, modes: Sequence[int] | None = None) -> Training 
         return None
     _check_fit(record, record.training_record)
     _check_modes(record.training_record, record)
-    return _bridged(record.training_record).copy(modes)
+    return _bridge_gaps(record.training_record).copy(modes)
 
 
 def as_training(record: Record) -> Training:
@@ -62,10 +62,10 @@ def as_training(record: Record) -> Training:
     Raises RecordError where a mode has no measurement.
     """
     _check_modes(record)
-    return _bridged(record)
+    return _bridge_gaps(record)
 
 
-def _bridged(record: Record) -> Training:
+def _bridge_gaps(record: Record) -> Training:
     whole = fill_missing(record.without_outliers, Prior())
     return Training(whole.y_lgs, whole.u, whole.open_loop_y).copy()
 

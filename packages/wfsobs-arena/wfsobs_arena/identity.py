@@ -40,12 +40,13 @@ def code_version(algorithm: Any) -> str:
 
 
 def _functions(algorithm: Any) -> Iterator[Callable[..., Any]]:
-    """Yield the functions of an observer or a controller."""
-    for field in fields(algorithm):
-        value = getattr(algorithm, field.name)
-        while isinstance(value, partial):
-            value = value.func
-        if inspect.isroutine(value):
+    """Yield the functions of an observer or a controller, and those that they are told."""
+    waiting = [getattr(algorithm, field.name) for field in fields(algorithm)]
+    while waiting:
+        value = waiting.pop()
+        if isinstance(value, partial):
+            waiting += [value.func, *value.args, *value.keywords.values()]
+        elif inspect.isroutine(value):
             yield value
     yield type(algorithm)
 
