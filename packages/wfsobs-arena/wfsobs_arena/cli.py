@@ -69,8 +69,8 @@ def run(
     found = _select_tracks(add_records(whole, [Path(file) for file in files]), tracks)
     idle = [entry.id for entry in entrants if not cases_of(found, entry)]
     if idle and (entries or len(idle) == len(entrants)):
-        who = ", ".join(idle) if entries else "every entry"
-        raise SettingError(f"arena run: in no track that is chosen: {who}; next takes records by --record")
+        names = ", ".join(idle) if entries else "every entry"
+        raise SettingError(f"arena run: in no track that is chosen: {names}; next takes records by --record")
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     outcomes = run_arena(found, entrants, folder, tell=lambda line: click.echo(f"wfsobs: {line}", err=True))

@@ -40,7 +40,7 @@ def code_version(algorithm: Any) -> str:
 
 
 def _functions(algorithm: Any) -> Iterator[Callable[..., Any]]:
-    """Yield the functions of an observer or a controller, and those that they are told."""
+    """Yield the functions of an observer or a controller, and those among the arguments of a partial."""
     waiting = [getattr(algorithm, field.name) for field in fields(algorithm)]
     while waiting:
         value = waiting.pop()
