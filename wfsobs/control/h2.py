@@ -38,7 +38,7 @@ ROBUST = 0.8
 DELAY, GAIN, ROTATION = 0.5, 0.2, 10.0
 """Errors of the plant that are borne, either way: delay [frames], gain, rotation [deg]."""
 
-GRID = np.unique(np.concatenate([np.geomspace(1e-3, pi, 60), np.linspace(0.02, pi, 140)]))
+FREQUENCIES = np.unique(np.concatenate([np.geomspace(1e-3, pi, 60), np.linspace(0.02, pi, 140)]))
 """Frequencies of the limits [rad per step]."""
 
 ROUNDS = 300
@@ -58,13 +58,13 @@ def taps_of(spectra: Spectra, mirror: Mirror, caution: float) -> Array:
     P = mirror.response(pi * np.arange(n) / (n - 1))
     power = np.fft.irfft(np.abs(P) ** 2 * spectra.measurement)[:TAPS]
     target = np.fft.irfft(spectra.cross * np.conj(P))[:TAPS]
-    response, lags = mirror.response(GRID), np.arange(TAPS)
-    E = response[:, None] * np.exp(-1j * GRID[:, None] * lags)
-    of_limits = np.abs(response) ** 2 * np.cos(lags[:, None] * GRID)  # E* w E is Toeplitz, its first column of_limits w
-    most = ROBUST / caution / uncertainty(mirror, GRID)
+    response, lags = mirror.response(FREQUENCIES), np.arange(TAPS)
+    E = response[:, None] * np.exp(-1j * FREQUENCIES[:, None] * lags)
+    of_limits = np.abs(response) ** 2 * np.cos(lags[:, None] * FREQUENCIES)  # E* w E is Toeplitz, its first column of_limits w
+    most = ROBUST / caution / uncertainty(mirror, FREQUENCIES)
     scale = power[0]
     power[0] += 1e-12 * scale
-    peak, roll_off = np.full((2, GRID.size), 1e-9 * scale)
+    peak, roll_off = np.full((2, FREQUENCIES.size), 1e-9 * scale)
     q = np.zeros(TAPS)
     for _ in range(ROUNDS):
         q = np.linalg.solve(toeplitz(power + of_limits @ (peak + roll_off)), target + E.real.T @ peak)

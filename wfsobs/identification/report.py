@@ -10,7 +10,7 @@ import numpy as np
 
 from wfsobs.identification.process import IdentifiedProcess, Number
 from wfsobs.identification.process import format_number as format_number
-from wfsobs.identification.result import LEVEL, Identification, IdentifiedMode
+from wfsobs.identification.result import WHITE_LEVEL, Identification, IdentifiedMode
 from wfsobs.identification.result import mode_rows as mode_rows
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
@@ -71,7 +71,7 @@ def whiteness_lines(result: Identification) -> list[str]:
         outlying = {"samples": m.outlying, "NGS frames": m.difference.outlying if m.difference else 0}
         rest += "".join(f"; outlying {what} taken for missing: {count}" for what, count in outlying.items() if count)
         why = "".join(f"; {remark}" for remark in w.remarks)
-        out.append(f"{m.name}: residual is {'white' if w.white else 'NOT white'} at {LEVEL:.0%} ({tests}{rest}){why}")
+        out.append(f"{m.name}: residual is {'white' if w.white else 'NOT white'} at {WHITE_LEVEL:.0%} ({tests}{rest}){why}")
     return out
 
 

@@ -4,7 +4,7 @@ Two sensors differ by the noise of the NGS, and by what the LGS alone see. With 
 + v, and the mean of z over the same steps x + e + w / sqrt(n). Their difference holds the slow error e of the LGS and both
 noises, but no vibration. Its spectrum is fitted as that of a mode without peaks. e is taken for independent of phi.
 
-The residual of each mode is tested for whiteness twice, each test of level LEVEL.
+The residual of each mode is tested for whiteness twice, each test of level WHITE_LEVEL.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def _alone(rms: float, mode: int, modes: int) -> list[float]:
     return [min(rms, LARGEST_RMS) if i == mode else 0.0 for i in range(modes)]
 
 
-LEVEL = 0.01
+WHITE_LEVEL = 0.01
 LAGS = 100
 """Lags of the autocorrelation, beside one for every parameter of the model."""
 MIN_NOISE = 1e-6
@@ -170,8 +170,8 @@ class Whiteness:
 
     @property
     def white(self) -> bool:
-        """Whether both tests pass at LEVEL and no candidate is left."""
-        return min(self.periodogram, self.innovations) >= LEVEL and not self.left
+        """Whether both tests pass at WHITE_LEVEL and no candidate is left."""
+        return min(self.periodogram, self.innovations) >= WHITE_LEVEL and not self.left
 
 
 def cumulated_test(ratio: Array, n: int) -> float:

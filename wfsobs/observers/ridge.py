@@ -20,7 +20,8 @@ from wfsobs.observers.gpr.inputs import Windows, scales_of, training_signals, tu
 from wfsobs.observers.gpr.kernels import sliding_products, square_from_band
 from wfsobs.observers.gpr.offline import OFFLINE, OfflineGpr, training_targets
 from wfsobs.observers.step import HeldEstimate, whole_frames
-from wfsobs.prior import OfflineBands, Prior, Training
+from wfsobs.prior import OfflineBands, Prior
+from wfsobs.record import Training
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, Sampling, pseudo_open_loop
 from wfsobs.signal.linalg import eliminate, solve_rows

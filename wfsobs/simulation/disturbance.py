@@ -19,7 +19,6 @@ from wfsobs.scenario.groups.events import PEAK, phase_turns, strength
 from wfsobs.scenario.measured_spectra import measured_spectrum
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.spectrum import bin_edges, bin_frequencies, gaussian_signal, random_phase_signal, resonance_power, table_power
-from wfsobs.simulation import events
 from wfsobs.simulation.synthesis import damping_for_width, line_width, period_steps, widen_lines
 from wfsobs.simulation.turbulence import SOURCES, ModeSource, columns, mode_power
 from wfsobs.typing import Array
@@ -80,14 +79,14 @@ def make_disturbance(scenario: Scenario, n_steps: int, rng: np.random.Generator,
         `watch` asks to stop.
     """
     turbulence_rng, vibration_rng = rng.spawn(2)
-    at = events.turbulence_clock(scenario, n_steps)
-    air = SOURCES[scenario.turbulence.source](scenario, events.turbulence_steps(at, n_steps), turbulence_rng, watch)
+    at = turbulence_clock(scenario, n_steps)
+    air = SOURCES[scenario.turbulence.source](scenario, turbulence_steps(at, n_steps), turbulence_rng, watch)
     vibration = columns(VIBRATION[scenario.vibration.source], scenario, n_steps, vibration_rng, watch)
     return Disturbance(
-        events.interpolate_steps(air.on_axis, at),
+        interpolate_steps(air.on_axis, at),
         vibration,
-        None if air.ngs is None else events.interpolate_steps(air.ngs, at),
-        None if air.lgs is None else tuple(events.interpolate_steps(x, at) for x in air.lgs),
+        None if air.ngs is None else interpolate_steps(air.ngs, at),
+        None if air.lgs is None else tuple(interpolate_steps(x, at) for x in air.lgs),
     )
 
 
@@ -140,8 +139,8 @@ def _ar2_vibration(scenario: Scenario, mode: int, n: int, rng: np.random.Generat
     for i, (peak, stream) in enumerate(zip(scenario.vibration.peaks, rng.spawn(len(scenario.vibration.peaks)), strict=True)):
         damping = damping_for_width(line_width(scenario), peak.frequency, peak.damping)
         process = Ar2(2.0 * np.pi * peak.frequency, damping, peak_rms(peak.rms, mode), scenario.dt)
-        x, changes = process.sample(n, stream), events.peak_events(scenario, i)
-        out += events.shift_process(process, x, changes) if changes else x
+        x, changes = process.sample(n, stream), peak_events(scenario, i)
+        out += shift_process(process, x, changes) if changes else x
     return out
 
 
@@ -163,13 +162,13 @@ def _dft_vibration(scenario: Scenario, mode: int, n: int, rng: np.random.Generat
     out = signal(_bin_power(scenario, mode, period, width, without=moving), period, bins)[:n]
     t = np.arange(n) * scenario.dt
     for i, (peak, stream) in enumerate(zip(scenario.vibration.peaks, peak_streams, strict=True)):
-        changes = events.peak_events(scenario, i)
+        changes = peak_events(scenario, i)
         if _is_pure_line(scenario, peak):
             amplitude = np.sqrt(2.0) * peak_rms(peak.rms, mode) * strength(changes, t)
             out += amplitude * np.cos(2.0 * np.pi * (peak.frequency * t + phase_turns(changes, t) + stream.random()))
         elif i in moving:
             power = _below_cutoff(scenario.vibration.cutoff, _resonance(scenario, peak, mode, period, width), period, scenario.dt)
-            out += events.shift_peak(signal(power, period, stream), changes, scenario.dt)[:n]
+            out += shift_peak(signal(power, period, stream), changes, scenario.dt)[:n]
     return out
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import delay_signal, frame_mean
 from wfsobs.scenario import Scenario
-from wfsobs.simulation import events
+from wfsobs.simulation.events import interpolate_steps, laser_count, missing_frames, turbulence_clock, turbulence_steps
 from wfsobs.simulation.disturbance import Disturbance
 from wfsobs.simulation.guide_stars import MEAN, lgs_weights, low_frequency_process
 from wfsobs.simulation.sensor_noise import white_noise
@@ -74,7 +74,7 @@ def measure_open_loop(scenario: Scenario, disturbance: Disturbance, rng: np.rand
     n_steps, n_modes = disturbance.total.shape
     errors = _lgs_errors(scenario, n_steps, n_modes, lgs_rng, watch)
     seen = [_without_tip_tilt(scenario, x) for x in disturbance.lgs_turbulence or [disturbance.turbulence]]
-    lgs, working = np.full((n_steps, n_modes), np.nan), events.laser_count(scenario, n_steps)
+    lgs, working = np.full((n_steps, n_modes), np.nan), laser_count(scenario, n_steps)
     for stars in np.unique(working[working > 0]):
         lgs[working == stars] = _combine(scenario, seen, disturbance.vibration, errors[:stars])[working == stars]
 
@@ -85,7 +85,7 @@ def measure_open_loop(scenario: Scenario, disturbance: Disturbance, rng: np.rand
     ngs_turbulence = disturbance.turbulence if disturbance.ngs_turbulence is None else disturbance.ngs_turbulence
     total = ngs_turbulence + disturbance.vibration
     ngs = np.where(is_frame[:, None], frame_mean(total, n) + noise, np.nan)
-    lost = events.missing_frames(scenario, n_steps, lost_rng)
+    lost = missing_frames(scenario, n_steps, lost_rng)
     lgs[lost["lgs"]], ngs[lost["ngs"]] = np.nan, np.nan
     is_whole = (working == scenario.sensors.lgs_count).all()
     each = _apart(seen, disturbance.vibration, errors, working) if len(seen) > 1 and scenario.sensors.lgs_radius > 0 else None
@@ -122,7 +122,7 @@ def measure_noise(scenario: Scenario, n_steps: int, rng: np.random.Generator) ->
     """
     lgs_rng, ngs_rng, _ = rng.spawn(3)
     stars = [white_noise(scenario, "lgs", n_steps, star.spawn(2)[0]) for star in lgs_rng.spawn(scenario.sensors.lgs_count)]
-    nothing, working = np.zeros_like(stars[0]), events.laser_count(scenario, n_steps)
+    nothing, working = np.zeros_like(stars[0]), laser_count(scenario, n_steps)
     lgs = nothing.copy()
     for count in np.unique(working[working > 0]):
         lgs[working == count] = _combine(scenario, [nothing], nothing, stars[:count])[working == count]
@@ -153,7 +153,7 @@ def _lgs_errors(scenario: Scenario, n_steps: int, n_modes: int, rng: np.random.G
 
     White noise, plus the slow LGS error where turbulence has no layers; the wind carries it along with the turbulence.
     """
-    out, at = [], events.turbulence_clock(scenario, n_steps)
+    out, at = [], turbulence_clock(scenario, n_steps)
     for star in rng.spawn(scenario.sensors.lgs_count):
         noise_rng, slow_rng = star.spawn(2)
         error = white_noise(scenario, "lgs", n_steps, noise_rng)
@@ -161,6 +161,6 @@ def _lgs_errors(scenario: Scenario, n_steps: int, n_modes: int, rng: np.random.G
             watch.check()
             process = low_frequency_process(scenario, mode)
             if process.rms > 0:
-                error[:, mode] += events.interpolate_steps(process.sample(events.turbulence_steps(at, n_steps), stream), at)
+                error[:, mode] += interpolate_steps(process.sample(turbulence_steps(at, n_steps), stream), at)
         out.append(error)
     return out
