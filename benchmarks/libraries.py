@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from wfsobs.bench.tasks import KalmanProblem, Library, MultirateProblem, OnlineProblem
-from wfsobs.observers.gpr.kernels import SquaredExponential
+from wfsobs.observers.gpr.windows import SquaredExponential
 from wfsobs.typing import Array
 
 NAMES = {"scikit-learn": "sklearn", "filterpy": "filterpy", "statsmodels": "statsmodels"}

@@ -17,7 +17,7 @@ import numpy as np
 
 from wfsobs.app.work import one_blas_thread
 from wfsobs.evaluation.bound import INFORMATION, bound, joint_observers, record_bounds
-from wfsobs.evaluation.rows import JOINT_BOUNDS
+from wfsobs.evaluation.result import JOINT_BOUNDS
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS

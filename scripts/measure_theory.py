@@ -20,7 +20,7 @@ import numpy as np
 
 from wfsobs.app.views.spectrum_editor import DRAGGED, FRAME, LOOSE
 from wfsobs.app.work import one_blas_thread
-from wfsobs.evaluation.error_spectra import Theory, is_predicted
+from wfsobs.evaluation.exact_errors import Theory, is_predicted
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario

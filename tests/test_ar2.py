@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_lyapunov
 
-from wfsobs.signal.ar2 import Ar2, turbulence_corner
+from wfsobs.signal.autoregressive import Ar2, turbulence_corner
 
 EXAMPLES = settings(max_examples=60, deadline=None, derandomize=True)
 EPS = np.finfo(float).eps

@@ -9,13 +9,12 @@ import pytest
 from scipy.special import jv
 
 from tests.noll import noll_covariance
-from wfsobs.atmosphere.von_karman import von_karman_density
+from wfsobs.atmosphere import von_karman_density
 from wfsobs.priors_from.scenario import modelled_processes
 from wfsobs.scenario import Scenario
 from wfsobs.simulation import layers as atmosphere
 from wfsobs.simulation.disturbance import make_disturbance
-from wfsobs.simulation.guide_stars import lgs_error_process, lgs_error_variance, low_frequency_process
-from wfsobs.simulation.sensing import measure_open_loop
+from wfsobs.simulation.sensing import lgs_error_process, lgs_error_variance, low_frequency_process, measure_open_loop
 from wfsobs.simulation.turbulence import turbulence_process, turbulence_rms
 
 FLOW: dict[str, Any] = {"turbulence.source": "frozen-flow", "sensors.kind": "zernike"}

@@ -12,15 +12,15 @@ from scipy.linalg import cholesky, solve_triangular, toeplitz
 
 from tests.records import kalman_model
 from wfsobs.evaluation.bound import bound_rms, least_errors_of_both, record_bounds
-from wfsobs.evaluation.rows import can_be_best
+from wfsobs.evaluation.result import can_be_best
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, COMMON_BOUNDS, SCORED
 from wfsobs.observers.kalman.multirate import optimal_cycle
 from wfsobs.priors_from.scenario import measurement_noise
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.signal.riccati import periodic_steady_state
-from wfsobs.simulation.guide_stars import lgs_error_process
+from wfsobs.signal.gains import periodic_steady_state
 from wfsobs.simulation.loop import simulate
+from wfsobs.simulation.sensing import lgs_error_process
 from wfsobs.simulation.true_spectra import TrueSpectra, true_spectra
 from wfsobs.typing import Array
 

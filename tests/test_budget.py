@@ -22,7 +22,7 @@ from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.pipeline import run
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.autoregressive import Ar2
 from wfsobs.simulation.loop import simulate, simulate_noise
 
 LINEAR = ("kf-lgs", "kf-ngs", "multirate", "multirate-optimal", "ridge", "ridge-30", "butterworth-cl", "persistence")

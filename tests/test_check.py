@@ -22,7 +22,7 @@ from wfsobs.identification.plant import GroupPlant, PlantNumber, identify_plant
 from wfsobs.identification.result import Identification
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError
-from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.autoregressive import Ar2
 from wfsobs.telemetry import check
 from wfsobs.telemetry.check import LEVEL, find_changes
 from wfsobs.telemetry.records import save_record

@@ -5,10 +5,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs.scenario import Scenario, configfile
-from wfsobs.scenario.grid import parse_variation
+from wfsobs.scenario.configfile import parse_variation
 from wfsobs.scenario.groups.atmosphere import Peak
 from wfsobs.scenario.presets import PRESETS, paper
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -19,14 +19,12 @@ from wfsobs.evaluation.bound import record_bounds
 from wfsobs.evaluation.result import Failure
 from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.estimates import Estimate
 from wfsobs.priors_from.scenario import prior_and_settings, usual_observers
-from wfsobs.record import Record
+from wfsobs.record import Estimate, Record
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.idle import idle_settings, used_settings, why_idle_at
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.errors import SettingError
-from wfsobs.settings.parameters import Reals
+from wfsobs.scenario.scenario import idle_settings, used_settings, why_idle_at
+from wfsobs.settings.values import Reals, SettingError
 from wfsobs.simulation.loop import record_settings, simulate, training_settings
 from wfsobs.testing import QUICK
 
@@ -135,7 +133,7 @@ class TestSettingsWithoutEffect:
         idle = idle_settings(scenario)
         assert "gpr_online.highpass" not in idle and "gpr_offline.highpass" in idle
         assert "sensors.spots" not in idle and "sensors.lgs_noise" in idle
-        manual = {"kalman.process_noise": "manual", "control.integrator": "manual", "kalman.peak": "matched"}
+        manual = {"kalman.process_noise": "manual", "control.laws": "manual", "kalman.peak": "matched"}
         assert {"kalman.vibration_rms", "control.gain"} <= set(idle)
         idle = idle_settings(scenario.replace(manual))
         assert not {"kalman.vibration_rms", "control.gain"} & set(idle) and "kalman.frequency" in idle

@@ -20,12 +20,11 @@ from wfsobs.identification import identify
 from wfsobs.observers import OBSERVERS
 from wfsobs.record import Record
 from wfsobs.scenario.groups.events import Event, phase_turns, shift, strength, turbulence_time
-from wfsobs.signal.ar2 import Ar2, turbulence_corner
+from wfsobs.signal.autoregressive import Ar2, turbulence_corner
 from wfsobs.signal.spectrum import bin_frequencies, random_phase_signal
-from wfsobs.simulation.disturbance import make_disturbance
-from wfsobs.simulation.events import interpolate_steps, shift_peak, shift_process
-from wfsobs.simulation.guide_stars import lgs_weights
+from wfsobs.simulation.disturbance import interpolate_steps, make_disturbance, shift_peak, shift_process
 from wfsobs.simulation.loop import integrate_commands
+from wfsobs.simulation.sensing import lgs_weights
 from wfsobs.telemetry.records import load_record, save_record
 
 pytestmark = pytest.mark.slow

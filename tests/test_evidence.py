@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from scipy.stats import binom, ttest_1samp, ttest_rel
 
 from wfsobs.evaluation.evidence import Evidence, columns_differ, gather_evidence, holm, marks_of, means_differ
-from wfsobs.evaluation.rows import can_be_best
+from wfsobs.evaluation.result import can_be_best
 from wfsobs.evaluation.scores import Score, batch_means
 from wfsobs.evaluation.verdict import verdict
 from wfsobs.observers import OBSERVERS

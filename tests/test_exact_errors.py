@@ -16,7 +16,7 @@ from wfsobs.observers.kalman.multirate import optimal_model
 from wfsobs.prior import LgsError, Model
 from wfsobs.priors_from.scenario import lgs_error_of, model_of, prior_of
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.signal.riccati import periodic_steady_state
+from wfsobs.signal.gains import periodic_steady_state
 from wfsobs.simulation.loop import simulate
 
 

@@ -11,8 +11,8 @@ from wfsobs.execution import run_observer
 from wfsobs.scenario import Scenario
 from wfsobs.signal.wiener import circle_mean
 from wfsobs.simulation.flow_spectra import flow_spectra
-from wfsobs.simulation.guide_stars import lgs_error_variance
 from wfsobs.simulation.loop import simulate
+from wfsobs.simulation.sensing import lgs_error_variance
 from wfsobs.simulation.true_spectra import has_known_spectra, n_frequencies, true_spectra
 from wfsobs.simulation.turbulence import turbulence_rms
 

@@ -10,9 +10,7 @@ from scipy.signal import welch
 from scipy.special import j0, jv
 
 from tests.noll import noll_covariance
-from wfsobs.atmosphere.frozen_flow import FrequencyGrid, View, fft_length, frozen_flow, waves
-from wfsobs.atmosphere.plane_waves import Footprint
-from wfsobs.atmosphere.von_karman import TurbulenceLayer, von_karman_density
+from wfsobs.atmosphere import Footprint, FrequencyGrid, TurbulenceLayer, View, fft_length, frozen_flow, von_karman_density, waves
 from wfsobs.sensors.zernike import ZernikeProjection, bessel_ratio, noll
 
 D, R0, L0 = 8.0, 0.157, 25.0

@@ -18,7 +18,7 @@ from wfsobs.prior import Lines, Model, Prior
 from wfsobs.priors_from.scenario import measurement_noise, prior_of
 from wfsobs.record import Record, hold_last, pseudo_open_loop
 from wfsobs.scenario import Scenario
-from wfsobs.signal.riccati import steady_state
+from wfsobs.signal.gains import steady_state
 from wfsobs.signal.spectrum import rms
 
 

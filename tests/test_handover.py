@@ -17,9 +17,9 @@ from astropy.io import fits
 from click.testing import CliRunner
 from scipy.io import loadmat
 
+from wfsobs import handover
 from wfsobs.cli import main
 from wfsobs.files import write_whole
-from wfsobs.handover import c99
 from wfsobs.signal.gate import GateSettings, OutlierGate
 
 ROUNDING = 1e-12
@@ -113,7 +113,7 @@ def run(arrays: dict[str, np.ndarray], given: np.ndarray) -> np.ndarray:
 def _whole() -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Measurements without gaps, and the commands for them by controller, from the run over a record."""
     from wfsobs.control.controllers import CONTROLLERS
-    from wfsobs.priors_from.controllers import own_settings, plant_of, prior_for
+    from wfsobs.priors_from.scenario import own_settings, plant_of, prior_for
     from wfsobs.record import Measurements
     from wfsobs.scenario.presets import paper
 
@@ -246,7 +246,7 @@ def test_c99_leaves_nothing_half_written(tmp_path: Path, monkeypatch: pytest.Mon
     if is_there:
         (tmp_path / "out").mkdir()
     with monkeypatch.context() as patched:
-        patched.setattr(c99, "write_whole", write_some)
+        patched.setattr(handover, "write_whole", write_some)
         done = CliRunner().invoke(main, ["design", "--controller", "integrator", "--to", "c99", "--out", str(tmp_path / "out")])
     assert done.exit_code == 2 and "No space left" in done.output
     assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")] == ["out"] * is_there

@@ -14,10 +14,7 @@ from scipy.stats import binom, gamma, kstest
 
 from wfsobs.cli import main
 from wfsobs.identification import Identification, identify
-from wfsobs.identification.one_mode import MEAN, VARIANCE, WIDTH, OneMode, is_continuum, margin
-from wfsobs.identification.process import IdentifiedProcess, Number, mean, merge_peaks
-from wfsobs.identification.process import with_reliable_std as known_number
-from wfsobs.identification.report import (
+from wfsobs.identification.identification import (
     add_comments,
     format_number,
     identification_dict,
@@ -25,20 +22,30 @@ from wfsobs.identification.report import (
     mode_rows,
     whiteness_lines,
 )
+from wfsobs.identification.one_mode import MEAN, VARIANCE, WIDTH, OneMode, is_continuum, margin
+from wfsobs.identification.process import IdentifiedProcess, Number, mean, merge_peaks
+from wfsobs.identification.process import with_reliable_std as known_number
 from wfsobs.identification.result import autocorrelation_test, cumulated_test, innovations
 from wfsobs.pipeline import observe
 from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.autoregressive import Ar2
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import true_spectra
-from wfsobs.spectral.lines import Sinusoid, line_in_record, nearest_line
 from wfsobs.spectral.model import Spectrum
-from wfsobs.spectral.periodogram import Cells, fast_length, inflation, periodogram, periodogram_frequencies
-from wfsobs.spectral.search import PAD, search_peaks
-from wfsobs.spectral.whittle import fit_spectrum, spectrum_information, spectrum_negative_log_likelihood
+from wfsobs.spectral.search import PAD, Sinusoid, line_in_record, nearest_line, search_peaks
+from wfsobs.spectral.whittle import (
+    Cells,
+    fast_length,
+    fit_spectrum,
+    inflation,
+    periodogram,
+    periodogram_frequencies,
+    spectrum_information,
+    spectrum_negative_log_likelihood,
+)
 from wfsobs.telemetry.records import save_record
 
 pytestmark = pytest.mark.slow

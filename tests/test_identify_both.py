@@ -14,7 +14,7 @@ from wfsobs.identification.process import Number
 from wfsobs.identification.result import FEWEST, read_difference, sensor_differences, without_error
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.autoregressive import Ar2
 
 SCENARIO = PRESETS["paper"]().replace({"run.duration": 20.0})
 NOISE, ERROR = 0.010, 0.049 / np.sqrt(2.0)

@@ -10,13 +10,12 @@ from scipy.linalg import circulant
 from scipy.stats import binom, norm
 
 from wfsobs.identification import identify
-from wfsobs.identification.report import whiteness_lines
+from wfsobs.identification.identification import whiteness_lines
 from wfsobs.record import Record, RecordError
-from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.autoregressive import Ar2
 from wfsobs.spectral.missing import FAR, MOST_OUTLYING, MissingSamples, find_outlying
 from wfsobs.spectral.model import Spectrum
-from wfsobs.spectral.periodogram import Cells, periodogram_frequencies
-from wfsobs.spectral.whittle import spectrum_information
+from wfsobs.spectral.whittle import Cells, periodogram_frequencies, spectrum_information
 from wfsobs.typing import Array
 
 pytestmark = pytest.mark.slow

@@ -15,8 +15,8 @@ from wfsobs.cli import main
 from wfsobs.closed_loop.design import design
 from wfsobs.evaluation.bound import bound_rms
 from wfsobs.identification import Identification, identify
+from wfsobs.identification.identification import identification_toml
 from wfsobs.identification.process import IdentifiedProcess, Number, merge_peaks
-from wfsobs.identification.report import identification_toml
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.pipeline import observe, run
@@ -25,8 +25,7 @@ from wfsobs.priors_from.scenario import lines_of, modelled_peak, observer_settin
 from wfsobs.record import Record, Sampling
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.ar3 import Ar3
+from wfsobs.signal.autoregressive import Ar2, Ar3
 from wfsobs.signal.statespace import sample_ar3
 from wfsobs.simulation.turbulence import turbulence_rms
 from wfsobs.telemetry.records import save_record

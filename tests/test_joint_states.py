@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.autoregressive import Ar2
 from wfsobs.signal.joint_states import LeastVariance, StateFilter, frame_shares, shared_covariance
 from wfsobs.signal.statespace import disturbance_model
 

@@ -10,8 +10,8 @@ from wfsobs.scenario import Scenario
 from wfsobs.sensors.shack_hartmann import Aliasing
 from wfsobs.simulation import layers as atmosphere
 from wfsobs.simulation.flow_spectra import TurbulenceSpectra, flow_spectra
-from wfsobs.simulation.lenslet_spectra import lenslet_flow_spectra, true_lenslet_spectra
 from wfsobs.simulation.loop import simulate
+from wfsobs.simulation.mode_spectra import lenslet_flow_spectra, true_lenslet_spectra
 from wfsobs.simulation.sensor_noise import shack_hartmann
 from wfsobs.typing import Array
 

@@ -12,15 +12,15 @@ from wfsobs.priors_from.scenario import measurement_noise
 from wfsobs.record import delay_signal
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.disturbance import make_disturbance, vibration_variance
-from wfsobs.simulation.guide_stars import (
+from wfsobs.simulation.loop import simulate
+from wfsobs.simulation.sensing import (
     lgs_error_process,
     lgs_error_variance,
     lgs_noise_rms,
     lgs_turbulence_covariance,
     lgs_weights,
+    measure_open_loop,
 )
-from wfsobs.simulation.loop import simulate
-from wfsobs.simulation.sensing import measure_open_loop
 
 BEST: dict[str, Any] = {"sensors.lgs_combination": "minimum-variance"}
 FLOW: dict[str, Any] = {"turbulence.source": "frozen-flow", "sensors.kind": "zernike"}

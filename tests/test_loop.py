@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from wfsobs.record import Record, RecordError, pseudo_open_loop
 from wfsobs.scenario import Scenario
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 from wfsobs.simulation.loop import TRAINING_MARGIN, integrate_commands, simulate
 
 NOISELESS = {"sensors.lgs_noise": 0.0, "sensors.ngs_noise": 0.0, "sensors.lgs_low_frequency_rms": 0.0}

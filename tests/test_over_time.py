@@ -12,12 +12,11 @@ from tests.records import ON_PAPER
 from wfsobs import PRESETS, SettingError
 from wfsobs.cli import main
 from wfsobs.cli.show import OverTime
-from wfsobs.evaluation.recovery import PooledRms, recovery, running_rms, trailing_rms
+from wfsobs.evaluation.scores import PooledRms, recovery, running_rms, trailing_rms
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import VIBRATION
-from wfsobs.observers.estimates import Estimate
 from wfsobs.pipeline import run
-from wfsobs.record import Record
+from wfsobs.record import Estimate, Record
 
 pytestmark = pytest.mark.slow
 

@@ -18,9 +18,9 @@ from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, BOUNDS, COMMON_BOUNDS, L
 from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, Observer
-from wfsobs.observers.estimates import Estimate, Estimates
 from wfsobs.pipeline import as_stated
 from wfsobs.progress import Cancelled, Watch
+from wfsobs.record import Estimate, Estimates
 from wfsobs.signal.spectrum import rms
 
 

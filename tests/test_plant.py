@@ -16,10 +16,9 @@ from wfsobs import PRESETS, simulate
 from wfsobs.cli import main
 from wfsobs.control.true_plant import ActingPlant, TruePlant
 from wfsobs.identification.plant import GroupPlant, PlantNumber, identify_plant, plant_lines
-from wfsobs.identification.plant_likelihood import few_lags, second_order
-from wfsobs.identification.probe import design_probe
+from wfsobs.identification.plant_likelihood import design_probe, few_lags, second_order
 from wfsobs.record import Record, RecordError
-from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.autoregressive import Ar2
 from wfsobs.signal.wiener import circle_mean
 from wfsobs.simulation.true_spectra import true_spectra
 from wfsobs.telemetry.records import save_record

@@ -10,9 +10,9 @@ from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.exact_errors import exact_errors
 from wfsobs.observers import OBSERVERS
 from wfsobs.priors_from.scenario import continuum_power, lines_of
-from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.autoregressive import Ar2
 from wfsobs.simulation.disturbance import vibration_power
-from wfsobs.spectral.rational import fit_processes
+from wfsobs.spectral.model import fit_processes
 
 DT, N = 1e-3, 2**16
 F = np.fft.rfftfreq(N, DT)

@@ -9,8 +9,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 
-from wfsobs.signal.ar2 import Ar2, turbulence_corner
-from wfsobs.signal.riccati import RiccatiError, SteadyState, periodic_steady_state, steady_state
+from wfsobs.signal.autoregressive import Ar2, turbulence_corner
+from wfsobs.signal.gains import RiccatiError, SteadyState, periodic_steady_state, steady_state
 from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
 
 EPS = np.finfo(float).eps

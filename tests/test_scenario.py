@@ -13,8 +13,8 @@ import pytest
 
 from wfsobs import PRESETS
 from wfsobs.scenario import Scenario
-from wfsobs.settings.errors import SettingError
 from wfsobs.settings.priors import PAPER_PEAK_HZ
+from wfsobs.settings.values import SettingError
 from wfsobs.simulation.disturbance import vibration_variance
 
 TABLE = {"frequency": [1.0, 2.0, 3.0], "tip": [1.0, 1.0, 1.0], "tilt": [1.0, 1.0, 1.0]}

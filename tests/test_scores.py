@@ -7,11 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wfsobs.evaluation.error_spectra import cumulative_rms, scored_samples
+from wfsobs.evaluation.exact_errors import cumulative_rms, scored_samples
 from wfsobs.evaluation.scores import lag, score, supervised_scores, unsupervised_scores
-from wfsobs.observers.estimates import TOTAL, Estimate
-from wfsobs.record import Record
-from wfsobs.signal.ar2 import Ar2
+from wfsobs.record import TOTAL, Estimate, Record
+from wfsobs.signal.autoregressive import Ar2
 from wfsobs.signal.spectrum import psd, rms
 
 NAMES = ["tip", "tilt"]

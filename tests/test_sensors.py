@@ -11,7 +11,7 @@ from wfsobs.progress import QUIET
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.sensors.zernike import ZernikeProjection
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 from wfsobs.simulation.sensor_noise import aliasing_rms, noise_covariance, noise_rms, sensor, shack_hartmann
 from wfsobs.simulation.turbulence import SOURCES
 

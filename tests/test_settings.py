@@ -16,9 +16,8 @@ from hypothesis import strategies as st
 
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.atmosphere import Peak
-from wfsobs.settings.errors import SettingError
 from wfsobs.settings.group import Group
-from wfsobs.settings.parameters import Reals, allowed_values, unit_of
+from wfsobs.settings.values import Reals, SettingError, allowed_values, unit_of
 
 EXAMPLES = settings(max_examples=30, deadline=None, derandomize=True)
 HUGE = 10**400

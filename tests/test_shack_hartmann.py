@@ -11,9 +11,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import j1, jv
 
-from wfsobs.atmosphere.frozen_flow import FrequencyGrid, View, frozen_flow, waves
-from wfsobs.atmosphere.plane_waves import Footprint, Wave
-from wfsobs.atmosphere.von_karman import TurbulenceLayer, von_karman_density
+from wfsobs.atmosphere import Footprint, FrequencyGrid, TurbulenceLayer, View, Wave, frozen_flow, von_karman_density, waves
 from wfsobs.sensors import zernike
 from wfsobs.sensors.lenslets import Lenslets, interaction, polynomials, reconstructor
 from wfsobs.sensors.shack_hartmann import ARCSEC, Aliasing, ShackHartmann, SpotModel, TrigonometricSum, lagrange_weights

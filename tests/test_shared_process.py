@@ -9,7 +9,7 @@ from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.exact_errors import exact_errors
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.signal.ar3 import Ar3, fit_shared_process
+from wfsobs.signal.autoregressive import Ar3, fit_shared_process
 from wfsobs.typing import Array
 
 DT, N, NOISE = 1e-3, 2**16, 1e-4

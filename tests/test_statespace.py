@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.ar3 import Ar3
+from wfsobs.signal.autoregressive import Ar2, Ar3
 from wfsobs.signal.statespace import disturbance_model, paper_matrices, sample_ar3, third_order_model
 
 TURBULENCE, VIBRATION = Ar2(7.0686, 0.9, 0.5, 1e-3), Ar2(298.4, 0.03, 0.015, 1e-3)

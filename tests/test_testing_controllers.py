@@ -11,7 +11,7 @@ import pytest
 
 from wfsobs.control.base import Controller
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.control.integrator import integrator_law
+from wfsobs.control.laws import integrator_law
 from wfsobs.control.mirror import Law, Plant
 from wfsobs.prior import Bands, Prior
 from wfsobs.record import Measurements, Record

@@ -11,8 +11,7 @@ from scipy.signal import get_window
 
 import wfsobs
 from wfsobs.evaluation.bound import bound_rms
-from wfsobs.evaluation.error_spectra import TRUTH, Prediction, Theory, band_rms, spectra
-from wfsobs.evaluation.exact_errors import exact_errors
+from wfsobs.evaluation.exact_errors import TRUTH, Prediction, Theory, band_rms, exact_errors, spectra
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
@@ -20,7 +19,7 @@ from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.priors_from.scenario import lines_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.autoregressive import Ar2
 from wfsobs.signal.spectrum import expected_psd
 
 RIGHT = Scenario().replace(

@@ -17,13 +17,12 @@ from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.evaluation.result import Result
 from wfsobs.identification import Identification, identify
-from wfsobs.identification.report import identification_toml
+from wfsobs.identification.identification import identification_toml
 from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import observe
 from wfsobs.prior import Bands, Lines, Model
 from wfsobs.priors_from import scenario as from_scenario
-from wfsobs.priors_from.identification import told_by
-from wfsobs.priors_from.training import training_of, with_training
+from wfsobs.priors_from.telemetry import told_by, training_of, with_training
 from wfsobs.record import Record, RecordError, Training
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS

@@ -11,8 +11,7 @@ from scipy.signal import lfilter
 
 from wfsobs.evaluation.budget import error_budget
 from wfsobs.evaluation.evidence import LEVEL, Evidence, means_differ
-from wfsobs.evaluation.result import Result
-from wfsobs.evaluation.rows import NOTHING, PEAKS, can_be_best, prior_knowledge, row_label, target_title
+from wfsobs.evaluation.result import NOTHING, PEAKS, Result, can_be_best, prior_knowledge, row_label, target_title
 from wfsobs.evaluation.scores import BATCHES, BOUND_BOTH, BOUNDS, PREDICTION, batch_means
 from wfsobs.evaluation.verdict import HEADINGS, explain_harm, verdict
 from wfsobs.observers import OBSERVERS

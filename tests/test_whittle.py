@@ -9,7 +9,7 @@ from scipy.special import expit, logit
 
 from wfsobs.priors_from.scenario import measurement_noise, modelled_processes
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.signal.ar3 import TOLERANCE, Ar3, Ar3Fits
+from wfsobs.signal.autoregressive import TOLERANCE, Ar3, Ar3Fits
 from wfsobs.signal.whittle import information, whittle_fit
 from wfsobs.simulation.true_spectra import lgs_turbulence_spectrum, turbulence_spectra
 from wfsobs.typing import Array

@@ -14,8 +14,8 @@ from wfsobs.observers.base import TARGETS
 from wfsobs.priors_from.scenario import measurement_noise
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.signal.ar2 import Ar2, turbulence_corner
-from wfsobs.signal.riccati import steady_state
+from wfsobs.signal.autoregressive import Ar2, turbulence_corner
+from wfsobs.signal.gains import steady_state
 from wfsobs.signal.wiener import advance_spectrum, circle_mean, error_spectrum, explained_variance, factorise
 from wfsobs.simulation.disturbance import vibration_variance
 from wfsobs.simulation.true_spectra import TrueSpectra, line_width, n_frequencies, true_spectra, turbulence_spectra

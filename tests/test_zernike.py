@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.noll import noll_covariance
-from wfsobs.atmosphere.plane_waves import Footprint, Wave
+from wfsobs.atmosphere import Footprint, Wave
 from wfsobs.sensors.zernike import (
     ZernikeProjection,
     bessel_ratio,

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from wfsobs.scenario import Scenario
     from wfsobs.scenario.presets import PRESETS
     from wfsobs.scenario.scenario import register
-    from wfsobs.settings.errors import SettingError
+    from wfsobs.settings.values import SettingError
     from wfsobs.signal.spectrum import psd
     from wfsobs.simulation.loop import simulate
     from wfsobs.stepping import design
@@ -57,7 +57,7 @@ _HOMES = {
     "register": "scenario.scenario",
     "Scenario": "scenario",
     "PRESETS": "scenario.presets",
-    "SettingError": "settings.errors",
+    "SettingError": "settings.values",
     "psd": "signal.spectrum",
     "simulate": "simulation.loop",
     "load": "telemetry.records",

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from wfsobs.atmosphere.von_karman import FIELD
+from wfsobs.atmosphere import FIELD
 from wfsobs.dependence import observers_reached
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.gpr.inputs import AT_ONCE
+from wfsobs.observers.gpr.windows import AT_ONCE
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import TRAINING_MARGIN
 

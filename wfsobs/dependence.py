@@ -19,12 +19,11 @@ import numpy as np
 
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
-from wfsobs.observers.estimates import Estimate
 from wfsobs.prior import Lines, Part, Prior, Training
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Record
+from wfsobs.record import Estimate, Record
 from wfsobs.scenario import Scenario
-from wfsobs.settings.tree import Plain
+from wfsobs.settings.values import Plain
 from wfsobs.simulation.loop import record_settings, simulate, training_settings
 
 T = TypeVar("T")

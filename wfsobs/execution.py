@@ -12,15 +12,13 @@ from wfsobs.dependence import RecordMemo
 from wfsobs.evaluation.result import Failure
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
-from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimate, Estimates
 from wfsobs.priors_from.scenario import PriorParts, arguments, prior_and_settings, usual_observers
 from wfsobs.progress import QUIET, Watch, detach_watch
-from wfsobs.record import Record
+from wfsobs.record import NEXT_Z, TOTAL, Estimate, Estimates, Record
 from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.idle import used_settings
-from wfsobs.settings.errors import error_line
-from wfsobs.settings.tree import Plain
+from wfsobs.scenario.scenario import used_settings
+from wfsobs.settings.values import Plain, error_line
 from wfsobs.typing import Array
 
 

@@ -14,15 +14,13 @@ from wfsobs.evaluation.result import Failure, Result
 from wfsobs.evaluation.scores import SCORED, Derive, make_anew, score
 from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.estimates import Estimate
 from wfsobs.prior import GIVEN, IDENTIFIED, TRUE, PriorSource
-from wfsobs.priors_from.identification import told_by
 from wfsobs.priors_from.scenario import as_sampled
-from wfsobs.priors_from.training import trained_until, with_training
+from wfsobs.priors_from.telemetry import told_by, trained_until, with_training
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Record
+from wfsobs.record import Estimate, Record
 from wfsobs.scenario import Scenario
-from wfsobs.sensors.modes import HIGHEST_ORDER, order_of
+from wfsobs.sensors.zernike import HIGHEST_ORDER, order_of
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
 

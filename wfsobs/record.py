@@ -1,8 +1,11 @@
-"""Types of one run's data: `Measurements` of sensors and mirror, and `Record`, which adds the truth where there is one."""
+"""Types of one run's data: `Measurements` of sensors and mirror, and `Record`, which adds the truth where there is one.
+
+Estimates of an observer: what it returns, and one target of it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
@@ -11,12 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wfsobs.notebook import PlotAccessor, html_table, import_extra
-from wfsobs.settings.errors import shorten
+from wfsobs.settings.values import shorten
 from wfsobs.signal.gate import GateSettings, OutlierGate, frame_mean_of, let_through
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:
     import xarray
+
 
 DELAY = 2
 """The paper's delay: a command is computed once y_lgs[k] is known, acts during step k + 1, and is seen at k + 2."""
@@ -380,3 +384,66 @@ def hold_last(x: Array) -> Array:
         return x
     last = np.maximum.accumulate(np.where(gone, -1, np.arange(x.shape[0])[:, None]), axis=0)
     return np.where(last < 0, 0.0, np.take_along_axis(x, np.maximum(last, 0), axis=0))
+
+
+TURBULENCE, VIBRATION = "turbulence", "vibration"
+TARGETS = (TURBULENCE, VIBRATION)
+
+TOTAL, NEXT_Z = "total", "next z"
+"""Of the standard deviations: the sum of turbulence and vibration, and the next measurement, as the sum predicts it."""
+
+
+class Estimates(dict[str, Array]):
+    """Estimates of an observer, target -> (n_steps, n_modes) [um], and how sure it is of them.
+
+    Parameters
+    ----------
+    values : mapping of str to Array
+        Target -> estimate, NaN where there is none.
+    sd : mapping of str to Array, optional
+        Target -> standard deviation of the estimate's error by the observer's own model, (n_steps, n_modes) [um], perhaps a
+        read-only view of fewer numbers; no target without a model, NaN where not known. TOTAL and NEXT_Z, too, where the model
+        has them: of the sum of its estimates, less the disturbance at the step and less z of the next.
+    """
+
+    def __init__(self, values: Mapping[str, Array], sd: Mapping[str, Array] | None = None):
+        super().__init__(values)
+        self.sd: dict[str, Array] = dict(sd or {})
+
+
+def by_name(x: Array) -> dict[str, Array]:
+    """Return the columns of x (n, 2 to 4, n_modes) by what they are: targets, and of standard deviations TOTAL and NEXT_Z."""
+    return {name: x[:, i] for i, name in zip(range(x.shape[1]), (*TARGETS, TOTAL, NEXT_Z), strict=False)}
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Estimate of one target by one observer.
+
+    Attributes
+    ----------
+    observer, target : str
+        Of whom, and of what.
+    values : Array
+        Estimate, (n_steps, n_modes) [um]; NaN where there is none.
+    seconds_per_step : float
+        Computing time per step and mode [s].
+    sd : Array or None
+        Standard deviation of its error by the observer's own model, (n_steps, n_modes) [um]; None where it has no model, NaN
+        where there is no number.
+    sd_of_sum : mapping of str to Array
+        TOTAL and NEXT_Z -> that of all estimates of the observer together; empty where it has no such model.
+    """
+
+    observer: str
+    target: str
+    values: Array
+    seconds_per_step: float
+    sd: Array | None = None
+    sd_of_sum: Mapping[str, Array] = field(default_factory=dict[str, Array])
+
+    def __repr__(self) -> str:
+        n_steps, n_modes = self.values.shape
+        return (
+            f"Estimate({self.observer}, {self.target}, steps {n_steps}, modes {n_modes}, {self.seconds_per_step:.3g} s per step)"
+        )

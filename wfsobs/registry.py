@@ -17,8 +17,8 @@ from typing import Any, Protocol, TypeVar
 
 import param
 
-from wfsobs.settings.errors import SettingError
 from wfsobs.settings.group import Group, Section
+from wfsobs.settings.values import SettingError
 
 log: logging.Logger = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import label, rows
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.control.integrator import highest_stable_gain
+from wfsobs.control.laws import highest_stable_gain
 from wfsobs.control.mirror import Mirror
 from wfsobs.evaluation.scores import BOUND, BOUNDS
 from wfsobs.scenario import Scenario
@@ -43,7 +43,7 @@ LINEAR = [name for name, c in CONTROLLERS.items() if c.is_quick and name != "non
 
 def two_frames() -> None:
     """The two-frame loop, by theory and simulated: 20 seeds of 60 s, tip and tilt."""
-    half = {"control.integrator": "manual", "control.gain": 0.5}
+    half = {"control.laws": "manual", "control.gain": 0.5}
     print("| Controller | Theory, nm | Simulated, nm | over theory |\n|---|---|---|---|")
     cases = (
         ("Integrator, g = 0.5", "integrator", half),

@@ -19,7 +19,7 @@ from importlib.metadata import version
 
 import numpy as np
 
-from wfsobs.atmosphere.von_karman import von_karman_density
+from wfsobs.atmosphere import von_karman_density
 from wfsobs.sensors import zernike
 from wfsobs.sensors.lenslets import Lenslets, reconstructor
 from wfsobs.sensors.shack_hartmann import ARCSEC, ShackHartmann

@@ -17,11 +17,10 @@ from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.exact_errors import exact_errors
 from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.estimates import TOTAL
-from wfsobs.record import Record
+from wfsobs.record import TOTAL, Record
 from wfsobs.scenario import Scenario
-from wfsobs.simulation.lenslet_spectra import true_lenslet_spectra
 from wfsobs.simulation.loop import simulate
+from wfsobs.simulation.mode_spectra import true_lenslet_spectra
 from wfsobs.simulation.true_spectra import has_known_spectra
 from wfsobs.typing import Array
 

@@ -14,7 +14,7 @@ from wfsobs.cli.show import OverTime, recovery_texts
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.run import close_loop, closed_loop
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.evaluation.rows import row_label
+from wfsobs.evaluation.result import row_label
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.missing import fill_missing

@@ -20,8 +20,8 @@ from scipy.stats import binomtest, ncx2
 from wfsobs import PRESETS, Record, Scenario, observe, simulate
 from wfsobs.identification import Identification, identify
 from wfsobs.identification.identification import ALONE, LEVEL
-from wfsobs.signal.ar2 import Ar2
-from wfsobs.simulation.guide_stars import lgs_error_process, lgs_noise_rms
+from wfsobs.signal.autoregressive import Ar2
+from wfsobs.simulation.sensing import lgs_error_process, lgs_noise_rms
 from wfsobs.simulation.true_spectra import true_spectra
 from wfsobs.simulation.turbulence import turbulence_process
 from wfsobs.spectral.search import BELOW, LOWEST, OF_LINES, STRUCTURES

@@ -21,9 +21,8 @@ from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.observers.kalman.step import by_target
 from wfsobs.priors_from.scenario import measurement_noise, modelled_processes
 from wfsobs.record import Record, Training
-from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.bandpass import bandpass_bank, filter_causal, filter_zero_phase
-from wfsobs.signal.spectrum import rms
+from wfsobs.signal.autoregressive import Ar2
+from wfsobs.signal.spectrum import bandpass_bank, filter_causal, filter_zero_phase, rms
 from wfsobs.signal.statespace import disturbance_model
 
 SEEDS = range(1, 21)

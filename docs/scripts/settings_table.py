@@ -10,7 +10,7 @@ import param
 
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import Group, holds_groups
-from wfsobs.settings.parameters import Reals, unit_of
+from wfsobs.settings.values import Reals, unit_of
 
 PAGE = Path(__file__).parents[1] / "settings.md"
 

@@ -25,7 +25,7 @@ from wfsobs.control.controllers import CONTROLLERS  # noqa: E402
 from wfsobs.control.margins import residual_density  # noqa: E402
 from wfsobs.control.mismatch import SensorSpectra, loops, weigh  # noqa: E402
 from wfsobs.control.true_plant import TruePlant  # noqa: E402
-from wfsobs.priors_from.controllers import own_settings, plant_of, prior_for  # noqa: E402
+from wfsobs.priors_from.scenario import own_settings, plant_of, prior_for  # noqa: E402
 from wfsobs.scenario.configfile import load_scenario, save_scenario  # noqa: E402
 from wfsobs.simulation.flow_spectra import flow_spectra  # noqa: E402
 
@@ -142,7 +142,7 @@ def theory(name, gain, noise, error=1.0):
     scenario = wfsobs.Scenario().replace({f"turbulence.{key}": value for key, value in air.items()})
     frequency = np.linspace(0.0, 0.5 / DT, 2**16 + 1)
     told = load_scenario("found.toml").replace({"control.delay": 2.0})
-    told = told.replace({"control.integrator": "manual", "control.gain": GAIN * gain, "control.leak": 1.0})
+    told = told.replace({"control.laws": "manual", "control.gain": GAIN * gain, "control.leak": 1.0})
     controller, plant = CONTROLLERS[name], plant_of(told)
     total, density = 0.0, np.zeros_like(frequency)
     for mode in range(2):

@@ -1,7 +1,7 @@
 """A controller for wfsobs, all of it in one file: an integrator with a gain of its own."""
 
 from wfsobs.control.base import Controller
-from wfsobs.control.integrator import integrator_law
+from wfsobs.control.laws import integrator_law
 from wfsobs.observers.base import Look
 from wfsobs.settings import Group, Real, Section
 

@@ -15,7 +15,7 @@ from wfsobs.app.store import Store
 from wfsobs.app.style import TERM_COLOURS
 from wfsobs.app.views.errors import MainLines, Strip, VerdictLine
 from wfsobs.evaluation.budget import TERMS, Budget
-from wfsobs.evaluation.rows import own_bound
+from wfsobs.evaluation.result import own_bound
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import simulate

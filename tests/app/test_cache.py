@@ -22,7 +22,7 @@ from wfsobs.evaluation.result import Result
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 
 WAIT = 60.0
 

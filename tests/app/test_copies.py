@@ -28,14 +28,14 @@ from wfsobs.app.work import RunResults
 from wfsobs.cli import main
 from wfsobs.closed_loop.rows import rows
 from wfsobs.evaluation.scores import BOUNDS
-from wfsobs.identification import report as identified
+from wfsobs.identification.identification import identification_dict, identification_toml
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.formats import format_of
 from wfsobs.telemetry.records import load_record, record_arrays
-from wfsobs.tuning import report as tunings
+from wfsobs.tuning.tuning import tuning_dict
 
 CLOSE = 1e-6
 """Another process may add up in another order, which the GPR magnify; numbers are printed with all digits."""
@@ -184,8 +184,8 @@ def test_identify(board: Dashboard, loop: Any) -> None:
     page.level.value, page.lowest.value = "0.02", "8"
     page.starter.begin()
     loop.until(lambda: page.work.state != RUNNING, 120)
-    expected = identified.identification_dict(page.work.result[0])
-    for found in (shell(board), identified.identification_dict(script(board)["found"])):
+    expected = identification_dict(page.work.result[0])
+    for found in (shell(board), identification_dict(script(board)["found"])):
         assert [[p["frequency"] for p in m["peaks"]] for m in found["modes"]] == [
             pytest.approx([p["frequency"] for p in m["peaks"]], rel=CLOSE) for m in expected["modes"]
         ]
@@ -199,8 +199,8 @@ def test_tune(board: Dashboard, loop: Any) -> None:
     page.observer.value, page.evaluations.value = "kf-lgs", "4"
     page.starter.begin()
     loop.until(lambda: page.work.state != RUNNING, 120)
-    expected = tunings.tuning_dict(page.work.result)
-    for found in (shell(board), tunings.tuning_dict(script(board)["tuned"])):
+    expected = tuning_dict(page.work.result)
+    for found in (shell(board), tuning_dict(script(board)["tuned"])):
         assert found["settings"] == pytest.approx(expected["settings"], rel=CLOSE)
         for stage in ("before", "after"):
             assert found[stage]["test_um"] == pytest.approx(expected[stage]["test_um"], rel=CLOSE)
@@ -302,9 +302,7 @@ def test_what_pages_have_found_is_saved(dashboard: Dashboard, loop: Any, sent: l
     loop.until(lambda: page.work.state != RUNNING, 120)
     files = saved(dashboard, loop, sent)
     result = page.work.result[0]
-    assert files["wfsobs-model.toml"].decode() == identified.identification_toml(
-        result, result.scenario(dashboard.store.scenario)
-    )
+    assert files["wfsobs-model.toml"].decode() == identification_toml(result, result.scenario(dashboard.store.scenario))
 
     dashboard.pages.current = "tune"
     page = dashboard.pages.by_name["tune"]

@@ -13,7 +13,7 @@ from wfsobs.app.controls.panel import Controls
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.store import Store
 from wfsobs.app.views.traces import BINS
-from wfsobs.evaluation.recovery import running_rms
+from wfsobs.evaluation.scores import running_rms
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.events import OF_KIND, Event
 from wfsobs.signal.envelope import envelope

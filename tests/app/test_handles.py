@@ -23,12 +23,12 @@ from wfsobs.app.views.spectrum_editor import (
     without_peak,
 )
 from wfsobs.closed_loop.design import design
-from wfsobs.control.integrator import highest_stable_gain
-from wfsobs.evaluation.error_spectra import Theory
-from wfsobs.priors_from.controllers import plant_of
+from wfsobs.control.laws import highest_stable_gain
+from wfsobs.evaluation.exact_errors import Theory
+from wfsobs.priors_from.scenario import plant_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 from wfsobs.simulation.turbulence import turbulence_process
 
 
@@ -249,7 +249,7 @@ class TestGain:
         # between two points of the curve the level is taken as linear
         assert after["frequency"] == pytest.approx(0.5 * handle["frequency"], rel=5e-3)
         values = {it["name"]: it["value"] for it in gain.handles[0].layer.frame["numbers"]}
-        scenario = store.scenario.replace({"control.integrator": "manual", "control.gain": float(values["gain"])})
+        scenario = store.scenario.replace({"control.laws": "manual", "control.gain": float(values["gain"])})
         expected = design(scenario, ["integrator"]).laws["integrator"][0].predicted_rms
         assert expected is not None
         assert float(values["integrator"]) == pytest.approx(1e3 * expected, rel=0.01)  # three digits, of the gain too

@@ -21,8 +21,8 @@ from wfsobs.app.sources import LoadedRecord, SimulatedRecord
 from wfsobs.app.style import LOOKS
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.identification import Identification, identify
+from wfsobs.identification.identification import format_number, whiteness_lines
 from wfsobs.identification.process import Number
-from wfsobs.identification.report import format_number, whiteness_lines
 from wfsobs.pipeline import observe
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario

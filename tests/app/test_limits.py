@@ -23,7 +23,7 @@ from wfsobs.cli.serve import serve
 from wfsobs.cost import run_bytes, run_seconds
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS, paper
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 
 
 def refused(limits: Limits, changes: dict[str, Any]) -> str:

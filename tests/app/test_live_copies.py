@@ -24,10 +24,10 @@ from wfsobs.app.share import CopiedTask, to_command, to_python
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.cli import main
 from wfsobs.live.loop import LiveOrder
-from wfsobs.live.replay import Replay
 from wfsobs.live.simulated import SimulatedLoop
+from wfsobs.live.source import Replay
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.estimates import TOTAL
+from wfsobs.record import TOTAL
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
 from wfsobs.simulation.loop import simulate

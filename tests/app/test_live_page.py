@@ -29,14 +29,12 @@ from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.style import look
 from wfsobs.app.views.plots import new_figure
-from wfsobs.live.board import NEXT
+from wfsobs.live.board import NEXT, SHARED, SharedView
 from wfsobs.live.finding import Change, Finding, MinuteSpectrum, PeakFinding
 from wfsobs.live.loop import LiveLoop, LiveOrder
-from wfsobs.live.recording import Recorder
-from wfsobs.live.ring import Ring
+from wfsobs.live.ring import Recorder, Ring
 from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.live.source import ALARM, LiveEvent
-from wfsobs.live.view import SHARED, SharedView
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -139,7 +137,7 @@ def test_pages_share_what_was_read_a_moment_ago(monkeypatch: pytest.MonkeyPatch)
     """Of the same window, while the loop plays, until the next picture is due."""
     now, shared = [5.0], SharedView()
     read: list[float] = []
-    monkeypatch.setattr("wfsobs.live.view.monotonic", lambda: now[0])
+    monkeypatch.setattr("wfsobs.live.board.monotonic", lambda: now[0])
 
     def look(seconds: float, *, anew: bool = False) -> int:
         view: Any = read.append

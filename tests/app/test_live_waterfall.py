@@ -7,10 +7,9 @@ import pytest
 
 from wfsobs.app.display import Display
 from wfsobs.app.pages.live_figures import COLUMNS, MEASUREMENT, Waterfall
-from wfsobs.live.board import trace_width
+from wfsobs.live.board import LiveView, trace_width
 from wfsobs.live.finding import LOWEST, ROWS, second_spectrum
 from wfsobs.live.ring import LiveFrame
-from wfsobs.live.view import LiveView
 from wfsobs.signal.spectrum import psd
 
 DT = 1e-3

@@ -20,7 +20,7 @@ from wfsobs.app.views.plots import GREY, MOST_COLOURED, ROOM_OF_NAME
 from wfsobs.app.views.traces import first_window
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.evidence import gather_evidence, rank_observers
-from wfsobs.evaluation.rows import NO_ESTIMATE, NOTHING, PEAKS, is_non_causal, prior_knowledge
+from wfsobs.evaluation.result import NO_ESTIMATE, NOTHING, PEAKS, is_non_causal, prior_knowledge
 from wfsobs.evaluation.scores import PREDICTION, Score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS

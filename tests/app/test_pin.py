@@ -15,7 +15,7 @@ from wfsobs.app.render import change, hundredths, number
 from wfsobs.app.style import observers_of
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.evidence import gather_evidence
-from wfsobs.evaluation.rows import group_by_knowledge
+from wfsobs.evaluation.result import group_by_knowledge
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS

@@ -21,8 +21,8 @@ from wfsobs.identification import identify
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.atmosphere import Layer, Peak, Process
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.errors import SettingError
 from wfsobs.settings.group import Group
+from wfsobs.settings.values import SettingError
 from wfsobs.simulation.loop import simulate
 
 QUICK = {

@@ -15,7 +15,7 @@ from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 
 
 def answer(scenario: Scenario) -> RunResults:

@@ -10,7 +10,7 @@ import pytest
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.render import number
 from wfsobs.app.work import TRUTH
-from wfsobs.evaluation.error_spectra import band_rms, cumulative_rms
+from wfsobs.evaluation.exact_errors import band_rms, cumulative_rms
 from wfsobs.signal.spectrum import psd
 
 

@@ -28,9 +28,9 @@ from wfsobs.campaign.sweep import SweepResults, parse_axis, plan_sweep, run_swee
 from wfsobs.campaign.usual_values import usual_values
 from wfsobs.evaluation.scores import Score
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.idle import idle_settings, why_idle_at
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.errors import SettingError
+from wfsobs.scenario.scenario import idle_settings, why_idle_at
+from wfsobs.settings.values import SettingError
 
 WAIT = 60.0
 """As long as one run is waited for elsewhere [s]."""

@@ -25,8 +25,8 @@ from wfsobs.scenario.configfile import changed_settings
 from wfsobs.scenario.names import setting_name
 from wfsobs.simulation.loop import simulate
 from wfsobs.tuning import Evaluation, TuningResult, tune
-from wfsobs.tuning.report import best_so_far
 from wfsobs.tuning.trials import Errors
+from wfsobs.tuning.tuning import best_so_far
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from tests.records import ON_PAPER
 from wfsobs.app import work
 from wfsobs.app.work import TRUTH, RunResults, compute
 from wfsobs.dependence import Memo
-from wfsobs.evaluation.error_spectra import scored_samples
+from wfsobs.evaluation.exact_errors import scored_samples
 from wfsobs.progress import QUIET, Cancelled, Watch
 from wfsobs.scenario import Scenario
 from wfsobs.signal.spectrum import psd

@@ -28,8 +28,8 @@ from wfsobs.app.report.page import STEP
 from wfsobs.app.style import TERM_COLOURS
 from wfsobs.app.work import TRUTH
 from wfsobs.cli import main
-from wfsobs.evaluation.error_spectra import cumulative_rms, spectra
-from wfsobs.evaluation.rows import row_label
+from wfsobs.evaluation.exact_errors import cumulative_rms, spectra
+from wfsobs.evaluation.result import row_label
 from wfsobs.observers.base import TARGETS
 
 SETTINGS = {

@@ -12,7 +12,7 @@ from wfsobs.campaign.compare import LEVEL, Comparison, compare, mean_interval
 from wfsobs.campaign.plan import Stop, looks, parse_plan
 from wfsobs.campaign.run import wanted_seeds
 from wfsobs.campaign.store import ROWS, BatchIndex, schema, write_batch
-from wfsobs.evaluation.rows import can_be_best
+from wfsobs.evaluation.result import can_be_best
 from wfsobs.observers import OBSERVERS
 
 

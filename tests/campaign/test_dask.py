@@ -129,7 +129,7 @@ def test_a_scheduler_without_workers_is_told_and_waited_for(cluster, tmp_path):
 @pytest.mark.parametrize("address", ["localhost", "head:8786", "tcp://head", "smoke://head:8786", ""])
 def test_an_address_that_is_none_is_refused_at_once(address, monkeypatch):
     from wfsobs.campaign import pools
-    from wfsobs.settings.errors import SettingError
+    from wfsobs.settings.values import SettingError
 
     monkeypatch.setattr("distributed.Client", lambda *_, **__: pytest.fail("a client is made"))
     with pytest.raises(SettingError, match=f"^--scheduler {address}: takes an address with a port, such as tcp://head:8786$"):
@@ -138,7 +138,7 @@ def test_an_address_that_is_none_is_refused_at_once(address, monkeypatch):
 
 def test_without_a_scheduler_there_is_one_line(tmp_path, monkeypatch):
     from wfsobs.campaign import pools
-    from wfsobs.settings.errors import SettingError
+    from wfsobs.settings.values import SettingError
 
     monkeypatch.setattr(pools, "DASK_TIMEOUT", 1.0)
     with pytest.raises(SettingError, match=r"--scheduler tcp://127.0.0.1:1: no scheduler answers"):

@@ -7,11 +7,10 @@ import pytest
 
 from wfsobs.campaign.compare import CampaignErrors, compare
 from wfsobs.campaign.follow import CampaignFolder
-from wfsobs.campaign.plan import parse_plan
+from wfsobs.campaign.plan import MOST_VALUES, parse_plan, plan_axes
 from wfsobs.campaign.run import run_rows
-from wfsobs.campaign.selection import MOST_VALUES, plan_axes
 from wfsobs.campaign.store import batch_files, open_folder, read_batch, read_results, write_batch
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 
 PLAN = """
 name = "Tiny"

@@ -8,7 +8,7 @@ import pytest
 from wfsobs.campaign.plan import Campaign, parse_plan
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 
 TEXT = """
 name = "Wind"

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import kstest
 
 from wfsobs.campaign.sweep import conditions, grid, product, sample
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 
 
 def test_a_grid_has_every_combination_once():

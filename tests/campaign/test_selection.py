@@ -7,13 +7,12 @@ import pyarrow.compute as pc
 import pytest
 from click.testing import CliRunner
 
-from wfsobs.campaign.plan import parse_plan
+from wfsobs.campaign.plan import cells_where, condition, parse_plan, plan_axes
 from wfsobs.campaign.run import run_rows
-from wfsobs.campaign.selection import cells_where, condition, plan_axes
 from wfsobs.campaign.store import open_folder, read_results, write_batch
 from wfsobs.cli import main
 from wfsobs.cli.campaign import summary_table
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 
 PLAN = """
 name = "Tiny"

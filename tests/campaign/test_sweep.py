@@ -16,11 +16,11 @@ from scipy.stats import t as student
 import wfsobs
 from wfsobs.campaign.sweep import EACH_RUN, EACH_STEP, MOST_CELLS, SweepResults, parse_axis, plan_sweep, run_sweep
 from wfsobs.cli import main
-from wfsobs.evaluation.rows import row_label
+from wfsobs.evaluation.result import row_label
 from wfsobs.evaluation.scores import BOUND, Score
 from wfsobs.evaluation.verdict import sentence_of_several
 from wfsobs.scenario import Scenario
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 
 SHORT = {"run.duration": 1.0, "run.warm_up": 0.2, "run.seed": 7}
 FEW = ("kf-lgs", "kf-multi", "multirate")

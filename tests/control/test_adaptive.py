@@ -9,7 +9,7 @@ import wfsobs
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import controller_needs
 from wfsobs.closed_loop.run import closed_loop
-from wfsobs.control.integrator import integrator_law
+from wfsobs.control.laws import integrator_law
 from wfsobs.control.mirror import Mirror
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.step import frames_of

@@ -16,20 +16,26 @@ from wfsobs.closed_loop.rows import ClosedLoop, Outcome, residual_rms, strehl
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.control.base import Settings
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.control.integrator import best_gain, highest_stable_gain, integrator_law
+from wfsobs.control.laws import best_gain, highest_stable_gain, integrator_law
 from wfsobs.control.margins import residual_variance
 from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers.baselines import online_reference
 from wfsobs.prior import Prior
-from wfsobs.priors_from.controllers import controller_arguments, own_settings
-from wfsobs.priors_from.scenario import bands_of, measurement_noise, modelled_processes, spectra_of
+from wfsobs.priors_from.scenario import (
+    bands_of,
+    controller_arguments,
+    measurement_noise,
+    modelled_processes,
+    own_settings,
+    spectra_of,
+)
 from wfsobs.progress import QUIET
 from wfsobs.record import Measurements, Record, RecordError, Training, delay_signal
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.errors import SettingError
-from wfsobs.signal.riccati import steady_state
+from wfsobs.settings.values import SettingError
+from wfsobs.signal.gains import steady_state
 from wfsobs.signal.spectrum import psd
 from wfsobs.signal.statespace import paper_matrices
 from wfsobs.simulation.loop import simulate
@@ -84,7 +90,7 @@ def test_the_two_frame_loop_leaves_what_theory_says() -> None:
     (lqg,) = {d.predicted_rms for d in several[0].design.laws["lqg-kf-lgs"]}
     (best,) = {d.law.gain for d in several[0].design.laws["integrator"] if d.law}
     assert lqg == pytest.approx(21.63e-3, abs=0.005e-3) and best == pytest.approx(0.64, abs=0.005)
-    half = design(MATCHED.replace({"control.integrator": "manual", "control.gain": 0.5}), ("integrator",))
+    half = design(MATCHED.replace({"control.laws": "manual", "control.gain": 0.5}), ("integrator",))
     assert half.laws["integrator"][0].predicted_rms == pytest.approx(36.9e-3, abs=0.05e-3)
     assert several[0].design.laws["integrator"][0].predicted_rms == pytest.approx(34.1e-3, abs=0.05e-3)
     # Two modes of 295 s each: the mean over seeds spreads by 0.16 % and 0.38 % (40 seeds).
@@ -313,7 +319,7 @@ def test_no_controller_of_the_lgs_beats_the_bound(delay: float, noise: float) ->
     ],
 )
 def test_an_unstable_loop_is_said_to_be_one(changes: dict[str, Any]) -> None:
-    result = run(QUICK | {"control.integrator": "manual"} | changes)
+    result = run(QUICK | {"control.laws": "manual"} | changes)
     for one in result.outcomes:
         if one.controller.startswith("integrator"):
             assert one.stable == (False, False) and one.residual is None and one.u is None

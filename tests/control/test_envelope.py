@@ -14,7 +14,7 @@ from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.envelope import PlantEnvelope, Spread, Uncertainty, plant_envelope, residuals
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.control.true_plant import TruePlant
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import true_spectra
 from wfsobs.tuning import tuned_envelope

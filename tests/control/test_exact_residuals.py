@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from tests.records import MATCHED
-from wfsobs.closed_loop.design import design
-from wfsobs.closed_loop.exact_residuals import exact_residuals
+from wfsobs.closed_loop.design import design, exact_residuals
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.bound import bound_rms

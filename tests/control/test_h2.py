@@ -7,7 +7,7 @@ import pytest
 
 from wfsobs import PRESETS, plant_envelope
 from wfsobs.closed_loop.design import design
-from wfsobs.control import h2
+from wfsobs.control import laws
 from wfsobs.control.mirror import Mirror
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.prior import Spectra
@@ -18,7 +18,7 @@ def test_an_ar1_without_noise_is_predicted_by_its_law(a: float) -> None:
     """Two steps ahead that is a^2 times the last value; at this size no limit acts."""
     omega = np.linspace(0.0, np.pi, 257)
     S = (1.0 - a**2) / np.abs(1.0 - a * np.exp(-1j * omega)) ** 2
-    assert h2.taps_of(Spectra(S, S, S), Mirror(2.0), 1.0) == pytest.approx(a**2 * np.eye(h2.TAPS)[0], abs=1e-6)
+    assert laws.taps_of(Spectra(S, S, S), Mirror(2.0), 1.0) == pytest.approx(a**2 * np.eye(laws.TAPS)[0], abs=1e-6)
 
 
 @pytest.mark.parametrize("preset", ["paper", "ut4", "galacsi-nfm"])
@@ -30,15 +30,15 @@ def test_limits_hold_between_the_frequencies_where_they_are_set(preset: str) -> 
         plan = design(s.replace({"control.caution": caution}), ["h2-fir"])
         for mode in range(2):
             T = plan.loop("h2-fir", mode)(omega)
-            assert np.abs(1.0 - T).max() < 1.05 * h2.PEAK
-            assert (np.abs(T) * h2.uncertainty(plan.mirror, omega)).max() < 1.05 * h2.ROBUST / caution
+            assert np.abs(1.0 - T).max() < 1.05 * laws.PEAK
+            assert (np.abs(T) * laws.uncertainty(plan.mirror, omega)).max() < 1.05 * laws.ROBUST / caution
 
 
 def test_uncertainty_is_that_of_the_plant() -> None:
     """A delay of half a frame, gain and rotation move P where nothing is fractional by |1.2 exp(i (w / 2 + 10 deg)) - 1|."""
     omega = np.array([1e-6, 0.05])
     expected = np.abs(1.2 * np.exp(1j * (0.5 * omega + np.radians(10.0))) - 1.0)
-    assert h2.uncertainty(Mirror(3.0), omega) == pytest.approx(expected, rel=2e-3)
+    assert laws.uncertainty(Mirror(3.0), omega) == pytest.approx(expected, rel=2e-3)
 
 
 @pytest.mark.parametrize("preset", ["paper", "strong-turbulence", "ut4", "galacsi-nfm"])

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs.closed_loop.design import design
-from wfsobs.control.integrator import highest_stable_gain, integrator_law
+from wfsobs.control.laws import highest_stable_gain, integrator_law
 from wfsobs.control.margins import Margins, crossings, frequencies, margins
 from wfsobs.control.mirror import Law, Mirror
 from wfsobs.scenario.presets import PRESETS

@@ -16,7 +16,7 @@ from wfsobs.closed_loop.promise import DRAWS, _interval_of, as_seen, draw_plants
 from wfsobs.control.true_plant import ActingPlant, TruePlant, drive
 from wfsobs.identification.plant import GroupPlant, PlantNumber
 from wfsobs.identification.plant_likelihood import PlantFit
-from wfsobs.priors_from.controllers import full_plant_of
+from wfsobs.priors_from.scenario import full_plant_of
 from wfsobs.record import Record, RecordError
 from wfsobs.typing import Array
 
@@ -25,7 +25,7 @@ SCENARIO = wfsobs.PRESETS["paper"]().replace(
         "run.duration": 10.0,
         "run.seed": 4,
         "sensors.lgs_low_frequency_rms": 0.0,
-        "control.integrator": "manual",
+        "control.laws": "manual",
         "control.gain": 0.4,
         "plant.delay_error": 0.3,
         "plant.gain_error": [0.1],
@@ -181,7 +181,7 @@ def test_the_promise_takes_a_mirror_with_dynamics_into_account(monkeypatch: pyte
 def test_the_next_record_keeps_the_promise(telemetry: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("wfsobs.closed_loop.promise.DRAWS", FEWER)
     names = ["integrator", "lqg-kf-lgs", "lqg-kf-multi", "lqg-multirate"]
-    found = make_promise(telemetry, SCENARIO.replace({"control.integrator": "optimised"}), controllers=names)
+    found = make_promise(telemetry, SCENARIO.replace({"control.laws": "optimised"}), controllers=names)
     true, inverse = full_plant_of(SCENARIO), np.linalg.inv(found.matrix)
     disturbance, noise = noise_of(wfsobs.simulate(SCENARIO.replace({"run.seed": 40})))
     for one in found.residuals:

@@ -12,11 +12,11 @@ from click.testing import CliRunner
 import wfsobs
 from wfsobs.cli.group import main
 from wfsobs.closed_loop.design import design
-from wfsobs.control.integrator import best_gain, gain_from_telemetry, highest_stable_gain
+from wfsobs.control.laws import best_gain, gain_from_telemetry, highest_stable_gain
 from wfsobs.control.mirror import Mirror
 from wfsobs.prior import Spectra
 from wfsobs.record import RecordError, delay_signal
-from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.autoregressive import Ar2
 from wfsobs.typing import Array
 
 DT = 1e-3

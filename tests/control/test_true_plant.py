@@ -16,15 +16,15 @@ from scipy.signal import freqs
 from tests.records import MATCHED
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.run import closed_loop
-from wfsobs.control.integrator import highest_stable_gain, integrator_law
+from wfsobs.control.laws import highest_stable_gain, integrator_law
 from wfsobs.control.margins import disk_margin, frequencies
 from wfsobs.control.mirror import Law, Mirror
 from wfsobs.control.mismatch import draws_of, loops, margins_of, one_loop, radius, step_matrices
 from wfsobs.control.true_plant import ActingPlant, TruePlant, true_matrix
-from wfsobs.priors_from.controllers import full_plant_of, true_plant_of
+from wfsobs.priors_from.scenario import full_plant_of, true_plant_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 from wfsobs.simulation.loop import simulate
 
 ONE, TWO = np.eye(1), np.eye(2)

@@ -3,13 +3,11 @@
 import queue
 from types import SimpleNamespace
 
-from wfsobs.live.board import Board, trace_width
+from wfsobs.live.board import Board, last_frames, read_view, trace_width
 from wfsobs.live.crew import Site
 from wfsobs.live.processes import made_crew
-from wfsobs.live.recording import Recorder
-from wfsobs.live.ring import Ring, Rows
+from wfsobs.live.ring import Recorder, Ring, Rows
 from wfsobs.live.source import LiveEvent
-from wfsobs.live.view import last_frames, read_view
 
 
 def keep_lines(lines):

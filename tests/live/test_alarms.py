@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from tests.live.in_process import keep_lines
-from wfsobs.live.board import SLOTS, slot_width, trace_width
+from wfsobs.live.board import SLOTS, LiveView, slot_width, trace_width
 from wfsobs.live.loop import FEWEST, Alarms, noise_of
 from wfsobs.live.ring import LiveFrame
-from wfsobs.live.view import LiveView
 
 
 def second(noise, error=0.01, missing=0, seed=1):

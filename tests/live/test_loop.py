@@ -18,14 +18,13 @@ import pytest
 
 import wfsobs
 from wfsobs.live import simulated
-from wfsobs.live.board import Board, Delivery, trace_width
+from wfsobs.live.board import Board, Delivery, read_view, trace_width
 from wfsobs.live.crew import Site
 from wfsobs.live.loop import TICK, LiveLoop, _keep
 from wfsobs.live.processes import POLL, REST, Pause, made_crew
 from wfsobs.live.ring import LiveFrame, Ring, Rows, merged_rows
 from wfsobs.live.simulated import FADE, GLANCE, SimulatedFrames, SimulatedLoop
 from wfsobs.live.source import Pace
-from wfsobs.live.view import read_view
 from wfsobs.scenario.presets import paper
 from wfsobs.settings.group import SettingError
 

@@ -7,8 +7,7 @@ from tests.live.in_process import keep_lines
 from wfsobs import PRESETS, simulate
 from wfsobs.live.finding import identify_frames
 from wfsobs.live.loop import Alarms
-from wfsobs.live.recording import open_loop_record
-from wfsobs.live.ring import LiveFrame
+from wfsobs.live.ring import LiveFrame, open_loop_record
 
 pytestmark = pytest.mark.slow
 

@@ -6,8 +6,7 @@ import pytest
 from tests.live.in_process import LoopInProcess
 from tests.live.test_programme import Maker
 from wfsobs.live.loop import Shadow
-from wfsobs.live.programme import Programme
-from wfsobs.live.simulated import SimulatedFrames
+from wfsobs.live.simulated import Programme, SimulatedFrames
 from wfsobs.live.source import LiveEvent
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.stepping import sampling_of

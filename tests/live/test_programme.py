@@ -9,10 +9,8 @@ import wfsobs
 from wfsobs.live.board import Board
 from wfsobs.live.crew import Site
 from wfsobs.live.processes import made_crew
-from wfsobs.live.programme import STAIR, Programme
-from wfsobs.live.recording import record_of
-from wfsobs.live.ring import LiveFrame
-from wfsobs.live.simulated import SimulatedFrames, endless_blocks
+from wfsobs.live.ring import LiveFrame, record_of
+from wfsobs.live.simulated import STAIR, Programme, SimulatedFrames, endless_blocks
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS, paper
 from wfsobs.settings.group import SettingError

@@ -14,10 +14,8 @@ import wfsobs
 from wfsobs.live.attached import SPELL, StreamFrames, StreamSource
 from wfsobs.live.board import LONG_STEPS
 from wfsobs.live.checks import observers_on
-from wfsobs.live.recording import open_loop_record
-from wfsobs.live.replay import RecordFrames, Replay, frame_rows
-from wfsobs.live.ring import LiveFrame, Ring
-from wfsobs.live.source import Desk
+from wfsobs.live.ring import LiveFrame, Ring, open_loop_record
+from wfsobs.live.source import Desk, RecordFrames, Replay, frame_rows
 from wfsobs.scenario.presets import paper
 from wfsobs.streams.shared_image import SharedImage
 from wfsobs.streams.wiring import NgsWiring

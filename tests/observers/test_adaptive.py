@@ -18,13 +18,12 @@ from wfsobs.observers.kalman.window_model import model_filter, pack_spectrum, un
 from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import Record, RecordError, delay_signal
 from wfsobs.scenario import Scenario
-from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.ar3 import Ar3
-from wfsobs.signal.riccati import RiccatiError
+from wfsobs.signal.autoregressive import Ar2, Ar3
+from wfsobs.signal.gains import RiccatiError
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.spectral.model import BACKGROUND_WORTH, Spectrum, densities
-from wfsobs.spectral.periodogram import periodogram_frequencies
 from wfsobs.spectral.quick import WindowFit, quick_spectrum
+from wfsobs.spectral.whittle import periodogram_frequencies
 
 DT, NOISE = 1e-3, 0.014
 TURBULENCE = Ar2(7.0, 0.9, 0.5, DT)

@@ -10,14 +10,13 @@ import pytest
 
 from tests.observers.test_adaptive import DT, MODEL, NOISE, PEAK, TURBULENCE, made, rms, with_window
 from wfsobs.execution import run_observer
-from wfsobs.observers.estimates import TOTAL
 from wfsobs.observers.kalman import window_model
 from wfsobs.observers.kalman.single import steady_filter
-from wfsobs.record import Record
+from wfsobs.record import TOTAL, Record
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.spectral.model import Spectrum
-from wfsobs.spectral.periodogram import periodogram_frequencies
 from wfsobs.spectral.quick import quick_spectrum_of_samples
+from wfsobs.spectral.whittle import periodogram_frequencies
 from wfsobs.typing import Array
 
 N = 4000

@@ -22,15 +22,15 @@ from wfsobs.prior import Asterism, Lines, Prior
 from wfsobs.priors_from.scenario import arguments, prior_of, usual_observers
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.settings.errors import SettingError
-from wfsobs.signal.ar2 import Ar2
+from wfsobs.settings.values import SettingError
+from wfsobs.signal.autoregressive import Ar2
+from wfsobs.signal.gains import lyapunov
 from wfsobs.signal.joint_states import PresentInputs, StateFilter, frame_shares
-from wfsobs.signal.riccati import lyapunov
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.simulation.flow_spectra import star_basis
-from wfsobs.simulation.guide_stars import lgs_weights
 from wfsobs.simulation.loop import simulate
-from wfsobs.simulation.synthesis import line_width
+from wfsobs.simulation.sensing import lgs_weights
+from wfsobs.simulation.turbulence import line_width
 from wfsobs.telemetry.records import load_record, save_record
 from wfsobs.testing import check_observer, step_difference
 

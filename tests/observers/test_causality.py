@@ -15,8 +15,7 @@ import pytest
 from tests.records import ON_PAPER
 from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.estimates import Estimates
-from wfsobs.record import Record
+from wfsobs.record import Estimates, Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate

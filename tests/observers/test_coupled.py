@@ -12,8 +12,7 @@ from tests.test_mode_spectra import FLOW
 from wfsobs.campaign.plan import parse_plan
 from wfsobs.campaign.sweep import parse_axis, plan_sweep
 from wfsobs.evaluation.bound import bound, bound_rms
-from wfsobs.evaluation.error_spectra import is_predicted
-from wfsobs.evaluation.exact_errors import exact_errors
+from wfsobs.evaluation.exact_errors import exact_errors, is_predicted
 from wfsobs.evaluation.scores import BOUND, BOUND_MODES, SCORED, half_width
 from wfsobs.evaluation.verdict import verdict
 from wfsobs.execution import run_observer

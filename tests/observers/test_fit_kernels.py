@@ -10,8 +10,7 @@ from scipy.linalg import sqrtm
 
 import wfsobs
 from wfsobs import RecordError
-from wfsobs.observers.gp.kernels import Kernel, Matern, Poles, QuasiPeriodic, Sho, SquaredExponentialInTime, Sum
-from wfsobs.observers.gp.observers import kernels_of
+from wfsobs.observers.gp import Kernel, Matern, Poles, QuasiPeriodic, Sho, SquaredExponentialInTime, Sum, kernels_of
 from wfsobs.prior import Lines
 from wfsobs.priors_from.scenario import prior_of
 from wfsobs.record import Record

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from celerite2 import terms
 
-from wfsobs.observers.gp.kernels import Kernel, Matern, QuasiPeriodic, Sho, SquaredExponentialInTime, Sum, log_likelihood, regress
+from wfsobs.observers.gp import Kernel, Matern, QuasiPeriodic, Sho, SquaredExponentialInTime, Sum, log_likelihood, regress
 from wfsobs.typing import Array
 
 DT, N, NOISE = 1e-3, 300, 0.014

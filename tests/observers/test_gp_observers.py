@@ -9,7 +9,7 @@ import pytest
 
 import wfsobs
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.gp.observers import GaussianProcess, kernels_of
+from wfsobs.observers.gp import GaussianProcess, kernels_of
 from wfsobs.prior import Lines
 from wfsobs.priors_from.scenario import prior_of
 from wfsobs.signal.statespace import disturbance_model

@@ -27,9 +27,9 @@ from wfsobs.observers.gpr.adaptive import (
 )
 from wfsobs.observers.step import StepError
 from wfsobs.record import Record, RecordError, Sampling
-from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.autoregressive import Ar2
+from wfsobs.signal.gains import steady_state
 from wfsobs.signal.periodic import PeriodicFilter
-from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.spectral.model import Spectrum
 from wfsobs.spectral.search import expected_above_zero, missed_variance

@@ -14,13 +14,12 @@ from tests.records import kalman_model
 from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.kalman.single import between_frames, steady_filter
 from wfsobs.priors_from.scenario import arguments, measurement_noise, modelled_processes
-from wfsobs.record import Record
+from wfsobs.record import Estimates, Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.autoregressive import Ar2
 from wfsobs.signal.statespace import paper_matrices
 from wfsobs.simulation.loop import simulate
 

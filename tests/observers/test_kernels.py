@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wfsobs.observers.gpr.kernels import (
+from wfsobs.observers.gpr.windows import (
     ConditionError,
     SquaredExponential,
     band,

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from wfsobs.control.controllers import gpr_online_ahead, of_z
 from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.observers.baselines import online_reference
-from wfsobs.observers.gpr.inputs import scale_of, window_signals
-from wfsobs.observers.gpr.kernels import SquaredExponential
 from wfsobs.observers.gpr.sliding_regression import LateRegression
+from wfsobs.observers.gpr.windows import SquaredExponential, scale_of, window_signals
 from wfsobs.prior import Prior
 from wfsobs.priors_from.scenario import bands_of
 from wfsobs.progress import QUIET

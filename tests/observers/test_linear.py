@@ -11,15 +11,14 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from wfsobs.evaluation.bound import bound_rms
 from wfsobs.execution import run_observer
+from wfsobs.observers.gpr.offline import TAPS, fit, predict
 from wfsobs.observers.kalman.single import steady_filter
-from wfsobs.observers.ridge import TAPS, fit, predict
 from wfsobs.priors_from.scenario import lines_of, measurement_noise, modelled_processes, modelled_turbulence
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.ar3 import Ar3, Ar3Fits
-from wfsobs.signal.riccati import steady_state
+from wfsobs.signal.autoregressive import Ar2, Ar3, Ar3Fits
+from wfsobs.signal.gains import steady_state
 from wfsobs.signal.statespace import disturbance_model, third_order_model
 from wfsobs.simulation.disturbance import vibration_lines
 from wfsobs.simulation.loop import simulate

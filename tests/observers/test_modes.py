@@ -5,7 +5,7 @@ import threading
 import numpy as np
 import pytest
 
-from wfsobs.observers.gpr.inputs import over_modes
+from wfsobs.observers.gpr.windows import over_modes
 from wfsobs.progress import QUIET, Cancelled, Watch
 
 

@@ -15,8 +15,8 @@ from wfsobs.priors_from.scenario import model_of, modelled_processes
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.riccati import RiccatiError, steady_state
+from wfsobs.signal.autoregressive import Ar2
+from wfsobs.signal.gains import RiccatiError, steady_state
 from wfsobs.signal.statespace import disturbance_model, paper_matrices
 from wfsobs.simulation.loop import simulate
 

@@ -12,12 +12,10 @@ from wfsobs import PRESETS, simulate
 from wfsobs.evaluation.scores import calibration
 from wfsobs.execution import run_observer
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.estimates import TOTAL
 from wfsobs.observers.kalman import adaptive
 from wfsobs.observers.kalman.window_model import Adaptive, Lengths, WindowModel, behind_gaps, identify_window, window_lengths
-from wfsobs.record import RecordError
-from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.ar3 import Ar3
+from wfsobs.record import TOTAL, RecordError
+from wfsobs.signal.autoregressive import Ar2, Ar3
 from wfsobs.signal.statespace import sample_ar3
 from wfsobs.spectral.model import Spectrum
 from wfsobs.spectral.quick import WindowFit, follow_spectrum, quick_spectrum

@@ -14,9 +14,9 @@ from wfsobs.prior import LgsError, Model, Prior
 from wfsobs.priors_from.scenario import lgs_error_of, model_of, modelled_processes, prior_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
-from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.autoregressive import Ar2
+from wfsobs.signal.gains import periodic_steady_state, steady_state
 from wfsobs.signal.periodic import PeriodicFilter
-from wfsobs.signal.riccati import periodic_steady_state, steady_state
 from wfsobs.signal.statespace import disturbance_model, process_model
 from wfsobs.simulation.loop import simulate
 

@@ -16,7 +16,7 @@ from wfsobs.observers.baselines import open_loop_reference
 from wfsobs.priors_from.scenario import bands_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.signal.bandpass import bandpass_bank, filter_causal, filter_zero_phase
+from wfsobs.signal.spectrum import bandpass_bank, filter_causal, filter_zero_phase
 from wfsobs.simulation.loop import simulate
 
 

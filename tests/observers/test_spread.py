@@ -16,14 +16,14 @@ import wfsobs
 from tests.records import ON_PAPER
 from wfsobs.evaluation.scores import calibration, crps, half_width
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.gpr.kernels import SquaredExponential
 from wfsobs.observers.gpr.offline import HELD, train
 from wfsobs.observers.gpr.online import predict_sliding
+from wfsobs.observers.gpr.windows import SquaredExponential
 from wfsobs.observers.kalman.single import MultiPeak
 from wfsobs.prior import LgsError, Noise, Prior
 from wfsobs.priors_from.scenario import observer_settings, prior_of
 from wfsobs.record import Measurements
-from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.autoregressive import Ar2
 from wfsobs.tuning.trials import log_marginal_likelihood
 from wfsobs.typing import Array
 

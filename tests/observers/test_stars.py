@@ -16,15 +16,22 @@ from wfsobs import PRESETS
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.gp.observers import kernels_of, measured_late, sampled_model
+from wfsobs.observers.gp import kernels_of, measured_late, sampled_model
 from wfsobs.observers.kalman.multirate import beam_model
 from wfsobs.prior import Prior
-from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
-from wfsobs.priors_from.scenario import arguments, observer_settings, prior_of
+from wfsobs.priors_from.scenario import (
+    arguments,
+    controller_arguments,
+    observer_settings,
+    own_settings,
+    plant_of,
+    prior_for,
+    prior_of,
+)
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.signal.statespace import disturbance_model
-from wfsobs.simulation.guide_stars import low_frequency_process
+from wfsobs.simulation.sensing import low_frequency_process
 from wfsobs.simulation.sensor_noise import noise_rms
 from wfsobs.telemetry.records import load_record, save_record
 from wfsobs.testing import run_loop, run_steps

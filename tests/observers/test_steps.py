@@ -23,13 +23,12 @@ from wfsobs.observers.kalman.step import matrix_power
 from wfsobs.observers.missing import fill_missing
 from wfsobs.observers.step import StepError
 from wfsobs.prior import Bands, Lines, Model, Prior, Training
-from wfsobs.priors_from.controllers import own_settings
-from wfsobs.priors_from.scenario import arguments, has_prior, measurement_noise, observer_settings, prior_of
+from wfsobs.priors_from.scenario import arguments, has_prior, measurement_noise, observer_settings, own_settings, prior_of
 from wfsobs.progress import QUIET
 from wfsobs.record import Record, Sampling, hold_last, pseudo_open_loop
 from wfsobs.scenario import Scenario
+from wfsobs.signal.gains import steady_state
 from wfsobs.signal.joint_states import RIDGE
-from wfsobs.signal.riccati import steady_state
 from wfsobs.testing import run_steps, step_difference
 
 STEPS = [name for name, observer in OBSERVERS.items() if observer.step is not None]

@@ -19,10 +19,9 @@ from wfsobs.priors_from.scenario import model_of, modelled_processes
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
-from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.bandpass import bandpass_bank, filter_causal
-from wfsobs.signal.riccati import steady_state
-from wfsobs.signal.spectrum import random_phase_signal
+from wfsobs.signal.autoregressive import Ar2
+from wfsobs.signal.gains import steady_state
+from wfsobs.signal.spectrum import bandpass_bank, filter_causal, random_phase_signal
 from wfsobs.signal.statespace import paper_matrices
 from wfsobs.simulation.loop import simulate
 

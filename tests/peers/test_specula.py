@@ -19,7 +19,7 @@ from specula.lib.utils import get_type_hints, import_class  # noqa: E402
 from specula.processing_objects.ssr_filter import SsrFilter  # noqa: E402
 
 import wfsobs  # noqa: E402
-from wfsobs.handover.write import write_design  # noqa: E402
+from wfsobs.handover import write_design  # noqa: E402
 from wfsobs.peers.wfsobs_filter import ControllerError  # noqa: E402
 from wfsobs.scenario.configfile import save_scenario  # noqa: E402
 

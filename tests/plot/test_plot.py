@@ -24,14 +24,13 @@ from wfsobs.campaign.sweep import SweepResults, parse_axis, plan_sweep, run_swee
 from wfsobs.cli import main
 from wfsobs.closed_loop.envelope import PlantEnvelope
 from wfsobs.closed_loop.rows import ClosedLoop, residual_rms
-from wfsobs.evaluation.error_spectra import cumulative_rms, spectra
+from wfsobs.evaluation.exact_errors import cumulative_rms, spectra
 from wfsobs.identification.result import Identification
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.estimates import Estimate
-from wfsobs.plot.elements import BINS, save_figure, to_matplotlib
+from wfsobs.plot.elements import BINS, look, save_figure, to_matplotlib
 from wfsobs.plot.figures import plots_of
-from wfsobs.plot.looks import look
 from wfsobs.plot.paper import NUMBERS, draw_paper_figure, observers_in, samples_of
+from wfsobs.record import Estimate
 from wfsobs.signal.spectrum import psd
 
 SHORT = {"run.duration": 3.0, "gpr_offline.training_size": 30, "gpr_online.training_size": 30}

@@ -16,8 +16,7 @@ from wfsobs.app.report.page import page
 from wfsobs.app.report.sections import budget_state_table
 from wfsobs.evaluation.budget import TERMS, error_budget
 from wfsobs.evaluation.evidence import gather_evidence
-from wfsobs.evaluation.result import Result
-from wfsobs.evaluation.rows import row_label, target_title
+from wfsobs.evaluation.result import Result, row_label, target_title
 from wfsobs.evaluation.scores import BOUND, SCORED
 from wfsobs.observers.base import TARGETS
 from wfsobs.pipeline import run

@@ -14,9 +14,8 @@ from tests.report.levels import read_levels
 from wfsobs.app.report.data import Grid, bins_for, state_of, window_of
 from wfsobs.app.report.page import DECADES, LEVELS, STEP, Pool, encode
 from wfsobs.app.work import TRUTH
-from wfsobs.evaluation.error_spectra import cumulative_rms
-from wfsobs.evaluation.result import Result
-from wfsobs.evaluation.rows import score_rows
+from wfsobs.evaluation.exact_errors import cumulative_rms
+from wfsobs.evaluation.result import Result, score_rows
 from wfsobs.signal.spectrum import psd
 
 

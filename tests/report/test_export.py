@@ -15,7 +15,7 @@ from wfsobs import pipeline
 from wfsobs.app.report import page as report_export
 from wfsobs.app.work import RunResults
 from wfsobs.cli import main
-from wfsobs.evaluation.rows import TIME, score_rows
+from wfsobs.evaluation.result import TIME, score_rows
 from wfsobs.progress import QUIET, Cancelled, Watch
 from wfsobs.scenario import Scenario
 

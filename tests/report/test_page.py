@@ -24,13 +24,11 @@ from wfsobs.app.report.data import Grid, Report, state_of
 from wfsobs.app.report.page import page
 from wfsobs.app.report.sections import command_of
 from wfsobs.app.share import FILE, LONGEST
-from wfsobs.evaluation.result import Result
-from wfsobs.evaluation.rows import TIME, is_non_causal, row_label, scored_interval, target_title
+from wfsobs.evaluation.result import TIME, Result, is_non_causal, row_label, scored_interval, target_title
 from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import observe, run
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.configfile import from_toml, scenario_from
-from wfsobs.scenario.grid import Variation, parse_variation, scenarios
+from wfsobs.scenario.configfile import Variation, from_toml, parse_variation, scenario_from, scenarios
 
 MADE = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>&\"'"

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.grid import MOST, Variation, parse_variation, scenarios
-from wfsobs.settings.errors import SettingError
+from wfsobs.scenario.configfile import MOST, Variation, parse_variation, scenarios
+from wfsobs.settings.values import SettingError
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False) | st.integers(-(2**53), 2**53)
 VALUES = st.one_of(

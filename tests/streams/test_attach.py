@@ -26,9 +26,8 @@ from wfsobs.signal.gate import RUN, GateSettings
 from wfsobs.stepping import design
 from wfsobs.streams.attach import Attachment, CommandStream
 from wfsobs.streams.follower import Tally
-from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.shared_image import SharedImage
-from wfsobs.streams.wiring import Fallback, NgsWiring, Safety, Wiring
+from wfsobs.streams.wiring import Fallback, NgsStream, NgsWiring, Safety, Wiring
 
 pytestmark = pytest.mark.slow
 

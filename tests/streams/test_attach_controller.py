@@ -18,9 +18,8 @@ from wfsobs.control.supervisor import SupervisedController, Supervision
 from wfsobs.control.true_plant import ActingPlant, TruePlant, drive
 from wfsobs.record import Measurements, Sampling
 from wfsobs.streams.attach import ControllerAttachment
-from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.shared_image import SharedImage
-from wfsobs.streams.wiring import NgsWiring, Wiring
+from wfsobs.streams.wiring import NgsStream, NgsWiring, Wiring
 
 pytestmark = pytest.mark.slow
 

@@ -25,9 +25,8 @@ from wfsobs.cli import main
 from wfsobs.stepping import design
 from wfsobs.streams import network
 from wfsobs.streams.attach import Attachment
-from wfsobs.streams.layout import StreamError
 from wfsobs.streams.network import BURST, LARGEST, Publication, Subscription
-from wfsobs.streams.shared_image import SharedImage
+from wfsobs.streams.shared_image import SharedImage, StreamError
 from wfsobs.streams.wiring import Safety, Wiring
 
 ANYWHERE = "tcp://127.0.0.1:*"

@@ -17,9 +17,8 @@ from tests.streams.conftest import ENOUGH, started
 from wfsobs.cli import main
 from wfsobs.stepping import design
 from wfsobs.streams.attach import Attachment
-from wfsobs.streams.ngs_frames import SEARCH, NgsStream
 from wfsobs.streams.shared_image import SharedImage
-from wfsobs.streams.wiring import NgsWiring, Safety, Wiring
+from wfsobs.streams.wiring import SEARCH, NgsStream, NgsWiring, Safety, Wiring
 
 pytestmark = pytest.mark.slow
 

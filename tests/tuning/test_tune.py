@@ -23,12 +23,12 @@ from wfsobs.progress import QUIET, Cancelled, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.sensor_noise import noise_covariance
 from wfsobs.tuning import Evaluation, tune
 from wfsobs.tuning.records import NEXT, REFERENCE, TRUTH, cut_record, piece, reference, simulate_records, space, stream
-from wfsobs.tuning.report import tuning_dict, tuning_toml
+from wfsobs.tuning.tuning import tuning_dict, tuning_toml
 
 pytestmark = pytest.mark.slow
 

@@ -23,7 +23,7 @@ from wfsobs.app.store import Store
 from wfsobs.app.style import HtmlComponent, labels, script, sheets
 from wfsobs.app.views.plots import AFTERWARDS_MS, once
 from wfsobs.app.work import RunResults
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 
 LARGEST = 2_000_000
 """Of a scenario file that is opened [bytes]."""

@@ -14,8 +14,7 @@ from wfsobs.app.sources import LoadedRecord, Step, give_same_record
 from wfsobs.app.style import observers_of
 from wfsobs.app.work import TRUTH, Key, RunResults, SignalAndError
 from wfsobs.evaluation.evidence import Evidence
-from wfsobs.evaluation.result import Result
-from wfsobs.evaluation.rows import row_label, target_title
+from wfsobs.evaluation.result import Result, row_label, target_title
 from wfsobs.evaluation.scores import Score
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario

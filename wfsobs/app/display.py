@@ -9,11 +9,11 @@ import param
 
 from wfsobs.app.compared import ComparedRun, DrawnLines
 from wfsobs.app.glossary import LAG, REAL_TIME, RELATIVE, RMS_ERROR, STATED, TERMS
-from wfsobs.evaluation.error_spectra import cumulative_rms
+from wfsobs.evaluation.exact_errors import cumulative_rms
 from wfsobs.evaluation.scores import OF_STAR
 from wfsobs.scenario import Scenario
-from wfsobs.sensors.modes import HIGHEST_ORDER, TIP_TILT, Mode, modes_up_to
-from wfsobs.settings.parameters import unit_of
+from wfsobs.sensors.zernike import HIGHEST_ORDER, TIP_TILT, Mode, modes_up_to
+from wfsobs.settings.values import unit_of
 from wfsobs.typing import Array
 from wfsobs.units import micrometres_per, unit_text
 

@@ -10,7 +10,7 @@ from markupsafe import Markup, escape
 from wfsobs.app.render import macro, render
 from wfsobs.app.style import HtmlComponent, script, sheets
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.evaluation.rows import target_title
+from wfsobs.evaluation.result import target_title
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TURBULENCE, VIBRATION
 

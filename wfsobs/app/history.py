@@ -36,11 +36,11 @@ from wfsobs.app.store import Store
 from wfsobs.app.style import NO_ROOM, HtmlComponent, look, script, sheets
 from wfsobs.app.work import RunResults
 from wfsobs.evaluation.evidence import Evidence, rank_observers
-from wfsobs.evaluation.rows import can_be_best
+from wfsobs.evaluation.result import can_be_best
 from wfsobs.evaluation.scores import PREDICTION
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario.names import name_settings
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 
 AFTER_DRAWING = 1
 """Precedence of a watcher that comes after the figures, whose own is 0, and before the status line, whose own is 2."""

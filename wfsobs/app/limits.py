@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from wfsobs.app.jobs import Job, Work
 from wfsobs.cost import run_bytes, run_seconds
 from wfsobs.scenario import Scenario
-from wfsobs.settings.errors import SettingError
-from wfsobs.settings.parameters import Reals
+from wfsobs.settings.values import Reals, SettingError
 
 
 @dataclass(frozen=True)

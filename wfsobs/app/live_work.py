@@ -15,7 +15,7 @@ from wfsobs.app.service import Service
 from wfsobs.live.loop import LiveLoop, LiveOrder
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 
 LOOK = 0.2
 """Pause between two looks whether the loop goes on [s]."""

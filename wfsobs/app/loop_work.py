@@ -15,7 +15,7 @@ from wfsobs.closed_loop.run import each_outcome
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.margins import Curves, curves
 from wfsobs.dependence import Memo
-from wfsobs.priors_from.controllers import own_settings
+from wfsobs.priors_from.scenario import own_settings
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.signal.spectrum import psd

@@ -53,7 +53,7 @@ from wfsobs.campaign.follow import CampaignFolder
 from wfsobs.live.loop import LiveOrder
 from wfsobs.live.source import prefer
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 
 log = logging.getLogger(__name__)
 

@@ -26,7 +26,7 @@ from wfsobs.dependence import Memo
 from wfsobs.progress import Watch
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 
 if TYPE_CHECKING:
     from wfsobs.campaign.follow import CampaignFolder

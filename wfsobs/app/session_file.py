@@ -25,13 +25,13 @@ from wfsobs.app.service import run_key
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, Step, record_key
 from wfsobs.app.work import RunResults
 from wfsobs.evaluation.evidence import Evidence
-from wfsobs.evaluation.rows import NOT_OBSERVERS
+from wfsobs.evaluation.result import NOT_OBSERVERS
 from wfsobs.evaluation.scores import Calibration, Score
 from wfsobs.observers import OBSERVERS
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 from wfsobs.telemetry.columns import to_contents
 from wfsobs.telemetry.formats import npz
 from wfsobs.telemetry.intake import LONGEST_DELAY, DeclaredFormat, to_record

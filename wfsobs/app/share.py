@@ -29,8 +29,8 @@ from wfsobs.live.source import STREAM
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.configfile import from_toml, parse_toml, reference_preset, to_toml
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.errors import SettingError
 from wfsobs.settings.group import holds_groups, settings_of
+from wfsobs.settings.values import SettingError
 from wfsobs.telemetry.columns import ROLES, SIGNALS
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.preview import safe_name

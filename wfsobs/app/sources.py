@@ -11,7 +11,7 @@ from wfsobs.pipeline import as_stated
 from wfsobs.progress import Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.sensors.modes import HIGHEST_ORDER, order_of
+from wfsobs.sensors.zernike import HIGHEST_ORDER, order_of
 from wfsobs.telemetry.intake import DeclaredFormat
 
 

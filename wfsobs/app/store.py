@@ -28,7 +28,7 @@ from wfsobs.cost import rerun_seconds, run_seconds
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings, reference_preset
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.preview import Preview
 

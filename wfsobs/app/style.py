@@ -1,6 +1,6 @@
 """What the page is made of: its own components, whose parameters go down to the browser and messages up; texts, buttons, colours.
 
-Colours of observers and controllers are `wfsobs.plot.looks`.
+Colours of observers and controllers are `wfsobs.plot.elements`.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from panel.custom import JSComponent
 
 from wfsobs.app.render import Row, macro
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.evaluation.rows import NO_ESTIMATE
+from wfsobs.evaluation.result import NO_ESTIMATE
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, Look
-from wfsobs.observers.estimates import TOTAL
-from wfsobs.plot.looks import LOOKS as LOOKS
-from wfsobs.plot.looks import TERM_COLOURS as TERM_COLOURS
-from wfsobs.plot.looks import look as look
+from wfsobs.plot.elements import LOOKS as LOOKS
+from wfsobs.plot.elements import TERM_COLOURS as TERM_COLOURS
+from wfsobs.plot.elements import look as look
+from wfsobs.record import TOTAL
 
 
 class Component(JSComponent):

@@ -32,8 +32,8 @@ from wfsobs.app.views.plots import new_spectrum, send
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.names import name_settings
-from wfsobs.sensors.modes import TIP_TILT
-from wfsobs.settings.errors import SettingError
+from wfsobs.sensors.zernike import TIP_TILT
+from wfsobs.settings.values import SettingError
 from wfsobs.telemetry.columns import ROLES
 from wfsobs.telemetry.formats import FORMATS
 from wfsobs.telemetry.intake import DeclaredFormat

@@ -20,18 +20,16 @@ from wfsobs.app.jobs import INTERVAL, Tell
 from wfsobs.app.sources import Source
 from wfsobs.dependence import Memo, RecordMemo, digest, simulate_once
 from wfsobs.evaluation.bound import Bound, joint_observers, record_bounds
-from wfsobs.evaluation.error_spectra import spectra
-from wfsobs.evaluation.result import Failure, Result
-from wfsobs.evaluation.rows import NO_ESTIMATE
+from wfsobs.evaluation.exact_errors import spectra
+from wfsobs.evaluation.result import NO_ESTIMATE, Failure, Result
 from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import SLOW, TARGETS
-from wfsobs.observers.estimates import Estimate
 from wfsobs.pipeline import as_stated, collect, with_gate
 from wfsobs.prior import GIVEN, TRUE
 from wfsobs.priors_from.scenario import usual_observers
 from wfsobs.progress import Watch
-from wfsobs.record import Record
+from wfsobs.record import Estimate, Record
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import record_settings
 from wfsobs.typing import Array

@@ -38,10 +38,9 @@ from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, VIBRATION
 from wfsobs.observers.baselines import online_reference
-from wfsobs.observers.gpr.inputs import window_signals
-from wfsobs.observers.gpr.kernels import SquaredExponential
 from wfsobs.observers.gpr.offline import train, training_targets
 from wfsobs.observers.gpr.online import gpr_online, kernel_of
+from wfsobs.observers.gpr.windows import SquaredExponential, window_signals
 from wfsobs.observers.kalman.adaptive import adapt
 from wfsobs.observers.kalman.multirate import multirate_filter, multirate_noise
 from wfsobs.observers.kalman.single import steady_filter
@@ -52,7 +51,7 @@ from wfsobs.progress import QUIET
 from wfsobs.record import Record, pseudo_open_loop
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
-from wfsobs.signal.riccati import steady_state
+from wfsobs.signal.gains import steady_state
 from wfsobs.signal.statespace import paper_matrices
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.turbulence import SOURCES

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import cho_factor, cho_solve
 
-from wfsobs.observers.gpr.kernels import SquaredExponential
+from wfsobs.observers.gpr.windows import SquaredExponential
 from wfsobs.typing import Array
 
 BLOCK = 256

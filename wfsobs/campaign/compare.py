@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from wfsobs.evaluation.evidence import columns_differ
-from wfsobs.evaluation.rows import NOT_OBSERVERS, can_be_best
+from wfsobs.evaluation.result import NOT_OBSERVERS, can_be_best
 from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS
 from wfsobs.observers import OBSERVERS
 from wfsobs.typing import Array

@@ -13,7 +13,7 @@ from multiprocessing.connection import wait
 from time import monotonic
 from typing import Any
 
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 
 DASK_TIMEOUT = 60.0
 """How long a scheduler may be away before a campaign gives up [s]."""

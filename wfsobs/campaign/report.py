@@ -22,7 +22,7 @@ from wfsobs.campaign.compare import LEVEL, Comparison, compare, comparison_group
 from wfsobs.campaign.plan import Campaign
 from wfsobs.campaign.store import finished_runs, folder_plan, present_rows, read_results
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.evaluation.rows import NOT_OBSERVERS
+from wfsobs.evaluation.result import NOT_OBSERVERS
 from wfsobs.files import write_text
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario.names import setting_label

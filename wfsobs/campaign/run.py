@@ -34,14 +34,12 @@ from wfsobs.closed_loop.rows import rows as loop_rows
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.cost import run_seconds
 from wfsobs.evaluation.bound import Bound, record_bounds
-from wfsobs.evaluation.result import Failure
-from wfsobs.evaluation.rows import TIME, score_rows
+from wfsobs.evaluation.result import TIME, Failure, score_rows
 from wfsobs.execution import each_estimate
-from wfsobs.observers.estimates import Estimate
 from wfsobs.pipeline import collect
-from wfsobs.record import Record
+from wfsobs.record import Estimate, Record
 from wfsobs.scenario import Scenario
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
 

@@ -18,11 +18,11 @@ import numpy as np
 
 from wfsobs.campaign.plan import Campaign
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.evaluation.rows import NOT_OBSERVERS
+from wfsobs.evaluation.result import NOT_OBSERVERS
 from wfsobs.files import write_text, write_whole
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 from wfsobs.typing import Array
 from wfsobs.version import __version__
 

@@ -28,11 +28,9 @@ from wfsobs.pipeline import observe
 from wfsobs.priors_from.scenario import common_observers
 from wfsobs.progress import QUIET, Watch
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.configfile import format_value
-from wfsobs.scenario.grid import Variation, parse_variation
-from wfsobs.scenario.idle import idle_settings, why_idle_at
-from wfsobs.settings.errors import SettingError
-from wfsobs.settings.tree import leaves
+from wfsobs.scenario.configfile import Variation, format_value, parse_variation
+from wfsobs.scenario.scenario import idle_settings, why_idle_at
+from wfsobs.settings.values import SettingError, leaves
 from wfsobs.simulation.loop import simulate
 
 Changes = Mapping[str, Any]

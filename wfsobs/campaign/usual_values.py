@@ -9,8 +9,7 @@ import param
 
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import format_value
-from wfsobs.settings.errors import SettingError
-from wfsobs.settings.parameters import Reals
+from wfsobs.settings.values import Reals, SettingError
 
 
 def usual_values(scenario: Scenario, path: str) -> str:

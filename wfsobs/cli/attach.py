@@ -27,19 +27,16 @@ from wfsobs.control.supervisor import SupervisedController, Supervision
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.step import StepError, StepObserver
 from wfsobs.prior import LgsError, Lines, Model, Part, Training
-from wfsobs.priors_from.controllers import own_settings
-from wfsobs.priors_from.scenario import observer_settings
+from wfsobs.priors_from.scenario import observer_settings, own_settings
 from wfsobs.record import DELAY, Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 from wfsobs.stepping import design, prior_in
 from wfsobs.streams.attach import Attachment, CommandStream, ControllerAttachment
 from wfsobs.streams.follower import StreamFollower
-from wfsobs.streams.layout import StreamError
 from wfsobs.streams.network import Publication, Subscription, is_address
-from wfsobs.streams.ngs_frames import NgsStream
-from wfsobs.streams.shared_image import SharedImage, stream_path
-from wfsobs.streams.wiring import LIMIT, STUCK, Fallback, Safety, Wiring, check_elements
+from wfsobs.streams.shared_image import SharedImage, StreamError, stream_path
+from wfsobs.streams.wiring import LIMIT, STUCK, Fallback, NgsStream, Safety, Wiring, check_elements
 from wfsobs.units import UNITS, micrometres_per
 
 OBSERVERS_ALONE = ("name", "shadow", "commands", "delay", "fallback")

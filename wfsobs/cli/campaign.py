@@ -1,8 +1,9 @@
-"""`wfsobs campaign`: many scenarios and seeds, on many processes or machines, and their results in the terminal."""
+"""`wfsobs campaign` and `wfsobs sweep`: errors over settings and seeds, on many processes or machines."""
 
 from __future__ import annotations
 
 import csv
+import io
 import math
 import re
 import signal
@@ -13,7 +14,7 @@ from dataclasses import astuple, fields
 from pathlib import Path
 from time import perf_counter
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
@@ -21,23 +22,26 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from wfsobs.campaign.compare import QUANTILES, Comparison, compare
-from wfsobs.campaign.follow import CampaignFolder
-from wfsobs.campaign.plan import Campaign, load_plan
+from wfsobs.campaign.follow import CampaignFolder, TogetherRow, standings
+from wfsobs.campaign.plan import Campaign, cells_where, load_plan
 from wfsobs.campaign.pools import DaskCluster, Processes, usable_processors
 from wfsobs.campaign.run import BATCH, run_campaign, run_cost, run_rows
 from wfsobs.campaign.run import Progress as State
-from wfsobs.campaign.selection import cells_where
-from wfsobs.campaign.standings import TogetherRow, standings
 from wfsobs.campaign.store import RESULTS, add_settings, finished_runs, folder_plan, need_pyarrow, present_rows, read_results
-from wfsobs.cli.options import json_option
-from wfsobs.cli.show import new_table, print_json, print_note, show_table
-from wfsobs.evaluation.rows import NOT_OBSERVERS
+from wfsobs.campaign.sweep import MOST_SEEDS, SweepResults, parse_axis, plan_sweep, run_sweep
+from wfsobs.cli.options import json_option, observer_option, scenario_options
+from wfsobs.cli.show import new_table, print_json, print_note, progress_bar, show_table
+from wfsobs.evaluation.evidence import FEWEST
+from wfsobs.evaluation.result import NOT_OBSERVERS, row_label
 from wfsobs.evaluation.scores import COMMON_BOUNDS, SCORED
+from wfsobs.files import check_writable, write_text
 from wfsobs.observers import OBSERVERS
-from wfsobs.settings.errors import SettingError
+from wfsobs.scenario import Scenario
+from wfsobs.settings.values import SettingError
 
 if TYPE_CHECKING:
     import pyarrow
+
 
 SPREAD = f"{', '.join(f'{q * 100:g}' for q in QUANTILES)} % of seeds"
 """Heading of the quantiles."""
@@ -394,3 +398,78 @@ def report(folder: str, out: str | None) -> None:
     path = Path(out) if out else Path(folder) / "report.html"
     write_report(Path(folder), path)
     print_note(f"{path}: written")
+
+
+@click.command()
+@scenario_options
+@click.option(
+    "--over",
+    "axes",
+    multiple=True,
+    required=True,
+    metavar="NAME=VALUES",
+    help="Setting and its values: low:high:number, low:high:number:log or v1,v2,v3; repeated for a map over two settings.",
+)
+@click.option(
+    "--seeds",
+    type=click.IntRange(1, MOST_SEEDS),
+    default=4,
+    metavar="N",
+    help=f"Seeds of every scenario; no difference is significant with fewer than {FEWEST}.",
+)
+@observer_option
+@click.option("--csv", "csv_file", metavar="FILE", help="Save the errors of all observers.")
+def sweep(
+    scenario: Scenario,
+    axes: tuple[str, ...],
+    seeds: int,
+    observers: tuple[str, ...],
+    csv_file: str | None,
+) -> None:
+    """Run a scenario over the values of one or two settings and print the best observer in each (docs/sweeps.md)."""
+    plan = plan_sweep(scenario, [parse_axis(text) for text in axes], seeds, observers or None)
+    if csv_file:
+        check_writable(csv_file)
+    print_note(f"{len(plan.cells)} scenarios x {seeds} seeds = {plan.n_runs} runs, about {plan.seconds:.2g} s")
+    with progress_bar("runs") as watch:
+        results = run_sweep(plan, watch)
+    if csv_file:
+        write_text(csv_file, _csv(results.rows()))
+    show_table(_winners(results))
+    for cell, reason in results.failures.items():
+        print_note(f"{_settings(results, cell)}: {reason}")
+
+
+def _csv(rows: Sequence[dict[str, Any]]) -> str:
+    text = io.StringIO()
+    if rows:
+        writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    return text.getvalue()
+
+
+def _settings(results: SweepResults, cell: int) -> str:
+    return ", ".join(f"{path} = {value}" for path, value in results.sweep.cells[cell].items())
+
+
+def _winners(results: SweepResults) -> Table:
+    """Return a table with one row per scenario, target and mode."""
+    caption = f"~: another is not significantly worse, or fewer than {FEWEST} seeds"
+    out = new_table(
+        ("Settings", "Target", "Mode", "Best"),
+        ("mean rms, nm", "before the next, %"),
+        no_wrap=False,
+        title="Best observers",
+        caption=caption,
+    )
+    out.add_column("Equal to")
+    groups = list(dict.fromkeys(key[1:] for key in results.known_keys()))
+    for cell in range(len(results.sweep.cells)):
+        for target, mode in groups:
+            best = results.winner(cell, target, mode)
+            if best is not None:
+                margin = "" if best.margin is None else f"{'' if best.is_significant else '~'}{100 * best.margin:.1f}"
+                tied = ", ".join(map(row_label, best.ties))
+                out.add_row(_settings(results, cell), target, mode, row_label(best.name), f"{1e3 * best.rms:.2f}", margin, tied)
+    return out

@@ -21,11 +21,11 @@ from wfsobs.cli.options import (
 )
 from wfsobs.cli.show import print_note, progress_bar, warn
 from wfsobs.files import check_writable
-from wfsobs.handover.write import FORMATS, write_design
+from wfsobs.handover import FORMATS, write_design
 from wfsobs.pipeline import observe, run
 from wfsobs.plot.paper import NUMBERS, draw_paper_figure, observers_in
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.grid import MOST, parse_variation
+from wfsobs.scenario.configfile import MOST, parse_variation
 from wfsobs.settings.group import SettingError
 from wfsobs.telemetry.intake import DeclaredFormat
 

@@ -33,7 +33,7 @@ COMMANDS = {
     "rt-check": ("bench", "Tell what this machine can hold: how late a loop at the LGS rate wakes, and what a step takes in it."),
     "run": ("simulate", "Simulate the loop, run every observer and print the RMS table."),
     "serve": ("serve", "Serve the dashboard."),
-    "sweep": ("sweep", "Run a scenario over the values of one or two settings and print the best observer in each."),
+    "sweep": ("campaign", "Run a scenario over the values of one or two settings and print the best observer in each."),
     "tune": ("tuning", "Search for the best settings of an observer on a record, or of a controller on uncertain plants."),
 }
 """Command -> the module of this package where it is, and its line in `wfsobs --help`."""
@@ -77,7 +77,7 @@ class Commands(click.Group):
             return super().invoke(ctx)
         except ValueError as error:
             from wfsobs.record import RecordError
-            from wfsobs.settings.errors import SettingError
+            from wfsobs.settings.values import SettingError
 
             if not isinstance(error, (SettingError, RecordError)):
                 raise

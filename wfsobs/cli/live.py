@@ -35,12 +35,9 @@ from wfsobs.live.checks import can_control, check_slot, observers_on
 from wfsobs.live.crew import USUAL
 from wfsobs.live.follow import follow
 from wfsobs.live.loop import LiveOrder
-from wfsobs.live.programme import acts_of
-from wfsobs.live.recording import open_loop_record, record_of
-from wfsobs.live.replay import Replay
-from wfsobs.live.ring import LiveFrame
-from wfsobs.live.simulated import SimulatedLoop
-from wfsobs.live.source import LiveSource
+from wfsobs.live.ring import LiveFrame, open_loop_record, record_of
+from wfsobs.live.simulated import SimulatedLoop, acts_of
+from wfsobs.live.source import LiveSource, Replay
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.settings.group import SettingError
 from wfsobs.streams.network import is_address

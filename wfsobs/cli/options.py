@@ -14,12 +14,11 @@ from click.core import ParameterSource
 
 from wfsobs.cli.show import print_note
 from wfsobs.closed_loop.envelope import Uncertainty
-from wfsobs.priors_from.identification import told_by
-from wfsobs.priors_from.training import training_part
+from wfsobs.priors_from.telemetry import told_by, training_part
 from wfsobs.record import DELAY, Record
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 from wfsobs.streams.wiring import STUCK, NgsWiring
 from wfsobs.telemetry.command_response import saturation_lines
 from wfsobs.telemetry.intake import LONGEST_DELAY, DeclaredFormat

@@ -18,11 +18,10 @@ from rich.table import Table
 
 from wfsobs.evaluation.budget import TERMS, Budget
 from wfsobs.evaluation.evidence import Evidence, seeds_interval
-from wfsobs.evaluation.recovery import PooledRms, Recovery, recovery, running_rms
-from wfsobs.evaluation.result import Result
-from wfsobs.evaluation.rows import (
+from wfsobs.evaluation.result import (
     NOT_OBSERVERS,
     TIME,
+    Result,
     Row,
     above_bound,
     interval_text,
@@ -32,12 +31,12 @@ from wfsobs.evaluation.rows import (
     row_label,
     scored_interval,
 )
-from wfsobs.evaluation.scores import PREDICTION, RESIDUAL, SCORED
+from wfsobs.evaluation.scores import PREDICTION, RESIDUAL, SCORED, PooledRms, Recovery, recovery, running_rms
 from wfsobs.evaluation.verdict import explain_harm, verdict
 from wfsobs.observers.base import TARGETS
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 
 MOST_TIMES = 8
 """Columns of times in a table."""

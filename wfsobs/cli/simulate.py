@@ -46,16 +46,15 @@ from wfsobs.closed_loop.rows import rows as loop_rows
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.evaluation.budget import Budget, budget_row, error_budget
 from wfsobs.evaluation.evidence import FEWEST, gather_evidence, seeds_interval
-from wfsobs.evaluation.result import Result
-from wfsobs.evaluation.rows import Row, interval_text, score_rows
+from wfsobs.evaluation.result import Result, Row, interval_text, score_rows
 from wfsobs.files import check_writable
 from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import as_stated
 from wfsobs.pipeline import observe as observe_record
 from wfsobs.prior import GIVEN
-from wfsobs.priors_from.training import trained_until, with_training
+from wfsobs.priors_from.telemetry import trained_until, with_training
 from wfsobs.scenario import Scenario, configfile
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.formats.psd import load_psd
 from wfsobs.telemetry.intake import DeclaredFormat

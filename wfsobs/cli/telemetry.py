@@ -32,23 +32,28 @@ from wfsobs.cli.show import new_table, print_json, print_note, progress_bar, sho
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.promise import make_promise
 from wfsobs.closed_loop.rows import label
-from wfsobs.control.integrator import gain_from_telemetry
-from wfsobs.evaluation.rows import score_rows
+from wfsobs.control.laws import gain_from_telemetry
+from wfsobs.evaluation.result import score_rows
 from wfsobs.files import check_writable, write_text
 from wfsobs.identification import identify as identify_record
-from wfsobs.identification import report as identified
-from wfsobs.identification.identification import LEVEL
+from wfsobs.identification.identification import (
+    LEVEL,
+    format_number,
+    identification_dict,
+    identification_toml,
+    mode_rows,
+    whiteness_lines,
+)
 from wfsobs.identification.plant import identify_plant, plant_dict, plant_lines
-from wfsobs.identification.probe import design_probe
+from wfsobs.identification.plant_likelihood import design_probe
 from wfsobs.identification.process import Number
-from wfsobs.identification.report import format_number, mode_rows
 from wfsobs.identification.result import Identification
 from wfsobs.pipeline import as_stated
 from wfsobs.pipeline import observe as observe_record
-from wfsobs.priors_from.controllers import plant_of
+from wfsobs.priors_from.scenario import plant_of
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
+from wfsobs.sensors.zernike import HIGHEST_ORDER, modes_up_to
 from wfsobs.spectral.search import LOWEST
 from wfsobs.telemetry.check import Check, check_record
 from wfsobs.telemetry.intake import DeclaredFormat, to_record
@@ -166,12 +171,12 @@ def identify(
     with errors_of(record_file), progress_bar("sweeps") as watch:
         result = identify_record(record, level=level, lowest=lowest, watch=watch)
     if out:
-        write_text(out, identified.identification_toml(result, result.scenario(as_stated(record, scenario))))
+        write_text(out, identification_toml(result, result.scenario(as_stated(record, scenario))))
     if as_json:
-        print_json(identified.identification_dict(result))
+        print_json(identification_dict(result))
         return
     show_table(identification_table(result))
-    for line in identified.whiteness_lines(result):
+    for line in whiteness_lines(result):
         click.echo(line)
 
 
@@ -337,7 +342,7 @@ def check(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha
             "read_as": record.origin,
             "plant": plant_dict(result.plant) if result.plant else None,
             "findings": [asdict(f) for f in result.findings],
-            "identification": result.identification and identified.identification_dict(result.identification),
+            "identification": result.identification and identification_dict(result.identification),
             "reliable": result.is_reliable,
             "next": command,
         }

@@ -27,12 +27,24 @@ from wfsobs.files import check_writable, write_text
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 from wfsobs.telemetry.intake import DeclaredFormat
-from wfsobs.tuning import EnvelopeGoal, report
+from wfsobs.tuning import EnvelopeGoal
 from wfsobs.tuning import tune as search
-from wfsobs.tuning.report import nm, settings
-from wfsobs.tuning.tuning import EVALUATIONS, TuningResult
+from wfsobs.tuning.tuning import (
+    EVALUATIONS,
+    OTHER,
+    TEST,
+    TOGETHER,
+    VALIDATION,
+    TuningResult,
+    nm,
+    settings,
+    tuning_dict,
+    tuning_remarks,
+    tuning_rows,
+    tuning_toml,
+)
 
 
 def settings_table(result: TuningResult) -> Table:
@@ -50,12 +62,10 @@ def errors_table(result: TuningResult) -> Table:
         ("validation, before", "after", "test, before", "after"),
         title=f"{result.measure}{'' if result.target == PREDICTION else f' in {result.target}'}, nm",
     )
-    rows = report.tuning_rows(result)
-    validation, test, other = (
-        [row[1:] for row in rows if row[0] == section] for section in (report.VALIDATION, report.TEST, report.OTHER)
-    )
+    rows = tuning_rows(result)
+    validation, test, other = ([row[1:] for row in rows if row[0] == section] for section in (VALIDATION, TEST, OTHER))
     for (name, *searched), (_, *tested) in zip(validation, test, strict=True):
-        if name == report.TOGETHER:
+        if name == TOGETHER:
             out.add_section()
         out.add_row(name, *map(_error, (*searched, *tested)))
     for _, *tested in other:
@@ -174,11 +184,11 @@ def tune(
             watch=watch,
         )
     if out:
-        write_text(out, report.tuning_toml(tuned))
+        write_text(out, tuning_toml(tuned))
     if as_json:
-        print_json(report.tuning_dict(tuned))
+        print_json(tuning_dict(tuned))
         return
     show_table(settings_table(tuned))
     show_table(errors_table(tuned) if tuned.after.spreads is None else spreads_table(tuned))
-    for line in report.tuning_remarks(tuned):
+    for line in tuning_remarks(tuned):
         click.echo(line)

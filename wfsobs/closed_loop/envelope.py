@@ -23,14 +23,13 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.mirror import Law, Mirror
 from wfsobs.control.mismatch import loops, pairs, radius, stack_weights, weigh
 from wfsobs.control.true_plant import TruePlant
-from wfsobs.evaluation.rows import Row
+from wfsobs.evaluation.result import Row
 from wfsobs.notebook import PlotAccessor, import_extra
-from wfsobs.priors_from.controllers import full_plant_of, own_settings, plant_of, prior_for
-from wfsobs.priors_from.scenario import told_spectra
+from wfsobs.priors_from.scenario import full_plant_of, own_settings, plant_of, prior_for, told_spectra
 from wfsobs.progress import QUIET, Watch
 from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
-from wfsobs.settings.errors import SettingError, error_line
+from wfsobs.settings.values import SettingError, error_line
 from wfsobs.signal.joint_states import in_two_threads
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, true_spectra

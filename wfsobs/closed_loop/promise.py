@@ -32,12 +32,19 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError, hold_last
 from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
-from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
+from wfsobs.sensors.zernike import HIGHEST_ORDER, modes_up_to
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import true_spectra
 from wfsobs.spectral.missing import MissingSamples, find_outlying
-from wfsobs.spectral.periodogram import Cells, fast_length, inflation, periodogram, periodogram_frequencies
-from wfsobs.spectral.whittle import fit_spectrum, spectrum_information
+from wfsobs.spectral.whittle import (
+    Cells,
+    fast_length,
+    fit_spectrum,
+    inflation,
+    periodogram,
+    periodogram_frequencies,
+    spectrum_information,
+)
 from wfsobs.typing import Array
 
 DRAWS, RECORDS = 64, 8

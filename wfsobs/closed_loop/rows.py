@@ -12,12 +12,12 @@ import numpy as np
 from wfsobs.closed_loop.design import Design
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.evidence import means_differ
-from wfsobs.evaluation.rows import NOT_OBSERVERS, TRUE_SPECTRA, Row, knowledge_of
+from wfsobs.evaluation.result import NOT_OBSERVERS, TRUE_SPECTRA, Row, knowledge_of
 from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS, batch_means, rms_interval
 from wfsobs.evaluation.verdict import Contender, Verdict
 from wfsobs.notebook import PlotAccessor, import_extra
 from wfsobs.prior import TRUE, PriorSource, Spectra, words_for
-from wfsobs.priors_from.controllers import own_settings
+from wfsobs.priors_from.scenario import own_settings
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.spectrum import rms

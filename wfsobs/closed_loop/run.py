@@ -21,12 +21,12 @@ from wfsobs.control.supervisor import SupervisedController
 from wfsobs.control.true_plant import drive
 from wfsobs.dependence import Memo, digest, record_digest
 from wfsobs.pipeline import as_stated
-from wfsobs.priors_from.controllers import controller_arguments, full_plant_of, own_settings, supervision_of
+from wfsobs.priors_from.scenario import controller_arguments, full_plant_of, own_settings, supervision_of
 from wfsobs.progress import QUIET, Watch, detach_watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.idle import used_settings
-from wfsobs.settings.errors import error_line
+from wfsobs.scenario.scenario import used_settings
+from wfsobs.settings.values import error_line
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
 

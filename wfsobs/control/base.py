@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from wfsobs.control.integrator import limited_integrator
+from wfsobs.control.laws import limited_integrator
 from wfsobs.control.mirror import Law, Mirror, Plant
 from wfsobs.control.step import MakeStepLaw, StepController, StepLaw, StepPredict, VibrationAhead, step_law, take_missing
 from wfsobs.observers.base import NOT_TUNED, NOTHING, PLAIN, Look, Tunable, check_look

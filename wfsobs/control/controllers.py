@@ -12,9 +12,7 @@ from typing import Any, TypeVar
 
 from wfsobs import registry
 from wfsobs.control.base import Controller
-from wfsobs.control.h2 import h2_fir
-from wfsobs.control.integrator import best_gain, integrator_law
-from wfsobs.control.lqg import lqg, lqg_adaptive
+from wfsobs.control.laws import best_gain, h2_fir, integrator_law, lqg, lqg_adaptive
 from wfsobs.control.mirror import Law, Plant
 from wfsobs.observers.base import VIBRATION, Look, Tunable
 from wfsobs.observers.gpr.offline import OfflineEstimator, OfflineGpr, trained_estimator
@@ -41,7 +39,7 @@ from wfsobs.prior import (
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.registry import Registry
-from wfsobs.settings.tree import Plain
+from wfsobs.settings.values import Plain
 from wfsobs.typing import Array
 
 G = TypeVar("G", OfflineGpr, OnlineGpr)

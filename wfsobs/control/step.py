@@ -22,8 +22,8 @@ from wfsobs.observers.step import Estimator, StepBase, StepError, check_frame, t
 from wfsobs.observers.stepping import FilterBank, StateArrays, Stateful
 from wfsobs.prior import Bands, Prior
 from wfsobs.record import Sampling
-from wfsobs.signal.bandpass import bandpass_bank, bank_recursion
 from wfsobs.signal.gate import GateSettings
+from wfsobs.signal.spectrum import bandpass_bank, bank_recursion
 from wfsobs.typing import Array
 
 StepPredict = Callable[[Prior, Plant, Any, Sampling], Estimator]

@@ -32,11 +32,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from wfsobs.evaluation.bound import TRUE_MODEL
-from wfsobs.evaluation.rows import NO_ESTIMATE, given_lines, is_near, own_bound
+from wfsobs.evaluation.result import NO_ESTIMATE, given_lines, is_near, own_bound
 from wfsobs.evaluation.scores import Score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Observer
-from wfsobs.observers.estimates import TOTAL
 from wfsobs.observers.kalman.mode_filter import lgs_mean
 from wfsobs.observers.kalman.multirate import beam_model, estimated_cycle
 from wfsobs.observers.kalman.single import MIN_NOISE, steady_mode
@@ -45,15 +44,13 @@ from wfsobs.observers.step import Estimator
 from wfsobs.prior import Beams, LgsStars, Line, Lines, Prior
 from wfsobs.priors_from.scenario import beams_of, modelled_turbulence, observer_settings, prior_of, vibration_continuum
 from wfsobs.progress import QUIET, Watch, detach_watch
-from wfsobs.record import Measurements, Record, delay_signal, frame_mean
+from wfsobs.record import TOTAL, Measurements, Record, delay_signal, frame_mean
 from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
-from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.ar3 import Ar3
+from wfsobs.signal.autoregressive import Ar2, Ar3
 from wfsobs.simulation.disturbance import vibration_lines
-from wfsobs.simulation.guide_stars import lgs_noise_rms
 from wfsobs.simulation.loop import measure_closed_loop, simulate_noise
-from wfsobs.simulation.sensing import OpenLoop
+from wfsobs.simulation.sensing import OpenLoop, lgs_noise_rms
 from wfsobs.simulation.sensor_noise import noise_rms
 from wfsobs.simulation.turbulence import processes
 from wfsobs.typing import Array

@@ -16,7 +16,7 @@ from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.prior import Prior
 from wfsobs.priors_from.scenario import lgs_error_of, model_of
 from wfsobs.scenario import Scenario
-from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.autoregressive import Ar2
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.statespace import paper_matrices
 from wfsobs.simulation.sensor_noise import aliasing_rms, noise_rms

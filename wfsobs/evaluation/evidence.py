@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtr, stdtrit
 
-from wfsobs.evaluation.rows import EQUAL, NO_ESTIMATE, can_be_best
+from wfsobs.evaluation.result import EQUAL, NO_ESTIMATE, can_be_best
 from wfsobs.evaluation.scores import BOUNDS, Score, scatter_of_mean
 from wfsobs.observers import OBSERVERS
 from wfsobs.typing import Array

@@ -12,7 +12,7 @@ import numpy as np
 
 from wfsobs.evaluation.budget import NOISE, TERMS, Budget, error_budget
 from wfsobs.evaluation.evidence import Evidence, gather_evidence
-from wfsobs.evaluation.rows import (
+from wfsobs.evaluation.result import (
     BANDS,
     EQUAL,
     JOINT_BOUNDS,
@@ -40,9 +40,8 @@ from wfsobs.evaluation.scores import (
 )
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.estimates import Estimate
 from wfsobs.prior import TRUE, PriorSource
-from wfsobs.record import Record
+from wfsobs.record import Estimate, Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.spectrum import psd
 from wfsobs.simulation.disturbance import vibration_lines

@@ -17,13 +17,13 @@ from scipy.optimize import minimize
 from wfsobs.identification.process import Number
 from wfsobs.identification.result import MATCHED, base_scenario, model_settings, seen_z
 from wfsobs.notebook import import_extra
-from wfsobs.observers.gp.kernels import Kernel, Matern, Sho, SquaredExponentialInTime, Sum, log_likelihood
+from wfsobs.observers.gp import Kernel, Matern, Sho, SquaredExponentialInTime, Sum, log_likelihood
 from wfsobs.prior import Line, Lines
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.registry import kind_of
-from wfsobs.sensors.modes import MODE_NAMES
-from wfsobs.signal.ar2 import Ar2
+from wfsobs.sensors.zernike import MODE_NAMES
+from wfsobs.signal.autoregressive import Ar2
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ def fit_kernels(
     record : Record
         Measurements and commands; NaN is a missing sample.
     turbulence, vibration, background : sequence of Kernel
-        Kernels of `wfsobs.observers.gp.kernels` whose sum z is, but for white noise, with the numbers where the search starts:
+        Kernels of `wfsobs.observers.gp` whose sum z is, but for white noise, with the numbers where the search starts:
         rms [um], times [s], natural frequencies [rad/s]. The likelihood does not know which is which; observers do.
     noise : float
         Rms of the white noise where the search starts [um].

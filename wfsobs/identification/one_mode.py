@@ -15,14 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import gamma
 
-from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.ar3 import Ar3
-from wfsobs.spectral.lines import Sinusoid, nearest_line
+from wfsobs.signal.autoregressive import Ar2, Ar3
 from wfsobs.spectral.missing import MissingSamples
 from wfsobs.spectral.model import BACKGROUND_REACHES, BACKGROUND_WORTH, RMS, Spectrum, with_first_guess
-from wfsobs.spectral.periodogram import Cells, inflation, periodogram, periodogram_frequencies
-from wfsobs.spectral.search import LOWEST, PAD, Candidate
-from wfsobs.spectral.whittle import first_guess, fit_spectrum, spectrum_negative_log_likelihood, standard_deviations
+from wfsobs.spectral.search import LOWEST, PAD, Candidate, Sinusoid, nearest_line
+from wfsobs.spectral.whittle import (
+    Cells,
+    first_guess,
+    fit_spectrum,
+    inflation,
+    periodogram,
+    periodogram_frequencies,
+    spectrum_negative_log_likelihood,
+    standard_deviations,
+)
 from wfsobs.typing import Array
 
 ORDER_WORTH = 6.0

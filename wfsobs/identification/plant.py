@@ -33,9 +33,8 @@ from wfsobs.identification.plant_likelihood import (
 from wfsobs.identification.process import Number, format_number
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
-from wfsobs.sensors.modes import MODE_NAMES, TIP_TILT
-from wfsobs.sensors.zernike import noll
-from wfsobs.signal.ar2 import Ar2
+from wfsobs.sensors.zernike import MODE_NAMES, TIP_TILT, noll
+from wfsobs.signal.autoregressive import Ar2
 from wfsobs.spectral.model import Spectrum
 from wfsobs.spectral.quick import behind_pole
 from wfsobs.typing import Array

@@ -10,11 +10,10 @@ import numpy as np
 from scipy.fft import rfft
 
 from wfsobs.identification.one_mode import OneMode
-from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.ar3 import Ar3
-from wfsobs.spectral.lines import Sinusoid, line_in_record, short_taper
+from wfsobs.signal.autoregressive import Ar2, Ar3
 from wfsobs.spectral.missing import LEAST
 from wfsobs.spectral.model import HIGHEST, Spectrum
+from wfsobs.spectral.search import Sinusoid, line_in_record, short_taper
 from wfsobs.spectral.whittle import NO_NEARER, spectrum_information
 from wfsobs.typing import Array
 

@@ -37,14 +37,13 @@ from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.prior import Line, Lines
 from wfsobs.record import Record, RecordError, hold_last, pseudo_open_loop
 from wfsobs.scenario import Scenario
-from wfsobs.sensors.modes import order_of
-from wfsobs.signal.ar2 import Ar2, turbulence_corner
-from wfsobs.signal.ar3 import Ar3
+from wfsobs.sensors.zernike import order_of
+from wfsobs.signal.autoregressive import Ar2, Ar3, turbulence_corner
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.simulation.layers import relative_cone_error, relative_rms
 from wfsobs.spectral.missing import find_outlying
 from wfsobs.spectral.model import Spectrum
-from wfsobs.spectral.periodogram import fast_length, inflation
+from wfsobs.spectral.whittle import fast_length, inflation
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:

@@ -17,11 +17,9 @@ from wfsobs.live.source import SOURCE, STREAM, Desk, Staff, enter_process, recei
 from wfsobs.record import Sampling
 from wfsobs.signal.gate import GateSettings, OutlierGate, frame_mean_of
 from wfsobs.streams.follower import LONGEST_GAP
-from wfsobs.streams.layout import StreamError
 from wfsobs.streams.network import Subscription, is_address
-from wfsobs.streams.ngs_frames import NgsStream
-from wfsobs.streams.shared_image import SharedImage
-from wfsobs.streams.wiring import STUCK, NgsWiring, check_elements
+from wfsobs.streams.shared_image import SharedImage, StreamError
+from wfsobs.streams.wiring import STUCK, NgsStream, NgsWiring, check_elements
 from wfsobs.typing import Array
 
 

@@ -17,10 +17,9 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.step import StepController
 from wfsobs.control.supervisor import SupervisedController, Supervision
 from wfsobs.control.true_plant import ActingLoop, TruePlant
-from wfsobs.live.board import NEXT, SCORED, SLOTS, Board, slot_width, trace_width
+from wfsobs.live.board import NEXT, SCORED, SLOTS, Board, rms_of_known, slot_width, trace_width
 from wfsobs.live.ring import CAPACITY, LiveFrame, Ring, Rows
 from wfsobs.live.source import ALARM, Command, LiveEvent, enter_process, receive
-from wfsobs.live.view import rms_of_known
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.step import StepError, StepObserver
 from wfsobs.record import Sampling, fuse_frames

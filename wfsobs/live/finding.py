@@ -17,12 +17,12 @@ from scipy import stats
 
 from wfsobs.evaluation.bound import INFORMATION, bound
 from wfsobs.identification import identify
-from wfsobs.priors_from.identification import told_by
+from wfsobs.priors_from.telemetry import told_by
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.spectrum import psd
 from wfsobs.simulation.true_spectra import has_known_spectra
-from wfsobs.spectral.periodogram import periodogram
+from wfsobs.spectral.whittle import periodogram
 from wfsobs.typing import Array
 
 MOST_MISSING = 0.2

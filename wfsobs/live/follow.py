@@ -16,7 +16,7 @@ from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.live.source import LiveSource
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.estimates import TOTAL
+from wfsobs.record import TOTAL
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 

@@ -14,16 +14,14 @@ from weakref import ReferenceType, finalize, ref
 
 import numpy as np
 
-from wfsobs.live.board import NEXT
+from wfsobs.live.board import NEXT, LiveView, SharedView, read_view, rms_of_known
 from wfsobs.live.checks import check_slot, check_speed, make_design
 from wfsobs.live.crew import ControlView
 from wfsobs.live.finding import Bounds, Change, Finding, bounds_of, identify_frames, peak_changes
 from wfsobs.live.processes import LiveProcesses
-from wfsobs.live.programme import Programme, scenario_on
-from wfsobs.live.recording import Recorder
-from wfsobs.live.ring import LiveFrame
+from wfsobs.live.ring import LiveFrame, Recorder
+from wfsobs.live.simulated import Programme, scenario_on
 from wfsobs.live.source import ALARM, FAILURE, SIMULATION, STREAM, LiveEvent, LiveSource
-from wfsobs.live.view import LiveView, SharedView, read_view, rms_of_known
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.record import Record, Sampling

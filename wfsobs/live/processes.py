@@ -14,7 +14,7 @@ from threading import Event, Lock, RLock
 from time import monotonic, sleep
 from typing import Any, Final
 
-from wfsobs.live.board import CREWS, SLOTS, Board, Delivery, crew_of, trace_width
+from wfsobs.live.board import CREWS, SLOTS, Board, Delivery, LiveView, crew_of, last_frames, read_view, trace_width
 from wfsobs.live.crew import ROOM, ControlView, ObserverCrew, Site, control_frames, row_width, warm_up_of
 from wfsobs.live.ring import LiveFrame, Ring, Rows, Tracker, merged_rows
 from wfsobs.live.source import (
@@ -31,7 +31,6 @@ from wfsobs.live.source import (
     send_command,
     take_all,
 )
-from wfsobs.live.view import LiveView, last_frames, read_view
 from wfsobs.scenario import Scenario
 from wfsobs.stepping import design
 

@@ -5,16 +5,15 @@ from __future__ import annotations
 from wfsobs import registry
 from wfsobs.observers.base import Observer
 from wfsobs.observers.baselines import BUTTERWORTH_CL, BUTTERWORTH_OL, PERSISTENCE, ZERO
-from wfsobs.observers.gp.observers import GP_BOTH, GP_LGS
+from wfsobs.observers.gp import GP_BOTH, GP_LGS
 from wfsobs.observers.gpr.adaptive import GPR_ADAPTIVE
-from wfsobs.observers.gpr.offline import GPR_OFFLINE
+from wfsobs.observers.gpr.offline import GPR_OFFLINE, RIDGE, RIDGE_30
 from wfsobs.observers.gpr.online import GPR_ONLINE
 from wfsobs.observers.kalman.adaptive import KF_ADAPTIVE, MULTIRATE_ADAPTIVE
 from wfsobs.observers.kalman.coupled import KF_COUPLED
 from wfsobs.observers.kalman.joint import KF_ASTERISM, MULTIRATE_COUPLED
 from wfsobs.observers.kalman.multirate import MULTIRATE, MULTIRATE_MULTI, MULTIRATE_OPTIMAL
 from wfsobs.observers.kalman.single import KF_LGS, KF_MULTI, KF_NGS
-from wfsobs.observers.ridge import RIDGE, RIDGE_30
 from wfsobs.registry import Registry
 
 BUILT_IN = (

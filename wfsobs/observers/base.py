@@ -13,15 +13,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from wfsobs.observers.estimates import TARGETS as TARGETS
-from wfsobs.observers.estimates import TURBULENCE as TURBULENCE
-from wfsobs.observers.estimates import VIBRATION as VIBRATION
-from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
 from wfsobs.observers.step import MakeEstimator, StepError, StepObserver, run_frames
 from wfsobs.prior import PARTS, TRUE, Part, Prior, PriorSource, ask_nothing, words_for
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import SENSORS, Measurements, Record, Sampling, hold_last
+from wfsobs.record import SENSORS, Estimates, Measurements, Record, Sampling, hold_last
+from wfsobs.record import TARGETS as TARGETS
+from wfsobs.record import TURBULENCE as TURBULENCE
+from wfsobs.record import VIBRATION as VIBRATION
 from wfsobs.registry import check_tuple, check_weight
 from wfsobs.settings import Group, Section
 from wfsobs.signal.gate import GateSettings

@@ -12,13 +12,12 @@ from functools import partial
 import numpy as np
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Look, Observer, Tunable
-from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.step import HeldEstimate, StepError
 from wfsobs.observers.stepping import FilterBank
 from wfsobs.prior import Bands, OfflineBands, OnlineBands, Prior
 from wfsobs.progress import Watch
-from wfsobs.record import Measurements, Sampling
-from wfsobs.signal.bandpass import bandpass_bank, bank_recursion, filter_causal, filter_zero_phase
+from wfsobs.record import Estimates, Measurements, Sampling
+from wfsobs.signal.spectrum import bandpass_bank, bank_recursion, filter_causal, filter_zero_phase
 from wfsobs.typing import Array
 
 

@@ -2,7 +2,7 @@
 
 A lost measurement z[k] is replaced by what the Kalman filter of the own prior predicts for it, a lost NGS frame by what the NGS
 filter predicts. Who is told no model holds the last value. A lost command is held, as a mirror holds its position. The Kalman
-filters and the Gaussian processes in time take a measurement that is missing as missing (`wfsobs.signal.gap_gains`).
+filters and the Gaussian processes in time take a measurement that is missing as missing (`wfsobs.signal.gains`).
 Only samples before a gap fill it, so estimates stay causal, and what has been filled in counts in no score.
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 from wfsobs.observers.stepping import FilterBank, Gain, GainCycle, StateArrays
 from wfsobs.prior import Prior
 from wfsobs.record import Signals, delay_signal, frame_mean, hold_last
-from wfsobs.signal.riccati import steady_state
+from wfsobs.signal.gains import steady_state
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
 

@@ -17,12 +17,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wfsobs.observers.estimates import Estimates, by_name
 from wfsobs.observers.missing import Bridge
 from wfsobs.observers.stepping import StateArrays, Stateful, load_parts, save_parts
 from wfsobs.prior import Prior
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Measurements, Sampling
+from wfsobs.record import Estimates, Measurements, Sampling, by_name
 from wfsobs.signal.gate import GateSettings, OutlierGate, frame_mean_of
 from wfsobs.typing import Array
 

@@ -19,13 +19,12 @@ from wfsobs.identification.result import Identification
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.step import StepObserver
 from wfsobs.prior import Training
-from wfsobs.priors_from.identification import told_by
+from wfsobs.priors_from.telemetry import told_by
 from wfsobs.record import Record, Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.stepping import design
-from wfsobs.streams.layout import StreamError
-from wfsobs.streams.ngs_frames import GoingBack, NgsStream
-from wfsobs.streams.wiring import STUCK, NgsWiring
+from wfsobs.streams.shared_image import StreamError
+from wfsobs.streams.wiring import STUCK, GoingBack, NgsStream, NgsWiring
 from wfsobs.typing import Array
 
 

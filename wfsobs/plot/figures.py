@@ -18,28 +18,28 @@ from wfsobs.closed_loop.envelope import PlantEnvelope
 from wfsobs.closed_loop.rows import ClosedLoop, residual_rms
 from wfsobs.control.margins import Curves, curves
 from wfsobs.evaluation.budget import TERMS, error_budget
-from wfsobs.evaluation.error_spectra import FEWEST, TRUTH, cumulative_rms
-from wfsobs.evaluation.result import Result
-from wfsobs.evaluation.rows import NO_ESTIMATE, row_label
+from wfsobs.evaluation.exact_errors import FEWEST, TRUTH, cumulative_rms
+from wfsobs.evaluation.result import NO_ESTIMATE, Result, row_label
 from wfsobs.identification.result import Identification
 from wfsobs.observers.base import TARGETS, Look
 from wfsobs.plot.elements import (
     FREQUENCY,
+    TERM_COLOURS,
     draw_bars,
     draw_intervals,
     draw_line,
     draw_marks,
     draw_trace,
     legend_of,
+    look,
     overlay,
     quantity,
     stack,
     style,
 )
-from wfsobs.plot.looks import TERM_COLOURS, look
 from wfsobs.record import Record, hold_last
-from wfsobs.scenario.grid import Variation
-from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
+from wfsobs.scenario.configfile import Variation
+from wfsobs.sensors.zernike import HIGHEST_ORDER, modes_up_to
 from wfsobs.signal.spectrum import psd
 from wfsobs.typing import Array
 from wfsobs.units import unit_text

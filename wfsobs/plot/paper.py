@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from wfsobs.evaluation.error_spectra import TRUTH, spectra
+from wfsobs.evaluation.exact_errors import TRUTH, spectra
 from wfsobs.evaluation.result import Result
 from wfsobs.observers.base import TURBULENCE, VIBRATION
-from wfsobs.plot.looks import look
+from wfsobs.plot.elements import look
 from wfsobs.record import Record, RecordError
-from wfsobs.sensors.modes import TIP_TILT
+from wfsobs.sensors.zernike import TIP_TILT
 from wfsobs.signal.envelope import envelope, envelope_times
 from wfsobs.typing import Array
 

@@ -15,9 +15,8 @@ from typing import Any, Literal, NamedTuple, Self
 import numpy as np
 
 from wfsobs.record import Training
-from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.ar3 import Ar3
-from wfsobs.signal.gap_gains import ONE, SensorMean
+from wfsobs.signal.autoregressive import Ar2, Ar3
+from wfsobs.signal.gains import ONE, SensorMean
 from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array

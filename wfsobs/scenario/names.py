@@ -12,7 +12,7 @@ import param
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import format_value
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.sensors.modes import TIP_TILT
+from wfsobs.sensors.zernike import TIP_TILT
 from wfsobs.settings.group import Group, holds_groups
 from wfsobs.units import unit_text
 

@@ -3,10 +3,15 @@
 Labels contain the name and the paper's letter, documentation strings the unit in [brackets] and the
 source. "The paper" is Jaufmann et al., "Simulation of Wavefront-based Disturbance Observers for
 Large Telescopes". Wavefronts are Noll-normalised Zernike coefficients in micrometres rms.
+
+Settings of a scenario that have no effect for the values of the others, and why.
+
+Rules within a group are declared by the group (`Group.used_when`); here are those across groups.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from functools import cache, lru_cache
 from importlib.metadata import entry_points
 from itertools import pairwise
@@ -20,11 +25,10 @@ from wfsobs.scenario.groups.atmosphere import PsdTable, Telescope, Turbulence, V
 from wfsobs.scenario.groups.events import FRAMES, LASER, PEAK, WIND, Event, shift, turbulence_time
 from wfsobs.scenario.groups.plant import Control, Loop, PlantErrors, Run
 from wfsobs.scenario.groups.sensors import Sensors, fit_lenslets
-from wfsobs.sensors.modes import Mode, modes_up_to
-from wfsobs.settings.errors import SettingError
+from wfsobs.sensors.zernike import Mode, modes_up_to
 from wfsobs.settings.group import Group, Section, section
-from wfsobs.settings.parameters import declared_settings
 from wfsobs.settings.priors import Butterworth, Kalman
+from wfsobs.settings.values import Plain, SettingError, declared_settings
 from wfsobs.signal.gate import GateSettings
 
 if TYPE_CHECKING:
@@ -33,6 +37,7 @@ if TYPE_CHECKING:
     from wfsobs.observers.kalman.adaptive import Adaptive
     from wfsobs.observers.kalman.multirate import MultiRate
     from wfsobs.observers.kalman.single import MultiPeak
+
 
 HIGHEST = 0.9
 """Maximum height of a layer over that of the laser guide stars: in a higher one the beam nearly vanishes."""
@@ -64,7 +69,7 @@ class Scenario(Group):
     >>> s.set("turbulence.wind_speed", 200)
     Traceback (most recent call last):
     ...
-    wfsobs.settings.errors.SettingError: turbulence.wind_speed = 200: takes a number from 0.1 to 100 m/s
+    wfsobs.settings.values.SettingError: turbulence.wind_speed = 200: takes a number from 0.1 to 100 m/s
     """
 
     telescope: Telescope = section(Telescope, "Telescope")
@@ -288,3 +293,119 @@ def _validate_psd(psd: PsdTable, group: str) -> None:
 
 
 registry.announce(Scenario)
+
+
+FLOW_ONLY = (
+    "telescope.zenith_angle",
+    "sensors.kind",
+    "sensors.lgs_altitude",
+    "sensors.lgs_radius",
+    "sensors.lgs_angle",
+    "sensors.ngs_direction",
+)
+"""Settings of frozen flow, outside the group of the turbulence."""
+
+SIMULATION_ONLY = ("loop", "events", "run.seed")
+"""Settings that only the simulation of a record reads."""
+
+RECORD_ONLY = ("sensors.gate", "sensors.gate_level")
+"""Settings that no simulation of a record reads."""
+
+
+def idle_settings(scenario: Scenario, *, is_simulated: bool = True) -> dict[str, str]:
+    """Return the settings without effect.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings.
+    is_simulated : bool
+        Whether the record is simulated from them; otherwise it is given.
+
+    Returns
+    -------
+    dict of str to str
+        Dotted path of a setting, a list or a group -> reason in one line. What is below a path has no effect either.
+
+    Examples
+    --------
+    >>> idle_settings(Scenario())["gpr_online.highpass"]
+    'Used only where Filter of the inputs is high-pass'
+    """
+    out = dict(_within(scenario, "")) | dict(_across(scenario))
+    if is_simulated:
+        out |= dict.fromkeys(RECORD_ONLY, "Used only with a record that is given; a simulated one has no outliers")
+    else:
+        out |= dict.fromkeys(SIMULATION_ONLY, "Used only by a simulation; here the record is given")
+    return out
+
+
+def why_idle_at(path: str, idle: Mapping[str, str]) -> str:
+    """Return why the setting of a dotted path has no effect, by `idle_settings`; empty where it has one."""
+    keys = path.split(".")
+    return next((idle[above] for i in range(len(keys)) if (above := ".".join(keys[: i + 1])) in idle), "")
+
+
+def used_settings(scenario: Scenario) -> Plain:
+    """Return the settings that have an effect, as nested plain values."""
+    tree = scenario.effective_values()
+    for path in (*RECORD_ONLY, *(path for path, _ in _across(scenario))):
+        *above, name = path.split(".")
+        node: Any = tree
+        for key in above:
+            node = node[int(key)] if isinstance(node, list) else node.get(key, {})
+        node.pop(name, None)
+    return tree
+
+
+def _within(group: Group, prefix: str) -> Iterator[tuple[str, str]]:
+    """Yield the idle settings of a group and of the groups and lists in it, by their own rules."""
+    idle = group.idle()
+    yield from ((f"{prefix}{name}", reason) for name, reason in idle.items())
+    for name in group.settings():
+        value = getattr(group, name)
+        if name in idle:
+            continue
+        if isinstance(value, Group):
+            yield from _within(value, f"{prefix}{name}.")
+        elif isinstance(value, list):
+            for i, item in enumerate(value):
+                if isinstance(item, Group):
+                    yield from _within(item, f"{prefix}{name}.{i}.")
+
+
+def _across(scenario: Scenario) -> Iterator[tuple[str, str]]:
+    """Yield the idle settings by rules across groups."""
+    s, flow = scenario.sensors, scenario.turbulence.source == "frozen-flow"
+    if not flow:
+        yield from ((path, "Used only where Source of turbulence is frozen-flow") for path in FLOW_ONLY)
+        if scenario.telescope.radial_order == 1:
+            yield "turbulence.outer_scale", "Used only with frozen flow, and for radial orders above 1"
+    else:
+        yield "sensors.lgs_low_frequency_rms", "Used only where Source of turbulence is not frozen-flow"
+        if len(scenario.turbulence.layers) == 1:
+            yield "turbulence.layers.0.fraction", "Used only where there are several layers: they share the turbulence"
+        if s.lgs_radius == 0:
+            yield "sensors.lgs_angle", "Used only where LGS asterism, radius is above 0"
+    if scenario.turbulence.source == "none":
+        yield "sensors.tip_tilt_indetermination", "Used only where there is turbulence"
+    if scenario.plant.mount == "custom" and not scenario.plant.resonance:
+        yield "plant.damping", "Used only where Resonance is above 0"
+    if not scenario.plant.hysteresis:
+        yield "plant.hysteresis_range", "Used only where Hysteresis is above 0"
+    if not scenario.plant.optical_gain_rms:
+        yield "plant.optical_gain_time", "Used only where Optical gain, rms is above 0"
+    if s.noise_from == "nm" and not (flow and s.kind == "shack-hartmann"):
+        yield "sensors.lenslets", "Used only by Shack-Hartmann sensors in frozen flow, and for noise from photons"
+    if scenario.kalman.peak == "matched" and _every_mode_has_a_line(scenario):
+        yield "kalman.frequency", "Used only where Vibration peak is manual, or a mode has no line"
+        yield "kalman.damping", "Used only where Vibration peak is manual, or a mode has no line"
+
+
+def _every_mode_has_a_line(scenario: Scenario) -> bool:
+    """Return whether a list of peaks gives every mode a line; for other sources False."""
+    v = scenario.vibration
+    if v.source not in ("peaks", "ar2"):
+        return False
+    found = [peak.rms for peak in v.peaks if v.source == "ar2" or peak.frequency <= v.cutoff]
+    return all(any(i < len(rms) and rms[i] > 0 for rms in found) for i in range(len(scenario.modes)))

@@ -31,8 +31,7 @@ from scipy.fft import ifft2, next_fast_len
 from scipy.sparse import csr_array
 from scipy.special import i0
 
-from wfsobs.atmosphere.plane_waves import Footprint, Wave
-from wfsobs.atmosphere.von_karman import von_karman_density
+from wfsobs.atmosphere import Footprint, Wave, von_karman_density
 from wfsobs.sensors import zernike
 from wfsobs.sensors.lenslets import Lenslets, reconstructor
 from wfsobs.sensors.zernike import noll

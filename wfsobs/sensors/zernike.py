@@ -1,4 +1,4 @@
-"""Noll's Zernike modes: indices and names, Fourier transforms, and covariances in Kolmogorov turbulence.
+"""Noll's Zernike modes: indices, names and columns, Fourier transforms, and covariances in Kolmogorov turbulence.
 
 Reference: R. J. Noll, "Zernike polynomials and atmospheric turbulence", J. Opt. Soc. Am. 66, 207 (1976).
 """
@@ -8,13 +8,46 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wfsobs.atmosphere.plane_waves import Footprint, Wave
 from wfsobs.typing import Array
+
+if TYPE_CHECKING:
+    from wfsobs.atmosphere import Footprint, Wave
+
+HIGHEST_ORDER = 6
+
+
+class Mode(NamedTuple):
+    """One Zernike mode: name, Noll index, radial order n(i) of the paper's eq. 1d."""
+
+    name: str
+    noll: int
+    radial_order: int
+
+
+@cache
+def modes_up_to(order: int) -> tuple[Mode, ...]:
+    """Return all modes up to a radial order, without piston, in Noll's order.
+
+    >>> [mode.name for mode in modes_up_to(2)]
+    ['tip', 'tilt', 'defocus', 'oblique astigmatism', 'vertical astigmatism']
+    """
+    return tuple(Mode(mode_name(j), j, noll(j)[0]) for j in up_to_order(order))
+
+
+def order_of(n_modes: int) -> int | None:
+    """Return the smallest radial order that has so many modes, None where there is none.
+
+    >>> order_of(2), order_of(5), order_of(28)
+    (1, 2, None)
+    """
+    return next((order for order in range(1, HIGHEST_ORDER + 1) if len(modes_up_to(order)) >= n_modes), None)
+
 
 NAMES = {
     1: "piston",
@@ -55,6 +88,11 @@ def up_to_order(order: int) -> range:
     range(2, 7)
     """
     return range(2, (order + 1) * (order + 2) // 2 + 1)
+
+
+TIP_TILT = modes_up_to(1)
+MODE_NAMES = tuple(mode.name for mode in modes_up_to(HIGHEST_ORDER))
+"""Of the columns of an array of any width."""
 
 
 def bessel_ratio(order: int, x: Array) -> Array:

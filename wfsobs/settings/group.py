@@ -12,9 +12,19 @@ from typing import Any, ClassVar, NamedTuple, Self, TypeVar, cast
 import param
 
 from wfsobs.notebook import html_table
-from wfsobs.settings.errors import SettingError, shorten
-from wfsobs.settings.parameters import Reals, allowed_values, hint, settings_once, unit_of
-from wfsobs.settings.tree import Plain, leaves, put_value, to_native
+from wfsobs.settings.values import (
+    Plain,
+    Reals,
+    SettingError,
+    allowed_values,
+    hint,
+    leaves,
+    put_value,
+    settings_once,
+    shorten,
+    to_native,
+    unit_of,
+)
 
 UsedWhen = Mapping[str, tuple[str, tuple[Any, ...]]]
 """Setting -> another one of its group, and the values of it with which it has an effect."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from wfsobs.settings.group import Group, UsedWhen
-from wfsobs.settings.parameters import Choice, Real, Reals, Whole
+from wfsobs.settings.values import Choice, Real, Reals, Whole
 
 PAPER_PEAK_HZ = 47.4969
 """Dominant natural frequency of VLT UT4 (paper, Table 2)."""

@@ -32,7 +32,7 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 from scipy.linalg import block_diag, cho_solve, helmert, schur
 
-from wfsobs.signal.riccati import lyapunov
+from wfsobs.signal.gains import lyapunov
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array

@@ -18,8 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import toeplitz
 
-from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.ar3 import Ar3
+from wfsobs.signal.autoregressive import Ar2, Ar3
 from wfsobs.typing import Array
 
 MIN_MODEL_DAMPING = 1e-4

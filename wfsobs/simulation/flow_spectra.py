@@ -18,13 +18,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
-from wfsobs.atmosphere.plane_waves import Footprint
-from wfsobs.atmosphere.von_karman import CORE, TurbulenceLayer, fine_rule, nodes_across_wind, von_karman_density
+from wfsobs.atmosphere import CORE, Footprint, TurbulenceLayer, fine_rule, nodes_across_wind, von_karman_density
 from wfsobs.scenario import Scenario
 from wfsobs.sensors import zernike
 from wfsobs.signal.wiener import Complex
 from wfsobs.simulation import layers as atmosphere
-from wfsobs.simulation.guide_stars import MEAN, lgs_weights, stars_differ
+from wfsobs.simulation.sensing import MEAN, lgs_weights, stars_differ
 from wfsobs.typing import Array
 
 LOWEST = 1e-3

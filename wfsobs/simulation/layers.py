@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wfsobs.atmosphere.plane_waves import Footprint
-from wfsobs.atmosphere.von_karman import CORE, TurbulenceLayer, fine_rule, nodes_across_wind, von_karman_density
+from wfsobs.atmosphere import CORE, Footprint, TurbulenceLayer, fine_rule, nodes_across_wind, von_karman_density
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.zernike import ZernikeProjection, bessel_ratio, tabulated_bessel_ratio
 from wfsobs.typing import Array

@@ -13,8 +13,8 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.record import DELAY, Measurements, Record, Training, delay_signal, frame_mean
 from wfsobs.registry import sections
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.idle import used_settings
-from wfsobs.settings.tree import Plain
+from wfsobs.scenario.scenario import used_settings
+from wfsobs.settings.values import Plain
 from wfsobs.simulation.disturbance import make_disturbance
 from wfsobs.simulation.sensing import OpenLoop, measure_noise, measure_open_loop
 from wfsobs.typing import Array

@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from wfsobs.atmosphere.plane_waves import Sensor
+from wfsobs.atmosphere import Sensor
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.sensors import Kind, fit_lenslets
 from wfsobs.sensors.lenslets import Lenslets

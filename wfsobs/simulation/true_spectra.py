@@ -17,16 +17,14 @@ import numpy as np
 
 from wfsobs.scenario import Scenario
 from wfsobs.sensors import zernike
-from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.ar3 import Ar3
+from wfsobs.signal.autoregressive import Ar2, Ar3
 from wfsobs.signal.wiener import Complex, Whitener, advance_spectrum, error_spectrum, factorise, innovations_to_come
 from wfsobs.simulation import layers as atmosphere
 from wfsobs.simulation.disturbance import peak_rms, pure_lines, vibration_power
 from wfsobs.simulation.flow_spectra import TurbulenceSpectra, flow_spectra
-from wfsobs.simulation.guide_stars import lgs_noise_rms, lgs_weights, low_frequency_process
+from wfsobs.simulation.sensing import lgs_noise_rms, lgs_weights, low_frequency_process
 from wfsobs.simulation.sensor_noise import noise_rms
-from wfsobs.simulation.synthesis import damping_for_width, line_width, widen_lines
-from wfsobs.simulation.turbulence import processes, table_variance, turbulence_process
+from wfsobs.simulation.turbulence import damping_for_width, line_width, processes, table_variance, turbulence_process, widen_lines
 from wfsobs.typing import Array
 
 DECAYED = 2.5

@@ -18,7 +18,7 @@ from scipy.fft import irfft, rfft
 from scipy.ndimage import median_filter
 from scipy.sparse.linalg import LinearOperator, cg
 
-from wfsobs.spectral.periodogram import periodogram
+from wfsobs.spectral.whittle import periodogram
 from wfsobs.typing import Array
 
 DRAWS = 2

@@ -18,13 +18,11 @@ from math import log, pi, sqrt
 import numpy as np
 from scipy.special import logit
 
-from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.ar3 import Ar3
+from wfsobs.signal.autoregressive import Ar2, Ar3
 from wfsobs.spectral.missing import MissingSamples
 from wfsobs.spectral.model import BACKGROUND_REACHES, BACKGROUND_WORTH, DAMPING, FAST, SLOW, Spectrum, densities, with_first_guess
-from wfsobs.spectral.periodogram import FINE, NEAR, Cells, periodogram, periodogram_frequencies
 from wfsobs.spectral.search import LOWEST
-from wfsobs.spectral.whittle import first_guess
+from wfsobs.spectral.whittle import FINE, NEAR, Cells, first_guess, periodogram, periodogram_frequencies
 from wfsobs.typing import Array
 
 

@@ -19,8 +19,7 @@ from wfsobs.observers.step import StepObserver
 from wfsobs.record import Sampling
 from wfsobs.signal.gate import OutlierGate, frame_mean_of
 from wfsobs.streams.follower import LONGEST_GAP, StreamFollower
-from wfsobs.streams.ngs_frames import NgsStream
-from wfsobs.streams.wiring import FrameStream, SinkStream, SourceStream, Watchdog, Wiring, check_elements
+from wfsobs.streams.wiring import FrameStream, NgsStream, SinkStream, SourceStream, Watchdog, Wiring, check_elements
 from wfsobs.typing import Array
 
 FAR = 6.0

@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wfsobs.streams.layout import Semaphore, StreamError
-from wfsobs.streams.ngs_frames import GoingBack, NgsStream, StateObserver
-from wfsobs.streams.wiring import SinkStream, SourceStream, Wiring, check_elements
+from wfsobs.streams.shared_image import Semaphore, StreamError
+from wfsobs.streams.wiring import GoingBack, NgsStream, SinkStream, SourceStream, StateObserver, Wiring, check_elements
 from wfsobs.typing import Array
 
 EDGES = np.geomspace(1e-7, 10.0, 1601)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, Self
 
 import numpy as np
 
-from wfsobs.streams.layout import StreamError
+from wfsobs.streams.shared_image import StreamError
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:

@@ -1,31 +1,252 @@
-"""A stream of ImageStreamIO: one frame of numbers in a shared file, with a counter that rises with every frame."""
+"""A stream of ImageStreamIO: one frame of numbers in a shared file, with a counter that rises with every frame.
+
+Layouts of an ImageStreamIO file, as gcc on x86-64 makes them: 2.00, and the older 0.0.01 that xaosim writes too.
+
+A file holds a header, the data, keywords, and in 2.00 the semaphores. All numbers are little-endian.
+"""
 
 from __future__ import annotations
 
+import ctypes
+import errno
 import mmap
 import os
 import struct
+import sys
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from math import prod
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from wfsobs.files import write_whole
-from wfsobs.streams.layout import (
-    CURRENT,
-    LONGEST_NAME,
-    SEMAPHORE,
-    TIMES,
-    Layout,
-    Semaphore,
-    StreamError,
-    new_file,
-    open_named,
-    read_header,
-)
 from wfsobs.typing import Array
+
+SEMAPHORE = 32
+"""Bytes of a `sem_t` (glibc, 64 bit)."""
+
+MOST = 10
+"""Value up to which a writer raises a semaphore, so that a reader that sleeps does not find a queue when it wakes."""
+
+
+class _TimeSpec(ctypes.Structure):
+    _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
+
+
+@cache
+def _library() -> Any:
+    if sys.platform != "linux":
+        raise OSError(errno.ENOSYS, "streams are read on Linux alone", "ImageStreamIO")
+    library = ctypes.CDLL(None, use_errno=True)
+    library.sem_open.restype = ctypes.c_void_p
+    for name in ("sem_post", "sem_trywait", "sem_close"):
+        getattr(library, name).argtypes = (ctypes.c_void_p,)
+    library.sem_getvalue.argtypes = (ctypes.c_void_p, ctypes.POINTER(ctypes.c_int))
+    library.sem_timedwait.argtypes = (ctypes.c_void_p, ctypes.POINTER(_TimeSpec))
+    library.sem_init.argtypes = (ctypes.c_void_p, ctypes.c_int, ctypes.c_uint)
+    return library
+
+
+class Semaphore:
+    """A semaphore at an address.
+
+    Parameters
+    ----------
+    address : int
+        Of its `sem_t`, in memory that stays mapped.
+    """
+
+    def __init__(self, address: int):
+        self._address = address
+
+    def post(self) -> None:
+        """Raise it by one, unless it stands at `MOST`."""
+        value = ctypes.c_int()
+        _library().sem_getvalue(self._address, ctypes.byref(value))
+        if value.value < MOST:
+            _library().sem_post(self._address)
+
+    def drain(self) -> None:
+        """Lower it to 0."""
+        while _library().sem_trywait(self._address) == 0:
+            pass
+
+    def wait(self, seconds: float) -> bool:
+        """Lower it by one, waiting at most so long [s]; return whether it was."""
+        whole, rest = divmod(time.time_ns() + int(seconds * 1e9), 10**9)
+        until = _TimeSpec(whole, rest)
+        while _library().sem_timedwait(self._address, ctypes.byref(until)) != 0:
+            if ctypes.get_errno() != errno.EINTR:
+                return False
+        return True
+
+
+def open_named(name: str) -> Semaphore:
+    """Return the semaphore of this name (without its first "/"), made if there is none.
+
+    Raises
+    ------
+    OSError
+        It cannot be opened.
+    """
+    address = _library().sem_open(ctypes.c_char_p(f"/{name}".encode()), os.O_CREAT, 0o666, 0)
+    if not address:
+        code = ctypes.get_errno()
+        raise OSError(code, os.strerror(code), f"semaphore {name}")
+    return Semaphore(address)
+
+
+def new_semaphore() -> bytes:
+    """Return the bytes of a semaphore at 0 that processes share."""
+    memory = ctypes.create_string_buffer(SEMAPHORE)
+    _library().sem_init(ctypes.addressof(memory), 1, 0)
+    return memory.raw
+
+
+VERSION, NAME, AXES, COUNT_OF_ELEMENTS, DATATYPE, TIMES = 0, 32, 112, 128, 136, 152
+"""Offsets that both layouts have; the times are those of creation, last access, acquisition and writing."""
+
+LONGEST_NAME = 79
+DATATYPES: dict[int, np.dtype[Any]] = {9: np.dtype("<f4"), 10: np.dtype("<f8")}
+MATHEMATICAL = 2
+"""Type of an image that is a vector or matrix."""
+
+N_SEMAPHORES = 10
+"""Semaphores of a file that is made here."""
+
+N_TRACES = 10
+TRACE = 64
+"""Entries, and bytes of an entry, of the history of writing processes in 2.00."""
+
+
+class StreamError(ValueError):
+    """Error: a stream that cannot be read or written; one line with the reason."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Offsets of a version [bytes].
+
+    version          : the text at the start of a file
+    header           : bytes of the header
+    memory, location : "in shared memory" and the device (-1: none)
+    semaphores       : number of semaphores
+    count, writing   : the counter of frames (cnt0; cnt1 and cnt2 follow), and "is being written"
+    n_keywords       : number of keywords, of `keyword` bytes each
+    data_size        : size of the data with padding; None where there is none
+    """
+
+    version: str
+    header: int
+    memory: int
+    location: int
+    semaphores: int
+    count: int
+    writing: int
+    n_keywords: int
+    keyword: int
+    data_size: int | None = None
+
+
+CURRENT = Layout("2.00", 384, 224, 240, 258, 264, 288, 290, 128, 312)
+OLDER = Layout("0.0.01", 336, 216, 217, 234, 240, 264, 266, 120)
+LAYOUTS = {"2.00": CURRENT, "0.0.01": OLDER, "xaosim": OLDER}
+"""Text at the start of a file -> layout."""
+
+
+class Header(NamedTuple):
+    """What a file says of itself.
+
+    layout : its layout;  name : of the stream
+    shape  : of the data, the slowest axis first;  dtype : of its numbers
+    n_semaphores, semaphores : how many there are, and the offset of the first [bytes], None where they are not in the file
+    readers : offset of the ids of the processes that wait for them, int32, None where they are not in the file
+    """
+
+    layout: Layout
+    name: str
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    n_semaphores: int
+    semaphores: int | None
+    readers: int | None
+
+
+def read_header(path: str, buffer: memoryview) -> Header:
+    """Return what the header of a file says.
+
+    Raises
+    ------
+    StreamError
+        Another version, numbers other than float32 or float64, data on a GPU, or a file shorter than it says.
+    """
+    layout = _layout_of(path, buffer)
+    if len(buffer) < layout.header:
+        raise StreamError(f"{path}: {len(buffer)} bytes are less than a header of version {layout.version} ({layout.header})")
+    n_axes, datatype = buffer[AXES], buffer[DATATYPE]
+    sizes = struct.unpack_from("<3I", buffer, AXES + 4)
+    (n_elements,) = struct.unpack_from("<Q", buffer, COUNT_OF_ELEMENTS)
+    if datatype not in DATATYPES:
+        raise StreamError(f"{path}: data type {datatype}; takes float32 (9) and float64 (10)")
+    if struct.unpack_from("<b", buffer, layout.location)[0] not in (-1, 0) or not 1 <= n_axes <= 3:
+        raise StreamError(f"{path}: takes data of 1 to 3 axes in main memory")
+    dtype, shape = DATATYPES[datatype], tuple(reversed(sizes[:n_axes]))
+    if prod(shape) != n_elements:
+        shape = (n_elements,)  # one axis, of which xaosim leaves the size out
+    end = layout.header + n_elements * dtype.itemsize
+    if not 0 < n_elements <= len(buffer) or end > len(buffer):
+        raise StreamError(f"{path}: its header says {n_elements} numbers, the file has {len(buffer)} bytes")
+    name = bytes(buffer[NAME : NAME + LONGEST_NAME]).split(b"\0")[0].decode("ascii", "replace").strip()
+    return Header(layout, name, shape, dtype, *_semaphores(path, layout, buffer, end))
+
+
+def _layout_of(path: str, buffer: memoryview) -> Layout:
+    text = bytes(buffer[:32]).split(b"\0")[0].decode("ascii", "replace").strip()
+    if text not in LAYOUTS:
+        raise StreamError(f"{path}: version {text!r} of ImageStreamIO; takes {', '.join(LAYOUTS)}")
+    return LAYOUTS[text]
+
+
+def _semaphores(path: str, layout: Layout, buffer: memoryview, end: int) -> tuple[int, int | None, int | None]:
+    """Return how many semaphores there are, where in the file, and where the processes that wait for them are."""
+    (n,) = struct.unpack_from("<H", buffer, layout.semaphores)
+    if layout.data_size is None:
+        return n, None, None
+    (data_size,) = struct.unpack_from("<Q", buffer, layout.data_size)
+    (n_keywords,) = struct.unpack_from("<H", buffer, layout.n_keywords)
+    first = max(layout.header + data_size, end) + layout.keyword * n_keywords
+    if first + n * SEMAPHORE > len(buffer):
+        raise StreamError(f"{path}: its header says {n} semaphores, the file ends before them")
+    readers = first + (n + 1) * SEMAPHORE  # after that of the log
+    return n, first, readers if readers + 4 * n <= len(buffer) else None
+
+
+def new_file(name: str, shape: tuple[int, ...], dtype: np.dtype, layout: Layout) -> bytes:
+    """Return the bytes of a new file, zeros for data; whole, as who waits for a file takes it as soon as it is there."""
+    code = next(code for code, known in DATATYPES.items() if known == dtype)
+    size = -(-prod(shape) * dtype.itemsize // 8) * 8
+    n = N_SEMAPHORES if layout.data_size is not None else 0
+    traces = n * (SEMAPHORE + 16) + SEMAPHORE + N_TRACES * TRACE if n else 0  # semaphores, who waits, who wrote
+    made = bytearray(layout.header + size + traces)
+    struct.pack_into("<32s79s", made, VERSION, layout.version.encode(), name.encode())
+    axes = (*reversed(shape), 0, 0)[:3]
+    struct.pack_into("<B3x3I", made, AXES, len(shape), *axes)
+    struct.pack_into("<Q", made, COUNT_OF_ELEMENTS, prod(shape))
+    struct.pack_into("<B7xQ", made, DATATYPE, code, MATHEMATICAL)
+    struct.pack_into("<B", made, layout.memory, 1)
+    struct.pack_into("<b", made, layout.location, -1)
+    struct.pack_into("<H", made, layout.semaphores, n)
+    if layout.data_size is not None:
+        struct.pack_into("<Q", made, layout.data_size, size)
+        struct.pack_into("<H", made, 260, N_TRACES)
+        first = layout.header + size
+        made[first : first + (n + 1) * SEMAPHORE] = new_semaphore() * (n + 1)  # the last one is that of the log
+    return bytes(made)
+
 
 SUFFIX = ".im.shm"
 FOLDERS = ("/milk/shm", "/dev/shm", "/tmp")

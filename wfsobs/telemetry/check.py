@@ -22,7 +22,7 @@ from wfsobs.identification.result import Identification
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError, hold_last
 from wfsobs.scenario.groups.sensors import Sensors
-from wfsobs.sensors.modes import MODE_NAMES
+from wfsobs.sensors.zernike import MODE_NAMES
 from wfsobs.signal.gate import BLOCK
 from wfsobs.telemetry.preview import Reading
 from wfsobs.telemetry.records import PLAUSIBLE, z_rms

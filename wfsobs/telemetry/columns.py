@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from wfsobs.record import RecordError
-from wfsobs.sensors.modes import TIP_TILT
+from wfsobs.sensors.zernike import TIP_TILT
 from wfsobs.telemetry.formats.aot import TRANSLATED
 from wfsobs.telemetry.formats.contents import (
     CLOCKS,

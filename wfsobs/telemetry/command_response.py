@@ -19,7 +19,7 @@ import numpy as np
 
 from wfsobs.identification.plant_likelihood import LONGEST, ORDER, SPAN, prediction_errors, smooth_basis
 from wfsobs.record import Record, hold_last
-from wfsobs.sensors.modes import TIP_TILT
+from wfsobs.sensors.zernike import TIP_TILT
 from wfsobs.typing import Array
 
 MOST_STEPS = 100_000

@@ -16,7 +16,7 @@ import numpy as np
 
 from wfsobs.record import DELAY, Record, RecordError, Training, star_counts
 from wfsobs.scenario import Scenario
-from wfsobs.sensors.modes import order_of
+from wfsobs.sensors.zernike import order_of
 from wfsobs.telemetry.bridged import without_bridged
 from wfsobs.telemetry.columns import LoopMatrix, apply_matrices
 from wfsobs.telemetry.formats.contents import APART, FAST, FRAME, LARGEST, NGS, SIGNALS, STARS, TIME, TRAINING, Contents

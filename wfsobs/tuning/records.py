@@ -19,20 +19,19 @@ import param
 
 from wfsobs.control.base import Controller
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.control.integrator import best_gain
+from wfsobs.control.laws import best_gain
 from wfsobs.evaluation.scores import PREDICTION
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, VIBRATION, Observer, Tunable
 from wfsobs.observers.baselines import open_loop_reference
 from wfsobs.observers.missing import fill_missing
 from wfsobs.prior import Model
-from wfsobs.priors_from.controllers import plant_of
-from wfsobs.priors_from.scenario import bands_of, measurement_noise, observer_settings, prior_of, told_spectra
+from wfsobs.priors_from.scenario import bands_of, measurement_noise, observer_settings, plant_of, prior_of, told_spectra
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError, Training, delay_signal, frame_mean
 from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 from wfsobs.simulation.disturbance import vibration_lines, vibration_variance
 from wfsobs.simulation.layers import relative_rms
 from wfsobs.simulation.loop import TRAINING_MARGIN, simulate
@@ -124,7 +123,7 @@ def space(
                 switch: "manual",
                 **{p: _clip_to_limits(scenario, p, v) for p, v in zip(paths, matched(scenario), strict=True)},
             }
-    gain_from = by_hand.get("control.integrator", scenario.control.integrator)
+    gain_from = by_hand.get("control.laws", scenario.control.integrator)
     if name == "integrator" and "control.caution" in chosen and gain_from == "manual":
         raise SettingError("control.caution: has no effect on an integrator while control.integrator = manual")
     return Space(tuple(_axis(scenario, path, by_hand.get(path, scenario.lookup(path))) for path in chosen), by_hand)
@@ -188,7 +187,7 @@ def _gain(scenario: Scenario) -> tuple[float]:
 
 
 BY_HAND: dict[str, tuple[tuple[str, ...], Callable[[Scenario], tuple[float, ...]]]] = {
-    "control.integrator": (("control.gain",), _gain),
+    "control.laws": (("control.gain",), _gain),
     "kalman.peak": (("kalman.frequency", "kalman.damping"), _peak),
     "kalman.process_noise": (("kalman.turbulence_rms", "kalman.vibration_rms"), _process),
     "kalman.measurement_noise": (("kalman.lgs_noise", "kalman.ngs_noise"), _noise),

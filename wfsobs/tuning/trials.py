@@ -28,19 +28,17 @@ from wfsobs.evaluation.scores import PREDICTION, supervised_scores, unsupervised
 from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, VIBRATION
-from wfsobs.observers.estimates import Estimate
-from wfsobs.observers.gpr.inputs import scale_of, window_signals
-from wfsobs.observers.gpr.kernels import SquaredExponential
 from wfsobs.observers.gpr.offline import eliminated_covariance, training_targets
 from wfsobs.observers.gpr.online import kernel_of, online_targets
+from wfsobs.observers.gpr.windows import SquaredExponential, scale_of, window_signals
 from wfsobs.observers.missing import fill_missing
 from wfsobs.prior import Bands
 from wfsobs.priors_from.scenario import bands_of, prior_of
-from wfsobs.priors_from.training import training_of
+from wfsobs.priors_from.telemetry import training_of
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Record, RecordError, pseudo_open_loop
+from wfsobs.record import Estimate, Record, RecordError, pseudo_open_loop
 from wfsobs.scenario import Scenario
-from wfsobs.settings.errors import SettingError, error_line
+from wfsobs.settings.values import SettingError, error_line
 from wfsobs.tuning.records import Records, Space
 from wfsobs.typing import Array
 

@@ -26,7 +26,7 @@ from wfsobs_arena.trials import try_record
 from wfsobs.cli import main
 from wfsobs.prior import Prior
 from wfsobs.record import Record
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 from wfsobs.telemetry.records import save_record
 
 pytestmark = pytest.mark.slow

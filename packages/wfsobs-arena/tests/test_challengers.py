@@ -25,10 +25,10 @@ from wfsobs.control.mirror import Mirror
 from wfsobs.observers.base import TARGETS, Observer
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.prior import Model
-from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
+from wfsobs.priors_from.scenario import controller_arguments, own_settings, plant_of, prior_for
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.riccati import steady_state
+from wfsobs.signal.autoregressive import Ar2
+from wfsobs.signal.gains import steady_state
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.simulation.loop import simulate
 from wfsobs.testing import check_controller, check_observer

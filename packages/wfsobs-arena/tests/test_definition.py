@@ -9,8 +9,8 @@ from wfsobs_arena.cases import SimulatedCase
 from wfsobs_arena.definition import FILE, load_arena
 from wfsobs_arena.tracks import TRACKS, Track, add_track
 
-from wfsobs.settings.errors import SettingError
-from wfsobs.simulation.synthesis import period_steps
+from wfsobs.settings.values import SettingError
+from wfsobs.simulation.turbulence import period_steps
 
 WHOLE = load_arena()
 

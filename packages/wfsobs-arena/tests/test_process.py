@@ -17,7 +17,7 @@ from wfsobs_arena.run import run_arena
 
 from wfsobs.prior import Prior
 from wfsobs.record import Measurements
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 
 pytestmark = pytest.mark.slow
 

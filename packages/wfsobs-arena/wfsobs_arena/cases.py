@@ -15,10 +15,9 @@ from wfsobs.campaign.store import PHYSICS_VERSION
 from wfsobs.closed_loop.design import design
 from wfsobs.evaluation.bound import bound
 from wfsobs.observers.base import Observer
-from wfsobs.observers.estimates import TOTAL
 from wfsobs.prior import Prior
 from wfsobs.priors_from.scenario import prior_and_settings
-from wfsobs.record import Record
+from wfsobs.record import TOTAL, Record
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import simulate, training_settings
 from wfsobs.simulation.true_spectra import has_known_spectra

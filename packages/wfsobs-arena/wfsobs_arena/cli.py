@@ -9,7 +9,7 @@ import numpy as np
 from rich.table import Table
 
 from wfsobs.cli.show import show_table
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 from wfsobs.telemetry.records import save_arrays
 from wfsobs_arena.definition import Arena, add_records, load_arena
 from wfsobs_arena.entries import find_entries

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from wfsobs.scenario.configfile import parse_toml, preset
-from wfsobs.settings.errors import SettingError
-from wfsobs.settings.tree import leaves
-from wfsobs.simulation.synthesis import period_steps
+from wfsobs.settings.values import SettingError, leaves
+from wfsobs.simulation.turbulence import period_steps
 from wfsobs_arena.cases import Case, SimulatedCase
 from wfsobs_arena.telemetry import TelemetryCase
 from wfsobs_arena.tracks import TRACKS

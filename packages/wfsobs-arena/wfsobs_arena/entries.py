@@ -14,7 +14,7 @@ from typing import Any
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
-from wfsobs.settings.errors import SettingError, error_line
+from wfsobs.settings.values import SettingError, error_line
 from wfsobs_arena.challengers import CHALLENGERS
 from wfsobs_arena.identity import code_version
 from wfsobs_arena.tracks import Track

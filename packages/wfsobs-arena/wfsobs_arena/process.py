@@ -20,10 +20,10 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from wfsobs.observers.base import Observer
-from wfsobs.observers.estimates import NEXT_Z, TOTAL
 from wfsobs.progress import Watch
+from wfsobs.record import NEXT_Z, TOTAL
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.errors import error_line
+from wfsobs.settings.values import error_line
 from wfsobs.testing import QUICK, CheckError, check_controller, check_observer
 from wfsobs.typing import Array
 from wfsobs_arena.entries import ArenaEntry, load_object

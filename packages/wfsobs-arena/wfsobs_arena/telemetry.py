@@ -20,8 +20,8 @@ from wfsobs.identification.identification import identify
 from wfsobs.observers.base import Observer
 from wfsobs.pipeline import as_stated
 from wfsobs.prior import Prior
-from wfsobs.priors_from.identification import told_by
 from wfsobs.priors_from.scenario import prior_and_settings
+from wfsobs.priors_from.telemetry import told_by
 from wfsobs.record import Record, RecordError, hold_last
 from wfsobs.scenario import Scenario
 from wfsobs.telemetry.records import load

@@ -23,9 +23,9 @@ from wfsobs.app.render import render
 from wfsobs.app.store import Store
 from wfsobs.app.style import WIDE, HtmlComponent, html, script, sheets
 from wfsobs.scenario.names import column_of, name_settings
-from wfsobs.sensors.modes import TIP_TILT
+from wfsobs.sensors.zernike import TIP_TILT
 from wfsobs.settings.group import Group
-from wfsobs.settings.parameters import Reals
+from wfsobs.settings.values import Reals
 from wfsobs.units import unit_text
 
 ROOM = {"sizing_mode": "stretch_width", "margin": (4, 0)}

@@ -22,9 +22,9 @@ from wfsobs.app.views.plots import AFTERWARDS_MS, once
 from wfsobs.app.work import RunResults
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings
-from wfsobs.scenario.idle import idle_settings
 from wfsobs.scenario.names import preset_line, preset_title, setting_name
 from wfsobs.scenario.presets import PRESETS
+from wfsobs.scenario.scenario import idle_settings
 from wfsobs.settings.group import Group
 
 ON_BAR = {

@@ -23,15 +23,14 @@ from wfsobs.app.share import CAMPAIGN, EXPLORED, CopiedTask
 from wfsobs.app.store import Store
 from wfsobs.app.style import look, make_select, named_row
 from wfsobs.campaign.compare import CampaignErrors
-from wfsobs.campaign.follow import CampaignState, progress_text
+from wfsobs.campaign.follow import UNTESTED, CampaignState, TogetherRow, progress_text, standings
+from wfsobs.campaign.plan import SCENARIO, PlanAxis, condition, plan_axes
 from wfsobs.campaign.report import name_label
-from wfsobs.campaign.selection import SCENARIO, PlanAxis, condition, plan_axes
-from wfsobs.campaign.standings import UNTESTED, TogetherRow, standings
-from wfsobs.evaluation.rows import target_title
+from wfsobs.evaluation.result import target_title
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.names import setting_label, value_of
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 from wfsobs.typing import Array
 
 

@@ -55,10 +55,10 @@ from wfsobs.app.views.switches import LineChoice
 from wfsobs.closed_loop.envelope import POINTS, PlantEnvelope, Uncertainty
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label, loop_verdict, no_theory
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.evaluation.rows import Row as Score
+from wfsobs.evaluation.result import Row as Score
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.evaluation.verdict import Verdict
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 from wfsobs.signal.envelope import envelope, envelope_times
 
 UNSTABLE = macro("tag", "above", "unstable")

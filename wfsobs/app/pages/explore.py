@@ -34,7 +34,7 @@ from wfsobs.app.views.spectrum_editor import Frames, SpectrumEditor
 from wfsobs.app.views.switches import Pinning, SeedSwitch, group
 from wfsobs.app.views.traces import SpectraFigures, Stretch, Traces, drawn_peaks
 from wfsobs.app.work import TRUTH
-from wfsobs.evaluation.error_spectra import Theory
+from wfsobs.evaluation.exact_errors import Theory
 from wfsobs.observers.base import TARGETS, VIBRATION
 
 HEAD = grid_style("minmax(0, 2fr) minmax(0, 3fr)")

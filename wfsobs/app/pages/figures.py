@@ -19,7 +19,7 @@ from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.description import Description, describe
 from wfsobs.observers import OBSERVERS
 from wfsobs.plot.paper import DECADES, FIGURES, WHOLE, ZOOMED, PaperFigure, Plot, drawn_lines, is_dashed, samples_of
-from wfsobs.sensors.modes import TIP_TILT
+from wfsobs.sensors.zernike import TIP_TILT
 from wfsobs.typing import Array
 
 

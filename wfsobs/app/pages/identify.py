@@ -38,9 +38,8 @@ from wfsobs.app.style import look, make_button
 from wfsobs.app.views.plots import call, new_spectrum, set_ends
 from wfsobs.app.work import RunResults
 from wfsobs.identification import Identification, identify
-from wfsobs.identification.identification import LEVEL
-from wfsobs.identification.process import Number
-from wfsobs.identification.report import (
+from wfsobs.identification.identification import (
+    LEVEL,
     Fit,
     bin_periodogram,
     fitted_spectrum,
@@ -49,6 +48,7 @@ from wfsobs.identification.report import (
     mode_rows,
     whiteness_lines,
 )
+from wfsobs.identification.process import Number
 from wfsobs.identification.result import IdentifiedMode
 from wfsobs.observers.missing import fill_missing
 from wfsobs.pipeline import as_stated

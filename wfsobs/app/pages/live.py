@@ -45,22 +45,20 @@ from wfsobs.app.views.switches import group
 from wfsobs.app.views.traces import WINDOW_S
 from wfsobs.app.work import TRUTH
 from wfsobs.closed_loop.rows import strehl
-from wfsobs.evaluation.error_spectra import Theory
-from wfsobs.evaluation.rows import row_label, target_title
+from wfsobs.evaluation.exact_errors import Theory
+from wfsobs.evaluation.result import row_label, target_title
 from wfsobs.evaluation.scores import BOUNDS
-from wfsobs.live.board import ADAPTIVE, NEXT, SCORED, SLOTS
+from wfsobs.live.board import ADAPTIVE, NEXT, SCORED, SHARED, SLOTS, LiveView
 from wfsobs.live.checks import can_control, can_run, has_error, speed_of
 from wfsobs.live.crew import SEATS, USUAL
 from wfsobs.live.finding import Bounds, Change, PeakFinding, moves_of
 from wfsobs.live.loop import LiveLoop, LiveOrder
-from wfsobs.live.replay import Replay
 from wfsobs.live.simulated import SimulatedLoop
-from wfsobs.live.source import ALARM, SIMULATION, STREAM, LiveEvent, LiveSource
-from wfsobs.live.view import SHARED, LiveView
+from wfsobs.live.source import ALARM, SIMULATION, STREAM, LiveEvent, LiveSource, Replay
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.estimates import TOTAL
-from wfsobs.settings.errors import SettingError
+from wfsobs.record import TOTAL
+from wfsobs.settings.values import SettingError
 from wfsobs.typing import Array
 
 SHOWN_EVENTS = 40

@@ -21,13 +21,11 @@ from wfsobs.app.views.plots import FigureLines, Points, call, new_figure, new_sp
 from wfsobs.app.views.traces import WINDOW_S
 from wfsobs.app.work import TRUTH
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.evaluation.recovery import trailing_rms
-from wfsobs.evaluation.scores import BOUNDS
-from wfsobs.live.board import SLOTS
+from wfsobs.evaluation.scores import BOUNDS, trailing_rms
+from wfsobs.live.board import SLOTS, LiveView
 from wfsobs.live.crew import ControlView
 from wfsobs.live.finding import LENGTH, LOWEST, ROWS, Bounds, bridge_missing, second_spectrum
 from wfsobs.live.source import LiveEvent
-from wfsobs.live.view import LiveView
 from wfsobs.scenario import Scenario
 from wfsobs.signal.envelope import envelope, envelope_times
 from wfsobs.signal.spectrum import psd

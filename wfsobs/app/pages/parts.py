@@ -26,8 +26,7 @@ from wfsobs.app.views.plots import call
 from wfsobs.app.views.switches import LineChoice, not_known
 from wfsobs.app.work import RunResults
 from wfsobs.scenario.names import name_settings
-from wfsobs.settings.errors import SettingError
-from wfsobs.settings.parameters import hint
+from wfsobs.settings.values import SettingError, hint
 
 
 class LinkedFields:

@@ -50,14 +50,14 @@ from wfsobs.app.store import Store
 from wfsobs.app.style import HtmlComponent, look, make_select, script, sheets
 from wfsobs.campaign.sweep import MOST_SEEDS, SEED, Sweep, SweepResults, parse_axis, plan_sweep, run_cell
 from wfsobs.campaign.usual_values import usual_values
-from wfsobs.evaluation.rows import target_title
+from wfsobs.evaluation.result import target_title
 from wfsobs.evaluation.scores import SCORED
 from wfsobs.priors_from.scenario import quick_observers
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.grid import Variation
+from wfsobs.scenario.configfile import Variation
 from wfsobs.scenario.names import name_settings, setting_label
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 
 
 def compute(sweep: Sweep, cell: int, number: int, limits: Limits, watch: Watch, _tell: Tell) -> SeedScores:

@@ -16,7 +16,7 @@ from wfsobs.app.style import look, observers_of
 from wfsobs.app.views.plots import add_line, call, new_figure, set_ends
 from wfsobs.campaign.sweep import SweepResults
 from wfsobs.evaluation.evidence import FEWEST
-from wfsobs.evaluation.rows import row_label
+from wfsobs.evaluation.result import row_label
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH
 from wfsobs.evaluation.verdict import sentence_of_several
 from wfsobs.scenario.names import setting_label, setting_name, value_of

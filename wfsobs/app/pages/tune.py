@@ -48,10 +48,11 @@ from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings
 from wfsobs.scenario.names import setting_name
-from wfsobs.sensors.modes import TIP_TILT
+from wfsobs.sensors.zernike import TIP_TILT
 from wfsobs.tuning import Evaluation, TuningResult, tune
 from wfsobs.tuning.records import MEASURES, NEXT, REFERENCE, TRUTH, judged_by
-from wfsobs.tuning.report import (
+from wfsobs.tuning.tuning import (
+    EVALUATIONS,
     LIKELIHOOD,
     OTHER,
     SETTING,
@@ -63,7 +64,6 @@ from wfsobs.tuning.report import (
     tuning_rows,
     tuning_toml,
 )
-from wfsobs.tuning.tuning import EVALUATIONS
 
 MOST = 1000
 """Evaluations."""

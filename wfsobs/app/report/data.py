@@ -18,17 +18,16 @@ from wfsobs.closed_loop.rows import rows as controller_rows
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.budget import Budget, budget_row, error_budget
-from wfsobs.evaluation.error_spectra import cumulative_rms, spectra
 from wfsobs.evaluation.evidence import Evidence
-from wfsobs.evaluation.result import Result
-from wfsobs.evaluation.rows import Row, score_rows
+from wfsobs.evaluation.exact_errors import cumulative_rms, spectra
+from wfsobs.evaluation.result import Result, Row, score_rows
 from wfsobs.evaluation.scores import SCORED
 from wfsobs.evaluation.verdict import verdict
 from wfsobs.observers.base import TARGETS
 from wfsobs.priors_from.scenario import usual_observers
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.grid import Variation
+from wfsobs.scenario.configfile import Variation
 from wfsobs.signal.envelope import envelope, envelope_times
 from wfsobs.typing import Array
 

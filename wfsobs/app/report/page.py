@@ -60,9 +60,9 @@ from wfsobs.pipeline import run
 from wfsobs.progress import QUIET, Watch
 from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.grid import Variation, scenarios
+from wfsobs.scenario.configfile import Variation, scenarios
 from wfsobs.scenario.names import setting_label, value_of
-from wfsobs.sensors.modes import TIP_TILT
+from wfsobs.sensors.zernike import TIP_TILT
 from wfsobs.version import __version__
 
 START = 'document.documentElement.classList.add("js")'
@@ -345,7 +345,7 @@ def export(
     observers : sequence of str, optional
         Ids of the observers; by default all that the scenario has something for.
     vary : sequence of Variation, optional
-        Settings and their values (`wfsobs.scenario.grid.parse_variation`); every combination is run.
+        Settings and their values (`wfsobs.scenario.configfile.parse_variation`); every combination is run.
     preset : str
         Preset that the report compares the settings with.
     seeds : int

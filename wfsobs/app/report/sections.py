@@ -21,7 +21,7 @@ from wfsobs.app.views.errors import ScoreWriter
 from wfsobs.bench.measure import machine
 from wfsobs.closed_loop.rows import NOT_APPLICABLE, label
 from wfsobs.evaluation.budget import TERMS
-from wfsobs.evaluation.rows import Row, row_label, target_title
+from wfsobs.evaluation.result import Row, row_label, target_title
 from wfsobs.evaluation.scores import BOUND, OF_STAR, RESIDUAL
 from wfsobs.prior import GIVEN, IDENTIFIED, TRUE
 from wfsobs.scenario.configfile import changed_settings, reference_preset

@@ -25,11 +25,11 @@ from wfsobs.app.views.switches import LineChoice
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.budget import TERMS as BUDGET_TERMS
 from wfsobs.evaluation.evidence import Evidence, gather_evidence, marks_of, rank_observers
-from wfsobs.evaluation.result import Failure
-from wfsobs.evaluation.rows import NOTHING as NO_KNOWLEDGE
-from wfsobs.evaluation.rows import (
+from wfsobs.evaluation.result import NOTHING as NO_KNOWLEDGE
+from wfsobs.evaluation.result import (
     PEAKS,
     TIME,
+    Failure,
     above_bound,
     can_be_best,
     group_by_knowledge,
@@ -43,7 +43,7 @@ from wfsobs.evaluation.rows import (
     target_title,
     uncertainty_text,
 )
-from wfsobs.evaluation.rows import Row as ScoreRow
+from wfsobs.evaluation.result import Row as ScoreRow
 from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS, LOOP, OF_STAR, PREDICTION, RESIDUAL, SCORED, Score
 from wfsobs.evaluation.verdict import verdict
 from wfsobs.observers import OBSERVERS

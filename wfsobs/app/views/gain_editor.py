@@ -20,13 +20,12 @@ from wfsobs.app.style import look
 from wfsobs.app.views.plots import ExtraLines, Points
 from wfsobs.app.views.spectrum_editor import Frames, HandleLayer, positive
 from wfsobs.closed_loop.design import LawDesign, design_mode, nominal_loop
-from wfsobs.control.integrator import highest_stable_gain
+from wfsobs.control.laws import highest_stable_gain
 from wfsobs.control.margins import Curves, curves
-from wfsobs.evaluation.error_spectra import Theory
-from wfsobs.priors_from.controllers import plant_of
-from wfsobs.priors_from.scenario import told_spectra
+from wfsobs.evaluation.exact_errors import Theory
+from wfsobs.priors_from.scenario import plant_of, told_spectra
 from wfsobs.scenario import Scenario
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 from wfsobs.signal.wiener import Complex
 from wfsobs.simulation.true_spectra import has_known_spectra
 from wfsobs.typing import Array
@@ -202,7 +201,7 @@ class GainEditor:
                 gain = round(handle.axis.gain_at(self.store.scenario, message["frequency"]), 4)
             self._trial = gain if action == "drag" else None
             if action == "release":
-                self.store.replace({"control.integrator": "manual", "control.gain": gain})
+                self.store.replace({"control.laws": "manual", "control.gain": gain})
         except (SettingError, ValueError, KeyError) as error:
             self._note = str(error)
         self._ask(gain)
@@ -213,7 +212,7 @@ class GainEditor:
         if not self.display.editing:
             return
         mode = self.display.column
-        trial = self.store.scenario.replace({"control.integrator": "manual", "control.gain": float(gain), "events": []})
+        trial = self.store.scenario.replace({"control.laws": "manual", "control.gain": float(gain), "events": []})
         if mode < len(trial.modes):
             numbers = [handle.number for handle in self.handles]
             self.frames.ask("gain", partial(self._answer, trial, mode), partial(self._land, numbers))

@@ -21,14 +21,13 @@ from wfsobs.app.service import Session
 from wfsobs.app.store import Store
 from wfsobs.app.style import HtmlComponent, look, observers_of, script, sheets
 from wfsobs.app.views.plots import AFTERWARDS_MS, ExtraLines, Points, once
-from wfsobs.evaluation.error_spectra import TRUTH, Prediction, Theory, is_predicted
-from wfsobs.evaluation.exact_errors import SETTLED
+from wfsobs.evaluation.exact_errors import SETTLED, TRUTH, Prediction, Theory, is_predicted
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TURBULENCE, VIBRATION
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.atmosphere import Peak
-from wfsobs.settings.errors import SettingError
+from wfsobs.settings.values import SettingError
 from wfsobs.simulation.turbulence import turbulence_process
 
 Work = Callable[[], Any]

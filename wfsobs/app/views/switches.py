@@ -19,7 +19,7 @@ from wfsobs.app.render import macro
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.style import HEARD, follow_html, html, make_button, make_select, run_swatch, watch
 from wfsobs.scenario import Scenario
-from wfsobs.sensors.modes import TIP_TILT, Mode
+from wfsobs.sensors.zernike import TIP_TILT, Mode
 
 BUTTONS: Mapping[str, Any] = {"size": "small", "margin": 0, "variant": "outlined", "stylesheets": [HEARD]}
 """Style of the buttons of a switch."""

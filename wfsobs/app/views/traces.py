@@ -37,9 +37,8 @@ from wfsobs.app.views.plots import (
     zoom_of,
 )
 from wfsobs.app.work import TRUTH, Key, RunResults, SignalAndError
-from wfsobs.evaluation.error_spectra import band_rms, spectra
-from wfsobs.evaluation.recovery import trailing_rms
-from wfsobs.evaluation.scores import half_width
+from wfsobs.evaluation.exact_errors import band_rms, spectra
+from wfsobs.evaluation.scores import half_width, trailing_rms
 from wfsobs.observers.base import TARGETS, VIBRATION
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.events import LASER, PEAK, WIND, Event

@@ -47,7 +47,6 @@ from scipy.linalg import toeplitz
 from scipy.linalg.lapack import dpstrf
 
 from wfsobs.observers.base import VIBRATION, Look, Observer, Tunable
-from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.kalman.adaptive import identification_settings
 from wfsobs.observers.kalman.single import MIN_NOISE
 from wfsobs.observers.kalman.window_model import ADAPTIVE, Adaptive, pack_spectrum, unpack_spectrum, window_lengths
@@ -55,14 +54,14 @@ from wfsobs.observers.step import HeldEstimate, StepError, run_frames, whole_fra
 from wfsobs.observers.stepping import FilterBank, SampleHistory, Saved
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
-from wfsobs.record import Measurements, RecordError, Sampling
+from wfsobs.record import Estimates, Measurements, RecordError, Sampling
+from wfsobs.signal.gains import lyapunov, steady_state
 from wfsobs.signal.periodic import FilterStep, PeriodicFilter
-from wfsobs.signal.riccati import lyapunov, steady_state
 from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
 from wfsobs.spectral.model import Spectrum
-from wfsobs.spectral.periodogram import periodogram, periodogram_frequencies
 from wfsobs.spectral.quick import SHORTEST, quick_spectrum
 from wfsobs.spectral.search import missed_variance
+from wfsobs.spectral.whittle import periodogram, periodogram_frequencies
 from wfsobs.typing import Array
 
 

@@ -13,17 +13,26 @@ import numpy as np
 
 from wfsobs.observers.base import VIBRATION, Look, Observer, Tunable
 from wfsobs.observers.baselines import online_reference
-from wfsobs.observers.estimates import Estimates
-from wfsobs.observers.gpr.inputs import Gpr, Windows, over_modes, scales_of, tunable, turns
-from wfsobs.observers.gpr.kernels import SquaredExponential, band, check_condition, square_from_band
 from wfsobs.observers.gpr.sliding_regression import LateRegression, SlidingRegression, finish, run_lengths, slide
+from wfsobs.observers.gpr.windows import (
+    Gpr,
+    SquaredExponential,
+    Windows,
+    band,
+    check_condition,
+    over_modes,
+    scales_of,
+    square_from_band,
+    tunable,
+    turns,
+)
 from wfsobs.observers.step import HeldEstimate, StepError, run_frames, whole_frames
 from wfsobs.observers.stepping import FilterBank, Saved
 from wfsobs.prior import Bands, OnlineBands, Part, Prior, Training
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Measurements, RecordError, Sampling, Signals
+from wfsobs.record import Estimates, Measurements, RecordError, Sampling, Signals
 from wfsobs.settings import Real, Section, Whole
-from wfsobs.signal.bandpass import bandpass_bank, bank_recursion
+from wfsobs.signal.spectrum import bandpass_bank, bank_recursion
 from wfsobs.typing import Array
 
 

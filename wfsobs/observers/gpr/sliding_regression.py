@@ -42,7 +42,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.blas import dsymv, dsyr2k
 
-from wfsobs.observers.gpr.kernels import ConditionError, Points, SquaredExponential, restart_interval
+from wfsobs.observers.gpr.windows import ConditionError, Points, SquaredExponential, restart_interval
 from wfsobs.observers.stepping import Saved
 from wfsobs.signal.linalg import eliminate
 from wfsobs.typing import Array

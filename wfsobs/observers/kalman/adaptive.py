@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
-from wfsobs.observers.estimates import Estimates, by_name
 from wfsobs.observers.kalman.single import NGS
 from wfsobs.observers.kalman.step import STEADY, KalmanEstimator
 from wfsobs.observers.kalman.window_model import (
@@ -41,7 +40,7 @@ from wfsobs.observers.step import Estimator, StepError, run_frames
 from wfsobs.observers.stepping import SampleHistory, Saved
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
-from wfsobs.record import Measurements, RecordError, Sampling
+from wfsobs.record import Estimates, Measurements, RecordError, Sampling, by_name
 from wfsobs.typing import Array
 
 STILL = 0.7, 1.4

@@ -30,16 +30,15 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Look, Observer
-from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimates, by_name
 from wfsobs.observers.kalman.mode_filter import ModeFilter
 from wfsobs.observers.kalman.single import NGS, PEAKS, TUNABLE_PEAKS, MultiPeak, every_peak_filter, steady_mode, vibration_used
 from wfsobs.observers.kalman.step import carry_state, matrix_power
 from wfsobs.observers.step import Estimator, StepError, run_frames
 from wfsobs.prior import Asterism, FlowOfBoth, Lines, Prior
 from wfsobs.progress import Watch
-from wfsobs.record import Measurements, Sampling
-from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.ar3 import Ar3
+from wfsobs.record import NEXT_Z, TOTAL, Estimates, Measurements, Sampling, by_name
+from wfsobs.signal.autoregressive import Ar2, Ar3
+from wfsobs.signal.gains import lyapunov
 from wfsobs.signal.joint_states import (
     Present,
     PresentInputs,
@@ -53,7 +52,6 @@ from wfsobs.signal.joint_states import (
     shared_covariance,
 )
 from wfsobs.signal.periodic import PeriodicFilter
-from wfsobs.signal.riccati import lyapunov
 from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array

@@ -7,11 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wfsobs.observers.estimates import TARGETS
 from wfsobs.observers.stepping import GainCycle
 from wfsobs.prior import Prior
-from wfsobs.signal.gap_gains import ONE, GapGains, SensorMean
-from wfsobs.signal.riccati import Step, lyapunov
+from wfsobs.record import TARGETS
+from wfsobs.signal.gains import ONE, GapGains, SensorMean, Step, lyapunov
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
 

@@ -40,11 +40,9 @@ from wfsobs.observers.stepping import Gain, GainCycle
 from wfsobs.prior import Beams, LgsError, LgsStars, Lines, Model, Noise, NoiselessModel, Part, Prior
 from wfsobs.settings import Group, Real, Section
 from wfsobs.settings.group import UsedWhen
-from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.ar3 import Ar3
-from wfsobs.signal.gap_gains import ONE, SensorMean
+from wfsobs.signal.autoregressive import Ar2, Ar3
+from wfsobs.signal.gains import ONE, SensorMean, SteadyState, Step, periodic_steady_state, posteriors_of_gains, steady_state
 from wfsobs.signal.periodic import PeriodicFilter
-from wfsobs.signal.riccati import SteadyState, Step, periodic_steady_state, posteriors_of_gains, steady_state
 from wfsobs.signal.statespace import DisturbanceModel, blocks_along_diagonal, disturbance_model
 from wfsobs.typing import Array
 

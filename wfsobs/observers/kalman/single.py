@@ -24,10 +24,9 @@ from wfsobs.observers.stepping import Gain, GainCycle
 from wfsobs.prior import LgsModel, LgsStars, Lines, Model, NgsModel, Prior
 from wfsobs.record import Sampling
 from wfsobs.settings import Group, Real, Section, Whole
-from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.gap_gains import ONE, SensorMean
+from wfsobs.signal.autoregressive import Ar2
+from wfsobs.signal.gains import ONE, SensorMean, SteadyState, steady_state
 from wfsobs.signal.periodic import PeriodicFilter
-from wfsobs.signal.riccati import SteadyState, steady_state
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
 

@@ -5,7 +5,7 @@ the model and P that of the estimate after a measurement, the error of the predi
 
     A^f P A^f' + S - A^f S A^f'.
 
-A measurement that is missing is NaN. Near it the gains are those of the covariance as it is there (`wfsobs.signal.gap_gains`).
+A measurement that is missing is NaN. Near it the gains are those of the covariance as it is there (`wfsobs.signal.gains`).
 """
 
 from __future__ import annotations
@@ -16,15 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import block_diag, fractional_matrix_power
 
-from wfsobs.observers.estimates import TARGETS, Estimates, by_name
 from wfsobs.observers.kalman.mode_filter import ModeFilter, StatedErrors
 from wfsobs.observers.step import Estimator, StepError, run_frames, whole_frames
 from wfsobs.observers.stepping import FilterBank, Gain, GainCycle, Saved
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
-from wfsobs.record import Measurements, Sampling
-from wfsobs.signal.gap_gains import GapGains, GapStep, SensorMean
-from wfsobs.signal.riccati import lyapunov
+from wfsobs.record import TARGETS, Estimates, Measurements, Sampling, by_name
+from wfsobs.signal.gains import GapGains, GapStep, SensorMean, lyapunov
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
 

@@ -6,10 +6,10 @@ from typing import ClassVar
 
 import param
 
-from wfsobs.sensors.modes import HIGHEST_ORDER
+from wfsobs.sensors.zernike import HIGHEST_ORDER
 from wfsobs.settings.group import Group, UsedWhen, section
-from wfsobs.settings.parameters import Choice, Real, Reals, Whole
 from wfsobs.settings.priors import PAPER_PEAK_HZ
+from wfsobs.settings.values import Choice, Real, Reals, Whole
 
 
 class Telescope(Group):

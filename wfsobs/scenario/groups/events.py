@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from wfsobs.settings.group import Group, UsedWhen
-from wfsobs.settings.parameters import Choice, Real, Whole
+from wfsobs.settings.values import Choice, Real, Whole
 from wfsobs.typing import Array
 
 PEAK, WIND, LASER, FRAMES = "peak", "wind", "laser", "frames"

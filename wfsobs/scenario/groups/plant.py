@@ -7,7 +7,7 @@ from typing import ClassVar, NamedTuple
 import param
 
 from wfsobs.settings.group import Group, UsedWhen
-from wfsobs.settings.parameters import Choice, Real, Reals, Whole
+from wfsobs.settings.values import Choice, Real, Reals, Whole
 
 
 class Mount(NamedTuple):

@@ -7,9 +7,8 @@ from typing import ClassVar, Literal
 import param
 
 from wfsobs.sensors.lenslets import Lenslets, highest_order
-from wfsobs.settings.errors import SettingError
 from wfsobs.settings.group import Group, UsedWhen, section
-from wfsobs.settings.parameters import Choice, Real, Reals, Whole
+from wfsobs.settings.values import Choice, Real, Reals, SettingError, Whole
 
 
 class LensletArrays(Group):

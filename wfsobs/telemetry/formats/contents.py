@@ -17,7 +17,7 @@ from typing import IO, Any
 import numpy as np
 
 from wfsobs.record import RecordError
-from wfsobs.sensors.modes import TIP_TILT
+from wfsobs.sensors.zernike import TIP_TILT
 from wfsobs.typing import Array
 from wfsobs.units import DAYS, SECONDS, parse_unit, split_unit
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from wfsobs.control.base import Controller
 from wfsobs.observers.base import TURBULENCE, VIBRATION, Observer
-from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimates
+from wfsobs.record import NEXT_Z, TOTAL, Estimates
 from wfsobs.typing import Array
 
 

@@ -16,10 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from wfsobs.observers.base import TARGETS, Observer
-from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimates
 from wfsobs.prior import Model, Prior
 from wfsobs.progress import Watch
-from wfsobs.record import Measurements
+from wfsobs.record import NEXT_Z, TOTAL, Estimates, Measurements
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
 from wfsobs_arena.challengers.base import Challenger

@@ -15,10 +15,9 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from wfsobs.observers.base import TARGETS, Observer
-from wfsobs.observers.estimates import Estimates
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
-from wfsobs.record import Measurements
+from wfsobs.record import Estimates, Measurements
 from wfsobs.typing import Array
 from wfsobs_arena.challengers.base import WHOLE, Challenger, whole_estimate
 from wfsobs_arena.challengers.rls import histories

@@ -1,9 +1,10 @@
-"""Training data: of a record, from another record of the same loop, or the first part of the record itself."""
+"""What observers are told of telemetry: an identification or the file of one, and training data."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,7 +12,29 @@ from wfsobs.observers.missing import fill_missing
 from wfsobs.prior import Prior
 from wfsobs.record import Record, RecordError, Training
 from wfsobs.scenario import Scenario
-from wfsobs.settings.errors import shorten
+from wfsobs.settings.values import shorten
+
+if TYPE_CHECKING:
+    from wfsobs.identification.result import Identification
+
+
+FOUND = ("telescope", "turbulence", "vibration", "sensors", "kalman", "butterworth")
+"""Groups of settings of which priors are made."""
+
+
+def told_by(model: Scenario | Identification, scenario: Scenario) -> Scenario:
+    """Return a scenario with the models of an identification, and all other settings of `scenario`.
+
+    model : an identification, or the file of one (`wfsobs identify --out`)
+    """
+    if not isinstance(model, Scenario):
+        model = model.scenario(scenario)
+    out = scenario.before_events.copy()
+    for group in FOUND:
+        setattr(out, group, getattr(model, group).copy())
+    out.kalman.ngs_between_frames = scenario.kalman.ngs_between_frames  # what a filter does, not what it is told
+    return out
+
 
 SAME_RATE = 1e-6
 """Relative difference of two rates that is none: time stamps are rounded."""

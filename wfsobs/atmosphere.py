@@ -1,5 +1,20 @@
 """Von Karman turbulence carried by the wind unchanged, layer by layer, without a phase screen.
 
+The phase of a layer at time t, in the pupil plane, is a sum of plane waves that move with the wind,
+
+    phi(r, t) = Re sum_k A(k) exp(i k . (r - v t)),    k_x > 0 along the wind.
+
+A sensor's output is a fixed linear functional of the phase, given by its value for exp(i k . r), its transform M(k).
+A whole time series is then one Fourier transform of
+
+    a(k_x) = sum_ky A(k_x, k_y) M(k),    a(t) = Re sum_kx a(k_x) exp(-i k_x v t).
+
+Sensors that share the waves share the turbulence, so their covariances are exact.
+
+The trapezoidal rule in u(k) = asinh(k / q) / h + k / delta, q^2 the outer scale's k_0^2 and, where the rule is across the
+wind, k_x^2 besides. The first term follows the spectrum, analytic in u; the second keeps the spacing below delta, which
+resolves the aperture and the way between beams.
+
 A layer is a sum of plane waves with independent complex Gaussian amplitudes (see `plane_waves`), so the signals of all sensors
 are sums over its waves, and the covariances between them are those of the continuous spectrum as far as the sums are quadratures
 of the integrals. In the layer's own frame, x along the wind, a wave of k_x oscillates with the frequency f = k_x v / 2 pi.
@@ -19,15 +34,168 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len
 from scipy.special import erfc
 
-from wfsobs.atmosphere.plane_waves import Footprint, Sensor, Wave
-from wfsobs.atmosphere.von_karman import CORE, FIELD, TurbulenceLayer, fine_rule, nodes_across_wind, von_karman_density
 from wfsobs.progress import QUIET, Watch
 from wfsobs.typing import Array
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """Where a beam crosses a layer.
+
+    Attributes
+    ----------
+    scale : float
+        Beam diameter over aperture diameter, 1 - h / H for a star at height H, 1 for one at infinity.
+    shift : tuple of float
+        (x, y) of its centre on the layer [m], pupil frame.
+    """
+
+    scale: float = 1.0
+    shift: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Wave:
+    """The random waves of one layer on a block of spatial frequencies.
+
+    Attributes
+    ----------
+    kx : Array
+        Along the wind, above 0, (Nx,) [rad/m].
+    ky : Array
+        Across the wind, ascending and symmetric about 0, (Ny,) [rad/m].
+    angle : float
+        Direction that the wind blows to, from the pupil's x axis to its y axis [rad].
+    amplitude : Array
+        Complex A of the sums above, quadrature weights included, (Ny, Nx) [um of wavefront].
+    """
+
+    kx: Array
+    ky: Array
+    angle: float
+    amplitude: Array
+
+    def through(self, footprint: Footprint) -> Array:
+        """Return the amplitudes in a frame about the centre of the footprint, A exp(i k . shift), complex (Ny, Nx) [um]."""
+        x, y = footprint.shift
+        if x == 0.0 and y == 0.0:
+            return self.amplitude
+        c, s = np.cos(self.angle), np.sin(self.angle)
+        along, across = c * x + s * y, c * y - s * x
+        return self.amplitude * np.exp(1j * self.ky * across)[:, None] * np.exp(1j * self.kx * along)
+
+    def in_pupil(self) -> tuple[Array, Array]:
+        """Return (k_x, k_y) of the waves in the pupil frame, each (Ny, Nx) [rad/m]."""
+        c, s = np.cos(self.angle), np.sin(self.angle)
+        kx, ky = self.kx[None, :], self.ky[:, None]
+        return c * kx - s * ky, s * kx + c * ky
+
+
+class Sensor(Protocol):
+    """A linear wavefront sensor with its reconstruction."""
+
+    @property
+    def n_outputs(self) -> int:
+        """Number of outputs, such as Zernike coefficients."""
+        ...
+
+    @property
+    def reach(self) -> float:
+        """Maximum spatial frequency on the pupil that the sensor needs [rad/m]; waves beyond may be left out."""
+        ...
+
+    def measure(self, wave: Wave, footprint: Footprint) -> Array:
+        """Return the response to the waves, a(k_x) per output: complex (n_outputs, Nx) [um].
+
+        A wave exp(i k . r) of the layer is exp(i s k . r) on the pupil, s the scale of the footprint, times the factor
+        that `Wave.through` puts into the amplitudes.
+        """
+        ...
+
+
+SEEING_WAVELENGTH = 0.5
+"""Wavelength of r0 [um]."""
+CORE = 64.0
+"""k D / 2 up to which waves are finely resolved across the wind; less than 1e-4 of the variance of radial order 6 lies beyond."""
+FIELD = 1e-3
+"""Shifts between beams that the spacing across the wind resolves [m per m of height, 3.4 arcmin]."""
+
+
+@dataclass(frozen=True)
+class TurbulenceLayer:
+    """One layer along the line of sight.
+
+    Attributes
+    ----------
+    strength : float
+        r0^(-5/3) of the layer alone, r0 at 500 nm [m^(-5/3)].
+    height : float
+        Distance along the line of sight [m].
+    speed : float
+        Wind speed [m/s].
+    angle : float
+        Direction that the wind blows to, from the pupil's x axis to its y axis [rad].
+    """
+
+    strength: float
+    height: float
+    speed: float
+    angle: float
+
+
+def von_karman_density(k2: Array, strength: float, outer_scale: float) -> Array:
+    """Return the von Karman density of the wavefront; its integral over the plane d^2k is the variance.
+
+    0.0229 r0^(-5/3) (f^2 + L0^-2)^(-11/6) rad^2 m^2 with k = 2 pi f (Noll 1976, eq. 21, with an outer scale).
+
+    Parameters
+    ----------
+    k2 : Array
+        Squared angular spatial frequency [rad^2/m^2].
+    strength : float
+        r0^(-5/3), r0 at 500 nm [m^(-5/3)].
+    outer_scale : float
+        L0 [m].
+
+    Returns
+    -------
+    Array
+        Density [um^2 m^2].
+    """
+    in_angular = 0.0229 * strength * (2.0 * np.pi) ** (11.0 / 3.0 - 2.0)
+    return in_angular * (k2 + (2.0 * np.pi / outer_scale) ** 2) ** (-11.0 / 6.0) * (SEEING_WAVELENGTH / (2.0 * np.pi)) ** 2
+
+
+def fine_rule(height: float, diameter: float) -> tuple[float, float]:
+    """Return (delta, h) of the fine rule across the wind."""
+    return np.pi / (diameter + FIELD * height), 0.5
+
+
+def nodes_across_wind(q: float, end: float, delta: float, h: float) -> tuple[Array, Array]:
+    """Return nodes k_y, symmetric about 0, and weights [rad/m] of the rule above, out to about `end`."""
+
+    def u(k: Array) -> Array:
+        return np.arcsinh(k / q) / h + k / delta
+
+    n = int(np.ceil(float(u(np.array(end)))))
+    wanted = np.arange(n) + 0.5
+    table = q * np.sinh(np.linspace(0.0, np.arcsinh(end / q) + 1.0, 8 * n + 2))
+    k = np.interp(wanted, u(table), table)
+    for _ in range(3):
+        k -= (u(k) - wanted) * _spacing(k, q, delta, h)
+    weight = _spacing(k, q, delta, h)
+    return np.concatenate([-k[::-1], k]), np.concatenate([weight[::-1], weight])
+
+
+def _spacing(k: Array, q: float, delta: float, h: float) -> Array:
+    return 1.0 / (1.0 / (h * np.hypot(k, q)) + 1.0 / delta)
+
 
 TAPER = 16
 """Multiples of 1 / P below which single nodes replace the FFT."""

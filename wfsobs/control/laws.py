@@ -1,4 +1,4 @@
-"""The integrator u[k] = leak u[k-1] - g y[k], the yardstick of every other controller, and its best gain.
+"""The integrator, LQG and H2: control laws, and the best gain of an integrator.
 
 The integrator's optimal gain from closed-loop telemetry, without a model of spectra or noise.
 
@@ -7,21 +7,48 @@ y = E(g) z. With white noise and at least one step of delay, E(g) = 1 + terms of
 with the residual that it measures and mean y^2 is the mean square of the residual plus the variance of the noise, whatever g is:
 the gain that is best for y is best for the residual. This is the integral over the measured spectrum times |E(g)|^2 by which
 observatories optimise modal gains (Gendron and Lena 1994, A&A 291, 337), taken over the samples themselves.
+
+The mirror follows a command at once and without cost, so the best command is minus the prediction of what the disturbance
+will be while it acts (certainty equivalence): u[k] = -(turb_hat[k+1] + vib_hat[k+1]) for the paper's delay of two
+frames, and for n + f frames the mean over the time that the command is held,
+
+    u[k] = -((1 - f) phi_hat[k+n-1] + f phi_hat[k+n]).
+
+The adaptive ones predict by a filter that is identified anew while the loop runs, from the pseudo-open-loop so far; until its
+first window is full an integrator closes the loop.
+
+A law u = -Q z is in itself the parametrisation of all stabilising controllers by a stable Q (Youla). With Q of finite length the
+mean square of the residual is quadratic in its taps, and what limits it is convex:
+
+    |1 - P Q| <= PEAK                      no disturbance is amplified by more
+    |P Q| W <= ROBUST / caution,           W = max |P' / P - 1| over errors of delay, gain and rotation
+
+The second, below 1, keeps the loop stable for every such plant P' (small gain; a rotation by theta turns the two modes of a pair
+of azimuthal order m by exp(+-i m theta), and m = 1 is borne). It rolls the command off where the delay is felt most. After
+P. Dinis et al. 2024 (arXiv:2410.05123), who design by the frequency response of a plant that was measured. The limits act by
+multipliers at each frequency, which grow in proportion to what is exceeded (iterative reweighting, as C. Lawson's).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import pi
+from typing import Any
 
 import numpy as np
+from scipy.linalg import toeplitz
 from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 
 from wfsobs.control.margins import residual_density
-from wfsobs.control.mirror import Law, Mirror
+from wfsobs.control.mirror import Law, Mirror, Plant
+from wfsobs.control.step import Integrators, PredictionLaws
+from wfsobs.observers.base import TARGETS
+from wfsobs.observers.kalman.step import MakeFilter
+from wfsobs.observers.step import MakeEstimator
 from wfsobs.observers.stepping import Gain, GainCycle
-from wfsobs.prior import Spectra
-from wfsobs.record import RecordError
+from wfsobs.prior import Noise, Prior, Spectra
+from wfsobs.record import RecordError, Sampling
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.typing import Array
 
@@ -192,3 +219,100 @@ def _least(gains: Array, variance: Array) -> tuple[float, float]:
     a, b, c = np.polyfit(gains[three] - gains[best], variance[three], 2)
     step = float(np.clip(-0.5 * b / a, gains[0] - gains[1], gains[1] - gains[0])) if a > 0.0 else 0.0
     return float(gains[best] + step), float(c + step * (b + step * a))
+
+
+def command_rows(A: Array, phi: Array, mirror: Mirror) -> Array:
+    """Row (1, n) that makes the command of the estimated state x_hat[k].
+
+    A (n, n): transition; phi (n,): row that gives phi_dist[k], which no other part of the state drives later on
+    """
+    row = -phi
+    out = np.zeros_like(row)
+    for tap in mirror.taps[1:]:
+        out += tap * row
+        row = row @ A
+    return out[None, :]
+
+
+def _with_caution(prior: Prior, settings: Any) -> Prior:
+    """Return a prior with the noise that the settings have a filter take measurements to have."""
+    factor = settings.control.caution
+    if factor == 1.0:
+        return prior
+    return replace(
+        prior,
+        model=tuple(replace(m, lgs_noise=factor * m.lgs_noise, ngs_noise=factor * m.ngs_noise) for m in prior.model),
+        lines=tuple(replace(lines, noise=factor * lines.noise) for lines in prior.lines),
+        noise=tuple(Noise(factor * lgs, factor * ngs) for lgs, ngs in prior.noise),
+    )
+
+
+def lqg(make: MakeFilter, group: str, prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
+    """Return the law that commands against what a filter predicts; group : its settings, "" for none. Raises ValueError."""
+    one = make(getattr(settings, group, None), _with_caution(prior, settings), mode, plant.ratio)
+    row = command_rows(one.cycle[0][0], one.rows(TARGETS).sum(axis=0), plant.mirror)
+    return Law(one.gains.recursion(row), gains=one.gains, row=row[0], filter=one)
+
+
+def lqg_adaptive(make: MakeEstimator, prior: Prior, plant: Plant, settings: Any, sampling: Sampling) -> PredictionLaws:
+    """Return the laws of an adaptive filter, at first of integrators. Raises RecordError for a window of too few samples."""
+    first = integrator_law(plant.mirror, settings.control.fallback_gain, settings.control.leak)
+    integrators = Integrators([first] * sampling.n_modes, plant.mirror)
+    return PredictionLaws(make(prior, settings.adaptive, sampling, 0.0), integrators, plant.mirror)
+
+
+TAPS = 64
+"""Length of Q."""
+
+PEAK = 2.0
+"""Largest amplification of a disturbance."""
+
+ROBUST = 0.8
+"""Part of what small gain allows that a law of caution 1 takes."""
+
+DELAY, GAIN, ROTATION = 0.5, 0.2, 10.0
+"""Errors of the plant that are borne, either way: delay [frames], gain, rotation [deg]."""
+
+FREQUENCIES = np.unique(np.concatenate([np.geomspace(1e-3, pi, 60), np.linspace(0.02, pi, 140)]))
+"""Frequencies of the limits [rad per step]."""
+
+ROUNDS = 300
+"""Of the multipliers; after a third of them the taps change by less than 1e-6."""
+
+
+def h2_fir(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
+    """Return the law of one mode of least residual within the limits, by the spectra in the prior; `control.caution` counts."""
+    q = taps_of(prior.spectra[mode], plant.mirror, settings.control.caution)
+    gains = GainCycle([Gain(np.eye(q.size, k=-1), np.zeros((1, q.size)), np.eye(q.size)[:, :1])])  # the state is the last z
+    return Law(gains.filter(-q[None]), gains=gains, row=-q)
+
+
+def taps_of(spectra: Spectra, mirror: Mirror, caution: float) -> Array:
+    """Return the taps of Q (TAPS,), of commands over measurements; spectra : on equidistant frequencies up to half the rate."""
+    n = spectra.measurement.size
+    P = mirror.response(pi * np.arange(n) / (n - 1))
+    power = np.fft.irfft(np.abs(P) ** 2 * spectra.measurement)[:TAPS]
+    target = np.fft.irfft(spectra.cross * np.conj(P))[:TAPS]
+    response, lags = mirror.response(FREQUENCIES), np.arange(TAPS)
+    E = response[:, None] * np.exp(-1j * FREQUENCIES[:, None] * lags)
+    of_limits = np.abs(response) ** 2 * np.cos(lags[:, None] * FREQUENCIES)  # E* w E is Toeplitz, its first column of_limits w
+    most = ROBUST / caution / uncertainty(mirror, FREQUENCIES)
+    scale = power[0]
+    power[0] += 1e-12 * scale
+    peak, roll_off = np.full((2, FREQUENCIES.size), 1e-9 * scale)
+    q = np.zeros(TAPS)
+    for _ in range(ROUNDS):
+        q = np.linalg.solve(toeplitz(power + of_limits @ (peak + roll_off)), target + E.real.T @ peak)
+        T = E @ q
+        peak = np.maximum(peak * (np.abs(1.0 - T) / PEAK) ** 1.5, 1e-14 * scale)
+        roll_off = np.maximum(roll_off * (np.abs(T) / most) ** 1.5, 1e-14 * scale)
+    return q
+
+
+def uncertainty(mirror: Mirror, omega: Array) -> Array:
+    """Return W at omega [rad per step], the same shape (n,)."""
+    lags = np.linspace(max(-DELAY, 1.0 - mirror.delay), DELAY, 5)
+    turned = [replace(mirror, delay=mirror.delay + lag).response(omega) / mirror.response(omega) for lag in lags]
+    angles = np.exp(1j * np.radians([-ROTATION, 0.0, ROTATION]))
+    factors = np.multiply.outer([1.0 - GAIN, 1.0, 1.0 + GAIN], angles).ravel()
+    return np.abs(np.multiply.outer(factors, np.array(turned)) - 1.0).max(axis=(0, 1))
