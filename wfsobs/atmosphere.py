@@ -11,20 +11,18 @@ A whole time series is then one Fourier transform of
 
 Sensors that share the waves share the turbulence, so their covariances are exact.
 
-The trapezoidal rule in u(k) = asinh(k / q) / h + k / delta, q^2 the outer scale's k_0^2 and, where the rule is across the
-wind, k_x^2 besides. The first term follows the spectrum, analytic in u; the second keeps the spacing below delta, which
-resolves the aperture and the way between beams.
+Integrals over spatial frequencies are by the trapezoidal rule in u(k) = asinh(k / q) / h + k / delta, q^2 the outer scale's k_0^2
+and, where the rule is across the wind, k_x^2 besides. The first term follows the spectrum, analytic in u; the second keeps the
+spacing below delta, which resolves the aperture and the way between beams.
 
-A layer is a sum of plane waves with independent complex Gaussian amplitudes (see `plane_waves`), so the signals of all sensors
-are sums over its waves, and the covariances between them are those of the continuous spectrum as far as the sums are quadratures
-of the integrals. In the layer's own frame, x along the wind, a wave of k_x oscillates with the frequency f = k_x v / 2 pi.
+The amplitudes of the waves are independent complex Gaussian numbers, so the signals of all sensors are sums over the waves, and
+the covariances between them are those of the continuous spectrum as far as the sums are quadratures of the integrals. In the
+layer's own frame, x along the wind, a wave of k_x oscillates with the frequency f = k_x v / 2 pi.
 
 Along the wind: an FFT over a period P of more than twice the record and the passage of a beam gives f = j / P. The spectrum
 is not smooth on that grid near f = 0, where most of the power is, so below TAPER / P a smooth window hands it over to
 Gauss-Legendre nodes, panel by panel down to the outer scale, that are summed one by one (`frequency_grid`). Both together have
 the right covariance at all lags of the record, the first step like the last, and none of the FFT's period.
-
-Across the wind: the rule of `von_karman`.
 
 Small waves that a Zernike mode averages away cause the aliasing of a Shack-Hartmann sensor. They are computed, with random
 numbers of their own, where a sensor's `reach` includes them.

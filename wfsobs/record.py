@@ -1,7 +1,4 @@
-"""Types of one run's data: `Measurements` of sensors and mirror, and `Record`, which adds the truth where there is one.
-
-Estimates of an observer: what it returns, and one target of it.
-"""
+"""Types of one run's data: `Measurements`, `Record`, which adds the truth where there is one, and `Estimates` of an observer."""
 
 from __future__ import annotations
 

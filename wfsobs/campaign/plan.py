@@ -1,6 +1,6 @@
 """What a campaign runs: its scenarios, seeds, observers and controllers, from a TOML file.
 
-Some scenarios of a campaign, by the values of what they differ in: NAME=VALUE, of numbers also NAME=LOW..HIGH.
+Some of its scenarios are chosen by the values of what they differ in: NAME=VALUE, of numbers also NAME=LOW..HIGH.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """The laws of all controllers of a scenario, and what theory says of them before any random number.
 
-The residual of a linear controller under the true spectra, computed, not measured on records; of both sensors, too.
-
-What the mirror does against the disturbance of step k, -phi_corr[k], is an estimate of it from measurements as old as the delay
-is long, so that its residual is the error of a fixed linear observer (`exact_errors`).
+The residual of a linear controller follows from the true spectra; of both sensors, too. What the mirror does against the
+disturbance of step k, -phi_corr[k], is an estimate of it from measurements as old as the delay is long, so that its residual is
+the error of a fixed linear observer (`exact_errors`).
 """
 
 from __future__ import annotations

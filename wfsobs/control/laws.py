@@ -1,24 +1,26 @@
-"""The integrator, LQG and H2: control laws, and the best gain of an integrator.
+"""Control laws: the integrator and its best gain, LQG, and H2 robust to a plant that is not the assumed one.
 
-The integrator's optimal gain from closed-loop telemetry, without a model of spectra or noise.
+The integrator u[k] = leak u[k-1] - g y[k] is the yardstick of all others. Its optimal gain is found from closed-loop telemetry,
+without a model of spectra or noise. The pseudo-open-loop z of a record is what an integrator of another gain would have been
+given: it would have left the measurement y = E(g) z. With white noise and at least one step of delay, E(g) = 1 + terms of the
+past, so that the noise of y is uncorrelated with the residual that it measures and mean y^2 is the mean square of the residual
+plus the variance of the noise, whatever g is: the gain that is best for y is best for the residual. This is the integral over the
+measured spectrum times |E(g)|^2 by which observatories optimise modal gains (Gendron and Lena 1994, A&A 291, 337), taken over the
+samples themselves.
 
-The pseudo-open-loop z of a record is what an integrator of another gain would have been given: it would have left the measurement
-y = E(g) z. With white noise and at least one step of delay, E(g) = 1 + terms of the past, so that the noise of y is uncorrelated
-with the residual that it measures and mean y^2 is the mean square of the residual plus the variance of the noise, whatever g is:
-the gain that is best for y is best for the residual. This is the integral over the measured spectrum times |E(g)|^2 by which
-observatories optimise modal gains (Gendron and Lena 1994, A&A 291, 337), taken over the samples themselves.
-
-The mirror follows a command at once and without cost, so the best command is minus the prediction of what the disturbance
-will be while it acts (certainty equivalence): u[k] = -(turb_hat[k+1] + vib_hat[k+1]) for the paper's delay of two
-frames, and for n + f frames the mean over the time that the command is held,
+LQG commands against the disturbance what a Kalman filter predicts of it. The mirror follows a command at once and without cost,
+so the best command is minus the prediction of what the disturbance will be while it acts (certainty equivalence): u[k] =
+-(turb_hat[k+1] + vib_hat[k+1]) for the paper's delay of two frames, and for n + f frames the mean over the time that the command
+is held,
 
     u[k] = -((1 - f) phi_hat[k+n-1] + f phi_hat[k+n]).
 
 The adaptive ones predict by a filter that is identified anew while the loop runs, from the pseudo-open-loop so far; until its
 first window is full an integrator closes the loop.
 
-A law u = -Q z is in itself the parametrisation of all stabilising controllers by a stable Q (Youla). With Q of finite length the
-mean square of the residual is quadratic in its taps, and what limits it is convex:
+H2 control is a finite impulse response from z to the command. A law u = -Q z is in itself the parametrisation of all stabilising
+controllers by a stable Q (Youla). With Q of finite length the mean square of the residual is quadratic in its taps, and what
+limits it is convex:
 
     |1 - P Q| <= PEAK                      no disturbance is amplified by more
     |P Q| W <= ROBUST / caution,           W = max |P' / P - 1| over errors of delay, gain and rotation

@@ -2,7 +2,7 @@
 
 Every bound is that of the true spectra and noises of a scenario (`true_spectra`), after an infinitely long record. For Gaussian
 signals no observer is better, linear or not, unless it has more information, or remembers a record of random phases, which is
-periodic (`synthesis`).
+periodic (`turbulence`).
 
 - *lgs*: all measurements of the mean of the LGS in one mode, or of what `sensors.lgs_combination` makes of them: the error of the
   Wiener filter (`wiener`). Undamped lines are then known. A record is neither infinitely long nor the mean of all:

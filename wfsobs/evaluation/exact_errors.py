@@ -19,7 +19,7 @@ A wave exp(i w k) of z becomes n waves of the estimate,
 and one of the frames likewise. At w + 2 pi l / n the error has, on average over the cycle, |1 at l = 0, -c_l, -d_l|^2 in the
 spectral matrix of s, z and y at w. (Bittanti and Colaneri, Periodic Systems, 2009, chapter 6, have these transfer functions.)
 
-Predictions follow from the true spectra of the scenario (`true_spectra`) and the responses of an observer (`exact_errors`). They
+Predictions follow from the true spectra of the scenario (`true_spectra`) and the responses of an observer. They
 are the expectation over records after an infinitely long start. A record is one of them, and the scores of a short one scatter
 around it.
 
@@ -250,7 +250,7 @@ def exact_errors(
     scenario : Scenario
         Of known spectra (`has_known_spectra`).
     spectra : sequence of TrueSpectra
-        Mode by mode, what it meets; by default the true spectra of the scenario, which leave out aliasing (`lenslet_spectra`).
+        Mode by mode, what it meets; by default the true spectra of the scenario, which leave out aliasing.
 
     Returns
     -------

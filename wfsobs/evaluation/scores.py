@@ -2,7 +2,7 @@
 
 Errors that are compared are on common samples.
 
-Error against time: the effect of an event, and the recovery time of each observer.
+The error against time shows the effect of an event, and how long each observer takes to recover.
 """
 
 from __future__ import annotations

@@ -1,17 +1,18 @@
 """A controller's design for programs elsewhere: matrices, C99, python-control.
 
-Per mode, with e[k] the innovation of the measurements v[k] (z alone, or z and the NGS frame):
+What every format holds is a linear controller as matrices. Per mode, with e[k] the innovation of the measurements v[k] (z alone,
+or z and the NGS frame):
 
     e = v - C x,    w = x + L e,    u = row w,    x <- A w,
 
 (A, C, L) repeating every few steps. To a Kalman filter a measurement that is missing is none, and near it the gains are those of
 its covariance (`wfsobs.signal.gains`). To another controller its innovation is that of what a filter of its own predicts.
 
-Sparse rows of A and dense C and L are tables of constants; one function runs any of the filters. The state is a struct of the
-caller's. Near gaps the covariance of a Kalman filter goes along, in double precision; it starts from that of the steady state,
-which is a table as well.
+In C99, with the gate before it and without dependencies, sparse rows of A and dense C and L are tables of constants; one function
+runs any of the filters. The state is a struct of the caller's. Near gaps the covariance of a Kalman filter goes along, in double
+precision; it starts from that of the steady state, which is a table as well.
 
-Test vectors of a controller: measurements with gaps, and the commands of its run over the record.
+A test comes with it on vectors: measurements with gaps, and the commands of its run over the record.
 
 Of the measurements that arrays take none is missing. Other simulators give the controller what their sensor measures, the
 residual of the loop, so that the commands which the pseudo-open-loop measurement subtracts become states of the system.

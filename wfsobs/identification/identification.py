@@ -1,6 +1,6 @@
 """Identification of a record: noise, turbulence, then peaks one at a time until the residual is white.
 
-An identification as a dictionary, as rows and lines of text and as a TOML file of settings; spectra to draw of it.
+What is found goes on as a dictionary, rows and lines of text, a TOML file of settings, and spectra to draw.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ well. A probe in the commands makes that small.
 A mirror with dynamics has an impulse response of unit gain, with a group delay at low frequency and two shape parameters: an
 arbitrary response over four lags, or that of a second-order mirror.
 
-The probe that tells the plant of a closed loop to a wanted accuracy at the least cost.
+`design_probe` makes that which tells the plant to a wanted accuracy at the least cost.
 """
 
 from __future__ import annotations

@@ -86,7 +86,7 @@ class IdentifiedPeak:
 EDGE = 4.0
 """Minimum distance of a line from zero and from half the rate for a standard deviation, in bins: its image overlaps it."""
 NARROW = 4.0
-"""Half width of a resonance in bins below which it is known by its amplitude in time (`lines`), beyond it by its bins."""
+"""Half width of a resonance in bins below which it is known by its amplitude in time (`search`), beyond it by its bins."""
 RESOLVED = 1.0
 """Minimum half width in bins for a standard deviation of the rms of the process that a resonance is drawn from."""
 POOR = 1.0 / 3.0

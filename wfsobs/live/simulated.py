@@ -1,12 +1,11 @@
 """The simulated loop as a source: one process makes blocks ahead of time, another sends their frames by the clock.
 
-An endless simulation in constant memory: records that fade into each other.
+The simulation is endless, in constant memory, of records that fade into each other. Records of equal length overlap by half,
+weighted by a sine of half a period, the squares of which add up to one. So the sum of two independent Gaussian records has their
+variance at every step, and at a lag tau their covariance times cos(pi tau / length): there is no seam, and lines are wider by 1 /
+(2 length).
 
-Records of equal length overlap by half, weighted by a sine of half a period, the squares of which add up to one. So the sum of
-two independent Gaussian records has their variance at every step, and at a lag tau their covariance times cos(pi tau / length):
-there is no seam, and lines are wider by 1 / (2 length).
-
-What a simulated loop is at each time: settings and losses, by the events of its scenario, over and over, and by hand.
+Its settings and losses change by the events of its scenario, over and over, and by hand (`Programme`).
 """
 
 from __future__ import annotations

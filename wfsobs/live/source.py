@@ -1,7 +1,4 @@
-"""Sources of frames, in processes of their own, by the clock: a simulation, a record, a stream; and the events they tell.
-
-A record as a source: its frames by the clock, once.
-"""
+"""Sources of frames, in processes of their own, by the clock: a simulation, a record, a stream; and the events they tell."""
 
 from __future__ import annotations
 

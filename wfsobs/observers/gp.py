@@ -7,7 +7,7 @@ A stationary process whose spectrum is a rational function of the frequency is t
 and regression on it is a Kalman filter: exact, and linear in the number of samples (Hartikainen and Sarkka, MLSP 2010; Sarkka and
 Solin, Applied Stochastic Differential Equations, 2019, chapter 12). States are scaled so that they are of the order of one.
 
-Regression on evenly spaced samples, and its likelihood with the gradient:
+On evenly spaced samples that is, with the gradient of its likelihood,
 
     z[k] = f(k dt) + noise,    f ~ GP(0, kernel)
 
@@ -15,9 +15,9 @@ The filter starts from the prior, so that its predictions and its likelihood are
 Derivatives are those of the complex step: with one hyper-parameter at x + i e, e = 1e-30, the imaginary part of the result over
 e is its derivative, to rounding, as nothing is subtracted (Squire and Trapp, SIAM Review 40, 110, 1998).
 
-Turbulence is one kernel, every line of the vibration an oscillator, and the sensor's error may have a colour: a Matern 1/2
-background of its own, part of the measurement and of no target. The state has one element more, the sum one step ago, which is
-what a measurement sees:
+In the observers turbulence is one kernel, every line of the vibration an oscillator, and the sensor's error may have a colour: a
+Matern 1/2 background of its own, part of the measurement and of no target. The state has one element more, the sum one step ago,
+which is what a measurement sees:
 
     z[k] = f[k-1] + noise,    (x, f)[k+1] = (A x[k] + v, h x[k]).
 

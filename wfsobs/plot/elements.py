@@ -3,12 +3,10 @@
 Elements carry the options of Bokeh and of Matplotlib, so that either draws them. Compose them with `+` and `*`; `hv.extension`
 chooses what a notebook shows.
 
-Colours, dashes and names: how an observer or a controller looks wherever it appears.
-
-Observers and controllers say it themselves; here are the other lines. Filters of one sensor are warm, multi-rate ones violet,
-Gaussian processes blue-green: families that hold without red or green cones. LGS, NGS, multi-rate and Butterworth have the
-paper's colours; its greens of the GPR, one with orange and red for a deuteranope, are bluer here. In dark mode each has a lighter
-relative; dashes tell apart what comes close in colour.
+How an observer or a controller looks wherever it appears, its colour, dashes and name, it says itself; here are the other lines.
+Filters of one sensor are warm, multi-rate ones violet, Gaussian processes blue-green: families that hold without red or green
+cones. LGS, NGS, multi-rate and Butterworth have the paper's colours; its greens of the GPR, one with orange and red for a
+deuteranope, are bluer here. In dark mode each has a lighter relative; dashes tell apart what comes close in colour.
 """
 
 from __future__ import annotations

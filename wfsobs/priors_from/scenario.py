@@ -1,5 +1,7 @@
 """What observers and controllers are told of a scenario and a record.
 
+Of controllers that is the plant, a prior, and settings of their own.
+
 The part of the vibration that is no line is a few processes; the turbulence is the scenario's own process, or one that is
 fitted to its true spectra.
 

@@ -4,9 +4,8 @@ Labels contain the name and the paper's letter, documentation strings the unit i
 source. "The paper" is Jaufmann et al., "Simulation of Wavefront-based Disturbance Observers for
 Large Telescopes". Wavefronts are Noll-normalised Zernike coefficients in micrometres rms.
 
-Settings of a scenario that have no effect for the values of the others, and why.
-
-Rules within a group are declared by the group (`Group.used_when`); here are those across groups.
+Settings that have no effect for the values of the others are told with the reason: rules within a group by the group
+(`Group.used_when`), those across groups here.
 """
 
 from __future__ import annotations

@@ -2,18 +2,17 @@
 
 The paper's eq. 1 (turbulence) and eq. 2 (vibration) are the same process with other numbers.
 
-Frozen flow falls as f^-17/3 there (Conan, Rousset and Madec, JOSA A 12, 1559, 1995), an AR(2) as f^-4: a filter
-with the AR(2) model takes too much of the noise for turbulence.
+Beyond the third corner the spectrum falls as f^-6. Frozen flow falls as f^-17/3 there (Conan, Rousset and Madec, JOSA A 12, 1559,
+1995), an AR(2) as f^-4: a filter with the AR(2) model takes too much of the noise for turbulence.
 
-Two views of one process as a sum of independent processes, fitted to their spectra.
-
-The views are s and m, with real cross spectrum. With a gain g,
+Two views of one process are a sum of independent processes, fitted to their spectra. The views are s and m, with real cross
+spectrum. With a gain g,
 
     s = c + d,    m = g c + e,
 
 c is what both see, d and e what one sees alone. Then S_c = S_sm / g, S_d = S_s - S_sm / g and S_e = S_m - g S_sm, which at every
 frequency are positive for some g. Here it is the regression of m on s, so that what is strong is common; where others came out
-negative they are taken as zero. Each is a third-order process (`ar3`) in the white noise beside which it has to be known.
+negative they are taken as zero. Each is a third-order process in the white noise beside which it has to be known.
 """
 
 from __future__ import annotations

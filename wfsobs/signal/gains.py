@@ -1,6 +1,8 @@
 """Kalman gains: the steady ones by structured doubling, and those near missing measurements.
 
-P = A P A' - A P C' (C P C' + R)^-1 C P A' + Q        (paper, eq. 8b)
+The steady ones follow from discrete algebraic Riccati equations,
+
+    P = A P A' - A P C' (C P C' + R)^-1 C P A' + Q        (paper, eq. 8b)
 
 and the periodic one, where (A, C, Q, R) repeat every few steps. One step maps a covariance to the next as
 
@@ -13,7 +15,9 @@ Kleinman steps remove the rounding errors: the true covariance of the present ga
 Lyapunov equation, a sum of positive terms that loses nothing, and its gains are better, quadratically. Where the noise
 is so small that rounding spoils the doubling, they start from the covariance without measurements.
 
-P = A P[k-1] A' + Q,    S = C P C' + R,    L = P C' S^-1,    P[k] = P - L S L',
+Near a gap the covariance is followed step by step until it is steady again,
+
+    P = A P[k-1] A' + Q,    S = C P C' + R,    L = P C' S^-1,    P[k] = P - L S L',
 
 row by row of C, those that were measured. The first row may be the mean over several sensors of which some are out
 (`SensorMean`): its noise is then greater, and it sees states beside those of the filter, which the mean over all does not see.

@@ -3,9 +3,8 @@
 A new source of vibration is one more function in `VIBRATION`, under the name of the scenario's `source`
 setting; turbulence has a module of its own.
 
-Effects of a scenario's events on the disturbance and on the measurements.
-
-A peak is shifted through its analytic signal x_a, which has its positive frequencies alone,
+Events of a scenario change the disturbance and the measurements. A peak is shifted through its analytic signal x_a, which has its
+positive frequencies alone,
 
     x'(t) = strength(t) Re(x_a(t) exp(2 pi i integral shift dt)),
 

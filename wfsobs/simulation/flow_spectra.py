@@ -1,11 +1,11 @@
 """Temporal spectra of frozen flow seen by ideal sensors: the expectation of the signals of `frozen_flow`.
 
 A layer of wind speed v turns the spatial frequency k_x along the wind into f = k_x v / 2 pi. With Phi the von Karman density and
-M_i the transform of a functional (`plane_waves`), two of them have the one-sided cross spectrum
+M_i the transform of a functional, two of them have the one-sided cross spectrum
 
     S_ij(f) = (2 pi / v) 2 integral dk_y Phi(k) conj(M_i(k)) M_j(k),
 
-times sinc^2(f T) for the mean over a step. Layers are independent and add. Aliasing is left out (`lenslet_spectra`).
+times sinc^2(f T) for the mean over a step. Layers are independent and add. Aliasing is left out (`mode_spectra` has it).
 """
 
 from __future__ import annotations

@@ -4,16 +4,14 @@ The modes are projections of one screen that moves with the wind. What enters th
 and what the LGS see through a narrower beam as one mode is of several modes of the whole aperture. So the modes have a matrix of
 spectra S(f), Hermitian and positive semidefinite, that `flow_spectra` has the diagonal of.
 
-True spectra of what each LGS of an asterism measures in one mode: of the mean, and of differences between the stars.
+What each LGS of an asterism measures in one mode is a mean and differences between the stars. The differences are orthonormal
+(`star_basis`), so that their noise is that of one star, and independent of the mean's. Vibration is the same for all stars and in
+none of them.
 
-The differences are orthonormal (`star_basis`), so that their noise is that of one star, and independent of the mean's. Vibration
-is the same for all stars and in none of them.
-
-Temporal spectra of frozen flow seen by Shack-Hartmann sensors, their aliasing included: those of records with such sensors.
-
-As `flow_spectra`, with the transforms M_j(k) of the sensors in place of those of the Zernike modes, and nodes as fine as they ask
-for. Aliasing is correlated with the modes that it is taken for, so the whole spectra are computed, not those of an added noise.
-It takes one or two seconds a mode, where spectra of ideal sensors take a tenth of one; bounds and theory leave aliasing out.
+Records with Shack-Hartmann sensors have their aliasing: as `flow_spectra`, with the transforms M_j(k) of the sensors in place of
+those of the Zernike modes, and nodes as fine as they ask for. Aliasing is correlated with the modes that it is taken for, so the
+whole spectra are computed, not those of an added noise. It takes one or two seconds a mode, where spectra of ideal sensors take a
+tenth of one; bounds and theory leave aliasing out.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 """Open-loop measurements: the disturbance seen by the wavefront sensors with the mirror at rest.
 
-Errors of laser guide stars, and the combination of several to one measurement.
-
-The minimum-variance weights are those of the best linear estimate of the disturbance on the axis from all
-LGS measurements of one step,
+Several laser guide stars are combined to one measurement. The minimum-variance weights are those of the best linear estimate of
+the disturbance on the axis from all LGS measurements of one step,
 
     W = C_ty C_yy^-1,    C_ty = E phi_dist y',    C_yy = E y y',
 

@@ -1,7 +1,7 @@
 """True spectra of a scenario, mode by mode, from its settings alone.
 
 The width of lines determines how well they can be predicted. Damped ones have the width that they have in the record
-(`synthesis`); undamped ones are predicted without error after long enough (`TrueSpectra.without_lines`). For the residual of
+(`turbulence`); undamped ones are predicted without error after long enough (`TrueSpectra.without_lines`). For the residual of
 a controller they are taken `line_width` wide at half maximum.
 """
 

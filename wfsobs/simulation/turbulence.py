@@ -2,8 +2,6 @@
 
 A new source is one more function in `SOURCES`, under the name of the scenario's `turbulence.source` setting.
 
-Spectral resolution of the synthesis of a record, and of a bound.
-
 A record made by an inverse DFT of its own length is a sum of lines at multiples of 1 / T: it is periodic, so T seconds of it
 determine the rest. A record is therefore cut from a period many times as long. The width of lines determines how well
 they can be predicted; a record of T resolves none narrower than about 1 / T. Damped peaks and tables therefore get

@@ -1,12 +1,10 @@
-"""The spectrum of one mode of z: white noise, turbulence of order two or three, AR(2) resonances. For lines see `lines`.
+"""The spectrum of one mode of z: white noise, turbulence of order two or three, AR(2) resonances. For lines see `search`.
 
-A coloured background of a measurement: noise that is flat up to a corner far above that of turbulence.
+A measurement may have a coloured background, noise that is flat up to a corner far above that of turbulence: the aliasing of a
+Shack-Hartmann sensor is like that.
 
-The aliasing of a Shack-Hartmann sensor is like that.
-
-A spectrum as the sum of a few AR(2) processes: the rational function of their poles that is nearest to it.
-
-What a filter makes of a spectrum is decided where that stands above what else is measured, `beside`. The processes are therefore
+Any spectrum is approximated by the sum of a few AR(2) processes, the rational function of their poles that is nearest to it. What
+a filter makes of a spectrum is decided where that stands above what else is measured, `beside`. The processes are therefore
 fitted by Whittle's likelihood of both together, all octaves with the same weight: a filter tells disturbances apart at low
 frequencies, of which a linear axis has few. They are added one by one, each where the likelihood gains most.
 """

@@ -10,12 +10,11 @@ The whitened periodogram I / S of the right S is exponential of mean 1. An undam
 several; means over 1 ... 243 bins are Gamma distributed. Every frequency gets a share of the level as df / f: of two equally
 strong peaks the lower is the likelier to be one of a structure; most of it below STRUCTURES.
 
-The variance of vibration that is in a window and in none of the lines found there, as far as the window can tell.
-
-Lines that do not stand out are taken for continuum. In octave b of frequency, between the lines that were found, the periodogram
-is above the spectrum by E_b = sum (I - S) df, of standard deviation s_b = sqrt(sum S^2) df. What is missed there, M_b >= 0, has
-an exponential prior, so that given E_b it is a normal variable of mean E_b - s_b^2 / scale and standard deviation s_b above zero.
-The scale is that of a line that would just stand out: SEEN bins of continuum, their geometric mean over the octaves.
+Lines that do not stand out are taken for continuum; the window tells a little of their variance. In octave b of frequency,
+between the lines that were found, the periodogram is above the spectrum by E_b = sum (I - S) df, of standard deviation s_b =
+sqrt(sum S^2) df. What is missed there, M_b >= 0, has an exponential prior, so that given E_b it is a normal variable of mean E_b
+- s_b^2 / scale and standard deviation s_b above zero. The scale is that of a line that would just stand out: SEEN bins of
+continuum, their geometric mean over the octaves.
 
 Under turbulence little is known of lines, and the prior is all there is; where there is noise alone, the periodogram decides.
 """

@@ -1,8 +1,7 @@
 """A stream of ImageStreamIO: one frame of numbers in a shared file, with a counter that rises with every frame.
 
-Layouts of an ImageStreamIO file, as gcc on x86-64 makes them: 2.00, and the older 0.0.01 that xaosim writes too.
-
-A file holds a header, the data, keywords, and in 2.00 the semaphores. All numbers are little-endian.
+Layouts of the file are those that gcc on x86-64 makes: 2.00, and the older 0.0.01 that xaosim writes too. A file holds a header,
+the data, keywords, and in 2.00 the semaphores. All numbers are little-endian.
 """
 
 from __future__ import annotations

@@ -2,9 +2,8 @@
 
 A stream is shared memory (`SharedImage`) or a network (`Subscription`, `Publication`); estimates go out while all is well.
 
-The frames of a second, slower sensor, each with the LGS frame that it belongs to: their exposures end together.
-
-An NGS frame that comes after its LGS frame goes to its place.
+The frames of a second, slower sensor go each with the LGS frame that it belongs to: their exposures end together. One that comes
+after its LGS frame goes to its place.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
 """Tuning: the settings of an observer, or of a controller, that are best on what it is not scored on in the end.
 
 On an uncertain plant a controller is tuned for the least residual at the worst of its plants, or below which 95 % of them are.
-
-A tuning as a plain dictionary, as lines of text, and as a TOML file of settings.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """Vibration by regression on windows, trained once, on a record of its own: Gaussian processes and ridge regression.
 
-The target of a window is the zero-phase Butterworth reference of the training record's open-loop twin at the
-window's last step; without a twin, that of its z.
+Of the GPR (paper, Algorithms 1 and 2) the target of a window is the zero-phase Butterworth reference of the training record's
+open-loop twin at the window's last step; without a twin, that of its z.
 
-With w = a - b c and c = (delta.a) / (1 / s2 + delta.b) (`kernels` has
-a, b, delta), a prediction is
+With w = a - b c and c = (delta.a) / (1 / s2 + delta.b) (`windows` has a, b, delta), a prediction is
 
     mean = kappa.w + delta_t c,
     variance = M_tt - |L^-1 kappa|^2 + (delta_t - kappa.b)^2 / (1 / s2 + delta.b),    L L' = M + sigma_n^2 I.
@@ -12,9 +11,9 @@ a, b, delta), a prediction is
 The variance, that of the vibration without the noise of a target, costs m^2 operations where the mean costs m: it is computed
 once in so many steps and held.
 
-With windows as rows of X, targets f and both centred, the weights are w = X' (X X' + lambda I)^-1 f. A squared-exponential
-kernel whose length scale l is far above the norm of the windows is linear, k = s2 (1 - |x - x'|^2 / 2 l^2), and the GPR
-then is this with lambda = (sigma_n l / sigma_SE)^2 and a free constant.
+Ridge regression is what a GPR has to beat. With windows as rows of X, targets f and both centred, the weights are w = X' (X X' +
+lambda I)^-1 f. A squared-exponential kernel whose length scale l is far above the norm of the windows is linear, k = s2 (1 - |x -
+x'|^2 / 2 l^2), and the GPR then is this with lambda = (sigma_n l / sigma_SE)^2 and a free constant.
 """
 
 from __future__ import annotations

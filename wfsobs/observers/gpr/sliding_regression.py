@@ -1,6 +1,6 @@
 """Regression on the last windows of a stream, every mode by itself: one sample in, one estimate out, then an update.
 
-The numbers are those of `gpr_online` over a record. The inverse N of M + sigma_n^2 I (`kernels` has the split) is kept up to
+The numbers are those of `gpr_online` over a record. The inverse N of M + sigma_n^2 I (`windows` has the split) is kept up to
 date, one slot per training point, a new point taking the slot s of the oldest one:
 
     without the oldest       N_ = N - q q' / q_s,  q = N e_s           (row and column s become zero)
@@ -25,7 +25,7 @@ Gaussian process regression in a sliding window, by recursive elimination.
 At every step k the w points before k are the training set and point k is the test. Written as one symmetric
 matrix over [points | f | delta], with M between points, the target f and the border delta as two more rows and
 -1 / s2 at (delta, delta), the prediction at step k is what is left at (k, f), with opposite sign, once the training
-points and delta have been eliminated (`kernels` derives it).
+points and delta have been eliminated (`windows` derives it).
 
 b steps in a row share w - b + 1 training points. Eliminating those once, by one Cholesky factorisation of a positive
 definite block, leaves the same sliding problem with window b - 1 over the points that come and go; that one is
