@@ -42,7 +42,7 @@ def hidden(rng: np.random.Generator, seed: int) -> wfsobs.Scenario:
             "vibration.peaks": peaks,
             "sensors.lgs_low_frequency_rms": 0.0,
             "sensors.lgs_noise": rng.uniform(0.01, 0.04),
-            "control.laws": "manual",
+            "control.integrator": "manual",
             "control.gain": rng.uniform(0.2, 0.5),
             "plant.delay_error": rng.uniform(-0.5, 0.5),
             "plant.gain_error": [rng.uniform(-0.2, 0.2)] * 2,
@@ -83,7 +83,7 @@ def main(loops: int, first: int, has_probe: bool) -> None:
             print(i, "the integrator is not stable")
             continue
         try:
-            found = make_promise(telemetry, scenario.replace({"control.laws": "optimised"}), controllers=CONTROLLERS)
+            found = make_promise(telemetry, scenario.replace({"control.integrator": "optimised"}), controllers=CONTROLLERS)
         except RecordError as error:
             undecided += 1
             print(i, error, flush=True)

@@ -133,7 +133,7 @@ class TestSettingsWithoutEffect:
         idle = idle_settings(scenario)
         assert "gpr_online.highpass" not in idle and "gpr_offline.highpass" in idle
         assert "sensors.spots" not in idle and "sensors.lgs_noise" in idle
-        manual = {"kalman.process_noise": "manual", "control.laws": "manual", "kalman.peak": "matched"}
+        manual = {"kalman.process_noise": "manual", "control.integrator": "manual", "kalman.peak": "matched"}
         assert {"kalman.vibration_rms", "control.gain"} <= set(idle)
         idle = idle_settings(scenario.replace(manual))
         assert not {"kalman.vibration_rms", "control.gain"} & set(idle) and "kalman.frequency" in idle

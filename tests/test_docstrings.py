@@ -47,7 +47,7 @@ def disagreements(text: str) -> list[str]:
 @pytest.mark.slow
 def test_parameters_of_docstrings_are_those_of_the_signatures() -> None:
     found = {str(path.relative_to(ROOT)): disagreements(path.read_text(encoding="utf-8")) for path in ROOT.rglob("*.py")}
-    assert len(found) > 300
+    assert len(found) > 200
     assert {path: lines for path, lines in found.items() if lines} == {}
 
 

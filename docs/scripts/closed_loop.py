@@ -43,7 +43,7 @@ LINEAR = [name for name, c in CONTROLLERS.items() if c.is_quick and name != "non
 
 def two_frames() -> None:
     """The two-frame loop, by theory and simulated: 20 seeds of 60 s, tip and tilt."""
-    half = {"control.laws": "manual", "control.gain": 0.5}
+    half = {"control.integrator": "manual", "control.gain": 0.5}
     print("| Controller | Theory, nm | Simulated, nm | over theory |\n|---|---|---|---|")
     cases = (
         ("Integrator, g = 0.5", "integrator", half),

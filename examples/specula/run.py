@@ -142,7 +142,7 @@ def theory(name, gain, noise, error=1.0):
     scenario = wfsobs.Scenario().replace({f"turbulence.{key}": value for key, value in air.items()})
     frequency = np.linspace(0.0, 0.5 / DT, 2**16 + 1)
     told = load_scenario("found.toml").replace({"control.delay": 2.0})
-    told = told.replace({"control.laws": "manual", "control.gain": GAIN * gain, "control.leak": 1.0})
+    told = told.replace({"control.integrator": "manual", "control.gain": GAIN * gain, "control.leak": 1.0})
     controller, plant = CONTROLLERS[name], plant_of(told)
     total, density = 0.0, np.zeros_like(frequency)
     for mode in range(2):

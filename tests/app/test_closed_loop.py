@@ -140,7 +140,7 @@ def the_marks_lie_on_the_curves_where_the_margins_are(page: ClosedLoopPage) -> N
 
 
 def test_it_follows_the_settings_while_it_is_seen(page: ClosedLoopPage, dashboard: Dashboard, loop: Any) -> None:
-    dashboard.store.change("control.laws", "manual")
+    dashboard.store.change("control.integrator", "manual")
     dashboard.store.change("control.gain", 1.5)
     loop.finish(dashboard.store)
     done(page, loop)

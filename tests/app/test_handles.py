@@ -249,7 +249,7 @@ class TestGain:
         # between two points of the curve the level is taken as linear
         assert after["frequency"] == pytest.approx(0.5 * handle["frequency"], rel=5e-3)
         values = {it["name"]: it["value"] for it in gain.handles[0].layer.frame["numbers"]}
-        scenario = store.scenario.replace({"control.laws": "manual", "control.gain": float(values["gain"])})
+        scenario = store.scenario.replace({"control.integrator": "manual", "control.gain": float(values["gain"])})
         expected = design(scenario, ["integrator"]).laws["integrator"][0].predicted_rms
         assert expected is not None
         assert float(values["integrator"]) == pytest.approx(1e3 * expected, rel=0.01)  # three digits, of the gain too

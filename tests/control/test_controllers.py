@@ -90,7 +90,7 @@ def test_the_two_frame_loop_leaves_what_theory_says() -> None:
     (lqg,) = {d.predicted_rms for d in several[0].design.laws["lqg-kf-lgs"]}
     (best,) = {d.law.gain for d in several[0].design.laws["integrator"] if d.law}
     assert lqg == pytest.approx(21.63e-3, abs=0.005e-3) and best == pytest.approx(0.64, abs=0.005)
-    half = design(MATCHED.replace({"control.laws": "manual", "control.gain": 0.5}), ("integrator",))
+    half = design(MATCHED.replace({"control.integrator": "manual", "control.gain": 0.5}), ("integrator",))
     assert half.laws["integrator"][0].predicted_rms == pytest.approx(36.9e-3, abs=0.05e-3)
     assert several[0].design.laws["integrator"][0].predicted_rms == pytest.approx(34.1e-3, abs=0.05e-3)
     # Two modes of 295 s each: the mean over seeds spreads by 0.16 % and 0.38 % (40 seeds).
@@ -319,7 +319,7 @@ def test_no_controller_of_the_lgs_beats_the_bound(delay: float, noise: float) ->
     ],
 )
 def test_an_unstable_loop_is_said_to_be_one(changes: dict[str, Any]) -> None:
-    result = run(QUICK | {"control.laws": "manual"} | changes)
+    result = run(QUICK | {"control.integrator": "manual"} | changes)
     for one in result.outcomes:
         if one.controller.startswith("integrator"):
             assert one.stable == (False, False) and one.residual is None and one.u is None

@@ -24,7 +24,7 @@ ADAPTIVE = {"lqg-kf-adaptive", "lqg-multirate-adaptive"}
 OF_ONE_LINE = {"lqg-kf-lgs", "lqg-multirate", "lqg-multirate-optimal"}
 
 CASES: dict[str, tuple[dict[str, Any], set[str]]] = {
-    "gain": ({"control.laws": "manual", "control.gain": 0.31}, {"integrator", *GPR}),
+    "gain": ({"control.integrator": "manual", "control.gain": 0.31}, {"integrator", *GPR}),
     "line width": ({"multipeak.line_width": 1.0}, OF_LINES),
     "Kalman peak": ({"kalman.peak": "manual", "kalman.frequency": 21.0}, OF_ONE_LINE),
     "GPR": ({"gpr_online.length_scale": 20.0}, {"integrator+gpr-online"}),

@@ -46,7 +46,7 @@ def _record() -> Record:
 def test_a_prediction_is_the_vibration_while_the_command_acts(name: str, delay: float, record: Record) -> None:
     """A command held for a frame acts from `delay` - 1 to `delay` steps after its own: the mean of a line over that time."""
     assert record.vibration is not None
-    scenario, controller = LINE.replace({"control.delay": delay, "control.laws": "manual"}), CONTROLLERS[name]
+    scenario, controller = LINE.replace({"control.delay": delay, "control.integrator": "manual"}), CONTROLLERS[name]
     settings, plant = own_settings(controller, scenario), plant_of(scenario)
     measured, prior = controller_arguments(controller, record, settings, prior_for(controller, scenario))
     assert controller.predict is not None

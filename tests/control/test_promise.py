@@ -25,7 +25,7 @@ SCENARIO = wfsobs.PRESETS["paper"]().replace(
         "run.duration": 10.0,
         "run.seed": 4,
         "sensors.lgs_low_frequency_rms": 0.0,
-        "control.laws": "manual",
+        "control.integrator": "manual",
         "control.gain": 0.4,
         "plant.delay_error": 0.3,
         "plant.gain_error": [0.1],
@@ -181,7 +181,7 @@ def test_the_promise_takes_a_mirror_with_dynamics_into_account(monkeypatch: pyte
 def test_the_next_record_keeps_the_promise(telemetry: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("wfsobs.closed_loop.promise.DRAWS", FEWER)
     names = ["integrator", "lqg-kf-lgs", "lqg-kf-multi", "lqg-multirate"]
-    found = make_promise(telemetry, SCENARIO.replace({"control.laws": "optimised"}), controllers=names)
+    found = make_promise(telemetry, SCENARIO.replace({"control.integrator": "optimised"}), controllers=names)
     true, inverse = full_plant_of(SCENARIO), np.linalg.inv(found.matrix)
     disturbance, noise = noise_of(wfsobs.simulate(SCENARIO.replace({"run.seed": 40})))
     for one in found.residuals:

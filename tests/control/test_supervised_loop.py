@@ -49,7 +49,7 @@ def test_on_the_right_plant_it_is_the_controller_from_frame_1000_on(record: Reco
 def test_where_it_would_diverge_the_integrator_takes_over(record: Record, wrong: ClosedLoop) -> None:
     alone = closed_loop(record, design(RIGHT.replace({**WRONG, "control.supervised": False}), NAMES[1:]))
     assert all(one.residual is None and one.stable == (False, False) for one in alone.outcomes)
-    manual = {"control.laws": "manual", "control.gain": 0.2, "control.supervised": False}
+    manual = {"control.integrator": "manual", "control.gain": 0.2, "control.supervised": False}
     (integrator,) = closed_loop(record, design(RIGHT.replace({**WRONG, **manual}), ["integrator"])).outcomes
     assert integrator.residual is not None
     for one in wrong.outcomes[1:]:

@@ -46,7 +46,7 @@ def crew_of(scenario, names, said=None):
 def test_the_residuals_are_those_of_the_closed_loop():
     """By the batch run over the same record: delay, a fraction of a frame, and a limit of the mirror included."""
     scenario = paper().replace(
-        {**SMALL, "control.delay": 2.5, "control.rate": 0.02, "control.laws": "manual", "control.gain": 0.4}
+        {**SMALL, "control.delay": 2.5, "control.rate": 0.02, "control.integrator": "manual", "control.gain": 0.4}
     )
     crew, record = crew_of(scenario, NAMES)
     view = ControlView(0, record.dt, rows_of(crew, record))

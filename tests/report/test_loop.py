@@ -45,7 +45,7 @@ def test_they_stand_in_the_page_best_first(report: Report) -> None:
 
 
 def test_an_unstable_loop_says_so(result: Result) -> None:
-    changed = replace(result, scenario=result.scenario.replace({"control.laws": "manual", "control.gain": 1.5}))
+    changed = replace(result, scenario=result.scenario.replace({"control.integrator": "manual", "control.gain": 1.5}))
     text = page(Report("paper", changed.scenario, (), (state_of(changed),)), MADE)
     assert text.count("unstable</span>") == 2
 

@@ -65,7 +65,7 @@ def test_a_gain_by_hand_starts_from_the_optimal_one_less_its_caution() -> None:
     s = FAST.replace({"control.caution": 2.0})
     gains = [one.law.gain for one in design(s, ["integrator"]).laws["integrator"] if one.law and one.law.gain]
     found = space(s, "integrator", ["control.gain"], CONTROLLERS)
-    assert found.by_hand == {"control.laws": "manual", "control.gain": pytest.approx(np.mean(gains), rel=1e-4)}
+    assert found.by_hand == {"control.integrator": "manual", "control.gain": pytest.approx(np.mean(gains), rel=1e-4)}
     tuned = tune(s, "integrator", ["control.gain"], evaluations=6, envelope=EnvelopeGoal(by="p95"))
     assert tuned.after.validation and tuned.after.spreads
     assert tuned.after.validation.rms == pytest.approx(together(tuned.after.spreads[0].p95), rel=1e-12)

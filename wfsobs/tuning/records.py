@@ -123,7 +123,7 @@ def space(
                 switch: "manual",
                 **{p: _clip_to_limits(scenario, p, v) for p, v in zip(paths, matched(scenario), strict=True)},
             }
-    gain_from = by_hand.get("control.laws", scenario.control.integrator)
+    gain_from = by_hand.get("control.integrator", scenario.control.integrator)
     if name == "integrator" and "control.caution" in chosen and gain_from == "manual":
         raise SettingError("control.caution: has no effect on an integrator while control.integrator = manual")
     return Space(tuple(_axis(scenario, path, by_hand.get(path, scenario.lookup(path))) for path in chosen), by_hand)
@@ -187,7 +187,7 @@ def _gain(scenario: Scenario) -> tuple[float]:
 
 
 BY_HAND: dict[str, tuple[tuple[str, ...], Callable[[Scenario], tuple[float, ...]]]] = {
-    "control.laws": (("control.gain",), _gain),
+    "control.integrator": (("control.gain",), _gain),
     "kalman.peak": (("kalman.frequency", "kalman.damping"), _peak),
     "kalman.process_noise": (("kalman.turbulence_rms", "kalman.vibration_rms"), _process),
     "kalman.measurement_noise": (("kalman.lgs_noise", "kalman.ngs_noise"), _noise),

@@ -4,7 +4,7 @@ Log marginal likelihood of a GPR's training targets: what Gaussian processes are
 
     log p(f) = -1/2 f' C^-1 f - 1/2 log det C - m/2 log 2 pi,    C = K + sigma_n^2 I
 
-With M of `observers.kernels`, C = (M + sigma_n^2 I) + s2 delta delta', a rank-one border: with a = f' N f, b = f' N delta,
+With M of `gpr.windows`, C = (M + sigma_n^2 I) + s2 delta delta', a rank-one border: with a = f' N f, b = f' N delta,
 c = delta' N delta, N = (M + sigma_n^2 I)^-1,
 
     f' C^-1 f = a - b^2 / (1 / s2 + c),    log det C = log det (M + sigma_n^2 I) + log(1 + s2 c).

@@ -201,7 +201,7 @@ class GainEditor:
                 gain = round(handle.axis.gain_at(self.store.scenario, message["frequency"]), 4)
             self._trial = gain if action == "drag" else None
             if action == "release":
-                self.store.replace({"control.laws": "manual", "control.gain": gain})
+                self.store.replace({"control.integrator": "manual", "control.gain": gain})
         except (SettingError, ValueError, KeyError) as error:
             self._note = str(error)
         self._ask(gain)
@@ -212,7 +212,7 @@ class GainEditor:
         if not self.display.editing:
             return
         mode = self.display.column
-        trial = self.store.scenario.replace({"control.laws": "manual", "control.gain": float(gain), "events": []})
+        trial = self.store.scenario.replace({"control.integrator": "manual", "control.gain": float(gain), "events": []})
         if mode < len(trial.modes):
             numbers = [handle.number for handle in self.handles]
             self.frames.ask("gain", partial(self._answer, trial, mode), partial(self._land, numbers))
