@@ -18,7 +18,7 @@ import wfsobs
 from wfsobs.closed_loop.promise import make_promise
 from wfsobs.control.true_plant import FAR, ActingPlant, TruePlant, drive
 from wfsobs.identification.plant_likelihood import design_probe
-from wfsobs.priors_from.scenario import full_plant_of
+from wfsobs.priors_from.controllers import full_plant_of
 from wfsobs.record import Record, RecordError
 
 CONTROLLERS = ("integrator", "lqg-kf-lgs", "lqg-kf-multi", "h2-fir")

@@ -11,8 +11,7 @@ import pytest
 
 from wfsobs import PRESETS, Scenario, SettingError, observe, simulate
 from wfsobs.closed_loop.design import design
-from wfsobs.closed_loop.rows import rows
-from wfsobs.closed_loop.run import closed_loop
+from wfsobs.closed_loop.run import closed_loop, rows
 from wfsobs.cost import run_bytes, run_seconds
 from wfsobs.evaluation.bound import record_bounds
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH

@@ -17,7 +17,8 @@ import wfsobs
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.scores import rms
 from wfsobs.observers import OBSERVERS
-from wfsobs.priors_from.scenario import arguments, controller_arguments, own_settings, plant_of, prior_for
+from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
+from wfsobs.priors_from.scenario import arguments
 from wfsobs.record import Record
 from wfsobs.signal.gate import BLOCK, MEMORY, OPEN, ORDER, RAREST, RARITY, RUN, USUAL, GateSettings, OutlierGate
 from wfsobs.testing import run_loop, run_steps

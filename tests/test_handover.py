@@ -113,7 +113,7 @@ def run(arrays: dict[str, np.ndarray], given: np.ndarray) -> np.ndarray:
 def _whole() -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Measurements without gaps, and the commands for them by controller, from the run over a record."""
     from wfsobs.control.controllers import CONTROLLERS
-    from wfsobs.priors_from.scenario import own_settings, plant_of, prior_for
+    from wfsobs.priors_from.controllers import own_settings, plant_of, prior_for
     from wfsobs.record import Measurements
     from wfsobs.scenario.presets import paper
 

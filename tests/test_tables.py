@@ -11,7 +11,7 @@ import pytest
 
 import wfsobs
 from wfsobs.campaign.sweep import parse_axis, plan_sweep, run_sweep
-from wfsobs.closed_loop.rows import rows as loop_rows
+from wfsobs.closed_loop.run import rows as loop_rows
 from wfsobs.observers.gp import Matern
 
 SCENARIO = wfsobs.PRESETS["paper"]().replace({"run.duration": 4.0, "run.warm_up": 1.0})

@@ -10,7 +10,8 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.step import StepError
 from wfsobs.prior import LgsStars, Part, Prior, Spectra, Training
-from wfsobs.priors_from.scenario import SHARED, as_sampled, observer_settings, own_settings, plant_of, prior_of
+from wfsobs.priors_from.controllers import own_settings, plant_of
+from wfsobs.priors_from.scenario import SHARED, as_sampled, observer_settings, prior_of
 from wfsobs.priors_from.telemetry import as_training, told_by
 from wfsobs.record import Record, Sampling, as_whole
 from wfsobs.scenario import Scenario

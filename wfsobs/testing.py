@@ -28,7 +28,8 @@ from wfsobs.control.true_plant import TruePlant, drive
 from wfsobs.observers.base import TARGETS, Observer
 from wfsobs.observers.step import StepObserver, frames_of
 from wfsobs.prior import Prior
-from wfsobs.priors_from.scenario import arguments, controller_arguments, own_settings, plant_of, prior_for
+from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
+from wfsobs.priors_from.scenario import arguments
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, Record, hold_last
 from wfsobs.scenario import Scenario

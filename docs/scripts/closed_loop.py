@@ -9,8 +9,7 @@ from statistics import median
 import numpy as np
 
 from wfsobs.closed_loop.design import design
-from wfsobs.closed_loop.rows import label, rows
-from wfsobs.closed_loop.run import closed_loop
+from wfsobs.closed_loop.run import closed_loop, label, rows
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.laws import highest_stable_gain
 from wfsobs.control.mirror import Mirror

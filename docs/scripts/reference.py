@@ -12,7 +12,7 @@ import click
 from settings_table import changes
 
 from wfsobs.cli import main
-from wfsobs.closed_loop.rows import controller_needs
+from wfsobs.closed_loop.run import controller_needs
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario

@@ -25,7 +25,7 @@ from wfsobs.control.controllers import CONTROLLERS  # noqa: E402
 from wfsobs.control.margins import residual_density  # noqa: E402
 from wfsobs.control.mismatch import SensorSpectra, loops, weigh  # noqa: E402
 from wfsobs.control.true_plant import TruePlant  # noqa: E402
-from wfsobs.priors_from.scenario import own_settings, plant_of, prior_for  # noqa: E402
+from wfsobs.priors_from.controllers import own_settings, plant_of, prior_for  # noqa: E402
 from wfsobs.scenario.configfile import load_scenario, save_scenario  # noqa: E402
 from wfsobs.simulation.flow_spectra import flow_spectra  # noqa: E402
 

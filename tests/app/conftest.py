@@ -22,7 +22,7 @@ from wfsobs.app.service import Service, Session, run_key
 from wfsobs.app.sources import LoadedRecord, Source
 from wfsobs.app.store import Store
 from wfsobs.app.work import RunResults, compute
-from wfsobs.closed_loop.rows import Outcome
+from wfsobs.closed_loop.run import Outcome
 from wfsobs.dependence import Memo
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario

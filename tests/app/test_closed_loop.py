@@ -20,8 +20,7 @@ from wfsobs.app.pages.pages import EXPLORE, LOOP
 from wfsobs.app.style import look
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.envelope import plant_envelope
-from wfsobs.closed_loop.rows import label, rows
-from wfsobs.closed_loop.run import closed_loop
+from wfsobs.closed_loop.run import closed_loop, label, rows
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS
 from wfsobs.signal.envelope import envelope

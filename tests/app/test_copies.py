@@ -26,7 +26,7 @@ from wfsobs.app.share import LOOP, OBSERVE, TUNE, CopiedTask, from_query, to_com
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord
 from wfsobs.app.work import RunResults
 from wfsobs.cli import main
-from wfsobs.closed_loop.rows import rows
+from wfsobs.closed_loop.run import rows
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.identification.identification import identification_dict, identification_toml
 from wfsobs.record import RecordError

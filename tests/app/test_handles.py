@@ -25,7 +25,7 @@ from wfsobs.app.views.spectrum_editor import (
 from wfsobs.closed_loop.design import design
 from wfsobs.control.laws import highest_stable_gain
 from wfsobs.evaluation.exact_errors import Theory
-from wfsobs.priors_from.scenario import plant_of
+from wfsobs.priors_from.controllers import plant_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.values import SettingError

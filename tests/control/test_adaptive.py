@@ -7,8 +7,7 @@ import pytest
 
 import wfsobs
 from wfsobs.closed_loop.design import design
-from wfsobs.closed_loop.rows import controller_needs
-from wfsobs.closed_loop.run import closed_loop
+from wfsobs.closed_loop.run import closed_loop, controller_needs
 from wfsobs.control.laws import integrator_law
 from wfsobs.control.mirror import Mirror
 from wfsobs.observers import OBSERVERS

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from tests.records import kalman_model
 from wfsobs.closed_loop.design import Design, design
-from wfsobs.closed_loop.rows import ClosedLoop, Outcome, residual_rms, strehl
-from wfsobs.closed_loop.run import closed_loop
+from wfsobs.closed_loop.run import ClosedLoop, Outcome, closed_loop, residual_rms, strehl
 from wfsobs.control.base import Settings
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.laws import best_gain, highest_stable_gain, integrator_law
@@ -22,14 +21,8 @@ from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers.baselines import online_reference
 from wfsobs.prior import Prior
-from wfsobs.priors_from.scenario import (
-    bands_of,
-    controller_arguments,
-    measurement_noise,
-    modelled_processes,
-    own_settings,
-    spectra_of,
-)
+from wfsobs.priors_from.controllers import controller_arguments, own_settings
+from wfsobs.priors_from.scenario import bands_of, measurement_noise, modelled_processes, spectra_of
 from wfsobs.progress import QUIET
 from wfsobs.record import Measurements, Record, RecordError, Training, delay_signal
 from wfsobs.scenario import Scenario

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from wfsobs.control.mirror import Mirror
-from wfsobs.priors_from.scenario import plant_of
+from wfsobs.priors_from.controllers import plant_of
 from wfsobs.record import delay_signal
 from wfsobs.scenario import Scenario
 

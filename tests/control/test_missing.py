@@ -11,7 +11,7 @@ import wfsobs
 from tests.observers.test_missing import STRETCHES, Model, dropout, inputs, model_of, textbook
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.mirror import Mirror
-from wfsobs.priors_from.scenario import controller_arguments, own_settings, plant_of, prior_for
+from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.typing import Array

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from wfsobs.closed_loop.design import design
-from wfsobs.closed_loop.rows import Outcome
-from wfsobs.closed_loop.run import each_outcome
+from wfsobs.closed_loop.run import Outcome, each_outcome
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.dependence import Memo
 from wfsobs.record import Record

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.priors_from.scenario import controller_arguments, own_settings, plant_of, prior_for
+from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
 from wfsobs.progress import QUIET
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario

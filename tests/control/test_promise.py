@@ -16,7 +16,7 @@ from wfsobs.closed_loop.promise import DRAWS, _interval_of, as_seen, draw_plants
 from wfsobs.control.true_plant import ActingPlant, TruePlant, drive
 from wfsobs.identification.plant import GroupPlant, PlantNumber
 from wfsobs.identification.plant_likelihood import PlantFit
-from wfsobs.priors_from.scenario import full_plant_of
+from wfsobs.priors_from.controllers import full_plant_of
 from wfsobs.record import Record, RecordError
 from wfsobs.typing import Array
 

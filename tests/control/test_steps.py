@@ -17,7 +17,7 @@ from wfsobs.control.mirror import Law
 from wfsobs.control.step import LinearLaws
 from wfsobs.control.supervisor import SupervisedController
 from wfsobs.observers.step import StepError
-from wfsobs.priors_from.scenario import controller_arguments, own_settings, plant_of, prior_for
+from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.periodic import PeriodicFilter

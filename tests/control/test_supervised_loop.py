@@ -13,8 +13,7 @@ from wfsobs.app.loop_work import LoopResults
 from wfsobs.app.pages.closed_loop import loop_html
 from wfsobs.cli import main
 from wfsobs.closed_loop.design import design
-from wfsobs.closed_loop.rows import ClosedLoop, rows
-from wfsobs.closed_loop.run import closed_loop
+from wfsobs.closed_loop.run import ClosedLoop, closed_loop, rows
 from wfsobs.record import Record
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate

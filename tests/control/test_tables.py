@@ -10,8 +10,7 @@ from click.testing import CliRunner, Result
 
 from wfsobs.cli import main
 from wfsobs.closed_loop.design import design
-from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label
-from wfsobs.closed_loop.run import closed_loop
+from wfsobs.closed_loop.run import LIMITED, NOT_APPLICABLE, closed_loop, label
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.scores import COMMON_BOUNDS
 from wfsobs.scenario import configfile

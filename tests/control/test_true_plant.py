@@ -21,7 +21,7 @@ from wfsobs.control.margins import disk_margin, frequencies
 from wfsobs.control.mirror import Law, Mirror
 from wfsobs.control.mismatch import draws_of, loops, margins_of, one_loop, radius, step_matrices
 from wfsobs.control.true_plant import ActingPlant, TruePlant, true_matrix
-from wfsobs.priors_from.scenario import full_plant_of, true_plant_of
+from wfsobs.priors_from.controllers import full_plant_of, true_plant_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.values import SettingError

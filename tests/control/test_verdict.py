@@ -8,7 +8,7 @@ from wfsobs import PRESETS, close_loop
 from wfsobs.app.display import Display
 from wfsobs.app.loop_work import LoopResults
 from wfsobs.app.pages.closed_loop import loop_html
-from wfsobs.closed_loop.rows import loop_verdict, rows
+from wfsobs.closed_loop.run import loop_verdict, rows
 from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS
 
 

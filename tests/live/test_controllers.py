@@ -9,8 +9,7 @@ import pytest
 
 import wfsobs
 from wfsobs.closed_loop.design import design as design_laws
-from wfsobs.closed_loop.rows import residual_rms
-from wfsobs.closed_loop.run import closed_loop
+from wfsobs.closed_loop.run import closed_loop, residual_rms
 from wfsobs.live.checks import make_design
 from wfsobs.live.crew import SEATS, ControlCrew, ControlView, row_width
 from wfsobs.live.loop import LiveLoop

@@ -11,7 +11,8 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.execution import run_observer
 from wfsobs.observers.base import TARGETS
 from wfsobs.prior import Beams, Lines, Model
-from wfsobs.priors_from.scenario import one_process, own_settings, plant_of, prior_of
+from wfsobs.priors_from.controllers import own_settings, plant_of
+from wfsobs.priors_from.scenario import one_process, prior_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate

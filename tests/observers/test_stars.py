@@ -19,15 +19,8 @@ from wfsobs.observers.base import TARGETS
 from wfsobs.observers.gp import kernels_of, measured_late, sampled_model
 from wfsobs.observers.kalman.multirate import beam_model
 from wfsobs.prior import Prior
-from wfsobs.priors_from.scenario import (
-    arguments,
-    controller_arguments,
-    observer_settings,
-    own_settings,
-    plant_of,
-    prior_for,
-    prior_of,
-)
+from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
+from wfsobs.priors_from.scenario import arguments, observer_settings, prior_of
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.signal.statespace import disturbance_model

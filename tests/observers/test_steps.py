@@ -23,7 +23,8 @@ from wfsobs.observers.kalman.step import matrix_power
 from wfsobs.observers.missing import fill_missing
 from wfsobs.observers.step import StepError
 from wfsobs.prior import Bands, Lines, Model, Prior, Training
-from wfsobs.priors_from.scenario import arguments, has_prior, measurement_noise, observer_settings, own_settings, prior_of
+from wfsobs.priors_from.controllers import own_settings
+from wfsobs.priors_from.scenario import arguments, has_prior, measurement_noise, observer_settings, prior_of
 from wfsobs.progress import QUIET
 from wfsobs.record import Record, Sampling, hold_last, pseudo_open_loop
 from wfsobs.scenario import Scenario

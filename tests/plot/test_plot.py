@@ -23,7 +23,7 @@ import wfsobs
 from wfsobs.campaign.sweep import SweepResults, parse_axis, plan_sweep, run_sweep
 from wfsobs.cli import main
 from wfsobs.closed_loop.envelope import PlantEnvelope
-from wfsobs.closed_loop.rows import ClosedLoop, residual_rms
+from wfsobs.closed_loop.run import ClosedLoop, residual_rms
 from wfsobs.evaluation.exact_errors import cumulative_rms, spectra
 from wfsobs.identification.result import Identification
 from wfsobs.observers import OBSERVERS

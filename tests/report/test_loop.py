@@ -10,7 +10,7 @@ import pytest
 from wfsobs.app.render import number
 from wfsobs.app.report.data import Report, state_of
 from wfsobs.app.report.page import page
-from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label
+from wfsobs.closed_loop.run import LIMITED, NOT_APPLICABLE, label
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.scores import COMMON_BOUNDS

@@ -10,12 +10,11 @@ from wfsobs.app.jobs import Tell
 from wfsobs.app.work import RunResults
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.envelope import PlantEnvelope, plant_envelope
-from wfsobs.closed_loop.rows import ClosedLoop, Row, rows
-from wfsobs.closed_loop.run import each_outcome
+from wfsobs.closed_loop.run import ClosedLoop, Row, each_outcome, rows
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.margins import Curves, curves
 from wfsobs.dependence import Memo
-from wfsobs.priors_from.scenario import own_settings
+from wfsobs.priors_from.controllers import own_settings
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.signal.spectrum import psd

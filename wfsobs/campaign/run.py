@@ -30,8 +30,8 @@ from wfsobs.campaign.store import (
     write_batch,
 )
 from wfsobs.closed_loop.design import Design, design
-from wfsobs.closed_loop.rows import rows as loop_rows
 from wfsobs.closed_loop.run import closed_loop
+from wfsobs.closed_loop.run import rows as loop_rows
 from wfsobs.cost import run_seconds
 from wfsobs.evaluation.bound import Bound, record_bounds
 from wfsobs.evaluation.result import TIME, Failure, score_rows

@@ -27,7 +27,8 @@ from wfsobs.control.supervisor import SupervisedController, Supervision
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.step import StepError, StepObserver
 from wfsobs.prior import LgsError, Lines, Model, Part, Training
-from wfsobs.priors_from.scenario import observer_settings, own_settings
+from wfsobs.priors_from.controllers import own_settings
+from wfsobs.priors_from.scenario import observer_settings
 from wfsobs.record import DELAY, Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError

@@ -41,9 +41,8 @@ from wfsobs.cli.show import (
 )
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.envelope import POINTS, PlantEnvelope, Uncertainty, plant_envelope
-from wfsobs.closed_loop.rows import LIMITED, label, linear, no_theory
-from wfsobs.closed_loop.rows import rows as loop_rows
-from wfsobs.closed_loop.run import closed_loop
+from wfsobs.closed_loop.run import LIMITED, closed_loop, label, linear, no_theory
+from wfsobs.closed_loop.run import rows as loop_rows
 from wfsobs.evaluation.budget import Budget, budget_row, error_budget
 from wfsobs.evaluation.evidence import FEWEST, gather_evidence, seeds_interval
 from wfsobs.evaluation.result import Result, Row, interval_text, score_rows

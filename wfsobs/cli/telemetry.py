@@ -31,7 +31,7 @@ from wfsobs.cli.options import (
 from wfsobs.cli.show import new_table, print_json, print_note, progress_bar, show, show_table, show_verdicts, warn
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.promise import make_promise
-from wfsobs.closed_loop.rows import label
+from wfsobs.closed_loop.run import label
 from wfsobs.control.laws import gain_from_telemetry
 from wfsobs.evaluation.result import score_rows
 from wfsobs.files import check_writable, write_text
@@ -50,7 +50,7 @@ from wfsobs.identification.process import Number
 from wfsobs.identification.result import Identification
 from wfsobs.pipeline import as_stated
 from wfsobs.pipeline import observe as observe_record
-from wfsobs.priors_from.scenario import plant_of
+from wfsobs.priors_from.controllers import plant_of
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.zernike import HIGHEST_ORDER, modes_up_to

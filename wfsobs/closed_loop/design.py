@@ -22,7 +22,8 @@ from wfsobs.evaluation.bound import INFORMATION, PeriodicError, least_residual
 from wfsobs.evaluation.exact_errors import variance_of
 from wfsobs.observers.kalman.multirate import UnstableCycle
 from wfsobs.prior import Prior, Spectra
-from wfsobs.priors_from.scenario import own_settings, plant_of, prior_for, supervision_of, told_spectra, true_plant_of
+from wfsobs.priors_from.controllers import own_settings, plant_of, prior_for, supervision_of, true_plant_of
+from wfsobs.priors_from.scenario import told_spectra
 from wfsobs.record import TOTAL
 from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario

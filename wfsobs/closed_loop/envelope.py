@@ -25,7 +25,8 @@ from wfsobs.control.mismatch import loops, pairs, radius, stack_weights, weigh
 from wfsobs.control.true_plant import TruePlant
 from wfsobs.evaluation.result import Row
 from wfsobs.notebook import PlotAccessor, import_extra
-from wfsobs.priors_from.scenario import full_plant_of, own_settings, plant_of, prior_for, told_spectra
+from wfsobs.priors_from.controllers import full_plant_of, own_settings, plant_of, prior_for
+from wfsobs.priors_from.scenario import told_spectra
 from wfsobs.progress import QUIET, Watch
 from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario

@@ -39,7 +39,7 @@ from wfsobs.files import write_text, write_whole
 from wfsobs.observers.step import StepError
 from wfsobs.observers.stepping import Gain, GainCycle
 from wfsobs.prior import Prior
-from wfsobs.priors_from.scenario import own_settings, plant_of
+from wfsobs.priors_from.controllers import own_settings, plant_of
 from wfsobs.record import Measurements, Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError

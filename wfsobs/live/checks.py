@@ -16,7 +16,8 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, Observer
 from wfsobs.observers.step import StepObserver
 from wfsobs.prior import Training
-from wfsobs.priors_from.scenario import full_plant_of, has_prior, observer_settings, supervision_of
+from wfsobs.priors_from.controllers import full_plant_of, supervision_of
+from wfsobs.priors_from.scenario import has_prior, observer_settings
 from wfsobs.record import Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError

@@ -15,7 +15,7 @@ import numpy as np
 
 from wfsobs.campaign.sweep import SweepResults
 from wfsobs.closed_loop.envelope import PlantEnvelope
-from wfsobs.closed_loop.rows import ClosedLoop, residual_rms
+from wfsobs.closed_loop.run import ClosedLoop, residual_rms
 from wfsobs.control.margins import Curves, curves
 from wfsobs.evaluation.budget import TERMS, error_budget
 from wfsobs.evaluation.exact_errors import FEWEST, TRUTH, cumulative_rms

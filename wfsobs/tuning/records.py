@@ -26,7 +26,8 @@ from wfsobs.observers.base import TARGETS, VIBRATION, Observer, Tunable
 from wfsobs.observers.baselines import open_loop_reference
 from wfsobs.observers.missing import fill_missing
 from wfsobs.prior import Model
-from wfsobs.priors_from.scenario import bands_of, measurement_noise, observer_settings, plant_of, prior_of, told_spectra
+from wfsobs.priors_from.controllers import plant_of
+from wfsobs.priors_from.scenario import bands_of, measurement_noise, observer_settings, prior_of, told_spectra
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError, Training, delay_signal, frame_mean
 from wfsobs.registry import name_list

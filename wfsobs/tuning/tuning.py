@@ -25,7 +25,7 @@ from wfsobs.closed_loop.envelope import (
     uncertain_plants,
     with_laws,
 )
-from wfsobs.closed_loop.rows import label
+from wfsobs.closed_loop.run import label
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.result import row_label
 from wfsobs.notebook import import_extra

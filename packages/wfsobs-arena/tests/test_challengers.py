@@ -25,7 +25,7 @@ from wfsobs.control.mirror import Mirror
 from wfsobs.observers.base import TARGETS, Observer
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.prior import Model
-from wfsobs.priors_from.scenario import controller_arguments, own_settings, plant_of, prior_for
+from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.autoregressive import Ar2
 from wfsobs.signal.gains import steady_state

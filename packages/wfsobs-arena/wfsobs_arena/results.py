@@ -17,7 +17,7 @@ from wfsobs.campaign.store import PHYSICS_VERSION
 from wfsobs.files import write_whole
 from wfsobs.observers.base import Observer
 from wfsobs.prior import IDENTIFIED, TRUE
-from wfsobs.priors_from.scenario import own_settings
+from wfsobs.priors_from.controllers import own_settings
 from wfsobs.scenario import Scenario
 from wfsobs_arena.cases import Case
 from wfsobs_arena.challengers import CHALLENGERS

@@ -12,7 +12,7 @@ import numpy as np
 from wfsobs.control.base import Controller
 from wfsobs.evaluation.scores import calibration
 from wfsobs.observers.base import Observer
-from wfsobs.priors_from.scenario import controller_arguments, own_settings, plant_of, prior_for
+from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
 from wfsobs.record import NEXT_Z, TOTAL, Record
 from wfsobs.typing import Array
 from wfsobs_arena.cases import Case, mean_square

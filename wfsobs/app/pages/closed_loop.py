@@ -53,7 +53,7 @@ from wfsobs.app.views.plots import (
 )
 from wfsobs.app.views.switches import LineChoice
 from wfsobs.closed_loop.envelope import POINTS, PlantEnvelope, Uncertainty
-from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label, loop_verdict, no_theory
+from wfsobs.closed_loop.run import LIMITED, NOT_APPLICABLE, label, loop_verdict, no_theory
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.result import Row as Score
 from wfsobs.evaluation.scores import BOUNDS

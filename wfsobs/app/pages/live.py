@@ -44,7 +44,7 @@ from wfsobs.app.views.spectrum_editor import Frames, SpectrumEditor
 from wfsobs.app.views.switches import group
 from wfsobs.app.views.traces import WINDOW_S
 from wfsobs.app.work import TRUTH
-from wfsobs.closed_loop.rows import strehl
+from wfsobs.closed_loop.run import strehl
 from wfsobs.evaluation.exact_errors import Theory
 from wfsobs.evaluation.result import row_label, target_title
 from wfsobs.evaluation.scores import BOUNDS

@@ -14,8 +14,8 @@ from wfsobs.app.style import observers_of
 from wfsobs.app.views.errors import main_observers
 from wfsobs.app.work import TRUTH
 from wfsobs.closed_loop.design import design
-from wfsobs.closed_loop.rows import rows as controller_rows
 from wfsobs.closed_loop.run import closed_loop
+from wfsobs.closed_loop.run import rows as controller_rows
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.budget import Budget, budget_row, error_budget
 from wfsobs.evaluation.evidence import Evidence

@@ -48,7 +48,7 @@ from wfsobs.app.report.sections import (
 from wfsobs.app.style import PRIMARY, asset, look, observers_of
 from wfsobs.app.views.plots import MODEL, PEAKS, add_line, add_marks, model_mark, new_figure, new_spectrum, peak_marks
 from wfsobs.app.work import TRUTH, RunResults
-from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE
+from wfsobs.closed_loop.run import LIMITED, NOT_APPLICABLE
 from wfsobs.evaluation.budget import TERMS
 from wfsobs.evaluation.evidence import Evidence, gather_evidence
 from wfsobs.evaluation.result import Result

@@ -19,7 +19,7 @@ from wfsobs.app.share import FILE, given_options, to_file
 from wfsobs.app.style import BOUND_MARKS, TERM_COLOURS
 from wfsobs.app.views.errors import ScoreWriter
 from wfsobs.bench.measure import machine
-from wfsobs.closed_loop.rows import NOT_APPLICABLE, label
+from wfsobs.closed_loop.run import NOT_APPLICABLE, label
 from wfsobs.evaluation.budget import TERMS
 from wfsobs.evaluation.result import Row, row_label, target_title
 from wfsobs.evaluation.scores import BOUND, OF_STAR, RESIDUAL

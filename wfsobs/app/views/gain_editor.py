@@ -23,7 +23,8 @@ from wfsobs.closed_loop.design import LawDesign, design_mode, nominal_loop
 from wfsobs.control.laws import highest_stable_gain
 from wfsobs.control.margins import Curves, curves
 from wfsobs.evaluation.exact_errors import Theory
-from wfsobs.priors_from.scenario import plant_of, told_spectra
+from wfsobs.priors_from.controllers import plant_of
+from wfsobs.priors_from.scenario import told_spectra
 from wfsobs.scenario import Scenario
 from wfsobs.settings.values import SettingError
 from wfsobs.signal.wiener import Complex
