@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from wfsobs import PRESETS, close_loop
 from wfsobs.app.display import Display
 from wfsobs.app.loop_work import LoopResults
 from wfsobs.app.pages.closed_loop import loop_html
-from wfsobs.closed_loop.run import loop_verdict, rows
+from wfsobs.closed_loop.design import design
+from wfsobs.closed_loop.run import ClosedLoop, Outcome, loop_verdict, rows
 from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS
+from wfsobs.simulation.loop import simulate
 
 
 @pytest.mark.slow
@@ -54,3 +57,16 @@ def test_a_controller_that_learns_is_ranked_where_its_own_laws_close_the_loop() 
         assert ('<p class="text">LQG, adaptive KF: an integrator' in page) == (said != "") and 'class="failure"' not in page
     (outcome,) = close_loop(scenario.replace({"run.duration": 0.9}), controllers=names[1:]).outcomes
     assert outcome.residual is None and outcome.note.startswith("the record has 900 steps, its first window is full after 100")
+
+
+def test_controllers_that_one_record_cannot_tell_apart_are_equal_only_where_their_residuals_are_alike() -> None:
+    names = ["integrator", "lqg-kf-lgs", "lqg-kf-multi"]
+    plan = design(PRESETS["paper"]().replace({"run.duration": 1.0, "run.warm_up": 0.5}), names)
+    record, outcomes = simulate(plan.scenario), []
+    for name, size, at in zip(plan.laws, (1.0, 1.2, 8.0), (550, 750, 950), strict=True):
+        # One sample is all of a residual, which is then known badly.
+        residual = np.full((record.n_steps, record.n_modes), 1e-3)
+        residual[at] = size
+        outcomes.append(Outcome(name, (True, True), residual))
+    found = loop_verdict(ClosedLoop(plan, record, tuple(outcomes)), "tip")
+    assert found is not None and found.ties == ("lqg-kf-lgs",)

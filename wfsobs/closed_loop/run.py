@@ -23,7 +23,7 @@ from wfsobs.control.supervisor import SupervisedController
 from wfsobs.control.true_plant import drive
 from wfsobs.dependence import Memo, digest, record_digest
 from wfsobs.evaluation.evidence import means_differ
-from wfsobs.evaluation.result import NOT_OBSERVERS, TRUE_SPECTRA, Row, knowledge_of
+from wfsobs.evaluation.result import EQUAL, NOT_OBSERVERS, TRUE_SPECTRA, Row, knowledge_of
 from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS, batch_means, rms_interval
 from wfsobs.evaluation.verdict import Contender, Verdict
 from wfsobs.notebook import PlotAccessor, import_extra
@@ -200,7 +200,7 @@ def loop_verdict(result: ClosedLoop, mode: str) -> Verdict | None:
             name,
             float(errors[i]),
             rms_interval(float(errors[i]), squares[:, i : i + 1]),
-            not worse[i],
+            not (worse[i] or errors[i] > (1.0 + EQUAL) * errors[best]),
             TRUE_SPECTRA if "spectra" in controller_needs(name, result.scenario) else knowledge_of(CONTROLLERS[name].prior),
             0,
             limit,
