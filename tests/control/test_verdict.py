@@ -12,6 +12,7 @@ from wfsobs.app.pages.closed_loop import loop_html
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.run import ClosedLoop, Outcome, loop_verdict, rows
 from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS
+from wfsobs.prior import GIVEN, IDENTIFIED, TRUE
 from wfsobs.simulation.loop import simulate
 
 
@@ -70,3 +71,7 @@ def test_controllers_that_one_record_cannot_tell_apart_are_equal_only_where_thei
         outcomes.append(Outcome(name, (True, True), residual))
     found = loop_verdict(ClosedLoop(plan, record, tuple(outcomes)), "tip")
     assert found is not None and found.ties == ("lqg-kf-lgs",)
+    loop = ClosedLoop(plan, record, tuple(outcomes[-1:]))
+    for source in (TRUE, IDENTIFIED, GIVEN):
+        named = loop_verdict(loop, "tip", source=source)
+        assert named is not None and f"With {'known' if source == TRUE else source} peak frequencies: " in named.sentences()[0]

@@ -14,6 +14,7 @@ from wfsobs.closed_loop.run import ClosedLoop, Row, each_outcome, rows
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.margins import Curves, curves
 from wfsobs.dependence import Memo
+from wfsobs.prior import TRUE, PriorSource
 from wfsobs.priors_from.controllers import own_settings
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
@@ -31,6 +32,7 @@ class LoopResults:
     rows    : those of `wfsobs loop --json`
     spectra : controller -> (frequency (n,) [Hz], density of the residual (n, n_modes) [um^2/Hz])
     curves  : controller -> per mode, of stable time-invariant laws
+    source  : where the prior of the controllers comes from
     """
 
     result: ClosedLoop
@@ -38,6 +40,7 @@ class LoopResults:
     spectra: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
     curves: Mapping[str, tuple[Curves, ...]] = field(default_factory=dict)
     complete: bool = False
+    source: PriorSource = TRUE
 
     def residual(self, controller: str) -> Array | None:
         """(n_steps, n_modes) [um], or None."""
@@ -67,8 +70,9 @@ def compute(of: RunResults, watch: Watch, tell: Tell, memo: Memo | None = None) 
             spectra[outcome.controller] = psd(outcome.residual[start:], record.dt)
         if outcome.controller not in quick[:-1]:
             result = ClosedLoop(plan, record, tuple(outcomes))
-            table = tuple(rows(result, None, source=of.result.prior_source))
-            shown = LoopResults(result, table, dict(spectra), linear, outcome.controller == names[-1])
+            source = of.result.prior_source
+            table = tuple(rows(result, None, source=source))
+            shown = LoopResults(result, table, dict(spectra), linear, outcome.controller == names[-1], source)
             if not shown.complete:
                 tell(result=shown)
     return shown

@@ -174,11 +174,13 @@ def rows(result: ClosedLoop, seed: int | None, *, source: PriorSource = TRUE) ->
     return out
 
 
-def loop_verdict(result: ClosedLoop, mode: str) -> Verdict | None:
+def loop_verdict(result: ClosedLoop, mode: str, *, source: PriorSource = TRUE) -> Verdict | None:
     """Return the verdict on the controllers by their residuals in one mode, with the limit; None where none ran.
 
     The intervals and which residuals do not differ significantly from the least are by the scatter within the record. One
     whose own laws close the loop for a part of that time alone is left out.
+
+    source : where the prior of the controllers comes from
     """
     column = [m.name for m in result.scenario.modes].index(mode)
     first = round(result.design.start / result.record.dt)
@@ -208,7 +210,7 @@ def loop_verdict(result: ClosedLoop, mode: str) -> Verdict | None:
         )
         for i, name in enumerate(left)
     ]
-    return Verdict("residual", mode, tuple(sorted(places, key=lambda place: place.rms)), 0, ())
+    return Verdict("residual", mode, tuple(sorted(places, key=lambda place: place.rms)), 0, (), source=source)
 
 
 def controller_needs(controller: str, scenario: Scenario, *, source: PriorSource = TRUE) -> str:

@@ -213,8 +213,8 @@ class Verdict:
             words, heading = [place.with_error(scale, unit)], HEADINGS[place.knowledge]
             if place.knowledge == PEAKS and place.n_peaks < self.lines:
                 heading = f"With {place.n_peaks} of {self.lines} peak frequencies known"
-            elif place.knowledge == PEAKS and self.source != TRUE:
-                heading = f"With {self.source} peak frequencies"
+            elif place.knowledge in (PEAKS, TRUE_SPECTRA) and self.source != TRUE:
+                heading = heading.replace("known", self.source)
             if place is not self.best:
                 words += ["statistically equal to the best"] * place.is_tie
             else:

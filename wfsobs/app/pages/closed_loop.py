@@ -507,7 +507,7 @@ class ClosedLoopPage(Page):
         shown = self.results
         if shown is None or self.display.column >= len(shown.result.scenario.modes):
             return
-        self._verdict = loop_verdict(shown.result, self.display.mode)
+        self._verdict = loop_verdict(shown.result, self.display.mode, source=shown.source)
         for drawn in self._figures:
             drawn.draw(shown, self.display)
         self.lines.offer([place.observer for place in self._verdict.named_places] if self._verdict else CONTROLLERS)
