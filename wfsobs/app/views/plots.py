@@ -150,8 +150,7 @@ def new_figure(x: Any = None, y: Any = None, label: str = "", log: str = "", **o
         **options,
     )
     fig.outline_line_color = None  # of which a theme has its own idea, the dark one alone
-    fig.toolbar.logo = None
-    fig.toolbar.autohide = True
+    fig.toolbar.update(logo=None, autohide=True, stylesheets=[":host(.bk-inner) { background: none; }"])  # white by itself
     return fig
 
 
