@@ -150,7 +150,7 @@ def test_a_change_of_a_setting_shows_the_change_of_every_error(page: Page, loop:
     page.store.change("turbulence.wind_speed", 30.0)
     loop.finish(page.store)
     second = errors()
-    assert page.strip.cards.heads["change"] == "Change"
+    assert page.strip.cards.heads["change"] == f"Change [{page.display.unit_label}]"
     for name in ("kf-lgs", "multirate-multi"):
         row = page.row(name)
         decimals = len(number(1e3 * second[name]).partition(".")[2])

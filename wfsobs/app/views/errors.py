@@ -365,7 +365,7 @@ class Table:
         return macro("change", change(before, now)) + number(before * self.display.scale(run.scenario))
 
 
-HEADS = {"note": RELATIVE, "change": "Change", "bar": "Error budget"}
+HEADS = {"note": RELATIVE, "bar": "Error budget"}
 """Headings beside that of the errors."""
 
 LEAST = 0.01
@@ -471,7 +471,7 @@ class Strip:
         unit, shown = self.display.unit_label, self.run.result
         error = "RMS error" if shown is None or shown.values(TRUTH, self.target) is not None else "Prediction error"
         terms = {part[3] for item in items for part in item["parts"] if part[1] >= LEAST}
-        heads = HEADS | {"value": f"{error} [{unit}]"}
+        heads = HEADS | {"value": f"{error} [{unit}]", "change": f"Change [{unit}]"}
         heads["change"] *= any(item["change"] for item in items)
         heads["bar"] *= bool(terms)
         limit = [("currentColor", LIMIT)] * any(item["limit"] for item in items)
