@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import Any
 
 from tests.app.conftest import OneSeed
@@ -11,6 +12,9 @@ from wfsobs.app.jobs import DONE
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.views.errors import Table
+from wfsobs.evaluation.bound import NO_BOUND
+from wfsobs.evaluation.result import Failure
+from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.simulation.loop import simulate
 
 
@@ -23,6 +27,23 @@ def test_lines_are_true_for_the_simulation_of_the_settings_and_given_for_a_loade
     store.run_on(LoadedRecord(simulate(store.scenario), "mine", "key"), store.scenario)
     loop.until(lambda: store.run.state == DONE and store.run.result.is_recorded)
     assert "Prior knowledge: given peak frequencies<" in table.pane.html and ": peak freq" not in table.pane.html
+
+
+def test_what_has_no_error_says_its_own_reason(make_store: Any, loop: Any) -> None:
+    store: Store = make_store()
+    table = Table(Display(), OneSeed(store))
+    store.start()
+    loop.finish(store)
+    full = store.run.result.result
+    part = replace(
+        full,
+        estimates=tuple(e for e in full.estimates if e.observer != "kf-lgs"),
+        scores=tuple(s for s in full.scores if s.observer not in ("kf-lgs", *BOUNDS)),
+        failures=(Failure("kf-lgs", "kf-lgs left out: it is not here"),),
+    )
+    store.run.result = replace(store.run.result, result=part)
+    for why in (NO_BOUND, "it is not here"):
+        assert f'<span title="{why}">–</span>' in table.html()
 
 
 def test_every_dash_has_a_reason_and_no_number_an_exponent(make_store: Any, loop: Any) -> None:

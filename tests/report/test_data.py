@@ -14,8 +14,10 @@ from tests.report.levels import read_levels
 from wfsobs.app.report.data import Grid, bins_for, state_of, window_of
 from wfsobs.app.report.page import DECADES, LEVELS, STEP, Pool, encode
 from wfsobs.app.work import TRUTH
+from wfsobs.evaluation.bound import NO_BOUND
 from wfsobs.evaluation.exact_errors import cumulative_rms
 from wfsobs.evaluation.result import Result, score_rows
+from wfsobs.scenario.groups.events import Event
 from wfsobs.signal.spectrum import psd
 
 
@@ -113,6 +115,11 @@ def test_an_unfinished_observer_is_named(result: Result) -> None:
     done = {name: tuple(it for it in getattr(result, name) if it.observer != "gpr-online") for name in ("estimates", "scores")}
     part = replace(result, **done)
     assert state_of(part).reasons == ("gpr-online left out: not finished when the report was made",)
+
+
+def test_that_there_is_no_bound_is_said(result: Result) -> None:
+    events = result.scenario.replace({"events": [Event(start=1.0, wind_factor=2.0)]})
+    assert state_of(replace(result, scenario=events)).reasons == (NO_BOUND,)
 
 
 def test_the_window_is_told_where_all_states_share_it(result: Result) -> None:

@@ -76,6 +76,8 @@ INFORMATION: Mapping[str, str] = dict(zip(("lgs", "both", "stars", "modes", "bot
 ALONE: dict[str, str] = dict(zip(BOUNDS[3:], BOUNDS[:3], strict=True))
 """Row of the bound of all modes together -> that of every mode by itself."""
 
+NO_BOUND = "no bound: the spectra of this scenario are not known, or events change them"
+
 SHARE = 0.95
 """Share of the records whose rms lies in an interval."""
 
@@ -214,7 +216,7 @@ def bound(scenario: Scenario, *, information: str = "lgs", ahead: float = 0, mod
     if information not in INFORMATION:
         raise ValueError(f"information = {information!r}: takes one of {', '.join(INFORMATION)}")
     if not has_known_spectra(scenario):
-        raise ValueError("no bound: the spectra of this scenario are not known, or events change them")
+        raise ValueError(NO_BOUND)
     every = range(len(scenario.modes))
     row, chosen = INFORMATION[information], every if modes is None else modes
     if wrong := [mode for mode in chosen if mode not in every]:

@@ -17,6 +17,7 @@ from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.closed_loop.run import rows as controller_rows
 from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.evaluation.bound import NO_BOUND
 from wfsobs.evaluation.budget import Budget, budget_row, error_budget
 from wfsobs.evaluation.evidence import Evidence
 from wfsobs.evaluation.exact_errors import cumulative_rms, spectra
@@ -29,6 +30,7 @@ from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import Variation
 from wfsobs.signal.envelope import envelope, envelope_times
+from wfsobs.simulation.true_spectra import has_known_spectra
 from wfsobs.typing import Array
 
 Floats = NDArray[np.float32]
@@ -102,7 +104,7 @@ class State:
     """One combination of the settings varied, and what came of it.
 
     rows    : as `wfsobs run --json` gives them, and the computing time
-    reasons : why an observer gave nothing, a line each
+    reasons : why an observer gave nothing, and why there is no bound, a line each
     grid    : the points kept of the traces
     lines   : "kind/target/observer/mode" -> points; kind is signal, error [um], psd, psd-error [um^2/Hz], cumulative or
               cumulative-error [um]; frequencies [Hz] of the latter two pairs as "frequency", "frequency-cumulative"
@@ -197,11 +199,12 @@ def state_of(
     rows = score_rows(scores, scenario.run.seed, source=result.prior_source)
     budgets, simulation = (list_budgets(result), scenario) if is_simulated else ([], None)
     of = scenario, record, result.estimates, result.scores
+    no_bound = [NO_BOUND] if is_simulated and not has_known_spectra(scenario) else []
     known = {"simulation": simulation, "evidence": evidence, "budgets": budgets, "source": result.prior_source}
     return State(
         scenario,
         rows,
-        tuple(_reasons(result, usual_observers(scenario, record) if observers is None else observers)),
+        (*_reasons(result, usual_observers(scenario, record) if observers is None else observers), *no_bound),
         grid,
         lines,
         loop_rows(result),

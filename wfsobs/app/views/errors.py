@@ -23,13 +23,14 @@ from wfsobs.app.service import IDLE
 from wfsobs.app.style import TERM_COLOURS, WIDE, HtmlComponent, follow_html, look, observers_of, script, sheets, swatch, watch
 from wfsobs.app.views.switches import LineChoice
 from wfsobs.app.work import TRUTH, RunResults
+from wfsobs.evaluation.bound import NO_BOUND
 from wfsobs.evaluation.budget import TERMS as BUDGET_TERMS
 from wfsobs.evaluation.evidence import Evidence, gather_evidence, marks_of, rank_observers
 from wfsobs.evaluation.result import NOTHING as NO_KNOWLEDGE
 from wfsobs.evaluation.result import (
     PEAKS,
     TIME,
-    Failure,
+    Result,
     above_bound,
     can_be_best,
     group_by_knowledge,
@@ -193,11 +194,16 @@ class VerdictLine:
 ABOVE = macro("tag", "above", "worse than zero")
 
 
-def lines_of_failures(failures: Iterable[Failure]) -> list[str]:
+def reasons_of(result: Result) -> dict[str, str]:
+    """Return why observers have no estimate."""
+    return {it.observer: it.reason.removeprefix(f"{it.observer} left out: ") for it in result.failures}
+
+
+def lines_of_failures(result: Result) -> list[str]:
     """Say which observers have no estimate, a line for each reason."""
     names: dict[str, list[str]] = {}
-    for failure in failures:
-        names.setdefault(failure.reason.removeprefix(f"{failure.observer} left out: "), []).append(row_label(failure.observer))
+    for name, reason in reasons_of(result).items():
+        names.setdefault(reason, []).append(row_label(name))
     return [f"{', '.join(of)} left out: {reason}" for reason, of in names.items()]
 
 
@@ -232,12 +238,12 @@ class ScoreWriter:
         words: Iterable[str],
         rows: Mapping[str, ScoreRow | None],
         leaders: Sequence[str],
-        why: str = "",
+        why: Mapping[str, str] = {},
         cells_beside: Callable[[str], list[str]] = lambda _name: [],
     ) -> list[tuple[str, list[Row]]]:
         """Return the rows of a target in one mode, a group per kind of prior knowledge, the smallest error first.
 
-        words : of the title, a group without rows;  rows : observer -> its row, None where there is none;  why : there is none
+        words : of the title, a group without rows;  rows : observer -> its row, None where there is none;  why : observer -> why
         cells_beside : returns those that go beside the error
         """
         known = {name: row for name, row in rows.items() if row}
@@ -245,7 +251,7 @@ class ScoreWriter:
 
         def make_row(name: str) -> Row:
             row, bound = rows[name], known.get(own_bound(name) or "")
-            error, *others = self._cells(row, target, marks.get(name)) if row else [missing(why)] * 6
+            error, *others = self._cells(row, target, marks.get(name)) if row else [missing(why[name])] * 6
             notes = ["looks ahead" if is_non_causal(name) else "", own_interval(row) if row else ""]
             if row and bound and above_bound(row["rms_um"], row["interval_um"], bound["rms_um"]) == 0.0:
                 notes.append(AT_LIMIT)
@@ -303,7 +309,7 @@ class Table:
         """Write the table."""
         shown = self.run.result
         groups = [group for target in self._targets() for group in self._target(target)]
-        left_out = lines_of_failures(shown.result.failures) if shown else []
+        left_out = lines_of_failures(shown.result) if shown else []
         return f"{table('RMS errors', self._columns(), groups=groups)}{macro('texts', 'failure', left_out)}"
 
     def _columns(self) -> dict[str, str]:
@@ -341,9 +347,12 @@ class Table:
         )
         first, *more = WITHOUT_TRUTH.get(target, [target_title(target)])
         leaders = seeds.evidence.leaders(target, display.mode) if seeds.evidence else ()
-        why = "not computed yet"
+        why = dict.fromkeys(rows, "not computed yet")
         if shown and self.run.state == DONE:
-            why = "no error: it has no estimate" if scores else "no error: nothing is scored, all may be warm-up"
+            none = "it has no estimate" if scores else "nothing is scored, all may be warm-up"
+            why = dict.fromkeys(rows, f"no error: {none}")
+            if scores:
+                why |= dict.fromkeys(BOUNDS, NO_BOUND) | reasons_of(shown.result)
 
         def compared(name: str) -> list[str]:
             return [self._compared_cell(run, name, target, scores.get(name)) for run in display.compared_runs]
