@@ -125,9 +125,9 @@ def test_observers_that_lack_something_are_left_out_with_a_line(tmp_path):
     np.savez(tmp_path / "bare.npz", y_lgs=simulated.y_lgs, u=simulated.u, dt=simulated.dt)
     result = call("observe", str(tmp_path / "bare.npz"), *QUICK, "--out", str(tmp_path / "e.npz"))
     assert result.exit_code == 0
-    assert "kf-ngs left out: the record has no y_ngs, ratio" in result.stderr
-    assert "butterworth-ol left out: the record has no open_loop_y" in result.stderr
-    assert "gpr-offline left out: the record has no training" in result.stderr
+    assert "kf-ngs left out: the record has no NGS measurements" in result.stderr
+    assert "butterworth-ol left out: the record has no measurements with the mirror at rest" in result.stderr
+    assert "gpr-offline left out: the record has no training data" in result.stderr
     scored = json.loads(call("observe", str(tmp_path / "bare.npz"), *QUICK, "--json").stdout)
     assert {(r["observer"], r["target"]) for r in scored} == {
         ("kf-lgs", "next z"),

@@ -8,10 +8,11 @@ from typing import Any
 
 from tests.app.conftest import OneSeed
 from wfsobs.app.display import Display
+from wfsobs.app.idle_work import Budgets
 from wfsobs.app.jobs import DONE
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
-from wfsobs.app.views.errors import Table
+from wfsobs.app.views.errors import MainLines, Strip, Table
 from wfsobs.evaluation.bound import NO_BOUND
 from wfsobs.evaluation.result import Failure
 from wfsobs.evaluation.scores import BOUNDS
@@ -31,7 +32,10 @@ def test_lines_are_true_for_the_simulation_of_the_settings_and_given_for_a_loade
 
 def test_what_has_no_error_says_its_own_reason(make_store: Any, loop: Any) -> None:
     store: Store = make_store()
-    table = Table(Display(), OneSeed(store))
+    seeds = OneSeed(store)
+    table = Table(display := Display(), seeds)
+    lines = MainLines(display, seeds)
+    strip = Strip("vibration", display, lines, Budgets(seeds, lines.names))
     store.start()
     loop.finish(store)
     full = store.run.result.result
@@ -44,6 +48,8 @@ def test_what_has_no_error_says_its_own_reason(make_store: Any, loop: Any) -> No
     store.run.result = replace(store.run.result, result=part)
     for why in (NO_BOUND, "it is not here"):
         assert f'<span title="{why}">–</span>' in table.html()
+    (card,) = (item for item in strip.items() if item["name"] == "kf-lgs")
+    assert card["note"] == "left out" and "it is not here" in card["about"]
 
 
 def test_every_dash_has_a_reason_and_no_number_an_exponent(make_store: Any, loop: Any) -> None:

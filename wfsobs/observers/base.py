@@ -83,6 +83,15 @@ def check_look(look: object) -> None:
             raise ValueError(f"look.{name} = {colour!r}: takes a colour of CSS, such as #rrggbb or a name")
 
 
+_WORDS = {
+    "y_ngs": "NGS measurements",
+    "ratio": "NGS measurements",
+    "y_stars": "measurements of every LGS",
+    "open_loop_y": "measurements with the mirror at rest",
+    "training": "training data",
+}
+"""Field that a record may not have -> what is in it."""
+
 PLAIN = Look(dash=(4, 2))
 """Default look."""
 
@@ -183,8 +192,8 @@ class Observer:
         return record.measurements("open_loop_y" in self.needs, sensors=sensors)
 
     def missing(self, record: Record) -> tuple[str, ...]:
-        """Return the needed fields that a record does not have."""
-        return tuple(name for name in self.needs if getattr(record, name) is None)
+        """Return what a record does not have of what is needed, in words."""
+        return tuple(dict.fromkeys(_WORDS.get(name, name) for name in self.needs if getattr(record, name) is None))
 
     def estimate(
         self, measurements: Measurements, prior: Prior, settings: Group | None = None, watch: Watch = QUIET

@@ -545,7 +545,10 @@ class Strip:
         return card_of(name, self.display.dark, note, **fields)
 
     def _card_without(self, name: str) -> dict[str, Any]:
-        return self._card(name, "computing …" if self.run.state == RUNNING else "no result")
+        if self.run.state == RUNNING:
+            return self._card(name, "computing …")
+        reason = reasons_of(self.run.result.result).get(name) if self.run.result else None
+        return self._card(name, "left out", about=f"Left out: {reason}.") if reason else self._card(name, "no result")
 
     def _error_card(self, name: str, score: Score, results: RunResults) -> dict[str, Any]:
         mean, scale = self.seeds.over_seeds(score), self.display.scale(results.scenario)
