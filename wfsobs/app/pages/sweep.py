@@ -201,7 +201,7 @@ EARLIER = "The settings in the drawer have changed since this sweep."
 FIRST = (("turbulence.wind_speed", "5:25:5"), ("sensors.exposure_ratio", "2,5,10,20"))
 SEEDS = 4
 QUICK, EVERY = "quick", "every"
-OBSERVERS_OF = {"Fast observers only (no GPR)": QUICK, "All": EVERY}
+OBSERVERS_OF = {"Without observers that learn during the run": QUICK, "All": EVERY}
 REDRAW = 0.3
 """Least time between two pictures while runs come in [s]."""
 
@@ -265,7 +265,7 @@ class SweepPage(Page):
             AxisFields(store, ("and over", "Values of the second"), several, *FIRST[1]),
         )
         self.seeds: Final = number_field("Seeds of each", SEEDS, 120)
-        self.observers: Final = make_select("Observers", OBSERVERS_OF, QUICK, 290)
+        self.observers: Final = make_select("Observers", OBSERVERS_OF, QUICK, 350)
         first, second = self.axes
         linked = {"over": first.select, "values": first.values, "second": second.select, "second_values": second.values}
         linked |= {"seeds": self.seeds, "observers": self.observers}
