@@ -22,7 +22,7 @@ from wfsobs.app.sources import LoadedRecord
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings
-from wfsobs.scenario.names import setting_name
+from wfsobs.scenario.names import setting_label
 from wfsobs.simulation.loop import simulate
 from wfsobs.tuning import Evaluation, TuningResult, tune
 from wfsobs.tuning.trials import Errors
@@ -70,7 +70,7 @@ def test_it_shows_what_the_core_finds(page: TunePage, dashboard: Dashboard, loop
     assert row(table, "other target", "rms over modes")[:2] == [number(1e3 * s.rms, 4) for s in (before.other, after.other)]
     for path, value in changed_settings(expected.scenario, before.scenario).items():
         text = f"{value:.6g}" if isinstance(value, float) else str(value)
-        assert row(table, "setting", setting_name(path))[1] == text
+        assert row(table, "setting", setting_label(expected.scenario, path))[1] == text
     assert "likelihood" not in table, "it is no GPR"
     data = page.figure.source.data
     np.testing.assert_allclose(data["tried"], [1e3 * e.rms for e in expected.history])

@@ -271,9 +271,8 @@ class RecordTrials(Trials):
         if not self.history and begins <= LATEST * record.n_steps * record.dt:
             self.warm_up = max(self.warm_up, begins)
         if begins > self.warm_up:
-            raise RecordError(
-                f"{self.observer} has its first estimate after {begins:g} s; the scores begin at {self.warm_up:g} s"
-            )
+            name = OBSERVERS[self.observer].label
+            raise RecordError(f"{name} has its first estimate after {begins:g} s; the scores begin at {self.warm_up:g} s")
         return self._errors(record, scenario, estimates, self.warm_up, self.records.target)
 
     def stage(self, evaluation: Evaluation) -> Stage:
@@ -310,5 +309,5 @@ class RecordTrials(Trials):
             scores = supervised_scores(record, [e for e in estimates if e.target == target], warm_up, names)
         modes = {s.mode: s.rms for s in scores}
         if len(modes) < len(names) or not all(map(isfinite, modes.values())):
-            raise RecordError(f"{self.observer} has no estimate after the warm-up, {warm_up:g} s")
+            raise RecordError(f"{OBSERVERS[self.observer].label} has no estimate after the warm-up, {warm_up:g} s")
         return Errors(modes)

@@ -47,7 +47,7 @@ from wfsobs.observers.base import VIBRATION
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings
-from wfsobs.scenario.names import setting_name
+from wfsobs.scenario.names import setting_label, setting_name
 from wfsobs.sensors.zernike import TIP_TILT
 from wfsobs.tuning import Evaluation, TuningResult, tune
 from wfsobs.tuning.records import MEASURES, NEXT, REFERENCE, TRUTH, judged_by
@@ -157,7 +157,10 @@ def tuning_html(result: TuningResult, display: Display, diameter: float) -> str:
     unit = unit_for(result, display)
     scale = per_micrometre(unit, diameter)
     groups = [
-        (TITLES[section].format(measure=result.measure, unit=UNITS[unit]), [_row(*row, scale) for row in found])
+        (
+            TITLES[section].format(measure=result.measure, unit=UNITS[unit]),
+            [_row(result.after.scenario, *row, scale) for row in found],
+        )
         for section, found in groupby(tuning_rows(result), key=lambda row: row[0])
     ]
     columns = {"What": "", "Before": "", "After": "", "Change [%]": ""}
@@ -165,8 +168,8 @@ def tuning_html(result: TuningResult, display: Display, diameter: float) -> str:
     return f"{table('Before and after', columns, groups=groups)}{macro('texts', 'text', notes)}"
 
 
-def _row(section: str, name: str, before: float | str | None, after: float | str | None, scale: float) -> Row:
-    error, name = section in (VALIDATION, TEST, OTHER), setting_name(name) if section == SETTING else name
+def _row(scenario: Scenario, section: str, name: str, before: float | str | None, after: float | str | None, scale: float) -> Row:
+    error, name = section in (VALIDATION, TEST, OTHER), setting_label(scenario, name) if section == SETTING else name
     scale = scale if error else 1.0
     cells = [x if isinstance(x, str) else NOTHING if x is None else number(x * scale, 4) for x in (before, after)]
     cells.append(change(before, after) if error and isinstance(before, float) and isinstance(after, float) else "")
