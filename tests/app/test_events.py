@@ -56,12 +56,12 @@ def test_running_rms_and_marks(dashboard: Dashboard, loop: Any) -> None:
 
 def the_marks_are_those_of_the_scenario(dashboard: Dashboard) -> None:
     for trace in dashboard.explore.traces.traces.values():
-        marks, top = trace.events, trace.figure.y_range.end  # type: ignore[attr-defined]
-        assert list(marks.jumps.data["x"]) == [1.5]
-        assert list(marks.spans.data["start"]) == [1.6, 1.7, 1.9]
-        assert list(marks.spans.data["end"]) == pytest.approx([1.8, 1.8, 1.95])
-        assert list(marks.words.data["text"]) == ["5.96 Hz peak −3 Hz × 2", "wind × 2", "25 % LGS lost", "1 LGS out"]
-        assert list(marks.words.data["y"]) == [top] * 4 and marks.words.data["below"] == [2, 15, 28, 2]
+        top = trace.figure.y_range.end
+        (marks,) = {mark.data_source for mark in trace.events.marks}  # type: ignore[attr-defined]
+        assert list(marks.data["start"]) == [1.5, 1.6, 1.7, 1.9]
+        assert list(marks.data["end"]) == pytest.approx([1.5, 1.8, 1.8, 1.95])
+        assert list(marks.data["text"]) == ["5.96 Hz peak −3 Hz × 2", "wind × 2", "25 % LGS lost", "1 LGS out"]
+        assert list(marks.data["top"]) == [top] * 4 and marks.data["below"] == [2, 15, 28, 2]
         values = np.concatenate([np.asarray(trace.source.data[name]) for name in trace.lines])
         assert np.nanmax(values) < top, "the words have room of their own"
 

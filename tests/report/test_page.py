@@ -24,11 +24,13 @@ from wfsobs.app.report.data import Grid, Report, state_of
 from wfsobs.app.report.page import page
 from wfsobs.app.report.sections import command_of
 from wfsobs.app.share import FILE, LONGEST
+from wfsobs.app.views.traces import word
 from wfsobs.evaluation.result import TIME, Result, is_non_causal, row_label, scored_interval, target_title
 from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import observe, run
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import Variation, from_toml, parse_variation, scenario_from, scenarios
+from wfsobs.scenario.groups.events import Event
 
 MADE = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>&\"'"
@@ -67,6 +69,15 @@ def test_the_policy_lets_nothing_out_and_only_these_scripts_run(text: str, parse
     links = [a["href"] for _, a in it.tags if "href" in a]
     assert all(link.startswith(("#line-", "data:application/toml;base64,")) for link in links)
     assert not any(name.startswith("on") for _, a in it.tags for name in a)
+
+
+def test_the_events_of_a_simulation_are_marked(result: Result, parse: Any) -> None:
+    events = [Event(start=1.5, kind="wind", wind_factor=2.0), Event(start=1.2, duration=0.1, kind="laser")]
+    scenario = result.scenario.replace({"events": events})
+    report = Report("paper", scenario, (), (replace(state_of(result), scenario=scenario),))
+    for recorded, of in ((False, sorted(events, key=lambda e: e.start)), (True, [])):
+        (state,) = parse(page(replace(report, is_recorded=recorded), MADE)).data("data")["states"]
+        assert state["events"]["start"] == [e.start for e in of] and state["events"]["text"] == [word(e, scenario) for e in of]
 
 
 def test_the_numbers_are_those_of_the_run(report: Report, text: str, parse: Any) -> None:

@@ -76,10 +76,11 @@ const fit = (axis, start, end) => { if (start < end) axis.setv({start, end, rese
 
 function drawTrace(figure, target) {
   // What a filter does while it settles does not count.
-  const {warm_up} = stateShown()
+  const {warm_up, events} = stateShown()
   const [low, high] = fill(figure, target, axis("time"), 0, () => shown.show, scaleOf(stateShown()), warm_up)
-  const room = 0.05 * (high - low) || 1
-  fit(figure.y_range, low - room, high + room)
+  const room = 0.05 * (high - low) || 1, top = high + room * Math.max(1, ...events.below.map((px) => 2 + px / 6))
+  fit(figure.y_range, low - room, top)
+  figure.renderers.find((it) => it.name === "events").data_source.data = {...events, top: events.start.map(() => top)}
   figure.left[0].axis_label = `${shown.show === "error" ? "error of " : ""}${shown.mode} [${unitShown()}]`
   const boxOf = (name) => figure.center.find((it) => it.type === "BoxAnnotation" && it.name === name)
   const [left, right] = data.window ?? [0, 0]
@@ -127,9 +128,10 @@ function rowOf(index, target, name) {
 // Axes have their colours from the style sheet.
 function paint() {
   const style = getComputedStyle(document.documentElement)
-  for (const {name, glyph} of Object.values(figures).flatMap(lines)) {
-    const colour = {value: style.getPropertyValue(`--line-${name}`)}
-    glyph.setv(glyph.type === "Scatter" ? {line_color: colour, fill_color: colour} : {line_color: colour})
+  for (const {name, glyph} of Object.values(figures).flatMap((it) => it.renderers)) {
+    const value = style.getPropertyValue(`--line-${name}`)
+    const keys = ["line_color", "fill_color", "text_color"].filter((key) => value && key in glyph.properties)
+    glyph.setv(Object.fromEntries(keys.map((key) => [key, {value}])))
   }
 }
 
@@ -188,8 +190,9 @@ function draw() {
 
 function drawAxes() {
   const [target] = data.targets, {length} = stateShown(), f = axis("frequency")
-  const middle = length / 2, half = Math.min(VIEW, length) / 2
-  figures[`trace-${target}`].x_range.setv({start: middle - half, end: middle + half, reset_start: 0, reset_end: length})
+  const view = Math.min(VIEW, length), middle = stateShown().events.start[0] ?? length / 2
+  const start = Math.max(Math.min(middle - view / 2, length - view), 0)
+  figures[`trace-${target}`].x_range.setv({start, end: start + view, reset_start: 0, reset_end: length})
   fit(figures[`spectrum-${target}`].x_range, f[0], f.at(-1))
 }
 

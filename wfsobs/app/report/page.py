@@ -47,6 +47,7 @@ from wfsobs.app.report.sections import (
 )
 from wfsobs.app.style import PRIMARY, asset, look, observers_of
 from wfsobs.app.views.plots import MODEL, PEAKS, add_line, add_marks, model_mark, new_figure, new_spectrum, peak_marks
+from wfsobs.app.views.traces import EVENT, EVENTS, add_event_marks, event_columns
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.closed_loop.run import LIMITED, NOT_APPLICABLE
 from wfsobs.evaluation.budget import TERMS
@@ -86,7 +87,7 @@ def page(report: Report, date: datetime) -> str:
         scripts={name: Markup(script) for name, script in scripts.items()},
         sheets={"shared": Markup(asset("style.css")), "own": Markup(asset("report.css"))},
         primary=PRIMARY,
-        looks={name: look(name) for name in _line_names()},
+        looks={name: look(name) for name in _line_names()} | {EVENTS: EVENT},
         lines=_lines(report),
         main=report.states[report.start].main,
         about=sentence_on,
@@ -156,7 +157,7 @@ def _figures(report: Report) -> dict[str, Any]:
 def _data(report: Report) -> dict[str, Any]:
     """Collect looks, states and lines."""
     pool = Pool()
-    states = [_state(state, pool) for state in report.states]
+    states = [_state(state, pool, report.is_recorded) for state in report.states]
     return {
         "names": _line_names(),
         "targets": TARGETS,
@@ -175,8 +176,9 @@ def _data(report: Report) -> dict[str, Any]:
     }
 
 
-def _state(state: State, pool: Pool) -> dict[str, Any]:
+def _state(state: State, pool: Pool, is_recorded: bool) -> dict[str, Any]:
     scenario, grid = state.scenario, state.grid
+    events = [] if is_recorded else sorted(scenario.events, key=lambda e: e.start)
     lines = {
         name: encode(line, pool, logarithmic=name.startswith(("psd", "cumulative")))
         for name, line in state.lines.items()
@@ -192,6 +194,7 @@ def _state(state: State, pool: Pool) -> dict[str, Any]:
         "axes": {name: pool.add(axis.astype("<f4").tobytes()) for name, axis in axes.items()},
         "peaks": _drawn_peaks(state),
         "model": [model_mark(scenario)],
+        "events": event_columns(events, scenario),
     }
 
 
@@ -239,6 +242,7 @@ def _trace(names: Sequence[str], times: Range1d, crosshair: CrosshairTool) -> fi
             BoxAnnotation(left=0, right=0, fill_color=colour, fill_alpha=0.10, line_width=0, level="underlay", name=name)
         )
     _add_lines(fig, names)
+    add_event_marks(fig)
     return fig
 
 

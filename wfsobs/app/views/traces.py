@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 import panel as pn
-from bokeh.models import BoxAnnotation, ColumnDataSource, CrosshairTool, GlyphRenderer, Label, Range1d, Span, Text, VSpan, VStrip
+from bokeh.models import BoxAnnotation, ColumnDataSource, CrosshairTool, GlyphRenderer, Label, Range1d, Span, Text, VStrip
 from bokeh.plotting import figure
 
 from wfsobs.app.compared import ComparedRun, DrawnLines
@@ -39,7 +39,7 @@ from wfsobs.app.views.plots import (
 from wfsobs.app.work import TRUTH, Key, RunResults, SignalAndError
 from wfsobs.evaluation.exact_errors import band_rms, spectra
 from wfsobs.evaluation.scores import half_width, trailing_rms
-from wfsobs.observers.base import TARGETS, VIBRATION
+from wfsobs.observers.base import TARGETS, VIBRATION, Look
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.events import LASER, PEAK, WIND, Event
 from wfsobs.signal.envelope import band_envelope, envelope, envelope_times
@@ -234,8 +234,8 @@ def _curve(spectrum: SignalAndError, error: bool, display: Display, scenario: Sc
     return display.curve(spectrum.frequency, density, scenario)
 
 
-COLOURS = {False: "#7A1FA2", True: "#E0B3FF"}
-"""In light and dark mode."""
+EVENTS, EVENT = "events", Look(light="#7A1FA2", dark="#E0B3FF")
+"""The name of their marks, and the look."""
 
 LEVELS = 3
 """Words one below the other before they start at the top again."""
@@ -267,61 +267,51 @@ def events_of(results: RunResults) -> list[Event]:
     return [] if results.simulation is None else sorted(results.simulation.events, key=lambda e: e.start)
 
 
-def room(results: RunResults) -> float:
-    """Compute the height of the words above the lines, as a share of the axis."""
-    return 0.1 * (1 + max(levels(results), default=-1))
-
-
-def levels(results: RunResults) -> list[int]:
+def levels(events: Sequence[Event], duration: float) -> list[int]:
     """How many lines below the top the word of each event stands, so that none stands in the one before."""
     out, before = [], -math.inf
-    for event in events_of(results):
-        near = event.start - before < WORD * results.scenario.run.duration
+    for event in events:
+        near = event.start - before < WORD * duration
         out.append((out[-1] + 1) % LEVELS if near else 0)
         before = event.start
     return out
 
 
+def event_columns(events: Sequence[Event], scenario: Scenario) -> dict[str, list[Any]]:
+    """Collect what `add_event_marks` draws, but for the top; below : of a word [px]."""
+    return {
+        "start": [e.start for e in events],
+        "end": [e.start + e.duration for e in events],
+        "text": [word(e, scenario) for e in events],
+        "below": [2 + LINE_PX * level for level in levels(events, scenario.run.duration)],
+    }
+
+
+def add_event_marks(fig: figure) -> list[GlyphRenderer[Any]]:
+    """Add a strip per event, with a word that hangs from the top of the axis; of no event yet."""
+    source = ColumnDataSource({name: [] for name in ("start", "end", "text", "below", "top")})
+    strip = VStrip(x0="start", x1="end", fill_alpha=0.13, line_width=1.5, line_dash=[6, 3])
+    text = Text(x="start", y="top", text="text", x_offset=4, y_offset="below", text_baseline="top", text_font_size="11px")
+    return [fig.add_glyph(source, it, name=EVENTS, level=level) for it, level in ((strip, "underlay"), (text, "overlay"))]
+
+
 class EventMarks:
-    """The marks in one figure, none until there is an event; words hang from the top of its axis."""
+    """The marks in one figure, none until there is an event."""
 
     def __init__(self, fig: figure):
         self.figure = fig
-        self._marks_exist = False
-        self.jumps: Final = ColumnDataSource({"x": []})
-        self.spans: Final = ColumnDataSource({"start": [], "end": []})
-        self.words: Final = ColumnDataSource({"x": [], "y": [], "text": [], "below": []})
-        self._line = VSpan(x="x", line_width=1.5, line_dash=[6, 3])
-        self._strip = VStrip(x0="start", x1="end", fill_alpha=0.13, line_width=0)
-        self._text = Text(x="x", y="y", text="text", x_offset=4, y_offset="below", text_baseline="top", text_font_size="11px")
+        self.marks: list[GlyphRenderer[Any]] = []
 
     def draw(self, results: RunResults, dark: bool) -> None:
         """Show those of the results."""
         events = events_of(results)
-        if not events and not self._marks_exist:
+        if not events and not self.marks:
             return
-        self._make()
-        lasting = [e for e in events if e.duration > 0]
-        send(self.jumps, {"x": [e.start for e in events if not e.duration > 0]})
-        send(self.spans, {"start": [e.start for e in lasting], "end": [e.start + e.duration for e in lasting]})
+        self.marks = self.marks or add_event_marks(self.figure)
         _, top = in_view(self.figure.y_range)
-        send(
-            self.words,
-            {
-                "x": [e.start for e in events],
-                "y": [top] * len(events),
-                "text": [word(e, results.scenario) for e in events],
-                "below": [2 + LINE_PX * level for level in levels(results)],
-            },
-        )
-        self._line.line_color = self._strip.fill_color = self._text.text_color = COLOURS[dark]
-
-    def _make(self) -> None:
-        if not self._marks_exist:
-            self._marks_exist = True
-            self.figure.add_glyph(self.spans, self._strip, level="underlay")
-            self.figure.add_glyph(self.jumps, self._line)
-            self.figure.add_glyph(self.words, self._text, level="overlay")
+        strip, text = self.marks
+        send(strip.data_source, {**event_columns(events, results.scenario), "top": [top] * len(events)})
+        strip.glyph.line_color = strip.glyph.fill_color = text.glyph.text_color = EVENT.colour(dark)
 
 
 BINS = 500
@@ -444,7 +434,8 @@ class _Trace(TargetFigure):
         settled = warm_up + WINDOW_S * display.running
         error = shows_error(results, self.target, display)
         extra = self._draw_runs(display, error, data["x"]) + self._draw_band(results, display, first, last, data["x"])
-        self._fit(data, settled, extra, room(results))
+        above = levels(events_of(results), results.scenario.run.duration)
+        self._fit(data, settled, extra, 0.1 * (1 + max(above, default=-1)))
         self.name_ends({name: (data["x"], data[name]) for name, line in self.lines.items() if line.visible}, display.dark)
         self.events.draw(results, display.dark)
         what = f"{'running rms of ' if error and display.running else ''}{'error of ' if error else ''}{display.mode_label}"
