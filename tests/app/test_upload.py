@@ -213,6 +213,7 @@ def test_a_vibration_spectrum(dashboard: Dashboard, loop: Any) -> None:
     rows = "29.4,0,0\n29.5,10,0\n30.5,10,0\n30.6,0,0\n"
     previewed(dashboard, loop, f"frequency,tip,tilt\n{rows}".encode(), "lines.csv")
     assert dashboard.upload.picker.message.startswith("lines.csv: has no unit of tip")
+    assert "unit" not in dashboard.upload.content.text.html, "it is said once"
     dashboard.upload.fields.unit.value = "nm"
     loop.until(lambda: not dashboard.upload.picker.message.startswith(("Reading", "Waiting")))
     assert "4 frequencies from 29.4 to 30.6 Hz" in dashboard.upload.content.text.html and "3.317 nm rms of tip, 0 nm" in (
@@ -283,7 +284,7 @@ def test_the_data_propose_sign_and_delay(dashboard: Dashboard, loop: Any, short:
     np.savez(file, y_lgs=y, u=u, dt=np.array(1e-3))
     previewed(dashboard, loop, file.getvalue(), "night.npz")
     text = dashboard.upload.content.text.html
-    assert "sign -1: commands move with the measurement" in text and "delay 3: commands 3 steps earlier explain" in text
+    assert "sign −1: commands move with the measurement" in text and "delay 3: commands 3 steps earlier explain" in text
     assert "unit proposed: the numbers are plausible as um (" in text, "on 8 m an arcsec would be 10 um"
     assert dashboard.upload.take.visible and dashboard.upload._preview.record.delay == 2
     dashboard.upload.take_proposals()
@@ -292,7 +293,7 @@ def test_the_data_propose_sign_and_delay(dashboard: Dashboard, loop: Any, short:
     assert found.record.delay == 3 and found.record.origin == "command sign -1"
     # the disturbance and the noise of one sample are all that is left of z
     assert found.rms["z"][0] == pytest.approx(np.sqrt(0.5 + 0.04), rel=0.02)
-    assert "sign -1: commands move with the measurement" in dashboard.upload.content.text.html, "of the file, however it is read"
+    assert "sign −1: commands move with the measurement" in dashboard.upload.content.text.html, "of the file, however it is read"
 
 
 def test_a_record_whose_unit_nobody_knows_waits_for_it(dashboard: Dashboard, loop: Any) -> None:

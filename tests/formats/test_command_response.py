@@ -21,7 +21,7 @@ from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.command_response import DECIDED, command_response, saturation_lines
 from wfsobs.telemetry.intake import DeclaredFormat
-from wfsobs.telemetry.preview import Preview, preview
+from wfsobs.telemetry.preview import Preview, Reading, preview
 from wfsobs.telemetry.records import load, save_record
 from wfsobs.typing import Array
 
@@ -87,6 +87,8 @@ def test_undecided_where_the_record_does_not_say() -> None:
     slow = command_response(Record(y, u, 1e-3))
     assert slow is not None and slow.sign == 1 and slow.delay is None and slow.margin < DECIDED
     assert "delay undecided" in slow.lines()[1] and slow.lines()[1].endswith("3 are needed")
+    told = Reading(response=slow, contradiction="command delay 2 is excluded by the data")
+    assert told.lines() == slow.lines()[:1], "the likelihood decides it"
     assert command_response(Record(y[:300], u[:300], 1e-3)) is None
     assert command_response(Record(y, np.zeros_like(u), 1e-3)) is None
 

@@ -56,6 +56,15 @@ def number(value: float | None, digits: int = 3) -> str:
     return (f"{value:.0f}" if "e" in text else text.rstrip(".")).replace("-", "−")
 
 
+def signs(text: str) -> str:
+    """Write the signs of numbers as the pages do.
+
+    >>> signs("-0.5 +- 0.02, as in band-pass")
+    '−0.5 ± 0.02, as in band-pass'
+    """
+    return re.sub(r"\B-(?=\d)", "−", text.replace("+-", "±"))
+
+
 def hundredths(value: float | None) -> str:
     """Write a number of a table with three digits, but none beyond the second decimal.
 

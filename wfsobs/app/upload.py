@@ -7,7 +7,7 @@ is confirmed. Reading is done beside the page, in a thread.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from html import escape
 from typing import Any, Final
@@ -22,7 +22,7 @@ from wfsobs.app.actions import Actions
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs import CANCELLED, FAILED, RUNNING, Job
 from wfsobs.app.pages.parts import read_number
-from wfsobs.app.render import render
+from wfsobs.app.render import render, signs
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.session_file import LARGEST, SUFFIX
 from wfsobs.app.sources import fit_to_record
@@ -186,12 +186,12 @@ class PreviewView:
             self.figure.line("x", "y", source=source, color=colour, line_width=1.4, legend_label=mode.name)
 
     def show(self, name: str, preview: Preview | SpectrumPreview | RecordError) -> None:
-        """Show what was read of the file of this name, or why it could not be."""
+        """Show what was read of the file of this name; why it could not be stands above."""
         known = None if isinstance(preview, RecordError) else preview
         self.figure.yaxis.axis_label = "PSD [µm²/Hz]" if isinstance(preview, SpectrumPreview) else "PSD of z [µm²/Hz]"
-        words = f"<p><b>{escape(name)}</b></p>{_list(known.lines() if known else [str(preview)])}"
+        words = f"<p><b>{escape(name)}</b></p>{_list(known.lines()) if known else ""}"
         if isinstance(preview, Preview):
-            words += f'<p>Evidence in the data:</p><div class="evidence">{_list(preview.reading.lines())}</div>'
+            words += f'<p>Evidence in the data:</p><div class="evidence">{_list(map(signs, preview.reading.lines()))}</div>'
         self.text.html = words
         self.figure.visible = known is not None
         for mode, source in enumerate(self.sources):
@@ -200,7 +200,7 @@ class PreviewView:
             send(source, {"x": x[x > 0], "y": y[x > 0]})
 
 
-def _list(lines: Sequence[str]) -> str:
+def _list(lines: Iterable[str]) -> str:
     return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>"
 
 
@@ -401,7 +401,7 @@ class Upload:
             fit_to_record(preview.record, self.store.scenario)
         except SettingError as error:
             return name_settings(str(error))
-        return preview.reading.missing
+        return signs(preview.reading.missing)
 
     def _ask(self, preview: ColumnsPreview) -> None:
         """Ask which column is what; read the file at once if its names tell enough."""

@@ -67,6 +67,8 @@ class Reading:
     def lines(self) -> list[str]:
         """Return the evidence, a line each."""
         lines = self.response.lines() if self.response else ["sign and delay: too few steps, or commands that do not move"]
+        if self.contradiction.startswith("command delay"):
+            lines = [line for line in lines if "delay undecided" not in line]
         lines += self.limits
         if self.units:
             ways = " or ".join(f"{unit} ({float(f'{1e3 * rms:.3g}'):g} nm rms of z)" for unit, rms in self.units.items())

@@ -34,7 +34,7 @@ from wfsobs.app.pages.parts import (
     tick,
     zoom_buttons,
 )
-from wfsobs.app.render import NOTHING, Row, macro, number, table
+from wfsobs.app.render import NOTHING, Row, macro, number, signs, table
 from wfsobs.app.service import IDLE, BackgroundTask
 from wfsobs.app.share import LOOP, CopiedTask
 from wfsobs.app.sources import LoadedRecord
@@ -351,7 +351,7 @@ def loop_verdict_html(
     said = [*verdict.sentences(scale, display.unit_label)] if verdict else []
     if envelope is not None:
         lines = envelope.sentences(scale, display.unit_label, display.column)
-        said += [line.replace("+-", "±").replace(" deg", "°") for line in lines]
+        said += [signs(line).replace(" deg", "°") for line in lines]
     return f'<p class="verdict">{escape(" ".join(said))}</p>' if said else ""
 
 
