@@ -189,7 +189,7 @@ class PreviewView:
         """Show what was read of the file of this name; why it could not be stands above."""
         known = None if isinstance(preview, RecordError) else preview
         self.figure.yaxis.axis_label = "PSD [µm²/Hz]" if isinstance(preview, SpectrumPreview) else "PSD of z [µm²/Hz]"
-        words = f"<p><b>{escape(name)}</b></p>{_list(known.lines()) if known else ""}"
+        words = f"<p><b>{escape(name)}</b></p>{_list(known.lines() if known else [])}"
         if isinstance(preview, Preview):
             words += f'<p>Evidence in the data:</p><div class="evidence">{_list(map(signs, preview.reading.lines()))}</div>'
         self.text.html = words
