@@ -308,15 +308,15 @@ def line(*parts: Any) -> pn.FlexBox:
 SMALL_LABEL = ".MuiFormControlLabel-label.MuiTypography-root { font-size: 0.8125rem; }"
 """As large as that of the buttons beside it."""
 
-HEIGHT = "clamp(230px, min(100vh - 330px, 64vh), 640px)"
+HEIGHT = "clamp(300px, min(100vh - 330px, 64vh), 640px)"
 """Of a figure: what a window has room for below what stands above the first one."""
 
 TALL: Mapping[str, Any] = {
     **WIDE,
-    "height": 230,
+    "height": 300,
     "stylesheets": [
         f":host {{ height: {HEIGHT} !important; flex-basis: auto !important; }}"
-        "@media (max-width: 1000px) { :host { height: clamp(230px, 42vh, 560px) !important; } }"
+        "@media (max-width: 1000px) { :host { height: clamp(300px, 42vh, 560px) !important; } }"
     ],
 }
 """A figure as high as the window has room for."""

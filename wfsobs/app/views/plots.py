@@ -116,7 +116,7 @@ GREY = {False: "#B4B4B4", True: "#666666"}
 MOST_COLOURED = 6
 """Of more lines in a figure those recede that the verdict does not name, until their cards are pointed at."""
 
-ROOM_OF_NAME = (0.075, 0.13)
+ROOM_OF_NAME = (0.08, 0.14)
 """A name of one line of text, and of two, of the height of the lowest axis."""
 
 ROOM_FOR_NAMES = 78
