@@ -57,7 +57,9 @@ def test_an_interval_holds_the_rms_over_all_records_for_slow_errors_and_fast(sha
     """Of 1000 first-order autoregressions of unit variance, whose correlation time is this share of the record."""
     rng, n = np.random.default_rng(3), 2000
     pole = np.exp(-1.0 / (share * n))
-    x, _ = lfilter([np.sqrt(1.0 - pole**2)], [1.0, -pole], rng.standard_normal((1000, n)), zi=pole * rng.standard_normal((1000, 1)))
+    x, _ = lfilter(
+        [np.sqrt(1.0 - pole**2)], [1.0, -pole], rng.standard_normal((1000, n)), zi=pole * rng.standard_normal((1000, 1))
+    )
     found = [rms_interval(rms(one), batch_means(one[:, None] ** 2)) for one in x]
     assert np.mean([of is not None and of[0] <= 1.0 <= of[1] for of in found]) == pytest.approx(0.945, abs=0.045)
 

@@ -517,8 +517,8 @@ def scatter_of_mean(values: Array, independent: bool = False) -> tuple[Array, Ar
     """Return the means of columns of values (n, k), their standard deviations and degrees of freedom, each (k,).
 
     Values that are not independent are batch means: slow signals make neighbours alike, which counts as fewer of them, those of a
-    first-order autoregression with their correlation (Law and Kelton, Simulation Modeling and Analysis, ch. 9). Of few independent
-    ones the scatter is underestimated: it is widened, so that intervals hold the truth for slow errors, too. Fewer than three of
+    first-order autoregression with their correlation (Law and Kelton, Simulation Modeling and Analysis, ch. 9). Few independent
+    ones underestimate the scatter: it is widened, so that intervals hold the truth for slow errors, too. Fewer than three of
     them say nothing, and fewer than two of any: NaN.
     """
     n, mean = len(values), values.mean(axis=0)
