@@ -49,6 +49,11 @@ CASES: dict[str, dict[str, Any]] = {
             {"frequency": 47.5, "damping": 0.0, "rms": [0.03]},
         ]
     },
+    "unlike pure lines": {
+        "vibration.peaks": [
+            {"frequency": f, "damping": 0.0, "rms": [rms]} for f, rms in ((6.0, 0.05), (40.0, 0.03), (60.0, 0.03), (80.0, 0.03))
+        ]
+    },
     "psd": {"vibration.source": "psd", "vibration.psd": TABLE},
     "ar2": {"vibration.source": "ar2", "vibration.peaks": [{"frequency": 17.0, "damping": 0.0, "rms": [0.05]}]},
     "turbulence of a table": {

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from wfsobs import PRESETS
+from wfsobs.closed_loop.design import design
 from wfsobs.control.mirror import Mirror
 from wfsobs.evaluation.bound import least_residual
 from wfsobs.simulation.true_spectra import TrueSpectra, true_spectra
@@ -14,15 +15,21 @@ from wfsobs.typing import Array
 SCENARIO = PRESETS["paper"]().replace({"turbulence.wind_speed": 40.0})
 
 
-def residual_of_taps(spectra: TrueSpectra, delay: float, taps: int) -> float:
-    """Rms of phi[k] + phi_corr[k] where u[k] is the best filter of z[k], ..., z[k - taps + 1], by least squares."""
-    known, mirror = spectra.without_lines, Mirror(delay).taps[1:]
+def residual_of_taps(spectra: TrueSpectra, delay: float, taps: int, jitter: float = 0.0) -> float:
+    """Rms of phi[k] + phi_corr[k] where u[k] is the best filter of z[k], ..., z[k - taps + 1], by least squares.
+
+    With jitter u[k-i-1] gives way to u[k-i] for a share of the frame that is random, and independent of the others.
+    """
+    late = delay - 1.0 + jitter * np.linspace(-0.999, 0.999, 1000)
+    share = np.clip(np.arange(1.0, int(delay + jitter) + 2)[:, None] - late, 0.0, 1.0)
+    known, mirror = spectra.without_lines, np.diff(share.mean(axis=1), prepend=0.0)
     signal, cross = known.total
     n = known.n
     z, s, zs = (np.fft.irfft(x, n) for x in (known.measurement, signal, cross))
     lags = np.arange(taps)[:, None] - np.arange(taps)
     # phi_corr[k] is the filter of sum_i mirror_i z[k-i]; z[k] is of step k - 1.
     measured = sum(a * b * z[(lags + i - j) % n] for i, a in enumerate(mirror) for j, b in enumerate(mirror))
+    measured += share.var(axis=1).sum() * (2.0 * z[lags % n] - z[(lags + 1) % n] - z[(lags - 1) % n])
     shared = sum(a * zs[(np.arange(taps) + 1 + i) % n] for i, a in enumerate(mirror))
     return float(np.sqrt(s[0] - shared @ np.linalg.solve(measured, shared)))
 
@@ -33,6 +40,13 @@ def test_no_filter_of_many_taps_leaves_less_and_some_leave_hardly_more(delay: fl
     spectra = true_spectra(SCENARIO, 0)
     bound, taps = least_residual(spectra, delay, "lgs"), residual_of_taps(spectra, delay, 1500)
     assert bound * (1.0 - 1e-5) < taps < bound * (1.0 + 1e-4)
+
+
+def test_with_jitter_there_is_no_bound_as_that_of_the_mean_delay_is_none() -> None:
+    spectra = true_spectra(SCENARIO, 0)
+    assert least_residual(spectra, 1.5, "lgs") < residual_of_taps(spectra, 2.0, 600, 0.5) < least_residual(spectra, 2.0, "lgs")
+    assert not design(SCENARIO.replace({"plant.delay_jitter": 0.5}), ["integrator"]).bounds
+    assert design(SCENARIO.replace({"plant.delay_error": 0.5}), ["integrator"]).bounds
 
 
 SHORT = SCENARIO.replace(

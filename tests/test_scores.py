@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.signal import lfilter
 
 from wfsobs.evaluation.exact_errors import cumulative_rms, scored_samples
-from wfsobs.evaluation.scores import lag, score, supervised_scores, unsupervised_scores
+from wfsobs.evaluation.scores import batch_means, lag, rms_interval, score, supervised_scores, unsupervised_scores
 from wfsobs.record import TOTAL, Estimate, Record
 from wfsobs.signal.autoregressive import Ar2
 from wfsobs.signal.spectrum import psd, rms
@@ -49,6 +50,18 @@ def test_scores_of_a_known_error(seed: int, log_scale: float, warm_up: float, un
         assert (s.observer, s.target, s.seconds_per_step) == ("x", "vibration", 2e-6)
         assert (s.start, s.stop, s.apart) == (pytest.approx(1e-3 * known[0]), pytest.approx(1e-3 * (known[-1] + 1)), False)
         assert s.lag == pytest.approx(0.0, abs=1e-4)  # white noise at 0.3: the peak of the correlation is at zero
+
+
+@pytest.mark.parametrize("share", [1e-3, 0.02, 1.0 / 9.0, 0.2])
+def test_an_interval_holds_the_rms_over_all_records_for_slow_errors_and_fast(share: float) -> None:
+    """Of 1000 first-order autoregressions of unit variance, whose correlation time is this share of the record."""
+    rng, n = np.random.default_rng(3), 2000
+    pole = np.exp(-1.0 / (share * n))
+    x, _ = lfilter(
+        [np.sqrt(1.0 - pole**2)], [1.0, -pole], rng.standard_normal((1000, n)), zi=pole * rng.standard_normal((1000, 1))
+    )
+    found = [rms_interval(rms(one), batch_means(one[:, None] ** 2)) for one in x]
+    assert np.mean([of is not None and of[0] <= 1.0 <= of[1] for of in found]) == pytest.approx(0.945, abs=0.045)
 
 
 def test_both_together_are_scored_against_the_sum_of_both_truths() -> None:

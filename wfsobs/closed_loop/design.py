@@ -58,7 +58,7 @@ class Design:
 
     laws   : controller -> one per mode
     bounds : BOUND, BOUND_BOTH -> per mode, rms [um] of the least residual of any causal controller of the mean of the LGS, or of
-        the NGS, too; none where the spectrum of the turbulence is not known
+        the NGS, too; none where the spectrum of the turbulence is not known, or there is jitter
     priors : controller -> what it is told, spectra aside, of which only laws are made
     start  : from which the residuals count [s]: after the warm-up, and after what is trained on
     true   : the plant as it is; None where it is the one that the controllers are designed for
@@ -101,7 +101,7 @@ def design(scenario: Scenario, controllers: Sequence[str] | None = None, start: 
 
     start : from which a residual counts [s], or from the end of the warm-up
     Laws are those of the scenario before its events. What they will leave is then not known by theory, nor a bound; neither where
-    errors of the plant begin later.
+    errors of the plant begin later, or its delay has jitter: an early command can beat the bound of the mean delay.
     """
     scenario.validate()
     before, plant = scenario.before_events, plant_of(scenario)
@@ -115,7 +115,7 @@ def design(scenario: Scenario, controllers: Sequence[str] | None = None, start: 
         delay = actual.delay
     for name in [name for name in laws if supervision_of(CONTROLLERS[name], scenario)]:
         laws[name] = tuple(replace(one, predicted_rms=None, margins=None) for one in made[name][0])
-    if scenario.events or (actual is not None and actual.start):
+    if scenario.events or (actual is not None and (actual.start or actual.jitter)):
         laws = {name: tuple(replace(one, predicted_rms=None) for one in designed) for name, designed in laws.items()}
         true = []
     given = ("lgs", "both") if true else ()

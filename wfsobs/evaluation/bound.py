@@ -66,7 +66,7 @@ from wfsobs.signal.spectrum import rms
 from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean, degrees_of_freedom, explained_variance
 from wfsobs.simulation.mode_spectra import AXIS, FIRST, LGS, NGS, StarSpectra, are_coupled, star_spectra
 from wfsobs.simulation.sensing import MEAN, stars_differ
-from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, true_spectra
+from wfsobs.simulation.true_spectra import CausalEstimate, TrueSpectra, has_known_spectra, true_spectra
 from wfsobs.simulation.turbulence import line_width
 from wfsobs.typing import Array
 
@@ -119,14 +119,15 @@ class PeriodicError:
         Of the bound of the LGS: autocovariance after an infinitely long record, (n_lags,) [um^2].
     transient : Array
         The same: variance after 0, 1, 2, ... measurements, as far as it falls by more than LEARNT, (n_past,) [um^2].
-    n_lines : int
-        The same: number of undamped lines, whose phases and amplitudes are learnt from the record.
+    n_lines : float
+        The same: number of undamped lines, whose phases and amplitudes are learnt from the record; of unlike ones, that of equal
+        ones whose errors together scatter as much.
     """
 
     variance: Array
     covariance: Array = field(default_factory=partial(np.empty, 0))
     transient: Array = field(default_factory=partial(np.empty, 0))
-    n_lines: int = 0
+    n_lines: float = 0.0
 
     @property
     def rms(self) -> float:
@@ -282,9 +283,25 @@ def least_errors(spectra: TrueSpectra, ahead: int = 0, n_steps: int = 1) -> Erro
     variance = lines[:, 0] + [sum(circle_mean(known.signal[part]) for part in parts[of]) for of in sums.values()]
     gained = explained_variance(measured, cross, enough=variance - (1.0 + LEARNT) * covariance[:, 0])
     transient = variance[:, None] - np.hstack([np.zeros((len(sums), 1)), gained])
-    found = zip(sums, covariance, transient, strict=True)
-    n_lines = len(spectra.pure)
-    return _complete({name: PeriodicError(left[:1], left, learnt, n_lines) for name, left, learnt in found}, known)
+    counts = [_count_lines(spectra, one, name, ahead, n_steps) for name, one in zip(sums, best, strict=True)]
+    found = zip(sums, covariance, transient, counts, strict=True)
+    return _complete({name: PeriodicError(left[:1], left, learnt, n) for name, left, learnt, n in found}, known)
+
+
+def _count_lines(spectra: TrueSpectra, best: CausalEstimate, target: str, ahead: int, n_steps: int) -> float:
+    """Return (sum c)^2 / sum c^2, c : error of the target, in power, by each undamped line after `n_steps`; 0 of none.
+
+    A line is learnt in the spectrum of the rest of z. The filter of that rest takes a share of its error away.
+    """
+    if not spectra.pure:
+        return 0.0
+    whitener, gain = spectra.without_lines.whitener, spectra.gain
+    at, power = zip(*((min(round(f * whitener.n), whitener.n // 2), power) for f, power in spectra.pure), strict=True)
+    taken = ((best.cross * whitener.backwards - best.to_come.conj()) * whitener.backwards.conj())[list(at)]
+    own = (target != TURBULENCE) * np.exp(2j * pi * (1 + ahead) * np.array(at) / whitener.n)
+    rest = 2.0 * whitener.spectrum[list(at)] / n_steps
+    c = np.abs(own - gain * taken) ** 2 / (gain**2 / rest + 1.0 / np.array(power))
+    return float(c.sum() ** 2 / (c**2).sum())
 
 
 def least_errors_of_both(spectra: TrueSpectra, ahead: int = 0, stars: StarSpectra | None = None) -> Errors:

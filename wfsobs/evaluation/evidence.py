@@ -28,11 +28,6 @@ FEWEST = 3
 SAME = 1e-3
 """Errors that differ by a smaller share of them are the same: two ways of one filter, or the third digit of a table."""
 
-SLOW, SLOW_FACTOR = 10.0, 1.5
-"""Degrees of freedom below which the pieces of one record are so correlated that their scatter is known badly, and how much wider
-it is then taken: set so that of two to eight equal errors 5 % are called different for correlation times up to a ninth of the
-record (simulated first-order autoregressions)."""
-
 Key = tuple[str, str, str]
 """Observer, target, mode."""
 
@@ -118,16 +113,12 @@ def means_differ(values: Array, in_order: bool = False) -> NDArray[np.bool_]:
 
     The logarithm of the ratio of two means has the variance of the mean of their influences, value / mean (the delta method).
 
-    values : rows are seeds, or with `in_order` pieces of one record, which may be correlated. Of few independent ones the scatter
-        is underestimated: it is widened so that slow errors (correlated over up to a ninth of the record) are not called
-        different more often than others.
+    values : rows are seeds, or with `in_order` pieces of one record, which may be correlated
     """
     one, other = all_pairs(values.shape[1])
     mean = np.maximum(values.mean(axis=0), np.finfo(float).tiny)
     influence = values[:, other] / mean[other] - values[:, one] / mean[one]
     _, error, freedom = scatter_of_mean(influence, independent=not in_order)
-    if in_order:
-        error *= (1.0 + 1.0 / freedom) ** 2 * (SLOW_FACTOR if freedom.size and np.median(freedom) < SLOW else 1.0)
     return pairs_differ(t_probability(np.log(mean[other] / mean[one]), error, freedom))
 
 

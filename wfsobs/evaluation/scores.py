@@ -250,6 +250,11 @@ SHARE = 0.5
 BATCHES = 20
 """Pieces of a record whose means tell how far that of the whole scatters."""
 
+SLOW, SLOW_FACTOR = 10.0, 1.5
+"""Degrees of freedom below which the pieces of one record are so correlated that their scatter is known badly, and how much wider
+it is then taken: set so that of two to eight equal errors 5 % are called different for correlation times up to a ninth of the
+record (simulated first-order autoregressions)."""
+
 MAX_LAG = 0.025
 """Maximum lag [s]."""
 
@@ -512,8 +517,9 @@ def scatter_of_mean(values: Array, independent: bool = False) -> tuple[Array, Ar
     """Return the means of columns of values (n, k), their standard deviations and degrees of freedom, each (k,).
 
     Values that are not independent are batch means: slow signals make neighbours alike, which counts as fewer of them, those of a
-    first-order autoregression with their correlation (Law and Kelton, Simulation Modeling and Analysis, ch. 9). Fewer than three
-    of them say nothing, and fewer than two of any: NaN.
+    first-order autoregression with their correlation (Law and Kelton, Simulation Modeling and Analysis, ch. 9). Few independent
+    ones underestimate the scatter: it is widened, so that intervals hold the truth for slow errors, too. Fewer than three of
+    them say nothing, and fewer than two of any: NaN.
     """
     n, mean = len(values), values.mean(axis=0)
     if n < (2 if independent else 3):
@@ -525,7 +531,9 @@ def scatter_of_mean(values: Array, independent: bool = False) -> tuple[Array, Ar
     alike = np.divide((deviation[1:] * deviation[:-1]).sum(axis=0), power, out=np.zeros_like(power), where=power > 0)
     alike = np.maximum(alike + 1.0 / n, 0.0)  # the estimate of a correlation from n values is low by about 1 / n
     effective = np.maximum(n * (1.0 - alike) / (1.0 + alike), 2.0)
-    return mean, np.sqrt(power / (n - 1) / effective), effective - 1.0
+    freedom = effective - 1.0
+    wider = (1.0 + 1.0 / freedom) ** 2 * (SLOW_FACTOR if freedom.size and np.median(freedom) < SLOW else 1.0)
+    return mean, wider * np.sqrt(power / (n - 1) / effective), freedom
 
 
 def rms_interval(rms: float, squares: Array) -> tuple[float, float] | None:
