@@ -24,9 +24,9 @@ from wfsobs.typing import Array
 DRAWS = 2
 """Records drawn for V. Its scale is known: the shares of all bins add up to the share of measured samples."""
 BANDS = 40
-"""Bands over which V is smoothed. Of isolated samples it is flat where S is white or far above noise: a resonance makes no step."""
+"""Bands over which V is smoothed. Of single samples it is flat where S is white or far above noise: a resonance makes no step."""
 LONG = 20
-"""Samples in a row that are a long gap. Little is known within: V / S is smoothed, as the gap hides resonances and noise alike."""
+"""Samples in a row that are a long gap. It hides resonances and noise alike, so V / S is smoothed, not V."""
 CLOSE, MOST = 1e-4, 300
 """Approximate error of a filled sample, over the noise, at which conjugate gradients stop; maximum number of steps."""
 LEAST = 1e-3
