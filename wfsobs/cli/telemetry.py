@@ -71,7 +71,7 @@ def convert(record_file: str, out: str, scenario: Scenario, declaration: Declare
 
     What is written is read back and compared; parts that the format has no place for are named.
     """
-    check_writable(out)
+    check_writable(out, record_file, *declaration.files)
     record = load_declared(record_file, scenario, declaration, sha256)
     save_record(out, record)
     if lost := name_differences(record, load_record(out, scenario, DeclaredFormat(trust=True))):
@@ -119,7 +119,7 @@ def observe(
 ) -> None:
     """Run the observers on a record of any format (by default preset paper)."""
     if out:
-        check_writable(out)
+        check_writable(out, record_file, train, *declaration.files)
     scenario = told_scenario(prior, scenario)
     record = load_declared(record_file, scenario, declaration, sha256)
     learnt = training(train, train_until, record, scenario, declaration)
@@ -165,9 +165,9 @@ def identify(
     as_json: bool,
 ) -> None:
     """Find noise, turbulence and vibration peaks in a record (docs/identification.md)."""
-    record = load_declared(record_file, scenario, declaration, sha256)
     if out:
-        check_writable(out)
+        check_writable(out, record_file, *declaration.files)
+    record = load_declared(record_file, scenario, declaration, sha256)
     with errors_of(record_file), progress_bar("sweeps") as watch:
         result = identify_record(record, level=level, lowest=lowest, watch=watch)
     if out:
