@@ -163,13 +163,13 @@ def lossy(seed: int, duration: float, rate: float, lost: float, gap: int = 1) ->
     return Record(z[:, None], np.zeros((n, 1)), dt)
 
 
-def held(seeds: range, duration: float, *kind: Any) -> tuple[dict[str, Counter[str]], str]:
+def held(seeds: range, duration: float, *losses: Any) -> tuple[dict[str, Counter[str]], str]:
     """By quantity, how many of the 95 % intervals, 1.96 stated standard deviations, hold the truth ("held"), of how many
     ("stated"), and how many numbers state none ("none"); and the records with a peak more."""
     out: dict[str, Counter[str]] = {}
     more = []
     for seed in seeds:
-        mode = identify(lossy(seed, duration, *kind)).modes[0]
+        mode = identify(lossy(seed, duration, *losses)).modes[0]
         omega, damping, rms = TURBULENCE
         pairs = [("noise", mode.noise, NOISE)]
         if t := mode.turbulence:
@@ -205,9 +205,9 @@ def share(of: Counter[str]) -> str:
 def coverage(count: int, duration: float) -> None:
     """Intervals that hold the truth, as a table: records of their own for every column, and all together."""
     columns = []
-    for i, (name, kind) in enumerate(KINDS.items()):
+    for i, (name, losses) in enumerate(KINDS.items()):
         seeds = range(i * count + 1, (i + 1) * count + 1)
-        found, more = held(seeds, duration, *kind)
+        found, more = held(seeds, duration, *losses)
         columns.append(found)
         print(f"{name}: seeds {seeds[0]} to {seeds[-1]}; a peak more: {more}", flush=True)
     print(f"| | {' | '.join(KINDS)} | all |\n|{'---|' * (len(KINDS) + 2)}")
