@@ -333,7 +333,7 @@ def check(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha
     is_refused = bool(reading.contradiction) and not result.corrections  # there is no option for a rotation
     trust = declaration.trust or is_refused or any(own.get(name) in contents.arrays for name in result.corrections)
     words = replace(declaration, trust=trust).options(result.corrections)
-    command = shlex.join(["wfsobs", "identify", record_file, *scenario_words(), *words])
+    command = shlex.join(["wfsobs", "identify", record_file, *scenario_words(), *words]) if result.identification else None
     if as_json:
         found = {
             "steps": record.n_steps,
@@ -349,7 +349,8 @@ def check(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha
         print_json(found)
         return
     show_table(check_table(result, record_file))
-    click.echo(f"{result.summary} {'It is refused as it is; all the same' if is_refused else 'Go on with'}:\n  {command}")
+    go_on = f" {'It is refused as it is; all the same' if is_refused else 'Go on with'}:\n  {command}" if command else ""
+    click.echo(result.summary + go_on)
 
 
 def check_table(result: Check, name: str) -> Table:
