@@ -18,6 +18,7 @@ from scipy.stats import binom
 from tests.test_plant import closed_loop, rotation
 from wfsobs import PRESETS, load, simulate
 from wfsobs.cli import main
+from wfsobs.identification import identify
 from wfsobs.identification.plant import GroupPlant, PlantNumber, identify_plant
 from wfsobs.identification.result import Identification
 from wfsobs.progress import Watch
@@ -102,12 +103,12 @@ def once() -> Iterator[None]:
 
 @pytest.fixture
 def commands_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave out the model of the disturbance, half of the work, where only the commands are looked at."""
+    """Identify the disturbance, half of the work, from few frames where only the commands are looked at."""
 
-    def none(record: Record, watch: Watch) -> Identification:
-        raise RecordError("left out")
+    def of_few(record: Record, watch: Watch) -> Identification:
+        return identify(begin(record, 1500), watch=watch)
 
-    monkeypatch.setattr(check, "identify", none)
+    monkeypatch.setattr(check, "identify", of_few)
 
 
 def checked(tmp_path: Path, record: Record, *options: str) -> dict[str, Any]:
@@ -257,8 +258,11 @@ def test_too_little_is_said(tmp_path: Path, record: Record) -> None:
     z = record.z[2:2000]
     at_rest = verdicts(checked(tmp_path, Record(z, np.zeros_like(z), record.dt)))
     assert at_rest["commands"] == "ok"
-    seen = verdicts(checked(tmp_path, begin(record, 300)))
+    few = checked(tmp_path, begin(record, 300))
+    seen = verdicts(few)
     subjects = ("command sign, delay, gain, rotation", "stationarity", "identification")
     assert [seen[subject] for subject in subjects] == ["undecided", "undecided", "excluded"]
+    assert few["next"] is None
+    assert CliRunner().invoke(main, ["check", str(tmp_path / "r.npz")]).stdout.endswith("\nIt cannot be identified.\n")
     done = CliRunner().invoke(main, ["check", str(tmp_path / "no.npz")])
     assert (done.exit_code, done.output.count("\n")) == (2, 1)

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 from typing import IO, NoReturn
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -71,3 +72,28 @@ def test_a_file_that_cannot_be_written_is_named_before_anything_is_computed(tmp_
         (tmp_path / "a.npz").symlink_to(path)
     result = CliRunner().invoke(main, ["run", "--save", str(tmp_path / "a.npz" if link else path)])
     assert (result.exit_code, result.output) == (2, f"wfsobs: {path.parent}: No such file or directory\n")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "convert night.npz night.npz",
+        "identify night.npz --out link.npz",
+        "observe night.npz --out night.npz",
+        "observe none.npz --train night.npz --out night.npz",
+        "identify none.npz --reconstructor night.npz:R --out night.npz",
+        "identify none.npz --command-modes night.npz --out night.npz",
+        "tune --observer kf-lgs --record night.npz --out night.npz",
+        "live --headless --replay night.npz --record night.npz",
+        "run --vibration-psd night.npz --save night.npz",
+    ],
+)
+def test_a_file_that_is_read_is_not_replaced(arguments: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    np.savez("night.npz", R=np.eye(2))
+    Path("link.npz").symlink_to("night.npz")
+    before = Path("night.npz").read_bytes()
+    result = CliRunner().invoke(main, arguments.split())
+    out = "link.npz" if "link" in arguments else "night.npz"
+    assert (result.exit_code, result.output) == (2, f"wfsobs: {out}: is read by this command; write to another file\n")
+    assert Path("night.npz").read_bytes() == before

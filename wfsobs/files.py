@@ -57,8 +57,11 @@ def _write_and_rename(path: Path, write: Callable[[IO[bytes]], object]) -> None:
             raise
 
 
-def check_writable(path: str | Path) -> None:
-    """Raise OSError where `write_whole` could not write to `path`."""
+def check_writable(path: str | Path, *inputs: str | Path | None) -> None:
+    """Raise OSError where `write_whole` could not write to `path`, or would replace one of the files that are read."""
+    read = (one for one in inputs if one and os.path.exists(one) and os.path.exists(path))
+    if not _is_device(path) and any(os.path.samefile(path, one) for one in read):
+        raise OSError(errno.EEXIST, "is read by this command; write to another file", str(path))
     path = Path(os.path.realpath(path) if os.path.islink(path) and not _is_device(path) else path)
     folder = path.parent
     number, where = (

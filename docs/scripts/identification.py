@@ -147,28 +147,29 @@ KINDS = {
     "10 % lost": (1000.0, 0.1),
     "30 % lost": (1000.0, 0.3),
     "2 kHz, nothing lost": (2000.0, 0.0),
+    "10 % lost in gaps of 0.3 s": (1000.0, 0.1, 300),
 }
-"""Rate [Hz] and share of lost frames of its records."""
+"""Rate [Hz], share of lost frames, and frames of a gap of its records."""
 
 
-def lossy(seed: int, rate: float, duration: float, lost: float) -> Record:
-    """One mode of AR(2) processes, random from the first sample on, of which a share is lost, frame by frame."""
+def lossy(seed: int, duration: float, rate: float, lost: float, gap: int = 1) -> Record:
+    """One mode of AR(2) processes, random from the first sample on, of which a share is lost, in gaps of some frames."""
     rng, dt, n = np.random.default_rng(seed), 1.0 / rate, round(duration * rate)
     z = NOISE * rng.standard_normal(n) + Ar2(*TURBULENCE, dt).sample(n, rng)
     for f, xi, rms in WITH:
         pure = sqrt(2.0) * rms * np.cos(2.0 * pi * f * dt * np.arange(n) + rng.uniform(0.0, 2.0 * pi))
         z += pure if xi == 0 else Ar2(2.0 * pi * f, xi, rms, dt).sample(n, rng)
-    z[rng.random(n) < lost] = np.nan
+    z[np.convolve(rng.random(n) < lost / gap, np.ones(gap))[:n] > 0] = np.nan
     return Record(z[:, None], np.zeros((n, 1)), dt)
 
 
-def held(seeds: range, rate: float, duration: float, lost: float) -> tuple[dict[str, Counter[str]], str]:
+def held(seeds: range, duration: float, *losses: Any) -> tuple[dict[str, Counter[str]], str]:
     """By quantity, how many of the 95 % intervals, 1.96 stated standard deviations, hold the truth ("held"), of how many
     ("stated"), and how many numbers state none ("none"); and the records with a peak more."""
     out: dict[str, Counter[str]] = {}
     more = []
     for seed in seeds:
-        mode = identify(lossy(seed, rate, duration, lost)).modes[0]
+        mode = identify(lossy(seed, duration, *losses)).modes[0]
         omega, damping, rms = TURBULENCE
         pairs = [("noise", mode.noise, NOISE)]
         if t := mode.turbulence:
@@ -204,9 +205,9 @@ def share(of: Counter[str]) -> str:
 def coverage(count: int, duration: float) -> None:
     """Intervals that hold the truth, as a table: records of their own for every column, and all together."""
     columns = []
-    for i, (name, (rate, lost)) in enumerate(KINDS.items()):
+    for i, (name, losses) in enumerate(KINDS.items()):
         seeds = range(i * count + 1, (i + 1) * count + 1)
-        found, more = held(seeds, rate, duration, lost)
+        found, more = held(seeds, duration, *losses)
         columns.append(found)
         print(f"{name}: seeds {seeds[0]} to {seeds[-1]}; a peak more: {more}", flush=True)
     print(f"| | {' | '.join(KINDS)} | all |\n|{'---|' * (len(KINDS) + 2)}")

@@ -177,16 +177,25 @@ def test_the_promise_takes_a_mirror_with_dynamics_into_account(monkeypatch: pyte
     assert (high - low < 0.5 * middle).all(), "it says something"
 
 
+def test_a_mode_that_is_lacking_is_named(telemetry: Record) -> None:
+    one = replace(telemetry, y_lgs=telemetry.y_lgs[:, :1], u=telemetry.u[:, :1])
+    with pytest.raises(RecordError, match=r"^the record has 1 of 2 modes; a promise takes all of a radial order$"):
+        make_promise(one, SCENARIO)
+
+
 @pytest.mark.slow
 def test_the_next_record_keeps_the_promise(telemetry: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("wfsobs.closed_loop.promise.DRAWS", FEWER)
-    names = ["integrator", "lqg-kf-lgs", "lqg-kf-multi", "lqg-multirate"]
+    names = ["integrator", "none", "integrator+gpr-online", "lqg-kf-lgs", "lqg-kf-multi", "lqg-multirate"]
     found = make_promise(telemetry, SCENARIO.replace({"control.integrator": "optimised"}), controllers=names)
     true, inverse = full_plant_of(SCENARIO), np.linalg.inv(found.matrix)
     disturbance, noise = noise_of(wfsobs.simulate(SCENARIO.replace({"run.seed": 40})))
+    no_linear, no_ngs = "no linear controller: no promise", "the record has no NGS"
+    why = {"none": no_linear, "integrator+gpr-online": no_linear, "lqg-multirate": no_ngs}
+    assert {one.controller: one.note for one in found.residuals if one.note} == why
     for one in found.residuals:
-        if one.controller == "lqg-multirate":
-            assert one.note == "the record has no NGS" and not one.switch_on
+        if one.note:
+            assert not one.switch_on
             continue
         assert one.rms is not None and one.low is not None and one.high is not None and one.switch_on
         controller, plant = wfsobs.design(one.controller, found.scenario), ActingPlant(true)

@@ -98,7 +98,7 @@ def live(
     _check_options(replay_file, stream, ngs, headless)
     for file in (record_file, log_file):
         if file:
-            check_writable(file)
+            check_writable(file, replay_file, *declaration.files)
     source = _source(scenario, replay_file, stream, modes, declaration, sha256)
     if not isinstance(source, SimulatedLoop):
         scenario = scenario.before_events

@@ -153,7 +153,7 @@ def run(
     if save and seeds > 1:
         raise SettingError("--save: saves one record; leave --seeds at 1")
     if save:
-        check_writable(save)
+        check_writable(save, vibration_psd)
     if (budget or budget_of) and (seeds > 1 or over_time):
         raise SettingError("--budget: is of one record, without --over-time; leave --seeds at 1")
     if unknown := set(budget_of) - set(OBSERVERS):

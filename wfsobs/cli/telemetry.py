@@ -71,7 +71,7 @@ def convert(record_file: str, out: str, scenario: Scenario, declaration: Declare
 
     What is written is read back and compared; parts that the format has no place for are named.
     """
-    check_writable(out)
+    check_writable(out, record_file, *declaration.files)
     record = load_declared(record_file, scenario, declaration, sha256)
     save_record(out, record)
     if lost := name_differences(record, load_record(out, scenario, DeclaredFormat(trust=True))):
@@ -119,7 +119,7 @@ def observe(
 ) -> None:
     """Run the observers on a record of any format (by default preset paper)."""
     if out:
-        check_writable(out)
+        check_writable(out, record_file, train, *declaration.files)
     scenario = told_scenario(prior, scenario)
     record = load_declared(record_file, scenario, declaration, sha256)
     learnt = training(train, train_until, record, scenario, declaration)
@@ -165,9 +165,9 @@ def identify(
     as_json: bool,
 ) -> None:
     """Find noise, turbulence and vibration peaks in a record (docs/identification.md)."""
-    record = load_declared(record_file, scenario, declaration, sha256)
     if out:
-        check_writable(out)
+        check_writable(out, record_file, *declaration.files)
+    record = load_declared(record_file, scenario, declaration, sha256)
     with errors_of(record_file), progress_bar("sweeps") as watch:
         result = identify_record(record, level=level, lowest=lowest, watch=watch)
     if out:
@@ -333,7 +333,7 @@ def check(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha
     is_refused = bool(reading.contradiction) and not result.corrections  # there is no option for a rotation
     trust = declaration.trust or is_refused or any(own.get(name) in contents.arrays for name in result.corrections)
     words = replace(declaration, trust=trust).options(result.corrections)
-    command = shlex.join(["wfsobs", "identify", record_file, *scenario_words(), *words])
+    command = shlex.join(["wfsobs", "identify", record_file, *scenario_words(), *words]) if result.identification else None
     if as_json:
         found = {
             "steps": record.n_steps,
@@ -349,7 +349,8 @@ def check(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha
         print_json(found)
         return
     show_table(check_table(result, record_file))
-    click.echo(f"{result.summary} {'It is refused as it is; all the same' if is_refused else 'Go on with'}:\n  {command}")
+    go_on = f" {'It is refused as it is; all the same' if is_refused else 'Go on with'}:\n  {command}" if command else ""
+    click.echo(result.summary + go_on)
 
 
 def check_table(result: Check, name: str) -> Table:

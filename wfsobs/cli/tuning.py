@@ -163,14 +163,14 @@ def tune(
         raise SettingError("give --observer, or --envelope and --controller")
     if not on_envelope and goal != EnvelopeGoal():
         raise SettingError("--delay, --gain, --rotation, --resonance, --by, --loss: only with --envelope")
+    if out:
+        check_writable(out, record_file, *declaration.files)
     if record_file is None:
         refuse_options(RECORD_OPTIONS, "only with --record")
     else:
         if validation is not None:
             raise SettingError("--validation: only for simulated records, not with --record")
         record = load_declared(record_file, scenario, declaration, sha256)
-    if out:
-        check_writable(out)
     with progress_bar("evaluations") as watch:
         tuned = search(
             scenario,

@@ -166,10 +166,12 @@ def make_promise(
     Raises
     ------
     RecordError
-        The data do not decide delay, gain and rotation: a probe is needed (`wfsobs probe`).
+        The data do not decide delay, gain and rotation: a probe is needed (`wfsobs probe`). Or a mode of a radial order is lacking.
     SettingError
         A controller is unknown.
     """
+    if record.n_modes < (most := len(base_scenario(record.n_modes, record.dt, scenario).modes)):
+        raise RecordError(f"the record has {record.n_modes} of {most} modes; a promise takes all of a radial order")
     groups = identify_plant(record, watch.silent)
     rng = np.random.default_rng(seed)
     likeliest, *others = draw_plants(groups, record.n_modes, rng)
@@ -204,7 +206,8 @@ def make_promise(
         watch.check()
         laws = [one.law for one in plan.laws[name] if one.law is not None]
         if CONTROLLERS[name].predict is not None or CONTROLLERS[name].law is None:
-            continue  # not linear, or no control
+            out += [ResidualPromise(name, note="no linear controller: no promise")] * (name in (names or ()))
+            continue
         lacks_ngs = CONTROLLERS[name].ngs and record.y_ngs is None
         if lacks_ngs or len(laws) < record.n_modes or not all(law.stable for law in laws):
             notes = ["the record has no NGS"] if lacks_ngs else [one.note for one in plan.laws[name] if one.note]

@@ -300,7 +300,8 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
     for again in range(REFINEMENTS):
         more = [data.fit(data.with_spectra(fit.theta, fit.spectra, MOST_PEAKS), gains, STEPS) for fit in fits]
         better = [new.criterion < old.criterion - 1.0 for old, new in zip(fits, more, strict=True)]
-        fits = [new if again == 0 or new.criterion < old.criterion else old for old, new in zip(fits, more, strict=True)]
+        before = fits if again else [data.fit(fit, gains, STEPS) for fit in fits]  # with gains of their own as well
+        fits = [min(pair, key=lambda fit: fit.criterion) for pair in zip(before, more, strict=True)]
         if not any(better):
             break
     each = min(fits, key=lambda fit: fit.criterion)

@@ -11,7 +11,6 @@ from scipy.fft import rfft
 
 from wfsobs.identification.one_mode import OneMode
 from wfsobs.signal.autoregressive import Ar2, Ar3
-from wfsobs.spectral.missing import LEAST
 from wfsobs.spectral.model import HIGHEST, Spectrum
 from wfsobs.spectral.search import Sinusoid, line_in_record, short_taper
 from wfsobs.spectral.whittle import NO_NEARER, spectrum_information
@@ -151,7 +150,8 @@ def _narrow(mode: OneMode, x: Array, near: float, rest: Spectrum) -> IdentifiedP
 
     def floor(f: Array) -> Array:
         S = rest.psd(f)
-        return S / np.maximum(1.0 - np.interp(f, mode.f, mode.missing_power) / S, LEAST)
+        # what is missing of all, the line included, over S alone: at most what white noise would lack
+        return S / np.maximum(1.0 - np.interp(f, mode.f, mode.missing_power) / S, 1.0 - mode.missing.is_missing.mean())
 
     frequency, frequency_std, rms, rms_std = line_in_record(x, mode.dt, near, floor)
     return IdentifiedProcess(

@@ -15,7 +15,7 @@ from math import ceil, log
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.fft import irfft, rfft
-from scipy.ndimage import median_filter
+from scipy.ndimage import binary_opening, median_filter
 from scipy.sparse.linalg import LinearOperator, cg
 
 from wfsobs.spectral.whittle import periodogram
@@ -24,7 +24,9 @@ from wfsobs.typing import Array
 DRAWS = 2
 """Records drawn for V. Its scale is known: the shares of all bins add up to the share of measured samples."""
 BANDS = 40
-"""Bands over which V is smoothed. It is flat where S is white or far above noise, so a resonance makes no step in it."""
+"""Bands over which V is smoothed. Of single samples it is flat where S is white or far above noise: a resonance makes no step."""
+LONG = 20
+"""Samples in a row that are a long gap. It hides resonances and noise alike, so V / S is smoothed, not V."""
 CLOSE, MOST = 1e-4, 300
 """Approximate error of a filled sample, over the noise, at which conjugate gradients stop; maximum number of steps."""
 LEAST = 1e-3
@@ -100,16 +102,22 @@ class MissingSamples:
 
     def measured_share(self, S: Array, unknown: Array) -> Array:
         """Return the measured share 1 - V / S of every bin, (bins,): for white noise the share of measured samples."""
-        V = np.mean([periodogram(e, self.dt) for e in unknown], axis=0)
-        j = np.arange(1.0, len(V) + 1.0)
-        edges = np.unique(np.concatenate([[0], np.geomspace(1, len(V), BANDS).astype(int)]))
-        centre, level = (np.array([x[a:b].mean() for a, b in pairwise(edges)]) for x in (np.log(j), V))
-        V = np.exp(np.interp(np.log(j), centre, np.log(np.maximum(level, np.finfo(float).tiny))))
+        is_long, V = binary_opening(self.is_missing, np.ones(LONG)), np.zeros_like(S)
+        for part, unit in ((is_long, S), (~is_long, np.ones_like(S))):
+            V += unit * _smooth(np.mean([periodogram(e * part, self.dt) for e in unknown], axis=0) / unit)
         return np.maximum(1.0 - V / S * self.is_missing.mean() / np.mean(V / S), LEAST)
 
     def _at_all_frequencies(self, S: Array) -> Array:
         """Return a density at all frequencies of rfft, zero included."""
         return np.concatenate([S[:1], S, S[-1:]])[: self.n // 2 + 1]
+
+
+def _smooth(V: Array) -> Array:
+    """Return V (bins,) smoothed over BANDS."""
+    j = np.arange(1.0, len(V) + 1.0)
+    edges = np.unique(np.concatenate([[0], np.geomspace(1, len(V), BANDS).astype(int)]))
+    centre, level = (np.array([x[a:b].mean() for a, b in pairwise(edges)]) for x in (np.log(j), V))
+    return np.exp(np.interp(np.log(j), centre, np.log(np.maximum(level, np.finfo(float).tiny))))
 
 
 def find_outlying(z: Array) -> Array:

@@ -97,6 +97,8 @@ class Check:
     @property
     def summary(self) -> str:
         """What `is_reliable` says, as a sentence."""
+        if self.identification is None:
+            return "It cannot be identified."
         if not self.is_reliable:
             return "An identification of it is to be taken with care."
         undecided = [f.subject for f in self.findings if f.verdict == "undecided"]
