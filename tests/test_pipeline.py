@@ -400,6 +400,8 @@ def raise_error(error: Exception) -> None:
         (lambda z: {"vibration": np.ma.masked_array(z, z > 0)}, "vibration takes NaN where there is no number, not a mask$"),
         (lambda z: Estimates({"vibration": z}, {"vibration": z * 0 - 1}), "sd of vibration takes numbers from 0, not negative"),
         (lambda z: raise_error(ValueError()), "ValueError$"),
+        (lambda z: raise_error(KeyError("x")), "KeyError: 'x'$"),
+        (lambda z: raise_error(SystemExit(3)), "SystemExit: 3$"),
         (lambda z: raise_error(ValueError("singular\n  matrix")), "singular matrix$"),
         (lambda z: raise_error(np.linalg.LinAlgError("singular")), "singular$"),
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from time import perf_counter
@@ -13,13 +14,15 @@ from wfsobs.evaluation.result import Failure
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
 from wfsobs.priors_from.scenario import PriorParts, arguments, prior_and_settings, usual_observers
-from wfsobs.progress import QUIET, Watch, detach_watch
+from wfsobs.progress import QUIET, Cancelled, Watch, detach_watch
 from wfsobs.record import NEXT_Z, TOTAL, Estimate, Estimates, Record
 from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.scenario import used_settings
 from wfsobs.settings.values import Plain, error_line
 from wfsobs.typing import Array
+
+log = logging.getLogger(__name__)
 
 
 def each_estimate(
@@ -102,7 +105,7 @@ def _recall(
     try:
         prior, settings = prior_and_settings(observer, record, scenario, parts)
         return memo.find(observer, prior, own if observer.counts is None else observer.counts(prior, settings))
-    except ValueError:
+    except Exception:  # it says so when it runs
         return "", []
 
 
@@ -119,7 +122,11 @@ def _one(observer: Observer, record: Record, scenario: Scenario, watch: Watch, p
             if np.isnan(values[target]).all():
                 sensors = " or ".join(sensor.upper() for sensor in observer.sensors)
                 raise ValueError(f"{target} is NaN in every step, perhaps for too few measurements of the {sensors}")
-    except ValueError as error:
+    except Cancelled:
+        raise
+    except (Exception, SystemExit) as error:  # by an observer of another package, perhaps: the others keep their results
+        if not isinstance(error, ValueError):
+            log.info("%s failed", observer.id, exc_info=True)
         return [Failure(observer.id, f"{observer.id} left out: {error_line(error)}")]
     seconds = (perf_counter() - start) / max(record.n_steps * record.n_modes, 1)
     of_sum = {name: values.sd[name] for name in (TOTAL, NEXT_Z) if name in values.sd}

@@ -186,14 +186,18 @@ def test_everything_is_done_never_too_much_at_once(workers: int, jobs: list[tupl
         assert queue.close(WAIT)
 
 
-def test_a_job_that_fails_leaves_the_thread_to_others(make_queue: Any, caplog: Any) -> None:
+@pytest.mark.parametrize("error", [ZeroDivisionError("of a package"), SystemExit("of a package")])
+def test_a_job_that_fails_leaves_the_thread_to_others(make_queue: Any, caplog: Any, error: BaseException) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
     queue, log = make_queue(1), Log()
     fails, after = Asked(log, "a"), Asked(log, "b")
-    fails.job.work = lambda *_: 1 / 0
+    fails.job.work = fail
     fails.into(queue)
     after.into(queue)
     log.until(lambda: log.started == ["b"])
-    assert fails.known["message"] == "ZeroDivisionError: division by zero" and "Traceback" in caplog.text
+    assert fails.known["message"] == f"{type(error).__name__}: of a package" and "Traceback" in caplog.text
     after.gate.set()
 
 

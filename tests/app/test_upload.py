@@ -400,6 +400,14 @@ def test_parts_that_make_no_sense(dashboard: Dashboard, monkeypatch: pytest.Monk
     assert upload._content == b"" and upload.picker.message == "night.csv: larger than 0 MB"
 
 
+def test_reading_is_bounded_on_a_server_with_limits(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
+    service = dashboard.store.session.service
+    for limits, line in ((Limits(steps=100), "The record has 750 steps; at most 100"), (Limits(seconds=0.0), "more than 0 s")):
+        service.limits = limits
+        previewed(dashboard, loop, file_of(short))
+        assert line in dashboard.upload.picker.message and dashboard.upload.use.disabled
+
+
 def test_on_a_server_with_limits(loop: Any, short: Scenario) -> None:
     """The line of runs and the limits hold for records as well, and nobody gets the results of another's."""
     service = Service(Limits(duration=2.0), 1, 100_000_000)

@@ -215,7 +215,7 @@ def test_an_observer_that_ends_in_an_error_is_a_failure_of_its_own(monkeypatch):
     plan = parse_plan(TINY.format(seeds=1), Path())
     rows = run_rows(plan.cells[0], 1, plan.observers, ())
     failed = [r for r in rows if r["name"] == "persistence"]
-    assert [(r["rms_nm"], r["note"]) for r in failed] == [(None, "ZeroDivisionError: of a package")]
+    assert [(r["rms_nm"], r["note"]) for r in failed] == [(None, "persistence left out: ZeroDivisionError: of a package")]
     assert len([r for r in rows if r["name"] == "kf-lgs" and r["rms_nm"]]) == 6  # of either target and of both, two modes
 
 

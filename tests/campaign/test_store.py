@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from wfsobs.campaign import store
 from wfsobs.campaign.plan import parse_plan
 from wfsobs.campaign.store import (
     ROWS,
+    BatchIndex,
     batch_files,
     finished_runs,
     present_rows,
@@ -66,6 +68,22 @@ def test_a_file_cut_off_is_left_out_and_nothing_is_half_written(folder, monkeypa
     with pytest.raises(OSError, match="No space left"):
         write_batch(folder, [row("c")], HERE)
     assert len(list((folder / ROWS).iterdir())) == 2
+
+
+@pytest.mark.parametrize("change", ["foreign", "no key", "no rms", "another type", "null cells"])
+def test_a_file_of_other_columns_is_left_out(folder, change):
+    write_batch(folder, [row("a")], HERE)
+    table = pq.read_table(batch_files(folder)[0])
+    other = {
+        "foreign": pa.table({"a": [1, 2]}),
+        "no key": table.drop_columns(["key"]),
+        "no rms": table.drop_columns(["rms_nm"]),
+        "another type": table.set_column(table.schema.get_field_index("cell"), "cell", pa.array(["first"])),
+        "null cells": table.set_column(table.schema.get_field_index("cell"), "cell", pa.array([None], "int32")),
+    }[change]
+    pq.write_table(other, folder / ROWS / "other.parquet")
+    assert read_results(folder)["key"].to_pylist() == ["a"]
+    assert BatchIndex(folder).read(range(10))["key"].to_pylist() == ["a"]
 
 
 def test_rows_of_another_version_or_of_other_seeds_are_not_those_of_a_plan(folder, monkeypatch):

@@ -341,6 +341,23 @@ def test_a_controller_without_a_law_says_so(monkeypatch: pytest.MonkeyPatch) -> 
     assert one.residual is None and one.note == "law takes a wfsobs.control.mirror.Law, not a NoneType"
 
 
+def of_no_numbers(_prior: Prior, _mode: int, plant: Plant, _settings: Settings) -> Any:
+    return integrator_law(plant.mirror, np.nan, leak=1.0)
+
+
+def that_fails(*_: Any) -> Any:
+    raise KeyError("gain")
+
+
+@pytest.mark.parametrize(("part", "value"), [("law", that_fails), ("law", of_no_numbers), ("predict", that_fails)])
+def test_a_controller_that_fails_leaves_the_others_theirs(part: str, value: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    of = CONTROLLERS["integrator+gpr-online" if part == "predict" else "integrator"]
+    monkeypatch.setitem(CONTROLLERS, "none", replace(of, id="none", **{part: value}))
+    one, other = run(QUICK, ("none", "integrator")).outcomes
+    assert one.residual is None and (one.note == "KeyError: 'gain'" or value is of_no_numbers)
+    assert other.residual is not None
+
+
 def test_what_cannot_run_says_why() -> None:
     both = {"multirate.measurement_noise": "manual", "multirate.lgs_noise": 0.04, "multirate.ngs_noise": 0.001}
     (one,) = run(QUICK | both, ("lqg-multirate",)).outcomes

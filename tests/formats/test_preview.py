@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
+from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
@@ -187,6 +188,25 @@ def test_zeros_that_no_measurement_packs_like_are_not_unpacked(monkeypatch) -> N
         assert tracemalloc.get_traced_memory()[1] < 5_000_000
     finally:
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize("name", ["bytes.npz", "bytes.npy", "bytes.fits"])
+def test_small_numbers_count_as_many_bytes_as_they_take(monkeypatch, name: str) -> None:
+    y = np.random.default_rng(0).integers(0, 99, (200_000, 2)).astype(np.uint8)
+    data = {"npz": zipped({"y_lgs.npy": npy(y)}), "npy": npy(y), "fits": fits_of(fits.ImageHDU(y, name="Y_LGS"))}
+    monkeypatch.setattr(module, "MOST_NUMBERS", 8 * y.size - 1)
+    assert "holds more than" in refused(data[name.partition(".")[2]], name)
+
+
+def test_steps_are_checked_before_the_record_is_made(monkeypatch) -> None:
+    def check_steps(n: int) -> None:
+        raise ValueError(f"{n} steps")
+
+    monkeypatch.setattr(module, "to_record", lambda *_: pytest.fail("it was made"))
+    with pytest.raises(ValueError, match=f"^{RECORD.n_steps} steps$"):
+        preview(CONTENT[".npz"], "a.npz", check_steps=check_steps)
+    with pytest.raises(Cancelled):
+        preview(CONTENT[".npz"], "a.npz", watch=Watch(is_cancelled=lambda: True))
 
 
 def test_a_zip_that_lies_about_its_size(monkeypatch) -> None:

@@ -138,3 +138,9 @@ def test_the_command_runs_on_it(tmp_path) -> None:
         assert found == pytest.approx(np.sqrt(np.trapezoid(table[mode], table["frequency"])), rel=1e-6)
     none = CliRunner().invoke(main, ["run", "--vibration-psd", str(tmp_path / "none.csv")])
     assert none.exit_code == 2 and "none.csv: cannot be read" in none.stderr and none.stderr.count("\n") == 1
+
+
+def test_a_table_of_too_many_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wfsobs.telemetry.formats.psd.MOST", 8)
+    with pytest.raises(RecordError, match=r"^a\.csv: holds more than"):
+        read_psd(io.BytesIO(b"frequency,tip,tilt\n1,1,1\n"), "a.csv")

@@ -167,7 +167,7 @@ class Job:
                 said, news["message"] = "late", f"It took more than {self.time_limit:g} s, which is what this server allows"
         except self.refusal as error:
             said, news["message"] = "refused", str(error)
-        except Exception as error:  # a bug, but the server goes on
+        except (Exception, SystemExit) as error:  # a bug, but the server goes on
             log.exception("%s %d failed", self.kind, self.number)
             news["message"] = f"{type(error).__name__}: {error}"
         finally:
@@ -293,7 +293,7 @@ class JobQueue:
             again = False
             try:
                 again = job.run(lambda: self.closing, self.cache.put, self.is_busy)
-            except Exception:  # a bug, but the thread is for all
+            except (Exception, SystemExit):  # a bug, but the thread is for all
                 log.exception("a job failed")
             finally:
                 with self._change:

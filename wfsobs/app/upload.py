@@ -21,6 +21,7 @@ from bokeh.models import ColumnDataSource
 from wfsobs.app.actions import Actions
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs import CANCELLED, FAILED, RUNNING, Job
+from wfsobs.app.limits import Limits
 from wfsobs.app.pages.parts import read_number
 from wfsobs.app.render import render, signs
 from wfsobs.app.service import BackgroundTask
@@ -29,6 +30,7 @@ from wfsobs.app.sources import fit_to_record
 from wfsobs.app.store import Store
 from wfsobs.app.style import WIDE, HtmlComponent, html, make_button, make_select, script, sheets
 from wfsobs.app.views.plots import new_spectrum, send
+from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.names import name_settings
@@ -204,11 +206,17 @@ def _list(lines: Iterable[str]) -> str:
     return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>"
 
 
-def read_stranger(content: bytes, name: str, scenario: Scenario, declaration: DeclaredFormat) -> AnyPreview:
-    """Read a file that may be anything. Raises RecordError, one line."""
+READ_RATE = 2e6
+"""About what is read of a file [bytes/s]."""
+
+
+def read_stranger(
+    content: bytes, name: str, scenario: Scenario, declaration: DeclaredFormat, limits: Limits, watch: Watch
+) -> AnyPreview:
+    """Read a file that may be anything. Raises RecordError or SettingError, one line, and Cancelled."""
     try:
-        return preview_any(content, name, scenario, declaration)
-    except RecordError:
+        return preview_any(content, name, scenario, declaration, limits.check_steps, watch)
+    except (RecordError, SettingError, Cancelled):
         raise
     except Exception:  # whatever a stranger's file may do
         raise RecordError(f"{name}: cannot be read") from None
@@ -360,8 +368,9 @@ class Upload:
         scenario = self.store.scenario.replace({"telescope.radial_order": 6})  # as many modes as there may be
 
         def read() -> None:
-            work = partial(read_stranger, self._content, self._name, scenario, self.read_fields())
-            self.reading.start(Job("upload", lambda _watch, _tell: work()))
+            limits, cost = self.store.session.service.limits, len(self._content) / READ_RATE
+            work = partial(read_stranger, self._content, self._name, scenario, self.read_fields(), limits)
+            self.reading.start(Job("upload", lambda watch, _tell: work(watch), cost=cost, time_limit=limits.seconds))
 
         self.reading.attempt(read)
 

@@ -7,7 +7,7 @@ import os
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from time import perf_counter, sleep, time
@@ -39,7 +39,7 @@ from wfsobs.execution import each_estimate
 from wfsobs.pipeline import collect
 from wfsobs.record import Estimate, Record
 from wfsobs.scenario import Scenario
-from wfsobs.settings.values import SettingError
+from wfsobs.settings.values import SettingError, error_line
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
 
@@ -149,7 +149,7 @@ def _observer_rows(record: Record, ready: _Ready, observers: Sequence[str]) -> l
         return [_failure(name, str(error)) for name in observers]
     except Exception as error:  # by an observer of another package, perhaps
         if len(observers) == 1:
-            return [_failure(observers[0], f"{type(error).__name__}: {error}")]
+            return [_failure(observers[0], error_line(error))]
         return [row for name in observers for row in _observer_rows(record, ready, [name])]
     rows = [
         {
@@ -176,7 +176,9 @@ def _controller_rows(record: Record, ready: _Ready, controllers: Sequence[str]) 
         ready.design = ready.design or design(ready.scenario, controllers)
         result = closed_loop(record, ready.design)
     except Exception as error:
-        return [_failure(name, f"{type(error).__name__}: {error}") for name in controllers]
+        if len(controllers) == 1:
+            return [_failure(controllers[0], error_line(error))]
+        return [row for name in controllers for row in _controller_rows(record, replace(ready, design=None), [name])]
     return [
         {
             "name": row["controller"],

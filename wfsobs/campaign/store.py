@@ -113,6 +113,9 @@ RESULTS = {
 PROVENANCE = {"step_us": "float64", "kernel": "string", "host": "string", "process": "int64", "written": "float64"}
 """Columns that say where and how a row was made."""
 
+COMPLETE = frozenset(("key", "cell", "seed", "name"))
+"""Columns without nulls."""
+
 ORDER = ("key", "cell", "target", "mode")
 """Two scenarios of one plan may have the same settings, and then have the same keys."""
 
@@ -155,14 +158,19 @@ def batch_files(folder: Path) -> list[Path]:
 
 
 def read_batch(path: Path, columns: Iterable[str]) -> pyarrow.Table | None:
-    """Return the rows of one file; None where it cannot be read."""
+    """Return the rows of one file; None where it cannot be read, or is none of a batch."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    columns, wanted = list(columns), schema()
     try:
-        return pq.ParquetFile(path).read(columns=list(columns))
-    except (OSError, pa.ArrowException):
+        file = pq.ParquetFile(path)
+        if not RESULTS.keys() <= {*file.schema_arrow.names}:
+            return None
+        table = file.read(columns=columns).select(columns).cast(pa.schema([wanted.field(name) for name in columns]))
+    except (OSError, pa.ArrowException, KeyError):
         return None
+    return None if any(table[name].null_count for name in COMPLETE.intersection(columns)) else table
 
 
 def read_batches(folder: Path, columns: Iterable[str]) -> Iterator[pyarrow.Table]:
@@ -235,13 +243,13 @@ class BatchIndex:
         for path in batch_files(folder):
             try:
                 known = pq.read_metadata(path)
-            except (OSError, pa.ArrowException):  # as in `read_batch`
+                column = known.schema.names.index("cell")
+                of_groups = [known.row_group(i).column(column).statistics for i in range(known.num_row_groups)]
+                span = int(min(s.min for s in of_groups)), int(max(s.max for s in of_groups))
+            except (OSError, pa.ArrowException, ValueError, TypeError, AttributeError):  # no rows, or as in `read_batch`
                 continue
-            column = known.schema.names.index("cell")
-            of_groups = [known.row_group(i).column(column).statistics for i in range(known.num_row_groups)]
-            if of_groups:
-                self._spans.append((path, min(s.min for s in of_groups), max(s.max for s in of_groups)))
-                self.n_rows += known.num_rows
+            self._spans.append((path, *span))
+            self.n_rows += known.num_rows
 
     def read(self, cells: range) -> pyarrow.Table:
         """Return the rows of some scenarios, each once, with COLUMNS, sorted as in `read_results`."""

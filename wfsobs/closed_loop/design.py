@@ -143,7 +143,7 @@ def _design_one(
     settings, modes = own_settings(controller, scenario), range(len(scenario.modes))
     try:
         prior = prior_for(controller, scenario, spectra)
-    except ValueError as error:
+    except (Exception, SystemExit) as error:
         return tuple(LawDesign(None, None, note=error_line(error)) for _ in modes), Prior()
     designed = (_of_mode(controller, prior, mode, plant, settings, spectra[mode] if spectra else None) for mode in modes)
     return tuple(designed), replace(prior, spectra=())
@@ -156,16 +156,14 @@ def _of_mode(
         return LawDesign(None, True)
     try:
         law = controller.law_of(prior, mode, plant, settings)
-    except UnstableCycle as error:
-        return LawDesign(None, False, note=error_line(error))
-    except ValueError as error:
-        return LawDesign(None, None, note=error_line(error))
-    stable, mirror = law.stable, plant.mirror
-    if not stable or controller.predict is not None or not law.time_invariant:
-        return LawDesign(law, stable)
-    predicted = None if spectra is None else float(np.sqrt(residual_variance(law, spectra, mirror)))
-    known = margins(nominal_loop(law, mirror), frequencies(law.poles), plant.dt)
-    return LawDesign(law, stable, predicted, known)
+        stable, mirror = law.stable, plant.mirror
+        if not stable or controller.predict is not None or not law.time_invariant:
+            return LawDesign(law, stable)
+        predicted = None if spectra is None else float(np.sqrt(residual_variance(law, spectra, mirror)))
+        known = margins(nominal_loop(law, mirror), frequencies(law.poles), plant.dt)
+        return LawDesign(law, stable, predicted, known)
+    except (Exception, SystemExit) as error:  # by a controller of another package, perhaps: the others keep their laws
+        return LawDesign(None, False if isinstance(error, UnstableCycle) else None, note=error_line(error))
 
 
 def loop_spectra(spectra: TrueSpectra) -> SensorSpectra:

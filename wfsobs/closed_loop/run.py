@@ -30,7 +30,7 @@ from wfsobs.notebook import PlotAccessor, import_extra
 from wfsobs.pipeline import as_stated
 from wfsobs.prior import TRUE, PriorSource, Spectra, words_for
 from wfsobs.priors_from.controllers import controller_arguments, full_plant_of, own_settings, supervision_of
-from wfsobs.progress import QUIET, Watch, detach_watch
+from wfsobs.progress import QUIET, Cancelled, Watch, detach_watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.scenario import used_settings
@@ -381,7 +381,9 @@ def _outcome(
                 u, correction = drive(acting, measured, true, _plant_generator(plan.scenario), alone)
                 if isinstance(acting, SupervisedController):
                     alarms = tuple((frame * record.dt, reason) for frame, reason in acting.alarms)
-    except ValueError as error:
+    except Cancelled:
+        raise
+    except (Exception, SystemExit) as error:  # by a controller of another package, perhaps: the others keep their outcomes
         return Outcome(controller.id, tuple(None for _ in stable), note=error_line(error))
     if not np.isfinite(correction).all():
         frame = int(np.argmin(np.isfinite(correction).all(axis=1)))

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from wfsobs.progress import QUIET, Watch
 from wfsobs.record import DELAY, Record, RecordError, hold_last
 from wfsobs.scenario import Scenario
 from wfsobs.signal.spectrum import psd, rms
@@ -182,24 +184,33 @@ class SpectrumPreview:
 
 
 def preview_any(
-    data: bytes, name: str, scenario: Scenario | None = None, declaration: DeclaredFormat | None = None
+    data: bytes,
+    name: str,
+    scenario: Scenario | None = None,
+    declaration: DeclaredFormat | None = None,
+    check_steps: Callable[[int], None] | None = None,
+    watch: Watch = QUIET,
 ) -> Preview | SpectrumPreview | ColumnsPreview:
     """Preview the bytes of a record, of a vibration spectrum, or of columns that have to be said what they are.
 
-    Raises RecordError with one clear line.
+    check_steps : raises ValueError for a number of steps that is too large
+
+    Raises RecordError with one clear line, Cancelled.
     """
     try:
-        return preview(data, name, scenario, declaration)
+        return preview(data, name, scenario, declaration, check_steps, watch)
     except RecordError as error:
         if not re.search(r": has no (y_lgs|u);", str(error)) or (declaration and declaration.columns):
             raise
         no_record = error
+    watch.check()
     shown, diameter = safe_name(name), (scenario or Scenario()).telescope.diameter
     if not shown.lower().endswith((".csv", ".txt", ".fits", ".fit", ".fts")):  # which no spectrum comes in
         return _preview_columns(data, shown, no_record)
     try:
         table = read_psd(io.BytesIO(data), shown, declaration.unit if declaration else None, diameter)
     except NoSpectrumError:
+        watch.check()
         return _preview_columns(data, shown, no_record)
     return SpectrumPreview(table, shown, np.array(table["frequency"]), np.column_stack([table["tip"], table["tilt"]]))
 
@@ -223,19 +234,31 @@ def _preview_columns(data: bytes, name: str, no_record: RecordError) -> ColumnsP
     return ColumnsPreview(name, why, {k: describe_values(v) for k, v in offered.items()}, roles)
 
 
-def preview(data: bytes, name: str, scenario: Scenario | None = None, declaration: DeclaredFormat | None = None) -> Preview:
-    """Preview the bytes of a record; its name gives the format. Raises RecordError with one clear line."""
+def preview(
+    data: bytes,
+    name: str,
+    scenario: Scenario | None = None,
+    declaration: DeclaredFormat | None = None,
+    check_steps: Callable[[int], None] | None = None,
+    watch: Watch = QUIET,
+) -> Preview:
+    """Preview the bytes of a record, as `preview_any`; its name gives the format."""
     shown, scenario, stated = safe_name(name), scenario or Scenario(), declaration or DeclaredFormat()
     if len(data) > MOST_FILE:
         raise RecordError(f"{shown}: has {len(data) / 1e6:.0f} MB, at most {MOST_FILE / 1e6:.0f} MB are taken")
     try:
         contents = read_contents(io.BytesIO(data), shown, stated.columns, MOST_NUMBERS)
+        watch.check()
+        if check_steps is not None:
+            check_steps(max((max(array.shape, default=0) for array in contents.arrays.values()), default=0))
         record = to_record(contents, scenario, stated)
     except RecordError as error:
         raise RecordError(f"{shown}: {error}") from None
+    watch.check()
     signals = {"y_lgs": record.y_lgs, "u": record.u, "z": (z := record.z[record.delay :])}.items()
     values = {key: tuple(rms(column[~np.isnan(column)]) for column in signal.T) for key, signal in signals}
     frequency, spectrum = psd(hold_last(z), record.dt)
+    watch.check()
     return Preview(record, shown, values, frequency, spectrum, read_off(record, contents, stated, scenario))
 
 

@@ -95,7 +95,7 @@ def read_fits(file: IO[bytes], most: int) -> FileColumns:
     """Read the tables and images of a FITS file, or an AOT file, which says so inside. Raises RecordError, TooLargeError."""
     with open_fits(file, most) as hdus:
         if KEYWORD not in hdus[0].header:
-            return tables_and_images(hdus)
+            return tables_and_images(hdus, most)
     return read(file, most)
 
 

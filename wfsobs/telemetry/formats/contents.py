@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 import tokenize
@@ -105,6 +106,8 @@ class FileColumns:
         Whole arrays, numbers and texts of the names of a record (NAMES).
     matrices : dict of str to Array
         Matrices of a loop from slopes to modes, the first choice first, and from modes to commands.
+    most : float
+        Maximum bytes of numbers that are added, 8 each.
     """
 
     columns: dict[str, Array] = field(default_factory=dict)
@@ -113,12 +116,14 @@ class FileColumns:
     numbers: dict[str, float] = field(default_factory=dict)
     contents: Contents = field(default_factory=Contents)
     matrices: dict[str, Array] = field(default_factory=dict)
+    most: float = math.inf
+    _bytes: int = 0
 
     def add(self, name: str, data: object, unit: str = "") -> None:
         """Add what a file holds under a name: as part of a record where it has the name of one, and numbers as columns.
 
         Columns of two dimensions are name[0], name[1], ..., the longest axis being time; fields of a structure are name.field.
-        Raises RecordError where a part of a record holds no numbers.
+        Raises RecordError where a part of a record holds no numbers, TooLargeError.
         """
         values, known = np.asarray(data), name.lower()
         if values.dtype.names and name.count(".") < DEEPEST:
@@ -145,6 +150,9 @@ class FileColumns:
 
     def _add_numbers(self, name: str, values: Array, unit: str) -> None:
         values = np.atleast_1d(values)
+        self._bytes += 8 * values.size
+        if self._bytes > self.most:
+            raise TooLargeError(self.most)
         known, longest = name.lower(), int(np.argmax(values.shape))
         rows = np.moveaxis(values, longest, 0).reshape(values.shape[longest], -1)
         if known in self.contents.arrays:
@@ -333,7 +341,7 @@ def _pad(x: Array, n: int) -> Array:
 class TooLargeError(RecordError):
     """Error: a file that exceeds the limit of memory."""
 
-    def __init__(self, most: int):
+    def __init__(self, most: float):
         super().__init__(f"holds more than {most / 1e6:.4g} MB of numbers, which is the most that is read here")
 
 

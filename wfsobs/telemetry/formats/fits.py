@@ -73,10 +73,10 @@ def _check_sizes(hdus: HDUList, length: int, most: int) -> None:
             raise RecordError("ends before its data do")
 
 
-def tables_and_images(hdus: HDUList) -> FileColumns:
-    """Read the tables and images of a file. Raises RecordError."""
+def tables_and_images(hdus: HDUList, most: float) -> FileColumns:
+    """Read the tables and images of a file. Raises RecordError, TooLargeError."""
     fits = astropy_fits()
-    out = FileColumns()
+    out = FileColumns(most=most)
     for number, hdu in enumerate(hdus):
         for key, keyword in KEYWORDS.items():
             if keyword in hdu.header and not (key == "unit" and hdu.is_image and hdu.data is not None):  # of one image alone

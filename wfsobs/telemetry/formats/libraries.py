@@ -70,7 +70,7 @@ def read_matlab(file: IO[bytes], most: int) -> FileColumns:
     head = file.read(USERBLOCK + len(HDF5))
     if head.endswith(HDF5) or head.startswith(HDF5):
         return read_hdf5(file, most)
-    out, content = FileColumns(), read_at_most(file, most)
+    out, content = FileColumns(most=most), read_at_most(file, most)
     with refuse_damage("damaged, or not a MATLAB file"):
         if (order := {b"IM": "<", b"MI": ">"}.get(content[126:128])) is None:
             _add_version_4(out, content)
@@ -82,9 +82,7 @@ def read_matlab(file: IO[bytes], most: int) -> FileColumns:
                         raise TooLargeError(most)
                     kind, body = next(_elements(memoryview(unpacked), order))
                 if kind == MATRIX:
-                    _add_matrix(out, body, order, most)
-                if sum(values.nbytes for values in out.columns.values()) > most:
-                    raise TooLargeError(most)
+                    _add_matrix(out, body, order)
     return out
 
 
@@ -116,7 +114,7 @@ def _elements(content: memoryview, order: str) -> Iterator[tuple[int, memoryview
         place += 8 + size + (-size % 8 if kind != PACKED else 0)
 
 
-def _add_matrix(out: FileColumns, body: memoryview, order: str, most: int, name: str = "") -> None:
+def _add_matrix(out: FileColumns, body: memoryview, order: str, name: str = "") -> None:
     """Add an array, or the fields of a structure; name : of a field, which has none of its own."""
     parts = _elements(body, order)
     (flags,) = struct.unpack_from(f"{order}I", next(parts)[1])
@@ -130,7 +128,7 @@ def _add_matrix(out: FileColumns, body: memoryview, order: str, most: int, name:
         names = bytes(next(parts)[1])
         for place, (_, field) in zip(range(0, len(names), length), parts, strict=False):
             key = names[place : place + length].partition(b"\0")[0].decode("latin-1")
-            _add_matrix(out, field, order, most, f"{name}.{key}")
+            _add_matrix(out, field, order, f"{name}.{key}")
     elif kind in NUMBERS_OR_TEXT and not flags & COMPLEX:
         stored, data = next(parts, (1, b""))
         if kind == TEXT:
@@ -138,10 +136,7 @@ def _add_matrix(out: FileColumns, body: memoryview, order: str, most: int, name:
                 name, bytes(data).decode({16: "utf-8", 4: f"utf-16{'lb'[order == '>']}e", 17: "utf-16"}.get(stored, "latin-1"))
             )
             return
-        values = np.frombuffer(data, order + STORED[stored])
-        if values.size * 8 > most:
-            raise TooLargeError(most)
-        out.add(name, values.reshape(shape, order="F"))
+        out.add(name, np.frombuffer(data, order + STORED[stored]).reshape(shape, order="F"))
     else:
         what = CLASSES.get(kind, "array of complex numbers")
         out.leave(name, f"{name} is a MATLAB {what}, which is not read: save it as arrays of numbers")

@@ -29,7 +29,7 @@ def read(file: IO[bytes], most: int) -> FileColumns:
     """
     if not zipfile.is_zipfile(file):
         raise RecordError("not an .npz file; a record is an .npz with y_lgs, u and dt")
-    out = FileColumns()
+    out = FileColumns(most=most)
     with refuse_damage(DAMAGED), zipfile.ZipFile(file) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         known = {name: info for name, info in members.items() if name.lower() in NAMES}
@@ -82,7 +82,7 @@ def _values(stream: IO[bytes], length: int, name: str) -> Array:
 
 def read_npy(file: IO[bytes], most: int) -> FileColumns:
     """Read one array, whose columns are array[0], array[1], ... Raises RecordError, TooLargeError."""
-    out, length = FileColumns(), file.seek(0, 2)
+    out, length = FileColumns(most=most), file.seek(0, 2)
     if length > most:
         raise TooLargeError(most)
     file.seek(0)

@@ -76,7 +76,8 @@ def read_psd(file: IO[bytes], name: str, unit: str | None = None, diameter: floa
         columns, units = _from_fits(file) if fits else _from_csv(file)
         return _to_table(columns, units, unit, diameter)
     except RecordError as error:
-        raise type(error)(f"{name}: {error}") from None
+        kind = NoSpectrumError if isinstance(error, NoSpectrumError) else RecordError
+        raise kind(f"{name}: {error}") from None
 
 
 def _from_csv(file: IO[bytes]) -> Table:
