@@ -12,7 +12,7 @@ from wfsobs.app.idle_work import Budgets
 from wfsobs.app.jobs import DONE
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
-from wfsobs.app.views.errors import MainLines, Strip, Table
+from wfsobs.app.views.errors import Cards, MainLines, Strip, Table
 from wfsobs.evaluation.bound import NO_BOUND
 from wfsobs.evaluation.result import Failure
 from wfsobs.evaluation.scores import BOUNDS
@@ -42,13 +42,15 @@ def test_what_has_no_error_says_its_own_reason(make_store: Any, loop: Any) -> No
     part = replace(
         full,
         estimates=tuple(e for e in full.estimates if e.observer != "kf-lgs"),
-        scores=tuple(s for s in full.scores if s.observer not in ("kf-lgs", *BOUNDS)),
+        scores=tuple(replace(s, interval=(0.0, 11.0 * s.rms)) for s in full.scores if s.observer not in ("kf-lgs", *BOUNDS)),
         failures=(Failure("kf-lgs", "kf-lgs left out: it is not here"),),
     )
     store.run.result = replace(store.run.result, result=part)
     for why in (NO_BOUND, "it is not here"):
         assert f'<span title="{why}">–</span>' in table.html()
     (card,) = (item for item in strip.items() if item["name"] == "kf-lgs")
+    assert table.html().count("interval unknown") == sum(s.mode == "tip" for s in part.scores), "it reaches beyond tenfold"
+    assert "<button" in strip.cards.html and "<button" not in Cards().html, "of no row"
     assert card["note"] == "left out" and "it is not here" in card["about"]
 
 

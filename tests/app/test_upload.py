@@ -136,7 +136,7 @@ def test_a_record_of_one_mode_offers_no_other(dashboard: Dashboard, loop: Any, s
     record = simulate(short.replace({"run.seed": 9}))
     np.savez(file := io.BytesIO(), y_lgs=record.y_lgs[:, :1], u=record.u[:, :1], dt=record.dt)
     previewed(dashboard, loop, file.getvalue(), "one.npz")
-    assert "1 mode, read" in dashboard.upload.content.text.html
+    assert "1 mode, in um" in dashboard.upload.content.text.html
     dashboard.upload.confirm()
     loop.finish(dashboard.store)
     assert dashboard.display.mode == "tip" and dashboard.modes.buttons.options == {"Tip": "tip"}

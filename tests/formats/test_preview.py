@@ -73,7 +73,7 @@ def test_what_is_stated_and_what_is_missing() -> None:
     )
     assert found.lines() == [
         "1500 steps at 1000 Hz, 1.5 s, 10 missing",
-        "2 modes, read as um rms",
+        "2 modes, in um rms",
         "a command is seen 2 steps later",
         "NGS: 200 Hz, 1 frames missing",
         "truth: none, scored by prediction of the next measurement",

@@ -113,6 +113,8 @@ def test_the_numbers_are_those_of_the_run(report: Report, text: str, parse: Any)
             name += f" {AT_LIMIT}" if (row["observer"], row["target"], row["mode"]) in limits else ""
             lag = "–" if row["lag_s"] is None else hundredths(1e3 * row["lag_s"])
             ends = " – ".join(number(1e3 * x) for x in row["interval_um"] or ())
+            if ends and row["interval_um"][1] > 10.0 * row["rms_um"]:
+                ends = "interval unknown"
             spread = f" {ends} " if ends else ""
             want[f"{target_title(row['target'])}, {row['mode']}", name] = [
                 spread + number(1e3 * row["rms_um"]),

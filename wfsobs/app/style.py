@@ -83,8 +83,14 @@ PRIMARY = "#0B4F6C"
 _COMPONENTS = {
     "MuiAppBar": {"styleOverrides": {"root": {"backgroundColor": f"{PRIMARY} !important", "color": "#fff !important"}}},
     "MuiButton": {"styleOverrides": {"root": {"textTransform": "none", "letterSpacing": 0, "minWidth": "32px"}}},
-    # The drawer over a narrow page is open when the page comes, until the browser has closed it (frame.js).
-    "MuiDrawer": {"styleOverrides": {"modal": {"@media (max-width: 999.95px)": {"visibility": "var(--wfsobs-drawer, hidden)"}}}},
+    # The drawer over a narrow page is open when the page comes, until the browser has closed it (frame.js). It is no lighter than
+    # what is in it in dark mode.
+    "MuiDrawer": {
+        "styleOverrides": {
+            "modal": {"@media (max-width: 999.95px)": {"visibility": "var(--wfsobs-drawer, hidden)"}},
+            "paper": {"backgroundImage": "none !important"},
+        }
+    },
     # Why a setting has no effect is to be read, though its box is grey.
     "MuiFormHelperText": {"styleOverrides": {"root": {"&.Mui-disabled": {"color": "inherit", "opacity": 0.75}}}},
     # Above the line of its mark: beside it is the box with the number that is being changed.

@@ -116,13 +116,24 @@ def interval_text(interval: Sequence[float] | None, scale: float) -> str:
     return "-" if interval is None else f"{interval[0] * scale:.2f} - {interval[1] * scale:.2f}"
 
 
+def is_unknown(x: float, interval: Sequence[float]) -> bool:
+    """Return whether an interval reaches beyond ten times the value: errors that one record has a single time."""
+    return interval[1] > 10.0 * x
+
+
 def uncertainty_text(x: float, interval: Sequence[float], write: Callable[[float], str]) -> str:
     """Return half the width of an interval, or both of its ends where it is wider than the value, as formatted by `write`.
 
+    It is unknown where it `is_unknown`.
+
     >>> uncertainty_text(9.63, (9.21, 10.05), "{:.2f}".format), uncertainty_text(21.9, (2.57, 187.0), "{:.1f}".format)
     ('± 0.42', '(2.6 to 187.0)')
+    >>> uncertainty_text(17.1, (0.3, 1020.5), "{:.1f}".format)
+    '(interval unknown)'
     """
     low, high = interval
+    if is_unknown(x, interval):
+        return "(interval unknown)"
     return f"± {write(0.5 * (high - low))}" if high - low <= x else f"({write(low)} to {write(high)})"
 
 

@@ -183,7 +183,7 @@ def higher_orders() -> Scenario:
 
 
 def peak_jump() -> Scenario:
-    """A line at 47.5 Hz, such as that of a fan, jumps by 3 Hz: fixed-model filters lose it, adaptive filters re-acquire it.
+    """A line at 47.5 Hz jumps by 3 Hz: filters of a fixed model lose it, adaptive ones do not.
 
     - vibration: a pure line of 30 nm on tip and 20 nm on tilt, ten times what two resonances have beside it; all else is the
       paper's;
@@ -263,7 +263,7 @@ def lost_frames() -> Scenario:
 
 
 def night() -> Scenario:
-    """Two minutes in which wind, a line, lasers and frames change: for a live loop, which plays them over and over.
+    """Two minutes of changes of wind, a line, lasers and frames, for a live loop.
 
     As peak-jump. In the first minute the wind doubles and falls back, both lasers are out for 2 s and a tenth of the LGS frames
     is lost for 5 s. In the second the line is at 50.5 Hz, and half of the NGS frames are lost for 5 s. So the two minutes differ

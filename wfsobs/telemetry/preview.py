@@ -131,7 +131,7 @@ class Preview:
         return [
             f"{r.n_steps} steps at {self.rate:.6g} Hz, {self.duration:.4g} s, {r.missing} missing"
             + (f", {r.outliers} outlying" if r.outliers else ""),
-            f"{r.n_modes} mode{'s' * (r.n_modes > 1)}, read as um rms" + (f" ({r.origin})" if r.origin else ""),
+            f"{r.n_modes} mode{'s' * (r.n_modes > 1)}, in um rms" + (f", read as {r.origin}" if r.origin else ""),
             f"a command is seen {self.reading.delay:g} step{'s' * (self.reading.delay != 1)} later",
             f"NGS: {ngs}",
             f"truth: {' and '.join(truth) or 'none, scored by prediction of the next measurement'}",

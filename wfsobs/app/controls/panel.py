@@ -177,7 +177,6 @@ class Controls:
             tags=[TAG + PRESET],
             value=store.preset,
             options={preset_title(name): name for name in PRESETS},
-            helper_text=preset_line(store.preset),
             size="small",
             stylesheets=[TWO_LINES],
             min_height=75,
@@ -329,7 +328,7 @@ class Controls:
         """Say what the preset is, or what differs from it, in all and by topic."""
         changed = self.store.changed_paths()
         told = f"{len(changed)} changed: {', '.join(map(setting_name, changed))}" if changed else preset_line(self.store.preset)
-        self.preset.helper_text = told
+        self.preset.param.update(helper_text=told, description=told)
         self.reset.disabled = not changed
         count = Counter(map(topic_of, changed))
         self.topic_list.rename(

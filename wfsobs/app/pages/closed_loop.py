@@ -67,7 +67,7 @@ LINEAR = tuple(c.id for c in CONTROLLERS.values() if c.law and not c.predict)
 
 PLANT_INTRO = (
     f"What the linear controllers, designed for the plant as it is set, leave over {POINTS} others, by theory: with errors of "
-    f"delay (±{Uncertainty.delay:g} frame), gain (±{100.0 * Uncertainty.gain:g} %), rotation (±{Uncertainty.rotation:g}°) and, "
+    f"delay (±{Uncertainty.delay:g} frames), gain (±{100.0 * Uncertainty.gain:g} %), rotation (±{Uncertainty.rotation:g}°) and, "
     f"where the mirror has one, resonance (±{100.0 * Uncertainty.resonance:g} %), of which they know nothing."
 )
 PLANT_ABOUT = "The worst plant bold, the mean faint, against the error of the delay; all other errors as they come."

@@ -35,6 +35,7 @@ from wfsobs.evaluation.result import (
     can_be_best,
     group_by_knowledge,
     is_non_causal,
+    is_unknown,
     own_bound,
     own_interval,
     prior_knowledge,
@@ -271,11 +272,7 @@ class ScoreWriter:
         no_lag = "estimate or truth is constant" if target in SCORED else "not compared with a truth"
         return [
             # The number last, so that numbers stand below each other.
-            (
-                macro("interval", *map(self.length, interval), IN_MOST if is_bound else over(self.n_seeds)) + " "
-                if interval
-                else ""
-            )
+            self._interval(row["rms_um"], interval, IN_MOST if is_bound else over(self.n_seeds))
             + (macro("tag", mark, mark) if mark else "")
             + self.length(row["rms_um"]),
             (ABOVE if is_worse else "") + _or_why(row["normalised_rms"], f"{_base(target)} is 0"),
@@ -284,6 +281,12 @@ class ScoreWriter:
             _or_why(None if time is None else 1e-6 * time / self.dt, "nothing is computed"),
             missing("it predicts no sigma of this error") if sd is None else self.length(sd),
         ]
+
+    def _interval(self, rms: float, interval: Sequence[float] | None, meaning: str) -> str:
+        if interval is None:
+            return ""
+        unknown = is_unknown(rms, interval)
+        return (macro("note", "interval unknown") if unknown else macro("interval", *map(self.length, interval), meaning)) + " "
 
 
 def _base(target: str) -> str:
