@@ -214,6 +214,17 @@ def test_an_unstable_multirate_cycle_leaves_only_that_observer_out():
     assert "multirate" not in {row["observer"] for row in json.loads(result.stdout)}
 
 
+@pytest.mark.parametrize("still", ["tip and tilt", "tilt"])
+@pytest.mark.parametrize("command", ["observe --observer kf-lgs", "tune --observer kf-lgs --record"])
+def test_a_mode_that_is_one_value_is_named(command, still, tmp_path):
+    path = tmp_path / "r.npz"
+    y = np.random.default_rng(1).standard_normal((1500, 2)) * [name not in still for name in ("tip", "tilt")]
+    np.savez(path, y_lgs=y, dt=1e-3, unit="um")
+    done = call(*command.split(), str(path), "--open-loop")
+    assert done.exit_code == 2 or still == "tilt"
+    assert f"{path}: y_lgs of {still} is one value all the time; a measurement has noise\n" in done.stderr
+
+
 def test_presets_lists_and_prints():
     listing = call("presets").stdout
     assert listing.startswith("paper ")
