@@ -197,6 +197,22 @@ def test_errors_are_one_line_and_status_2(arguments, message, tmp_path, monkeypa
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [
+        ("run", "--save"),
+        ("identify none.npz", "--out"),
+        ("check none.npz", "--command-gain"),
+        ("observe none.npz", "--train"),
+        ("campaign report none", "--out"),
+    ],
+)
+def test_an_empty_name_is_refused(command, option):
+    done = call(*command.split(), option, "")
+    assert done.exit_code == 2
+    assert done.stderr.endswith(f"Error: Invalid value for '{option}': takes a text that is not empty\n")
+
+
 def test_options_of_a_record_need_one_and_columns_of_a_settings_file_do_not(tmp_path):
     assert set(RECORD_OPTIONS) <= {parameter.name for parameter in loop.params}
     (tmp_path / "s.toml").write_text('[columns]\nu = "commands"\n')
