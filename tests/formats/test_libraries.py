@@ -279,7 +279,7 @@ def test_open_loop_needs_no_commands(tmp_path: Path) -> None:
         np.savez(tmp_path / "a.npz", y_lgs=Z, dt=1e-3, unit="nm", **arrays)
         record = wfsobs.load(tmp_path / "a.npz", open_loop=True)
         np.testing.assert_allclose(1e3 * record.z, Z, rtol=1e-12)
-        assert record.origin == "unit nm, open loop"
+        assert record.origin == f"unit nm, open loop{', u not used' * bool(arrays)}"
     for gain in ([1.0, 1.0, 1.0], 1e300, 0.0, np.nan):
         with pytest.raises(RecordError, match=r"a command gain takes a number from 0\.001 to 1000, or 2, one per mode"):
             wfsobs.load(tmp_path / "a.npz", command_gain=gain)

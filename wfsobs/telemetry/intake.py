@@ -113,6 +113,7 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
     if declaration.command_modes and parse_unit(contents.units.get("u", "um")) is None:  # of actuators
         del contents.units["u"]
     if declaration.open_loop:
+        modes.append("open loop, u not used" if "u" in signals and signals["u"].any() else "open loop")
         signals["u"] = np.zeros_like(signals["y_lgs"])
         contents.units.pop("u", None)
     n, n_modes = signals["y_lgs"].shape
@@ -349,7 +350,7 @@ WHOLE = 1e-6
 
 def _limit(signals: dict[str, Array], declaration: DeclaredFormat) -> list[str]:
     """Limit the commands, in their own unit, to what the mirror follows; return in a few words what was done."""
-    said = ["open loop"] * declaration.open_loop
+    said = list[str]()
     if declaration.rail is not None:
         beyond = np.abs(signals["u"]) > declaration.rail
         if beyond.all():
