@@ -258,6 +258,8 @@ def test_too_little_is_said(tmp_path: Path, record: Record) -> None:
     z = record.z[2:2000]
     at_rest = verdicts(checked(tmp_path, Record(z, np.zeros_like(z), record.dt)))
     assert at_rest["commands"] == "ok"
+    texts = {f["subject"]: f["text"] for f in checked(tmp_path, begin(record, 300), "--open-loop")["findings"]}
+    assert texts["commands"] == "not used, as stated: the mirror is at rest"
     few = checked(tmp_path, begin(record, 300))
     seen = verdicts(few)
     subjects = ("command sign, delay, gain, rotation", "stationarity", "identification")

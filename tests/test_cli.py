@@ -197,6 +197,22 @@ def test_errors_are_one_line_and_status_2(arguments, message, tmp_path, monkeypa
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [
+        ("run", "--save"),
+        ("identify none.npz", "--out"),
+        ("check none.npz", "--command-gain"),
+        ("observe none.npz", "--train"),
+        ("campaign report none", "--out"),
+    ],
+)
+def test_an_empty_name_is_refused(command, option):
+    done = call(*command.split(), option, "")
+    assert done.exit_code == 2
+    assert done.stderr.endswith(f"Error: Invalid value for '{option}': takes a text that is not empty\n")
+
+
 def test_options_of_a_record_need_one_and_columns_of_a_settings_file_do_not(tmp_path):
     assert set(RECORD_OPTIONS) <= {parameter.name for parameter in loop.params}
     (tmp_path / "s.toml").write_text('[columns]\nu = "commands"\n')
@@ -212,6 +228,17 @@ def test_an_unstable_multirate_cycle_leaves_only_that_observer_out():
     assert "multirate left out: multi-rate filter: the cycle of 5 steps is unstable" in result.stderr
     assert "LGS noise 40 nm and NGS noise 1 nm" in result.stderr
     assert "multirate" not in {row["observer"] for row in json.loads(result.stdout)}
+
+
+@pytest.mark.parametrize("still", ["tip and tilt", "tilt"])
+@pytest.mark.parametrize("command", ["observe --observer kf-lgs", "tune --observer kf-lgs --record"])
+def test_a_mode_that_is_one_value_is_named(command, still, tmp_path):
+    path = tmp_path / "r.npz"
+    y = np.random.default_rng(1).standard_normal((1500, 2)) * [name not in still for name in ("tip", "tilt")]
+    np.savez(path, y_lgs=y, dt=1e-3, unit="um")
+    done = call(*command.split(), str(path), "--open-loop")
+    assert done.exit_code == 2 or still == "tilt"
+    assert f"{path}: y_lgs of {still} is one value all the time; a measurement has noise\n" in done.stderr
 
 
 def test_presets_lists_and_prints():

@@ -13,6 +13,8 @@ from click.testing import CliRunner
 
 from wfsobs.cli import main
 from wfsobs.files import check_writable, write_whole
+from wfsobs.handover import ENDINGS
+from wfsobs.telemetry.formats import WRITTEN
 
 
 def full(_file: IO[bytes]) -> NoReturn:
@@ -97,3 +99,20 @@ def test_a_file_that_is_read_is_not_replaced(arguments: str, tmp_path: Path, mon
     out = "link.npz" if "link" in arguments else "night.npz"
     assert (result.exit_code, result.output) == (2, f"wfsobs: {out}: is read by this command; write to another file\n")
     assert Path("night.npz").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "endings"),
+    [
+        ("observe none.npz --out", ".npz"),
+        ("probe --out", ".npz"),
+        ("export", ".html, .htm"),
+        ("run --save", ", ".join(WRITTEN)),
+        ("live --headless --record", ", ".join(WRITTEN)),
+        *((f"design --controller integrator --to {form} --out", ending) for form, ending in ENDINGS.items()),
+    ],
+)
+def test_an_ending_of_another_format_is_refused(arguments: str, endings: str) -> None:
+    result = CliRunner().invoke(main, [*arguments.split(), "a.npy"])
+    assert (result.exit_code, result.output) == (2, f"wfsobs: a.npy: its name ends in none of {endings}\n")
+    assert not Path("a.npy").exists()

@@ -27,7 +27,7 @@ ROUNDING = 1e-12
 
 
 def write(tmp_path: Path, controller: str, form: str, *more: str) -> Path:
-    path = tmp_path / "out"
+    path = tmp_path / f"out{handover.ENDINGS.get(form, '')}"
     result = CliRunner().invoke(main, ["design", "--controller", controller, "--to", form, "--out", str(path), *more])
     assert result.exit_code == 0, result.output
     return path
@@ -225,9 +225,10 @@ def test_the_matrices_for_compass(tmp_path: Path, controller: str, whole: tuple)
 )
 def test_what_a_format_cannot_hold_is_refused_in_one_line(tmp_path: Path, arguments: tuple[str, ...], reason: str) -> None:
     name, form, *more = arguments
-    result = CliRunner().invoke(main, ["design", "--controller", name, "--to", form, "--out", str(tmp_path / "out"), *more])
+    path = tmp_path / f"out{handover.ENDINGS.get(form, '')}"
+    result = CliRunner().invoke(main, ["design", "--controller", name, "--to", form, "--out", str(path), *more])
     assert result.exit_code == 2 and reason in result.output and result.output.count("\n") == 1
-    assert not (tmp_path / "out").exists()
+    assert not path.exists()
 
 
 def test_c99_overwrites_nothing(tmp_path: Path) -> None:

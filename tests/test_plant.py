@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 from wfsobs import PRESETS, simulate
 from wfsobs.cli import main
 from wfsobs.control.true_plant import ActingPlant, TruePlant
-from wfsobs.identification.plant import GroupPlant, PlantNumber, identify_plant, plant_lines
+from wfsobs.identification.plant import GroupPlant, PlantNumber, contradiction, identify_plant, plant_lines
 from wfsobs.identification.plant_likelihood import design_probe, few_lags, second_order
 from wfsobs.record import Record, RecordError
 from wfsobs.signal.autoregressive import Ar2
@@ -208,6 +208,11 @@ def test_signals_that_tell_nothing_of_a_plant_are_named() -> None:
 
 
 @pytest.mark.slow
+def test_commands_too_small_for_their_squares_tell_nothing() -> None:
+    y, u = np.random.default_rng(1).standard_normal((2, 1000, 2))
+    assert not contradiction(Record(y, 1e-200 * u, DT))
+
+
 def test_bad_samples_and_other_units_do_not_matter() -> None:
     record = closed_loop(10_000, 2.4, np.eye(2))
     y, rng = record.y_lgs.copy(), np.random.default_rng(3)

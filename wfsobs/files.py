@@ -57,8 +57,11 @@ def _write_and_rename(path: Path, write: Callable[[IO[bytes]], object]) -> None:
             raise
 
 
-def check_writable(path: str | Path, *inputs: str | Path | None) -> None:
-    """Raise OSError where `write_whole` could not write to `path`, or would replace one of the files that are read."""
+def check_writable(path: str | Path, *inputs: str | Path | None, endings: tuple[str, ...] = ()) -> None:
+    """Raise OSError where `write_whole` could not write to `path`, or would replace one of the files that are read.
+
+    endings : those that its name takes; any where there are none
+    """
     read = (one for one in inputs if one and os.path.exists(one) and os.path.exists(path))
     if not _is_device(path) and any(os.path.samefile(path, one) for one in read):
         raise OSError(errno.EEXIST, "is read by this command; write to another file", str(path))
@@ -79,3 +82,5 @@ def check_writable(path: str | Path, *inputs: str | Path | None) -> None:
     )
     if number:
         raise OSError(number, os.strerror(number), str(where))
+    if endings and not str(path).lower().endswith(endings):
+        raise OSError(errno.EINVAL, f"its name ends in none of {', '.join(endings)}", str(path))

@@ -279,9 +279,17 @@ def test_open_loop_needs_no_commands(tmp_path: Path) -> None:
         np.savez(tmp_path / "a.npz", y_lgs=Z, dt=1e-3, unit="nm", **arrays)
         record = wfsobs.load(tmp_path / "a.npz", open_loop=True)
         np.testing.assert_allclose(1e3 * record.z, Z, rtol=1e-12)
-        assert record.origin == "unit nm, open loop"
-    with pytest.raises(RecordError, match="a command gain takes a number above 0, or 2, one per mode"):
-        wfsobs.load(tmp_path / "a.npz", command_gain=[1.0, 1.0, 1.0])
+        assert record.origin == f"unit nm, open loop{', u not used' * bool(arrays)}"
+    for gain in ([1.0, 1.0, 1.0], 1e300, 0.0, np.nan):
+        with pytest.raises(RecordError, match=r"a command gain takes a number from 0\.001 to 1000, or 2, one per mode"):
+            wfsobs.load(tmp_path / "a.npz", command_gain=gain)
+
+
+def test_a_rail_below_every_command_is_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", y_lgs=Z, u=np.where(Z < 0, -250.0, 125.0), dt=1e-3, unit="nm")
+    assert "commands beyond the rail of 200" in wfsobs.load(tmp_path / "a.npz", rail=200.0, trust=True).origin
+    with pytest.raises(RecordError, match=r"rail = 100 is below every command; the largest is 250, in their unit$"):
+        wfsobs.load(tmp_path / "a.npz", rail=100.0)
 
 
 # ---------------------------------------------------------------------- what is refused
@@ -443,6 +451,6 @@ def test_what_is_missing_is_said_and_stays_missing(tmp_path: Path) -> None:
 
 def test_formats_that_are_only_read(tmp_path: Path) -> None:
     for ending in (".npy", ".sav"):
-        with pytest.raises(RecordError, match="files of its ending are read, not written"):
+        with pytest.raises(RecordError, match=r"its name ends in none of \.npz, ((?!\.npy|\.sav).)*\.pq$"):
             wfsobs.save(tmp_path / f"a{ending}", Record(Y, U, 1e-3))
     assert not [*tmp_path.iterdir()]

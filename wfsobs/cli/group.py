@@ -45,6 +45,24 @@ PACKAGES = {"arena": "wfsobs-arena"}
 """Commands that come with a package of this repository, and which."""
 
 
+class Text(click.types.StringParamType):
+    """Type of options that take a text which is not empty."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the text. Raises BadParameter."""
+        return super().convert(value or self.fail("takes a text that is not empty", param, ctx), param, ctx)
+
+
+def _without_empty(command: click.Command) -> click.Command:
+    """Return a command whose options refuse the empty text, unless it is their default."""
+    for one in command.params:
+        if one.type is click.STRING and one.default != "":
+            one.type = Text()
+    for inner in getattr(command, "commands", {}).values():
+        _without_empty(inner)
+    return command
+
+
 class Commands(click.Group):
     """Imports a command when it is called, and turns the errors a user can cause into one line and exit status 2."""
 
@@ -55,7 +73,8 @@ class Commands(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Return the command of this name."""
         if cmd_name in COMMANDS:
-            return getattr(import_module(f"wfsobs.cli.{COMMANDS[cmd_name][0]}"), cmd_name.replace("-", "_"))
+            module = import_module(f"wfsobs.cli.{COMMANDS[cmd_name][0]}")
+            return _without_empty(getattr(module, cmd_name.replace("-", "_")))
         if (point := _entries().get(cmd_name)) is not None:
             try:
                 return point.load()

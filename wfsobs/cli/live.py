@@ -42,6 +42,7 @@ from wfsobs.scenario import Scenario, configfile
 from wfsobs.settings.group import SettingError
 from wfsobs.streams.network import is_address
 from wfsobs.streams.shared_image import stream_path
+from wfsobs.telemetry.formats import WRITTEN
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.records import save_record
 from wfsobs.units import micrometres_per
@@ -96,9 +97,9 @@ def live(
     if replay_file and stream:
         raise SettingError("live: --replay and --in are two sources, take one")
     _check_options(replay_file, stream, ngs, headless)
-    for file in (record_file, log_file):
+    for file, endings in ((record_file, WRITTEN), (log_file, ())):
         if file:
-            check_writable(file, replay_file, *declaration.files)
+            check_writable(file, replay_file, *declaration.files, endings=endings)
     source = _source(scenario, replay_file, stream, modes, declaration, sha256)
     if not isinstance(source, SimulatedLoop):
         scenario = scenario.before_events

@@ -10,14 +10,16 @@ from math import erfc, isfinite, sqrt
 from typing import Any
 
 import click
+import numpy as np
 from click.core import ParameterSource
 
 from wfsobs.cli.show import print_note
 from wfsobs.closed_loop.envelope import Uncertainty
 from wfsobs.priors_from.telemetry import told_by, training_part
-from wfsobs.record import DELAY, Record
+from wfsobs.record import DELAY, Record, RecordError
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS
+from wfsobs.sensors.zernike import MODE_NAMES
 from wfsobs.settings.values import SettingError
 from wfsobs.streams.wiring import STUCK, NgsWiring
 from wfsobs.telemetry.command_response import saturation_lines
@@ -288,6 +290,12 @@ def load_with_delay(
         record, delay = read_with_delay(file, name, scenario, declaration)
     if record.origin:
         print_note(f"{record_file}: read as {record.origin}")
+    still = [name for name, y in zip(MODE_NAMES, record.y_lgs.T, strict=False) if np.fmax.reduce(y) == np.fmin.reduce(y)]
+    what = f"{record_file}: y_lgs of {' and '.join(still)} is one value all the time; a measurement has noise"
+    if len(still) == record.n_modes:
+        raise RecordError(what)
+    if still:
+        print_note(what)
     if record.missing:
         print_note(f"{record_file}: {record.missing} of {record.n_steps} frames are missing")
     expected = erfc(record.gate.level / sqrt(2.0)) * record.n_steps * record.n_modes if record.gate else 0.0

@@ -55,6 +55,7 @@ from wfsobs.priors_from.telemetry import trained_until, with_training
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.settings.values import SettingError
 from wfsobs.simulation.loop import simulate
+from wfsobs.telemetry.formats import WRITTEN
 from wfsobs.telemetry.formats.psd import load_psd
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.records import save_record
@@ -153,7 +154,7 @@ def run(
     if save and seeds > 1:
         raise SettingError("--save: saves one record; leave --seeds at 1")
     if save:
-        check_writable(save, vibration_psd)
+        check_writable(save, vibration_psd, endings=WRITTEN)
     if (budget or budget_of) and (seeds > 1 or over_time):
         raise SettingError("--budget: is of one record, without --over-time; leave --seeds at 1")
     if unknown := set(budget_of) - set(OBSERVERS):

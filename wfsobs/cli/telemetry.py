@@ -119,7 +119,7 @@ def observe(
 ) -> None:
     """Run the observers on a record of any format (by default preset paper)."""
     if out:
-        check_writable(out, record_file, train, *declaration.files)
+        check_writable(out, record_file, train, *declaration.files, endings=(".npz",))
     scenario = told_scenario(prior, scenario)
     record = load_declared(record_file, scenario, declaration, sha256)
     learnt = training(train, train_until, record, scenario, declaration)
@@ -297,7 +297,7 @@ def promise(
 def probe(scenario: Scenario, seconds: float, delay: float, gain: float, rotation: float, out: str | None, as_json: bool) -> None:
     """Design a probe: commands by which delay, gain and rotation of a loop are known better (by default preset paper)."""
     if out:
-        check_writable(out)
+        check_writable(out, endings=(".npz",))
     wanted = {"delay_frames": delay, "gain": gain, "rotation_deg": rotation}
     found = design_probe(scenario, seconds, wanted)
     if out:

@@ -166,7 +166,7 @@ def make_promise(
     Raises
     ------
     RecordError
-        The data do not decide delay, gain and rotation: a probe is needed (`wfsobs probe`). Or a mode of a radial order is lacking.
+        The data do not decide delay, gain and rotation: a probe is needed (`wfsobs probe`). Or a mode is lacking.
     SettingError
         A controller is unknown.
     """

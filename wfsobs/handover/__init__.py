@@ -35,7 +35,7 @@ from wfsobs.control.base import Controller, Settings
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.control.step import Integrators, KalmanLaws, LinearLaws, StepController
-from wfsobs.files import write_text, write_whole
+from wfsobs.files import check_writable, write_text, write_whole
 from wfsobs.observers.step import StepError
 from wfsobs.observers.stepping import Gain, GainCycle
 from wfsobs.prior import Prior
@@ -515,6 +515,8 @@ FORMATS = ("c99", "compass", "control", "mat", "npz", "specula")
 """What a design can be written as."""
 
 ARRAYS = {"compass": write_compass, "control": write_control, "mat": write_mat, "npz": write_npz, "specula": write_specula}
+ENDINGS = {"compass": ".npz", "control": ".py", "mat": ".mat", "npz": ".npz", "specula": ".fits"}
+"""Of the files that these write."""
 
 
 def write_design(name: str, scenario: Scenario, form: str, path: str | Path) -> None:
@@ -543,6 +545,8 @@ def write_design(name: str, scenario: Scenario, form: str, path: str | Path) -> 
     CONTROLLERS.check_ids([name])
     if form not in FORMATS:
         raise SettingError(f"--to {form}: takes one of {', '.join(FORMATS)}")
+    if form != "c99":
+        check_writable(path, endings=(ENDINGS[form],))
     controller, sampling, plant = CONTROLLERS[name], sampling_of(scenario), plant_of(scenario)
     groups = own_settings(controller, scenario)
     prior = prior_in(name, scenario, controller.parts(groups), scenario, sampling, None)

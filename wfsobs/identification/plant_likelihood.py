@@ -427,7 +427,7 @@ def guess_plant(data: PlantLikelihood) -> tuple[Array, float, Array]:
     for delay in range(1, LONGEST + 1):
         seen = R @ rough(np.concatenate([np.zeros((delay - 1, k, k)), g[: SPAN - delay + 1]]))
         product, power = float(np.sum(rough(h[1:]) * seen)), float(np.sum(seen**2))
-        if product > 0:
+        if product > 0 and power > 0:
             best = max(best, (product**2 / power, product / power))
     explained = best[0] > 0.5 * np.sum(rough(h[1:]) ** 2)
     gain = best[1] if explained and not FAR < best[1] < 1.0 / FAR else 1.0

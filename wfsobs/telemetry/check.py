@@ -175,7 +175,8 @@ def _plant(record: Record, reading: Reading) -> tuple[tuple[GroupPlant, ...], li
     found = [Remark("commands", "excluded", reading.contradiction)] if reading.contradiction else []
     found += [Remark("mirror", "note", line) for line in reading.limits]
     if not record.u.any():
-        return (), [*found, Remark("commands", "ok", "none: the mirror is at rest")]
+        what = "not used, as stated" if "u not used" in record.origin else "none"
+        return (), [*found, Remark("commands", "ok", f"{what}: the mirror is at rest")]
     if reading.limits:
         return (), [*found, Remark(PLANT, "undecided", "not looked at while commands are beyond what the mirror follows")]
     try:

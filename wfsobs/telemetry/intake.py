@@ -113,6 +113,7 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
     if declaration.command_modes and parse_unit(contents.units.get("u", "um")) is None:  # of actuators
         del contents.units["u"]
     if declaration.open_loop:
+        modes.append("open loop, u not used" if "u" in signals and signals["u"].any() else "open loop")
         signals["u"] = np.zeros_like(signals["y_lgs"])
         contents.units.pop("u", None)
     n, n_modes = signals["y_lgs"].shape
@@ -349,9 +350,12 @@ WHOLE = 1e-6
 
 def _limit(signals: dict[str, Array], declaration: DeclaredFormat) -> list[str]:
     """Limit the commands, in their own unit, to what the mirror follows; return in a few words what was done."""
-    said = ["open loop"] * declaration.open_loop
+    said = list[str]()
     if declaration.rail is not None:
         beyond = np.abs(signals["u"]) > declaration.rail
+        if beyond.all():
+            most = np.abs(signals["u"]).max()
+            raise RecordError(f"rail = {declaration.rail:g} is below every command; the largest is {most:.4g}, in their unit")
         for name in {"u", "training_u"} & signals.keys():
             signals[name] = np.clip(signals[name], -declaration.rail, declaration.rail)
         said.append(f"{beyond.any(axis=1).sum()} commands beyond the rail of {declaration.rail:g}")
@@ -364,8 +368,8 @@ def _apply_mirror(signals: dict[str, Array], delay: float, declaration: Declared
     With the part p of a step that is (1 - p) u[k] + p u[k-1], times the gain; what was before the record is taken as its first.
     """
     part, gain = delay - int(delay + WHOLE), np.array(declaration.command_gain or (1.0,))
-    if gain.size not in (1, signals["y_lgs"].shape[1]) or not (np.isfinite(gain) & (gain > 0)).all():
-        raise RecordError(f"a command gain takes a number above 0, or {signals['y_lgs'].shape[1]}, one per mode")
+    if gain.size not in (1, signals["y_lgs"].shape[1]) or not ((gain >= 1e-3) & (gain <= 1e3)).all():
+        raise RecordError(f"a command gain takes a number from 0.001 to 1000, or {signals['y_lgs'].shape[1]}, one per mode")
     for name in {"u", "training_u"} & signals.keys():
         u = signals[name]
         signals[name] = gain * (u if part < WHOLE else (1.0 - part) * u + part * np.concatenate([u[:1], u[:-1]]))

@@ -370,7 +370,7 @@ def export(
         `watch` asks to stop.
     """
     chosen, observers = scenarios(scenario, vary), name_list(observers)
-    check_writable(path)
+    check_writable(path, endings=(".html", ".htm"))
     kept = []
     for i, one in enumerate(chosen):
         of = []

@@ -51,6 +51,10 @@ FORMATS = (
 )
 
 
+WRITTEN = tuple(ending for fmt in FORMATS if fmt.write for ending in fmt.endings)
+"""Endings of formats that are not only read."""
+
+
 def format_of(name: str) -> Format:
     """Return the format of a file name, by its ending. Raises RecordError."""
     for fmt in FORMATS:
@@ -70,6 +74,7 @@ def from_gzip(file: IO[bytes], most: int) -> IO[bytes]:
 
 def writer_of(name: str) -> Callable[[IO[bytes], Mapping[str, Array]], None]:
     """Return what writes the format of a file name. Raises RecordError, also of formats that are only read."""
-    if (write := format_of(name).write) is None:
-        raise RecordError("files of its ending are read, not written")
-    return write
+    for fmt in FORMATS:
+        if fmt.write and name.lower().endswith(fmt.endings):
+            return fmt.write
+    raise RecordError(f"its name ends in none of {', '.join(WRITTEN)}")
