@@ -25,6 +25,7 @@ from wfsobs.campaign.compare import compare
 from wfsobs.campaign.follow import CampaignFolder
 from wfsobs.campaign.plan import Campaign, parse_plan
 from wfsobs.campaign.run import run_rows
+from wfsobs.campaign.store import PLAN as PLAN_FILE
 from wfsobs.campaign.store import batch_files, open_folder, read_results, write_batch
 from wfsobs.cli import main
 from wfsobs.scenario import Scenario
@@ -192,6 +193,14 @@ def test_observers_without_errors_are_listed(dashboard: Dashboard, loop: Any, pl
     assert cells_of(page, "persistence")["Failed"] == "2" and "Without errors" not in page.table.html
     page.filters["turbulence.wind_speed"].value = "20"
     assert "<p>Without errors: Persistence; <code>wfsobs campaign table</code> says why.</p>" in page.table.html
+
+
+def test_a_folder_that_is_gone_is_named_without_where_it_was(dashboard: Dashboard, loop: Any, tmp_path: Path) -> None:
+    page = open_campaign(dashboard, loop)
+    (tmp_path / PLAN_FILE).unlink()
+    page.tick()
+    loop.until(lambda: page.failure.html)
+    assert f">{tmp_path.name}/{PLAN_FILE}: cannot be read: " in page.failure.html
 
 
 def test_a_reload_returns_to_the_fields(dashboard: Dashboard, loop: Any) -> None:

@@ -48,7 +48,7 @@ def test_a_page_that_cannot_be_assembled(monkeypatch: pytest.MonkeyPatch, loop: 
 def test_a_failing_run_shows_inline(loop: Any, short: Scenario, enter: Any) -> None:
     def work(scenario: Scenario, *how: Any) -> RunResults:
         if scenario.loop.gain == 0.1:
-            raise RuntimeError("no such luck")
+            raise RuntimeError("no *such* <luck>")
         return compute(scenario, *how)
 
     dashboard = Dashboard(loop.queue.put, enter(work), short)
@@ -59,7 +59,7 @@ def test_a_failing_run_shows_inline(loop: Any, short: Scenario, enter: Any) -> N
     table = dashboard.explore.table.pane.html
     dashboard.store.change("loop.gain", 0.1)
     loop.finish(dashboard.store)
-    assert dashboard.alert.visible and "no such luck" in dashboard.alert.object
+    assert dashboard.alert.visible and "<p>RuntimeError: no *such* &lt;luck&gt;</p>" == dashboard.alert.object
     assert dashboard.stale.visible and faded(dashboard)
     assert dashboard.explore.table.pane.html == table, "the last result stands"
     dashboard.store.change("loop.gain", 0.2)

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import wfsobs
-from wfsobs.app.share import LONGEST, changes, from_file, from_query, to_command, to_file, to_python, to_query
+from wfsobs.app.share import LONGEST, MOST, changes, from_file, from_query, to_command, to_file, to_python, to_query
 from wfsobs.cli import main
 from wfsobs.identification import identify
 from wfsobs.scenario import Scenario
@@ -193,6 +193,16 @@ def test_what_cannot_be_used_changes_nothing_and_has_one_line(query: str) -> Non
     assert link.scenario == PRESETS["paper"]() and link.preset == "paper"
     assert len(link.errors) == 1
     assert "\n" not in link.errors[0] and len(link.errors[0]) <= 200
+
+
+def test_what_is_dropped_of_a_link_is_said() -> None:
+    twice = from_query("?run.duration=3&run.duration=2&theme=dark&theme=light")
+    assert twice.scenario.run.duration == 2.0
+    assert twice.errors == ("run.duration = 2: given more than once, the last counts",)
+    (line,) = from_query("?simulation&simulation.run.duration=nan").errors
+    assert line.startswith("simulation.run.duration = nan: ")
+    link = from_query("&".join([f"x{i}=0" for i in range(MOST)] + ["run.duration=2"]))
+    assert link.errors[0] == f"The link has {MOST + 1} fields: the first {MOST} are read."
 
 
 def test_fields_that_only_go_together_in_any_order_beside_one_that_never_does() -> None:

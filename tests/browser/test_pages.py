@@ -117,6 +117,12 @@ PAINTED = """name => [...Bokeh.index.query((it) => it.model.type === "Figure" &&
 """Whether a figure stands, so that it hears of the pointer."""
 
 
+RENAMED = """() => {
+    const all = Bokeh.documents.flatMap((it) => [...it.all_models]).filter((it) => it.data?.labels)
+    for (const {data} of all) data.labels = {...data.labels, "kf-lgs": "<i>LGS & KF"}
+}"""
+
+
 def test_values_at_the_pointer_and_by_the_arrow_keys(wide: Page) -> None:
     page = wide
     box = page.locator(".values")
@@ -128,8 +134,10 @@ def test_values_at_the_pointer_and_by_the_arrow_keys(wide: Page) -> None:
     expect(box).not_to_contain_text("Adaptive KF")  # hidden
     page.mouse.move(at["x"] + at["width"] / 2, at["y"] - 60)
     expect(box).to_be_hidden()
+    page.evaluate(RENAMED)
     page.mouse.move(at["x"] + at["width"] / 2, at["y"] + at["height"] / 2)
     expect(box).to_be_visible()
+    expect(box).to_contain_text("<i>LGS & KF")
     page.mouse.wheel(0, 3000)  # away from the figure
     expect(box).to_be_hidden()
     expect(figure).not_to_be_in_viewport()  # the page scrolls a while after the wheel has been heard

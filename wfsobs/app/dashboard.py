@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from html import escape
 from typing import Any, Final
 from uuid import uuid4
 
@@ -258,7 +259,7 @@ class Dashboard:
     def _refresh(self, *_: object) -> None:
         run = self.store.run
         failed = run.state == FAILED
-        self.alert.param.update(object=name_settings(run.message), visible=failed)
+        self.alert.param.update(object=f"<p>{escape(name_settings(run.message))}</p>", visible=failed)  # else Markdown
         texts = [STALE] if self.store.stale else []
         if self.store.waiting:
             texts.append(f"{waiting_text(self.store.waiting)}.")

@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from inspect import signature
-from math import inf
+from math import inf, isfinite
 from types import UnionType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -400,6 +400,11 @@ def _entry(values: Any, records: _Records) -> HistoryEntry:
         raise SessionError(DAMAGED)
     lost = bool(record) and source is None
     scores = [read_as(Score, score) for score in listed]
+    if not isfinite(plain["time"]):
+        raise SessionError(f"time = {plain['time']:g}: takes a finite number")
+    for rms in (score.rms for score in scores):
+        if not 0.0 <= rms < inf:
+            raise SessionError(f"rms = {rms:g}: takes a finite number from 0")
     plain |= {
         "key": get_text(values, "key", 64) if lost else run_key(scenario, source),
         "name": " ".join(plain["name"][:LONGEST_NAME].split()) or "no name",

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -183,9 +184,12 @@ def from_query(query: str, check: Check = Scenario.validate) -> Link:
             (f"The link has {len(query)} characters, at most {LONGEST} are allowed: the link is ignored.",),
         )
     pairs = parse_qsl(query.removeprefix("?").replace("+", "%2B"), keep_blank_values=True)
-    fields = {key: text for key, text in pairs[:MOST] if not key.startswith(PASSED_OVER)}
+    own = [pair for pair in pairs if not pair[0].startswith(PASSED_OVER)]
+    rejected = [f"The link has {len(own)} fields: the first {MOST} are read."] if len(own) > MOST else []
+    fields = dict(own[:MOST])
+    times = Counter(key for key, _ in own[:MOST])
+    rejected += [_line(key, text, "given more than once, the last counts") for key, text in fields.items() if times[key] > 1]
     name = fields.pop("preset", FIRST_PRESET)
-    rejected = []
     if name not in PRESETS:
         rejected.append(_line("preset", name, f"takes one of {', '.join(PRESETS)}"))
         name = FIRST_PRESET
@@ -195,6 +199,7 @@ def from_query(query: str, check: Check = Scenario.validate) -> Link:
     simulation, more = _apply(PRESETS[name](), of_simulation, check) if kept else (None, [])
     record, why = read_record_fields(named) if named else (None, {})
     unread = [_line(key, named.get(key, ""), reason) for key, reason in why.items()]
+    more = [f"{KEPT}.{line}" for line in more]
     return Link(scenario, name, (*rejected, *refused, *more, *unread), simulation, record)
 
 

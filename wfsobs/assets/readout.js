@@ -90,5 +90,6 @@ function named(axis) {
 function rowOf(label, value, unit, colour = "transparent") {
   const size = Math.abs(value), isCommon = size === 0 || (size >= 1e-3 && size < 1e5)
   const number = (isCommon ? `${Number(value.toPrecision(4))}` : value.toExponential(2)).replace("-", "−")
-  return `<div><i style="background: ${colour}"></i><span>${label}</span><b>${number} ${unit}</b></div>`
+  const text = label.replaceAll("&", "&amp;").replaceAll("<", "&lt;") // a package may have any
+  return `<div><i style="background: ${colour}"></i><span>${text}</span><b>${number} ${unit}</b></div>`
 }

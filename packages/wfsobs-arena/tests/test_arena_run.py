@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from wfsobs_arena.tracks import TRACKS
 from wfsobs_arena.trials import try_record
 
 from wfsobs.cli import main
+from wfsobs.observers import OBSERVERS
 from wfsobs.prior import Prior
 from wfsobs.record import Record
 from wfsobs.settings.values import SettingError
@@ -64,6 +66,19 @@ def test_an_entry_runs_once_and_stands_on_the_page(arena: Arena, tmp_path: Path,
     page = (tmp_path / "index.html").read_text()
     assert "Persistence" in page and f"{row['score']:.3f}" in page
     assert "http" not in page  # self-contained
+    of_trials, of_checks = (next(tmp_path.glob(f"results/persistence/{name}*.json")) for name in ("turbulence", "check"))
+    known = json.loads(of_trials.read_text())
+    for path, damage in (
+        (of_trials, {"trials": None}),
+        (of_trials, {"trials": [known["trials"][0] | {"extra": 1}]}),
+        (of_trials, {"trials": [known["trials"][0] | {"squares": [None]}]}),
+        (of_checks, {"refusal": None}),
+    ):
+        whole = path.read_text()
+        path.write_text(json.dumps(json.loads(whole) | damage))
+        with pytest.raises(AssertionError, match="runs again"):
+            run_arena(arena, entries, tmp_path)
+        path.write_text(whole)
 
 
 def test_tables_of_other_tracks_stay(arena: Arena, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,8 +98,10 @@ def test_tables_of_other_tracks_stay(arena: Arena, tmp_path: Path, monkeypatch: 
     both = page("events", "second events")
     assert both.index("the turbulence") < both.index("second events") and "first events" not in both
     assert "the turbulence" not in page("events", "other events", quick.version + 1)
-    (tmp_path / "results.json").write_text("[]")
-    assert "the turbulence" in page("turbulence", "the turbulence")
+    whole = json.loads((tmp_path / "results.json").read_text())
+    for damaged in ([], whole | {"tracks": None}):
+        (tmp_path / "results.json").write_text(json.dumps(damaged))
+        assert "the turbulence" in page("turbulence", "the turbulence")
 
 
 @pytest.mark.parametrize(
@@ -169,6 +186,13 @@ def test_what_an_entry_is_told() -> None:
 def test_an_entry_that_is_none(name: str) -> None:
     with pytest.raises(SettingError, match="--entry"):
         find_entries([name])
+
+
+def test_an_id_that_is_no_name_of_a_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    place = "wfsobs_arena.challengers:ELSEWHERE"
+    monkeypatch.setattr("wfsobs_arena.challengers.ELSEWHERE", replace(OBSERVERS["zero"], id="../../x"), raising=False)
+    with pytest.raises(SettingError, match=rf"^--entry {place}: the id '\.\./\.\./x' takes lower-case letters"):
+        find_entries([place])
 
 
 def test_the_reference_of_thirty_taps_is_least_squares() -> None:

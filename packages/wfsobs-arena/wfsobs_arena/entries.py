@@ -14,6 +14,7 @@ from typing import Any
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
+from wfsobs.registry import ID
 from wfsobs.settings.values import SettingError, error_line
 from wfsobs_arena.challengers import CHALLENGERS
 from wfsobs_arena.identity import code_version
@@ -112,6 +113,8 @@ def _from_module(name: str) -> Any:
     kinds = (OBSERVERS.kind, CONTROLLERS.kind)
     if not isinstance(algorithm, kinds):
         raise SettingError(f"--entry {name}: takes an Observer or a Controller, not a {type(algorithm).__name__}")
+    if not ID.fullmatch(str(algorithm.id)):  # it names a folder
+        raise SettingError(f"--entry {name}: the id {algorithm.id!r} takes lower-case letters, digits and hyphens between them")
     return algorithm
 
 

@@ -138,9 +138,12 @@ def _add_known(values: Table, path: Path) -> Table:
         return values
     if not isinstance(known, dict) or any(known.get(name) != values[name] for name in ("version", "digest", "physics", "wfsobs")):
         return values
-    by_track = {table["id"]: table for table in (*known["tracks"], *values["tracks"])}
     ranked = {row["entry"] for table in values["tracks"] for row in table["rows"]}
-    refused = {one["entry"]: one for one in (*known["refused"], *values["refused"]) if one["entry"] not in ranked}
+    try:
+        by_track = {table["id"]: table for table in (*known["tracks"], *values["tracks"])}
+        refused = {one["entry"]: one for one in (*known["refused"], *values["refused"]) if one["entry"] not in ranked}
+    except (KeyError, TypeError):
+        return values
     return values | {"tracks": [by_track[name] for name in TRACKS if name in by_track], "refused": list(refused.values())}
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from itertools import chain
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -133,7 +135,7 @@ def _refusal(arena: Arena, entry: ArenaEntry, folder: Path, process: EntryProces
     """Return why an entry is refused by the checks, empty where it is not; checked once."""
     path, key = folder / "check.json", [arena.version, CHECKS, entry.version]
     known = _load_file(path, key)
-    if known is None:
+    if known is None or not isinstance(known.get("refusal"), str):
         try:
             process.check(arena.rules.seconds(QUICK["run.duration"]))
             known = {"key": key, "refusal": ""}
@@ -153,8 +155,13 @@ def _load_file(path: Path, key: list[Any]) -> dict[str, Any] | None:
 
 
 def _read(path: Path, key: list[Any]) -> dict[int, Trial]:
-    values = _load_file(path, key)
-    return {} if values is None else {one["seed"]: Trial(**one) for one in values["trials"]}
+    """Return the results in a file of this key by seed, none where it holds anything else."""
+    try:
+        trials = [Trial(**one) for one in (_load_file(path, key) or {"trials": ()})["trials"]]
+        is_whole = all(map(isfinite, chain.from_iterable((*t.squares, *t.reference) for t in trials)))
+    except (KeyError, TypeError):
+        return {}
+    return {trial.seed: trial for trial in trials} if is_whole else {}
 
 
 def _write(path: Path, values: dict[str, Any]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -257,8 +258,9 @@ class CampaignPage(Page):
             self._explore()
 
     def _take(self, *_: object) -> None:
-        if self.work.state == FAILED:
-            self._refuse(line_of(SettingError(self.work.message)))
+        if self.work.state == FAILED and self.folder is not None:
+            elsewhere = f"{self.folder.folder.parent}{os.sep}"  # no business of a visitor
+            self._refuse(line_of(SettingError(self.work.message.replace(elsewhere, ""))))
         state = self.state
         if state is not None:
             self._make(state)
