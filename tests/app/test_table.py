@@ -54,6 +54,19 @@ def test_what_has_no_error_says_its_own_reason(make_store: Any, loop: Any) -> No
     assert card["note"] == "left out" and "it is not here" in card["about"]
 
 
+def test_before_a_run_there_is_a_row_for_what_will_run(make_store: Any, loop: Any) -> None:
+    store: Store = make_store()
+    table = Table(Display(), OneSeed(store))
+
+    def rows() -> list[str]:
+        return re.findall('data-observer="([^"]+)"', table.html())
+
+    before = rows()
+    store.start()
+    loop.finish(store)
+    assert sorted(before) == sorted(rows())
+
+
 def test_every_dash_has_a_reason_and_no_number_an_exponent(make_store: Any, loop: Any) -> None:
     store: Store = make_store()
     table = Table(Display(), OneSeed(store))

@@ -26,6 +26,7 @@ from wfsobs.evaluation.scores import Score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.pipeline import observe
+from wfsobs.priors_from.scenario import usual_observers
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
@@ -86,6 +87,12 @@ class SeedRuns(param.Parameterized):
         store.param.watch(self._follow, "stale")
         self.task.param.watch(self._take, "result")
         self.param.watch(self._go_on, "count")
+
+    @property
+    def usual(self) -> list[str]:
+        """Ids of the observers that run where none is named: on the record shown, or on one of the settings."""
+        shown = self.run.result
+        return usual_observers(shown.scenario, shown.result.record) if shown else usual_observers(self.store.scenario)
 
     @property
     def n_known(self) -> int:

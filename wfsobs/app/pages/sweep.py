@@ -265,7 +265,7 @@ class SweepPage(Page):
             AxisFields(store, ("and over", "Values of the second"), several, *FIRST[1]),
         )
         self.seeds: Final = number_field("Seeds of each", SEEDS, 120)
-        self.observers: Final = make_select("Observers", OBSERVERS_OF, QUICK, 350)
+        self.observers: Final = make_select("Observers", OBSERVERS_OF, QUICK, 340)
         first, second = self.axes
         linked = {"over": first.select, "values": first.values, "second": second.select, "second_values": second.values}
         linked |= {"seeds": self.seeds, "observers": self.observers}

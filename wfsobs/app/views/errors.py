@@ -48,10 +48,8 @@ from wfsobs.evaluation.result import (
 from wfsobs.evaluation.result import Row as ScoreRow
 from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS, LOOP, OF_STAR, PREDICTION, RESIDUAL, SCORED, Score
 from wfsobs.evaluation.verdict import verdict
-from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.prior import TRUE, PriorSource
-from wfsobs.priors_from.scenario import is_usual, usual_observers
 
 REFERENCES = ("kf-lgs", "gpr-online")
 """The two that the paper compares: always shown."""
@@ -306,7 +304,9 @@ class Table:
         self.display = display
         self.seeds: Final = seeds
         switches = ["mode", "unit", "dark", "compared_runs"]
-        self.pane: Final = follow_html(self.html, (self.run, ["result", "state"]), (seeds, "evidence"), (display, switches))
+        self.pane: Final = follow_html(
+            self.html, (self.run, ["result", "state"]), (seeds, "evidence"), (display, switches), (seeds.store, "waiting")
+        )
 
     def html(self) -> str:
         """Write the table."""
@@ -334,9 +334,9 @@ class Table:
         """List the rows of a target under its title; those whose errors are not known yet too."""
         shown, display, seeds = self.run.result, self.display, self.seeds
         rows: dict[str, ScoreRow | None] = {}
-        for name in (*observers_of(target, with_zero=True), *COMMON_BOUNDS) if target in SCORED else ():
-            if not shown or name in BOUNDS or is_usual(OBSERVERS[name], shown.scenario, shown.result.record):
-                rows[name] = None
+        if target in SCORED:
+            usual = seeds.usual
+            rows = dict.fromkeys([*(name for name in observers_of(target, with_zero=True) if name in usual), *COMMON_BOUNDS])
         scores = {s.observer: s for s in shown.result.scores if (s.target, s.mode) == (target, display.mode)} if shown else {}
         for name, score in scores.items():
             (rows[name],) = score_rows([seeds.over_seeds(score)], None)
@@ -464,7 +464,12 @@ class Strip:
         lines.choices[target].tie(self.cards)
         self._refresh()
         watch(self._follow, (run, ["result", "state"]), (seeds, "evidence"))
-        watch(self._refresh, (budgets, "by_observer"), (display, ["mode", "unit", "dark", "compared_runs"]))
+        watch(
+            self._refresh,
+            (budgets, "by_observer"),
+            (seeds.store, "waiting"),
+            (display, ["mode", "unit", "dark", "compared_runs"]),
+        )
 
     def _follow(self, *_: object) -> None:
         """Keep what was shown before, so that the change from there can be shown."""
@@ -493,8 +498,8 @@ class Strip:
     def items(self) -> list[dict[str, Any]]:
         """Describe the cards."""
         shown = self.run.result
-        runs = usual_observers(shown.scenario, shown.result.record) if shown else observers_of(self.target)
-        names = [name for name in observers_of(self.target) if name in runs]
+        usual = self.seeds.usual
+        names = [name for name in observers_of(self.target) if name in usual]
         main = (TRUTH, *(self.lines.names(self.target) if shown and shown.result.scores else REFERENCES))
         if shown is None:
             cards = [self._card(TRUTH, ""), *map(self._card_without, names)]
