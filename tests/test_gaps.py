@@ -15,7 +15,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.missing import fill_missing
 from wfsobs.prior import Lines, Model, Prior
-from wfsobs.priors_from.scenario import measurement_noise, prior_of
+from wfsobs.priors_from.scenario import arguments, measurement_noise, prior_of
 from wfsobs.record import Record, hold_last, pseudo_open_loop
 from wfsobs.scenario import Scenario
 from wfsobs.signal.gains import steady_state
@@ -151,6 +151,20 @@ def test_every_observer_runs_on_a_record_with_gaps_nearly_as_well() -> None:
     for a, b in zip(full.scores, gaps.scores, strict=True):
         assert (a.observer, a.target, a.mode) == (b.observer, b.target, b.mode)
         assert 0.8 * a.rms <= b.rms <= 1.5 * a.rms + 1e-12, a.observer
+
+
+def test_no_deviation_is_stated_where_a_measurement_was_filled() -> None:
+    """Over a record and frame by frame; in other steps it is."""
+    s, observer = scenario().replace({"turbulence.source": "frozen-flow"}), OBSERVERS["kf-coupled"]
+    record = gappy(simulate(s))
+    measurements, prior, settings = arguments(observer, replace(record, u=hold_last(record.u)), s)
+    found, design = observer.estimate(measurements, prior, settings), observer.design(prior, settings, measurements.sampling)
+    for k, (z, u) in enumerate(zip(measurements.z, measurements.u, strict=True)):
+        design.update(z, u=u)
+        for target in observer.targets:
+            stated = found.sd[target][k]
+            np.testing.assert_array_equal(np.isnan(stated), np.isnan(record.y_lgs[k]))
+            np.testing.assert_array_equal(np.isnan(design.predict(0.0, target)[1]), np.isnan(stated))
 
 
 def test_filled_samples_count_in_no_prediction_score() -> None:

@@ -17,7 +17,7 @@ from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.coupled import flow_model
 from wfsobs.observers.kalman.joint import INDEPENDENT, AsterismModel, coupled_model
 from wfsobs.pipeline import observe, run
-from wfsobs.prior import Flow, FlowOfBoth, Lines
+from wfsobs.prior import Flow, FlowOfBoth, LgsStars, Lines
 from wfsobs.priors_from.scenario import arguments, prior_of, usual_observers
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import simulate
@@ -29,7 +29,9 @@ LONG = SHAKEN.replace({"telescope.radial_order": 1, "run.duration": 160.0})
 
 
 def model_of(scenario: Scenario) -> AsterismModel:
-    return coupled_model(prior_of(scenario, None, (Lines, FlowOfBoth)), scenario.multipeak, scenario.sensors.exposure_ratio)
+    return coupled_model(
+        prior_of(scenario, None, (Lines, FlowOfBoth, LgsStars)), scenario.multipeak, scenario.sensors.exposure_ratio
+    )
 
 
 def test_the_bound_is_that_of_dense_algebra() -> None:
@@ -91,6 +93,32 @@ def test_a_gain_of_the_lgs_for_the_vibration_is_known() -> None:
     missed = (found["turbulence"] + found["vibration"])[1000:-1] - record.z[1001:]
     stated = np.sqrt(np.mean(found.sd["next z"][1000:-1] ** 2, axis=0))
     np.testing.assert_allclose(np.sqrt(np.mean(missed**2, axis=0)), stated, rtol=0.05)
+
+
+def test_with_two_lgs_of_four_it_is_as_sure_as_with_two() -> None:
+    """States are those of filters for four; with all four it is 2 to 11 % surer."""
+    of_four, of_two = (model_of(SHAKEN.replace({"sensors.lgs_count": count})) for count in (4, 2))
+    fewer = of_four.late(0, 2)
+    for target in TARGETS:
+        for frames in (0.0, 1.5):
+            np.testing.assert_allclose(fewer.plan(frames, target)[1], of_two.plan(frames, target)[1], rtol=5e-3)
+    np.testing.assert_allclose(fewer.next_z_sd((True,)), of_two.next_z_sd((True,)), rtol=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["kf-coupled", "multirate-coupled"])
+def test_with_two_lgs_of_four_errors_are_as_stated(name: str) -> None:
+    """From a second after they went out; steps are the run."""
+    out = [{"kind": "laser", "start": 20.0, "duration": 140.0, "lasers": 2}]
+    scenario = LONG.replace({"sensors.lgs_count": 4, "events": out})
+    record, at = simulate(scenario), slice(round(21.0 / scenario.dt), -1)
+    given = arguments(OBSERVERS[name], record, scenario)
+    found = OBSERVERS[name].estimate(*given)
+    for target in TARGETS:
+        error = np.mean((found[target] - record.truth(target))[at] ** 2, axis=0)
+        np.testing.assert_allclose(error, np.mean(found.sd[target][at] ** 2, axis=0), rtol=0.1)
+    short = scenario.replace({"run.duration": 2.0, "events": [out[0] | {"start": 1.0, "duration": 0.5}]})
+    assert step_difference(OBSERVERS[name], *arguments(OBSERVERS[name], simulate(short), short)) <= 1e-12
 
 
 @pytest.mark.slow

@@ -214,7 +214,8 @@ class Observer:
         Returns
         -------
         Estimates
-            Target -> estimate, (n_steps, n_modes) [um]; NaN where there is none. With `sd`, their standard deviations.
+            Target -> estimate, (n_steps, n_modes) [um]; NaN where there is none. With `sd`, their standard deviations; NaN where
+            a measurement has been filled.
 
         Raises
         ------
@@ -228,7 +229,10 @@ class Observer:
         else:
             given = fill_missing(measurements, prior, getattr(settings, "line_width", LINE_WIDTH))
         found = self.run(given, prior, settings, watch) if self.run else run_design(self, given, prior, settings, watch)
-        return check_estimates(found, self.targets, measurements.y_lgs.shape)
+        out = check_estimates(found, self.targets, measurements.y_lgs.shape)
+        if not self.takes_missing and (filled := np.isnan(measurements.y_lgs)).any():
+            out.sd = {of: np.where(filled, np.nan, sd) for of, sd in out.sd.items()}
+        return out
 
     def design(
         self,

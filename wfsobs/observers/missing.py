@@ -3,7 +3,8 @@
 A lost measurement z[k] is replaced by what the Kalman filter of the own prior predicts for it, a lost NGS frame by what the NGS
 filter predicts. Who is told no model holds the last value. A lost command is held, as a mirror holds its position. The Kalman
 filters and the Gaussian processes in time take a measurement that is missing as missing (`wfsobs.signal.gains`).
-Only samples before a gap fill it, so estimates stay causal, and what has been filled in counts in no score.
+Only samples before a gap fill it, so estimates stay causal. What has been filled in counts in no score of predicting
+measurements, and no standard deviation is stated there.
 """
 
 from __future__ import annotations
@@ -79,10 +80,11 @@ def predict_missing(z: Array, predictors: Sequence[Predictor]) -> Array:
 class Bridge(StateArrays):
     """`predict_missing`, one frame at a time.
 
-    gains : of the filters that predict, by mode; other modes hold their last value
+    gains      : of the filters that predict, by mode; other modes hold their last value
+    is_missing : which modes of the last measurement were not there
     """
 
-    state_names: tuple[str, ...] = ("_last", "_bank")
+    state_names: tuple[str, ...] = ("_last", "_bank", "is_missing")
 
     def __init__(self, n_modes: int, predictors: Sequence[Predictor] = ()):
         found = [(mode, gains) for mode, one in enumerate(predictors) if (gains := _gains(one)) is not None]
@@ -90,14 +92,15 @@ class Bridge(StateArrays):
         self._modes = np.array([mode for mode, _ in found], dtype=int)
         self._bank = FilterBank([gains.estimator() for _, gains in found]) if found else None
         self._rows = expected_rows([gains for _, gains in found])
-        self._last = np.zeros(n_modes)
+        self._last, self.is_missing = np.zeros(n_modes), np.zeros(n_modes, dtype=bool)
         self._all_modes = len(found) == n_modes
         self.mark_start()
 
     def complete(self, z: Array, is_whole: bool = False) -> Array:
         """Return z (n_modes,) [um] with its NaN replaced; z itself where it is known to have none."""
+        self.is_missing[...] = not is_whole and np.isnan(z)
         if not is_whole:
-            z = np.where(np.isnan(z), self._expectation(), z)
+            z = np.where(self.is_missing, self._expectation(), z)
         if self._bank is None:
             self._last[...] = z
         elif self._all_modes:
@@ -116,7 +119,7 @@ class Bridge(StateArrays):
 
     def take_over(self, old: Bridge) -> None:
         """Go on from the state of another one, as far as it is of the same kind."""
-        self._last[...] = old._last
+        self._last[...], self.is_missing[...] = old._last, old.is_missing
         if self._bank is not None and old._bank is not None and self._bank.x.shape == old._bank.x.shape:
             self._bank.load(old._bank.save())
 

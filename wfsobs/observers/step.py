@@ -353,7 +353,7 @@ class StepObserver(StepBase):
         -------
         mean, sd : Array
             Prediction, and its standard deviation by the observer's own model once that is in its steady state, each
-            (n_modes,) [um]. NaN where there is none.
+            (n_modes,) [um]. NaN where there is none; no deviation where the last measurement was filled.
 
         Raises
         ------
@@ -366,6 +366,8 @@ class StepObserver(StepBase):
             check_request(self.id, frames, target, self.targets, self.estimator.horizon)
             self._allowed_requests.add((frames, target))
         mean, sd = self.estimator.predict(frames, target) if self.frame else (self._nothing, self._nothing)
+        if self._lgs is not None and self._lgs.is_missing.any():
+            sd = np.where(self._lgs.is_missing, np.nan, sd)
         if out is None:
             return mean.copy(), sd.copy()
         out[0][...], out[1][...] = mean, sd

@@ -30,7 +30,8 @@ LOWEST = 1e-3
 """Frequency below which spectra are flat, over that of the wind across the outer scale."""
 
 RIPPLES = 24
-"""Spectra have ripples of width speed / diameter; up to this many they are resolved, beyond only their mean."""
+"""Spectra have ripples of width speed / diameter, and up to this many are exact to 0.1 %. Beyond, 30 Hz for 10 m/s on 8 m, they
+go through single samples: a factor of 1.5 to 2 off at a frequency, up to 35 % in the mean over an octave (tip and tilt)."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ import numpy as np
 from wfsobs.observers.base import TARGETS, Look, Observer
 from wfsobs.observers.kalman.joint import MEANS, AsterismModel, JointEstimator
 from wfsobs.observers.kalman.single import PEAKS, TUNABLE_PEAKS, MultiPeak, vibration_used
-from wfsobs.prior import Flow, Lines, Prior
+from wfsobs.prior import Flow, LgsStars, Lines, Prior
 from wfsobs.record import Sampling
 from wfsobs.signal.joint_states import StateFilter
 
@@ -45,7 +45,7 @@ KF_COUPLED = Observer(
     "Coupled KF",
     TARGETS,
     help="Kalman filter on the LGS of all modes together, for frozen flow; not in the paper",
-    prior=(Lines, Flow),
+    prior=(Lines, Flow, LgsStars),
     settings=PEAKS,
     linear=True,
     couples_modes=True,

@@ -11,9 +11,10 @@ LGS that see the same, and where a record or a loop has them together alone. Whe
 nothing to couple, and the observer refuses. A measurement of which a mode is missing is none, and so is an NGS frame.
 
 The weights are those of the LGS that are there, of the NGS alone where none is, and what is stated of the errors is by them. They
-are made when a set of LGS first occurs. The states of one that is out go on with the measurements that the others predict for it,
-so that it can come back at any time. One of which a mode is missing is out. While an NGS frame is lost the weights are those of
-the frames before it; when the next comes, or after several, the filter of the frames takes for it what all states told of it.
+are made when a set of LGS, or a number of them in their mean (`LgsStars`), first occurs. The states of one that is out go on with
+the measurements that the others predict for it, so that it can come back at any time. One of which a mode is missing is out.
+While an NGS frame is lost the weights are those of the frames before it; when the next comes, or after several, the filter of the
+frames takes for it what all states told of it.
 
 The states are those of the independent filter of a mode and running means, of the mean of the LGS in all modes, then of each
 difference; and those of the filter and the means of the NGS frames, mode after mode.
@@ -30,15 +31,15 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Look, Observer
-from wfsobs.observers.kalman.mode_filter import ModeFilter
+from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean
 from wfsobs.observers.kalman.single import NGS, PEAKS, TUNABLE_PEAKS, MultiPeak, every_peak_filter, steady_mode, vibration_used
 from wfsobs.observers.kalman.step import carry_state, matrix_power
 from wfsobs.observers.step import Estimator, StepError, run_frames
-from wfsobs.prior import Asterism, FlowOfBoth, Lines, Prior
+from wfsobs.prior import Asterism, FlowOfBoth, LgsStars, Lines, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import NEXT_Z, TOTAL, Estimates, Measurements, Sampling, by_name
 from wfsobs.signal.autoregressive import Ar2, Ar3
-from wfsobs.signal.gains import lyapunov
+from wfsobs.signal.gains import SensorMean, lyapunov
 from wfsobs.signal.joint_states import (
     Present,
     PresentInputs,
@@ -88,6 +89,8 @@ class AsterismModel:
         Running means of every LGS measurement, and of every NGS frame.
     age : int
         Steps between the last NGS frame and the first for which there are weights: so many frames, which are lost.
+    stars : int
+        LGS that a measurement is the mean over, where the prior tells of fewer; 0 for all.
 
     Raises
     ------
@@ -109,6 +112,7 @@ class AsterismModel:
         frame_means: StateFilter = FRAME_MEANS,
         *,
         age: int = 0,
+        stars: int = 0,
     ):
         asterism = prior.asterism
         if asterism is None:
@@ -116,10 +120,14 @@ class AsterismModel:
         if ratio != asterism.ratio:
             raise ValueError(f"the prior has an NGS frame every {asterism.ratio} steps, the loop every {ratio}")
         self._again = partial(AsterismModel, prior, settings, ratio, means, frame_means)
-        self.basis, self.ratio, self._asterism = asterism.basis, asterism.ratio, asterism
+        sees = [lgs_mean(prior, mode, has_slow_error=True) for mode in range(len(prior.lines))]
+        self.all_stars = len(sees[0].noise)
+        white = asterism.noise * [one.noise[stars - 1] for one in sees]
+        self.basis, self.ratio, self._asterism = asterism.basis, asterism.ratio, replace(asterism, noise=white)
         self._age, self._steps = age, range(age, age + asterism.ratio)
         independent = (every_peak_filter(settings, prior, mode) for mode in range(len(prior.lines)))
         self.fast: list[Beginning] = [begin_with_means(one, means) for one in independent]
+        self._slow_errors = [_slow_error(one.filter, mean, stars) for one, mean in zip(self.fast, sees, strict=True)]
         self._peaks = line_models(prior, settings)
         self.has_frames: bool = len(asterism.measurement) > self.n_stars
         if self.has_frames:
@@ -140,9 +148,9 @@ class AsterismModel:
         """Number of LGS."""
         return len(self.basis)
 
-    def late(self, n_lost: int) -> AsterismModel:
-        """Return the model of the same states while the last so many NGS frames are lost."""
-        return self._again(age=n_lost * self.ratio)
+    def late(self, n_lost: int, stars: int = 0) -> AsterismModel:
+        """Return the model of the same states while the last so many NGS frames are lost, and the LGS are so many."""
+        return self._again(age=n_lost * self.ratio, stars=stars)
 
     def plan(self, frames: float, target: str, present: Present | None = None) -> tuple[Array, Array]:
         """Return weights and standard deviations of a target, or TOTAL, so many frames ahead.
@@ -212,6 +220,7 @@ class AsterismModel:
         ]
         first = starts[m]
         fast[first:, first:] += block_diag(*of_noise * (stars - 1))
+        fast[:first, :first] += block_diag(*(one.states for one in self._slow_errors))
         covariances = []
         for phase, between in enumerate(self._between(powers[:n, n:])):
             covariance = np.block([[fast, between], [between.T, slow]])
@@ -255,13 +264,15 @@ class AsterismModel:
         for i, (model, of_lines) in enumerate(zip(self._peaks, self._of_lines, strict=True)):
             for cross, seen in zip(found, of_lines, strict=True):
                 cross[i, self._places[i]] += self._asterism.line_gain[i] * np.ravel(model.C @ model.A @ seen)
+                cross[i, self._places[i][: len(self.fast[i].first)]] += self._slow_errors[i].ahead
         return found
 
     def _measurement_covariance(self) -> Array:
         """Return that of the measurements of `_next_measurement`, without noise, (n_lgs * n_modes, n_lgs * n_modes)."""
         n = self.n_stars * len(self._peaks)
         lines = self._asterism.line_gain**2 * [(model.C @ model.C.T).item() for model in self._peaks]
-        return np.real(self._powers[:n, :n].sum(axis=2)) + np.diag(np.pad(lines, (0, n - len(lines))))
+        own = lines + [one.variance for one in self._slow_errors]
+        return np.real(self._powers[:n, :n].sum(axis=2)) + np.diag(np.pad(own, (0, n - len(own))))
 
     def _combination(self, present: Present) -> Array:
         """Return the weights of the LGS in z, of these alone where it is their mean; NaN where a z of some is not known."""
@@ -296,6 +307,23 @@ class Beginning(NamedTuple):
     filter: StateFilter
     first: Array
     model: DisturbanceModel | None = None
+
+
+class _SlowError(NamedTuple):
+    """What a mean over fewer LGS has beside that of all: variance, covariance of the states, and of the next one and these."""
+
+    variance: float
+    states: Array
+    ahead: Array
+
+
+def _slow_error(one: StateFilter, mean: SensorMean, stars: int) -> _SlowError:
+    """Return it, of the mean over so many."""
+    row = mean.C[stars - 1]
+    seen, n = np.vstack([np.eye(len(row)), np.outer(one.G, row)]), len(row)
+    step = np.hstack([seen @ mean.A, np.vstack([np.zeros((n, len(one.F))), one.F])])
+    covariance = lyapunov(step, seen @ mean.Q @ seen.T)
+    return _SlowError(row @ covariance[:n, :n] @ row, covariance[n:, n:], row @ mean.A @ covariance[:n, n:])
 
 
 NO_STATES = Beginning(StateFilter(np.zeros((0, 0)), np.zeros(0)), np.zeros(0))
@@ -386,13 +414,16 @@ class JointEstimator(Estimator):
         What the states tell of the last NGS frames, where these are lost, the first of them first, (AWAITED, n_modes) [um].
     phase : int
         Steps since the last NGS frame, or what stands for one; WITHOUT before the first that came, FIRST before the first step.
+    stars : int
+        LGS that the last measurement is the mean over; 0 for all.
     """
 
     frames: Array
     stand_in_frames: Array
     phase: int
+    stars: int = 0
 
-    state_names: tuple[str, ...] = ("x", "frames", "stand_in_frames", "phase", "present")
+    state_names: tuple[str, ...] = ("x", "frames", "stand_in_frames", "phase", "present", "stars")
 
     def __init__(self, model: AsterismModel):
         self.model = model
@@ -401,13 +432,17 @@ class JointEstimator(Estimator):
         self.frames, self.stand_in_frames = np.zeros(self._slow.first.shape), np.zeros((AWAITED, len(self._slow.first)))
         late = lru_cache(AWAITED)(model.late)
 
-        def compute(n_lost: int, name: str, *details: Any) -> Any:
-            return getattr(late(n_lost) if n_lost else model, name)(*details)
+        def compute(n_lost: int, stars: int, name: str, *details: Any) -> Any:
+            return getattr(late(n_lost, stars) if n_lost or stars else model, name)(*details)
 
         self._of_model = lru_cache(PLANS)(compute)
         self.present: Present = (True,) * model.n_stars
         self.phase = FIRST
         self.mark_start()
+
+    def see_stars(self, count: int | None) -> None:
+        """Take the LGS measurement of the next frame for the mean over so many stars; None for all."""
+        self.stars = count if count and count < self.model.all_stars else 0
 
     def advance_each(self, each: Array, ngs: Array | None) -> None:
         """Take the measurement of every LGS, (n_lgs, n_modes) [um], and the NGS frame that is due; NaN is missing."""
@@ -436,7 +471,7 @@ class JointEstimator(Estimator):
             self.frames = self._slow.advance(self.frames, one)
         if is_lost:
             n, self.stand_in_frames = self.n_lost - given_up, np.roll(self.stand_in_frames, -given_up, axis=0)
-            self.stand_in_frames[n] = self._of_model(n + 1, "frame", self.present) @ self.state()
+            self.stand_in_frames[n] = self._of_model(n + 1, self.stars, "frame", self.present) @ self.state()
             self.phase = (n + 1) * self.model.ratio
         else:
             self.frames, self.phase = self._slow.advance(self.frames, ngs), 0
@@ -448,7 +483,10 @@ class JointEstimator(Estimator):
 
     def _now(self, name: str, *details: Any) -> Any:
         """Return what the model has of that name in this step, for the LGS that are there."""
-        found, at = self._of_model(self.n_lost, name, *details, self.present), self.phase - self.n_lost * self.model.ratio
+        found, at = (
+            self._of_model(self.n_lost, self.stars, name, *details, self.present),
+            self.phase - self.n_lost * self.model.ratio,
+        )
         return (found[0][at], found[1][at]) if isinstance(found, tuple) else found[at]
 
     def _complete(self, each: Array, missing: Array) -> Array:
@@ -475,7 +513,9 @@ class JointEstimator(Estimator):
         """Run the filter over a record from rest: all steps at once where nothing is missing."""
         each, n = self._each_of(measurements), self.model.ratio
         frames = measurements.z_ngs[n::n] if self.model.has_frames else None
-        if np.isnan(each).any() or (frames is not None and np.isnan(frames).any()):
+        stars = measurements.lgs_stars
+        is_fewer = stars is not None and bool((stars < self.model.all_stars).any())
+        if is_fewer or np.isnan(each).any() or (frames is not None and np.isnan(frames).any()):
             return run_frames(self, TARGETS, measurements, watch)
         return _run_at_once(self.model, each, frames, watch)
 
@@ -496,7 +536,7 @@ class JointEstimator(Estimator):
         if old.x.shape[:2] != self.x.shape[:2] or old.model.has_frames != self.model.has_frames:
             raise StepError("its states are not those of the other design")
         self.x, self.frames = self._fast.carry(old._fast, old.x), self._slow.carry(old._slow, old.frames)
-        self.stand_in_frames[...], self.phase, self.present = old.stand_in_frames, old.phase, old.present
+        self.stand_in_frames[...], self.phase, self.present, self.stars = old.stand_in_frames, old.phase, old.present, old.stars
 
 
 def _as_set(missing: Array) -> Present:
@@ -599,7 +639,7 @@ MULTIRATE_COUPLED = Observer(
     "Coupled multi-rate KF",
     TARGETS,
     help="Kalman filter on both sensors in all modes together, for frozen flow; not in the paper",
-    prior=(Lines, FlowOfBoth),
+    prior=(Lines, FlowOfBoth, LgsStars),
     settings=PEAKS,
     needs=NGS,
     linear=True,
