@@ -215,6 +215,10 @@ def test_an_empty_name_is_refused(command, option):
 
 def test_options_of_a_record_need_one_and_columns_of_a_settings_file_do_not(tmp_path):
     assert set(RECORD_OPTIONS) <= {parameter.name for parameter in loop.params}
+    (tmp_path / "s.toml").write_text("[columns]\nu = 3\n")
+    assert call("check", "r.npz", "--config", str(tmp_path / "s.toml")).stderr.startswith(
+        f"wfsobs: {tmp_path / 's.toml'}: columns: "
+    )
     (tmp_path / "s.toml").write_text('[columns]\nu = "commands"\n')
     done = call("loop", "--config", str(tmp_path / "s.toml"), "--set", "run.duration=1.2", "--controller", "integrator")
     assert done.exit_code == 0, done.stderr

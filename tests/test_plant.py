@@ -274,6 +274,10 @@ def test_a_probe_of_a_mirror_at_rest_is_all_in_the_residual() -> None:
 def test_text() -> None:
     assert PlantNumber(2.0123, 0.0234).text() == "2.012 +- 0.023" and PlantNumber(170.0, 12.0).text(" nm") == "170 +- 12 nm"
     assert PlantNumber().text() == "not identifiable"
+    known = PlantNumber(1.0, 0.1)
+    groups = [GroupPlant((n,), (known,), (known,), None, known, known, 1.0, (4,), False, 0.0, np.eye(2)) for n in ("tip", "tilt")]
+    for peaks, text in ((4, "resonances per mode: 4;"), (6, "resonances per mode: 4 to 6;")):
+        assert any(text in line for line in plant_lines([groups[0], replace(groups[1], peaks=(peaks,))]))
 
 
 def test_flipped_without_an_angle() -> None:

@@ -69,10 +69,10 @@ def micrometres_per(unit: str, diameter: float) -> float:
 def parse_unit(text: str) -> str | None:
     """Return the unit of a file's text, or None for an unknown one.
 
-    >>> parse_unit("micron"), parse_unit("mas"), parse_unit("V")
+    >>> parse_unit("Micron"), parse_unit("mas"), parse_unit("V")
     ('um', 'mas', None)
     """
-    name = _SYNONYMS.get(text.strip(), text.strip())
+    name = _SYNONYMS.get(text.strip().lower(), text.strip())
     return name if name in LENGTHS or name in ANGLES else None
 
 

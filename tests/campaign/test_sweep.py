@@ -121,7 +121,7 @@ def test_every_cell_has_its_first_seed_before_any_has_its_second(base: Scenario)
         (["turbulence.wind_speed=0:5:4:log"], 2, "must be below the second and above 0"),
         (["turbulence.wind_speed=5:20:1"], 2, "takes low:high:number with a number from 2 to 50"),
         (["turbulence.wind_speed=5:nan:3"], 2, "takes low:high:number"),
-        (["turbulence.wind_speed=5"], 2, "1 values; takes 2 to 50"),
+        (["turbulence.wind_speed=5:20"], 2, "1 values; takes 2 to 50, as low:high:number or with commas"),
         (["turbulence.wind_speed=5,5"], 2, "has 5 twice"),
         (["turbulence.wind_speed"], 2, "takes name=value,value"),
         (["turbulence.wind=5,6"], 2, "turbulence.wind: no such setting"),

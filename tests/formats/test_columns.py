@@ -338,7 +338,7 @@ def test_what_is_no_unit_is_refused_unless_one_is_stated(names: tuple[str, str])
     np.testing.assert_allclose(found.y_lgs, 2.0 * Y, rtol=1e-12)
 
 
-@pytest.mark.parametrize("unit", [" nm", "_nm", " [nm]", "[nm]", " (nm)"])
+@pytest.mark.parametrize("unit", [" nm", "_nm", " [nm]", "[nm]", " (nm)", " [Nanometres]"])
 def test_units_of_modes_however_they_stand_behind_them(unit: str) -> None:
     names = ["time_s", *(f"{signal}/{mode}{unit}" for signal in ("y_lgs", "u") for mode in ("tilt", "tip"))]
     is_as_clean(read_record(io.BytesIO(table(names, TIME, *Y.T[::-1], *U.T[::-1])), "a.csv"), "unit nm")

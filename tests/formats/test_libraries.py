@@ -242,6 +242,7 @@ def test_a_folder_of_arrays_on_the_command_line(tmp_path: Path) -> None:
         (tmp_path / "out.h5").unlink()
     done = CliRunner().invoke(main, words)
     assert done.exit_code == 2 and "as its names suggest: --column 'u=commands' --column 'y_lgs=slopes'" in done.output
+    assert done.output.startswith(f"wfsobs: {tmp_path / 'night'}: has no y_lgs")
     assert not (tmp_path / "out.h5").exists()
     (tmp_path / "night" / "slopes.npy").rename(tmp_path / "night" / "primary.npy")
     done = CliRunner().invoke(main, words)

@@ -13,7 +13,7 @@ import wfsobs
 from wfsobs.cli import main
 from wfsobs.record import RecordError
 
-N, SLOPES, ACTUATORS = 400, 24, 40
+N, SLOPES, ACTUATORS = 1200, 24, 40
 
 
 @pytest.fixture
@@ -88,7 +88,7 @@ def test_a_frame_of_which_a_slope_is_missing_is_missing(signals: dict[str, np.nd
         (np.ones((2, SLOPES)), "does not tell 2 modes apart"),
         (np.full((2, SLOPES), np.nan), "finite numbers"),
         ("nowhere.npy", "nowhere.npy: cannot be read"),
-        ("{file}", "has no matrix ''; it has M, R, slopes, volts: give FILE:NAME"),
+        ("{file}", "which of its arrays is the matrix? It has M, R, slopes, volts: give FILE:NAME"),
         ("{file}:Q", "has no matrix 'Q'"),
     ],
 )

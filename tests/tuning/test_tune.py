@@ -66,6 +66,7 @@ def test_saved_settings_give_the_tuned_scenario(tuned) -> None:
     [
         ("kf-lgs", ["kalman.frequenc"], "no such setting"),
         ("kf-lgs", ["kalman.process_noise"], "not a single number"),
+        ("kf-lgs", ["vibration.peaks"], "vibration.peaks: cannot be tuned, it is not a single number"),
         ("kf-lgs", ["butterworth.frequencies"], "not a single number"),
         ("kf-lgs", ["gpr_online.depth"], "not a setting of kf-lgs"),
         ("kf-lgs", ["turbulence.wind_speed"], "not a setting of kf-lgs"),
@@ -79,6 +80,18 @@ def test_saved_settings_give_the_tuned_scenario(tuned) -> None:
 def test_what_cannot_be_tuned_is_refused(observer: str, names: list[str] | None, says: str) -> None:
     with pytest.raises(SettingError, match=says):
         tune(short(), observer, names)
+
+
+def test_a_length_that_no_record_has_is_named() -> None:
+    for length, of in ((0.01, "run.duration"), (0.5, "run.warm_up")):
+        with pytest.raises(SettingError, match=rf"^validation = {length}: {of} = "):
+            tune(short(), "kf-lgs", validation=length)
+
+
+def test_a_target_of_which_a_record_has_no_truth_is_refused() -> None:
+    record = replace(simulate(short(**{"run.duration": 6.0})), turbulence=None, vibration=None)
+    with pytest.raises(SettingError, match=r"^target = turbulence: the record has no truth; kf-lgs is tuned by its next z$"):
+        tune(short(), "kf-lgs", record=record, target="turbulence")
 
 
 def test_names_are_one_text_or_any_of_them() -> None:

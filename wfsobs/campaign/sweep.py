@@ -367,7 +367,9 @@ def plan_sweep(base: Scenario, axes: Sequence[Variation], seeds: int, observers:
         if axis.path == SEED:
             raise SettingError(f"--over {SEED}: every scenario has the same seeds; give their number")
         if not 2 <= len(axis.values) <= MOST_VALUES:
-            raise SettingError(f"--over {axis.path}: {len(axis.values)} values; takes 2 to {MOST_VALUES}")
+            raise SettingError(
+                f"--over {axis.path}: {len(axis.values)} values; takes 2 to {MOST_VALUES}, as low:high:number or with commas"
+            )
     OBSERVERS.check_ids(observers or ())
     if not 1 <= seeds <= MOST_SEEDS:
         raise SettingError(f"seeds = {seeds}: takes a whole number from 1 to {MOST_SEEDS}")

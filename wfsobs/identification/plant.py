@@ -245,7 +245,8 @@ def plant_lines(groups: Sequence[GroupPlant]) -> list[str]:
     """Return what a plant means and what it rests on, a line each."""
     worst, peaks = max(group.uncertainty for group in groups), [n for group in groups for n in group.peaks]
     colour = "a coloured background, " if any(group.has_background for group in groups) else ""
-    form = f"white noise, turbulence of second or third order, {colour}{min(peaks)} to {max(peaks)} resonances per mode"
+    number = " to ".join(dict.fromkeys(f"{n(peaks)}" for n in (min, max)))
+    form = f"white noise, turbulence of second or third order, {colour}resonances per mode: {number}"
     new = min(group.own_share for group in groups)
     basis = (
         f"the commands are excited: {100.0 * new:.2g} % of what is new in them does not follow from the measurements"

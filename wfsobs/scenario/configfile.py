@@ -131,7 +131,7 @@ def load_columns(path: str | Path) -> dict[str, str]:
     try:
         columns = parse_toml(_text(path)).get("columns", {})
         if not isinstance(columns, dict) or not all(isinstance(name, str) for name in columns.values()):
-            raise SettingError('columns: takes a table such as "y_lgs/tip" = "slope_x"')
+            raise SettingError(f'{path}: columns: takes a table such as "y_lgs/tip" = "slope_x"')
     except NotToml as error:
         raise SettingError(f"{path}: {error}") from None
     return columns

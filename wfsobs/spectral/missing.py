@@ -102,7 +102,7 @@ class MissingSamples:
 
     def measured_share(self, S: Array, unknown: Array) -> Array:
         """Return the measured share 1 - V / S of every bin, (bins,): for white noise the share of measured samples."""
-        is_long, V = binary_opening(self.is_missing, np.ones(LONG)), np.zeros_like(S)
+        is_long, V = binary_opening(self.is_missing, np.ones(LONG, int)), np.zeros_like(S)
         for part, unit in ((is_long, S), (~is_long, np.ones_like(S))):
             V += unit * _smooth(np.mean([periodogram(e * part, self.dt) for e in unknown], axis=0) / unit)
         return np.maximum(1.0 - V / S * self.is_missing.mean() / np.mean(V / S), LEAST)

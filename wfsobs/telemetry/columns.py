@@ -336,7 +336,8 @@ def matrix_of(file: FileColumns, source: str, name: str = "") -> LoopMatrix:
         found = {"": [column for columns in found.values() for column in columns]}
     name = name or (next(iter(found)) if len(found) == 1 else "")
     if name not in found:
-        raise RecordError(f"{source}: has no matrix {name!r}; it has {', '.join(sorted(found)[:20])}: give FILE:NAME")
+        what = f"has no matrix {name!r}; it" if name else "which of its arrays is the matrix? It"
+        raise RecordError(f"{source}: {what} has {', '.join(sorted(found)[:20])}: give FILE:NAME")
     if len({column.size for column in found[name]}) > 1:
         raise RecordError(f"{source}: {name} has rows of unlike lengths")
     return LoopMatrix(source, tuple(map(tuple, np.array(found[name]).tolist())))

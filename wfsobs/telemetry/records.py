@@ -129,7 +129,7 @@ def open_record(path: str | Path, sha256: str | None = None) -> Iterator[tuple[I
                 if found != sha256.lower():
                     raise RecordError(f"{path}: is another file: its SHA-256 is {found}, not {sha256[:64]}")
                 file.seek(0)
-            yield file, f"{path}.npz" if folder else str(path)
+            yield file, f"{Path(path)}/.npz" if folder else str(path)
     except OSError as error:
         raise RecordError(f"{path}: cannot be read: {error.strerror or error}") from None
 
@@ -260,7 +260,7 @@ def read_with_delay(
             raise RecordError(f"{why}; --trust goes on")
         return record, stated_delay(contents, stated)
     except RecordError as error:
-        raise RecordError(f"{name}: {error}") from None
+        raise RecordError(f"{name.removesuffix('/.npz')}: {error}") from None
 
 
 def contradiction_of(record: Record, contents: Contents, declaration: DeclaredFormat, scenario: Scenario) -> str:

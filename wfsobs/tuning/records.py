@@ -132,7 +132,7 @@ def space(
 
 def _check(scenario: Scenario, of: str, tunable: Tunable, path: str) -> None:
     usual, others = tunable
-    settings = {name: p for name, _, p in scenario.walk()}
+    settings = {name: p for name, _, p in scenario.walk()} | dict(scenario.lists())
     if path not in settings:
         raise SettingError(f"{path}: no such setting")
     if not isinstance(settings[path], param.Number):
@@ -267,8 +267,11 @@ def simulate_records(scenario: Scenario, space: Space, target: str, duration: fl
         return made[key]
 
     largest = scenario.replace({a.path: int(a.high) for a in space.axes if a.path in LENGTHS})
-    short = scenario if duration is None else scenario.replace({"run.duration": duration})
-    short.validate()
+    try:
+        short = scenario if duration is None else scenario.replace({"run.duration": duration})
+        short.validate()
+    except SettingError as error:
+        raise SettingError(f"validation = {duration:g}: {error}") from None
     validation = simulate(short, rng=stream(scenario, VALIDATION), watch=watch)
     return Records(replace(validation, training=record_of(largest).training), record_of, target)
 
