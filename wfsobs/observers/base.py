@@ -167,9 +167,12 @@ class Observer:
             raise ValueError(f"targets = (): takes one at least, of {', '.join(TARGETS)}")
         if self.run is None and self.step is None:
             raise ValueError("has neither a run nor a step")
-        for name, of in (("run", self.run), ("step", self.step)):
-            if of is not None and not callable(of):
+        for name in ("run", "step", "seconds", "counts", "asks"):
+            of = getattr(self, name)
+            if not callable(of) and (of is not None or name == "asks"):
                 raise ValueError(f"{name} = {of!r}: takes a function")
+        if not isinstance(self.help, str):
+            raise ValueError(f"help = {self.help!r}: takes a text")
         check_weight(self.weight)
         check_look(self.look)
 
