@@ -283,6 +283,10 @@ class Observer:
         return ", ".join(words_for(self.prior, source=source)) or NOTHING
 
 
+LARGEST = 1e100
+"""Largest number of an estimate [um]: sums of squares of larger ones may overflow."""
+
+
 def check_estimates(estimates: object, targets: tuple[str, ...], shape: tuple[int, ...]) -> Estimates:
     """Return what an observer found, arrays of this shape, (n_steps, n_modes). Raises ValueError."""
     if not isinstance(estimates, Mapping):
@@ -299,6 +303,8 @@ def check_estimates(estimates: object, targets: tuple[str, ...], shape: tuple[in
             raise ValueError(f"{name} takes real numbers, NaN where there is none, not {kind}")
         if isinstance(values, np.ma.MaskedArray):
             raise ValueError(f"{name} takes NaN where there is no number, not a mask")
+        if (np.abs(values) > LARGEST).any():
+            raise ValueError(f"{name} takes numbers up to {LARGEST:g}, not {np.nanmax(np.abs(values)):g}")
         if name not in targets and (values < 0).any():
             raise ValueError(f"{name} takes numbers from 0, not negative ones")
     return out
