@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from math import inf, nan
+
 import pytest
 
 from wfsobs.cost import frozen_flow_seconds, part_seconds, run_seconds
 from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import Observer
 from wfsobs.observers.gpr import offline, online
 from wfsobs.observers.gpr.offline import OfflineGpr
 from wfsobs.observers.gpr.online import OnlineGpr
@@ -95,6 +98,12 @@ def test_other_turbulence_costs_no_waves() -> None:
 
 def test_the_presets_are_a_moment() -> None:
     assert run_seconds(paper()) < 1.5 and run_seconds(ut4()) < 1.5
+
+
+@pytest.mark.parametrize("estimate", [lambda *_: 1 / 0, lambda *_: nan, lambda *_: -1.0, lambda *_: "long"])
+def test_a_time_that_is_none_is_beyond_any_limit(estimate, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(OBSERVERS, "mine", Observer("mine", "Mine", ("vibration",), lambda *_: {}, seconds=estimate))
+    assert run_seconds(paper()) == inf
 
 
 def test_parts_add_up_and_grow_with_the_record() -> None:

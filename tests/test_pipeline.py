@@ -399,6 +399,7 @@ def raise_error(error: Exception) -> None:
         (lambda z: {"vibration": np.full_like(z, np.nan)}, "vibration is NaN in every step, perhaps for too few"),
         (lambda z: {"vibration": np.ma.masked_array(z, z > 0)}, "vibration takes NaN where there is no number, not a mask$"),
         (lambda z: Estimates({"vibration": z}, {"vibration": z * 0 - 1}), "sd of vibration takes numbers from 0, not negative"),
+        (lambda z: {"vibration": np.where(z > 0, 1e200, np.nan)}, "vibration takes numbers up to 1e\\+100, not 1e\\+200$"),
         (lambda z: raise_error(ValueError()), "ValueError$"),
         (lambda z: raise_error(KeyError("x")), "KeyError: 'x'$"),
         (lambda z: raise_error(SystemExit(3)), "SystemExit: 3$"),

@@ -10,7 +10,9 @@ moment from a wait.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from math import inf
+from typing import Any
 
 from wfsobs.atmosphere import FIELD
 from wfsobs.dependence import observers_reached
@@ -55,12 +57,21 @@ def part_seconds(scenario: Scenario) -> dict[str, float]:
     air = _steps_of_air(scenario)
     return {
         **{
-            o.id: o.seconds(None if o.group is None else getattr(scenario, o.group), n, n_modes, scenario.dt)
+            o.id: _observer_seconds(o.seconds, None if o.group is None else getattr(scenario, o.group), n, n_modes, scenario.dt)
             for o in OBSERVERS.values()
             if o.seconds is not None
         },
         REST: 2.5e-6 * n_modes * (n + training) + frozen_flow_seconds(scenario, air + training),
     }
+
+
+def _observer_seconds(estimate: Callable[..., float], *of: Any) -> float:
+    """Return the time of an observer of any package [s]; infinite where it is none."""
+    try:
+        seconds = float(estimate(*of))
+    except Exception:
+        return inf
+    return seconds if seconds >= 0.0 else inf
 
 
 def _steps_of_air(scenario: Scenario) -> int:

@@ -225,3 +225,9 @@ def test_an_origin_that_is_none_is_refused(origin: str) -> None:
     said = CliRunner().invoke(serve, ["--embed", origin])
     assert said.exit_code == 2
     assert "is no origin; it takes https://HOST[:PORT] or http://HOST[:PORT]" in said.output
+
+
+@pytest.mark.parametrize("host", ["http://x/", "a b", "x:y", ""])
+def test_a_host_that_is_none_is_refused(host: str) -> None:
+    said = CliRunner().invoke(serve, ["--origin", host])
+    assert said.exit_code == 2 and "is no origin; it takes HOST[:PORT]" in said.output

@@ -1,5 +1,6 @@
 """Files of results."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +11,12 @@ import pytest
 from wfsobs.campaign import store
 from wfsobs.campaign.plan import parse_plan
 from wfsobs.campaign.store import (
+    PLAN,
     ROWS,
     BatchIndex,
     batch_files,
     finished_runs,
+    folder_plan,
     present_rows,
     read_results,
     row_key,
@@ -21,6 +24,7 @@ from wfsobs.campaign.store import (
     schema,
     write_batch,
 )
+from wfsobs.settings.values import SettingError
 
 HERE = {"host": "here", "process": 1, "written": 0.0}
 
@@ -84,6 +88,19 @@ def test_a_file_of_other_columns_is_left_out(folder, change):
     pq.write_table(other, folder / ROWS / "other.parquet")
     assert read_results(folder)["key"].to_pylist() == ["a"]
     assert BatchIndex(folder).read(range(10))["key"].to_pylist() == ["a"]
+
+
+@pytest.mark.parametrize(
+    "damage", [{"scenarios": []}, {"scenarios": {"s": []}}, {"cells": [["s", []]]}, {"cells": [["t", {}]]}, {"seeds": "6"}]
+)
+def test_a_plan_that_was_damaged_is_said_to_be_none(folder, damage):
+    values = {"name": "n", "first_seed": 1, "seeds": 2, "observers": [], "controllers": [], "stop": None}
+    values |= {"scenarios": {"s": {}}, "cells": [["s", {}]]}
+    (folder / PLAN).write_text(json.dumps(values))
+    assert folder_plan(folder).n_runs == 2
+    (folder / PLAN).write_text(json.dumps(values | damage))
+    with pytest.raises(SettingError, match="is not the plan of a campaign"):
+        folder_plan(folder)
 
 
 def test_rows_of_another_version_or_of_other_seeds_are_not_those_of_a_plan(folder, monkeypatch):

@@ -189,11 +189,11 @@ class Campaign:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Campaign:
-        """Return the plan of `to_dict`."""
-        bases, first = values["scenarios"], values["first_seed"]
+        """Return the plan of `to_dict`. Raises AttributeError, KeyError, TypeError or ValueError of other values."""
+        bases, first = {name: {**base} for name, base in values["scenarios"].items()}, values["first_seed"]
         return cls(
             values["name"],
-            tuple(Cell(i, name, bases[name], changes) for i, (name, changes) in enumerate(values["cells"])),
+            tuple(Cell(i, name, bases[name], {**changes}) for i, (name, changes) in enumerate(values["cells"])),
             range(first, first + values["seeds"]),
             tuple(values["observers"]),
             tuple(values["controllers"]),

@@ -321,7 +321,7 @@ def folder_plan(folder: Path) -> Campaign:
         raise SettingError(f"{folder}: holds no campaign ({PLAN} is missing)")
     try:
         return Campaign.from_dict(json.loads((folder / PLAN).read_text(encoding="utf-8")))
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, AttributeError):
         raise SettingError(f"{folder / PLAN}: is not the plan of a campaign") from None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from typing import Any
 
 import click
@@ -11,13 +12,19 @@ from wfsobs.cli.options import POSITIVE, FiniteRange, needing
 
 ORIGIN = re.compile(r"https?://(\*\.)?[\w.-]+(:\d+|:\*)?|https?://\[[\da-f:]+\](:\d+)?", re.ASCII | re.IGNORECASE)
 
+HOST = re.compile(r"[\w.*-]+(:\d+)?", re.ASCII)
 
-def _check_embedders(_context: click.Context, _option: click.Parameter, origins: tuple[str, ...]) -> tuple[str, ...]:
-    """Return origins that can stand in a header."""
-    for origin in origins:
-        if not ORIGIN.fullmatch(origin):
-            raise click.BadParameter(f"{origin!r} is no origin; it takes https://HOST[:PORT] or http://HOST[:PORT]")
-    return origins
+
+def _check(pattern: re.Pattern[str], takes: str) -> Callable[[click.Context, click.Parameter, tuple[str, ...]], tuple[str, ...]]:
+    """Return the check of an option's values, which a header or the server takes as they are."""
+
+    def check(_context: click.Context, _option: click.Parameter, values: tuple[str, ...]) -> tuple[str, ...]:
+        for value in values:
+            if not pattern.fullmatch(value):
+                raise click.BadParameter(f"{value!r} is no origin; it takes {takes}")
+        return values
+
+    return check
 
 
 @click.command()
@@ -29,6 +36,7 @@ def _check_embedders(_context: click.Context, _option: click.Parameter, origins:
     "origins",
     multiple=True,
     metavar="HOST[:PORT]",
+    callback=_check(HOST, "HOST[:PORT]"),
     help="Host name of the page behind a proxy; can be repeated.",
 )
 @click.option(
@@ -36,7 +44,7 @@ def _check_embedders(_context: click.Context, _option: click.Parameter, origins:
     "embedders",
     multiple=True,
     metavar="ORIGIN",
-    callback=_check_embedders,
+    callback=_check(ORIGIN, "https://HOST[:PORT] or http://HOST[:PORT]"),
     help="Origin (https://HOST[:PORT]) whose pages may show this one in a frame; can be repeated. By default none.",
 )
 @click.option("--prefix", default="", show_default=False, metavar="PATH", help="Path of the page behind a proxy.")

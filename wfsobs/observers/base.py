@@ -176,9 +176,12 @@ class Observer:
             raise ValueError(f"targets = (): takes one at least, of {', '.join(TARGETS)}")
         if self.run is None and self.step is None:
             raise ValueError("has neither a run nor a step")
-        for name, of in (("run", self.run), ("step", self.step)):
-            if of is not None and not callable(of):
+        for name in ("run", "step", "seconds", "counts", "asks"):
+            of = getattr(self, name)
+            if not callable(of) and (of is not None or name == "asks"):
                 raise ValueError(f"{name} = {of!r}: takes a function")
+        if not isinstance(self.help, str):
+            raise ValueError(f"help = {self.help!r}: takes a text")
         check_weight(self.weight)
         check_look(self.look)
 
@@ -293,6 +296,10 @@ class Observer:
         return ", ".join(words_for(self.prior, source=source)) or NOTHING
 
 
+LARGEST = 1e100
+"""Largest number of an estimate [um]: sums of squares of larger ones may overflow."""
+
+
 def check_estimates(estimates: object, targets: tuple[str, ...], shape: tuple[int, ...]) -> Estimates:
     """Return what an observer found, arrays of this shape, (n_steps, n_modes). Raises ValueError."""
     if not isinstance(estimates, Mapping):
@@ -309,6 +316,8 @@ def check_estimates(estimates: object, targets: tuple[str, ...], shape: tuple[in
             raise ValueError(f"{name} takes real numbers, NaN where there is none, not {kind}")
         if isinstance(values, np.ma.MaskedArray):
             raise ValueError(f"{name} takes NaN where there is no number, not a mask")
+        if (np.abs(values) > LARGEST).any():
+            raise ValueError(f"{name} takes numbers up to {LARGEST:g}, not {np.nanmax(np.abs(values)):g}")
         if name not in targets and (values < 0).any():
             raise ValueError(f"{name} takes numbers from 0, not negative ones")
     return out
