@@ -29,7 +29,7 @@ from wfsobs.app.style import TERM_COLOURS
 from wfsobs.app.work import TRUTH
 from wfsobs.cli import main
 from wfsobs.evaluation.exact_errors import cumulative_rms, spectra
-from wfsobs.evaluation.result import row_label
+from wfsobs.evaluation.result import is_unknown, row_label
 from wfsobs.observers.base import TARGETS
 
 SETTINGS = {
@@ -196,7 +196,8 @@ def test_every_state_shows_the_numbers_of_its_run(page: Page) -> None:
                 assert cells[0].startswith(row_label(row["observer"]))
                 error = number(row["rms_um"] * scale)
                 ends = " – ".join(number(x * scale) for x in row["interval_um"] or ())
-                spread = f"{ends} " if ends else ""
+                unknown = bool(ends) and is_unknown(row["rms_um"], row["interval_um"])
+                spread = "interval unknown " if unknown else f"{ends} " if ends else ""
                 assert cells[1:3] == [spread + error, hundredths(row["normalised_rms"])]
                 assert cells[3] == ("–" if row["lag_s"] is None else hundredths(1e3 * row["lag_s"]))
                 assert lines.get(key, f"{error} {written}") == f"{error} {written}"
