@@ -31,6 +31,7 @@ from wfsobs.settings.values import SettingError
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.tuning import EnvelopeGoal
 from wfsobs.tuning import tune as search
+from wfsobs.tuning.records import judged_by
 from wfsobs.tuning.tuning import (
     EVALUATIONS,
     OTHER,
@@ -171,6 +172,8 @@ def tune(
         if validation is not None:
             raise SettingError("--validation: only for simulated records, not with --record")
         record = load_declared(record_file, scenario, declaration, sha256)
+        if target and (judged := judged_by(record, name, target)[0]) != target:
+            raise SettingError(f"--target {target}: the record has no truth; {name} is tuned by its {judged}")
     with progress_bar("evaluations") as watch:
         tuned = search(
             scenario,

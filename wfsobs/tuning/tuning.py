@@ -168,13 +168,11 @@ def tune(
     if record is not None:
         scenario = as_stated(record, scenario)
     scenario.validate()
-    searched, wanted = space(scenario, observer, names), target_of(observer, target)
+    searched, target = space(scenario, observer, names), target_of(observer, target)
     if record is None:
-        records = simulate_records(scenario, searched, wanted, validation, watch)
+        records = simulate_records(scenario, searched, target, validation, watch)
     else:
-        records = cut_record(record, scenario, observer, wanted)
-        if target not in (None, records.target):
-            raise SettingError(f"target = {target}: the record has no truth; {observer} is tuned by its {records.target}")
+        records = cut_record(record, scenario, observer, target)
     trials = RecordTrials(scenario, searched, evaluations, watch, on_evaluation, records, observer)
     return _search(trials, observer, records.target, records.against)
 
