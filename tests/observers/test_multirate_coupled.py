@@ -14,8 +14,8 @@ from wfsobs.evaluation.bound import bound
 from wfsobs.evaluation.scores import BOUND_BOTH, BOUND_BOTH_MODES, half_width
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.kalman.coupled import flow_model
-from wfsobs.observers.kalman.joint import INDEPENDENT, AsterismModel, coupled_model
+from wfsobs.observers.kalman.coupled import INDEPENDENT_ON_BOTH, coupled_model, flow_model
+from wfsobs.observers.kalman.joint import AsterismModel
 from wfsobs.pipeline import observe, run
 from wfsobs.prior import Flow, FlowOfBoth, LgsStars, Lines
 from wfsobs.priors_from.scenario import arguments, prior_of, usual_observers
@@ -191,7 +191,7 @@ def test_with_ngs_frames_lost_it_is_as_sure_as_it_says() -> None:
 def test_where_modes_are_independent_it_refuses_and_runs_only_if_named() -> None:
     scenario = wfsobs.PRESETS["paper"]().replace({"run.duration": 1.0, "run.warm_up": 0.1})
     (line,) = observe(simulate(scenario), scenario, observers=[OBSERVER.id]).failures
-    assert line.reason == f"multirate-coupled left out: {INDEPENDENT}"
+    assert line.reason == f"multirate-coupled left out: {INDEPENDENT_ON_BOTH}"
     assert OBSERVER.id not in usual_observers(scenario) and OBSERVER.id in usual_observers(FLOW)
     with pytest.raises(ValueError, match="the bound of each is its own"):
         bound(scenario, information="both-modes")

@@ -32,10 +32,10 @@ from scipy.linalg import block_diag
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Look, Observer
 from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean
-from wfsobs.observers.kalman.single import NGS, PEAKS, TUNABLE_PEAKS, MultiPeak, every_peak_filter, steady_mode, vibration_used
+from wfsobs.observers.kalman.single import PEAKS, TUNABLE_PEAKS, MultiPeak, every_peak_filter, steady_mode, vibration_used
 from wfsobs.observers.kalman.step import carry_state, matrix_power
 from wfsobs.observers.step import Estimator, StepError, run_frames
-from wfsobs.prior import Asterism, FlowOfBoth, LgsStars, Lines, Prior
+from wfsobs.prior import Asterism, Lines, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import NEXT_Z, TOTAL, Estimates, Measurements, Sampling, by_name
 from wfsobs.signal.autoregressive import Ar2, Ar3
@@ -354,9 +354,6 @@ def begin_with_means(one: ModeFilter, means: StateFilter) -> Beginning:
     return Beginning(both, np.concatenate([np.zeros(len(step.A)), at_rest]), one.model)
 
 
-INDEPENDENT = "the modes tell nothing of one another: `multirate-multi` estimates each by itself"
-"""Why there is no coupled filter."""
-
 PLANS = 64
 """Weights that are kept, of a target, a horizon and a set of LGS each; others are computed anew."""
 
@@ -599,21 +596,9 @@ class AsterismEstimator(JointEstimator):
         self.advance_each(self._each, ngs)
 
 
-def coupled_model(prior: Prior, settings: MultiPeak, ratio: int | None) -> AsterismModel:
-    """Return the weights. Raises ValueError where the prior has no flow."""
-    if prior.asterism is None:
-        raise ValueError(INDEPENDENT)
-    return AsterismModel(prior, settings, ratio)
-
-
 def kf_asterism(prior: Prior, settings: MultiPeak, sampling: Sampling, _horizon: float) -> AsterismEstimator:
     """Return the filter on every LGS by itself."""
     return AsterismEstimator(AsterismModel(prior, settings, sampling.ratio))
-
-
-def multirate_coupled(prior: Prior, settings: MultiPeak, sampling: Sampling, _horizon: float) -> JointEstimator:
-    """Return the filter on all LGS together. Raises ValueError where the prior has no flow."""
-    return JointEstimator(coupled_model(prior, settings, sampling.ratio))
 
 
 KF_ASTERISM = Observer(
@@ -631,24 +616,5 @@ KF_ASTERISM = Observer(
     tunable=TUNABLE_PEAKS,
     look=Look("Asterism", "#923222", "#F5B022", (8, 2, 2, 2)),
     step=kf_asterism,
-    counts=vibration_used,
-)
-
-MULTIRATE_COUPLED = Observer(
-    "multirate-coupled",
-    "Coupled multi-rate KF",
-    TARGETS,
-    help="Kalman filter on both sensors in all modes together, for frozen flow; not in the paper",
-    prior=(Lines, FlowOfBoth, LgsStars),
-    settings=PEAKS,
-    needs=NGS,
-    linear=True,
-    couples_modes=True,
-    takes_missing=True,
-    sensors=("lgs", "ngs"),
-    weight=3.0,
-    tunable=TUNABLE_PEAKS,
-    look=Look("Coupled, both", "#3806FF", "#2C49F5", (10, 2, 4, 2)),
-    step=multirate_coupled,
     counts=vibration_used,
 )
