@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+from contextlib import nullcontext
 from pathlib import Path
 from typing import IO, NoReturn
 
@@ -60,11 +61,21 @@ def test_a_link_stays_one(tmp_path: Path) -> None:
 
 def test_a_pipe_is_written_to() -> None:
     receive, send = os.pipe()
-    check_writable(f"/dev/fd/{send}")
+    check_writable(f"/dev/fd/{send}", endings=(".npz",))
     write_whole(f"/dev/fd/{send}", lambda file: file.write(b"through"))
     os.close(send)
     with os.fdopen(receive, "rb") as file:
         assert file.read() == b"through"
+
+
+def test_the_ending_is_that_of_the_name_which_is_given(tmp_path: Path) -> None:
+    for name, target in (("a.npz", "blob"), ("blob", "a.npz")):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / name).symlink_to(folder / target)
+        says = pytest.raises(OSError, match="its name ends in none of") if name == "blob" else nullcontext()
+        with says:
+            check_writable(folder / name, endings=(".npz",))
 
 
 @pytest.mark.parametrize("link", [False, True])

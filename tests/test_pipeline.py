@@ -12,6 +12,7 @@ import pytest
 
 from tests.records import ON_PAPER
 from wfsobs import PRESETS, Record, RecordError, Scenario, SettingError, observe, run, simulate
+from wfsobs.dependence import Memo, RecordMemo
 from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.result import Failure
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, BOUNDS, COMMON_BOUNDS, LOOP, PREDICTION, RESIDUAL, SCORED, score
@@ -126,23 +127,23 @@ def test_same_seed_same_result_and_a_subset_is_part_of_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("missing", "left_out"),
+    ("missing", "words", "left_out"),
     [
         (
             {"y_ngs": None, "ratio": None},
+            "NGS measurements",
             ["kf-ngs", "multirate", "multirate-optimal", "multirate-multi", "multirate-adaptive", "gp-both"],
         ),
-        ({"open_loop_y": None}, ["butterworth-ol"]),
-        ({"training": None}, ["gpr-offline", "ridge", "ridge-30"]),
+        ({"open_loop_y": None}, "measurements with the mirror at rest", ["butterworth-ol"]),
+        ({"training": None}, "training data", ["gpr-offline", "ridge", "ridge-30"]),
     ],
 )
-def test_what_a_record_lacks_is_one_line_per_observer(missing: dict[str, None], left_out: list[str]) -> None:
+def test_what_a_record_lacks_is_one_line_per_observer(missing: dict[str, None], words: str, left_out: list[str]) -> None:
     record = replace(simulate(scenario()), **missing)
     result = observe(record, scenario())
     assert [f.observer for f in result.failures] == left_out
     for failure in result.failures:
-        assert failure.reason.startswith(f"{failure.observer} left out:") and "\n" not in failure.reason
-        assert all(name in failure.reason for name in missing if name in OBSERVERS[failure.observer].needs)
+        assert failure.reason == f"{failure.observer} left out: the record has no {words}"
     assert {e.observer for e in result.estimates} == set(ON_PAPER) - set(left_out)
 
 
@@ -415,6 +416,14 @@ def test_what_is_no_estimate_is_one_line_and_the_others_keep_theirs(
     result = run(scenario(), observers=["mine", "zero"])
     assert [f.observer for f in result.failures] == ["mine"] and re.match(f"mine left out: .*{reason}", result.failures[0].reason)
     assert {e.observer for e in result.estimates} == {"zero"}
+
+
+def test_an_observer_that_cannot_count_its_peaks_runs_with_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    wrong = replace(OBSERVERS["kf-lgs"], counts=lambda *_: raise_error(KeyError("x")))
+    monkeypatch.setitem(OBSERVERS, "kf-lgs", wrong)
+    record = simulate(scenario())
+    found = each_estimate(record, scenario(), observers=["kf-lgs", "zero"], memo=RecordMemo(Memo(), record))
+    assert {e.observer for e in found} == {"kf-lgs", "zero"}
 
 
 @pytest.mark.parametrize("n", [1, 5, 21, 100])

@@ -67,7 +67,7 @@ def each_estimate(
             partial=lambda target, values, o=observer: on_partial(o.id, target, values) if on_partial else None,
         )
         for item in _one(observer, record, scenario, inner, parts):
-            if memo is not None and isinstance(item, Estimate):
+            if memo is not None and isinstance(item, Estimate) and observer.id in names:
                 memo.note(names[observer.id], item)
             yield item
         done += observer.weight
@@ -105,7 +105,7 @@ def _recall(
     try:
         prior, settings = prior_and_settings(observer, record, scenario, parts)
         return memo.find(observer, prior, own if observer.counts is None else observer.counts(prior, settings))
-    except Exception:  # it says so when it runs
+    except (Exception, SystemExit):  # it says so when it runs
         return "", []
 
 

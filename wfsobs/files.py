@@ -65,6 +65,7 @@ def check_writable(path: str | Path, *inputs: str | Path | None, endings: tuple[
     read = (one for one in inputs if one and os.path.exists(one) and os.path.exists(path))
     if not _is_device(path) and any(os.path.samefile(path, one) for one in read):
         raise OSError(errno.EEXIST, "is read by this command; write to another file", str(path))
+    named = str(path)
     path = Path(os.path.realpath(path) if os.path.islink(path) and not _is_device(path) else path)
     folder = path.parent
     number, where = (
@@ -82,5 +83,5 @@ def check_writable(path: str | Path, *inputs: str | Path | None, endings: tuple[
     )
     if number:
         raise OSError(number, os.strerror(number), str(where))
-    if endings and not str(path).lower().endswith(endings):
-        raise OSError(errno.EINVAL, f"its name ends in none of {', '.join(endings)}", str(path))
+    if endings and not _is_device(named) and not named.lower().endswith(endings):
+        raise OSError(errno.EINVAL, f"its name ends in none of {', '.join(endings)}", named)

@@ -126,9 +126,13 @@ def test_report_and_command(tuned: TuningResult, tmp_path) -> None:
     arguments = ["tune", "--set", "sensors.lgs_rate=500", "--evaluations", "2", "--controller", "lqg-kf-lgs"]
     shown = CliRunner().invoke(main, [*arguments, "--envelope", "--rotation", "5"])
     assert shown.exit_code == 0 and "unstable plants" in shown.output and "control.caution" in shown.output, shown.output
+    path = tmp_path / "r.npz"
+    np.savez(path, y_lgs=np.random.default_rng(1).standard_normal((1500, 2)), u=np.zeros((1500, 2)), dt=1e-3, unit="nm")
     for wrong, says in (
         (arguments, "give --observer, or --envelope and --controller"),
         (["tune", "--observer", "kf-lgs", "--loss", "0.2"], "only with --envelope"),
+        ([*arguments, "--envelope", "--record", str(path), "--target", "vibration"], "by theory, and takes no record"),
+        (["tune", "--observer", "kf-ngs", "--record", str(path), "--target", "vibration"], "kf-ngs estimates turbulence"),
     ):
         refused = CliRunner().invoke(main, wrong)
         assert refused.exit_code == 2 and says in refused.output

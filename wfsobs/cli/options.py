@@ -278,8 +278,16 @@ def training(
 
 
 def load_declared(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None = None) -> Record:
-    """Read the record of a file; print its interpretation on standard error."""
-    return load_with_delay(record_file, scenario, declaration, sha256)[0]
+    """Read the record of a file; print its interpretation on standard error. Raises RecordError, of constants as well."""
+    record = load_with_delay(record_file, scenario, declaration, sha256)[0]
+    if len(_still(record)) == record.n_modes:
+        raise RecordError(f"{record_file}: y_lgs is one value all the time; a measurement has noise")
+    return record
+
+
+def _still(record: Record) -> list[str]:
+    """Return the modes whose measurement does not change."""
+    return [name for name, y in zip(MODE_NAMES, record.y_lgs.T, strict=False) if np.fmax.reduce(y) == np.fmin.reduce(y)]
 
 
 def load_with_delay(
@@ -290,12 +298,8 @@ def load_with_delay(
         record, delay = read_with_delay(file, name, scenario, declaration)
     if record.origin:
         print_note(f"{record_file}: read as {record.origin}")
-    still = [name for name, y in zip(MODE_NAMES, record.y_lgs.T, strict=False) if np.fmax.reduce(y) == np.fmin.reduce(y)]
-    what = f"{record_file}: y_lgs of {' and '.join(still)} is one value all the time; a measurement has noise"
-    if len(still) == record.n_modes:
-        raise RecordError(what)
-    if still:
-        print_note(what)
+    if still := _still(record):
+        print_note(f"{record_file}: y_lgs of {' and '.join(still)} is one value all the time; a measurement has noise")
     if record.missing:
         print_note(f"{record_file}: {record.missing} of {record.n_steps} frames are missing")
     expected = erfc(record.gate.level / sqrt(2.0)) * record.n_steps * record.n_modes if record.gate else 0.0

@@ -172,7 +172,8 @@ def tune(
         if validation is not None:
             raise SettingError("--validation: only for simulated records, not with --record")
         record = load_declared(record_file, scenario, declaration, sha256)
-        if target and (judged := judged_by(record, name, target)[0]) != target:
+        is_known = target and not on_envelope and name in OBSERVERS and target in OBSERVERS[name].targets
+        if target and is_known and (judged := judged_by(record, name, target)[0]) != target:
             raise SettingError(f"--target {target}: the record has no truth; {name} is tuned by its {judged}")
     with progress_bar("evaluations") as watch:
         tuned = search(

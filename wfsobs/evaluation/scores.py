@@ -532,7 +532,8 @@ def scatter_of_mean(values: Array, independent: bool = False) -> tuple[Array, Ar
     alike = np.maximum(alike + 1.0 / n, 0.0)  # the estimate of a correlation from n values is low by about 1 / n
     effective = np.maximum(n * (1.0 - alike) / (1.0 + alike), 2.0)
     freedom = effective - 1.0
-    wider = (1.0 + 1.0 / freedom) ** 2 * (SLOW_FACTOR if freedom.size and np.median(freedom) < SLOW else 1.0)
+    is_slow = freedom.size and np.median(freedom) < SLOW * min(n / BATCHES, 1.0)
+    wider = (1.0 + 1.0 / freedom) ** 2 * (SLOW_FACTOR if is_slow else 1.0)
     return mean, wider * np.sqrt(power / (n - 1) / effective), freedom
 
 

@@ -368,8 +368,8 @@ def _apply_mirror(signals: dict[str, Array], delay: float, declaration: Declared
     With the part p of a step that is (1 - p) u[k] + p u[k-1], times the gain; what was before the record is taken as its first.
     """
     part, gain = delay - int(delay + WHOLE), np.array(declaration.command_gain or (1.0,))
-    if gain.size not in (1, signals["y_lgs"].shape[1]) or not ((gain >= 1e-3) & (gain <= 1e3)).all():
-        raise RecordError(f"a command gain takes a number from 0.001 to 1000, or {signals['y_lgs'].shape[1]}, one per mode")
+    if gain.size not in (1, signals["y_lgs"].shape[1]) or not ((gain >= 1e-9) & (gain <= 1e9)).all():
+        raise RecordError(f"a command gain takes a number from 1e-9 to 1e9, or {signals['y_lgs'].shape[1]}, one per mode")
     for name in {"u", "training_u"} & signals.keys():
         u = signals[name]
         signals[name] = gain * (u if part < WHOLE else (1.0 - part) * u + part * np.concatenate([u[:1], u[:-1]]))

@@ -150,11 +150,14 @@ class FileColumns:
 
     def _add_numbers(self, name: str, values: Array, unit: str) -> None:
         values = np.atleast_1d(values)
-        self._bytes += 8 * values.size
-        if self._bytes > self.most:
-            raise TooLargeError(self.most)
         known, longest = name.lower(), int(np.argmax(values.shape))
         rows = np.moveaxis(values, longest, 0).reshape(values.shape[longest], -1)
+        size = 8 * (values.size if known in NAMES else rows[:, :MOST_COLUMNS].size)
+        if self._bytes + size > self.most:
+            if known not in NAMES:
+                return self.leave(name, f"there is no room for {name}")
+            raise TooLargeError(self.most)
+        self._bytes += size
         if known in self.contents.arrays:
             raise RecordError(f"two parts are named {known}")
         if known in CLOCKS:
