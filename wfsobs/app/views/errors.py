@@ -250,7 +250,7 @@ class ScoreWriter:
 
         def make_row(name: str) -> Row:
             row, bound = rows[name], known.get(own_bound(name) or "")
-            error, *others = self._cells(row, target, marks.get(name)) if row else [missing(why[name])] * 6
+            error, *others = self._cells(row, target, marks.get(name)) if row else [missing(why.get(name, ""))] * 6
             notes = ["looks ahead" if is_non_causal(name) else "", own_interval(row) if row else ""]
             if row and bound and above_bound(row["rms_um"], row["interval_um"], bound["rms_um"]) == 0.0:
                 notes.append(AT_LIMIT)
