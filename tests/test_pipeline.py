@@ -418,6 +418,12 @@ def test_what_is_no_estimate_is_one_line_and_the_others_keep_theirs(
     assert {e.observer for e in result.estimates} == {"zero"}
 
 
+def test_want_of_memory_is_no_result_of_an_observer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(OBSERVERS, "mine", Observer("mine", "Mine", ("vibration",), lambda *_: raise_error(MemoryError())))
+    with pytest.raises(MemoryError):
+        run(scenario(), observers=["mine", "zero"])
+
+
 def test_an_observer_that_cannot_count_its_peaks_runs_with_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     wrong = replace(OBSERVERS["kf-lgs"], counts=lambda *_: raise_error(KeyError("x")))
     monkeypatch.setitem(OBSERVERS, "kf-lgs", wrong)

@@ -11,7 +11,6 @@ moment from a wait.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import inf
 from typing import Any
 
 from wfsobs.atmosphere import FIELD
@@ -66,12 +65,12 @@ def part_seconds(scenario: Scenario) -> dict[str, float]:
 
 
 def _observer_seconds(estimate: Callable[..., float], *of: Any) -> float:
-    """Return the time of an observer of any package [s]; infinite where it is none."""
+    """Return the time of an observer of any package [s]; none where it cannot tell, as the limit of time holds all the same."""
     try:
         seconds = float(estimate(*of))
     except Exception:
-        return inf
-    return seconds if seconds >= 0.0 else inf
+        return 0.0
+    return seconds if seconds >= 0.0 else 0.0
 
 
 def _steps_of_air(scenario: Scenario) -> int:

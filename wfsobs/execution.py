@@ -122,7 +122,7 @@ def _one(observer: Observer, record: Record, scenario: Scenario, watch: Watch, p
             if np.isnan(values[target]).all():
                 sensors = " or ".join(sensor.upper() for sensor in observer.sensors)
                 raise ValueError(f"{target} is NaN in every step, perhaps for too few measurements of the {sensors}")
-    except Cancelled:
+    except (Cancelled, MemoryError):  # which pass: nothing to be kept of the observer
         raise
     except (Exception, SystemExit) as error:  # by an observer of another package, perhaps: the others keep their results
         if not isinstance(error, ValueError):

@@ -259,7 +259,9 @@ class Dashboard:
     def _refresh(self, *_: object) -> None:
         run = self.store.run
         failed = run.state == FAILED
-        self.alert.param.update(object=f"<p>{escape(name_settings(run.message))}</p>", visible=failed)  # else Markdown
+        self.alert.param.update(
+            object=f"<p>{escape(' '.join(name_settings(run.message).split()))}</p>", visible=failed
+        )  # else Markdown
         texts = [STALE] if self.store.stale else []
         if self.store.waiting:
             texts.append(f"{waiting_text(self.store.waiting)}.")

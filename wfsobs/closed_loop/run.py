@@ -381,7 +381,7 @@ def _outcome(
                 u, correction = drive(acting, measured, true, _plant_generator(plan.scenario), alone)
                 if isinstance(acting, SupervisedController):
                     alarms = tuple((frame * record.dt, reason) for frame, reason in acting.alarms)
-    except Cancelled:
+    except (Cancelled, MemoryError):
         raise
     except (Exception, SystemExit) as error:  # by a controller of another package, perhaps: the others keep their outcomes
         return Outcome(controller.id, tuple(None for _ in stable), note=error_line(error))

@@ -19,7 +19,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.signal.spectrum import psd, rms
 from wfsobs.telemetry.columns import describe_values, suggest_clock, suggest_roles
 from wfsobs.telemetry.command_response import CommandResponse, command_response, saturation_lines
-from wfsobs.telemetry.formats.contents import TIME, Contents
+from wfsobs.telemetry.formats.contents import TIME, TRAINING, Contents
 from wfsobs.telemetry.formats.psd import NoSpectrumError, read_psd
 from wfsobs.telemetry.intake import DeclaredFormat, stated_delay, stated_sign, to_record
 from wfsobs.telemetry.records import contradiction_of, plausible_units, read_columns, read_contents
@@ -250,7 +250,8 @@ def preview(
         contents = read_contents(io.BytesIO(data), shown, stated.columns, MOST_NUMBERS)
         watch.check()
         if check_steps is not None:
-            check_steps(max((max(array.shape, default=0) for array in contents.arrays.values()), default=0))
+            longest = (max(x.shape, default=0) for name, x in contents.arrays.items() if name not in TRAINING)
+            check_steps(max(longest, default=0))
         record = to_record(contents, scenario, stated)
     except RecordError as error:
         raise RecordError(f"{shown}: {error}") from None

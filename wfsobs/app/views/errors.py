@@ -192,6 +192,8 @@ class VerdictLine:
 
 ABOVE = macro("tag", "above", "worse than zero")
 
+NO_SIMULATION = "no bound: the spectra of a loaded record are not known"
+
 
 def reasons_of(result: Result) -> dict[str, str]:
     """Return why observers have no estimate."""
@@ -355,7 +357,7 @@ class Table:
             none = "it has no estimate" if scores else "nothing is scored, all may be warm-up"
             why = dict.fromkeys(rows, f"no error: {none}")
             if scores:
-                why |= dict.fromkeys(BOUNDS, NO_BOUND) | reasons_of(shown.result)
+                why |= dict.fromkeys(BOUNDS, NO_BOUND if shown.simulation else NO_SIMULATION) | reasons_of(shown.result)
 
         def compared(name: str) -> list[str]:
             return [self._compared_cell(run, name, target, scores.get(name)) for run in display.compared_runs]
