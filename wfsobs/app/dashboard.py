@@ -259,9 +259,8 @@ class Dashboard:
     def _refresh(self, *_: object) -> None:
         run = self.store.run
         failed = run.state == FAILED
-        self.alert.param.update(
-            object=f"<p>{escape(' '.join(name_settings(run.message).split()))}</p>", visible=failed
-        )  # else Markdown
+        said = escape(" ".join(name_settings(run.message).split()))
+        self.alert.param.update(object=f"<p>{said}</p>", visible=failed)  # a paragraph is no Markdown
         texts = [STALE] if self.store.stale else []
         if self.store.waiting:
             texts.append(f"{waiting_text(self.store.waiting)}.")
