@@ -337,7 +337,7 @@ def test_in_a_dozen_scenarios_the_verdict_is_that_of_the_table(name: str) -> Non
             if not errors:
                 assert heading not in said
                 continue
-            match = re.search(rf"{heading}: (.*?) ([\d.]+)(?: ± [\d.]+| \([\d.]+ to [\d.]+\))? nm", said)
+            match = re.search(rf"{heading}: (.*?) ([\d.]+)(?: ± [\d.]+| \([\d.]+ to [\d.]+\)| \(interval unknown\))? nm", said)
             # Three digits; of two that are the same to a thousandth the first in the tables is named.
             assert match and float(match[2]) == pytest.approx(1e3 * min(errors.values()), rel=6e-3)
             assert match[1] in {row_label(n) for n, x in errors.items() if x <= 1.001 * min(errors.values())}

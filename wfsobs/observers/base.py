@@ -296,7 +296,7 @@ class Observer:
         return ", ".join(words_for(self.prior, source=source)) or NOTHING
 
 
-LARGEST = 1e100
+LARGEST = np.float64(1e100)
 """Largest number of an estimate [um]: sums of squares of larger ones may overflow."""
 
 

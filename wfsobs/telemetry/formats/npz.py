@@ -87,7 +87,10 @@ def read_npy(file: IO[bytes], most: int) -> FileColumns:
         raise TooLargeError(most)
     file.seek(0)
     with refuse_damage(DAMAGED):
-        out.add("array", _values(file, length, "array"))
+        values = _values(file, length, "array")
+        if 8 * values.size > most:
+            raise TooLargeError(most)
+        out.add("array", values)
     return out
 
 
