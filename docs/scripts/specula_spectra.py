@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from wfsobs.observers.base import Look
-from wfsobs.plot.elements import FREQUENCY, PAGE, draw_line, look, overlay, quantity, save_figure, stack
+from wfsobs.plot.elements import FREQUENCY, PAGE, draw_line, overlay, quantity, save_figure, stack
+from wfsobs.plot.looks import look
 from wfsobs.signal.spectrum import psd
 
 RATE = 1000.0

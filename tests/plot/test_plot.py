@@ -27,8 +27,9 @@ from wfsobs.closed_loop.run import ClosedLoop, residual_rms
 from wfsobs.evaluation.exact_errors import cumulative_rms, spectra
 from wfsobs.identification.result import Identification
 from wfsobs.observers import OBSERVERS
-from wfsobs.plot.elements import BINS, look, save_figure, to_matplotlib
+from wfsobs.plot.elements import BINS, save_figure, to_matplotlib
 from wfsobs.plot.figures import plots_of
+from wfsobs.plot.looks import look
 from wfsobs.plot.paper import NUMBERS, draw_paper_figure, observers_in, samples_of
 from wfsobs.record import Estimate
 from wfsobs.signal.spectrum import psd

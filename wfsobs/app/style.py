@@ -22,9 +22,9 @@ from wfsobs.evaluation.result import NO_ESTIMATE
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, Look
-from wfsobs.plot.elements import LOOKS as LOOKS
-from wfsobs.plot.elements import TERM_COLOURS as TERM_COLOURS
-from wfsobs.plot.elements import look as look
+from wfsobs.plot.looks import LOOKS as LOOKS
+from wfsobs.plot.looks import TERM_COLOURS as TERM_COLOURS
+from wfsobs.plot.looks import look as look
 from wfsobs.record import TOTAL
 
 

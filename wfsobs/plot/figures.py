@@ -24,19 +24,18 @@ from wfsobs.identification.result import Identification
 from wfsobs.observers.base import TARGETS, Look
 from wfsobs.plot.elements import (
     FREQUENCY,
-    TERM_COLOURS,
     draw_bars,
     draw_intervals,
     draw_line,
     draw_marks,
     draw_trace,
     legend_of,
-    look,
     overlay,
     quantity,
     stack,
     style,
 )
+from wfsobs.plot.looks import TERM_COLOURS, look
 from wfsobs.record import Record, hold_last
 from wfsobs.scenario.configfile import Variation
 from wfsobs.sensors.zernike import HIGHEST_ORDER, modes_up_to

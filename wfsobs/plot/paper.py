@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from wfsobs.evaluation.exact_errors import TRUTH, spectra
 from wfsobs.evaluation.result import Result
 from wfsobs.observers.base import TURBULENCE, VIBRATION
-from wfsobs.plot.elements import look
+from wfsobs.plot.looks import look
 from wfsobs.record import Record, RecordError
 from wfsobs.sensors.zernike import TIP_TILT
 from wfsobs.signal.envelope import envelope, envelope_times
