@@ -13,9 +13,16 @@ from wfsobs.identification import identify
 from wfsobs.identification.identification import whiteness_lines
 from wfsobs.record import Record, RecordError
 from wfsobs.signal.autoregressive import Ar2
-from wfsobs.spectral.missing import FAR, MOST_OUTLYING, MissingSamples, find_outlying
 from wfsobs.spectral.model import Spectrum
-from wfsobs.spectral.whittle import Cells, periodogram_frequencies, spectrum_information
+from wfsobs.spectral.whittle import (
+    FAR,
+    MOST_OUTLYING,
+    Cells,
+    MissingSamples,
+    find_outlying,
+    periodogram_frequencies,
+    spectrum_information,
+)
 from wfsobs.typing import Array
 
 pytestmark = pytest.mark.slow

@@ -35,10 +35,11 @@ from wfsobs.scenario import Scenario
 from wfsobs.sensors.zernike import HIGHEST_ORDER, modes_up_to
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import true_spectra
-from wfsobs.spectral.missing import MissingSamples, find_outlying
 from wfsobs.spectral.whittle import (
     Cells,
+    MissingSamples,
     fast_length,
+    find_outlying,
     fit_spectrum,
     inflation,
     periodogram,

@@ -38,9 +38,8 @@ from wfsobs.scenario.configfile import add_comments, to_toml
 from wfsobs.sensors.zernike import MODE_NAMES
 from wfsobs.signal.autoregressive import Ar3
 from wfsobs.signal.gains import RiccatiError
-from wfsobs.spectral.missing import find_outlying
 from wfsobs.spectral.search import LOWEST, PAD, Candidate, SearchResult, search_peaks
-from wfsobs.spectral.whittle import fast_length, periodogram, periodogram_frequencies, taper
+from wfsobs.spectral.whittle import fast_length, find_outlying, periodogram, periodogram_frequencies, taper
 from wfsobs.typing import Array
 
 PARTS = 10

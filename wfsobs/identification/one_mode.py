@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from scipy.stats import gamma
 
 from wfsobs.signal.autoregressive import Ar2, Ar3
-from wfsobs.spectral.missing import MissingSamples
 from wfsobs.spectral.model import BACKGROUND_REACHES, BACKGROUND_WORTH, RMS, Spectrum, with_first_guess
 from wfsobs.spectral.search import LOWEST, PAD, Candidate, Sinusoid, nearest_line
 from wfsobs.spectral.whittle import (
     Cells,
+    MissingSamples,
     first_guess,
     fit_spectrum,
     inflation,
@@ -267,7 +267,7 @@ class OneMode:
     I : Array
         Expected periodogram of the complete `left`.
     share : Array
-        Measured share of every bin, see `missing`.
+        Measured share of every bin, see `measured_share`.
     rejections : list
         Candidates that no peak explains.
     removals : list

@@ -36,12 +36,13 @@ from wfsobs.record import Record, hold_last
 from wfsobs.scenario import Scenario
 from wfsobs.signal.wiener import circle_mean
 from wfsobs.simulation.true_spectra import true_spectra
-from wfsobs.spectral.missing import MissingSamples, find_outlying
 from wfsobs.spectral.model import Spectrum
 from wfsobs.spectral.quick import quick_spectrum
 from wfsobs.spectral.whittle import (
     Cells,
+    MissingSamples,
     fast_length,
+    find_outlying,
     inflation,
     periodogram_frequencies,
     spectrum_negative_log_likelihood,

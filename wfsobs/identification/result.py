@@ -41,9 +41,8 @@ from wfsobs.sensors.zernike import order_of
 from wfsobs.signal.autoregressive import Ar2, Ar3, turbulence_corner
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.simulation.layers import relative_cone_error, relative_rms
-from wfsobs.spectral.missing import find_outlying
 from wfsobs.spectral.model import Spectrum
-from wfsobs.spectral.whittle import fast_length, inflation
+from wfsobs.spectral.whittle import fast_length, find_outlying, inflation
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:

@@ -19,10 +19,9 @@ import numpy as np
 from scipy.special import logit
 
 from wfsobs.signal.autoregressive import Ar2, Ar3
-from wfsobs.spectral.missing import MissingSamples
 from wfsobs.spectral.model import BACKGROUND_REACHES, BACKGROUND_WORTH, DAMPING, FAST, SLOW, Spectrum, densities, with_first_guess
 from wfsobs.spectral.search import LOWEST
-from wfsobs.spectral.whittle import FINE, NEAR, Cells, first_guess, periodogram, periodogram_frequencies
+from wfsobs.spectral.whittle import FINE, NEAR, Cells, MissingSamples, first_guess, periodogram, periodogram_frequencies
 from wfsobs.typing import Array
 
 

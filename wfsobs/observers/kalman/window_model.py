@@ -22,11 +22,10 @@ from wfsobs.record import RecordError
 from wfsobs.settings import Group, Real, Section, Whole
 from wfsobs.signal.autoregressive import Ar2, Ar3
 from wfsobs.signal.statespace import disturbance_model
-from wfsobs.spectral.missing import MissingSamples
 from wfsobs.spectral.model import Spectrum
 from wfsobs.spectral.quick import SHORTEST, follow_spectrum, quick_spectrum, quick_spectrum_of_samples
 from wfsobs.spectral.search import missed_rms
-from wfsobs.spectral.whittle import periodogram_frequencies
+from wfsobs.spectral.whittle import MissingSamples, periodogram_frequencies
 from wfsobs.typing import Array
 
 
