@@ -13,8 +13,6 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
-import tomli_w
-
 from wfsobs.files import write_whole
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -87,6 +85,8 @@ def _merge(into: dict[str, Any], table: dict[str, Any], where: str = "") -> None
 
 def to_toml(scenario: Scenario) -> str:
     """Return every setting as TOML, peaks as [[vibration.peaks]] tables; `from_toml` returns an equal scenario."""
+    import tomli_w  # here, since who identifies and tunes need not write a file
+
     return tomli_w.dumps(scenario.to_dict())
 
 
