@@ -243,6 +243,8 @@ def test_a_mode_that_is_one_value_is_named(command, still, tmp_path):
     done = call(*command.split(), str(path), "--open-loop")
     assert done.exit_code == 2 or still == "tilt"
     assert f"{path}: y_lgs of {still} is one value all the time; a measurement has noise\n" in done.stderr
+    written = call("convert", str(path), str(tmp_path / "r.csv"), "--open-loop")
+    assert written.exit_code == 0 and (tmp_path / "r.csv").exists(), written.stderr
 
 
 def test_presets_lists_and_prints():

@@ -1,6 +1,6 @@
 """What the page is made of: its own components, whose parameters go down to the browser and messages up; texts, buttons, colours.
 
-Colours of observers and controllers are `wfsobs.plot.elements`.
+Colours of observers and controllers are `wfsobs.plot.looks`.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ def convert(record_file: str, out: str, scenario: Scenario, declaration: Declare
     What is written is read back and compared; parts that the format has no place for are named.
     """
     check_writable(out, record_file, *declaration.files)
-    record = load_declared(record_file, scenario, declaration, sha256)
+    record = load_with_delay(record_file, scenario, declaration, sha256)[0]
     save_record(out, record)
     if lost := name_differences(record, load_record(out, scenario, DeclaredFormat(trust=True))):
         print_note(f"{out}: has no place for {', '.join(lost)}")

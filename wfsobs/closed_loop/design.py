@@ -143,6 +143,8 @@ def _design_one(
     settings, modes = own_settings(controller, scenario), range(len(scenario.modes))
     try:
         prior = prior_for(controller, scenario, spectra)
+    except MemoryError:
+        raise
     except (Exception, SystemExit) as error:
         return tuple(LawDesign(None, None, note=error_line(error)) for _ in modes), Prior()
     designed = (_of_mode(controller, prior, mode, plant, settings, spectra[mode] if spectra else None) for mode in modes)
@@ -162,6 +164,8 @@ def _of_mode(
         predicted = None if spectra is None else float(np.sqrt(residual_variance(law, spectra, mirror)))
         known = margins(nominal_loop(law, mirror), frequencies(law.poles), plant.dt)
         return LawDesign(law, stable, predicted, known)
+    except MemoryError:
+        raise
     except (Exception, SystemExit) as error:  # by a controller of another package, perhaps: the others keep their laws
         return LawDesign(None, False if isinstance(error, UnstableCycle) else None, note=error_line(error))
 

@@ -1,10 +1,10 @@
 """Missing samples, bridged causally in one place, for observers and controllers that do not take them as missing.
 
 A lost measurement z[k] is replaced by what the Kalman filter of the own prior predicts for it, a lost NGS frame by what the NGS
-filter predicts. Who is told no model holds the last value. A lost command is held, as a mirror holds its position. The Kalman
-filters and the Gaussian processes in time take a measurement that is missing as missing (`wfsobs.signal.gains`).
-Only samples before a gap fill it, so estimates stay causal. What has been filled in counts in no score of predicting
-measurements, and no standard deviation is stated there.
+filter predicts. An observer without a model holds the last value. A lost command is held, as a mirror holds its position. The
+Kalman filters and the Gaussian processes in time take a measurement that is missing as missing (`wfsobs.signal.gains`). Only
+samples before a gap fill it, so estimates stay causal. What has been filled in counts in no score of predicting measurements, and
+no standard deviation is stated there.
 """
 
 from __future__ import annotations

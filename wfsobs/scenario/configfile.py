@@ -85,7 +85,7 @@ def _merge(into: dict[str, Any], table: dict[str, Any], where: str = "") -> None
 
 def to_toml(scenario: Scenario) -> str:
     """Return every setting as TOML, peaks as [[vibration.peaks]] tables; `from_toml` returns an equal scenario."""
-    import tomli_w  # here, since who identifies and tunes need not write a file
+    import tomli_w  # here: identification and tuning work without it
 
     return tomli_w.dumps(scenario.to_dict())
 

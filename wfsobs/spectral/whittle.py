@@ -292,7 +292,7 @@ class MissingSamples:
     dt : float
         Time step [s].
     rng : numpy.random.Generator, optional
-        For the records drawn; who only fills has none.
+        For the records drawn; filling needs none.
     """
 
     is_missing: Array
