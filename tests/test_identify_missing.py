@@ -16,6 +16,7 @@ from wfsobs.signal.autoregressive import Ar2
 from wfsobs.spectral.model import Spectrum
 from wfsobs.spectral.whittle import (
     FAR,
+    LEAST,
     MOST_OUTLYING,
     Cells,
     MissingSamples,
@@ -94,7 +95,8 @@ def test_share_of_a_bin_that_is_measured(gone: Array) -> None:
     for octave in range(3, octaves.max() + 1):
         inside = octaves == octave
         assert np.mean(shares, axis=0)[inside].mean() == pytest.approx(exact[inside].mean(), abs=0.03)
-    assert np.mean(shares) == pytest.approx(1.0 - gone.mean(), abs=1e-3)  # a bin with little left is given LEAST
+    is_raised = np.min(shares) <= LEAST  # a bin with little left is given LEAST
+    assert np.mean(shares) == pytest.approx(1.0 - gone.mean(), abs=LEAST if is_raised else 1e-4)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.3])
