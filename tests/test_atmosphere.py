@@ -13,9 +13,8 @@ from wfsobs.atmosphere import von_karman_density
 from wfsobs.priors_from.scenario import modelled_processes
 from wfsobs.scenario import Scenario
 from wfsobs.simulation import layers as atmosphere
-from wfsobs.simulation.disturbance import make_disturbance
+from wfsobs.simulation.disturbance import make_disturbance, turbulence_process, turbulence_rms
 from wfsobs.simulation.sensing import lgs_error_process, lgs_error_variance, low_frequency_process, measure_open_loop
-from wfsobs.simulation.turbulence import turbulence_process, turbulence_rms
 
 FLOW: dict[str, Any] = {"turbulence.source": "frozen-flow", "sensors.kind": "zernike"}
 QUIET_SENSORS: dict[str, Any] = {"sensors.lgs_noise": 0.0, "sensors.ngs_noise": 0.0, "vibration.source": "none"}

@@ -14,7 +14,7 @@ from tests.records import kalman_model
 from wfsobs.evaluation.bound import bound_rms, least_errors_of_both, record_bounds
 from wfsobs.evaluation.result import can_be_best
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, COMMON_BOUNDS, SCORED
-from wfsobs.observers.kalman.multirate import optimal_cycle
+from wfsobs.observers.kalman.filters import optimal_cycle
 from wfsobs.priors_from.scenario import measurement_noise
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS

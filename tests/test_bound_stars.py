@@ -12,12 +12,12 @@ from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.signal.wiener import advance_spectrum
 from wfsobs.simulation import layers as atmosphere
+from wfsobs.simulation.disturbance import SOURCES
 from wfsobs.simulation.flow_spectra import star_basis, star_flow_spectra
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.mode_spectra import AXIS, FIRST, LGS, NGS, StarSpectra, star_spectra
 from wfsobs.simulation.sensing import stars_differ
 from wfsobs.simulation.true_spectra import true_spectra
-from wfsobs.simulation.turbulence import SOURCES
 from wfsobs.typing import Array
 
 ASTERISM = Scenario().replace(

@@ -18,7 +18,7 @@ from wfsobs.cli import main
 from wfsobs.evaluation.budget import AVERAGED, TERMS, Budget, error_budget, shapley_shares, split_lines, split_record
 from wfsobs.evaluation.result import Result
 from wfsobs.evaluation.scores import BOUNDS
-from wfsobs.observers.kalman.single import steady_filter
+from wfsobs.observers.kalman.filters import steady_filter
 from wfsobs.pipeline import run
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS

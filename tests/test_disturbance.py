@@ -9,8 +9,7 @@ import pytest
 from scipy.signal import periodogram
 
 from wfsobs.scenario import Scenario
-from wfsobs.simulation.disturbance import Disturbance, make_disturbance, vibration_variance
-from wfsobs.simulation.turbulence import turbulence_process
+from wfsobs.simulation.disturbance import Disturbance, make_disturbance, turbulence_process, vibration_variance
 
 N = 4000
 

@@ -12,7 +12,7 @@ from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.exact_errors import exact_errors
 from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.kalman.multirate import optimal_model
+from wfsobs.observers.kalman.filters import optimal_model
 from wfsobs.prior import LgsError, Model
 from wfsobs.priors_from.scenario import lgs_error_of, model_of, prior_of
 from wfsobs.scenario.presets import PRESETS

@@ -10,11 +10,11 @@ from wfsobs.evaluation.bound import bound_rms, record_bounds
 from wfsobs.execution import run_observer
 from wfsobs.scenario import Scenario
 from wfsobs.signal.wiener import circle_mean
+from wfsobs.simulation.disturbance import turbulence_rms
 from wfsobs.simulation.flow_spectra import flow_spectra
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.sensing import lgs_error_variance
 from wfsobs.simulation.true_spectra import has_known_spectra, n_frequencies, true_spectra
-from wfsobs.simulation.turbulence import turbulence_rms
 
 FLOW = Scenario().replace(
     {

@@ -18,7 +18,7 @@ from wfsobs.identification import Identification, identify
 from wfsobs.identification.identification import identification_toml
 from wfsobs.identification.process import IdentifiedProcess, Number, merge_peaks
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.kalman.single import steady_filter
+from wfsobs.observers.kalman.filters import steady_filter
 from wfsobs.pipeline import observe, run
 from wfsobs.prior import Lines
 from wfsobs.priors_from.scenario import lines_of, modelled_peak, observer_settings, prior_of
@@ -27,7 +27,7 @@ from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.autoregressive import Ar2, Ar3
 from wfsobs.signal.statespace import sample_ar3
-from wfsobs.simulation.turbulence import turbulence_rms
+from wfsobs.simulation.disturbance import turbulence_rms
 from wfsobs.telemetry.records import save_record
 from wfsobs.typing import Array
 

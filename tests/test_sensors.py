@@ -12,8 +12,8 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.sensors.zernike import ZernikeProjection
 from wfsobs.settings.values import SettingError
+from wfsobs.simulation.disturbance import SOURCES
 from wfsobs.simulation.sensor_noise import aliasing_rms, noise_covariance, noise_rms, sensor, shack_hartmann
-from wfsobs.simulation.turbulence import SOURCES
 
 SHORT = {"run.duration": 0.4, "run.warm_up": 0.1, "gpr_offline.training_size": 2, "gpr_offline.depth": 2}
 

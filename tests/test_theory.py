@@ -15,7 +15,7 @@ from wfsobs.evaluation.exact_errors import TRUTH, Prediction, Theory, band_rms, 
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.kalman.single import steady_filter
+from wfsobs.observers.kalman.filters import steady_filter
 from wfsobs.priors_from.scenario import lines_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS

@@ -21,9 +21,9 @@ from wfsobs import PRESETS, Record, Scenario, observe, simulate
 from wfsobs.identification import Identification, identify
 from wfsobs.identification.identification import ALONE, LEVEL
 from wfsobs.signal.autoregressive import Ar2
+from wfsobs.simulation.disturbance import turbulence_process
 from wfsobs.simulation.sensing import lgs_error_process, lgs_noise_rms
 from wfsobs.simulation.true_spectra import true_spectra
-from wfsobs.simulation.turbulence import turbulence_process
 from wfsobs.spectral.search import BELOW, LOWEST, OF_LINES, STRUCTURES
 
 QUIET: dict[str, Any] = {"vibration.source": "none"}

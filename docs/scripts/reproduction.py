@@ -17,7 +17,7 @@ import numpy as np
 
 import wfsobs
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.kalman.single import steady_filter
+from wfsobs.observers.kalman.filters import steady_filter
 from wfsobs.observers.kalman.step import by_target
 from wfsobs.priors_from.scenario import measurement_noise, modelled_processes
 from wfsobs.record import Record, Training

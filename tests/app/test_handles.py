@@ -29,7 +29,7 @@ from wfsobs.priors_from.controllers import plant_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.values import SettingError
-from wfsobs.simulation.turbulence import turbulence_process
+from wfsobs.simulation.disturbance import turbulence_process
 
 
 def moved(scenario: Scenario, target: str, name: str, mode: int = 0, **by: float) -> Scenario:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from wfsobs.execution import run_observer
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman import window_model
-from wfsobs.observers.kalman.single import steady_filter
+from wfsobs.observers.kalman.filters import steady_filter
 from wfsobs.observers.kalman.window_model import model_filter, pack_spectrum, unpack_spectrum
 from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import Record, RecordError, delay_signal

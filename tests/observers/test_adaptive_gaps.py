@@ -11,7 +11,7 @@ import pytest
 from tests.observers.test_adaptive import DT, MODEL, NOISE, PEAK, TURBULENCE, made, rms, with_window
 from wfsobs.execution import run_observer
 from wfsobs.observers.kalman import window_model
-from wfsobs.observers.kalman.single import steady_filter
+from wfsobs.observers.kalman.filters import steady_filter
 from wfsobs.record import TOTAL, Record
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.spectral.model import Spectrum

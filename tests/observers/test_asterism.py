@@ -27,10 +27,10 @@ from wfsobs.signal.autoregressive import Ar2
 from wfsobs.signal.gains import lyapunov
 from wfsobs.signal.joint_states import PresentInputs, StateFilter, frame_shares
 from wfsobs.signal.statespace import disturbance_model
+from wfsobs.simulation.disturbance import line_width
 from wfsobs.simulation.flow_spectra import star_basis
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.sensing import lgs_weights
-from wfsobs.simulation.turbulence import line_width
 from wfsobs.telemetry.records import load_record, save_record
 from wfsobs.testing import check_observer, step_difference
 

@@ -14,7 +14,7 @@ from tests.records import kalman_model
 from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.kalman.single import between_frames, steady_filter
+from wfsobs.observers.kalman.filters import between_frames, steady_filter
 from wfsobs.priors_from.scenario import arguments, measurement_noise, modelled_processes
 from wfsobs.record import Estimates, Record
 from wfsobs.scenario import Scenario

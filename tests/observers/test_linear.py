@@ -12,7 +12,7 @@ from scipy.linalg import solve_discrete_lyapunov
 from wfsobs.evaluation.bound import bound_rms
 from wfsobs.execution import run_observer
 from wfsobs.observers.gpr.offline import TAPS, fit, predict
-from wfsobs.observers.kalman.single import steady_filter
+from wfsobs.observers.kalman.filters import steady_filter
 from wfsobs.priors_from.scenario import lines_of, measurement_noise, modelled_processes, modelled_turbulence
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
@@ -20,10 +20,9 @@ from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.autoregressive import Ar2, Ar3, Ar3Fits
 from wfsobs.signal.gains import steady_state
 from wfsobs.signal.statespace import disturbance_model, third_order_model
-from wfsobs.simulation.disturbance import vibration_lines
+from wfsobs.simulation.disturbance import turbulence_process, vibration_lines
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.sensor_noise import noise_covariance
-from wfsobs.simulation.turbulence import turbulence_process
 
 
 def small(changes: dict | None = None) -> Scenario:

@@ -16,7 +16,7 @@ from wfsobs.evaluation.scores import half_width
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.gp import kernels_of, measured_late, sampled_model
-from wfsobs.observers.kalman.multirate import every_peak_model, multirate_noise, optimal_model
+from wfsobs.observers.kalman.filters import every_peak_model, multirate_noise, optimal_model
 from wfsobs.priors_from.scenario import arguments, observer_settings, prior_of
 from wfsobs.record import Measurements, Record
 from wfsobs.scenario import Scenario

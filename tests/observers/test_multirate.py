@@ -9,7 +9,7 @@ import pytest
 
 from tests.records import kalman_model
 from wfsobs.execution import run_observer
-from wfsobs.observers.kalman.multirate import UnstableCycle, multirate_filter, multirate_noise
+from wfsobs.observers.kalman.filters import UnstableCycle, multirate_filter, multirate_noise
 from wfsobs.pipeline import run
 from wfsobs.priors_from.scenario import model_of, modelled_processes
 from wfsobs.record import Record

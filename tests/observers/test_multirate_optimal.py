@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from tests.records import kalman_model
 from wfsobs.execution import run_observer
-from wfsobs.observers.kalman.multirate import optimal_cycle, optimal_filter, optimal_model
+from wfsobs.observers.kalman.filters import optimal_cycle, optimal_filter, optimal_model
 from wfsobs.prior import LgsError, Model, Prior
 from wfsobs.priors_from.scenario import lgs_error_of, model_of, modelled_processes, prior_of
 from wfsobs.scenario import Scenario

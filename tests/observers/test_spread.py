@@ -19,7 +19,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.gpr.offline import HELD, train
 from wfsobs.observers.gpr.online import predict_sliding
 from wfsobs.observers.gpr.windows import SquaredExponential
-from wfsobs.observers.kalman.single import MultiPeak
+from wfsobs.observers.kalman.filters import MultiPeak
 from wfsobs.prior import LgsError, Noise, Prior
 from wfsobs.priors_from.scenario import observer_settings, prior_of
 from wfsobs.record import Measurements

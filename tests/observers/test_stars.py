@@ -17,7 +17,7 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.gp import kernels_of, measured_late, sampled_model
-from wfsobs.observers.kalman.multirate import beam_model
+from wfsobs.observers.kalman.filters import beam_model
 from wfsobs.prior import Prior
 from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
 from wfsobs.priors_from.scenario import arguments, observer_settings, prior_of

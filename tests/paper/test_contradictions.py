@@ -13,8 +13,7 @@ from scipy.signal import lfilter
 
 from tests.records import kalman_model
 from wfsobs.execution import run_observer
-from wfsobs.observers.kalman.multirate import multirate_noise
-from wfsobs.observers.kalman.single import steady_filter
+from wfsobs.observers.kalman.filters import multirate_noise, steady_filter
 from wfsobs.priors_from.scenario import model_of, modelled_processes
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario

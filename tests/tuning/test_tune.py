@@ -16,7 +16,7 @@ from tests.records import ON_PAPER, kalman_model
 from wfsobs.cli import main
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import run_design
-from wfsobs.observers.kalman.single import steady_filter
+from wfsobs.observers.kalman.filters import steady_filter
 from wfsobs.pipeline import observe, run
 from wfsobs.priors_from.scenario import measurement_noise
 from wfsobs.progress import QUIET, Cancelled, Watch

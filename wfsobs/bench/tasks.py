@@ -42,8 +42,7 @@ from wfsobs.observers.gpr.offline import train, training_targets
 from wfsobs.observers.gpr.online import gpr_online, kernel_of
 from wfsobs.observers.gpr.windows import SquaredExponential, window_signals
 from wfsobs.observers.kalman.adaptive import adapt
-from wfsobs.observers.kalman.multirate import multirate_filter, multirate_noise
-from wfsobs.observers.kalman.single import steady_filter
+from wfsobs.observers.kalman.filters import multirate_filter, multirate_noise, steady_filter
 from wfsobs.pipeline import run
 from wfsobs.prior import Bands
 from wfsobs.priors_from.scenario import bands_of, model_of, modelled_processes, prior_of, usual_observers
@@ -53,8 +52,8 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
 from wfsobs.signal.gains import steady_state
 from wfsobs.signal.statespace import paper_matrices
+from wfsobs.simulation.disturbance import SOURCES
 from wfsobs.simulation.loop import simulate
-from wfsobs.simulation.turbulence import SOURCES
 from wfsobs.typing import Array
 
 EXACT_STEPS = 3000

@@ -20,7 +20,7 @@ from wfsobs.control.mismatch import SensorSpectra, loops, margins_of, one_loop, 
 from wfsobs.control.true_plant import TruePlant
 from wfsobs.evaluation.bound import INFORMATION, PeriodicError, least_residual
 from wfsobs.evaluation.exact_errors import variance_of
-from wfsobs.observers.kalman.multirate import UnstableCycle
+from wfsobs.observers.kalman.filters import UnstableCycle
 from wfsobs.prior import Prior, Spectra
 from wfsobs.priors_from.controllers import own_settings, plant_of, prior_for, supervision_of, true_plant_of
 from wfsobs.priors_from.scenario import told_spectra

@@ -18,8 +18,16 @@ from wfsobs.observers.base import VIBRATION, Look, Tunable
 from wfsobs.observers.gpr.offline import OfflineEstimator, OfflineGpr, trained_estimator
 from wfsobs.observers.gpr.online import OnlineEstimator, OnlineGpr, learning_estimator
 from wfsobs.observers.kalman.adaptive import KF_ADAPTIVE, MULTIRATE_ADAPTIVE, kf_adaptive, multirate_adaptive
-from wfsobs.observers.kalman.multirate import TUNABLE, matched_noise, multirate_mode, optimal_mode, optimal_mode_of_peaks
-from wfsobs.observers.kalman.single import MODEL, every_peak_filter, one_peak_filter
+from wfsobs.observers.kalman.filters import (
+    MODEL,
+    TUNABLE,
+    every_peak_filter,
+    matched_noise,
+    multirate_mode,
+    one_peak_filter,
+    optimal_mode,
+    optimal_mode_of_peaks,
+)
 from wfsobs.observers.kalman.window_model import window_lengths
 from wfsobs.prior import (
     Bands,

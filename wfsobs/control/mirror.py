@@ -23,7 +23,7 @@ from math import inf
 import numpy as np
 from scipy.signal import lfilter
 
-from wfsobs.observers.kalman.mode_filter import ModeFilter
+from wfsobs.observers.kalman.step import ModeFilter
 from wfsobs.observers.stepping import GainCycle
 from wfsobs.signal.joint_states import StateFilter
 from wfsobs.signal.periodic import PeriodicFilter

@@ -54,8 +54,7 @@ from wfsobs.evaluation.scores import (
 )
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, TURBULENCE
-from wfsobs.observers.kalman.coupled import flow_model
-from wfsobs.observers.kalman.joint import AsterismModel
+from wfsobs.observers.kalman.joint import AsterismModel, flow_model
 from wfsobs.prior import Asterism, Flow, FlowOfBoth, Lines
 from wfsobs.priors_from.scenario import has_prior, prior_of
 from wfsobs.record import TOTAL, Record
@@ -64,10 +63,10 @@ from wfsobs.signal.joint_states import in_two_threads, running_means
 from wfsobs.signal.sensor_array import FastSensors, SlowSensor, SlowTarget, variance_from_frames, variance_from_sensors
 from wfsobs.signal.spectrum import rms
 from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean, degrees_of_freedom, explained_variance
+from wfsobs.simulation.disturbance import line_width
 from wfsobs.simulation.mode_spectra import AXIS, FIRST, LGS, NGS, StarSpectra, are_coupled, star_spectra
 from wfsobs.simulation.sensing import MEAN, stars_differ
 from wfsobs.simulation.true_spectra import CausalEstimate, TrueSpectra, has_known_spectra, true_spectra
-from wfsobs.simulation.turbulence import line_width
 from wfsobs.typing import Array
 
 INFORMATION: Mapping[str, str] = dict(zip(("lgs", "both", "stars", "modes", "both-modes", "asterism"), BOUNDS, strict=True))

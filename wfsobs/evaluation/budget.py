@@ -36,10 +36,8 @@ from wfsobs.evaluation.result import NO_ESTIMATE, given_lines, is_near, own_boun
 from wfsobs.evaluation.scores import Score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Observer
-from wfsobs.observers.kalman.mode_filter import lgs_mean
-from wfsobs.observers.kalman.multirate import beam_model, estimated_cycle
-from wfsobs.observers.kalman.single import MIN_NOISE, steady_mode
-from wfsobs.observers.kalman.step import KalmanEstimator
+from wfsobs.observers.kalman.filters import MIN_NOISE, beam_model, estimated_cycle, steady_mode
+from wfsobs.observers.kalman.step import KalmanEstimator, lgs_mean
 from wfsobs.observers.step import Estimator
 from wfsobs.prior import Beams, LgsStars, Line, Lines, Prior
 from wfsobs.priors_from.scenario import beams_of, modelled_turbulence, observer_settings, prior_of, vibration_continuum
@@ -48,11 +46,10 @@ from wfsobs.record import TOTAL, Measurements, Record, delay_signal, frame_mean
 from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
 from wfsobs.signal.autoregressive import Ar2, Ar3
-from wfsobs.simulation.disturbance import vibration_lines
+from wfsobs.simulation.disturbance import processes, vibration_lines
 from wfsobs.simulation.loop import measure_closed_loop, simulate_noise
 from wfsobs.simulation.sensing import OpenLoop, lgs_noise_rms
 from wfsobs.simulation.sensor_noise import noise_rms
-from wfsobs.simulation.turbulence import processes
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wfsobs.observers.kalman.multirate import multirate_filter, multirate_noise, optimal_filter, optimal_model
-from wfsobs.observers.kalman.single import steady_filter
+from wfsobs.observers.kalman.filters import multirate_filter, multirate_noise, optimal_filter, optimal_model, steady_filter
 from wfsobs.prior import Prior
 from wfsobs.priors_from.scenario import lgs_error_of, model_of
 from wfsobs.scenario import Scenario

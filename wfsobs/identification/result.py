@@ -33,7 +33,7 @@ from wfsobs.identification.process import (
     with_reliable_std,
 )
 from wfsobs.notebook import PlotAccessor, html_table, import_extra
-from wfsobs.observers.kalman.single import steady_filter
+from wfsobs.observers.kalman.filters import steady_filter
 from wfsobs.prior import Line, Lines
 from wfsobs.record import Record, RecordError, hold_last, pseudo_open_loop
 from wfsobs.scenario import Scenario

@@ -10,10 +10,8 @@ from wfsobs.observers.gpr.adaptive import GPR_ADAPTIVE
 from wfsobs.observers.gpr.offline import GPR_OFFLINE, RIDGE, RIDGE_30
 from wfsobs.observers.gpr.online import GPR_ONLINE
 from wfsobs.observers.kalman.adaptive import KF_ADAPTIVE, MULTIRATE_ADAPTIVE
-from wfsobs.observers.kalman.coupled import KF_COUPLED, MULTIRATE_COUPLED
-from wfsobs.observers.kalman.joint import KF_ASTERISM
-from wfsobs.observers.kalman.multirate import MULTIRATE, MULTIRATE_MULTI, MULTIRATE_OPTIMAL
-from wfsobs.observers.kalman.single import KF_LGS, KF_MULTI, KF_NGS
+from wfsobs.observers.kalman.filters import KF_LGS, KF_MULTI, KF_NGS, MULTIRATE, MULTIRATE_MULTI, MULTIRATE_OPTIMAL
+from wfsobs.observers.kalman.joint import KF_ASTERISM, KF_COUPLED, MULTIRATE_COUPLED
 from wfsobs.registry import Registry
 
 BUILT_IN = (

@@ -39,10 +39,8 @@ from scipy.linalg import block_diag, expm
 from scipy.special import iv
 
 from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
-from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean
-from wfsobs.observers.kalman.multirate import MultiRate, optimal_model
-from wfsobs.observers.kalman.single import NGS, steady_mode
-from wfsobs.observers.kalman.step import kalman_filters
+from wfsobs.observers.kalman.filters import NGS, MultiRate, optimal_model, steady_mode
+from wfsobs.observers.kalman.step import ModeFilter, kalman_filters, lgs_mean
 from wfsobs.observers.missing import LINE_WIDTH
 from wfsobs.prior import LgsError, LgsStars, Lines, Noise, Prior
 from wfsobs.settings import Group, Real, Section

@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from math import nan, pi
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 
-from wfsobs.record import Training
+from wfsobs.record import Training as Training
 from wfsobs.signal.autoregressive import Ar2, Ar3
 from wfsobs.signal.gains import ONE, SensorMean
 from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
@@ -22,8 +22,18 @@ from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
 
 
+class _Share:
+    """A part of a prior of which a kind may have a share alone: the rest is NaN."""
+
+    unknown: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        for name in self.unknown:
+            object.__setattr__(self, name, nan)
+
+
 @dataclass(frozen=True)
-class Model:
+class Model(_Share):
     """The model of one mode with one vibration peak (paper, eq. 1, 2 and 7).
 
     turbulence, vibration : the processes, sampled at the fast step unless moved by `at`
@@ -44,28 +54,22 @@ class Model:
         return disturbance_model([self.turbulence], [self.vibration])
 
 
-@dataclass(frozen=True)
 class LgsModel(Model):
     """That for a filter of the LGS alone: the noise of NGS frames is NaN."""
 
-    def __post_init__(self) -> None:
-        _forget(self, "ngs_noise")
+    unknown = ("ngs_noise",)
 
 
-@dataclass(frozen=True)
 class NgsModel(Model):
     """That for a filter of NGS frames alone: the noise of the LGS is NaN."""
 
-    def __post_init__(self) -> None:
-        _forget(self, "lgs_noise")
+    unknown = ("lgs_noise",)
 
 
-@dataclass(frozen=True)
 class NoiselessModel(Model):
     """The two processes alone: both noises are NaN."""
 
-    def __post_init__(self) -> None:
-        _forget(self, "lgs_noise", "ngs_noise")
+    unknown = ("lgs_noise", "ngs_noise")
 
 
 class Noise(NamedTuple):
@@ -76,7 +80,7 @@ class Noise(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Bands:
+class Bands(_Share):
     """Where the vibration of every mode is: the Butterworth bank of the paper (section 2.3).
 
     frequencies : centres [Hz]; bandwidth_offline, bandwidth_online : widths on open-loop and closed-loop data [Hz]
@@ -89,26 +93,16 @@ class Bands:
     order: int
 
 
-@dataclass(frozen=True)
 class OfflineBands(Bands):
     """Those on open-loop data alone: the other width is NaN."""
 
-    def __post_init__(self) -> None:
-        _forget(self, "bandwidth_online")
+    unknown = ("bandwidth_online",)
 
 
-@dataclass(frozen=True)
 class OnlineBands(Bands):
     """Those on closed-loop data alone: the other width is NaN."""
 
-    def __post_init__(self) -> None:
-        _forget(self, "bandwidth_offline")
-
-
-def _forget(part: Model | Bands, *names: str) -> None:
-    """Make numbers of a part NaN."""
-    for name in names:
-        object.__setattr__(part, name, nan)
+    unknown = ("bandwidth_offline",)
 
 
 class LgsError(NamedTuple):
@@ -258,36 +252,6 @@ class Flow(FlowOfBoth):
     """That without an NGS, as of frames of every step."""
 
 
-__all__ = [
-    "GIVEN",
-    "IDENTIFIED",
-    "TRUE",
-    "Asterism",
-    "Bands",
-    "Beams",
-    "Flow",
-    "FlowOfBoth",
-    "LgsError",
-    "LgsModel",
-    "LgsStars",
-    "Line",
-    "Lines",
-    "Model",
-    "NgsModel",
-    "Noise",
-    "NoiselessModel",
-    "OfflineBands",
-    "OnlineBands",
-    "Part",
-    "Prior",
-    "PriorSource",
-    "Spectra",
-    "Training",
-    "ask_nothing",
-    "asks_for",
-    "words_for",
-]
-
 PriorSource = Literal["true", "identified", "given"]
 """Where lines and spectra of a prior come from."""
 TRUE: PriorSource = "true"
@@ -297,20 +261,7 @@ IDENTIFIED: PriorSource = "identified"
 GIVEN: PriorSource = "given"
 """From settings, on a record that was not simulated from them."""
 
-Part = (
-    type[Model]
-    | type[Noise]
-    | type[LgsError]
-    | type[LgsStars]
-    | type[Lines]
-    | type[Beams]
-    | type[Flow]
-    | type[FlowOfBoth]
-    | type[Asterism]
-    | type[Bands]
-    | type[Spectra]
-    | type[Training]
-)
+Part = type[Model | Noise | LgsError | LgsStars | Lines | Beams | Flow | FlowOfBoth | Asterism | Bands | Spectra | Training]
 """A kind of thing that an observer or a controller can ask for."""
 
 _WORDS: dict[Part, tuple[str, ...]] = {

@@ -19,7 +19,7 @@ import numpy as np
 
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
-from wfsobs.observers.kalman.single import MIN_NOISE
+from wfsobs.observers.kalman.filters import MIN_NOISE
 from wfsobs.prior import (
     Asterism,
     Bands,
@@ -49,7 +49,14 @@ from wfsobs.scenario.measured_spectra import ALL, LINES
 from wfsobs.settings.group import Group
 from wfsobs.signal.autoregressive import Ar2, Ar3, Ar3Fits, SharedProcess, fit_shared_process
 from wfsobs.signal.statespace import MIN_MODEL_DAMPING
-from wfsobs.simulation.disturbance import vibration_lines, vibration_power, vibration_variance
+from wfsobs.simulation.disturbance import (
+    processes,
+    turbulence_process,
+    turbulence_rms,
+    vibration_lines,
+    vibration_power,
+    vibration_variance,
+)
 from wfsobs.simulation.flow_spectra import TurbulenceSpectra, star_basis
 from wfsobs.simulation.layers import relative_rms
 from wfsobs.simulation.mode_spectra import ModeSpectra, are_coupled, beam_spectra, combined_spectra, frequency_rule, mode_spectra
@@ -63,7 +70,6 @@ from wfsobs.simulation.true_spectra import (
     true_spectra,
     turbulence_spectra,
 )
-from wfsobs.simulation.turbulence import processes, turbulence_process, turbulence_rms
 from wfsobs.spectral.model import fit_processes
 from wfsobs.typing import Array
 

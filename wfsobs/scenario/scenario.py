@@ -34,8 +34,7 @@ if TYPE_CHECKING:
     from wfsobs.observers.gpr.offline import OfflineGpr
     from wfsobs.observers.gpr.online import OnlineGpr
     from wfsobs.observers.kalman.adaptive import Adaptive
-    from wfsobs.observers.kalman.multirate import MultiRate
-    from wfsobs.observers.kalman.single import MultiPeak
+    from wfsobs.observers.kalman.filters import MultiPeak, MultiRate
 
 
 HIGHEST = 0.9

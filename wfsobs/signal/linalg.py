@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -40,21 +40,24 @@ _keep: list[ctypes._SimpleCData] = []  # what the addresses below point at
 
 
 @cache
-def _int(value: int) -> int:
-    _keep.append(ctypes.c_int(value))
+def _at(kind: type[Any], value: Any) -> int:
+    """Return the address of a value that is kept."""
+    _keep.append(kind(value))
     return ctypes.addressof(_keep[-1])
 
 
-@cache
-def _real(value: float) -> int:
-    _keep.append(ctypes.c_double(value))
-    return ctypes.addressof(_keep[-1])
+_int, _real = partial(_at, ctypes.c_int), partial(_at, ctypes.c_double)
+_L, _R, _N, _T = (_at(ctypes.c_char, letter) for letter in (b"L", b"R", b"N", b"T"))
 
 
-@cache
-def _char(value: bytes) -> int:
-    _keep.append(ctypes.c_char(value))
-    return ctypes.addressof(_keep[-1])
+def _place(S: Array) -> tuple[int, int]:
+    """Return the addresses of the first element and of the distance from column to column."""
+    return S.ctypes.data, _int(S.strides[1] // S.itemsize)
+
+
+def _divide(side: int, turn: int, m: int, n: int, L: int, lead: int, X: int, step: int) -> None:
+    """Solve, in place of X (m, n), with the lower triangle L on its left or right, transposed or not."""
+    _trsm(side, _L, turn, _N, _int(m), _int(n), _real(1.0), L, lead, X, step)
 
 
 PANEL = 256
@@ -87,41 +90,24 @@ def eliminate(S: Array, n: int, check: Callable[[], None]) -> None:
 
 
 def _eliminate_panel(S: Array, n: int) -> None:
-    size = S.shape[0]
-    lead, here, item = _int(S.strides[1] // S.itemsize), S.ctypes.data, S.itemsize
+    rest, (here, lead), item = S.shape[0] - n, _place(S), S.itemsize
     below, corner = here + n * item, here + n * (S.strides[1] + item)
     info = ctypes.c_int(0)
-    rest = _int(size - n)
-    _potrf(_char(b"L"), _int(n), here, lead, ctypes.addressof(info))
+    _potrf(_L, _int(n), here, lead, ctypes.addressof(info))
     if info.value:
         raise np.linalg.LinAlgError("the matrix is not positive definite")
-    _trsm(_char(b"R"), _char(b"L"), _char(b"T"), _char(b"N"), rest, _int(n), _real(1.0), here, lead, below, lead)
-    _syrk(_char(b"L"), _char(b"N"), rest, _int(n), _real(-1.0), below, lead, _real(1.0), corner, lead)
+    _divide(_R, _T, rest, n, here, lead, below, lead)
+    _syrk(_L, _N, _int(rest), _int(n), _real(-1.0), below, lead, _real(1.0), corner, lead)
 
 
 def solve_rows(S: Array, n: int) -> Array:
     """Return S21 S11^-1, (N - n, n), from the result of `eliminate`; in place of S21."""
-    size, lead, here = S.shape[0], _int(S.strides[1] // S.itemsize), S.ctypes.data
-    _trsm(
-        _char(b"R"),
-        _char(b"L"),
-        _char(b"N"),
-        _char(b"N"),
-        _int(size - n),
-        _int(n),
-        _real(1.0),
-        here,
-        lead,
-        here + n * S.itemsize,
-        lead,
-    )
+    here, lead = _place(S)
+    _divide(_R, _N, S.shape[0] - n, n, here, lead, here + n * S.itemsize, lead)
     return S[n:, :n]
 
 
 def solve_lower(L: Array, X: Array) -> Array:
     """Return L^-1 X for the lower triangle L (n, n) and X (n, k); in place of X."""
-    n, k = X.shape
-    here, lead, there, step = L.ctypes.data, _int(L.strides[1] // L.itemsize), X.ctypes.data, _int(X.strides[1] // X.itemsize)
-    left, lower, plain = _char(b"L"), _char(b"L"), _char(b"N")
-    _trsm(left, lower, plain, plain, _int(n), _int(k), _real(1.0), here, lead, there, step)
+    _divide(_L, _N, *X.shape, *_place(L), *_place(X))
     return X

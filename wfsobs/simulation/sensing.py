@@ -29,11 +29,12 @@ from wfsobs.simulation.disturbance import (
     laser_count,
     missing_frames,
     turbulence_clock,
+    turbulence_process,
+    turbulence_rms,
     turbulence_steps,
     vibration_variance,
 )
 from wfsobs.simulation.sensor_noise import noise_covariance, noise_rms, white_noise
-from wfsobs.simulation.turbulence import turbulence_process, turbulence_rms
 from wfsobs.typing import Array
 
 MEAN = "mean"

@@ -20,11 +20,20 @@ from wfsobs.sensors import zernike
 from wfsobs.signal.autoregressive import Ar2, Ar3
 from wfsobs.signal.wiener import Complex, Whitener, advance_spectrum, error_spectrum, factorise, innovations_to_come
 from wfsobs.simulation import layers as atmosphere
-from wfsobs.simulation.disturbance import peak_rms, pure_lines, vibration_power
+from wfsobs.simulation.disturbance import (
+    damping_for_width,
+    line_width,
+    peak_rms,
+    processes,
+    pure_lines,
+    table_variance,
+    turbulence_process,
+    vibration_power,
+    widen_lines,
+)
 from wfsobs.simulation.flow_spectra import TurbulenceSpectra, flow_spectra
 from wfsobs.simulation.sensing import lgs_noise_rms, lgs_weights, low_frequency_process
 from wfsobs.simulation.sensor_noise import noise_rms
-from wfsobs.simulation.turbulence import damping_for_width, line_width, processes, table_variance, turbulence_process, widen_lines
 from wfsobs.typing import Array
 
 DECAYED = 2.5

@@ -33,11 +33,10 @@ from wfsobs.record import Record, RecordError, Training, delay_signal, frame_mea
 from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
 from wfsobs.settings.values import SettingError
-from wfsobs.simulation.disturbance import vibration_lines, vibration_variance
+from wfsobs.simulation.disturbance import turbulence_process, vibration_lines, vibration_variance
 from wfsobs.simulation.layers import relative_rms
 from wfsobs.simulation.loop import TRAINING_MARGIN, simulate
 from wfsobs.simulation.true_spectra import true_spectra
-from wfsobs.simulation.turbulence import turbulence_process
 from wfsobs.typing import Array
 
 FROM_ZERO = 1e-3

@@ -23,7 +23,7 @@ from wfsobs.control.base import Controller
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.mirror import Mirror
 from wfsobs.observers.base import TARGETS, Observer
-from wfsobs.observers.kalman.single import steady_filter
+from wfsobs.observers.kalman.filters import steady_filter
 from wfsobs.prior import Model
 from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
 from wfsobs.scenario.presets import PRESETS

@@ -10,7 +10,7 @@ from wfsobs_arena.definition import FILE, load_arena
 from wfsobs_arena.tracks import TRACKS, Track, add_track
 
 from wfsobs.settings.values import SettingError
-from wfsobs.simulation.turbulence import period_steps
+from wfsobs.simulation.disturbance import period_steps
 
 WHOLE = load_arena()
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from wfsobs.scenario.configfile import parse_toml, preset
 from wfsobs.settings.values import SettingError, leaves
-from wfsobs.simulation.turbulence import period_steps
+from wfsobs.simulation.disturbance import period_steps
 from wfsobs_arena.cases import Case, SimulatedCase
 from wfsobs_arena.telemetry import TelemetryCase
 from wfsobs_arena.tracks import TRACKS

@@ -28,7 +28,7 @@ from wfsobs.observers.base import TURBULENCE, VIBRATION
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.atmosphere import Peak
 from wfsobs.settings.values import SettingError
-from wfsobs.simulation.turbulence import turbulence_process
+from wfsobs.simulation.disturbance import turbulence_process
 
 Work = Callable[[], Any]
 Land = Callable[[Any, str], None]

@@ -48,7 +48,7 @@ from scipy.linalg.lapack import dpstrf
 
 from wfsobs.observers.base import VIBRATION, Look, Observer, Tunable
 from wfsobs.observers.kalman.adaptive import identification_settings
-from wfsobs.observers.kalman.single import MIN_NOISE
+from wfsobs.observers.kalman.filters import MIN_NOISE
 from wfsobs.observers.kalman.window_model import ADAPTIVE, Adaptive, pack_spectrum, unpack_spectrum, window_lengths
 from wfsobs.observers.step import HeldEstimate, StepError, run_frames, whole_frames
 from wfsobs.observers.stepping import FilterBank, SampleHistory, Saved

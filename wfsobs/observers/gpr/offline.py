@@ -18,7 +18,8 @@ x'|^2 / 2 l^2), and the GPR then is this with lambda = (sigma_n l / sigma_SE)^2 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,11 +38,9 @@ from wfsobs.observers.gpr.windows import (
     band,
     check_condition,
     over_modes,
-    scales_of,
     sliding_products,
     square_from_band,
     squared_norms,
-    training_signals,
     tunable,
     turns,
 )
@@ -141,13 +140,21 @@ def eliminated_covariance(
     return S, points
 
 
-def train(signals: Array, targets: Array, depth: int, m: int, kernel: SquaredExponential, watch: Watch = QUIET) -> TrainedGpr:
-    """Fit the first m windows of signals (n, channels) to targets (n,), one per step.
+def check_length(signals: Array, depth: int, m: int, ahead: int) -> None:
+    """Raise RecordError for signals (n, channels) that are too short for m windows and targets so many steps ahead."""
+    if len(signals) < (needed := depth + m + ahead):
+        more = f" + {ahead}" if ahead else ""
+        raise RecordError(f"the training data has {len(signals)} steps, depth + training size{more} need {needed}")
+
+
+def train(
+    signals: Array, targets: Array, depth: int, m: int, kernel: SquaredExponential, watch: Watch = QUIET, ahead: int = 0
+) -> TrainedGpr:
+    """Fit the first m windows of signals (n, channels) to targets (n,), one per step; ahead : steps from it to what they are.
 
     Raises RecordError where the record is too short, ConditionError where the precision is not enough.
     """
-    if signals.shape[0] < depth + m:
-        raise RecordError(f"the training data has {signals.shape[0]} steps, depth + training size need {depth + m}")
+    check_length(signals, depth, m, ahead)
     first = depth - 1
     S, points = eliminated_covariance(signals, targets, depth, first, m, kernel, watch)
     a, b = solve_rows(S, m)
@@ -177,18 +184,18 @@ def training_targets(
     return np.sum([w * longer[k : k + len(at)] for k, w in enumerate(weights) if w], axis=0)
 
 
-def train_mode(prior: Prior, g: OfflineGpr, mode: int, sampling: Sampling, weights: Array) -> TrainedGpr:
-    """Train on one mode of the training record; weights : as in `training_targets`. Raises RecordError, ConditionError."""
+def training_pairs(prior: Prior, windows: Windows, sampling: Sampling, weights: Array) -> Iterator[tuple[Array, Array]]:
+    """Yield the channels (n, channels) of windows of the training record and their targets (n,), mode by mode.
+
+    weights : as in `training_targets`. Raises RecordError.
+    """
     training, bands = prior.training, prior.bands
     if training is None:
         raise RecordError("the record has no training data")
     assert bands is not None
-    ahead = f" + {len(weights) - 1}" if len(weights) > 1 else ""
-    if len(training.y_lgs) < (needed := g.depth + g.training_size + len(weights) - 1):
-        raise RecordError(f"the training data has {len(training.y_lgs)} steps, depth + training size{ahead} need {needed}")
-    targets = training_targets(training, bands, sampling.dt, sampling.delay, weights)[:, mode]
-    signals = training_signals(g, training, mode, sampling.dt, sampling.delay)
-    return train(signals, targets, g.depth, g.training_size, kernel_of(g))
+    targets = training_targets(training, bands, sampling.dt, sampling.delay, weights)
+    for mode in range(sampling.n_modes):
+        yield windows.channels(training, mode), targets[:, mode]
 
 
 def gpr_offline(prior: Prior, settings: OfflineGpr, sampling: Sampling, horizon: float) -> OfflineEstimator:
@@ -199,23 +206,43 @@ def gpr_offline(prior: Prior, settings: OfflineGpr, sampling: Sampling, horizon:
 
 def trained_estimator(prior: Prior, g: OfflineGpr, sampling: Sampling, weights: Array, horizon: float | None) -> OfflineEstimator:
     """Return the GPR of all modes for this horizon; weights : as in `training_targets`."""
-    models = [train_mode(prior, g, mode, sampling, weights) for mode in range(sampling.n_modes)]
-    return OfflineEstimator(Windows(g, sampling, g.depth, scales_of(g, prior.training, sampling)), models, horizon)
+    windows, m, kernel = Windows(g, sampling, g.depth, prior.training), g.training_size, kernel_of(g)
+    pairs = training_pairs(prior, windows, sampling, weights)
+    return OfflineEstimator(windows, [train(*pair, g.depth, m, kernel, ahead=len(weights) - 1) for pair in pairs], horizon)
 
 
-class OfflineEstimator(HeldEstimate):
-    """Trained GPR of all modes, for one horizon."""
+class WindowEstimate(HeldEstimate):
+    """An estimate from windows, for one horizon."""
 
     windows: Windows
-    models: tuple[TrainedGpr, ...]
     needs_command: bool
 
     state_names: tuple[str, ...] = ("windows", "_mean")
 
-    def __init__(self, windows: Windows, models: Sequence[TrainedGpr], horizon: float | None):
-        super().__init__(len(models), horizon)
-        self.windows, self.models, self.needs_command = windows, tuple(models), windows.needs_command
+    def __init__(self, windows: Windows, n_modes: int, horizon: float | None):
+        super().__init__(n_modes, horizon)
+        self.windows, self.needs_command = windows, windows.needs_command
         self.mark_start()
+
+    def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
+        """Take a frame."""
+        self.windows.push(z, u)
+        if self.windows.is_full:
+            self._estimate(self.windows.window)
+
+    @abstractmethod
+    def _estimate(self, window: Array) -> None:
+        """Estimate from a window of all modes, (n_modes * channels, depth)."""
+
+
+class OfflineEstimator(WindowEstimate):
+    """Trained GPR of all modes, for one horizon."""
+
+    models: tuple[TrainedGpr, ...]
+
+    def __init__(self, windows: Windows, models: Sequence[TrainedGpr], horizon: float | None):
+        super().__init__(windows, len(models), horizon)
+        self.models = tuple(models)
 
     def run(self, measurements: Measurements, watch: Watch, *, with_sd: bool = True) -> Estimates:
         """Predict over a record, all modes at the same time. Raises RecordError for one that is shorter than a window."""
@@ -231,12 +258,9 @@ class OfflineEstimator(HeldEstimate):
         found = over_modes(measurements.n_modes, one, watch)
         return Estimates({VIBRATION: found[:, ::2]}, {VIBRATION: found[:, 1::2]})
 
-    def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
-        """Take a frame."""
-        self.windows.push(z, u)
-        if self.windows.is_full:
-            parts = np.split(self.windows.window, len(self.models))
-            self._mean[...] = [model.predict_one(x) for model, x in zip(self.models, parts, strict=True)]
+    def _estimate(self, window: Array) -> None:
+        parts = np.split(window, len(self.models))
+        self._mean[...] = [model.predict_one(x) for model, x in zip(self.models, parts, strict=True)]
 
     def take_over(self, old: Any) -> None:
         """Go on with the samples of another design."""
@@ -277,13 +301,12 @@ PLAIN = 1e-6
 """Its penalty, over the mean square of z: enough for a solution to exist."""
 
 
-def fit(signals: Array, targets: Array, depth: int, m: int, penalty: float) -> tuple[Array, float]:
+def fit(signals: Array, targets: Array, depth: int, m: int, penalty: float, ahead: int = 0) -> tuple[Array, float]:
     """Fit weights (depth, channels), the newest sample first, and a constant to the first m windows of signals (n, channels).
 
-    targets (n,), one per step. Raises RecordError where the record is too short.
+    targets (n,), one per step; ahead : as in `train`. Raises RecordError where the record is too short.
     """
-    if signals.shape[0] < depth + m:
-        raise RecordError(f"the training data has {signals.shape[0]} steps, depth + training size need {depth + m}")
+    check_length(signals, depth, m, ahead)
     f = targets[depth - 1 : depth - 1 + m]
     windows = sliding_window_view(signals[: depth - 1 + m], depth, axis=0)  # (m, channels, depth), the oldest sample first
     middle = windows.mean(axis=0)
@@ -325,7 +348,7 @@ def predict(signals: Array, weights: Array, constant: float) -> Array:
     return out
 
 
-class LinearPredictor(HeldEstimate):
+class LinearPredictor(WindowEstimate):
     """A linear predictor of all modes. One of the vibration h frames ahead is trained for that h, so it has no other horizon.
 
     Parameters
@@ -338,20 +361,14 @@ class LinearPredictor(HeldEstimate):
         Frames ahead that it was trained for.
     """
 
-    windows: Windows
-    needs_command: bool
     fits: Sequence[tuple[Array, float]]
 
-    state_names: tuple[str, ...] = ("windows", "_mean")
-
     def __init__(self, windows: Windows, fits: Sequence[tuple[Array, float]], horizon: float):
-        super().__init__(len(fits), horizon)
-        self.windows, self.needs_command, self.fits = windows, windows.needs_command, fits
-        channels = fits[0][0].shape[1]
+        super().__init__(windows, len(fits), horizon)
+        self.fits, channels = fits, fits[0][0].shape[1]
         self._weights = np.concatenate([weights[::-1].T for weights, _ in fits])  # as the window: (n_modes * channels, depth)
         self._starts = np.arange(0, len(self._weights), channels)
         self._constants = np.array([constant for _, constant in fits])
-        self.mark_start()
 
     def run(self, measurements: Measurements, watch: Watch) -> Estimates:
         """Run over a record, all steps at once."""
@@ -361,57 +378,32 @@ class LinearPredictor(HeldEstimate):
             columns.append(predict(self.windows.channels(measurements, mode), *fitted))
         return Estimates({VIBRATION: np.column_stack(columns)})
 
-    def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
-        """Take a frame."""
-        self.windows.push(z, u)
-        self._estimate()
-
-    def _estimate(self) -> None:
-        if self.windows.is_full:
-            parts = np.einsum("ij,ij->i", self._weights, self.windows.window)
-            np.add.reduceat(parts, self._starts, out=self._mean)
-            self._mean += self._constants
+    def _estimate(self, window: Array) -> None:
+        np.add.reduceat(np.einsum("ij,ij->i", self._weights, window), self._starts, out=self._mean)
+        self._mean += self._constants
 
     def take_over(self, old: Any) -> None:
         """Go on with the samples of another design."""
         self.windows.take_over(old.windows)
-        self._estimate()
-
-
-def _targets(prior: Prior, mode: int, dt: float, delay: int, horizon: int) -> tuple[Training, Array]:
-    """Return the training data, and the vibration of one mode `horizon` frames ahead."""
-    training, bands = prior.training, prior.bands
-    assert training is not None and bands is not None
-    return training, training_targets(training, bands, dt, delay, np.eye(horizon + 1)[-1])[:, mode]
-
-
-def fit_ridge(prior: Prior, g: OfflineGpr, mode: int, dt: float, delay: int, horizon: int = 0) -> tuple[Array, float]:
-    """Fit the linear limit of the offline GPR of one mode to the vibration `horizon` frames ahead, as `fit`."""
-    training, targets = _targets(prior, mode, dt, delay, horizon)
-    signals = training_signals(g, training, mode, dt, delay)
-    return fit(signals, targets, g.depth, g.training_size, (g.noise_std * g.length_scale / g.signal_std) ** 2)
+        if self.windows.is_full:
+            self._estimate(self.windows.window)
 
 
 def ridge(prior: Prior, settings: OfflineGpr, sampling: Sampling, horizon: float) -> LinearPredictor:
     """Return the linear limit of the offline GPR: its windows, its training size, its penalty."""
-    g, ahead, modes = settings, whole_frames(horizon, "ridge"), range(sampling.n_modes)
-    fits = [fit_ridge(prior, g, mode, sampling.dt, sampling.delay, ahead) for mode in modes]
-    return LinearPredictor(Windows(g, sampling, g.depth, scales_of(g, prior.training, sampling)), fits, ahead)
-
-
-def fit_30(prior: Prior, mode: int, dt: float, delay: int, horizon: int = 0) -> tuple[Array, float]:
-    """Fit the last 30 measurements z of one mode to the vibration `horizon` frames ahead, as `fit`."""
-    training, targets = _targets(prior, mode, dt, delay, horizon)
-    z = pseudo_open_loop(training.y_lgs, training.u, delay)[:, [mode]]
-    m = len(z) - TAPS - horizon  # the last targets have no reference
-    return fit(z, targets, TAPS, m, PLAIN * m * float(np.mean(z**2)))
+    g, ahead = settings, whole_frames(horizon, "ridge")
+    windows, penalty = Windows(g, sampling, g.depth, prior.training), (g.noise_std * g.length_scale / g.signal_std) ** 2
+    pairs = training_pairs(prior, windows, sampling, np.eye(ahead + 1)[-1])
+    return LinearPredictor(windows, [fit(*pair, g.depth, g.training_size, penalty, ahead) for pair in pairs], ahead)
 
 
 def ridge_30(prior: Prior, _settings: None, sampling: Sampling, horizon: float) -> LinearPredictor:
     """Return plain least squares on the last 30 measurements z, over all of the training record."""
-    ahead = whole_frames(horizon, "ridge-30")
-    fits = [fit_30(prior, mode, sampling.dt, sampling.delay, ahead) for mode in range(sampling.n_modes)]
-    return LinearPredictor(Windows(None, sampling, TAPS), fits, ahead)
+    ahead, windows, fits = whole_frames(horizon, "ridge-30"), Windows(None, sampling, TAPS), []
+    for z, targets in training_pairs(prior, windows, sampling, np.eye(ahead + 1)[-1]):
+        m = len(z) - TAPS - ahead  # the last targets have no reference
+        fits.append(fit(z, targets, TAPS, m, PLAIN * m * float(np.mean(z**2)), ahead))
+    return LinearPredictor(windows, fits, ahead)
 
 
 RIDGE = Observer(

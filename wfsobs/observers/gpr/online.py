@@ -21,7 +21,6 @@ from wfsobs.observers.gpr.windows import (
     band,
     check_condition,
     over_modes,
-    scales_of,
     square_from_band,
     tunable,
     turns,
@@ -244,7 +243,7 @@ def gpr_online(prior: Prior, settings: OnlineGpr, sampling: Sampling, horizon: f
 def learning_estimator(prior: Prior, g: OnlineGpr, sampling: Sampling, weights: Array) -> OnlineEstimator:
     """Return the online GPR; weights : of the vibration now, one frame ahead and so on in what it learns."""
     assert prior.bands is not None
-    windows = Windows(g, sampling, 1, scales_of(g, prior.training, sampling))
+    windows = Windows(g, sampling, 1, prior.training)
     return OnlineEstimator(windows, prior.bands, sampling, g.depth, g.training_size, kernel_of(g), weights)
 
 

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -41,7 +41,7 @@ from scipy.signal import butter, sosfilt, sosfilt_zi
 from wfsobs.observers.step import StepError
 from wfsobs.observers.stepping import SampleHistory, StateArrays
 from wfsobs.progress import Watch
-from wfsobs.record import Measurements, RecordError, Sampling, Training, pseudo_open_loop
+from wfsobs.record import RecordError, Sampling, Signals, Training, pseudo_open_loop
 from wfsobs.settings import Group, Real, Whole
 from wfsobs.settings.group import UsedWhen
 from wfsobs.typing import Array
@@ -322,28 +322,11 @@ def scale_of(settings: Gpr, training: Training | None, delay: int, mode: int) ->
     return Scale(x.mean(axis=0), np.where(std > 0, std, 1.0))
 
 
-def scales_of(settings: Gpr, training: Training | None, sampling: Sampling) -> list[Scale]:
-    """Return the scales of standardised inputs of every mode; none for others. Raises RecordError."""
-    found = (scale_of(settings, training, sampling.delay, mode) for mode in range(sampling.n_modes))
-    return [scale for scale in found if scale is not None]
-
-
-def training_signals(settings: Gpr, training: Training, mode: int, dt: float, delay: int) -> Array:
-    """Return the channels of a window in the training record, (n_steps, channels)."""
-    z = pseudo_open_loop(training.y_lgs, training.u, delay)
-    return window_signals(settings, training.y_lgs, training.u, z, mode, dt, scale_of(settings, training, delay, mode))
-
-
 def high_pass(corner: float, dt: float) -> Array:
     """Second-order sections of the Butterworth high-pass with that corner [Hz]. Raises RecordError beyond half the rate."""
     if corner >= 0.5 / dt:
         raise RecordError(f"the high-pass of the inputs at {corner:g} Hz must lie below half the rate, {0.5 / dt:g} Hz")
     return butter(ORDER, corner, "highpass", fs=1.0 / dt, output="sos")
-
-
-def at_rest(sos: Array, first: Array) -> Array:
-    """States (sections, 2, channels) in which a constant input `first` (channels,) gives no output."""
-    return sosfilt_zi(sos)[:, :, None] * first
 
 
 def _channels(settings: Gpr, y: Array, u: Array, z: Array, mode: int) -> Array:
@@ -366,7 +349,7 @@ class StreamingInputs(StateArrays):
     def run(self, samples: Array) -> Array:
         """Return the inputs of the next samples, both (n, channels)."""
         if self._sos is not None and self._filter is not None:
-            start = self._filter if self._is_started else at_rest(self._sos, samples[0])
+            start = self._filter if self._is_started else sosfilt_zi(self._sos)[:, :, None] * samples[0]  # no output at rest
             out, self._filter[...] = sosfilt(self._sos, samples, axis=0, zi=start)
             self._is_started = True
             return out
@@ -384,16 +367,23 @@ class Windows(StateArrays):
         Of the loop.
     depth : int
         Samples in a window.
-    scales : sequence of Scale
-        Of standardised inputs, one per mode; empty for others.
+    training : Training, optional
+        What the scales of standardised inputs are of.
+
+    Raises
+    ------
+    RecordError
+        Standardised inputs without training data.
     """
 
     depth: int
 
     state_names: tuple[str, ...] = ("_samples", "_commands", "_held_value", "count", "_inputs")
 
-    def __init__(self, settings: Gpr | None, sampling: Sampling, depth: int, scales: Sequence[Scale] = ()):
-        self._of_record = settings, sampling.dt, tuple(scales)
+    def __init__(self, settings: Gpr | None, sampling: Sampling, depth: int, training: Training | None = None):
+        found = [scale_of(settings, training, sampling.delay, mode) for mode in range(sampling.n_modes)] if settings else []
+        scales = [scale for scale in found if scale is not None]
+        self._of_record = settings, sampling, scales
         self.needs_command: bool = settings is not None and settings.inputs == "u-y"
         self.depth, self.count = depth, 0
         n = sampling.n_modes * (2 if self.needs_command else 1)
@@ -412,13 +402,13 @@ class Windows(StateArrays):
         """Whether the window is full."""
         return self.count >= self.depth
 
-    def channels(self, measurements: Measurements, mode: int) -> Array:
-        """Return the channels of a mode over a record, (n_steps, channels)."""
-        settings, dt, scales = self._of_record
+    def channels(self, of: Signals | Training, mode: int) -> Array:
+        """Return the channels of a mode over a record or training data, (n_steps, channels)."""
+        settings, sampling, scales = self._of_record
+        z = pseudo_open_loop(of.y_lgs, of.u, sampling.delay)
         if settings is None:
-            return measurements.z[:, [mode]]
-        scale = scales[mode] if scales else None
-        return window_signals(settings, measurements.y_lgs, measurements.u, measurements.z, mode, dt, scale)
+            return z[:, [mode]]
+        return window_signals(settings, of.y_lgs, of.u, z, mode, sampling.dt, scales[mode] if scales else None)
 
     def push(self, z: Array, u: Array | None) -> Array:
         """Take z and, where windows hold commands, u (n_modes,) [um]; return the frame's channels (n_modes * channels,)."""

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
-from wfsobs.observers.kalman.single import NGS
+from wfsobs.observers.kalman.filters import NGS
 from wfsobs.observers.kalman.step import STEADY, KalmanEstimator
 from wfsobs.observers.kalman.window_model import (
     ADAPTIVE,

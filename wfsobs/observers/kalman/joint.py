@@ -18,6 +18,17 @@ frames takes for it what all states told of it.
 
 The states are those of the independent filter of a mode and running means, of the mean of the LGS in all modes, then of each
 difference; and those of the filter and the means of the NGS frames, mode after mode.
+
+The coupled filter: every mode of frozen flow is estimated from the measurements of all modes.
+
+The wind carries what one mode measures into another, and the LGS see through their narrower beams as one mode what is several.
+The states of the independent filters of `kf-multi`, one per mode, and running means of every measurement over 0, 3, 9, ...
+243 steps are put together by the weights of least variance under the matrix of spectra in the prior (`signal.joint_states`).
+Longer means gain a little in an endless record, and lose more in its first seconds. Since the estimates of the independent
+filters are among what is weighed, it is no worse than they are where it is told the truth. It is the filter of `kalman.joint` on
+one star: `kf-coupled` without an NGS, `multirate-coupled` with one.
+
+Where modes tell nothing of one another, the prior has no such matrix: there is nothing to couple, and the observer refuses.
 """
 
 from __future__ import annotations
@@ -31,11 +42,10 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Look, Observer
-from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean
-from wfsobs.observers.kalman.single import PEAKS, TUNABLE_PEAKS, MultiPeak, every_peak_filter, steady_mode, vibration_used
-from wfsobs.observers.kalman.step import carry_state, matrix_power
+from wfsobs.observers.kalman.filters import NGS, PEAKS, TUNABLE_PEAKS, MultiPeak, every_peak_filter, steady_mode, vibration_used
+from wfsobs.observers.kalman.step import ModeFilter, carry_state, lgs_mean, matrix_power
 from wfsobs.observers.step import Estimator, StepError, run_frames
-from wfsobs.prior import Asterism, Lines, Prior
+from wfsobs.prior import Asterism, Flow, FlowOfBoth, LgsStars, Lines, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import NEXT_Z, TOTAL, Estimates, Measurements, Sampling, by_name
 from wfsobs.signal.autoregressive import Ar2, Ar3
@@ -616,5 +626,71 @@ KF_ASTERISM = Observer(
     tunable=TUNABLE_PEAKS,
     look=Look("Asterism", "#923222", "#F5B022", (8, 2, 2, 2)),
     step=kf_asterism,
+    counts=vibration_used,
+)
+
+
+INDEPENDENT = "the modes tell nothing of one another: `kf-multi` estimates each by itself"
+INDEPENDENT_ON_BOTH = INDEPENDENT.replace("kf-multi", "multirate-multi")
+"""Why there is no coupled filter."""
+
+
+def flow_model(prior: Prior, settings: MultiPeak, means: StateFilter = MEANS) -> AsterismModel:
+    """Return the weights of the LGS in all modes; means : of each measurement. Raises ValueError where the prior has no flow."""
+    if prior.flow is None:
+        raise ValueError(INDEPENDENT)
+    star = replace(prior.flow, noise=np.array([one.noise for one in prior.lines]))
+    return AsterismModel(replace(prior, asterism=star), settings, 1, means)
+
+
+def kf_coupled(prior: Prior, settings: MultiPeak, _sampling: Sampling, _horizon: float) -> JointEstimator:
+    """Return the filter on the LGS in all modes. Raises ValueError where the prior has no flow."""
+    return JointEstimator(flow_model(prior, settings))
+
+
+def coupled_model(prior: Prior, settings: MultiPeak, ratio: int | None) -> AsterismModel:
+    """Return the weights. Raises ValueError where the prior has no flow."""
+    if prior.asterism is None:
+        raise ValueError(INDEPENDENT_ON_BOTH)
+    return AsterismModel(prior, settings, ratio)
+
+
+def multirate_coupled(prior: Prior, settings: MultiPeak, sampling: Sampling, _horizon: float) -> JointEstimator:
+    """Return the filter on all LGS together. Raises ValueError where the prior has no flow."""
+    return JointEstimator(coupled_model(prior, settings, sampling.ratio))
+
+
+KF_COUPLED = Observer(
+    "kf-coupled",
+    "Coupled KF",
+    TARGETS,
+    help="Kalman filter on the LGS of all modes together, for frozen flow; not in the paper",
+    prior=(Lines, Flow, LgsStars),
+    settings=PEAKS,
+    linear=True,
+    couples_modes=True,
+    weight=2.0,
+    tunable=TUNABLE_PEAKS,
+    look=Look("Coupled", "#D35312", "#D48F4D", (10, 2, 2, 2)),
+    step=kf_coupled,
+    counts=vibration_used,
+)
+
+MULTIRATE_COUPLED = Observer(
+    "multirate-coupled",
+    "Coupled multi-rate KF",
+    TARGETS,
+    help="Kalman filter on both sensors in all modes together, for frozen flow; not in the paper",
+    prior=(Lines, FlowOfBoth, LgsStars),
+    settings=PEAKS,
+    needs=NGS,
+    linear=True,
+    couples_modes=True,
+    takes_missing=True,
+    sensors=("lgs", "ngs"),
+    weight=3.0,
+    tunable=TUNABLE_PEAKS,
+    look=Look("Coupled, both", "#3806FF", "#2C49F5", (10, 2, 4, 2)),
+    step=multirate_coupled,
     counts=vibration_used,
 )

@@ -14,9 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wfsobs.observers.kalman.mode_filter import ModeFilter
-from wfsobs.observers.kalman.multirate import beam_model, estimated_cycle
-from wfsobs.observers.kalman.single import MIN_NOISE, steady_mode
+from wfsobs.observers.kalman.filters import MIN_NOISE, beam_model, estimated_cycle, steady_mode
+from wfsobs.observers.kalman.step import ModeFilter
 from wfsobs.prior import Beams
 from wfsobs.record import RecordError
 from wfsobs.settings import Group, Real, Section, Whole
