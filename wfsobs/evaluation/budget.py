@@ -441,7 +441,7 @@ def follow_signal(
         ngs_noise = max(noise_rms(scenario, "ngs")[mode], MIN_NOISE)
         cycle = estimated_cycle(model, scenario.sensors.exposure_ratio, noise, ngs_noise, beams.lgs)
         used = np.array([[float(both)], [1.0]])
-        kalman = cycle._replace(steps=[(A, used * C, Q, R) for A, C, Q, R in cycle.steps]).filter_of(stars, 0)
+        kalman = cycle._replace(steps=[(A, used * C, Q, R) for A, C, Q, R in cycle.steps]).filter(stars, 0)
     found = KalmanEstimator([kalman]).run(signal, QUIET)
     return {target: found[target][:, 0] for target in TARGETS}
 

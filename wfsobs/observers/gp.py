@@ -30,11 +30,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import Field, dataclass
 from functools import cache, partial
-from math import factorial, pi, sqrt
+from math import comb, factorial, pi, sqrt
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
-import param
 from scipy.linalg import block_diag, expm
 from scipy.special import iv
 
@@ -44,6 +43,7 @@ from wfsobs.observers.kalman.step import ModeFilter, kalman_filters, lgs_mean
 from wfsobs.observers.missing import LINE_WIDTH
 from wfsobs.prior import LgsError, LgsStars, Lines, Noise, Prior
 from wfsobs.settings import Group, Real, Section
+from wfsobs.settings.values import Choice
 from wfsobs.signal.autoregressive import Ar2, Ar3
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
@@ -118,12 +118,9 @@ class Matern:
     def state_space(self) -> StateSpace:
         """Return its stochastic equation: a chain of poles at - sqrt(2 nu) / scale."""
         rate = np.sqrt(float(self.order)) / self.scale
-        if self.order == 1:
-            return _chain(rate, self.rms, [1.0], np.eye(1))
-        if self.order == 3:
-            return _chain(rate, self.rms, [1.0, 2.0], np.eye(2))
-        third = 1.0 / 3.0
-        return _chain(rate, self.rms, [1.0, 3.0, 3.0], np.array([[1.0, 0.0, -third], [0.0, third, 0.0], [-third, 0.0, 1.0]]))
+        n = (self.order + 1) // 2
+        P = np.array([[3.0, 0.0, -1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 3.0]]) / 3.0 if n == 3 else np.eye(n)
+        return _chain(rate, self.rms, [float(comb(n, i)) for i in range(n)], P)
 
 
 @dataclass(frozen=True)
@@ -321,11 +318,7 @@ def _regressions(models: Sequence[tuple[Kernel, Number]], dt: float, z: Array) -
     spaces = [kernel.state_space() for kernel, _ in models]
     A, Q = (np.array(parts) for parts in zip(*(space.discretise(dt) for space in spaces), strict=True))
     h, P = np.array([space.h for space in spaces]), np.array([space.P for space in spaces])
-    return _filter(A, Q, h, P, np.array([noise**2 for _, noise in models]), z)
-
-
-def _filter(A: Array, Q: Array, h: Array, P: Array, r: Array, z: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Run the filters: A, Q, P (m, n, n), h (m, n), r (m,)."""
+    r = np.array([noise**2 for _, noise in models])
     kind = np.result_type(A, Q, h, P, r)
     mean, variance, ahead, innovation = np.empty((4, len(z), len(r)), dtype=kind)
     x, turned = np.zeros(h.shape, dtype=kind), A.swapaxes(1, 2)
@@ -380,9 +373,8 @@ NOTHING = (Matern(0.0, 1.0, 1),)
 class GaussianProcess(Group):
     """Gaussian process regression in time, with a sum of kernels."""
 
-    turbulence: param.Selector[str] = param.Selector(
-        default=POLES,
-        objects=[POLES, *MATERN, SMOOTH],
+    turbulence: Choice = Choice(
+        [POLES, *MATERN, SMOOTH],
         label="Kernel of the turbulence",
         doc="as told: the poles of the model; the others have its rms and its corner frequency.",
     )
@@ -412,13 +404,9 @@ GP = Section("gp", "Gaussian process in time", GaussianProcess)
 def kernels_of(lines: Lines, settings: GaussianProcess) -> tuple[Kernel, Kernel, Kernel]:
     """Return the kernels of turbulence, vibration and background of one mode."""
     turbulence = tuple(_turbulence(process, settings.turbulence) for process in lines.turbulence)
-    peaks = []
-    for frequency, damping, rms in lines.lines:
-        omega = 2.0 * pi * frequency
-        peaks.append(Sho(rms, omega, min(max(damping, pi * LINE_WIDTH / omega), 1.0)))
-    peaks += [Sho(process.rms, process.omega, process.damping) for process in lines.continuum]
+    peaks = tuple(Sho(process.rms, process.omega, process.damping) for process in lines.vibration(LINE_WIDTH))
     colour = (Matern(settings.background_rms, settings.background_scale * 1e-3, 1),) if settings.background_rms else ()
-    return Sum(turbulence or NOTHING), Sum(tuple(peaks) or NOTHING), Sum(colour or NOTHING)
+    return Sum(turbulence or NOTHING), Sum(peaks or NOTHING), Sum(colour or NOTHING)
 
 
 def _turbulence(process: Ar2 | Ar3, kind: str) -> Kernel:
@@ -466,7 +454,7 @@ def on_both(settings: GaussianProcess, prior: Prior, mode: int, ratio: int) -> M
     lines = prior.lines[mode]
     model = sampled_model(kernels_of(lines, settings), lines.dt)
     cycle = optimal_model(MultiRate(), prior, mode, ratio, measured_late(model))
-    return cycle._replace(model=model).filter_of(prior, mode)
+    return cycle._replace(model=model).filter(prior, mode)
 
 
 GP_LGS = Observer(

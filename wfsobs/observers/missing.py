@@ -11,14 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
-from wfsobs.observers.stepping import FilterBank, Gain, GainCycle, StateArrays
+from wfsobs.observers.stepping import FilterBank, GainCycle, StateArrays, steady_gains
 from wfsobs.prior import Prior
 from wfsobs.record import Signals, delay_signal, frame_mean, hold_last
-from wfsobs.signal.gains import steady_state
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
 
@@ -28,11 +27,8 @@ LINE_WIDTH = 0.025
 """Width at half maximum that lines of a prior have at least [Hz], for an observer that has no setting of its own for it."""
 
 
-class Predictor(NamedTuple):
-    """A model of a measurement of one mode, and the rms of its white noise [um]."""
-
-    model: DisturbanceModel
-    noise: float
+Predictor = tuple[DisturbanceModel, float]
+"""A model of a measurement of one mode, and the rms of its white noise [um]."""
 
 
 def fill_missing(signals: S, prior: Prior, line_width: float = LINE_WIDTH) -> S:
@@ -57,13 +53,13 @@ def fill_missing(signals: S, prior: Prior, line_width: float = LINE_WIDTH) -> S:
 def _of_lgs(prior: Prior, line_width: float) -> list[Predictor]:
     """Return the LGS model of every mode; empty where the prior has no model."""
     if prior.model:
-        return [Predictor(m.disturbance(), m.lgs_noise) for m in prior.model]
-    return [Predictor(m.disturbance(line_width), m.noise) for m in prior.lines]
+        return [(m.disturbance(), m.lgs_noise) for m in prior.model]
+    return [(m.disturbance(line_width), m.noise) for m in prior.lines]
 
 
 def _of_ngs(prior: Prior, dt: float) -> list[Predictor]:
     """Return the model of every mode at the rate of NGS frames, `dt` [s] each; empty where the prior has no model."""
-    return [Predictor(m.at(dt).disturbance(), m.ngs_noise) for m in prior.model]
+    return [(m.at(dt).disturbance(), m.ngs_noise) for m in prior.model]
 
 
 def predict_missing(z: Array, predictors: Sequence[Predictor]) -> Array:
@@ -139,8 +135,7 @@ def expected_rows(gains: Sequence[GainCycle]) -> Array:
 
 
 def _gains(predictor: Predictor) -> GainCycle | None:
-    model, noise = predictor
     try:
-        return GainCycle([Gain(model.A, np.atleast_2d(model.C), steady_state(model.A, model.C, model.Q, np.array(noise**2)).L)])
+        return steady_gains(*predictor)[0]
     except ValueError:
         return None

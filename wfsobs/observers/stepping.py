@@ -18,7 +18,9 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from wfsobs.signal.gains import SteadyState, steady_state
 from wfsobs.signal.periodic import FilterStep, PeriodicFilter
+from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
 
 Saved = dict[str, Array]
@@ -171,6 +173,12 @@ class GainCycle:
         ]
         first = None if self.first is None else (np.zeros((n, n)), self.first.L, *nothing)
         return PeriodicFilter(maps, first)
+
+
+def steady_gains(model: DisturbanceModel, noise: float) -> tuple[GainCycle, SteadyState]:
+    """Return the gains of the steady-state filter of z (1 input), and its covariances; noise [um]. Raises RiccatiError."""
+    steady = steady_state(model.A, model.C, model.Q, np.array(noise**2))
+    return GainCycle([Gain(model.A, np.atleast_2d(model.C), steady.L)]), steady
 
 
 class FilterBank:

@@ -23,12 +23,11 @@ from math import cos, exp, expm1, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter, lfiltic
 from scipy.special import expit, logit
 
 from wfsobs.signal.whittle import negative_log_likelihood, whittle_fit
-from wfsobs.signal.wiener import circle_mean
+from wfsobs.signal.wiener import Complex, circle_mean
 from wfsobs.typing import Array
 
 
@@ -88,15 +87,30 @@ class Ar2:
         return self.omega / (2.0 * np.pi)
 
     @property
+    def turn(self) -> tuple[float, float]:
+        """Decay xi w T and angle w sqrt(1 - xi^2) T of the poles exp(-decay +- i angle) in a step."""
+        return self.damping * self.omega * self.dt, self.omega * np.sqrt(1.0 - self.damping**2) * self.dt
+
+    @property
     def a1(self) -> float:
         """First AR coefficient, 2 exp(-xi w T) cos(w sqrt(1 - xi^2) T) (paper, eq. 1b)."""
-        angle = self.omega * np.sqrt(1.0 - self.damping**2) * self.dt
-        return float(2.0 * np.exp(-self.damping * self.omega * self.dt) * np.cos(angle))
+        decay, angle = self.turn
+        return float(2.0 * np.exp(-decay) * np.cos(angle))
 
     @property
     def a2(self) -> float:
         """Second AR coefficient, -exp(-2 xi w T) (paper, eq. 1c)."""
-        return float(-np.exp(-2.0 * self.damping * self.omega * self.dt))
+        return float(-np.exp(-2.0 * self.turn[0]))
+
+    @property
+    def correlation(self) -> float:
+        """That of phi[k] and phi[k-1]."""
+        return self.a1 / (1.0 - self.a2)
+
+    @property
+    def denominator(self) -> list[float]:
+        """Coefficients 1, -a1, -a2 of the recursion."""
+        return [1.0, -self.a1, -self.a2]
 
     @property
     def transition(self) -> Array:
@@ -115,7 +129,7 @@ class Ar2:
         (1 + a2) ((1 - a2)^2 - a1^2) / (1 - a2), with the small factors (1 - a1 - a2) and
         (1 + a2) written so that nothing cancels when the process is slow or lightly damped.
         """
-        damped, angle = self.damping * self.omega * self.dt, self.omega * np.sqrt(1.0 - self.damping**2) * self.dt
+        damped, angle = self.turn
         one_plus_a2 = -np.expm1(-2.0 * damped)
         # 1 -+ a1 - a2 = |1 -+ exp(-damped + i angle)|^2
         at_zero = np.expm1(-damped) ** 2 + 4.0 * np.exp(-damped) * np.sin(angle / 2.0) ** 2
@@ -124,15 +138,14 @@ class Ar2:
 
     def autocovariance(self, n: int) -> Array:
         """Return E phi[k] phi[k-j] for j = 0 ... n - 1, shape (n,)."""
-        rho1 = self.a1 / (1.0 - self.a2)
-        state = lfiltic([1.0], [1.0, -self.a1, -self.a2], [rho1, 1.0])
-        tail, _ = lfilter([1.0], [1.0, -self.a1, -self.a2], np.zeros(max(n - 2, 0)), zi=state)
-        return self.rms**2 * np.concatenate([[1.0, rho1], tail])[:n]
+        first = np.array([1.0, self.correlation])
+        return self.rms**2 * np.concatenate([first, self.extrapolate(first, max(n - 2, 0))])[:n]
 
     def psd(self, frequency: Array) -> Array:
         """Return the one-sided power spectral density [unit^2/Hz] at `frequency` [Hz]."""
         turn = 2j * np.pi * np.asarray(frequency) * self.dt
-        pole = complex(-self.damping * self.omega, self.omega * np.sqrt(1.0 - self.damping**2)) * self.dt
+        decay, angle = self.turn
+        pole = complex(-decay, angle)
         # |1 - a1 q - a2 q^2| with q = exp(-turn), as the product of the distances to both poles
         distance = np.abs(np.expm1(pole - turn) * np.expm1(pole.conjugate() - turn))
         return 2.0 * self.dt * self.drive_variance / distance**2
@@ -142,19 +155,17 @@ class Ar2:
 
         With the two in reverse order, these are the expected steps before them.
         """
-        denominator = [1.0, -self.a1, -self.a2]
-        return lfilter([1.0], denominator, np.zeros(n), zi=lfiltic([1.0], denominator, [last[1], last[0]]))[0]
+        return self._continue(last, np.zeros(n))
+
+    def _continue(self, last: Array, drive: Array) -> Array:
+        return lfilter([1.0], self.denominator, drive, zi=lfiltic([1.0], self.denominator, last[::-1]))[0]
 
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """Draw `n` steps of the process, stationary from the first, shape (n,)."""
         start = rng.standard_normal(2)
-        rho1 = self.a1 / (1.0 - self.a2)
-        before = self.rms * start[0]  # phi[-2], and phi[-1] given it
+        rho1, before = self.correlation, self.rms * start[0]  # phi[-2], and phi[-1] given it
         last = rho1 * before + self.rms * np.sqrt(max(1.0 - rho1**2, 0.0)) * start[1]
-        drive = np.sqrt(self.drive_variance) * rng.standard_normal(n)
-        denominator = [1.0, -self.a1, -self.a2]
-        out, _ = lfilter([1.0], denominator, drive, zi=lfiltic([1.0], denominator, [last, before]))
-        return out
+        return self._continue(np.array([before, last]), np.sqrt(self.drive_variance) * rng.standard_normal(n))
 
 
 SLOWEST = 1e-6
@@ -193,12 +204,12 @@ class Ar3:
         return self.omega / (2.0 * np.pi)
 
     @property
-    def poles(self) -> NDArray[np.complex128]:
+    def poles(self) -> Complex:
         """The three poles."""
         return np.exp(-self.decays)
 
     @property
-    def decays(self) -> NDArray[np.complex128]:
+    def decays(self) -> Complex:
         """Exponents a_i of the three poles exp(-a_i)."""
         pair = complex(self.damping, np.sqrt(1.0 - self.damping**2)) * self.omega * self.dt
         return np.array([pair, pair.conjugate(), self.corner * self.dt])
@@ -259,9 +270,9 @@ class Ar3:
         return np.vstack([(moves @ by_decay).real, np.full(by_decay.shape[1], 2.0)])
 
 
-def _inverse_expm1(s: NDArray[np.complex128]) -> NDArray[np.complex128]:
+def _inverse_expm1(s: Complex) -> Complex:
     """Return 1 / (exp(s) - 1), finite for a large real part."""
-    lost: NDArray[np.complex128] = np.expm1(-s)
+    lost: Complex = np.expm1(-s)
     return -(1.0 + lost) / lost
 
 

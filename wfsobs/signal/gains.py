@@ -70,17 +70,8 @@ def posteriors_of_gains(cycle: Sequence[Step], gains: Sequence[Array]) -> list[A
     RiccatiError
         The filter is not stable.
     """
-    F, W = np.eye(len(cycle[0][0])), np.zeros_like(cycle[0][0])
-    for (A, C, Q, R), L in zip(cycle, gains, strict=True):
-        reduced = np.eye(len(A)) - L @ C
-        W = A @ (reduced @ W @ reduced.T + L @ R @ L.T) @ A.T + Q
-        F = A @ reduced @ F
-    P, out = lyapunov(F, W), []
-    for (A, C, Q, R), L in zip(cycle, gains, strict=True):
-        reduced = np.eye(len(A)) - L @ C
-        out.append(reduced @ P @ reduced.T + L @ R @ L.T)
-        P = A @ out[-1] @ A.T + Q
-    return out
+    states = _around(cycle, np.zeros_like(cycle[0][2]), gains)
+    return [one.posterior for one in _around(cycle, lyapunov(*_carry_around(cycle, states)), gains)]
 
 
 def lyapunov(F: Array, W: Array) -> Array:
@@ -240,7 +231,8 @@ def _compose(first: Map, then: Map) -> Map:
 
 def _double_cycle(cycle: Sequence[Step]) -> Array:
     """Return the covariance after very many cycles, by doubling until it is constant or only rounding changes it."""
-    m = reduce(_compose, (_power_of_map(_map(*step), n) for step, n in _runs(cycle)))
+    runs = [list(run) for _, run in groupby(cycle, key=id)]  # steps that come in a row as the same object
+    m = reduce(_compose, (_power_of_map(_map(*run[0]), len(run)) for run in runs))
     last = np.inf
     for _ in range(60):
         before = m
@@ -252,12 +244,6 @@ def _double_cycle(cycle: Sequence[Step]) -> Array:
             break
         last = moved
     return m[2]
-
-
-def _runs(cycle: Sequence[Step]) -> list[tuple[Step, int]]:
-    """Return the steps of a cycle, each with how often it comes in a row as the same object."""
-    runs = [list(run) for _, run in groupby(cycle, key=id)]
-    return [(run[0], len(run)) for run in runs]
 
 
 def _power_of_map(m: Map, times: int) -> Map:
@@ -275,12 +261,15 @@ def _without_measurements(cycle: Sequence[Step]) -> Array:
     return lyapunov(*_carry_around(cycle, blind))
 
 
-def _around(cycle: Sequence[Step], P: Array) -> list[SteadyState]:
-    """Return gains and covariances around one cycle from the prediction covariance P, and the residual after it."""
+def _around(cycle: Sequence[Step], P: Array, gains: Sequence[Array] | None = None) -> list[SteadyState]:
+    """Return gains and covariances around one cycle from the prediction covariance P, and the residual after it.
+
+    gains : filter gain of every step, by default the best
+    """
     found: list[tuple[Array, Array, Array, Array]] = []
     start = P
-    for A, C, Q, R in cycle:
-        L = np.linalg.solve(C @ P @ C.T + R, C @ P).T
+    for (A, C, Q, R), given in zip(cycle, gains or [None] * len(cycle), strict=True):
+        L = np.linalg.solve(C @ P @ C.T + R, C @ P).T if given is None else given
         # Joseph form: a sum of squares, so the covariance stays symmetric and non-negative.
         reduced = np.eye(len(A)) - L @ C
         filtered = reduced @ P @ reduced.T + L @ R @ L.T

@@ -74,8 +74,7 @@ def process_model(p: Ar2) -> ProcessModel:
     the same process is xi[k+1] = [[rho, a2 s], [s, -rho a2]] xi[k] + (1, -rho / s) v[k], v for phi of rms one. For s, nothing is
     subtracted from one: s (1 - a2) = |1 - exp(-2 xi w T + 2 i angle)| has the two squares below.
     """
-    damped, angle = p.damping * p.omega * p.dt, p.omega * np.sqrt(1.0 - p.damping**2) * p.dt
-    rho = p.a1 / (1.0 - p.a2)
+    (damped, angle), rho = p.turn, p.correlation
     s = np.hypot(np.expm1(-2.0 * damped), 2.0 * np.exp(-damped) * np.sin(angle)) / (1.0 - p.a2)
     drive = np.array([1.0, -rho / s])
     return ProcessModel(

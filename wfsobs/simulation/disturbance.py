@@ -127,7 +127,7 @@ def processes(scenario: Scenario, mode: int, dt: float) -> list[Ar2 | Ar3]:
     if t.source in ("ar2", "ar3"):
         return [(turbulence_process if t.source == "ar2" else third_order_process)(scenario, mode, dt)]
     for p in t.processes if t.source == "processes" else ():
-        omega, rms = 2.0 * pi * p.frequency, p.rms[mode] if mode < len(p.rms) else 0.0
+        omega, rms = 2.0 * pi * p.frequency, peak_rms(p.rms, mode)
         if rms > 0:
             third = p.third_corner * omega
             out.append(Ar3(omega, p.damping, third, rms, dt) if third else Ar2(omega, p.damping, rms, dt))

@@ -23,7 +23,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.sensors import zernike
 from wfsobs.signal.wiener import Complex
 from wfsobs.simulation import layers as atmosphere
-from wfsobs.simulation.sensing import MEAN, lgs_weights, stars_differ
+from wfsobs.simulation.sensing import MEAN, is_blind, lgs_weights, stars_differ
 from wfsobs.typing import Array
 
 LOWEST = 1e-3
@@ -378,8 +378,7 @@ def of_stars(scenario: Scenario, mode: int, layer: TurbulenceLayer, waves: Plane
     for star, gains in zip(atmosphere.laser_stars(scenario), lgs_weights(scenario)[mode], strict=True):
         footprint = atmosphere.footprint(star, layer)
         for other, gain in enumerate(gains):
-            blind = scenario.sensors.tip_tilt_indetermination and scenario.modes[other].radial_order == 1
-            if gain != 0.0 and not blind:
+            if gain != 0.0 and not is_blind(scenario, other):
                 combined += gain * star_mode(scenario, other, waves, footprint)
     return combined
 

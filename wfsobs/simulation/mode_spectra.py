@@ -20,7 +20,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from wfsobs.atmosphere import Footprint, TurbulenceLayer
@@ -41,7 +40,7 @@ from wfsobs.simulation.flow_spectra import (
     star_basis,
     star_flow_spectra,
 )
-from wfsobs.simulation.sensing import lgs_weights
+from wfsobs.simulation.sensing import is_blind, lgs_weights
 from wfsobs.simulation.sensor_noise import noise_rms, shack_hartmann
 from wfsobs.simulation.true_spectra import FLOOR, TrueSpectra, n_frequencies, notched_frequencies, per_sample, true_spectra
 from wfsobs.typing import Array
@@ -101,7 +100,7 @@ def _stars(scenario: Scenario) -> list[atmosphere.Star]:
     return [atmosphere.natural_star(scenario), *atmosphere.laser_stars(scenario)]
 
 
-def _through_lenslets(scenario: Scenario, mode: int, layer: TurbulenceLayer, waves: PlaneWaves) -> list[NDArray[np.complex128]]:
+def _through_lenslets(scenario: Scenario, mode: int, layer: TurbulenceLayer, waves: PlaneWaves) -> list[Complex]:
     """Return the transforms of axis, combined LGS and NGS."""
     natural = atmosphere.footprint(atmosphere.natural_star(scenario), layer)
     return [
@@ -111,11 +110,11 @@ def _through_lenslets(scenario: Scenario, mode: int, layer: TurbulenceLayer, wav
     ]
 
 
-def _lgs_mode(scenario: Scenario, mode: int, waves: PlaneWaves, footprint: Footprint) -> NDArray[np.complex128]:
+def _lgs_mode(scenario: Scenario, mode: int, waves: PlaneWaves, footprint: Footprint) -> Complex:
     return _sensor_mode(scenario, "lgs", mode, waves, footprint)
 
 
-def _sensor_mode(scenario: Scenario, kind: Kind, mode: int, waves: PlaneWaves, footprint: Footprint) -> NDArray[np.complex128]:
+def _sensor_mode(scenario: Scenario, kind: Kind, mode: int, waves: PlaneWaves, footprint: Footprint) -> Complex:
     """Return the transform of a mode as a sensor gives it."""
     seen = shack_hartmann(scenario, kind).transform(footprint.scale * waves.x, footprint.scale * waves.y)[mode]
     return seen * waves.turn(footprint)
@@ -150,8 +149,8 @@ class ModeSpectra:
     """
 
     own: Array
-    measurement: NDArray[np.complex128]
-    cross: NDArray[np.complex128]
+    measurement: Complex
+    cross: Complex
 
 
 def are_coupled(scenario: Scenario) -> bool:
@@ -243,12 +242,10 @@ def frequency_rule(scenario: Scenario) -> tuple[Array, Array]:
     return np.sqrt(edges[1:] * edges[:-1]), np.diff(edges)
 
 
-def _all_modes(scenario: Scenario, _mode: None, layer: TurbulenceLayer, waves: PlaneWaves) -> list[NDArray[np.complex128]]:
+def _all_modes(scenario: Scenario, _mode: None, layer: TurbulenceLayer, waves: PlaneWaves) -> list[Complex]:
     """Return the transforms of all modes on the axis, then of all modes of the combined LGS."""
     own = _modes_in(scenario, waves, Footprint())
-    weights = lgs_weights(scenario)
-    if scenario.sensors.tip_tilt_indetermination:
-        weights = weights * np.array([mode.radial_order != 1 for mode in scenario.modes])
+    weights = lgs_weights(scenario) * _are_seen(scenario)
     combined = np.zeros_like(own)
     for i, star in enumerate(atmosphere.laser_stars(scenario)):
         seen = _modes_in(scenario, waves, atmosphere.footprint(star, layer))
@@ -256,7 +253,7 @@ def _all_modes(scenario: Scenario, _mode: None, layer: TurbulenceLayer, waves: P
     return [*own, *combined]
 
 
-def _all_modes_of_both(scenario: Scenario, mode: None, layer: TurbulenceLayer, waves: PlaneWaves) -> list[NDArray[np.complex128]]:
+def _all_modes_of_both(scenario: Scenario, mode: None, layer: TurbulenceLayer, waves: PlaneWaves) -> list[Complex]:
     """Return those of `_all_modes`, then the transforms of all modes in the NGS."""
     natural = atmosphere.footprint(atmosphere.natural_star(scenario), layer)
     return [*_all_modes(scenario, mode, layer, waves), *_modes_in(scenario, waves, natural)]
@@ -271,14 +268,16 @@ def _all_modes_of_beams(scenario: Scenario, _mode: None, layer: TurbulenceLayer,
 
 def _mean_and_differences(scenario: Scenario) -> Array:
     """Return the weights of the modes of `_all_modes_of_beams` in those of axis, mean and differences of the LGS, and NGS."""
-    modes = np.eye(len(scenario.modes))
-    seen = modes.copy()
-    if scenario.sensors.tip_tilt_indetermination:
-        seen[[mode.radial_order == 1 for mode in scenario.modes]] = 0.0
-    return block_diag(modes, np.kron(star_basis(scenario.sensors.lgs_count), seen), modes)
+    modes, basis = np.eye(len(scenario.modes)), star_basis(scenario.sensors.lgs_count)
+    return block_diag(modes, np.kron(basis, np.diag(_are_seen(scenario))), modes)
 
 
-def _modes_in(scenario: Scenario, waves: PlaneWaves, footprint: Footprint) -> NDArray[np.complex128]:
+def _are_seen(scenario: Scenario) -> Array:
+    """Return 1 for every mode whose turbulence the LGS see, else 0."""
+    return np.array([float(not is_blind(scenario, mode)) for mode in range(len(scenario.modes))])
+
+
+def _modes_in(scenario: Scenario, waves: PlaneWaves, footprint: Footprint) -> Complex:
     return np.array([ideal_mode(scenario, mode, waves, footprint) for mode in range(len(scenario.modes))])
 
 

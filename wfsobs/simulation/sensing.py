@@ -41,11 +41,16 @@ MEAN = "mean"
 """The combination without a model."""
 
 
+def is_blind(scenario: Scenario, mode: int) -> bool:
+    """Return whether the LGS see no turbulence in a mode: tip or tilt, where they cannot tell these."""
+    return scenario.sensors.tip_tilt_indetermination and scenario.modes[mode].radial_order == 1
+
+
 def stars_differ(scenario: Scenario, mode: int) -> bool:
     """Return whether the LGS see different turbulence in a mode, so that each tells something that their mean does not."""
     s = scenario.sensors
-    blind = s.tip_tilt_indetermination and scenario.modes[mode].radial_order == 1
-    return scenario.turbulence.source == "frozen-flow" and s.lgs_count > 1 and s.lgs_radius > 0 and not blind
+    is_flow = scenario.turbulence.source == "frozen-flow"
+    return is_flow and s.lgs_count > 1 and s.lgs_radius > 0 and not is_blind(scenario, mode)
 
 
 def low_frequency_process(scenario: Scenario, mode: int) -> Ar2:
@@ -111,10 +116,9 @@ def lgs_turbulence_covariance(scenario: Scenario) -> Array:
     else:
         own = np.diag([turbulence_rms(scenario, mode) ** 2 for mode in range(modes)])
         out = np.tile(own[None, :, None, :], (stars, 1, stars, 1))
-    if scenario.sensors.tip_tilt_indetermination:
-        blind = [i for i, mode in enumerate(scenario.modes) if mode.radial_order == 1]
-        out[1:, blind] = 0.0
-        out[:, :, 1:, blind] = 0.0
+    blind = [mode for mode in range(modes) if is_blind(scenario, mode)]
+    out[1:, blind] = 0.0
+    out[:, :, 1:, blind] = 0.0
     for mode in range(modes):
         out[range(1, stars), mode, range(1, stars), mode] += low_frequency_process(scenario, mode).rms ** 2
     return out
@@ -273,10 +277,7 @@ def _combine(scenario: Scenario, turbulence_per_star: Sequence[Array], vibration
 
 def _without_tip_tilt(scenario: Scenario, turbulence: Array) -> Array:
     """Return the turbulence without tip and tilt where an LGS cannot see them."""
-    if not scenario.sensors.tip_tilt_indetermination:
-        return turbulence
-    visible = [mode.radial_order > 1 for mode in scenario.modes[: turbulence.shape[1]]]
-    return np.where(visible, turbulence, 0.0)
+    return np.where([is_blind(scenario, mode) for mode in range(turbulence.shape[1])], 0.0, turbulence)
 
 
 def _lgs_errors(scenario: Scenario, n_steps: int, n_modes: int, rng: np.random.Generator, watch: Watch) -> list[Array]:

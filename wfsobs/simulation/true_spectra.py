@@ -32,7 +32,7 @@ from wfsobs.simulation.disturbance import (
     widen_lines,
 )
 from wfsobs.simulation.flow_spectra import TurbulenceSpectra, flow_spectra
-from wfsobs.simulation.sensing import lgs_noise_rms, lgs_weights, low_frequency_process
+from wfsobs.simulation.sensing import is_blind, lgs_noise_rms, lgs_weights, low_frequency_process
 from wfsobs.simulation.sensor_noise import noise_rms
 from wfsobs.typing import Array
 
@@ -101,7 +101,7 @@ def _is_of_aperture(scenario: Scenario, mode: int) -> bool:
 def _vibrates(scenario: Scenario, mode: int) -> bool:
     v = scenario.vibration
     if v.source in ("peaks", "ar2"):
-        return any(mode < len(peak.rms) and peak.rms[mode] > 0 for peak in v.peaks)
+        return any(peak_rms(peak.rms, mode) > 0 for peak in v.peaks)
     return bool(vibration_power(scenario, mode, scenario.n_steps).any())
 
 
@@ -331,8 +331,7 @@ def _through_lgs(scenario: Scenario, mode: int, own: Array) -> TurbulenceSpectra
     """Return the spectra of turbulence that is common to all stars, each LGS with a slow error of its own."""
     weights = lgs_weights(scenario)[mode, :, mode]
     error = density(low_frequency_process(scenario, mode), 2 * (own.size - 1)) * np.sum(weights**2)
-    blind = scenario.sensors.tip_tilt_indetermination and scenario.modes[mode].radial_order == 1
-    gain = 0.0 if blind else weights.sum()
+    gain = 0.0 if is_blind(scenario, mode) else weights.sum()
     return TurbulenceSpectra(own, gain**2 * own + error, gain * own, own, own, gain * own)
 
 

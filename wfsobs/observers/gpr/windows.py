@@ -32,7 +32,6 @@ from types import MappingProxyType
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-import param
 from numpy.lib.stride_tricks import as_strided, sliding_window_view
 from scipy.linalg.blas import dsymv
 from scipy.linalg.lapack import dpotrf, dpotrs
@@ -44,6 +43,7 @@ from wfsobs.progress import Watch
 from wfsobs.record import RecordError, Sampling, Signals, Training, pseudo_open_loop
 from wfsobs.settings import Group, Real, Whole
 from wfsobs.settings.group import UsedWhen
+from wfsobs.settings.values import Choice
 from wfsobs.typing import Array
 
 
@@ -242,15 +242,13 @@ class Gpr(Group):
 
     used_when: ClassVar[UsedWhen] = MappingProxyType({"highpass": ("inputs_filter", ("high-pass",))})
 
-    inputs: param.Selector[str] = param.Selector(
-        default="u-y",
-        objects=["u-y", "z"],
+    inputs: Choice = Choice(
+        ["u-y", "z"],
         label="Inputs",
         doc="Contents of a window: commands and LGS measurements (paper, eq. 14) or pseudo-open-loop measurements z.",
     )
-    inputs_filter: param.Selector[str] = param.Selector(
-        default="raw",
-        objects=["raw", "high-pass", "standardised"],
+    inputs_filter: Choice = Choice(
+        ["raw", "high-pass", "standardised"],
         label="Filter of the inputs",
         doc="Processing of the inputs. raw: none (paper); high-pass: without turbulence below the corner; "
         "standardised: each channel over its standard deviation in the training record, so that l has no unit.",

@@ -44,11 +44,12 @@ import param
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
 from wfsobs.observers.kalman.step import FrameErrors, FrameEstimator, ModeFilter, kalman_filters, lgs_mean
-from wfsobs.observers.stepping import Gain, GainCycle
+from wfsobs.observers.stepping import Gain, GainCycle, steady_gains
 from wfsobs.prior import Beams, LgsError, LgsModel, LgsStars, Lines, Model, NgsModel, Noise, NoiselessModel, Part, Prior
 from wfsobs.record import Sampling
 from wfsobs.settings import Group, Real, Section, Whole
 from wfsobs.settings.group import UsedWhen
+from wfsobs.settings.values import Choice
 from wfsobs.signal.autoregressive import Ar2, Ar3
 from wfsobs.signal.gains import ONE, SensorMean, SteadyState, Step, periodic_steady_state, posteriors_of_gains, steady_state
 from wfsobs.signal.periodic import PeriodicFilter
@@ -70,12 +71,6 @@ TUNABLE_PEAKS = Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipea
 
 MIN_NOISE = 1e-6
 """Floor of a modelled measurement noise [um]: a filter for perfect measurements has no Riccati solution."""
-
-
-def steady_gains(model: DisturbanceModel, noise: float) -> tuple[GainCycle, SteadyState]:
-    """Return the gains of the steady-state filter of z (1 input), and its covariances; noise [um]."""
-    steady = steady_state(model.A, model.C, model.Q, np.array(noise**2))
-    return GainCycle([Gain(model.A, np.atleast_2d(model.C), steady.L)]), steady
 
 
 def steady_filter(model: DisturbanceModel, noise: float, outputs: Array | None = None) -> tuple[PeriodicFilter, SteadyState]:
@@ -116,14 +111,11 @@ def kf_ngs(prior: Prior, settings: Kalman, sampling: Sampling, _horizon: float) 
     assert sampling.ratio is not None
     n, how = sampling.ratio, settings.ngs_between_frames
     modes = [steady_mode(one.at(n * sampling.dt).disturbance(), one.ngs_noise) for one in prior.model]
-
-    spread = partial(_spread, prior.model, modes, n, how)
-    truths = [model.disturbance() for model in prior.model]
     errors = [
-        FrameErrors(truth, mode.gains.steps[0], n, model.ngs_noise)
-        for truth, mode, model in zip(truths, modes, prior.model, strict=True)
+        FrameErrors(model.disturbance(), mode.gains.steps[0], n, model.ngs_noise)
+        for mode, model in zip(modes, prior.model, strict=True)
     ]
-    return FrameEstimator(modes, truths, errors, spread, holds=how == "hold")
+    return FrameEstimator(modes, errors, partial(_spread, prior.model, modes, n, how), holds=how == "hold")
 
 
 def _spread(models: Sequence[Model], modes: Sequence[ModeFilter], n: int, how: str, mode: int, target: str, since: int) -> Array:
@@ -241,9 +233,8 @@ class MultiRate(Group):
         {"lgs_noise": ("measurement_noise", ("manual",)), "ngs_noise": ("measurement_noise", ("manual",))}
     )
 
-    measurement_noise: param.Selector[str] = param.Selector(
-        default="matched",
-        objects=["matched", "manual"],
+    measurement_noise: Choice = Choice(
+        ["matched", "manual"],
         label="Measurement noise R",
         doc="matched: as in the Kalman filters; manual: the two numbers below, r_NGS < r_LGS (paper, section 2.2.1).",
     )
@@ -414,14 +405,10 @@ class Cycle(NamedTuple):
     model: DisturbanceModel
     has_lgs_error: bool = False
 
-    def filter(self, mean: SensorMean = ONE) -> ModeFilter:
-        """Return the optimal filter; mean : the LGS whose mean it measures."""
-        gains, states = optimal_gains(self.steps)
+    def filter(self, prior: Prior | None = None, mode: int = 0) -> ModeFilter:
+        """Return the optimal filter on the LGS of a prior, by default one."""
+        (gains, states), mean = optimal_gains(self.steps), lgs_mean(prior or Prior(), mode, self.has_lgs_error)
         return ModeFilter(self.model, gains, tuple(state.posterior for state in states), tuple(self.steps), mean)
-
-    def filter_of(self, prior: Prior, mode: int) -> ModeFilter:
-        """Return the optimal filter on the LGS of a prior."""
-        return self.filter(lgs_mean(prior, mode, self.has_lgs_error))
 
 
 def optimal_model(settings: MultiRate, prior: Prior, mode: int, ratio: int, model: DisturbanceModel | None = None) -> Cycle:
@@ -440,7 +427,7 @@ def estimated_cycle(
 
 def optimal_mode(settings: MultiRate, prior: Prior, mode: int, ratio: int) -> ModeFilter:
     """Return the optimal filter of a mode with one peak."""
-    return optimal_model(settings, prior, mode, ratio).filter_of(prior, mode)
+    return optimal_model(settings, prior, mode, ratio).filter(prior, mode)
 
 
 MULTIRATE_OPTIMAL = Observer(
@@ -470,7 +457,7 @@ def every_peak_model(peaks: MultiPeak, prior: Prior, mode: int, ratio: int) -> C
 
 def optimal_mode_of_peaks(peaks: MultiPeak, prior: Prior, mode: int, ratio: int) -> ModeFilter:
     """Return the optimal filter of a mode with every peak."""
-    return every_peak_model(peaks, prior, mode, ratio).filter_of(prior, mode)
+    return every_peak_model(peaks, prior, mode, ratio).filter(prior, mode)
 
 
 def beam_model(beams: Beams, vibration: Sequence[Ar2]) -> DisturbanceModel:

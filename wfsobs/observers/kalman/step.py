@@ -46,8 +46,7 @@ class ModeFilter(NamedTuple):
 
     def rows(self, targets: Sequence[str]) -> Array:
         """Return rows of the whole state that give several targets, (len(targets), n)."""
-        rows = self.model.output_rows(targets)
-        return self._pad_rows(rows)
+        return self._pad_rows(self.model.output_rows(targets))
 
     def variance(self) -> Array:
         """Return the covariance of the state, (n, n), but for a running NGS frame."""
@@ -278,15 +277,18 @@ class LinearEstimator(Estimator):
         return self._of_equal.setdefault(model, self._of_equal.get(model) or self.modes[mode].gaps())
 
     def take_over(self, old: Any) -> None:
-        """Go on from another design."""
+        """Go on from another design; the states of LGS error and NGS frame stay as they are."""
         self.bank.phase, self.bank.last = old.bank.phase, old.bank.last
         for mode, (new, was) in enumerate(zip(self.modes, old.modes, strict=True)):
-            is_same, x = new.digest() == was.digest(), old.bank.x[mode]
+            is_same, own, x = new.digest() == was.digest(), self.bank.x[mode], old.bank.x[mode]
             if is_same:
                 n = len(new.gains.steps[0].A)
-                self.bank.x[mode, :n] = x[:n]
+                own[:n] = x[:n]
             else:
-                self.bank.x[mode, : len(new.model.A)] = carry_state(new.model, was.model, x[: len(was.model.A)])
+                n, m = len(new.model.A), len(was.model.A)
+                own[:n] = carry_state(new.model, was.model, x[:m])
+                if own[n:].shape == x[m:].shape:
+                    own[n:] = x[m:]
             self.bank.take_near(mode, old.bank if is_same else None)
 
 
@@ -389,15 +391,6 @@ class KalmanEstimator(LinearEstimator):
         self._plans[frames, target] = out = plan(rows, self.bank.x.shape[1], sd)
         return out
 
-    def take_over(self, old: Any) -> None:
-        """Go on from another design; the states of LGS error and NGS frame stay as they are."""
-        super().take_over(old)
-        for mode, (new, was) in enumerate(zip(self.modes, old.modes, strict=True)):
-            rest = self.bank.x[mode, len(new.model.A) :]
-            others = old.bank.x[mode, len(was.model.A) :]
-            if rest.shape == others.shape:
-                rest[...] = others
-
 
 MakeFilter = Callable[[Any, Prior, int, Any], ModeFilter]
 """(settings, prior, mode, ratio) -> the filter of that mode; ratio : None where there are no NGS frames."""
@@ -415,8 +408,6 @@ class FrameEstimator(LinearEstimator):
     ----------
     modes : sequence of ModeFilter
         The slow filters, one per mode.
-    truths : sequence of DisturbanceModel
-        The models at the fast step.
     errors : sequence of FrameErrors
         Of the slow filters.
     spread : callable
@@ -425,7 +416,6 @@ class FrameEstimator(LinearEstimator):
         Whether an estimate is held until the next frame, so that any fraction of a frame is defined.
     """
 
-    truths: Sequence[DisturbanceModel]
     errors: Sequence[FrameErrors]
 
     uses_ngs = True
@@ -434,7 +424,6 @@ class FrameEstimator(LinearEstimator):
     def __init__(
         self,
         modes: Sequence[ModeFilter],
-        truths: Sequence[DisturbanceModel],
         errors: Sequence[FrameErrors],
         spread: Callable[[int, str, int], Array],
         holds: bool,
@@ -442,7 +431,7 @@ class FrameEstimator(LinearEstimator):
         self._since = -1
         self._pairs = np.array([one.steady for one in errors])
         super().__init__(modes)
-        self.truths, self.errors, self._spread, self._holds = truths, errors, spread, holds
+        self.errors, self._spread, self._holds = errors, spread, holds
         self._frame_plans: dict[tuple[int, float, str], Plan] = {}
         self._unknown = np.full(len(self.modes), np.nan)
 
@@ -494,8 +483,8 @@ class FrameEstimator(LinearEstimator):
         return out
 
     def _sd(self, rows: Array, since: float, target: str, pairs: Iterable[Array]) -> Array:
-        found = zip(self.errors, self.truths, self.modes, rows[:, 0], pairs, strict=True)
-        return np.array([one.sd(m.outputs[target], row[: len(f.model.A)], since, S) for one, m, f, row, S in found])
+        found = zip(self.errors, self.modes, rows[:, 0], pairs, strict=True)
+        return np.array([one.sd(one.model.outputs[target], row[: len(f.model.A)], since, S) for one, f, row, S in found])
 
     def take_over(self, old: Any) -> None:
         """Go on from another design."""
@@ -514,6 +503,8 @@ class FrameErrors:
 
     Attributes
     ----------
+    model : DisturbanceModel
+        At the fast step.
     steady : Array
         Its covariance, the same after every frame unless one is missing.
 
@@ -536,7 +527,7 @@ class FrameErrors:
         Phi, W = np.diag([*np.ones(n), 0.0]), np.zeros_like(A)  # a frame that has been read starts anew
         for _ in range(ratio):
             Phi, W = A @ Phi, A @ W @ A.T + Q
-        self._A, self._Phi, self._W, self._noise = model.A, Phi, W, noise
+        self.model, self._Phi, self._W, self._noise = model, Phi, W, noise
         self.steady: Array = lyapunov(*self._map((np.eye(len(slow.L)) - slow.L @ slow.C) @ slow.A, slow.L))
 
     def _map(self, F: Array, L: Array) -> tuple[Array, Array]:
@@ -556,8 +547,8 @@ class FrameErrors:
 
         S : covariance of the pair, by default the steady one
         """
-        S, n, m = self.steady if S is None else S, len(self._A), len(self._Phi)
-        ahead = now @ matrix_power(self._A, since)
+        S, n, m = self.steady if S is None else S, len(self.model.A), len(self._Phi)
+        ahead = now @ matrix_power(self.model.A, since)
         variance = now @ S[:n, :n] @ now - 2.0 * ahead @ S[:n, m:] @ row + row @ S[m:, m:] @ row
         return float(np.sqrt(max(variance, 0.0)))
 
@@ -572,16 +563,14 @@ def over_record(sd: Array, n_steps: int, first: int = 0) -> Array:
     return out
 
 
-def by_target(columns: Sequence[Array], sd: Sequence[Array] = (), first: int = 0) -> Estimates:
+def by_target(columns: Sequence[Array], sd: Sequence[Array], first: int) -> Estimates:
     """Return results per mode (n_steps, n_targets) by target.
 
     sd : per mode (steps that repeat, 2 or 4), as of `by_name`, from step `first` on
     """
-    values, n_steps = np.stack(columns, axis=-1), len(columns[0])
-    spreads = np.stack(sd, axis=-1) if len(sd) else None
+    spreads = by_name(np.stack(sd, axis=-1))
     return Estimates(
-        by_name(values),
-        None if spreads is None else {name: over_record(x, n_steps, first) for name, x in by_name(spreads).items()},
+        by_name(np.stack(columns, axis=-1)), {name: over_record(x, len(columns[0]), first) for name, x in spreads.items()}
     )
 
 
