@@ -16,7 +16,7 @@ from wfsobs.control.laws import best_gain, h2_fir, integrator_law, lqg, lqg_adap
 from wfsobs.control.mirror import Law, Plant
 from wfsobs.observers.base import VIBRATION, Look, Tunable
 from wfsobs.observers.gpr.offline import OfflineEstimator, OfflineGpr, trained_estimator
-from wfsobs.observers.gpr.online import OnlineEstimator, OnlineGpr, learning_estimator
+from wfsobs.observers.gpr.online import OnlineEstimator, OnlineGpr
 from wfsobs.observers.kalman.adaptive import KF_ADAPTIVE, MULTIRATE_ADAPTIVE, kf_adaptive, multirate_adaptive
 from wfsobs.observers.kalman.filters import (
     MODEL,
@@ -69,7 +69,7 @@ def step_gpr_offline_ahead(prior: Prior, plant: Plant, settings: Any, sampling: 
 
 def step_gpr_online_ahead(prior: Prior, plant: Plant, settings: Any, sampling: Sampling) -> OnlineEstimator:
     """Return `gpr_online_ahead`, one frame at a time."""
-    return learning_estimator(prior, of_z(settings.gpr_online), sampling, plant.mirror.taps[1:])
+    return OnlineEstimator(prior, of_z(settings.gpr_online), sampling, plant.mirror.taps[1:])
 
 
 def of_z(settings: G) -> G:

@@ -138,16 +138,12 @@ class OnlineEstimator(HeldEstimate):
 
     Parameters
     ----------
-    windows : Windows
-        The channels of a sample; of depth 1.
-    bands : Bands
-        Of the bank that gives the targets.
+    prior : Prior
+        Bands of the bank that gives the targets, and training data for standardised inputs.
+    settings : OnlineGpr
+        Of windows, training set and covariance.
     sampling : Sampling
         Of the loop.
-    depth, m : int
-        Samples in a window, windows in the training set.
-    kernel : SquaredExponential
-        The covariance.
     weights : Array
         Of the vibration now, one frame ahead and so on in what it learns; fewer than m.
     """
@@ -158,16 +154,17 @@ class OnlineEstimator(HeldEstimate):
 
     state_names: tuple[str, ...] = ("windows", "bank", "_mean", "_band_signals", "regression")
 
-    def __init__(
-        self, windows: Windows, bands: Bands, sampling: Sampling, depth: int, m: int, kernel: SquaredExponential, weights: Array
-    ):
-        super().__init__(sampling.n_modes, float(len(weights) - 1))
-        self.windows, self.weights, self.needs_command = windows, weights, windows.needs_command
-        self._band_signals = np.zeros((len(weights), sampling.n_modes))  # oldest first
-        self._size = depth, m, 2 if windows.needs_command else 1, kernel
-        self._bands, bank = bands, bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, sampling.dt)
-        self.bank: FilterBank = FilterBank([bank_recursion(bank)] * sampling.n_modes)
-        self._pending, late, n = False, len(weights) - 1, sampling.n_modes
+    def __init__(self, prior: Prior, settings: OnlineGpr, sampling: Sampling, weights: Array):
+        (n, dt, *_), late, bands = sampling, len(weights) - 1, prior.bands
+        assert bands is not None
+        super().__init__(n, float(late))
+        self.windows, self.weights, self._bands = Windows(settings, sampling, 1, prior.training), weights, bands
+        self.needs_command = self.windows.needs_command
+        self._band_signals = np.zeros((len(weights), n))  # oldest first
+        self._size = settings.depth, settings.training_size, 2 if self.needs_command else 1, kernel_of(settings)
+        bank = bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, dt)
+        self.bank: FilterBank = FilterBank([bank_recursion(bank)] * n)
+        self._pending = False
         self.regression: LateRegression | SlidingRegression = (
             LateRegression(*self._size, late, n) if late else SlidingRegression(*self._size, n)
         )
@@ -237,14 +234,7 @@ class OnlineEstimator(HeldEstimate):
 
 def gpr_online(prior: Prior, settings: OnlineGpr, sampling: Sampling, horizon: float) -> OnlineEstimator:
     """Return the online GPR, which learns the vibration `horizon` frames ahead."""
-    return learning_estimator(prior, settings, sampling, np.eye(whole_frames(horizon, "gpr-online") + 1)[-1])
-
-
-def learning_estimator(prior: Prior, g: OnlineGpr, sampling: Sampling, weights: Array) -> OnlineEstimator:
-    """Return the online GPR; weights : of the vibration now, one frame ahead and so on in what it learns."""
-    assert prior.bands is not None
-    windows = Windows(g, sampling, 1, prior.training)
-    return OnlineEstimator(windows, prior.bands, sampling, g.depth, g.training_size, kernel_of(g), weights)
+    return OnlineEstimator(prior, settings, sampling, np.eye(whole_frames(horizon, "gpr-online") + 1)[-1])
 
 
 def standardised_parts(settings: Gpr) -> tuple[Part, ...]:

@@ -141,16 +141,15 @@ class ModeWindow:
         kalman = self.put_in_charge()
         if kalman is None:
             return
-        gains, tail = kalman.modes[0].gains, v[len(v) - min(TAIL // self._frame * self._frame, len(whole) - self._frame) :]
+        gains, tail = (
+            kalman.modes[0].gains,
+            v[len(v) - min(TAIL // self.lengths.frame * self.lengths.frame, len(whole) - self.lengths.frame) :],
+        )
         lost = bool(np.isnan(tail).any())
         since = len(whole) - 1 - lost * len(tail)
         (kalman.bank.x[0],) = gains.filter(np.eye(len(gains.steps[0].A))).run((whole - self.means)[: since + 1], since=since)
         for row in tail - self.means if lost else ():
             kalman.advance(row[:1], row[1:], None)
-
-    @property
-    def _frame(self) -> int:
-        return self.lengths.ratio or 1
 
     def put_in_charge(self) -> KalmanEstimator | None:
         """Activate the filter of what was found: at rest, of both sensors after a whole frame."""
@@ -158,7 +157,7 @@ class ModeWindow:
         self.kalman = None if one is None else KalmanEstimator([one])
         if one is not None and self.kalman is not None and self.surprise.size:
             self._ahead, self._variance = one.cycle[0][1][0] @ one.cycle[0][0], one.innovation_variances()
-            self.kalman.bank.phase, self.kalman.bank.last = 1, self._frame
+            self.kalman.bank.phase, self.kalman.bank.last = 1, self.lengths.frame
         return self.kalman
 
     def run(self, v: Array, dt: float, settings: Adaptive, tell: Callable[[float], None]) -> tuple[Array, Array]:
@@ -168,14 +167,15 @@ class ModeWindow:
         window is full.
         """
         n, interval = len(v), self.lengths.interval
-        out, sd = (np.full((n, len(TARGETS) + more), np.nan) for more in (0, 1))
+        out, sd = np.full((n, 2), np.nan), np.full((n, 3), np.nan)
         while self.due <= n:
             tell(self.began / n)
             end = self.due
             start = self.lengths.window_start(end, self.last_change)
             if self.identify(v[start:end], dt, settings) is None:
                 continue
-            here, stop = slice(end - 1, min(self.due, n)), min(self.due, n)
+            stop = min(self.due, n)
+            here = slice(end - 1, stop)
             if self.model.filter is None:
                 out[here] = self.means[-1], 0.0
                 continue
@@ -245,7 +245,7 @@ class ModeWindow:
         """Take over a state."""
         self.due, self.began, self.last_change, self.size = (int(i) for i in state["times"])
         self.means, self.surprise = state["means"].copy(), state["surprise"].copy()
-        steps = (dt, dt, dt * self._frame)
+        steps = (dt, dt, dt * self.lengths.frame)
         fit, spectrum, error = (unpack_spectrum(table, step) for table, step in zip(state["spectra"], steps, strict=True))
         ngs, hidden_rms = state["noise"].tolist()
         filter_ = None if spectrum is None else model_filter(spectrum, error, ngs, self.lengths.ratio)

@@ -302,13 +302,11 @@ class AsterismModel:
     def _of_vibration(self, frames: float) -> list[tuple[Array, Array]]:
         targets = [model.outputs[VIBRATION] for model in self._peaks]
         rows = [now @ matrix_power(model.A, frames) for now, model in zip(targets, self._peaks, strict=True)]
-        variances, found = np.array([now @ now for now in targets]), []  # the states have unit variance
-        for phase in range(self.ratio):
-            out = np.zeros((len(rows), self.n_states))
-            for i, (row, cross) in enumerate(zip(rows, self._of_lines, strict=True)):
-                out[i, self._places[i]] = row @ cross[phase]
-            found.append((out, variances))
-        return found
+        crosses = np.zeros((self.ratio, len(rows), self.n_states))
+        for i, (row, of_lines) in enumerate(zip(rows, self._of_lines, strict=True)):
+            crosses[:, i, self._places[i]] = row @ np.array(of_lines)
+        variances = np.array([now @ now for now in targets])  # the states have unit variance
+        return [(cross, variances) for cross in crosses]
 
 
 class Beginning(NamedTuple):
@@ -381,9 +379,10 @@ class _Bank:
         self.modes, sizes = modes, np.array([len(one.first) for one in modes])
         n = int(sizes.max())
         self.is_state = np.arange(n) < sizes[:, None]
-        self.F, self.G, self.first = np.zeros((len(modes), n, n)), np.zeros((len(modes), n)), np.zeros((len(modes), n))
-        for i, (one, first, _) in enumerate(modes):
-            self.F[i, : sizes[i], : sizes[i]], self.G[i, : sizes[i]], self.first[i, : sizes[i]] = *one, first
+        self.F, (self.G, self.first) = np.zeros((len(modes), n, n)), np.zeros((2, len(modes), n))
+        for i, ((F, G), first, _) in enumerate(modes):
+            m = len(first)
+            self.F[i, :m, :m], self.G[i, :m], self.first[i, :m] = F, G, first
 
     def begin(self, y: Array) -> Array:
         """Return the state after a first measurement (..., n_modes), (..., n_modes, n)."""
@@ -455,7 +454,7 @@ class JointEstimator(Estimator):
         """Take the measurement of every LGS, (n_lgs, n_modes) [um], and the NGS frame that is due; NaN is missing."""
         missing = np.isnan(each)
         each = self._complete(each, missing) if missing.any() else each
-        self.present = _as_set(missing)
+        self.present = tuple(not any(one) for one in missing)  # of which no mode is missing
         seen = self.model.basis @ each
         if self.phase == FIRST:
             self.x, self.phase = self._fast.begin(seen), WITHOUT
@@ -490,10 +489,8 @@ class JointEstimator(Estimator):
 
     def _now(self, name: str, *details: Any) -> Any:
         """Return what the model has of that name in this step, for the LGS that are there."""
-        found, at = (
-            self._of_model(self.n_lost, self.stars, name, *details, self.present),
-            self.phase - self.n_lost * self.model.ratio,
-        )
+        found = self._of_model(self.n_lost, self.stars, name, *details, self.present)
+        at = self.phase - self.n_lost * self.model.ratio
         return (found[0][at], found[1][at]) if isinstance(found, tuple) else found[at]
 
     def _complete(self, each: Array, missing: Array) -> Array:
@@ -544,11 +541,6 @@ class JointEstimator(Estimator):
             raise StepError("its states are not those of the other design")
         self.x, self.frames = self._fast.carry(old._fast, old.x), self._slow.carry(old._slow, old.frames)
         self.stand_in_frames[...], self.phase, self.present, self.stars = old.stand_in_frames, old.phase, old.present, old.stars
-
-
-def _as_set(missing: Array) -> Present:
-    """Return the LGS of which no mode is missing, from (n_lgs, n_modes)."""
-    return tuple(not any(one) for one in missing)
 
 
 def _run_at_once(model: AsterismModel, each: Array, frames: Array | None, watch: Watch) -> Estimates:

@@ -112,6 +112,11 @@ class Lengths(NamedTuple):
     first: int
     ratio: int | None = None
 
+    @property
+    def frame(self) -> int:
+        """Steps per NGS frame, 1 without NGS."""
+        return self.ratio or 1
+
     def next_length(self, window: int) -> int:
         """Return the steps from an identification to the next one, if the record is still."""
         if self.ratio is None:
@@ -126,7 +131,7 @@ class Lengths(NamedTuple):
     def check(self, settings: Adaptive, dt: float) -> None:
         """Raise RecordError for a window of too few samples."""
         least, what = (SHORTEST, "samples") if self.ratio is None else (max(-(-SHORTEST // self.ratio), FRAMES), "NGS frames")
-        needed = least * (self.ratio or 1)
+        needed = least * self.frame
         if self.window < needed:
             raise RecordError(f"adaptive.window = {settings.window:g}: takes {needed * dt:g} s or more, {least} {what}")
 
@@ -168,10 +173,8 @@ def behind_gaps(v: Array, lengths: Lengths, least: int) -> Array | None:
 
     least : minimum number of steps where a model is in charge that holds, else FEWEST of the shortest window do
     """
-    n = lengths.ratio or 1
-    steps = [1, n]
-    samples = sensor_samples(v, lengths.ratio)
-    start = max(step * last_long_gap(x, LONG * lengths.window / step) for x, step in zip(samples, steps, strict=False))
+    n, samples = lengths.frame, sensor_samples(v, lengths.ratio)
+    start = max(step * last_long_gap(x, LONG * lengths.window / step) for x, step in zip(samples, (1, n), strict=False))
     v = v[-(-start // n) * n :]
     is_long = len(v) >= max(least, FEWEST * lengths.window, SHORTEST)
     return v if is_long and all(np.isnan(x).mean() <= 1.0 - LEAST for x in sensor_samples(v, lengths.ratio)) else None
@@ -311,13 +314,13 @@ def unpack_spectrum(table: Array, dt: float) -> Spectrum | None:
     """Return the spectrum of these numbers."""
     if np.isnan(table[0, 0]):
         return None
-    processes = [None if np.isnan(row[0]) else _process(row, dt) for row in table[1:]]
-    resonances = tuple(p for p in processes[1:] if isinstance(p, Ar2))
-    omega, damping, rms = table[0, 1:].tolist()
-    background = None if np.isnan(omega) else Ar2(omega, damping, rms, dt)
-    return Spectrum(float(table[0, 0]), dt, processes[0], resonances, background)
+    background, turbulence, *rest = (_process(row, dt) for row in (np.append(table[0, 1:], np.nan), *table[1:]))
+    assert not isinstance(background, Ar3)
+    return Spectrum(float(table[0, 0]), dt, turbulence, tuple(p for p in rest if isinstance(p, Ar2)), background)
 
 
-def _process(row: Array, dt: float) -> Ar2 | Ar3:
+def _process(row: Array, dt: float) -> Ar2 | Ar3 | None:
     omega, damping, rms, corner = row.tolist()
+    if np.isnan(omega):
+        return None
     return Ar2(omega, damping, rms, dt) if np.isnan(corner) else Ar3(omega, damping, corner, rms, dt)
