@@ -28,9 +28,19 @@ def open_loop_reference(bands: Bands, open_loop_y: Array, dt: float) -> Array:
     return np.vstack([filtered[1:], np.full((1, filtered.shape[1]), np.nan)])
 
 
+def online_bank(bands: Bands, dt: float) -> list[Array]:
+    """Return the band-passes on closed-loop data."""
+    return bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, dt)
+
+
+def online_filters(bands: Bands, sampling: Sampling) -> FilterBank:
+    """Return these of all modes, one frame at a time."""
+    return FilterBank([bank_recursion(online_bank(bands, sampling.dt))] * sampling.n_modes)
+
+
 def online_reference(bands: Bands, z: Array, dt: float) -> Array:
     """Filter the pseudo-open-loop measurement z by the causal bank, (n_steps, n_modes) [um]."""
-    return filter_causal(bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, dt), z)
+    return filter_causal(online_bank(bands, dt), z)
 
 
 def butterworth_ol(measurements: Measurements, prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
@@ -43,12 +53,13 @@ def butterworth_ol(measurements: Measurements, prior: Prior, _settings: None, wa
 class BankEstimator(HeldEstimate):
     """The causal band-passes of all modes, one frame at a time. They predict nothing."""
 
+    filters: FilterBank
+
     state_names: tuple[str, ...] = ("filters", "_mean")
 
     def __init__(self, bands: Bands, sampling: Sampling):
         super().__init__(sampling.n_modes, 0.0, 0.0)
-        self._bands, bank = bands, bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, sampling.dt)
-        self.filters: FilterBank = FilterBank([bank_recursion(bank)] * sampling.n_modes)
+        self._bands, self.filters = bands, online_filters(bands, sampling)
         self.mark_start()
 
     def run(self, measurements: Measurements, watch: Watch) -> Estimates:

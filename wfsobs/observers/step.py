@@ -361,7 +361,9 @@ class StepObserver(StepBase):
             Another target, or frames that the observer does not predict.
         """
         if target is None:
-            target = only_target(self.id, self.targets)
+            if len(self.targets) != 1:
+                raise StepError(f"{self.id}: predict takes a target: {' or '.join(self.targets)}")
+            target = self.targets[0]
         if (frames, target) not in self._allowed_requests:
             check_request(self.id, frames, target, self.targets, self.estimator.horizon)
             self._allowed_requests.add((frames, target))
@@ -487,13 +489,6 @@ def check_state(id: str, state: Mapping[str, ArrayLike], own: Mapping[str, Array
     if given["frame"] < 0:
         raise StepError(f"{id}: load_state_dict: frame = {given['frame']:g}: takes 0 or more")
     return given
-
-
-def only_target(id: str, targets: Sequence[str]) -> str:
-    """Return the target of an observer that estimates one. Raises StepError."""
-    if len(targets) != 1:
-        raise StepError(f"{id}: predict takes a target: {' or '.join(targets)}")
-    return targets[0]
 
 
 def check_request(id: str, frames: float, target: str, targets: Sequence[str], horizon: float | None) -> None:

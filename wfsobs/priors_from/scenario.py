@@ -221,7 +221,7 @@ def beams_of(
     fits : those of similar scenarios, to start from
     """
     dt = dt or scenario.dt
-    line_gain = float(lgs_weights(scenario)[mode, :, mode].sum())
+    line_gain = float(_line_gain(scenario)[mode])
     if scenario.turbulence.source == "processes" or not _is_third_order(scenario, mode, dt):
         return Beams(lines_turbulence(scenario, mode, dt), lgs=(lgs_error_of(scenario, mode, dt).process,), line_gain=line_gain)
     found = _shared_turbulence(scenario, mode, dt) if spectra is None else _fit_shared(scenario, mode, dt, spectra, fits)
@@ -355,20 +355,20 @@ def prior_of(
     model, bands = _most_of(Model, asked), _most_of(Bands, asked)
     beams = [kind for kind in (Asterism, FlowOfBoth) if kind in asked]
 
-    def each(part: Part, make: Callable[[Scenario, int, float], Any]) -> tuple[Any, ...]:
-        return tuple(make(scenario, mode, dt) for mode in modes) if part in asked else ()
+    def each(part: Part, make: Callable[..., Any], *arguments: Any) -> tuple[Any, ...]:
+        return tuple(make(scenario, mode, *arguments) for mode in modes) if part in asked else ()
 
     return Prior(
         model=tuple(model_of(scenario, mode, dt, model) for mode in modes) if model else (),
-        noise=tuple(Noise(*measurement_noise(scenario, mode)) for mode in modes) if Noise in asked else (),
-        lgs_error=each(LgsError, lgs_error_of),
-        lines=each(Lines, lines_of),
-        stars=each(LgsStars, stars_of),
-        beams=each(Beams, beams_of),
+        noise=tuple(Noise(*one) for one in each(Noise, measurement_noise)),
+        lgs_error=each(LgsError, lgs_error_of, dt),
+        lines=each(Lines, lines_of, dt),
+        stars=each(LgsStars, stars_of, dt),
+        beams=each(Beams, beams_of, dt),
         flow=turbulence_together(Flow, scenario, len(modes), dt) if Flow in asked else None,
         asterism=turbulence_together(beams[0], scenario, len(modes), dt) if beams else None,
         bands=bands_of(scenario, bands) if bands else None,
-        spectra=tuple(spectra or [spectra_of(scenario, mode) for mode in modes]) if Spectra in asked else (),
+        spectra=tuple(spectra) if spectra and Spectra in asked else each(Spectra, spectra_of),
         training=training_of(record, modes) if Training in asked and record else None,
     )
 

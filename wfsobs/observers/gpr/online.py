@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from wfsobs.observers.base import VIBRATION, Look, Observer, Tunable
-from wfsobs.observers.baselines import online_reference
+from wfsobs.observers.baselines import online_filters, online_reference
 from wfsobs.observers.gpr.sliding_regression import LateRegression, SlidingRegression, finish, run_lengths, slide
 from wfsobs.observers.gpr.windows import (
     Gpr,
@@ -31,7 +31,6 @@ from wfsobs.prior import Bands, OnlineBands, Part, Prior, Training
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Estimates, Measurements, RecordError, Sampling, Signals
 from wfsobs.settings import Real, Section, Whole
-from wfsobs.signal.spectrum import bandpass_bank, bank_recursion
 from wfsobs.typing import Array
 
 
@@ -155,15 +154,14 @@ class OnlineEstimator(HeldEstimate):
     state_names: tuple[str, ...] = ("windows", "bank", "_mean", "_band_signals", "regression")
 
     def __init__(self, prior: Prior, settings: OnlineGpr, sampling: Sampling, weights: Array):
-        (n, dt, *_), late, bands = sampling, len(weights) - 1, prior.bands
+        n, late, bands = sampling.n_modes, len(weights) - 1, prior.bands
         assert bands is not None
         super().__init__(n, float(late))
         self.windows, self.weights, self._bands = Windows(settings, sampling, 1, prior.training), weights, bands
         self.needs_command = self.windows.needs_command
         self._band_signals = np.zeros((len(weights), n))  # oldest first
         self._size = settings.depth, settings.training_size, 2 if self.needs_command else 1, kernel_of(settings)
-        bank = bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, dt)
-        self.bank: FilterBank = FilterBank([bank_recursion(bank)] * n)
+        self.bank: FilterBank = online_filters(bands, sampling)
         self._pending = False
         self.regression: LateRegression | SlidingRegression = (
             LateRegression(*self._size, late, n) if late else SlidingRegression(*self._size, n)

@@ -141,10 +141,8 @@ class ModeWindow:
         kalman = self.put_in_charge()
         if kalman is None:
             return
-        gains, tail = (
-            kalman.modes[0].gains,
-            v[len(v) - min(TAIL // self.lengths.frame * self.lengths.frame, len(whole) - self.lengths.frame) :],
-        )
+        gains, frame = kalman.modes[0].gains, self.lengths.frame
+        tail = v[len(v) - min(TAIL // frame * frame, len(whole) - frame) :]
         lost = bool(np.isnan(tail).any())
         since = len(whole) - 1 - lost * len(tail)
         (kalman.bank.x[0],) = gains.filter(np.eye(len(gains.steps[0].A))).run((whole - self.means)[: since + 1], since=since)
