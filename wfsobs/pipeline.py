@@ -125,9 +125,9 @@ def observe(
         scenario = as_stated(record, told_by(prior, scenario))
     scenario.validate()
     record = with_gate(record, scenario) if gate and not is_simulated else record
+    start = 0.0
     if train is not None:
-        record = with_training(record, train, scenario)
-    start = trained_until(train)
+        record, start = with_training(record, train, scenario), trained_until(train)
     estimates: list[Estimate] = []
     failures: list[Failure] = []
     for item in each_estimate(record, scenario, watch, observers, memo=memo):

@@ -31,7 +31,7 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
 from wfsobs.settings.values import SettingError, error_line
-from wfsobs.signal.joint_states import in_two_threads
+from wfsobs.signal.wiener import in_two_threads
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, true_spectra
 from wfsobs.typing import Array

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from wfsobs.control.mirror import Law, Mirror, Plant
 from wfsobs.observers.base import TARGETS
+from wfsobs.observers.baselines import online_filters
 from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.observers.missing import Bridge
 from wfsobs.observers.step import Estimator, StepBase, StepError, check_frame, take_state
@@ -23,7 +24,6 @@ from wfsobs.observers.stepping import FilterBank, StateArrays, Stateful
 from wfsobs.prior import Bands, Prior
 from wfsobs.record import Sampling
 from wfsobs.signal.gate import GateSettings
-from wfsobs.signal.spectrum import bandpass_bank, bank_recursion
 from wfsobs.typing import Array
 
 StepPredict = Callable[[Prior, Plant, Any, Sampling], Estimator]
@@ -226,10 +226,7 @@ class VibrationAhead:
 
     def __init__(self, estimator: Estimator, bands: Bands, sampling: Sampling):
         self.estimator = estimator
-        self.bank: FilterBank = FilterBank(
-            [bank_recursion(bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, sampling.dt))]
-            * sampling.n_modes
-        )
+        self.bank: FilterBank = online_filters(bands, sampling)
         self.parts: dict[str, Stateful] = {"estimator": estimator, "bank": self.bank}
 
     def split(self, z: Array) -> tuple[Array, Array]:

@@ -59,10 +59,10 @@ from wfsobs.prior import Asterism, Flow, FlowOfBoth, Lines
 from wfsobs.priors_from.scenario import has_prior, prior_of
 from wfsobs.record import TOTAL, Record
 from wfsobs.scenario import Scenario
-from wfsobs.signal.joint_states import in_two_threads, running_means
+from wfsobs.signal.joint_states import running_means
 from wfsobs.signal.sensor_array import FastSensors, SlowSensor, SlowTarget, variance_from_frames, variance_from_sensors
 from wfsobs.signal.spectrum import rms
-from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean, degrees_of_freedom, explained_variance
+from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean, degrees_of_freedom, explained_variance, in_two_threads
 from wfsobs.simulation.disturbance import line_width
 from wfsobs.simulation.mode_spectra import AXIS, FIRST, LGS, NGS, StarSpectra, are_coupled, star_spectra
 from wfsobs.simulation.sensing import MEAN, stars_differ

@@ -37,8 +37,8 @@ import numpy as np
 from scipy.linalg import block_diag, expm
 from scipy.special import iv
 
-from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
-from wfsobs.observers.kalman.filters import NGS, MultiRate, optimal_model, steady_mode
+from wfsobs.observers.base import TARGETS, Look, Tunable
+from wfsobs.observers.kalman.filters import MultiRate, filter_of_both, linear_filter, optimal_model, steady_mode
 from wfsobs.observers.kalman.step import ModeFilter, kalman_filters, lgs_mean
 from wfsobs.observers.missing import LINE_WIDTH
 from wfsobs.prior import LgsError, LgsStars, Lines, Noise, Prior
@@ -457,33 +457,27 @@ def on_both(settings: GaussianProcess, prior: Prior, mode: int, ratio: int) -> M
     return cycle._replace(model=model).filter(prior, mode)
 
 
-GP_LGS = Observer(
+GP_LGS = linear_filter(
     "gp-lgs",
     "GP in time",
     TARGETS,
     help="Gaussian process in time, a kernel for the turbulence and one per line, as a filter; not in the paper",
     prior=(Lines, LgsStars),
     settings=GP,
-    linear=True,
     weight=2.0,
-    takes_missing=True,
     tunable=Tunable(("gp.background_rms", "gp.background_scale"), ("kalman.lgs_noise", "kalman.turbulence_rms")),
     look=Look("GP in time", "#478B83", "#8EFAF0", (6, 2, 2, 2)),
     step=partial(kalman_filters, on_lgs),
 )
 
-GP_BOTH = Observer(
+GP_BOTH = filter_of_both(
     "gp-both",
     "GP on both sensors",
     TARGETS,
     help="Gaussian process in time on both sensors; not in the paper",
     prior=(Noise, LgsError, LgsStars, Lines),
     settings=GP,
-    needs=NGS,
-    linear=True,
     weight=2.0,
-    takes_missing=True,
-    sensors=("lgs", "ngs"),
     tunable=Tunable(("gp.background_rms", "gp.background_scale"), ("kalman.lgs_noise", "kalman.ngs_noise")),
     look=Look("GP, both", "#55A17F", "#03E49C", (6, 2, 2, 2, 2, 2)),
     step=partial(kalman_filters, on_both),

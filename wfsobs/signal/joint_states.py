@@ -23,26 +23,21 @@ every n steps; its covariance is that of a Lyapunov equation of one cycle.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from functools import lru_cache
 from itertools import pairwise
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag, cho_solve, helmert, schur
 
 from wfsobs.signal.gains import lyapunov
 from wfsobs.signal.statespace import DisturbanceModel
-from wfsobs.signal.wiener import Complex
+from wfsobs.signal.wiener import Complex, in_two_threads
 from wfsobs.typing import Array
 
 RIDGE = 1e-10
 """Added to the covariance of the states, over that: rounding must not make it indefinite."""
-
-
-Item = TypeVar("Item")
-Found = TypeVar("Found")
 
 
 class StateFilter(NamedTuple):
@@ -65,12 +60,6 @@ def responses(filters: Sequence[StateFilter], common: StateFilter, omega: Array)
     """Return the responses of filters whose last states are those of one that all have in common."""
     of_common, n = common.response(omega), common.G.size
     return [np.vstack([StateFilter(one.F[:-n, :-n], one.G[:-n]).response(omega), of_common]) for one in filters]
-
-
-def in_two_threads(function: Callable[[Item], Found], items: Iterable[Item]) -> list[Found]:
-    """Return what a function makes of every item: products and factors of matrices leave the interpreter to others."""
-    with ThreadPoolExecutor(2) as pool:
-        return list(pool.map(function, items))
 
 
 def running_means(spans: Sequence[float], turns: Sequence[float] = (0.0,)) -> StateFilter:

@@ -17,8 +17,11 @@ mean over the whole circle is the variance.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +33,16 @@ Complex = NDArray[np.complex128]
 
 LOOK = 64
 """Measurements after which is looked whether their explained variance is enough."""
+
+
+Item = TypeVar("Item")
+Found = TypeVar("Found")
+
+
+def in_two_threads(function: Callable[[Item], Found], items: Iterable[Item]) -> list[Found]:
+    """Return what a function makes of every item: products and factors of matrices leave the interpreter to others."""
+    with ThreadPoolExecutor(2) as pool:
+        return list(pool.map(function, items))
 
 
 @dataclass(frozen=True)

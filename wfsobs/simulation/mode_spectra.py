@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -105,16 +106,12 @@ def _through_lenslets(scenario: Scenario, mode: int, layer: TurbulenceLayer, wav
     natural = atmosphere.footprint(atmosphere.natural_star(scenario), layer)
     return [
         ideal_mode(scenario, mode, waves, Footprint()),
-        of_stars(scenario, mode, layer, waves, _lgs_mode),
-        _sensor_mode(scenario, "ngs", mode, waves, natural),
+        of_stars(scenario, mode, layer, waves, partial(_sensor_mode, "lgs")),
+        _sensor_mode("ngs", scenario, mode, waves, natural),
     ]
 
 
-def _lgs_mode(scenario: Scenario, mode: int, waves: PlaneWaves, footprint: Footprint) -> Complex:
-    return _sensor_mode(scenario, "lgs", mode, waves, footprint)
-
-
-def _sensor_mode(scenario: Scenario, kind: Kind, mode: int, waves: PlaneWaves, footprint: Footprint) -> Complex:
+def _sensor_mode(kind: Kind, scenario: Scenario, mode: int, waves: PlaneWaves, footprint: Footprint) -> Complex:
     """Return the transform of a mode as a sensor gives it."""
     seen = shack_hartmann(scenario, kind).transform(footprint.scale * waves.x, footprint.scale * waves.y)[mode]
     return seen * waves.turn(footprint)

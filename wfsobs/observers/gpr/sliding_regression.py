@@ -126,13 +126,7 @@ def _gather_leaves(S: Array, f: Array, window: int, steps: int, out: Array) -> N
 def _leaf_indices(size: int, window: int, steps: int) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
     """Where the leaves of a matrix of `size` are in its lower triangle, and which targets belong to them."""
     step = np.arange(steps)
-    order = np.vstack(
-        [
-            step + np.arange(window + 1)[:, None],
-            np.full((1, steps), size - 2),
-            np.full((1, steps), size - 1),
-        ]
-    )
+    order = np.vstack([step + np.arange(window + 1)[:, None], np.tile([[size - 2], [size - 1]], steps)])
     return np.maximum(order[:, None], order[None]), np.minimum(order[:, None], order[None]), order[:window]
 
 

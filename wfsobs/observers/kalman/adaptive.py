@@ -23,7 +23,7 @@ import numpy as np
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
 from wfsobs.observers.kalman.filters import NGS
-from wfsobs.observers.kalman.step import STEADY, KalmanEstimator
+from wfsobs.observers.kalman.step import STEADY, KalmanEstimator, sensor_inputs
 from wfsobs.observers.kalman.window_model import (
     ADAPTIVE,
     Adaptive,
@@ -292,12 +292,7 @@ class AdaptiveEstimator(Estimator):
         if measurements.n_steps < needed:
             window = f"adaptive.window = {self.settings.window:g} s"
             raise RecordError(f"the record has {measurements.n_steps} steps; {window} needs {needed}")
-        v, n = measurements.z[:, None], self.lengths.ratio
-        if n is not None:
-            z_ngs = measurements.z_ngs
-            due = np.arange(len(z_ngs)) % n == 0
-            due[0] = False
-            v = np.stack([v[:, 0], np.where(due[:, None], z_ngs, 0.0)], axis=1)
+        v = sensor_inputs(measurements, self.lengths.ratio)
         if np.isnan(v).any():
             return run_frames(self, TARGETS, measurements, watch)
         columns = []

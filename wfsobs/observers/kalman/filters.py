@@ -63,6 +63,11 @@ if TYPE_CHECKING:
 NGS = ("y_ngs", "ratio")
 """Fields that a record with NGS frames has."""
 
+linear_filter = partial(Observer, linear=True, takes_missing=True)
+"""A linear filter that takes missing measurements as missing."""
+filter_of_both = partial(linear_filter, needs=NGS, sensors=("lgs", "ngs"))
+"""One of both sensors."""
+
 MODEL = ("kalman.frequency", "kalman.damping", "kalman.turbulence_rms", "kalman.vibration_rms")
 """Settings of the model with one peak."""
 
@@ -147,21 +152,19 @@ def way_between(_prior: Prior, settings: Kalman) -> str:
     return settings.ngs_between_frames
 
 
-KF_LGS = Observer(
+KF_LGS = linear_filter(
     "kf-lgs",
     "LGS KF",
     TARGETS,
     help="steady-state Kalman filter on the LGS, one vibration peak in its model",
     prior=(LgsModel, LgsStars),
-    linear=True,
-    takes_missing=True,
     # The gain depends on the ratios of turbulence, vibration and noise. Turbulence tuned for vibration would be no turbulence.
     tunable=Tunable((*MODEL[:2], "kalman.vibration_rms"), ("kalman.turbulence_rms", "kalman.lgs_noise")),
     look=Look("LGS KF", "#FF6600", "#FF8533"),
     step=partial(kalman_filters, one_peak_filter),
 )
 
-KF_NGS = Observer(
+KF_NGS = linear_filter(
     "kf-ngs",
     "NGS KF",
     (TURBULENCE,),
@@ -169,8 +172,6 @@ KF_NGS = Observer(
     prior=(NgsModel,),
     settings="kalman",
     needs=NGS,
-    linear=True,
-    takes_missing=True,
     sensors=("ngs",),
     tunable=Tunable(("kalman.turbulence_rms", "kalman.vibration_rms"), (*MODEL[:2], "kalman.ngs_noise")),
     look=Look("NGS KF", "#003DE6", "#7AA2FF", (8, 2)),
@@ -210,15 +211,13 @@ def vibration_used(prior: Prior, settings: MultiPeak) -> list[list[Ar2]]:
 
 PEAKS = Section("multipeak", "Multi-peak Kalman filter", MultiPeak)
 
-KF_MULTI = Observer(
+KF_MULTI = linear_filter(
     "kf-multi",
     "Multi-peak KF",
     TARGETS,
     help="Kalman filter on the LGS with every vibration peak in its model; not in the paper",
     prior=(Lines, LgsStars),
     settings=PEAKS,
-    linear=True,
-    takes_missing=True,
     tunable=TUNABLE_PEAKS,
     look=Look("Multi-peak", "#AE7D40", "#BA6A26", (14, 3)),
     step=partial(kalman_filters, every_peak_filter),
@@ -328,7 +327,7 @@ def noise_used(prior: Prior, settings: MultiRate) -> list[tuple[float, float]]:
     return [multirate_noise(settings, prior.noise_of(mode)) for mode in range(len(prior.model))]
 
 
-MULTIRATE = Observer(
+MULTIRATE = filter_of_both(
     "multirate",
     "Multi-rate KF",
     (TURBULENCE,),
@@ -336,10 +335,6 @@ MULTIRATE = Observer(
     prior=(NoiselessModel, LgsStars),
     asks=matched_noise,
     settings=RATES,
-    needs=NGS,
-    linear=True,
-    takes_missing=True,
-    sensors=("lgs", "ngs"),
     tunable=TUNABLE,
     look=Look("Multi-rate KF", "#E31FFF", "#7E75C8", (10, 2, 2, 2)),
     step=partial(kalman_filters, multirate_mode),
@@ -430,7 +425,7 @@ def optimal_mode(settings: MultiRate, prior: Prior, mode: int, ratio: int) -> Mo
     return optimal_model(settings, prior, mode, ratio).filter(prior, mode)
 
 
-MULTIRATE_OPTIMAL = Observer(
+MULTIRATE_OPTIMAL = filter_of_both(
     "multirate-optimal",
     "Optimal multi-rate KF",
     TARGETS,
@@ -438,10 +433,6 @@ MULTIRATE_OPTIMAL = Observer(
     prior=(NoiselessModel, LgsError, LgsStars),
     asks=matched_noise,
     settings=RATES,
-    needs=NGS,
-    linear=True,
-    takes_missing=True,
-    sensors=("lgs", "ngs"),
     tunable=TUNABLE,
     look=Look("Opt. multi-rate", "#5718C1", "#B848F9", (3, 2)),
     step=partial(kalman_filters, optimal_mode),
@@ -469,17 +460,13 @@ def beam_model(beams: Beams, vibration: Sequence[Ar2]) -> DisturbanceModel:
     return replace(model, C=model.C * np.repeat(gains, poles))
 
 
-MULTIRATE_MULTI = Observer(
+MULTIRATE_MULTI = filter_of_both(
     "multirate-multi",
     "Multi-rate multi-peak KF",
     TARGETS,
     help="Kalman filter on both sensors with every vibration peak in its model; not in the paper",
     prior=(Noise, LgsStars, Lines, Beams),
     settings=PEAKS,
-    needs=NGS,
-    linear=True,
-    takes_missing=True,
-    sensors=("lgs", "ngs"),
     tunable=Tunable(
         ("multipeak.line_width", "kalman.lgs_noise", "kalman.ngs_noise"),
         ("multipeak.turbulence_order", "kalman.turbulence_rms"),

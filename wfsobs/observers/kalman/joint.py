@@ -42,7 +42,15 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Look, Observer
-from wfsobs.observers.kalman.filters import NGS, PEAKS, TUNABLE_PEAKS, MultiPeak, every_peak_filter, steady_mode, vibration_used
+from wfsobs.observers.kalman.filters import (
+    PEAKS,
+    TUNABLE_PEAKS,
+    MultiPeak,
+    every_peak_filter,
+    filter_of_both,
+    steady_mode,
+    vibration_used,
+)
 from wfsobs.observers.kalman.step import ModeFilter, carry_state, lgs_mean, matrix_power
 from wfsobs.observers.step import Estimator, StepError, run_frames
 from wfsobs.prior import Asterism, Flow, FlowOfBoth, LgsStars, Lines, Prior
@@ -56,7 +64,6 @@ from wfsobs.signal.joint_states import (
     StateFilter,
     frame_mean_response,
     frame_shares,
-    in_two_threads,
     real_product,
     responses,
     running_means,
@@ -64,7 +71,7 @@ from wfsobs.signal.joint_states import (
 )
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
-from wfsobs.signal.wiener import Complex
+from wfsobs.signal.wiener import Complex, in_two_threads
 from wfsobs.typing import Array
 
 MEANS = running_means((0.0, 3.0, 9.0, 27.0, 81.0, 243.0))
@@ -668,18 +675,14 @@ KF_COUPLED = Observer(
     counts=vibration_used,
 )
 
-MULTIRATE_COUPLED = Observer(
+MULTIRATE_COUPLED = filter_of_both(
     "multirate-coupled",
     "Coupled multi-rate KF",
     TARGETS,
     help="Kalman filter on both sensors in all modes together, for frozen flow; not in the paper",
     prior=(Lines, FlowOfBoth, LgsStars),
     settings=PEAKS,
-    needs=NGS,
-    linear=True,
     couples_modes=True,
-    takes_missing=True,
-    sensors=("lgs", "ngs"),
     weight=3.0,
     tunable=TUNABLE_PEAKS,
     look=Look("Coupled, both", "#3806FF", "#2C49F5", (10, 2, 4, 2)),

@@ -350,12 +350,9 @@ class KalmanEstimator(LinearEstimator):
 
     def run(self, measurements: Measurements, watch: Watch) -> Estimates:
         """Run the filters over a record from rest: all steps at once where no measurement is missing."""
-        z, n = measurements.z, measurements.ratio
-        z_ngs = measurements.z_ngs if self.uses_ngs else None
-        lost = np.isnan(z).any() or (z_ngs is not None and np.isnan(z_ngs[n::n]).any())
-        if lost or measurements.lgs_stars is not None:
+        v = sensor_inputs(measurements, measurements.ratio if self.uses_ngs else None)
+        if np.isnan(v).any() or measurements.lgs_stars is not None:
             return run_frames(self, TARGETS, measurements, watch)
-        v = z[:, None] if z_ngs is None else np.stack([z, np.nan_to_num(z_ngs)], axis=1)
         columns, sd = [], []
         for mode, one in enumerate(self.modes):
             watch.step(mode / len(self.modes))
@@ -390,6 +387,19 @@ class KalmanEstimator(LinearEstimator):
             sd[-len(found[0]) :] = np.array(found).T
         self._plans[frames, target] = out = plan(rows, self.bank.x.shape[1], sd)
         return out
+
+
+def sensor_inputs(measurements: Measurements, ratio: int | None) -> Array:
+    """Return z and NGS frames, (n_steps, 1 or 2, n_modes) [um], NaN where one is missing, 0 where none is due.
+
+    ratio : steps per NGS frame; None for z alone
+    """
+    z = measurements.z[:, None]
+    if ratio is None:
+        return z
+    frames = np.zeros_like(z)
+    frames[ratio::ratio, 0] = measurements.z_ngs[ratio::ratio]
+    return np.concatenate([z, frames], axis=1)
 
 
 MakeFilter = Callable[[Any, Prior, int, Any], ModeFilter]
