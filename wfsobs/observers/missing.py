@@ -127,11 +127,9 @@ def bridges(prior: Prior, n_modes: int, dt: float, ratio: int | None, line_width
 
 def expected_rows(gains: Sequence[GainCycle]) -> Array:
     """Rows (n_modes, n) that give from x_hat[k-1] what the LGS measurement of step k is expected to be [um]."""
-    rows = [(one.steps[0].C[0] @ one.steps[-1].A) for one in gains]
-    out = np.zeros((len(rows), max(map(len, rows), default=0)))
-    for row, values in zip(out, rows, strict=True):
-        row[: len(values)] = values
-    return out
+    rows = [one.steps[0].C[0] @ one.steps[-1].A for one in gains]
+    n = max(map(len, rows), default=0)
+    return np.array([np.pad(row, (0, n - len(row))) for row in rows]).reshape(len(rows), n)
 
 
 def _gains(predictor: Predictor) -> GainCycle | None:

@@ -190,7 +190,9 @@ class StepBase:
         self._lgs, self._ngs = bridges or (None, None)
         if not uses_ngs:
             self._ngs = None
-        self._gates = make_gates(gate, sampling, uses_ngs, each_shape)
+        n, (stars, modes) = sampling.n_modes, each_shape or (0, 0)
+        sizes = {"gate_lgs": n, "gate_ngs": n * uses_ngs, "gate_each": stars * modes}
+        self._gates = {name: OutlierGate(size, gate) for name, size in sizes.items() if size} if gate else {}
         self._lgs_history = np.zeros((self._ratio if "gate_ngs" in self._gates else 0, sampling.n_modes))  # newest last
         known = {"lgs": self._lgs, "ngs": self._ngs, **self._gates}
         self._parts: dict[str, Stateful] = {name: part for name, part in known.items() if part is not None}
@@ -220,7 +222,8 @@ class StepBase:
     def _check(self, x: ArrayLike, ngs: ArrayLike | None, stars: int | None, name: str) -> tuple[Array, bool, Array | None]:
         """Return an LGS measurement, whether it has no NaN, and an NGS frame that is due. Raises StepError."""
         x, is_whole = check_frame(self.id, x, name, self.sampling.n_modes, self.frame)
-        check_stars(self.id, stars)
+        if stars is not None and (not isinstance(stars, (int, np.integer)) or stars < 0):
+            raise StepError(f"{self.id}: stars takes a whole number, 0 or more, not {shorten(repr(stars), 60)}")
         if not self.uses_ngs:
             return x, is_whole, None
         due = self.frame > 0 and self.frame % self._ratio == 0
@@ -266,7 +269,6 @@ class StepObserver(StepBase):
 
     targets: tuple[str, ...]
     estimator: Estimator
-    frame: int
 
     def __init__(
         self,
@@ -401,17 +403,6 @@ class StepObserver(StepBase):
         self._take_over(old)
 
 
-def make_gates(
-    settings: GateSettings | None, sampling: Sampling, uses_ngs: bool, each_shape: tuple[int, int] | None = None
-) -> dict[str, OutlierGate]:
-    """Return the gates of LGS measurements, of NGS frames and of every LGS by itself, by name; none without settings."""
-    if settings is None:
-        return {}
-    sizes = {"gate_lgs": sampling.n_modes, "gate_ngs": sampling.n_modes if uses_ngs else 0}
-    sizes["gate_each"] = each_shape[0] * each_shape[1] if each_shape else 0
-    return {name: OutlierGate(n, settings) for name, n in sizes.items() if n}
-
-
 def pass_gate(gates: Mapping[str, OutlierGate], name: str, z: Array, frame: int, sampling: Sampling) -> Array:
     """Return an LGS measurement of any shape [um] with outliers missing, or clipped; those that lack earlier commands pass."""
     if name not in gates or frame < sampling.delay:
@@ -444,12 +435,6 @@ def as_numbers(id: str, x: ArrayLike, name: str) -> Array:
     except (TypeError, ValueError):
         raise StepError(f"{id}: {name} takes real numbers, not {shorten(repr(x), 60)}") from None
     raise StepError(f"{id}: {name} takes real numbers, not {'text' if raw.dtype.kind in 'SU' else raw.dtype}")
-
-
-def check_stars(id: str, stars: object) -> None:
-    """Raise StepError unless stars is a number of LGS, or None for all."""
-    if stars is not None and (not isinstance(stars, (int, np.integer)) or stars < 0):
-        raise StepError(f"{id}: stars takes a whole number, 0 or more, not {shorten(repr(stars), 60)}")
 
 
 def check_each(id: str, each: ArrayLike | None, shape: tuple[int, int], frame: int) -> Array:

@@ -59,7 +59,7 @@ from wfsobs.simulation.disturbance import (
 )
 from wfsobs.simulation.flow_spectra import TurbulenceSpectra, star_basis
 from wfsobs.simulation.layers import relative_rms
-from wfsobs.simulation.mode_spectra import ModeSpectra, are_coupled, beam_spectra, combined_spectra, frequency_rule, mode_spectra
+from wfsobs.simulation.mode_spectra import are_coupled, beam_spectra, combined_spectra, frequency_rule, mode_spectra
 from wfsobs.simulation.sensing import lgs_error_process, lgs_error_variance, lgs_noise_rms, lgs_weights, stars_differ
 from wfsobs.simulation.sensor_noise import noise_rms
 from wfsobs.simulation.true_spectra import (
@@ -95,7 +95,8 @@ def has_stars_apart(scenario: Scenario) -> bool:
 def _of_beams(kind: type[Asterism], scenario: Scenario, dt: float) -> Any:
     """Return that of all modes in the beams of the LGS, and but for `Flow` in the NGS, which takes a while."""
     frequency, weight = frequency_rule(scenario)
-    found, strength, m = _SPECTRA[kind](scenario, frequency), _strength(scenario, dt), len(scenario.modes)
+    spectra = {Asterism: beam_spectra, FlowOfBoth: combined_spectra, Flow: mode_spectra}[kind]
+    found, strength, m = spectra(scenario, frequency), _strength(scenario, dt), len(scenario.modes)
     by_pair, beams = weight * np.outer(strength, strength)[:, :, None], len(found.measurement) // m
     noise, ngs_noise = np.array([measurement_noise(scenario, mode) for mode in range(m)]).T
     combination, line_gain, ratio = np.eye(m)[:, None], _line_gain(scenario), scenario.sensors.exposure_ratio
@@ -116,11 +117,6 @@ def _of_beams(kind: type[Asterism], scenario: Scenario, dt: float) -> Any:
         line_gain=line_gain,
         ratio=ratio,
     )
-
-
-_SPECTRA: Mapping[type[Asterism], Callable[[Scenario, Array], ModeSpectra]] = MappingProxyType(
-    {Asterism: beam_spectra, FlowOfBoth: combined_spectra, Flow: mode_spectra}
-)
 
 
 def _line_gain(scenario: Scenario) -> Array:

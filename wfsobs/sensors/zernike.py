@@ -37,7 +37,7 @@ def modes_up_to(order: int) -> tuple[Mode, ...]:
     >>> [mode.name for mode in modes_up_to(2)]
     ['tip', 'tilt', 'defocus', 'oblique astigmatism', 'vertical astigmatism']
     """
-    return tuple(Mode(mode_name(j), j, noll(j)[0]) for j in up_to_order(order))
+    return tuple(Mode(NAMES.get(j, f"Z{j}"), j, noll(j)[0]) for j in up_to_order(order))
 
 
 def order_of(n_modes: int) -> int | None:
@@ -74,11 +74,6 @@ def noll(j: int) -> tuple[int, int]:
     place = j - n * (n + 1) // 2 - 1
     m = 2 * ((place + (n + 1) % 2) // 2) + n % 2
     return n, m if j % 2 == 0 else -m
-
-
-def mode_name(j: int) -> str:
-    """Return the usual name of mode j, or Z and its number."""
-    return NAMES.get(j, f"Z{j}")
 
 
 def up_to_order(order: int) -> range:

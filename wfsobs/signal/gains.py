@@ -179,7 +179,9 @@ def periodic_steady_state(cycle: Sequence[Step]) -> list[SteadyState]:
     """
     found = _refine(cycle, _double_cycle(cycle))
     if found[0].residual > RESIDUAL:
-        found = _refine(cycle, _without_measurements(cycle))
+        # From the covariance of the model itself Kleinman steps converge as surely, but more slowly.
+        blind = _around([(A, np.zeros_like(C), Q, R) for A, C, Q, R in cycle], np.zeros_like(cycle[0][2]))
+        found = _refine(cycle, lyapunov(*_carry_around(cycle, blind)))
     residual = found[0].residual
     if not residual <= RESIDUAL:
         raise RiccatiError(
@@ -253,12 +255,6 @@ def _power_of_map(m: Map, times: int) -> Map:
     half = _power_of_map(m, times // 2)
     both = _compose(half, half)
     return _compose(both, m) if times % 2 else both
-
-
-def _without_measurements(cycle: Sequence[Step]) -> Array:
-    """Return the covariance of the model itself; Kleinman steps from it converge as surely, but more slowly."""
-    blind = _around([(A, np.zeros_like(C), Q, R) for A, C, Q, R in cycle], np.zeros_like(cycle[0][2]))
-    return lyapunov(*_carry_around(cycle, blind))
 
 
 def _around(cycle: Sequence[Step], P: Array, gains: Sequence[Array] | None = None) -> list[SteadyState]:

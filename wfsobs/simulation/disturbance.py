@@ -81,24 +81,8 @@ def widen_lines(spectrum: Array, width: float) -> Array:
     return np.maximum(np.fft.rfft(np.fft.irfft(spectrum, n) * np.exp(-pi * width * lag)).real, 0.0)
 
 
-@dataclass(frozen=True)
-class TurbulenceSignals:
-    """Turbulence of one run, each array (n_steps, n_modes) [um].
-
-    Attributes
-    ----------
-    on_axis : Array
-        The truth.
-    ngs : Array or None
-        In the beam of the NGS; None where it is the truth.
-    lgs : tuple of Array or None
-        In the beam of each LGS; None where it is the truth.
-    """
-
-    on_axis: Array
-    ngs: Array | None = None
-    lgs: tuple[Array, ...] | None = None
-
+TurbulenceSignals = tuple[Array, Array | None, tuple[Array, ...] | None]
+"""Turbulence on the axis, in the beam of the NGS and in that of each LGS, (n_steps, n_modes) [um]; None where it is the first."""
 
 Source = Callable[[Scenario, int, np.random.Generator, Watch], TurbulenceSignals]
 """(scenario, number of steps, generator, watch) -> turbulence."""
@@ -125,19 +109,15 @@ def processes(scenario: Scenario, mode: int, dt: float) -> list[Ar2 | Ar3]:
     """Return the coloured noises whose sum is the turbulence of one mode, for the sources that are such sums; else none."""
     t, out = scenario.turbulence, list[Ar2 | Ar3]()
     if t.source in ("ar2", "ar3"):
-        return [(turbulence_process if t.source == "ar2" else third_order_process)(scenario, mode, dt)]
+        found = turbulence_process(scenario, mode, dt)
+        third = t.third_corner * found.omega
+        return [found if t.source == "ar2" else Ar3(found.omega, found.damping, third, found.rms, dt)]
     for p in t.processes if t.source == "processes" else ():
         omega, rms = 2.0 * pi * p.frequency, peak_rms(p.rms, mode)
         if rms > 0:
             third = p.third_corner * omega
             out.append(Ar3(omega, p.damping, third, rms, dt) if third else Ar2(omega, p.damping, rms, dt))
     return out
-
-
-def third_order_process(scenario: Scenario, mode: int, dt: float) -> Ar3:
-    """Return the turbulence of one mode with its third corner, for source ar3."""
-    p = turbulence_process(scenario, mode, dt)
-    return Ar3(p.omega, p.damping, scenario.turbulence.third_corner * p.omega, p.rms, dt)
 
 
 def turbulence_rms(scenario: Scenario, mode: int) -> float:
@@ -178,7 +158,7 @@ def columns(source: ModeSource, scenario: Scenario, n_steps: int, rng: np.random
 
 def _mode_by_mode(source: ModeSource) -> Source:
     """Return a source that is the same for all stars."""
-    return lambda scenario, n, rng, watch: TurbulenceSignals(columns(source, scenario, n, rng, watch))
+    return lambda scenario, n, rng, watch: (columns(source, scenario, n, rng, watch), None, None)
 
 
 def _sum_of_processes(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
@@ -205,7 +185,7 @@ def _frozen_flow(scenario: Scenario, n: int, rng: np.random.Generator, watch: Wa
     on_axis, ngs, *lgs = frozen_flow(
         layers, scenario.turbulence.outer_scale, scenario.telescope.diameter, views, n, scenario.dt, rng, watch
     )
-    return TurbulenceSignals(on_axis, ngs, tuple(lgs))
+    return on_axis, ngs, tuple(lgs)
 
 
 SOURCES: dict[str, Source] = {
@@ -356,13 +336,13 @@ def make_disturbance(scenario: Scenario, n_steps: int, rng: np.random.Generator,
     """
     turbulence_rng, vibration_rng = rng.spawn(2)
     at = turbulence_clock(scenario, n_steps)
-    air = SOURCES[scenario.turbulence.source](scenario, turbulence_steps(at, n_steps), turbulence_rng, watch)
+    on_axis, ngs, lgs = SOURCES[scenario.turbulence.source](scenario, turbulence_steps(at, n_steps), turbulence_rng, watch)
     vibration = columns(VIBRATION[scenario.vibration.source], scenario, n_steps, vibration_rng, watch)
     return Disturbance(
-        interpolate_steps(air.on_axis, at),
+        interpolate_steps(on_axis, at),
         vibration,
-        None if air.ngs is None else interpolate_steps(air.ngs, at),
-        None if air.lgs is None else tuple(interpolate_steps(x, at) for x in air.lgs),
+        None if ngs is None else interpolate_steps(ngs, at),
+        None if lgs is None else tuple(interpolate_steps(x, at) for x in lgs),
     )
 
 
@@ -403,10 +383,6 @@ def vibration_lines(scenario: Scenario, mode: int) -> list[tuple[float, float, f
     else:
         found = []
     return [line for line in found if line[2] > 0 and (line[0] <= v.cutoff or v.source == "ar2")]
-
-
-def _no_vibration(_scenario: Scenario, _mode: int, n: int, _rng: np.random.Generator) -> Array:
-    return np.zeros(n)
 
 
 def _ar2_vibration(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
@@ -520,5 +496,5 @@ VIBRATION: dict[str, ModeSource] = {
     "psd": _dft_vibration,
     "measured": _dft_vibration,
     "ar2": _ar2_vibration,
-    "none": _no_vibration,
+    "none": lambda _scenario, _mode, n, _rng: np.zeros(n),
 }

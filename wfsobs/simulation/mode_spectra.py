@@ -90,15 +90,12 @@ def lenslet_flow_spectra(scenario: Scenario, mode: int, frequency: Array) -> Tur
     TurbulenceSpectra
         Six densities, (n,) each [um^2/Hz].
     """
-    beams = [atmosphere.footprint(star, layer).scale for star in _stars(scenario) for layer in atmosphere.layers(scenario)]
+    stars = [atmosphere.natural_star(scenario), *atmosphere.laser_stars(scenario)]
+    beams = [atmosphere.footprint(star, layer).scale for star in stars for layer in atmosphere.layers(scenario)]
     reach = max(shack_hartmann(scenario, kind).reach for kind in ("lgs", "ngs")) / min(beams)
     shared = spectra_between(scenario, mode, frequency, _through_lenslets, reach)
     own, measurement, ngs = shared.density
     return TurbulenceSpectra(own, measurement, shared.pair(0, 1), ngs, shared.pair(0, 2), shared.pair(2, 1))
-
-
-def _stars(scenario: Scenario) -> list[atmosphere.Star]:
-    return [atmosphere.natural_star(scenario), *atmosphere.laser_stars(scenario)]
 
 
 def _through_lenslets(scenario: Scenario, mode: int, layer: TurbulenceLayer, waves: PlaneWaves) -> list[Complex]:

@@ -209,10 +209,8 @@ def measure_open_loop(scenario: Scenario, disturbance: Disturbance, rng: np.rand
     n_steps, n_modes = disturbance.total.shape
     errors = _lgs_errors(scenario, n_steps, n_modes, lgs_rng, watch)
     seen = [_without_tip_tilt(scenario, x) for x in disturbance.lgs_turbulence or [disturbance.turbulence]]
-    lgs, working = np.full((n_steps, n_modes), np.nan), laser_count(scenario, n_steps)
-    for stars in np.unique(working[working > 0]):
-        lgs[working == stars] = _combine(scenario, seen, disturbance.vibration, errors[:stars])[working == stars]
-
+    working = laser_count(scenario, n_steps)
+    lgs = _combine_working(scenario, seen, disturbance.vibration, errors, working)
     n = scenario.sensors.exposure_ratio
     noise = white_noise(scenario, "ngs", n_steps, ngs_rng)
     frame = np.arange(n_steps)
@@ -257,11 +255,19 @@ def measure_noise(scenario: Scenario, n_steps: int, rng: np.random.Generator) ->
     """
     lgs_rng, ngs_rng, _ = rng.spawn(3)
     stars = [white_noise(scenario, "lgs", n_steps, star.spawn(2)[0]) for star in lgs_rng.spawn(scenario.sensors.lgs_count)]
-    nothing, working = np.zeros_like(stars[0]), laser_count(scenario, n_steps)
-    lgs = nothing.copy()
-    for count in np.unique(working[working > 0]):
-        lgs[working == count] = _combine(scenario, [nothing], nothing, stars[:count])[working == count]
-    return OpenLoop(lgs, white_noise(scenario, "ngs", n_steps, ngs_rng))
+    nothing = np.zeros_like(stars[0])
+    lgs = _combine_working(scenario, [nothing], nothing, stars, laser_count(scenario, n_steps))
+    return OpenLoop(np.nan_to_num(lgs), white_noise(scenario, "ngs", n_steps, ngs_rng))
+
+
+def _combine_working(
+    scenario: Scenario, turbulence_per_star: Sequence[Array], vibration: Array, errors: Sequence[Array], working: Array
+) -> Array:
+    """Combine the LGS that work, the first ones, (n_steps, n_modes); NaN where none does."""
+    out = np.full(vibration.shape, np.nan)
+    for stars in np.unique(working[working > 0]):
+        out[working == stars] = _combine(scenario, turbulence_per_star, vibration, errors[:stars])[working == stars]
+    return out
 
 
 def _combine(scenario: Scenario, turbulence_per_star: Sequence[Array], vibration: Array, errors: Sequence[Array]) -> Array:

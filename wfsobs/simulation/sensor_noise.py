@@ -9,7 +9,6 @@ import numpy as np
 from wfsobs.atmosphere import Sensor
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.sensors import Kind, fit_lenslets
-from wfsobs.sensors.lenslets import Lenslets
 from wfsobs.sensors.shack_hartmann import Aliasing, ShackHartmann, SpotModel
 from wfsobs.simulation import layers as atmosphere
 from wfsobs.typing import Array
@@ -26,9 +25,7 @@ def shack_hartmann(scenario: Scenario, kind: Kind) -> ShackHartmann:
     return _cached_sensor(lenslets, tuple(mode.noll for mode in scenario.modes), order)
 
 
-@lru_cache(maxsize=4)  # tens of megabytes each, for many modes
-def _cached_sensor(lenslets: Lenslets, nolls: tuple[int, ...], order: int) -> ShackHartmann:
-    return ShackHartmann(lenslets, nolls, order)
+_cached_sensor = lru_cache(maxsize=4)(ShackHartmann)  # tens of megabytes each, for many modes
 
 
 def noise_covariance(scenario: Scenario, kind: Kind) -> Array:
@@ -98,6 +95,4 @@ def aliasing_rms(scenario: Scenario, kind: Kind) -> Array:
     return np.sqrt(variance)
 
 
-@lru_cache(maxsize=4)
-def _aliasing(of: ShackHartmann) -> Aliasing:
-    return Aliasing(of)
+_aliasing = lru_cache(maxsize=4)(Aliasing)

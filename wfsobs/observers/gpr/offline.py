@@ -312,7 +312,9 @@ def fit(signals: Array, targets: Array, depth: int, m: int, penalty: float, ahea
     middle = windows.mean(axis=0)
     if m <= 2 * depth * signals.shape[1]:  # which of the two is cheaper
         S = np.empty((m + 1, m + 1), order="F")  # the inner products with the targets as one more row
-        S[:m, :m] = _centre(_inner_products(signals, depth, m))
+        gram = _inner_products(signals, depth, m)
+        mean = gram.mean(axis=0)
+        S[:m, :m] = gram - mean - mean[:, None] + mean.mean()  # of the windows less their mean
         S.flat[: m * (m + 1) : m + 2] += penalty
         S[m, :m] = f - f.mean()
         eliminate(S, m, QUIET.check)
@@ -330,12 +332,6 @@ def _inner_products(signals: Array, depth: int, m: int) -> Array:
     band = sliding_products(signals, signals, depth, depth - 1, depth - 1, m, m, triangle=True)
     lower = np.tril(square_from_band(band, 0, m))
     return lower + np.tril(lower, -1).T
-
-
-def _centre(gram: Array) -> Array:
-    """Return the inner products of windows minus their mean."""
-    mean = gram.mean(axis=0)
-    return gram - mean - mean[:, None] + mean.mean()
 
 
 def predict(signals: Array, weights: Array, constant: float) -> Array:

@@ -376,12 +376,8 @@ class LateRegression(SlidingRegression):
 
     def _means(self) -> Array:
         waiting = [(self.step - 1 - i) % self.m for i in range(self.late)]
-        columns = (
-            np.stack([self._column(slot) for slot in waiting[1:]], axis=1)
-            if self.late > 1
-            else np.empty((len(self._kappa), 0, self.m))
-        )
-        return np.array([self._mean(mode, waiting, columns[mode]) for mode in range(len(self._kappa))])
+        columns = np.array([self._column(slot) for slot in waiting[1:]]).reshape(-1, *self._kappa.shape)
+        return np.array([self._mean(mode, waiting, columns[:, mode]) for mode in range(len(self._kappa))])
 
     def _mean(self, mode: int, waiting: list[int], columns: Array) -> float:
         """Prediction of a mode; columns : of N at the windows that wait but the newest, (late - 1, m)."""

@@ -48,10 +48,6 @@ class ModeFilter(NamedTuple):
         """Return rows of the whole state that give several targets, (len(targets), n)."""
         return self._pad_rows(self.model.output_rows(targets))
 
-    def variance(self) -> Array:
-        """Return the covariance of the state, (n, n), but for a running NGS frame."""
-        return lyapunov(self.cycle[-1][0], self.cycle[-1][2])
-
     def innovation_variances(self) -> list[float]:
         """Return the variance of z less its prediction at every step that repeats [um^2]."""
         before = zip(self.posterior[-1:] + self.posterior[:-1], self.cycle[-1:] + self.cycle[:-1], self.cycle, strict=True)
@@ -99,7 +95,8 @@ class StatedErrors:
     """
 
     def __init__(self, mode: ModeFilter):
-        targets, S, repeat = mode.rows(TARGETS), mode.variance(), len(mode.cycle)
+        A, _, Q, _ = mode.cycle[-1]
+        targets, S, repeat = mode.rows(TARGETS), lyapunov(A, Q), len(mode.cycle)  # S : but for a running NGS frame
         total = targets.sum(axis=0)
         self._rows, self._least = [], []
         for j, (A, _, Q, R) in enumerate(mode.cycle):
@@ -250,9 +247,7 @@ class Plan(NamedTuple):
 
 def plan(rows: Sequence[Array], n: int, sd: Array) -> Plan:
     """Return the plan of rows of the states of the modes, padded to n states."""
-    padded = np.zeros((len(rows), 1, n))
-    for one, row in zip(padded, rows, strict=True):
-        one[0, : len(row)] = row
+    padded = np.array([[np.pad(row, (0, n - len(row)))] for row in rows])
     return Plan(padded, np.zeros(len(rows)), sd)
 
 
