@@ -52,9 +52,10 @@ class Memo:
 
     def keep(self, name: str, make: Callable[[], T]) -> T:
         """Return the value of a name, made where it is not known; None, which nobody can hold, is made every time."""
-        if (known := self.get(name)) is None and (known := make()) is not None:
-            self.put(name, known)
-        return known
+        if (known := self.get(name)) is not None:
+            return known
+        made = make()
+        return made if made is None else self.put(name, made)
 
     def __len__(self) -> int:
         return len(self._values)

@@ -109,5 +109,6 @@ def solve_rows(S: Array, n: int) -> Array:
 
 def solve_lower(L: Array, X: Array) -> Array:
     """Return L^-1 X for the lower triangle L (n, n) and X (n, k); in place of X."""
-    _divide(_L, _N, *X.shape, *_place(L), *_place(X))
+    n, k = X.shape
+    _divide(_L, _N, n, k, *_place(L), *_place(X))
     return X
