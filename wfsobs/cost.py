@@ -44,9 +44,7 @@ def rerun_seconds(before: Scenario, now: Scenario) -> float:
     0.0
     """
     reached, parts = observers_reached(before, now), part_seconds(now)
-    if reached is None:
-        return sum(parts.values())
-    return float(sum(seconds for name, seconds in parts.items() if name in reached))
+    return float(sum(seconds for name, seconds in parts.items() if reached is None or name in reached))
 
 
 def part_seconds(scenario: Scenario) -> dict[str, float]:

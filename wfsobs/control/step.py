@@ -19,7 +19,7 @@ from wfsobs.observers.base import TARGETS
 from wfsobs.observers.baselines import online_filters
 from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.observers.missing import Bridge
-from wfsobs.observers.step import Estimator, StepBase, StepError, check_frame, take_state
+from wfsobs.observers.step import Estimator, StepBase, StepError, take_state
 from wfsobs.observers.stepping import FilterBank, StateArrays, Stateful
 from wfsobs.prior import Bands, Prior
 from wfsobs.record import Sampling
@@ -335,7 +335,7 @@ class StepController(StepBase):
 
         Raises StepError for a wrong shape, or a number that is infinite or NaN: the command of the frame then stays.
         """
-        command, is_known = check_frame(self.id, command, "amend: command", self.sampling.n_modes, self.frame - 1)
+        command, is_known = self._check_frame(command, "amend: command", ago=1)
         if not is_known:
             raise StepError(f"{self.id}: amend: command has NaN; takes what the mirror was sent, finite numbers")
         if self.law is not None:

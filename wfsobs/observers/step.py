@@ -221,18 +221,45 @@ class StepBase:
 
     def _check(self, x: ArrayLike, ngs: ArrayLike | None, stars: int | None, name: str) -> tuple[Array, bool, Array | None]:
         """Return an LGS measurement, whether it has no NaN, and an NGS frame that is due. Raises StepError."""
-        x, is_whole = check_frame(self.id, x, name, self.sampling.n_modes, self.frame)
+        x, is_whole = self._check_frame(x, name)
         if stars is not None and (not isinstance(stars, (int, np.integer)) or stars < 0):
             raise StepError(f"{self.id}: stars takes a whole number, 0 or more, not {shorten(repr(stars), 60)}")
-        if not self.uses_ngs:
-            return x, is_whole, None
-        due = self.frame > 0 and self.frame % self._ratio == 0
-        return x, is_whole, check_ngs(self.id, ngs, due, self.sampling.n_modes, self._ratio, self.frame)
+        return x, is_whole, self._check_ngs(ngs) if self.uses_ngs else None
+
+    def _check_frame(self, x: ArrayLike, name: str, ago: int = 0) -> tuple[Array, bool]:
+        """Return one number per mode as an array, and whether it has no NaN, which is missing. Raises StepError.
+
+        ago : frames since that of x
+        """
+        if type(x) is not np.ndarray or x.dtype != float:
+            x = as_numbers(self.id, x, name)
+        shape = (self.sampling.n_modes,)
+        if x.shape != shape:
+            raise StepError(f"{self.id}: {name} takes the shape {shape}, one number per mode, not {x.shape}")
+        is_whole = all(map(isfinite, x.tolist()))  # faster than numpy for few, and no square overflows
+        if not is_whole and np.isinf(x).any():
+            raise StepError(f"{self.id}: {name} is infinite in frame {self.frame - ago}; NaN stands for a missing number")
+        return x, is_whole
+
+    def _check_ngs(self, ngs: ArrayLike | None) -> Array | None:
+        """Return an NGS frame that is due, NaN where it is missing, and None where none is due. Raises StepError."""
+        n = self._ratio
+        if self.frame > 0 and self.frame % n == 0:
+            return np.full(self.sampling.n_modes, np.nan) if ngs is None else self._check_frame(ngs, "ngs")[0]
+        if ngs is not None and not np.isnan(as_numbers(self.id, ngs, "ngs")).all():
+            raise StepError(f"{self.id}: an NGS frame in frame {self.frame}: one is due in every {n}th, {n}, {2 * n}, ...")
+        return None
+
+    def _pass_gate(self, name: str, z: Array) -> Array:
+        """Return an LGS measurement of any shape [um] with outliers missing, or clipped; those without earlier commands pass."""
+        if name not in self._gates or self.frame < self.sampling.delay:
+            return z
+        return self._gates[name].check(z.ravel()).reshape(z.shape)
 
     def _complete_lgs(self, z: Array, is_whole: bool) -> Array:
         """Pass the gate and the bridge of LGS measurements."""
         if self._gates:
-            z = pass_gate(self._gates, "gate_lgs", z, self.frame, self.sampling)
+            z = self._pass_gate("gate_lgs", z)
             is_whole = is_whole and not np.isnan(z).any()
         if self._lgs_history.size:
             self._lgs_history[:-1], self._lgs_history[-1] = self._lgs_history[1:], z
@@ -324,12 +351,11 @@ class StepObserver(StepBase):
         if self.estimator.needs_command:
             if u is None:
                 raise StepError(f"{self.id}: its windows hold commands: update(z, u=...) takes that of the frame, too")
-            u, _ = check_frame(self.id, u, "u", self.sampling.n_modes, self.frame)
+            u, _ = self._check_frame(u, "u")
         else:
             u = None
         if self._each_shape is not None and self._see_each is not None:
-            stars_apart = check_each(self.id, each, self._each_shape, self.frame)
-            self._see_each(pass_gate(self._gates, "gate_each", stars_apart, self.frame, self.sampling))
+            self._see_each(self._pass_gate("gate_each", self._check_each(each, self._each_shape)))
         z = self._complete_lgs(z, is_whole)
         slow = None if slow is None else self._complete_ngs(slow)
         if self._see_stars is not None:
@@ -367,7 +393,7 @@ class StepObserver(StepBase):
                 raise StepError(f"{self.id}: predict takes a target: {' or '.join(self.targets)}")
             target = self.targets[0]
         if (frames, target) not in self._allowed_requests:
-            check_request(self.id, frames, target, self.targets, self.estimator.horizon)
+            self._check_request(frames, target)
             self._allowed_requests.add((frames, target))
         mean, sd = self.estimator.predict(frames, target) if self.frame else (self._nothing, self._nothing)
         if self._lgs is not None and self._lgs.is_missing.any():
@@ -376,6 +402,27 @@ class StepObserver(StepBase):
             return mean.copy(), sd.copy()
         out[0][...], out[1][...] = mean, sd
         return out
+
+    def _check_each(self, each: ArrayLike | None, shape: tuple[int, int]) -> Array:
+        """Return the measurement of every LGS by itself as an array, NaN where one is out. Raises StepError."""
+        x = None if each is None else as_numbers(self.id, each, "each")
+        if x is None or x.shape != shape:
+            raise StepError(f"{self.id}: takes every LGS by itself: update(z, each=...) of the shape {shape}, (n_lgs, n_modes)")
+        if np.isinf(x).any():
+            raise StepError(f"{self.id}: each is infinite in frame {self.frame}; NaN stands for a star that is out")
+        return x
+
+    def _check_request(self, frames: float, target: str) -> None:
+        """Raise StepError for a prediction that the observer does not make."""
+        if target not in self.targets:
+            raise StepError(f"{self.id}: target {target!r}: it estimates {' and '.join(self.targets)}")
+        if not isinstance(frames, (int, float, np.number)) or not 0 <= frames < inf:
+            raise StepError(f"{self.id}: frames = {frames!r}: takes 0 or more")
+        horizon = self.estimator.horizon
+        if horizon is not None and frames != horizon:
+            raise StepError(
+                f"{self.id}: designed for {horizon:g} frames ahead; design it with horizon = {frames:g} for predict({frames:g})"
+            )
 
     def settle(self) -> None:
         """Do what does not need to be done before the estimate is out; the next `update` does it otherwise.
@@ -403,27 +450,8 @@ class StepObserver(StepBase):
         self._take_over(old)
 
 
-def pass_gate(gates: Mapping[str, OutlierGate], name: str, z: Array, frame: int, sampling: Sampling) -> Array:
-    """Return an LGS measurement of any shape [um] with outliers missing, or clipped; those that lack earlier commands pass."""
-    if name not in gates or frame < sampling.delay:
-        return z
-    return gates[name].check(z.ravel()).reshape(z.shape)
-
-
 KNOWN = frozenset({"beside", "commands", "covariance", "frames", "held_value", "last", "mirror", "sent", "states", "x"})
 """Parts of a state that hold finite numbers; others may have NaN where nothing is known yet."""
-
-
-def check_frame(id: str, x: ArrayLike, name: str, n_modes: int, frame: int) -> tuple[Array, bool]:
-    """Return one number per mode as an array, and whether it has no NaN, which is missing. Raises StepError."""
-    if type(x) is not np.ndarray or x.dtype != float:
-        x = as_numbers(id, x, name)
-    if x.shape != (n_modes,):
-        raise StepError(f"{id}: {name} takes the shape {(n_modes,)}, one number per mode, not {x.shape}")
-    is_whole = all(map(isfinite, x.tolist()))  # faster than numpy for few, and no square overflows
-    if not is_whole and np.isinf(x).any():
-        raise StepError(f"{id}: {name} is infinite in frame {frame}; NaN stands for a missing number")
-    return x, is_whole
 
 
 def as_numbers(id: str, x: ArrayLike, name: str) -> Array:
@@ -435,25 +463,6 @@ def as_numbers(id: str, x: ArrayLike, name: str) -> Array:
     except (TypeError, ValueError):
         raise StepError(f"{id}: {name} takes real numbers, not {shorten(repr(x), 60)}") from None
     raise StepError(f"{id}: {name} takes real numbers, not {'text' if raw.dtype.kind in 'SU' else raw.dtype}")
-
-
-def check_each(id: str, each: ArrayLike | None, shape: tuple[int, int], frame: int) -> Array:
-    """Return the measurement of every LGS by itself as an array, NaN where one is out. Raises StepError."""
-    x = None if each is None else as_numbers(id, each, "each")
-    if x is None or x.shape != shape:
-        raise StepError(f"{id}: takes every LGS by itself: update(z, each=...) of the shape {shape}, (n_lgs, n_modes)")
-    if np.isinf(x).any():
-        raise StepError(f"{id}: each is infinite in frame {frame}; NaN stands for a star that is out")
-    return x
-
-
-def check_ngs(id: str, ngs: ArrayLike | None, due: bool, n_modes: int, ratio: int, frame: int) -> Array | None:
-    """Return an NGS frame that is due, NaN where it is missing, and None where none is due. Raises StepError."""
-    if due:
-        return np.full(n_modes, np.nan) if ngs is None else check_frame(id, ngs, "ngs", n_modes, frame)[0]
-    if ngs is not None and not np.isnan(as_numbers(id, ngs, "ngs")).all():
-        raise StepError(f"{id}: an NGS frame in frame {frame}: one is due in every {ratio}th, {ratio}, {2 * ratio}, ...")
-    return None
 
 
 def check_state(id: str, state: Mapping[str, ArrayLike], own: Mapping[str, Array]) -> dict[str, Array]:
@@ -474,18 +483,6 @@ def check_state(id: str, state: Mapping[str, ArrayLike], own: Mapping[str, Array
     if given["frame"] < 0:
         raise StepError(f"{id}: load_state_dict: frame = {given['frame']:g}: takes 0 or more")
     return given
-
-
-def check_request(id: str, frames: float, target: str, targets: Sequence[str], horizon: float | None) -> None:
-    """Raise StepError for a prediction that an observer of these targets, and trained for this horizon, does not make."""
-    if target not in targets:
-        raise StepError(f"{id}: target {target!r}: it estimates {' and '.join(targets)}")
-    if not isinstance(frames, (int, float, np.number)) or not 0 <= frames < inf:
-        raise StepError(f"{id}: frames = {frames!r}: takes 0 or more")
-    if horizon is not None and frames != horizon:
-        raise StepError(
-            f"{id}: designed for {horizon:g} frames ahead; design it with horizon = {frames:g} for predict({frames:g})"
-        )
 
 
 def whole_frames(frames: float, what: str) -> int:

@@ -133,15 +133,8 @@ Present = tuple[bool, ...]
 """Which inputs are there."""
 
 
-class Selection(NamedTuple):
-    """What is taken of all states.
-
-    states : combinations of all states, (n, n_states), in every phase
-    least  : estimates that are linear in them, in every phase
-    """
-
-    states: Sequence[Array]
-    least: Sequence[LeastVariance]
+Selection = tuple[Sequence[Array], Sequence[LeastVariance]]
+"""Combinations of all states, (n, n_states), in every phase; and estimates that are linear in them, in every phase."""
 
 
 class PresentInputs:
@@ -180,14 +173,14 @@ class PresentInputs:
         if there.size == len(present):
             whole = np.eye(len(last))
             found = in_two_threads(LeastVariance, (*self._covariances, last[:n, :n]))
-            return Selection([whole] * len(self._covariances) + [whole[:n]], found)
+            return [whole] * len(self._covariances) + [whole[:n]], found
         mean = np.full((1, there.size), 1.0 / max(there.size, 1))
         among = np.vstack([mean, helmert(there.size)]) @ self._to_each[there] if there.size else np.empty((0, len(present)))
         fast = np.kron(among, np.eye(n // len(present)))
         both = block_diag(fast, np.eye(len(self._covariances[0]) - n))
         alone = both[: len(fast)]
         of_phases = [both @ one @ both.T for one in self._covariances] + [alone @ last @ alone.T]
-        return Selection([both] * len(self._covariances) + [alone], in_two_threads(LeastVariance, of_phases))
+        return [both] * len(self._covariances) + [alone], in_two_threads(LeastVariance, of_phases)
 
 
 class FrameShare(NamedTuple):
