@@ -21,7 +21,7 @@ which is what a measurement sees:
 
     z[k] = f[k-1] + noise,    (x, f)[k+1] = (A x[k] + v, h x[k]).
 
-On both sensors the slow error of the LGS and the NGS frame as the mean that it is are states, as in `kalman.multirate`; a
+On both sensors the slow error of the LGS and the NGS frame as the mean that it is are states, as in `kalman.filters`; a
 coloured background is an error of the LGS, and no part of what a frame is the mean of.
 """
 

@@ -104,7 +104,13 @@ def _at_nodes(air: _Air, mode: int | None, highest: float, sight: Sight, reach: 
     scenario = air.scenario
     found = atmosphere.layers(scenario)
     f = _frequencies(scenario, min(layer.speed for layer in found), highest, reach)
-    total = np.sum([_layer(scenario, mode, layer, f, sight, reach) for layer in found], axis=0)
+    front = max(CORE / (0.5 * scenario.telescope.diameter), reach)
+
+    def through(layer: TurbulenceLayer) -> Complex:
+        kx = 2.0 * np.pi * f / layer.speed
+        return np.concatenate([_block(scenario, mode, layer, kx[part], front, sight) for part in _blocks(kx, front)], axis=-1)
+
+    total = np.sum([through(layer) for layer in found], axis=0)
     f.flags.writeable = total.flags.writeable = False
     return f, total
 
@@ -125,13 +131,6 @@ def _frequencies(scenario: Scenario, speed: float, highest: float, reach: float)
     return f[: int(np.searchsorted(f, highest)) + 1]
 
 
-def _layer(scenario: Scenario, mode: int | None, layer: TurbulenceLayer, f: Array, sight: Sight, reach: float) -> Complex:
-    """Return the spectra of one layer between the signals, (n_signals, n_signals, n)."""
-    kx = 2.0 * np.pi * f / layer.speed
-    front = max(CORE / (0.5 * scenario.telescope.diameter), reach)
-    return np.concatenate([_block(scenario, mode, layer, kx[part], front, sight) for part in _blocks(kx, front)], axis=-1)
-
-
 def _blocks(kx: Array, front: float) -> Iterator[slice]:
     """Yield ranges of frequencies that share their nodes across the wind."""
     start = 0
@@ -143,6 +142,7 @@ def _blocks(kx: Array, front: float) -> Iterator[slice]:
 
 
 def _block(scenario: Scenario, mode: int | None, layer: TurbulenceLayer, kx: Array, front: float, sight: Sight) -> Complex:
+    """Return the spectra of one layer between the signals, (n_signals, n_signals, n)."""
     diameter, outer_scale = scenario.telescope.diameter, scenario.turbulence.outer_scale
     q0 = 2.0 * np.pi / outer_scale
     if kx[0] < front:

@@ -129,7 +129,12 @@ def predict_sliding(
             at = start + r * run
             to = min(at + run, n)
             leaves = np.empty((leaf_window + 3, leaf_window + 3, run))
-            S, f = _whole_run(V, points.delta, targets, kernel, at, r * run, m, run)
+            # The matrix over [m + run points | f | delta] of these steps, and the points' targets.
+            row, S, f = r * run, np.zeros((m + run + 2, m + run + 2), order="F"), np.zeros(m + run)
+            S[:-2, :-2] = square_from_band(V, row, m + run)
+            S[-1, :-2], S[-1, -1] = points.delta[row : row + m + run], -1.0 / kernel.variance
+            known = targets[at - m : at + run]
+            f[: known.size] = known
             check_condition(S[:m, :m], kernel)
             slide(S, f, m, lengths, leaves, check=check)
             values, spread = finish(leaves, leaf_window)
@@ -137,21 +142,6 @@ def predict_sliding(
             if deliver:
                 deliver(at, to, mean[at:to])
     return mean, variance
-
-
-def _whole_run(
-    V: Array, delta: Array, targets: Array, kernel: SquaredExponential, at: int, row: int, m: int, run: int
-) -> tuple[Array, Array]:
-    """Return the matrix over [m + run points | f | delta] of the steps at ... at + run - 1, and the points' targets."""
-    n = m + run
-    S = np.zeros((n + 2, n + 2), order="F")
-    S[:n, :n] = square_from_band(V, row, n)
-    S[n + 1, :n] = delta[row : row + n]
-    S[n + 1, n + 1] = -1.0 / kernel.variance
-    f = np.zeros(n)
-    known = targets[at - m : at + run]
-    f[: known.size] = known
-    return S, f
 
 
 class OnlineEstimator(HeldEstimate):
@@ -551,7 +541,10 @@ def fit(signals: Array, targets: Array, depth: int, m: int, penalty: float, ahea
     middle = windows.mean(axis=0)
     if m <= 2 * depth * signals.shape[1]:  # which of the two is cheaper
         S = np.empty((m + 1, m + 1), order="F")  # the inner products with the targets as one more row
-        gram = _inner_products(signals, depth, m)
+        lower = np.tril(
+            square_from_band(sliding_products(signals, signals, depth, depth - 1, depth - 1, m, m, triangle=True), 0, m)
+        )
+        gram = lower + np.tril(lower, -1).T  # X X', at a cost that depth does not enter
         mean = gram.mean(axis=0)
         S[:m, :m] = gram - mean - mean[:, None] + mean.mean()  # of the windows less their mean
         S.flat[: m * (m + 1) : m + 2] += penalty
@@ -564,13 +557,6 @@ def fit(signals: Array, targets: Array, depth: int, m: int, penalty: float, ahea
         X = (windows - middle).reshape(m, -1)
         w = solve(X.T @ X + penalty * np.eye(X.shape[1]), X.T @ (f - f.mean()), assume_a="pos").reshape(middle.shape)
     return w.T[::-1], float(f.mean() - np.sum(middle * w))
-
-
-def _inner_products(signals: Array, depth: int, m: int) -> Array:
-    """X X' of the first m windows, (m, m), at a cost that depth does not enter."""
-    band = sliding_products(signals, signals, depth, depth - 1, depth - 1, m, m, triangle=True)
-    lower = np.tril(square_from_band(band, 0, m))
-    return lower + np.tril(lower, -1).T
 
 
 def predict(signals: Array, weights: Array, constant: float) -> Array:

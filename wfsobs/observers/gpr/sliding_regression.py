@@ -81,7 +81,11 @@ def slide(
     """
     steps = S.shape[0] - 2 - window
     if not lengths:
-        _gather_leaves(S, f, window, steps, leaves[:, :, at : at + steps])
+        rows, columns, points = _leaf_indices(S.shape[0], window, steps)
+        out, targets = leaves[:, :, at : at + steps], f[points]
+        out[...] = S[rows, columns]
+        out[:window, window + 1] += targets
+        out[window + 1, :window] += targets
         return
     b, rest = lengths[0], lengths[1:]
     for start in range(0, steps, b):
@@ -111,15 +115,6 @@ def _eliminate_common(S: Array, f: Array, window: int, start: int, b: int, check
     T[to[3], to[3]] = S[border, border]
     eliminate(T, n, check)
     return T[n:, n:], np.concatenate([f[going], f[coming]])
-
-
-def _gather_leaves(S: Array, f: Array, window: int, steps: int, out: Array) -> None:
-    """out[:, :, i] = the matrix of [training points of step i | its test point | f | delta], symmetric."""
-    rows, columns, points = _leaf_indices(S.shape[0], window, steps)
-    out[...] = S[rows, columns]
-    targets = f[points]
-    out[:window, window + 1] += targets
-    out[window + 1, :window] += targets
 
 
 @lru_cache(maxsize=16)
