@@ -541,9 +541,8 @@ def fit(signals: Array, targets: Array, depth: int, m: int, penalty: float, ahea
     middle = windows.mean(axis=0)
     if m <= 2 * depth * signals.shape[1]:  # which of the two is cheaper
         S = np.empty((m + 1, m + 1), order="F")  # the inner products with the targets as one more row
-        lower = np.tril(
-            square_from_band(sliding_products(signals, signals, depth, depth - 1, depth - 1, m, m, triangle=True), 0, m)
-        )
+        products = sliding_products(signals, signals, depth, depth - 1, depth - 1, m, m, triangle=True)
+        lower = np.tril(square_from_band(products, 0, m))
         gram = lower + np.tril(lower, -1).T  # X X', at a cost that depth does not enter
         mean = gram.mean(axis=0)
         S[:m, :m] = gram - mean - mean[:, None] + mean.mean()  # of the windows less their mean
