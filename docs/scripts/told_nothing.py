@@ -25,7 +25,7 @@ from wfsobs.evaluation.exact_errors import exact_errors
 from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
-from wfsobs.simulation import turbulence
+from wfsobs.simulation import disturbance
 from wfsobs.typing import Array
 
 NAMES = ("kf-adaptive", "multirate-adaptive", "multirate-multi")
@@ -94,7 +94,7 @@ def main() -> None:
     )
     a = parser.parse_args()
     if a.line_width:
-        turbulence.SHARPER = 1.0 / (a.line_width * DURATION)
+        disturbance.SHARPER = 1.0 / (a.line_width * DURATION)
     heads = [f"`{name}` [nm] | {'computed' if name == NAMES[-1] else 'paired'}" for name in NAMES]
     print(f"| Preset, mode, target | bound of both [nm] | {' | '.join(heads)} |")
     print("|---" * (2 + 2 * len(NAMES)) + "|")
