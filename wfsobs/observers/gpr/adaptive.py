@@ -122,6 +122,11 @@ class Learnt(NamedTuple):
     weights: Array
     sd: float
 
+    @property
+    def whitener(self) -> FilterStep:
+        """The filter of the inputs."""
+        return whitener_of(self.fit)
+
 
 def nothing_learnt(depth: int) -> Learnt:
     """Return what is known before the first window: there is no estimate."""
@@ -342,7 +347,7 @@ class AdaptiveGprEstimator(HeldEstimate):
     def _use(self) -> None:
         """Take over what was learnt."""
         for mode, one in enumerate(self.learnt):
-            F, G, H, J = whitener_of(one.fit)
+            F, G, H, J = one.whitener
             order, filter_map = len(F), self._filters.maps[0][mode]
             filter_map[...] = 0.0
             filter_map[:order, :order], filter_map[:order, ORDER:] = F, G
@@ -351,7 +356,7 @@ class AdaptiveGprEstimator(HeldEstimate):
 
     def _whiten_past(self, mode: int, z: Array) -> Array:
         """Take the whitener of a mode through its window z (n,) from rest; return its last outputs, (depth,)."""
-        F, G, H, J = whitener_of(self.learnt[mode].fit)
+        F, G, H, J = self.learnt[mode].whitener
         whitener = PeriodicFilter([(F, G, np.vstack([H, F]), np.vstack([J, G]))])
         out = whitener.run(z[:, None], since=len(z) - self.schedule.depth)
         self._filters.x[mode] = 0.0
