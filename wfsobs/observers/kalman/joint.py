@@ -311,7 +311,7 @@ class AsterismModel:
         rows = [now @ matrix_power(model.A, frames) for now, model in zip(targets, self._peaks, strict=True)]
         crosses = np.zeros((self.ratio, len(rows), self.n_states))
         for i, (row, of_lines) in enumerate(zip(rows, self._of_lines, strict=True)):
-            crosses[:, i, self._places[i]] = row @ np.array(of_lines)
+            crosses[:, i, self._places[i]] = [row @ cross for cross in of_lines]
         variances = np.array([now @ now for now in targets])  # the states have unit variance
         return [(cross, variances) for cross in crosses]
 
