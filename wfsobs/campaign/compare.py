@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import groupby
+from operator import attrgetter
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -352,8 +354,5 @@ def each_group(table: pyarrow.Table) -> Iterator[tuple[tuple[int, str, str, str]
 
 
 def comparison_groups(comparisons: Sequence[Comparison]) -> dict[tuple[int, str, str], list[Comparison]]:
-    """Return (number of the scenario, target, mode) -> what was compared there."""
-    out: dict[tuple[int, str, str], list[Comparison]] = {}
-    for c in comparisons:
-        out.setdefault((c.cell, c.target, c.mode), []).append(c)
-    return out
+    """Return (number of the scenario, target, mode) -> what was compared there; comparisons : in the order of `compare`."""
+    return {key: list(of) for key, of in groupby(comparisons, attrgetter("cell", "target", "mode"))}

@@ -293,8 +293,7 @@ def standings(state: CampaignState, target: str, mode: str, cells: Sequence[int]
     state : of `wfsobs.campaign.follow.CampaignFolder`;  cells : of `wfsobs.campaign.plan.cells_where`
     """
     errors = state.errors[target, mode]
-    ratio, low, high = errors.over_bound(cells)
-    places = errors.standings(cells)
+    limits, places = errors.over_bound(cells), errors.standings(cells)
     out = []
     for s in places:
         i = errors.names.index(s.name)
@@ -306,13 +305,11 @@ def standings(state: CampaignState, target: str, mode: str, cells: Sequence[int]
                 mode,
                 s.name,
                 s.rms,
-                over_bound=float(ratio[i]),
-                over_bound_low=float(low[i]),
-                over_bound_high=float(high[i]),
-                above=s.above,
-                above_low=s.low,
-                above_high=s.high,
-                rank=_rank(s, places),
+                *(float(x[i]) for x in limits),
+                s.above,
+                s.low,
+                s.high,
+                _rank(s, places),
                 wins=len(won) if can_win else None,
                 decided_wins=sum(v.is_decided for v in won) if can_win else None,
                 records=int(errors.count[cells, i].sum()),

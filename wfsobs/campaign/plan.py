@@ -404,9 +404,10 @@ def cells_where(plan: Campaign, only: Iterable[str]) -> Array:
         if not equals or path not in axes:
             names = f"NAME=VALUE with one of {', '.join(axes)}" if axes else "nothing: there is a single scenario"
             raise SettingError(f"{text}: takes {names}")
-        found = _has_value(_values(plan, path), named)
+        values = _values(plan, path)
+        found = _has_value(values, named)
         if not found.any():
-            raise SettingError(f"{text}: takes {_list_values(_values(plan, path))}")
+            raise SettingError(f"{text}: takes {_list_values(values)}")
         chosen[path] = chosen.get(path, False) | found
     cells = np.flatnonzero(np.logical_and.reduce([np.ones(len(plan.cells), dtype=bool), *chosen.values()]))
     if not len(cells):
@@ -441,10 +442,9 @@ def _has_value(values: list[Any], name: str) -> Array:
 
 def _list_values(values: list[Any]) -> str:
     """Say what values there are."""
-    texts = list(dict.fromkeys(map(_text, values)))
     numbers = sorted({value for value in values if _is_number(value)})
+    texts = list(dict.fromkeys(map(_text, [*numbers, *values])))
     if len(texts) <= MOST_LISTED:
-        texts = [*map(_text, numbers), *(text for text in texts if text not in {_text(n) for n in numbers})]
         listed = f"one of {', '.join(texts)}"
     elif numbers:
         listed = f"one of {len(numbers)} numbers from {_text(numbers[0])} to {_text(numbers[-1])}"

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -220,11 +220,7 @@ def write_report(folder: Path, path: Path) -> None:
     text = environment.get_template("report.html").render(
         plan=plan,
         done=int(finished_runs(plan, folder).sum()),
-        maps=[
-            m
-            for key in dict.fromkeys((c.target, c.mode) for c in comparisons)
-            for m in _maps(plan, [c for c in comparisons if (c.target, c.mode) == key])
-        ],
+        maps=_maps(plan, groups),
         rankings=[(r, _lines(r)) for r in rank(comparisons)],
         groups=list(groups.items())[:MOST_ROWS],
         left_out=max(0, len(groups) - MOST_ROWS),
@@ -248,23 +244,25 @@ def colour(name: str) -> str:
     return entry.look.light if entry is not None else "#555577"
 
 
-def _maps(plan: Campaign, comparisons: Sequence[Comparison]) -> list[Map]:
+def _maps(plan: Campaign, groups: Mapping[tuple[int, str, str], Sequence[Comparison]]) -> list[Map]:
     """Return a map of winners for each scenario of a plan that is varied: over its first two settings that are numbers."""
-    out = []
-    for name in dict.fromkeys(c.scenario for c in comparisons):
-        cells = comparison_groups([c for c in comparisons if c.scenario == name])
-        changes = {key[0]: plan.cells[key[0]].changes for key in cells}
+    out, names = [], dict.fromkeys(cell.name for cell in plan.cells)
+    for (target, mode), name in product(dict.fromkeys(key[1:] for key in groups), names):
+        of = f"{target}, {mode}"
+        cells = {key[0]: rows for key, rows in groups.items() if key[1:] == (target, mode) and rows[0].scenario == name}
+        changes = {cell: plan.cells[cell].changes for cell in cells}
         paths = [p for p in plan.axes if all(isinstance(c.get(p), (int, float)) for c in changes.values())][:2]
         paths = [p for p in paths if len({c[p] for c in changes.values()}) > 1]
         if paths:
-            out.append(_map(plan, name, cells, changes, paths))
+            out.append(_map(plan, of, name, cells, changes, paths))
     return out
 
 
 def _map(
     plan: Campaign,
+    of: str,
     name: str,
-    cells: Mapping[tuple[int, str, str], Sequence[Comparison]],
+    cells: Mapping[int, Sequence[Comparison]],
     changes: Mapping[int, Mapping[str, Any]],
     paths: Sequence[str],
 ) -> Map:
@@ -275,7 +273,7 @@ def _map(
     squares, winners = [], dict[str, str]()
     first = plan.cells[next(iter(changes))].scenario()
     labels = [setting_label(first, path) for path in paths]
-    for (cell, target, mode), rows in cells.items():
+    for cell, rows in cells.items():
         best = next((r for r in rows if r.is_best), None)
         if best is None:
             continue
@@ -287,14 +285,13 @@ def _map(
             ", another is not significantly worse" if tie else ""
         )
         values = (f"{label} = {_short(changes[cell][p])}" for label, p in zip(labels, paths, strict=True))
-        text += f"; {', '.join(values)}; {target}, {mode}"
+        text += f"; {', '.join(values)}; {of}"
         winners[best.name] = name_label(best.name)
         opacity = 0.25 + 0.75 * min(1.0, margin / FULL_MARGIN)
         top = TOP + (len(ys) - 1 - j) * high
         squares.append(Square(LEFT + i * wide, top, wide - 1, high - 1, colour(best.name), 0.15 if tie else opacity, text))
-    target, mode = next(iter(cells))[1:]
     return Map(
-        f"{target}, {mode}: {name}",
+        f"{of}: {name}",
         labels[0],
         labels[1] if len(paths) > 1 else "",
         [(LEFT + (i + 0.5) * wide, _short(x)) for i, x in enumerate(xs) if i % max(1, len(xs) // 8) == 0],

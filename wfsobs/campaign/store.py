@@ -132,8 +132,7 @@ def schema() -> pyarrow.Schema:
     """Return the columns of a file."""
     import pyarrow as pa
 
-    types = {"string": pa.string(), "int32": pa.int32(), "int64": pa.int64(), "float64": pa.float64(), "bool": pa.bool_()}
-    return pa.schema([(name, types[kind]) for name, kind in {**RESULTS, **PROVENANCE}.items()])
+    return pa.schema([(name, pa.type_for_alias(kind)) for name, kind in {**RESULTS, **PROVENANCE}.items()])
 
 
 def write_batch(folder: Path, rows: Sequence[Mapping[str, Any]], provenance: Mapping[str, Any]) -> None:

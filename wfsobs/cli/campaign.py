@@ -156,10 +156,6 @@ def print_together(folder: Path, only: Sequence[str], target: str | None, mode: 
         out.writerows([["" if value != value else value for value in astuple(row)] for row in rows])  # NaN is not known
         return
     title = f"{state.plan.name}: {state.n_done} of {state.plan.n_runs} runs, {len(cells)} of {len(state.plan.cells)} scenarios"
-    show_table(_table(rows, title))
-
-
-def _table(rows: Sequence[TogetherRow], title: str) -> Table:
     caption = "wins: scenarios with the smallest error, and how many of them are significant"
     out = new_table(("Target", "Mode", "Name"), NUMBERS, no_wrap=False, title=title, caption=caption)
     before = None
@@ -178,7 +174,7 @@ def _table(rows: Sequence[TogetherRow], title: str) -> Table:
             "" if row.failures is None else str(row.failures),
         )
         before = key
-    return out
+    show_table(out)
 
 
 def _above(row: TogetherRow) -> str:

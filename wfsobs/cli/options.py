@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager
 from dataclasses import fields
 from functools import wraps
@@ -164,30 +164,23 @@ def record_options(command: Callable) -> Callable:
     """Add what is stated of a record file, from --unit to --trust, received as `declaration`, and --sha256."""
 
     @wraps(command)
-    def with_declaration(
-        *,
-        command_sign: str | None,
-        columns: Sequence[str],
-        command_gain: str | None,
-        reconstructor: str | None,
-        command_modes: str | None,
-        **values: Any,
-    ) -> Any:
+    def with_declaration(**values: Any) -> Any:
+        stated = {field.name: values.pop(field.name) for field in fields(DeclaredFormat)}
         config = click.get_current_context().params.get("config")
         roles = {} if config is None else configfile.load_columns(config)
-        for text in columns:
+        for text in stated["columns"]:
             role, equals, name = text.partition("=")
             if not equals:
                 raise SettingError(f"--column {text}: takes ROLE=NAME, such as y_lgs/tip=slope_x")
             roles[role.strip()] = name
+        sign, gain = stated["command_sign"], stated["command_gain"]
         try:
-            gain = tuple(map(float, command_gain.split(","))) if command_gain else None
+            gains = tuple(map(float, gain.split(","))) if gain else None
         except ValueError:
-            raise SettingError(f"--command-gain {command_gain}: takes a number, or one per mode with commas") from None
-        stated = {name: values.pop(name) for name in ("unit", "command_delay", "rate", "trust", "rail", "open_loop")}
-        sign = int(command_sign) if command_sign else None
-        stated |= {"reconstructor": read_loop_matrix(reconstructor), "command_modes": read_loop_matrix(command_modes)}
-        return command(declaration=DeclaredFormat(command_sign=sign, columns=roles, command_gain=gain, **stated), **values)
+            raise SettingError(f"--command-gain {gain}: takes a number, or one per mode with commas") from None
+        stated |= {name: read_loop_matrix(stated[name]) for name in ("reconstructor", "command_modes")}
+        stated |= {"columns": roles, "command_sign": int(sign) if sign else None, "command_gain": gains}
+        return command(declaration=DeclaredFormat(**stated), **values)
 
     return add_options(
         with_declaration,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from statistics import mean, median
+from statistics import mean
 
 import click
 import numpy as np
@@ -103,16 +103,10 @@ def loop_table(rows: Sequence[Row]) -> Table:
             median_text(same, "gain", 3),
             linear(same, _margins(same[0])),
             linear(same, median_text(same, "delay_margin_ms", 2)),
-            _share(same),
+            median_text(same, "limited", 2, 100.0),
         )
     out.caption = no_theory(rows) or None
     return out
-
-
-def _share(same: Sequence[Row]) -> str:
-    """Share of the limited steps in per cent, the median over seeds."""
-    shares = [100.0 * r["limited"] for r in same if r["limited"] is not None]
-    return f"{median(shares):.2f}" if shares else "-"
 
 
 def _margins(row: Row) -> str:

@@ -9,7 +9,7 @@ from dataclasses import asdict, replace
 
 import click
 import numpy as np
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from wfsobs.cli.options import (
@@ -355,9 +355,7 @@ def check(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha
 
 def check_table(result: Check, name: str) -> Table:
     """Return the findings of a check, a row each."""
-    out = Table(title=name, title_justify="left", show_edge=False)
-    for column in ("", "What", "Found"):
-        out.add_column(column, no_wrap=column == "")
+    out = Table(Column(no_wrap=True), "What", "Found", title=name, title_justify="left", show_edge=False)
     for f in result.findings:
         out.add_row(Text(f.verdict, COLOURS[f.verdict]), f.subject, Text(f.text))
     return out

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
@@ -13,7 +13,7 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
-from wfsobs.files import write_whole
+from wfsobs.files import write_text
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.values import Plain, SettingError, leaves
@@ -146,7 +146,7 @@ def _text(path: str | Path) -> str:
 
 def save_scenario(scenario: Scenario, path: str | Path) -> None:
     """Write every setting to a TOML file. Raises OSError."""
-    write_whole(path, lambda file: file.write(to_toml(scenario).encode()))
+    write_text(path, to_toml(scenario))
 
 
 @cache
@@ -276,30 +276,22 @@ def scenarios(base: Scenario, variations: Sequence[Variation]) -> list[Scenario]
 
     Raises SettingError where there are more than MOST, where two are the same, and for a value that a setting refuses.
     """
-    _check_number(variations)
+    paths, counts = [v.path for v in variations], [len(v.values) for v in variations]
+    for i, path in enumerate(paths):
+        if path in paths[:i]:
+            raise SettingError(f"--vary {path}: is given twice; put all its values into one list")
+    if prod(counts) > MOST:
+        raise SettingError(f"--vary: {' x '.join(map(str, counts))} = {prod(counts)} combinations, at most {MOST} can be run")
     out: list[Scenario] = []
     seen: list[Plain] = []
     for values in product(*(v.values for v in variations)):
-        changes = {v.path: value for v, value in zip(variations, values, strict=True)}
+        changes = dict(zip(paths, values, strict=True))
         one = base.replace(changes)
         one.validate()
         plain = one.to_dict()
         if plain in seen:
-            raise SettingError(f"--vary: {_join_changes(changes.items())} gives the same settings as another combination")
+            listed = ", ".join(f"{path} = {value}" for path, value in changes.items())
+            raise SettingError(f"--vary: {listed} gives the same settings as another combination")
         seen.append(plain)
         out.append(one)
     return out
-
-
-def _check_number(variations: Sequence[Variation]) -> None:
-    paths = [v.path for v in variations]
-    for i, path in enumerate(paths):
-        if path in paths[:i]:
-            raise SettingError(f"--vary {path}: is given twice; put all its values into one list")
-    counts = [len(v.values) for v in variations]
-    if prod(counts) > MOST:
-        raise SettingError(f"--vary: {' x '.join(map(str, counts))} = {prod(counts)} combinations, at most {MOST} can be run")
-
-
-def _join_changes(changes: Iterable[tuple[str, Any]]) -> str:
-    return ", ".join(f"{path} = {value}" for path, value in changes)
