@@ -220,10 +220,10 @@ class CampaignFolder:
     def _build(self) -> CampaignState:
         plan, codes = self._plan, self._codes
         rows = np.concatenate([np.zeros(0, dtype=ROW), *self._parts])
-        rows["seed"] -= plan.seeds.start
-        rows = rows[(rows["cell"] < len(plan.cells)) & (rows["seed"] >= 0) & (rows["seed"] < len(plan.seeds))]
+        seeds = rows["seed"] - plan.seeds.start
+        rows = rows[(rows["cell"] < len(plan.cells)) & (seeds >= 0) & (seeds < len(plan.seeds))]
         self._parts = [rows.copy()]
-        self._parts[0]["seed"] += plan.seeds.start
+        rows["seed"] -= plan.seeds.start
         shape = len(plan.cells), len(plan.seeds)
         errors = gather_errors(rows, codes, shape)
         done = np.ones(shape, dtype=bool)
@@ -297,6 +297,7 @@ def standings(state: CampaignState, target: str, mode: str, cells: Sequence[int]
     out = []
     for s in places:
         i = errors.names.index(s.name)
+        over, over_low, over_high = (float(x[i]) for x in limits)
         won = [v for cell in cells if (v := errors.winners.get(int(cell))) is not None and v.best.name == s.name]
         can_win, failed = errors.eligible[cells, i].any(), state.failures.get(s.name)
         out.append(
@@ -305,7 +306,9 @@ def standings(state: CampaignState, target: str, mode: str, cells: Sequence[int]
                 mode,
                 s.name,
                 s.rms,
-                *(float(x[i]) for x in limits),
+                over,
+                over_low,
+                over_high,
                 s.above,
                 s.low,
                 s.high,

@@ -14,6 +14,7 @@ from rich.text import Text
 
 from wfsobs.cli.options import (
     POSITIVE,
+    DeclaredFile,
     FiniteRange,
     controller_option,
     json_option,
@@ -66,13 +67,13 @@ from wfsobs.telemetry.records import load_record, name_differences, open_record,
 @click.argument("out", metavar="OUT")
 @scenario_options
 @record_options
-def convert(record_file: str, out: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None) -> None:
+def convert(record_file: str, out: str, scenario: Scenario, declaration: DeclaredFile) -> None:
     """Write a record in another format: .npz, .aot.fits, .fits, .h5, .mat, .csv or .parquet.
 
     What is written is read back and compared; parts that the format has no place for are named.
     """
     check_writable(out, record_file, *declaration.files)
-    record = load_with_delay(record_file, scenario, declaration, sha256)[0]
+    record = load_with_delay(record_file, scenario, declaration)[0]
     save_record(out, record)
     if lost := name_differences(record, load_record(out, scenario, DeclaredFormat(trust=True))):
         print_note(f"{out}: has no place for {', '.join(lost)}")
@@ -108,8 +109,7 @@ def _nm(n: Number) -> Number:
 def observe(
     record_file: str,
     scenario: Scenario,
-    declaration: DeclaredFormat,
-    sha256: str | None,
+    declaration: DeclaredFile,
     train: str | None,
     train_until: float | None,
     observers: tuple[str, ...],
@@ -121,7 +121,7 @@ def observe(
     if out:
         check_writable(out, record_file, train, *declaration.files, endings=(".npz",))
     scenario = told_scenario(prior, scenario)
-    record = load_declared(record_file, scenario, declaration, sha256)
+    record = load_declared(record_file, scenario, declaration)
     learnt = training(train, train_until, record, scenario, declaration)
     with progress_bar() as watch:
         told = None if prior is None else scenario
@@ -157,8 +157,7 @@ def observe(
 def identify(
     record_file: str,
     scenario: Scenario,
-    declaration: DeclaredFormat,
-    sha256: str | None,
+    declaration: DeclaredFile,
     level: float,
     lowest: float,
     out: str | None,
@@ -167,7 +166,7 @@ def identify(
     """Find noise, turbulence and vibration peaks in a record (docs/identification.md)."""
     if out:
         check_writable(out, record_file, *declaration.files)
-    record = load_declared(record_file, scenario, declaration, sha256)
+    record = load_declared(record_file, scenario, declaration)
     with errors_of(record_file), progress_bar("sweeps") as watch:
         result = identify_record(record, level=level, lowest=lowest, watch=watch)
     if out:
@@ -191,9 +190,9 @@ def errors_of(what: str) -> Iterator[None]:
 
 @record_command
 @json_option()
-def plant(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None, as_json: bool) -> None:
+def plant(record_file: str, scenario: Scenario, declaration: DeclaredFile, as_json: bool) -> None:
     """Identify what the commands of a closed loop do: delay, gain and rotation."""
-    record = load_declared(record_file, scenario, declaration.as_commanded, sha256)
+    record = load_declared(record_file, scenario, declaration.as_commanded)
     with errors_of(record_file), progress_bar("groups of modes") as watch:
         groups = identify_plant(record, watch)
     if as_json:
@@ -213,11 +212,9 @@ def plant(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha
 @record_command
 @click.option("--prior", metavar="FOUND.toml", help="Also the gain by these spectra: the file of `wfsobs identify --out`.")
 @json_option()
-def gain(
-    record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None, prior: str | None, as_json: bool
-) -> None:
+def gain(record_file: str, scenario: Scenario, declaration: DeclaredFile, prior: str | None, as_json: bool) -> None:
     """Find the integrator's optimal gain from closed-loop telemetry (docs/closed_loop.md)."""
-    whole, delay = load_with_delay(record_file, scenario, declaration, sha256)
+    whole, delay = load_with_delay(record_file, scenario, declaration)
     record = whole.without_outliers
     scenario = as_stated(record, told_scenario(prior, scenario)).replace({"control.delay": delay})
     mirror, leak = plant_of(scenario).mirror, scenario.control.leak
@@ -251,15 +248,14 @@ def gain(
 def promise(
     record_file: str,
     scenario: Scenario,
-    declaration: DeclaredFormat,
-    sha256: str | None,
+    declaration: DeclaredFile,
     controllers: tuple[str, ...],
     after: str | None,
     as_json: bool,
 ) -> None:
     """State what controllers will leave of a loop, before one of them is switched on (docs/trust.md)."""
-    record = load_declared(record_file, scenario, declaration.as_commanded, sha256)
-    later = None if after is None else load_declared(after, scenario, declaration.as_commanded)
+    record = load_declared(record_file, scenario, declaration.as_commanded)
+    later = None if after is None else load_declared(after, scenario, replace(declaration.as_commanded, sha256=None))
     with errors_of(record_file), progress_bar("controllers") as watch:
         result = make_promise(record, scenario, controllers=controllers or None, watch=watch)
     found = None if later is None else result.left_in(later)
@@ -320,9 +316,9 @@ COLOURS = {"ok": "green", "note": "yellow", "undecided": "yellow", "excluded": "
 
 @record_command
 @json_option()
-def check(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None, as_json: bool) -> None:
+def check(record_file: str, scenario: Scenario, declaration: DeclaredFile, as_json: bool) -> None:
     """Check a record: what was read, and what of it can be relied on."""
-    with open_record(record_file, sha256) as (file, name):
+    with open_record(record_file, declaration.sha256) as (file, name):
         with errors_of(record_file):
             contents = read_contents(file, name, declaration.columns)
             record, raw = (to_record(contents, scenario, way) for way in (declaration, declaration.as_commanded))
