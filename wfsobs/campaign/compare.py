@@ -201,8 +201,7 @@ class CampaignErrors:
     def winners(self) -> dict[int, CampaignWinner]:
         """The best of every scenario that has results."""
         known = np.flatnonzero((self.count * self.eligible).any(axis=1)).tolist()
-        found = {cell: self.verdict([cell]) for cell in known}
-        return {cell: verdict for cell, verdict in found.items() if verdict is not None}
+        return {cell: verdict for cell in known if (verdict := self.verdict([cell])) is not None}
 
 
 def can_win(name: str, target: str) -> bool:

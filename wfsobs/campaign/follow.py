@@ -228,12 +228,11 @@ class CampaignFolder:
         errors = gather_errors(rows, codes, shape)
         done = np.ones(shape, dtype=bool)
         failures = {}
-        failed = rows[rows["target"] == codes.get("", -1)]
         for name in (*plan.observers, *plan.controllers):
             seen, of = np.zeros(shape, dtype=bool), rows[rows["name"] == codes.get(name, -1)]
             seen[of["cell"], of["seed"]] = True
             done &= seen
-            lost = np.unique(failed[failed["name"] == codes.get(name, -1)][["cell", "seed"]])
+            lost = np.unique(of[of["target"] == codes.get("", -1)][["cell", "seed"]])
             failures[name] = np.bincount(lost["cell"], minlength=shape[0])
         n_done = int(done.sum())
         pace = measure_pace(self._batches, 1e-9 * self._plan_time, time())

@@ -26,7 +26,6 @@ from wfsobs.campaign.follow import CampaignFolder, TogetherRow, standings
 from wfsobs.campaign.plan import Campaign, cells_where, load_plan
 from wfsobs.campaign.pools import DaskCluster, Processes, usable_processors
 from wfsobs.campaign.run import BATCH, run_campaign, run_cost, run_rows
-from wfsobs.campaign.run import Progress as State
 from wfsobs.campaign.store import RESULTS, add_settings, finished_runs, folder_plan, need_pyarrow, present_rows, read_results
 from wfsobs.campaign.sweep import MOST_SEEDS, SweepResults, parse_axis, plan_sweep, run_sweep
 from wfsobs.cli.options import json_option, observer_option, scenario_options
@@ -286,11 +285,14 @@ def run(plan_file: str, out: str, workers: int | None, scheduler: str | None, sh
     with _bar(plan.name) as bar:
         place = DaskCluster(scheduler, print_note) if scheduler else Processes(workers or usable_processors())
         task = bar.add_task("runs", total=None)
-
-        def tell(state: State) -> None:
-            bar.update(task, completed=state.n_done, total=state.total)
-
-        state = run_campaign(plan, Path(out), place, shard=share, report=tell, must_stop=stop)
+        state = run_campaign(
+            plan,
+            Path(out),
+            place,
+            shard=share,
+            report=lambda it: bar.update(task, completed=it.n_done, total=it.total),
+            must_stop=stop,
+        )
     if as_json:
         print_json(
             {"total": state.total, "done": state.n_done, "before": state.before, "runs": state.runs, "breaks": state.breaks}
