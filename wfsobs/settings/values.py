@@ -212,7 +212,5 @@ def declared_settings(cls: type[param.Parameterized]) -> dict[str, param.Paramet
     return {name: p for name, p in cls.param.objects("existing").items() if name != "name"}
 
 
-@cache
-def settings_once(cls: type[param.Parameterized]) -> dict[str, param.Parameter[Any]]:
-    """Return `declared_settings` of a class that gets no more of them: asked some thousand times for a change of one."""
-    return declared_settings(cls)
+settings_once = cache(declared_settings)
+"""Return `declared_settings` of a class that gets no more of them: asked some thousand times for a change of one."""
