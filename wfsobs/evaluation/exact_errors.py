@@ -48,7 +48,6 @@ from wfsobs.progress import QUIET
 from wfsobs.record import TOTAL, Measurements, Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.autoregressive import Ar3Fits
-from wfsobs.signal.sensor_array import SlowSensor
 from wfsobs.signal.spectrum import expected_psd, psd
 from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean, square
 from wfsobs.simulation.flow_spectra import TurbulenceSpectra
@@ -89,23 +88,10 @@ class TargetSpectra:
     spectra: TrueSpectra
 
     @cached_property
-    def _ngs(self) -> tuple[SlowSensor, Complex]:
-        return ngs_frames(self.spectra)
-
-    @cached_property
-    def frames(self) -> Array:
-        """Spectrum of the NGS with the noise of a frame."""
-        return self._ngs[0].spectrum + self._ngs[0].noise
-
-    @property
-    def frames_by_z(self) -> Complex:
-        """Cross spectrum of the NGS with z."""
-        return self._ngs[0].cross
-
-    @cached_property
-    def by_frames(self) -> Complex:
-        """Cross spectrum of s with the NGS."""
-        return self.ngs_cross * self._ngs[1].conj()
+    def of_frames(self) -> tuple[Array, Complex, Complex]:
+        """Spectrum of the NGS with the noise of a frame, its cross spectrum with z, and that of s with it."""
+        ngs, exposure = ngs_frames(self.spectra)
+        return ngs.spectrum + ngs.noise, ngs.cross, self.ngs_cross * exposure.conj()
 
 
 def target_spectra(spectra: TrueSpectra, target: str) -> TargetSpectra:
@@ -208,7 +194,8 @@ def _estimate_power(response: Complex, sensors: TargetSpectra) -> Array:
     c, *of_frames = response
     power = square(c) * sensors.z
     for d in of_frames:
-        power = power + square(d) * sensors.frames + 2.0 * _real_product(d * sensors.frames_by_z, c)
+        frames, frames_by_z, _ = sensors.of_frames
+        power = power + square(d) * frames + 2.0 * _real_product(d * frames_by_z, c)
     return power
 
 
@@ -217,7 +204,7 @@ def _rest_of_error(response: Complex, sensors: TargetSpectra) -> Array:
     c, *of_frames = response
     shared = _real_product(sensors.by_z, c)
     for d in of_frames:
-        shared = shared + _real_product(sensors.by_frames, d)
+        shared = shared + _real_product(sensors.of_frames[2], d)
     return sensors.signal - 2.0 * shared
 
 
