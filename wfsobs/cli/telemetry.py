@@ -91,13 +91,9 @@ def identification_table(result: Identification) -> Table:
     for m in result.modes:
         out.add_section()
         for what, frequency, damping, rms in mode_rows(m):
-            numbers = (frequency, damping, None if rms is None else _nm(rms))
+            numbers = (frequency, damping, None if rms is None else Number(rms.value * 1e3, rms.std * 1e3))
             out.add_row(m.name, what, *("" if n is None else format_number(n) for n in numbers))
     return out
-
-
-def _nm(n: Number) -> Number:
-    return Number(n.value * 1e3, n.std * 1e3)
 
 
 @record_command
