@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, replace
 
 import click
@@ -55,6 +53,7 @@ from wfsobs.priors_from.controllers import plant_of
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.zernike import HIGHEST_ORDER, modes_up_to
+from wfsobs.settings.values import errors_of
 from wfsobs.spectral.search import LOWEST
 from wfsobs.telemetry.check import Check, check_record
 from wfsobs.telemetry.intake import DeclaredFormat, to_record
@@ -163,7 +162,7 @@ def identify(
     if out:
         check_writable(out, record_file, *declaration.files)
     record = load_declared(record_file, scenario, declaration)
-    with errors_of(record_file), progress_bar("sweeps") as watch:
+    with errors_of(record_file, RecordError), progress_bar("sweeps") as watch:
         result = identify_record(record, level=level, lowest=lowest, watch=watch)
     if out:
         write_text(out, identification_toml(result, result.scenario(as_stated(record, scenario))))
@@ -175,21 +174,12 @@ def identify(
         click.echo(line)
 
 
-@contextmanager
-def errors_of(what: str) -> Iterator[None]:
-    """Prefix the message of a RecordError, such as with the name of a file."""
-    try:
-        yield
-    except RecordError as error:
-        raise RecordError(f"{what}: {error}") from None
-
-
 @record_command
 @json_option()
 def plant(record_file: str, scenario: Scenario, declaration: DeclaredFile, as_json: bool) -> None:
     """Identify what the commands of a closed loop do: delay, gain and rotation."""
     record = load_declared(record_file, scenario, declaration.as_commanded)
-    with errors_of(record_file), progress_bar("groups of modes") as watch:
+    with errors_of(record_file, RecordError), progress_bar("groups of modes") as watch:
         groups = identify_plant(record, watch)
     if as_json:
         print_json(plant_dict(groups))
@@ -217,7 +207,7 @@ def gain(record_file: str, scenario: Scenario, declaration: DeclaredFile, prior:
     laws = design(scenario, ["integrator"]).laws["integrator"] if prior else ()
     rows = []
     for mode, name in enumerate(m.name for m in modes_up_to(HIGHEST_ORDER)[: record.n_modes]):
-        with errors_of(f"{record_file}: {name}"):
+        with errors_of(f"{record_file}: {name}", RecordError):
             found = gain_from_telemetry(record.z[record.delay :, mode], mirror, leak)
         left = float(np.sqrt(np.nanmean(np.square(record.y_lgs[:, mode]))))
         law = laws[mode].law if laws else None
@@ -252,7 +242,7 @@ def promise(
     """State what controllers will leave of a loop, before one of them is switched on (docs/trust.md)."""
     record = load_declared(record_file, scenario, declaration.as_commanded)
     later = None if after is None else load_declared(after, scenario, replace(declaration.as_commanded, sha256=None))
-    with errors_of(record_file), progress_bar("controllers") as watch:
+    with errors_of(record_file, RecordError), progress_bar("controllers") as watch:
         result = make_promise(record, scenario, controllers=controllers or None, watch=watch)
     found = None if later is None else result.left_in(later)
     if as_json:
@@ -315,7 +305,7 @@ COLOURS = {"ok": "green", "note": "yellow", "undecided": "yellow", "excluded": "
 def check(record_file: str, scenario: Scenario, declaration: DeclaredFile, as_json: bool) -> None:
     """Check a record: what was read, and what of it can be relied on."""
     with open_record(record_file, declaration.sha256) as (file, name):
-        with errors_of(record_file):
+        with errors_of(record_file, RecordError):
             contents = read_contents(file, name, declaration.columns)
             record, raw = (to_record(contents, scenario, way) for way in (declaration, declaration.as_commanded))
     reading = read_off(record, contents, declaration, scenario)
