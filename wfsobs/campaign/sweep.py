@@ -248,8 +248,7 @@ def parse_axis(text: str) -> Variation:
     (2, 5, 10)
     """
     path, _, listed = (part.strip() for part in text.partition("="))
-    found = RANGE.fullmatch(listed)
-    if not found:
+    if not (found := RANGE.fullmatch(listed)):
         return parse_variation(text, "--over")
     try:
         low, high, count = float(found[1]), float(found[2]), int(found[3])
@@ -516,8 +515,7 @@ class SweepResults:
 
     def known_keys(self) -> list[Key]:
         """Return (observer, target, mode) of all that is known in some cell, in the order of the scores."""
-        known = {(s.observer, s.target, s.mode): None for seeds in self.scores.values() for s in seeds[0]}
-        return list(known)
+        return list(dict.fromkeys((s.observer, s.target, s.mode) for seeds in self.scores.values() for s in seeds[0]))
 
     def to_xarray(self) -> xarray.Dataset:
         """Return mean errors `rms` and the ends `low` and `high` of their intervals [um], as `error` does, as labelled arrays.
