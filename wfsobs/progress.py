@@ -15,6 +15,18 @@ class Cancelled(Exception):
     """Error: the computation was stopped on request."""
 
 
+def _never() -> bool:
+    return False
+
+
+def _silent(_fraction: float) -> None:
+    return None
+
+
+def _keep(_target: str, _values: NDArray[np.float64]) -> None:
+    return None
+
+
 @dataclass(frozen=True)
 class Watch:
     """Callbacks of a computation; all are called from the working thread.
@@ -29,9 +41,9 @@ class Watch:
         Receives (target, values so far, with NaN where not yet computed) from observers that compute in blocks.
     """
 
-    progress: Callable[[float], None] = field(default=lambda _fraction: None, repr=False)
-    is_cancelled: Callable[[], bool] = field(default=lambda: False, repr=False)
-    partial: Callable[[str, NDArray[np.float64]], None] = field(default=lambda _target, _values: None, repr=False)
+    progress: Callable[[float], None] = field(default=_silent, repr=False)
+    is_cancelled: Callable[[], bool] = field(default=_never, repr=False)
+    partial: Callable[[str, NDArray[np.float64]], None] = field(default=_keep, repr=False)
 
     def check(self) -> None:
         """Raise `Cancelled` if the computation is to stop."""
