@@ -143,8 +143,8 @@ def _rows_of_all(
     try:
         return rows_of(record, ready, names)
     except Exception as error:  # by an observer of another package, perhaps
-        if len(names) == 1 or isinstance(error, SettingError):
-            return [_failure(name, error_line(error)) for name in names]
+        if len(names) == 1:
+            return [_failure(names[0], error_line(error))]
         return [row for name in names for row in _rows_of_all(rows_of, record, replace(ready, design=None), [name])]
 
 
