@@ -50,7 +50,7 @@ def filterpy_kalman(problem: KalmanProblem) -> Array:
     """Return the filtered states (n_steps, n); filterpy's steady-state functions are lighter than its filter object."""
     steps = _filterpy()
 
-    A, B, C, L, y, u = problem.loop
+    A, B, C, L, y, u, *_ = problem
     H, x, out = C[None], np.zeros((len(B), 1)), np.empty((len(y), len(B)))
     column, gain = B[:, None], L[:, None]
     for k in range(len(y)):
@@ -91,8 +91,8 @@ def statsmodels_kalman(problem: KalmanProblem) -> Array:
 
     Q, n = problem.Q, len(problem.Q)
     model = KalmanFilter(k_endog=1, k_states=n, k_posdef=n)
-    model["design"], model["obs_cov"] = problem.loop.C[None, :n], np.array([[problem.R]])
-    model["transition"], model["selection"], model["state_cov"] = problem.loop.A[:n, :n], np.eye(n), Q
+    model["design"], model["obs_cov"] = problem.C[None, :n], np.array([[problem.R]])
+    model["transition"], model["selection"], model["state_cov"] = problem.A[:n, :n], np.eye(n), Q
     model.initialize_known(np.zeros(n), problem.P)
     model.bind(problem.z)
     return model.filter().filtered_state.T

@@ -62,26 +62,20 @@ def check_writable(path: str | Path, *inputs: str | Path | None, endings: tuple[
 
     endings : those that its name takes; any where there are none
     """
-    read = (one for one in inputs if one and os.path.exists(one) and os.path.exists(path))
-    if not _is_device(path) and any(os.path.samefile(path, one) for one in read):
+    if _is_device(path):
+        return
+    if any(os.path.samefile(path, one) for one in inputs if one and os.path.exists(one) and os.path.exists(path)):
         raise OSError(errno.EEXIST, "is read by this command; write to another file", str(path))
     named = str(path)
-    path = Path(os.path.realpath(path) if os.path.islink(path) and not _is_device(path) else path)
+    path = Path(os.path.realpath(path) if os.path.islink(path) else path)
     folder = path.parent
-    number, where = (
-        (0, path)
-        if _is_device(path)
-        else (errno.EISDIR, path)
-        if path.is_dir()
-        else (errno.ENOENT, folder)
-        if not folder.exists()
-        else (errno.ENOTDIR, folder)
-        if not folder.is_dir()
-        else (errno.EACCES, folder)
-        if not os.access(folder, os.W_OK | os.X_OK)
-        else (0, path)
-    )
-    if number:
-        raise OSError(number, os.strerror(number), str(where))
-    if endings and not _is_device(named) and not named.lower().endswith(endings):
+    for number, where, is_wrong in (
+        (errno.EISDIR, path, path.is_dir()),
+        (errno.ENOENT, folder, not folder.exists()),
+        (errno.ENOTDIR, folder, not folder.is_dir()),
+        (errno.EACCES, folder, not os.access(folder, os.W_OK | os.X_OK)),
+    ):
+        if is_wrong:
+            raise OSError(number, os.strerror(number), str(where))
+    if endings and not named.lower().endswith(endings):
         raise OSError(errno.EINVAL, f"its name ends in none of {', '.join(endings)}", named)

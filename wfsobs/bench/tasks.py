@@ -123,8 +123,13 @@ FULL = Sizes(
 )
 
 
-class KalmanLoop(NamedTuple):
-    """Arguments of `textbook.kalman_loop`, with n = 6."""
+class KalmanProblem(NamedTuple):
+    """The paper's filter of one mode.
+
+    A to u  : arguments of `textbook.kalman_loop`, with the mirror in the state, n = 6
+    Q, R, P : drive (4, 4) and noise [um^2] of the disturbances alone, and the steady covariance (4, 4) before a measurement
+    z       : measurements without the mirror's part, (n_steps,)
+    """
 
     A: Array
     B: Array
@@ -132,17 +137,6 @@ class KalmanLoop(NamedTuple):
     L: Array
     y: Array
     u: Array
-
-
-class KalmanProblem(NamedTuple):
-    """The paper's filter of one mode.
-
-    loop    : with the mirror in the state
-    Q, R, P : drive (4, 4) and noise [um^2] of the disturbances alone, and the steady covariance (4, 4) before a measurement
-    z       : measurements without the mirror's part, (n_steps,)
-    """
-
-    loop: KalmanLoop
     Q: Array
     R: float
     P: Array
@@ -204,20 +198,16 @@ def kalman_record(sizes: Sizes) -> Iterator[Row]:
     scenario = sizes.scenario(sizes.filter_duration)
     record, prior = simulate(scenario), model_of(scenario, 0)
     y, u = record.y_lgs[:, 0], record.u[:, 0]
-    z, noise = pseudo_open_loop(y, u), prior.lgs_noise
+    noise = prior.lgs_noise
     ours, _ = steady_filter(prior.disturbance(), noise)
     A, B, C, Q = paper_model(scenario, record.dt)
     steady = steady_state(A[:4, :4], C[:4], Q, np.array(noise**2))
-    loop = KalmanLoop(A, B, C, _with_mirror(steady.L[:, 0]), y, u)
-    problem = KalmanProblem(loop, Q, noise**2, steady.P, z)
-    yield from _filters(
-        sizes,
-        "kalman-record",
-        problem,
-        lambda: ours.run(pseudo_open_loop(y, u)[:, None]),
-        textbook.kalman_loop,
-        loop,
-    )
+    problem = KalmanProblem(A, B, C, _with_mirror(steady.L[:, 0]), y, u, Q, noise**2, steady.P, pseudo_open_loop(y, u))
+
+    def run_ours() -> Array:
+        return ours.run(pseudo_open_loop(y, u)[:, None])
+
+    yield from _filters(sizes, "kalman-record", problem, run_ours, textbook.kalman_loop, problem[:6])
 
 
 def multirate_record(sizes: Sizes) -> Iterator[Row]:

@@ -10,6 +10,8 @@ the same regression in the split form of `observers.kernels`, which is well cond
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import cho_factor, cho_solve
@@ -71,14 +73,13 @@ def predict_online(X: Array, f: Array, rows: Array, m: int, kernel: SquaredExpon
     )
 
 
+@dataclass
 class OnlineStream:
     """The same one step at a time, with all that does not need the newest sample done before it comes."""
 
+    X: Array
     m: int
     kernel: SquaredExponential
-
-    def __init__(self, X: Array, m: int, kernel: SquaredExponential):
-        self.X, self.m, self.kernel = X, m, kernel
 
     def prepare(self, row: int) -> None:
         """Kernel and Cholesky factor of the training windows of a row of X."""

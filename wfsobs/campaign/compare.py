@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import groupby
+from operator import attrgetter
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -199,8 +201,7 @@ class CampaignErrors:
     def winners(self) -> dict[int, CampaignWinner]:
         """The best of every scenario that has results."""
         known = np.flatnonzero((self.count * self.eligible).any(axis=1)).tolist()
-        found = {cell: self.verdict([cell]) for cell in known}
-        return {cell: verdict for cell, verdict in found.items() if verdict is not None}
+        return {cell: verdict for cell in known if (verdict := self.verdict([cell])) is not None}
 
 
 def can_win(name: str, target: str) -> bool:
@@ -352,8 +353,5 @@ def each_group(table: pyarrow.Table) -> Iterator[tuple[tuple[int, str, str, str]
 
 
 def comparison_groups(comparisons: Sequence[Comparison]) -> dict[tuple[int, str, str], list[Comparison]]:
-    """Return (number of the scenario, target, mode) -> what was compared there."""
-    out: dict[tuple[int, str, str], list[Comparison]] = {}
-    for c in comparisons:
-        out.setdefault((c.cell, c.target, c.mode), []).append(c)
-    return out
+    """Return (number of the scenario, target, mode) -> what was compared there; comparisons : in the order of `compare`."""
+    return {key: list(of) for key, of in groupby(comparisons, attrgetter("cell", "target", "mode"))}

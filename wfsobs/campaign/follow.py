@@ -220,20 +220,19 @@ class CampaignFolder:
     def _build(self) -> CampaignState:
         plan, codes = self._plan, self._codes
         rows = np.concatenate([np.zeros(0, dtype=ROW), *self._parts])
-        rows["seed"] -= plan.seeds.start
-        rows = rows[(rows["cell"] < len(plan.cells)) & (rows["seed"] >= 0) & (rows["seed"] < len(plan.seeds))]
+        seeds = rows["seed"] - plan.seeds.start
+        rows = rows[(rows["cell"] < len(plan.cells)) & (seeds >= 0) & (seeds < len(plan.seeds))]
         self._parts = [rows.copy()]
-        self._parts[0]["seed"] += plan.seeds.start
+        rows["seed"] -= plan.seeds.start
         shape = len(plan.cells), len(plan.seeds)
         errors = gather_errors(rows, codes, shape)
         done = np.ones(shape, dtype=bool)
         failures = {}
-        failed = rows[rows["target"] == codes.get("", -1)]
         for name in (*plan.observers, *plan.controllers):
             seen, of = np.zeros(shape, dtype=bool), rows[rows["name"] == codes.get(name, -1)]
             seen[of["cell"], of["seed"]] = True
             done &= seen
-            lost = np.unique(failed[failed["name"] == codes.get(name, -1)][["cell", "seed"]])
+            lost = np.unique(of[of["target"] == codes.get("", -1)][["cell", "seed"]])
             failures[name] = np.bincount(lost["cell"], minlength=shape[0])
         n_done = int(done.sum())
         pace = measure_pace(self._batches, 1e-9 * self._plan_time, time())
@@ -293,11 +292,11 @@ def standings(state: CampaignState, target: str, mode: str, cells: Sequence[int]
     state : of `wfsobs.campaign.follow.CampaignFolder`;  cells : of `wfsobs.campaign.plan.cells_where`
     """
     errors = state.errors[target, mode]
-    ratio, low, high = errors.over_bound(cells)
-    places = errors.standings(cells)
+    limits, places = errors.over_bound(cells), errors.standings(cells)
     out = []
     for s in places:
         i = errors.names.index(s.name)
+        over, over_low, over_high = (float(x[i]) for x in limits)
         won = [v for cell in cells if (v := errors.winners.get(int(cell))) is not None and v.best.name == s.name]
         can_win, failed = errors.eligible[cells, i].any(), state.failures.get(s.name)
         out.append(
@@ -306,13 +305,13 @@ def standings(state: CampaignState, target: str, mode: str, cells: Sequence[int]
                 mode,
                 s.name,
                 s.rms,
-                over_bound=float(ratio[i]),
-                over_bound_low=float(low[i]),
-                over_bound_high=float(high[i]),
-                above=s.above,
-                above_low=s.low,
-                above_high=s.high,
-                rank=_rank(s, places),
+                over,
+                over_low,
+                over_high,
+                s.above,
+                s.low,
+                s.high,
+                _rank(s, places),
                 wins=len(won) if can_win else None,
                 decided_wins=sum(v.is_decided for v in won) if can_win else None,
                 records=int(errors.count[cells, i].sum()),

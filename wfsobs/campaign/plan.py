@@ -20,8 +20,8 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.priors_from.scenario import common_observers
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.configfile import format_value, load_scenario, parse_toml, preset
-from wfsobs.settings.values import SettingError, leaves
+from wfsobs.scenario.configfile import format_value, load_scenario, parse_toml, preset, read_text
+from wfsobs.settings.values import SettingError, errors_of, leaves
 from wfsobs.typing import Array
 
 
@@ -219,14 +219,9 @@ def load_plan(path: str | Path) -> Campaign:
     SettingError
         The file cannot be read, or a value cannot be used; the line starts with the path.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SettingError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or 'not UTF-8 text'}") from None
-    try:
+    text = read_text(path)
+    with errors_of(str(path)):
         return parse_plan(text, Path(path).parent)
-    except SettingError as error:
-        raise SettingError(f"{path}: {error}") from None
 
 
 def parse_plan(text: str, folder: Path) -> Campaign:
@@ -250,10 +245,8 @@ def parse_plan(text: str, folder: Path) -> Campaign:
         cells += [Cell(len(cells) + i, name, base, changes) for i, changes in enumerate(product(axes))]
     checked: list[Scenario] = []
     for cell in _corners(cells, axes):
-        try:
+        with errors_of(f"scenario {cell.index} ({cell.name})"):
             checked.append(cell.scenario())
-        except SettingError as error:
-            raise SettingError(f"scenario {cell.index} ({cell.name}): {error}") from None
     observers = observers if "observers" in values else common_observers(checked)
     stop = parse_stop(_table(values, "stop"), count)
     return Campaign(str(values.get("name", "Campaign")), tuple(cells), range(first, first + count), observers, controllers, stop)
@@ -404,9 +397,10 @@ def cells_where(plan: Campaign, only: Iterable[str]) -> Array:
         if not equals or path not in axes:
             names = f"NAME=VALUE with one of {', '.join(axes)}" if axes else "nothing: there is a single scenario"
             raise SettingError(f"{text}: takes {names}")
-        found = _has_value(_values(plan, path), named)
+        values = _values(plan, path)
+        found = _has_value(values, named)
         if not found.any():
-            raise SettingError(f"{text}: takes {_list_values(_values(plan, path))}")
+            raise SettingError(f"{text}: takes {_list_values(values)}")
         chosen[path] = chosen.get(path, False) | found
     cells = np.flatnonzero(np.logical_and.reduce([np.ones(len(plan.cells), dtype=bool), *chosen.values()]))
     if not len(cells):
@@ -441,10 +435,9 @@ def _has_value(values: list[Any], name: str) -> Array:
 
 def _list_values(values: list[Any]) -> str:
     """Say what values there are."""
-    texts = list(dict.fromkeys(map(_text, values)))
     numbers = sorted({value for value in values if _is_number(value)})
+    texts = list(dict.fromkeys(map(_text, [*numbers, *values])))
     if len(texts) <= MOST_LISTED:
-        texts = [*map(_text, numbers), *(text for text in texts if text not in {_text(n) for n in numbers})]
         listed = f"one of {', '.join(texts)}"
     elif numbers:
         listed = f"one of {len(numbers)} numbers from {_text(numbers[0])} to {_text(numbers[-1])}"

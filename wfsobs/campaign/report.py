@@ -11,9 +11,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.stats import rankdata, studentized_range
@@ -162,30 +162,6 @@ FULL_MARGIN = 0.3
 """Margin of the winner from which its colour is full: the second is 30 % worse."""
 
 
-class Square(NamedTuple):
-    """One scenario on a map."""
-
-    x: float
-    y: float
-    width: float
-    height: float
-    colour: str
-    opacity: float
-    text: str
-
-
-class Map(NamedTuple):
-    """Winners over one or two settings."""
-
-    title: str
-    x_name: str
-    y_name: str
-    x_labels: Sequence[tuple[float, str]]
-    y_labels: Sequence[tuple[float, str]]
-    squares: Sequence[Square]
-    winners: Sequence[tuple[str, str]]
-
-
 WIDTH, HEIGHT, LEFT, TOP = 520.0, 260.0, 90.0, 10.0
 """Size of a map, and the room for its labels [px]."""
 
@@ -220,11 +196,7 @@ def write_report(folder: Path, path: Path) -> None:
     text = environment.get_template("report.html").render(
         plan=plan,
         done=int(finished_runs(plan, folder).sum()),
-        maps=[
-            m
-            for key in dict.fromkeys((c.target, c.mode) for c in comparisons)
-            for m in _maps(plan, [c for c in comparisons if (c.target, c.mode) == key])
-        ],
+        maps=_maps(plan, groups),
         rankings=[(r, _lines(r)) for r in rank(comparisons)],
         groups=list(groups.items())[:MOST_ROWS],
         left_out=max(0, len(groups) - MOST_ROWS),
@@ -248,64 +220,68 @@ def colour(name: str) -> str:
     return entry.look.light if entry is not None else "#555577"
 
 
-def _maps(plan: Campaign, comparisons: Sequence[Comparison]) -> list[Map]:
+def _maps(plan: Campaign, groups: Mapping[tuple[int, str, str], Sequence[Comparison]]) -> list[dict[str, Any]]:
     """Return a map of winners for each scenario of a plan that is varied: over its first two settings that are numbers."""
-    out = []
-    for name in dict.fromkeys(c.scenario for c in comparisons):
-        cells = comparison_groups([c for c in comparisons if c.scenario == name])
-        changes = {key[0]: plan.cells[key[0]].changes for key in cells}
+    out, names = [], dict.fromkeys(cell.name for cell in plan.cells)
+    for (target, mode), name in product(dict.fromkeys(key[1:] for key in groups), names):
+        of = f"{target}, {mode}"
+        cells = {key[0]: rows for key, rows in groups.items() if key[1:] == (target, mode) and rows[0].scenario == name}
+        changes = {cell: plan.cells[cell].changes for cell in cells}
         paths = [p for p in plan.axes if all(isinstance(c.get(p), (int, float)) for c in changes.values())][:2]
         paths = [p for p in paths if len({c[p] for c in changes.values()}) > 1]
         if paths:
-            out.append(_map(plan, name, cells, changes, paths))
+            out.append(_map(plan, of, name, cells, changes, paths))
     return out
 
 
 def _map(
     plan: Campaign,
+    of: str,
     name: str,
-    cells: Mapping[tuple[int, str, str], Sequence[Comparison]],
+    cells: Mapping[int, Sequence[Comparison]],
     changes: Mapping[int, Mapping[str, Any]],
     paths: Sequence[str],
-) -> Map:
+) -> dict[str, Any]:
     """Return the map of one scenario; where a third setting varies, points share a square and the last one is seen."""
-    xs, ys = (sorted({c[path] for c in changes.values()}) for path in (paths[0], paths[-1]))
-    ys = ys if len(paths) > 1 else [0.0]
+    xs, ys, *_ = [*(sorted({c[path] for c in changes.values()}) for path in paths), [None]]
     wide, high = (WIDTH - LEFT - 10) / len(xs), (HEIGHT - TOP - 40) / len(ys)
     squares, winners = [], dict[str, str]()
     first = plan.cells[next(iter(changes))].scenario()
-    labels = [setting_label(first, path) for path in paths]
-    for (cell, target, mode), rows in cells.items():
+    x_name, y_name, *_ = labels = [*(setting_label(first, path) for path in paths), ""]
+    for cell, rows in cells.items():
         best = next((r for r in rows if r.is_best), None)
         if best is None:
             continue
         second = min((r.rms for r in rows if r.difference is not None), default=math.inf)
         margin = second / best.rms - 1.0 if best.rms > 0 and math.isfinite(second) else FULL_MARGIN
         tie = any(r.is_tie for r in rows)
-        i, j = xs.index(changes[cell][paths[0]]), ys.index(changes[cell][paths[1]]) if len(paths) > 1 else 0
-        text = f"{name_label(best.name)}, {best.rms:.1f} nm, {margin:.0%} before the next" + (
-            ", another is not significantly worse" if tie else ""
-        )
-        values = (f"{label} = {_short(changes[cell][p])}" for label, p in zip(labels, paths, strict=True))
-        text += f"; {', '.join(values)}; {target}, {mode}"
+        values = [changes[cell][path] for path in paths]
+        x, y, *_ = [*values, None]
         winners[best.name] = name_label(best.name)
-        opacity = 0.25 + 0.75 * min(1.0, margin / FULL_MARGIN)
-        top = TOP + (len(ys) - 1 - j) * high
-        squares.append(Square(LEFT + i * wide, top, wide - 1, high - 1, colour(best.name), 0.15 if tie else opacity, text))
-    target, mode = next(iter(cells))[1:]
-    return Map(
-        f"{target}, {mode}: {name}",
-        labels[0],
-        labels[1] if len(paths) > 1 else "",
-        [(LEFT + (i + 0.5) * wide, _short(x)) for i, x in enumerate(xs) if i % max(1, len(xs) // 8) == 0],
-        [
-            (TOP + (len(ys) - 0.5 - j) * high, _short(y))
-            for j, y in enumerate(ys)
-            if len(paths) > 1 and j % max(1, len(ys) // 8) == 0
-        ],
-        squares,
-        [(colour(n), text) for n, text in winners.items()],
-    )
+        text = f"{winners[best.name]}, {best.rms:.1f} nm, {margin:.0%} before the next"
+        text += ", another is not significantly worse" if tie else ""
+        text += f"; {', '.join(f'{label} = {_short(v)}' for label, v in zip(labels, values, strict=False))}; {of}"
+        squares.append(
+            {
+                "x": LEFT + xs.index(x) * wide,
+                "y": TOP + (len(ys) - 1 - ys.index(y)) * high,
+                "colour": colour(best.name),
+                "opacity": 0.15 if tie else 0.25 + 0.75 * min(1.0, margin / FULL_MARGIN),
+                "text": text,
+            }
+        )
+    some_y = range(0, len(ys), max(1, len(ys) // 8)) if y_name else ()
+    return {
+        "title": f"{of}: {name}",
+        "x_name": x_name,
+        "y_name": y_name,
+        "x_labels": [(LEFT + (i + 0.5) * wide, _short(xs[i])) for i in range(0, len(xs), max(1, len(xs) // 8))],
+        "y_labels": [(TOP + (len(ys) - 0.5 - j) * high, _short(ys[j])) for j in some_y],
+        "width": wide - 1,
+        "height": high - 1,
+        "squares": squares,
+        "winners": [(colour(n), text) for n, text in winners.items()],
+    }
 
 
 def _lines(ranking: Ranking) -> dict[str, Any]:

@@ -129,28 +129,33 @@ def run_rows(cell: Cell, seed: int, observers: Sequence[str], controllers: Seque
     except ValueError as error:  # settings that exclude each other, met in this cell alone
         names = (*observers, *controllers)
         return [{**same, **_failure(name, str(error)), "key": row_key(repr(cell.changes), seed, name)} for name in names]
-    found = _observer_rows(record, ready, observers) + _controller_rows(record, ready, controllers)
+    found = _rows_of_all(_observer_rows, record, ready, observers) + _rows_of_all(_controller_rows, record, ready, controllers)
     kernel = blas_kernel()
     return [{**same, **row, "key": row_key(ready.digest, seed, row["name"]), "kernel": kernel} for row in found]
 
 
-def _observer_rows(record: Record, ready: _Ready, observers: Sequence[str]) -> list[Row]:
-    """Return the rows of observers; one that ends in an error is a failure, and the others run without it."""
-    if not observers:
+def _rows_of_all(
+    rows_of: Callable[[Record, _Ready, Sequence[str]], list[Row]], record: Record, ready: _Ready, names: Sequence[str]
+) -> list[Row]:
+    """Return the rows of observers or controllers; one that ends in an error is a failure, and the others run without it."""
+    if not names:
         return []
     try:
-        items = list(each_estimate(record, ready.scenario, observers=observers))
-        if ready.bounds is None:
-            ready.bounds = record_bounds(ready.scenario, record, {item.observer for item in items if isinstance(item, Estimate)})
-        estimates = [item for item in items if isinstance(item, Estimate)]
-        failures = [item for item in items if isinstance(item, Failure)]
-        result = collect(ready.scenario, record, estimates, failures, least=ready.bounds)
-    except SettingError as error:
-        return [_failure(name, str(error)) for name in observers]
+        return rows_of(record, ready, names)
     except Exception as error:  # by an observer of another package, perhaps
-        if len(observers) == 1:
-            return [_failure(observers[0], error_line(error))]
-        return [row for name in observers for row in _observer_rows(record, ready, [name])]
+        if len(names) == 1:
+            return [_failure(names[0], error_line(error))]
+        return [row for name in names for row in _rows_of_all(rows_of, record, replace(ready, design=None), [name])]
+
+
+def _observer_rows(record: Record, ready: _Ready, observers: Sequence[str]) -> list[Row]:
+    """Return the rows of observers and of their bounds."""
+    items = list(each_estimate(record, ready.scenario, observers=observers))
+    estimates = [item for item in items if isinstance(item, Estimate)]
+    if ready.bounds is None:
+        ready.bounds = record_bounds(ready.scenario, record, {item.observer for item in estimates})
+    failures = [item for item in items if isinstance(item, Failure)]
+    result = collect(ready.scenario, record, estimates, failures, least=ready.bounds)
     rows = [
         {
             "name": row["observer"],
@@ -170,15 +175,8 @@ def _observer_rows(record: Record, ready: _Ready, observers: Sequence[str]) -> l
 
 def _controller_rows(record: Record, ready: _Ready, controllers: Sequence[str]) -> list[Row]:
     """Return the rows of controllers and of their bound."""
-    if not controllers:
-        return []
-    try:
-        ready.design = ready.design or design(ready.scenario, controllers)
-        result = closed_loop(record, ready.design)
-    except Exception as error:
-        if len(controllers) == 1:
-            return [_failure(controllers[0], error_line(error))]
-        return [row for name in controllers for row in _controller_rows(record, replace(ready, design=None), [name])]
+    ready.design = ready.design or design(ready.scenario, controllers)
+    result = closed_loop(record, ready.design)
     return [
         {
             "name": row["controller"],

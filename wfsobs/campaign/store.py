@@ -8,7 +8,7 @@ import os
 import re
 import sys
 import uuid
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -132,8 +132,7 @@ def schema() -> pyarrow.Schema:
     """Return the columns of a file."""
     import pyarrow as pa
 
-    types = {"string": pa.string(), "int32": pa.int32(), "int64": pa.int64(), "float64": pa.float64(), "bool": pa.bool_()}
-    return pa.schema([(name, types[kind]) for name, kind in {**RESULTS, **PROVENANCE}.items()])
+    return pa.schema([(name, pa.type_for_alias(kind)) for name, kind in {**RESULTS, **PROVENANCE}.items()])
 
 
 def write_batch(folder: Path, rows: Sequence[Mapping[str, Any]], provenance: Mapping[str, Any]) -> None:
@@ -157,7 +156,7 @@ def batch_files(folder: Path) -> list[Path]:
     return sorted((folder / ROWS).glob("[!.]*.parquet"))
 
 
-def read_batch(path: Path, columns: Iterable[str]) -> pyarrow.Table | None:
+def read_batch(path: Path, columns: Collection[str]) -> pyarrow.Table | None:
     """Return the rows of one file; None where it cannot be read, or is none of a batch."""
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -173,9 +172,8 @@ def read_batch(path: Path, columns: Iterable[str]) -> pyarrow.Table | None:
     return None if any(table[name].null_count for name in COMPLETE.intersection(columns)) else table
 
 
-def read_batches(folder: Path, columns: Iterable[str]) -> Iterator[pyarrow.Table]:
+def read_batches(folder: Path, columns: Collection[str]) -> Iterator[pyarrow.Table]:
     """Yield the rows of one file after the other; one that cannot be read is left out."""
-    columns = list(columns)
     for path in batch_files(folder):
         if (table := read_batch(path, columns)) is not None:
             yield table

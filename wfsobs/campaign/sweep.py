@@ -248,16 +248,15 @@ def parse_axis(text: str) -> Variation:
     (2, 5, 10)
     """
     path, _, listed = (part.strip() for part in text.partition("="))
-    found = RANGE.fullmatch(listed)
-    if not found:
+    if not (found := RANGE.fullmatch(listed)):
         return parse_variation(text, "--over")
-    allowed = f"--over {text}: takes low:high:number with a number from 2 to {MOST_VALUES}, such as 5:20:4, or values with commas"
     try:
         low, high, count = float(found[1]), float(found[2]), int(found[3])
     except ValueError:
-        raise SettingError(allowed) from None
+        low, high, count = 0.0, 0.0, 0
     if not (isfinite(low) and isfinite(high) and 2 <= count <= MOST_VALUES):
-        raise SettingError(allowed)
+        takes = f"low:high:number with a number from 2 to {MOST_VALUES}, such as 5:20:4, or values with commas"
+        raise SettingError(f"--over {text}: takes {takes}")
     if not low < high or (found[4] and low <= 0):
         raise SettingError(f"--over {text}: the first number must be below the second{' and above 0' if found[4] else ''}")
     values = np.geomspace(low, high, count) if found[4] else np.linspace(low, high, count)
@@ -434,6 +433,10 @@ class Winner:
         return self.seeds >= FEWEST and not self.ties
 
 
+NO_EVIDENCE = gather_evidence(())
+"""That of a scenario without a run."""
+
+
 @dataclass(frozen=True)
 class SweepResults:
     """What is known of a sweep so far.
@@ -482,9 +485,9 @@ class SweepResults:
 
     def winner(self, cell: int, target: str, mode: str) -> Winner | None:
         """Return the best observer of a cell; None where nothing is known."""
-        evidence = self.evidence.get(cell)
-        ranked = evidence.ranking(target, mode) if evidence else []
-        if evidence is None or not ranked:
+        evidence = self.evidence.get(cell, NO_EVIDENCE)
+        ranked = evidence.ranking(target, mode)
+        if not ranked:
             return None
         errors = [evidence.mean((name, target, mode)) or 0.0 for name in ranked[:2]]
         margin = max(errors[1] / errors[0] - 1.0, 0.0) if len(errors) > 1 and errors[0] > 0 else None
@@ -492,10 +495,10 @@ class SweepResults:
 
     def verdict(self, cell: int, target: str, mode: str) -> Verdict | None:
         """Return the verdict on a cell, without what does harm; None where nothing is known."""
-        evidence, scores = self.evidence.get(cell), self.scores.get(cell)
-        if evidence is None or not scores or not evidence.ranking(target, mode):
+        evidence = self.evidence.get(cell, NO_EVIDENCE)
+        if not evidence.ranking(target, mode):
             return None
-        places = contenders(self.sweep.scenario(cell), evidence, scores[0], target, mode)
+        places = contenders(self.sweep.scenario(cell), evidence, self.scores[cell][0], target, mode)
         return Verdict(target, mode, places, 0, (), evidence.n_seeds)
 
     def error(self, cell: int, key: Key) -> tuple[float, float, float] | None:
@@ -503,20 +506,16 @@ class SweepResults:
 
         Without an interval, the ends are the mean; a bound has none. None where the error is not known.
         """
+        evidence = self.evidence.get(cell, NO_EVIDENCE)
+        mean = evidence.mean(key)
         if key[0] in BOUNDS:
             known = [s.rms for scores in self.scores.get(cell, ()) for s in scores if (s.observer, s.target, s.mode) == key]
             mean = float(np.mean(known)) if known else None
-            return None if mean is None else (mean, mean, mean)
-        evidence = self.evidence.get(cell)
-        mean = evidence.mean(key) if evidence else None
-        if evidence is None or mean is None:
-            return None
-        return (mean, *(evidence.interval(key) or (mean, mean)))
+        return None if mean is None else (mean, *(evidence.interval(key) or (mean, mean)))
 
     def known_keys(self) -> list[Key]:
         """Return (observer, target, mode) of all that is known in some cell, in the order of the scores."""
-        known = {(s.observer, s.target, s.mode): None for seeds in self.scores.values() for s in seeds[0]}
-        return list(known)
+        return list(dict.fromkeys((s.observer, s.target, s.mode) for seeds in self.scores.values() for s in seeds[0]))
 
     def to_xarray(self) -> xarray.Dataset:
         """Return mean errors `rms` and the ends `low` and `high` of their intervals [um], as `error` does, as labelled arrays.

@@ -118,6 +118,5 @@ def _rows(timing: RealTime) -> list[tuple[str, list[float]]]:
 def _verdict(timing: RealTime) -> str:
     """Return one line: what is held."""
     in_time = f"{100 * (1 - timing.late_share):.2f} % of the frames at {timing.rate:g} Hz are done before the next is due"
-    if not timing.highest_rate:
-        return f"{timing.name}: {in_time}; this machine holds no rate in {100 * SHARE:g} % of the frames"
-    return f"{timing.name}: {in_time}; this machine holds {timing.highest_rate:g} Hz in {100 * SHARE:g} % of the frames"
+    held = f"{timing.highest_rate:g} Hz" if timing.highest_rate else "no rate"
+    return f"{timing.name}: {in_time}; this machine holds {held} in {100 * SHARE:g} % of the frames"

@@ -26,7 +26,6 @@ from wfsobs.campaign.follow import CampaignFolder, TogetherRow, standings
 from wfsobs.campaign.plan import Campaign, cells_where, load_plan
 from wfsobs.campaign.pools import DaskCluster, Processes, usable_processors
 from wfsobs.campaign.run import BATCH, run_campaign, run_cost, run_rows
-from wfsobs.campaign.run import Progress as State
 from wfsobs.campaign.store import RESULTS, add_settings, finished_runs, folder_plan, need_pyarrow, present_rows, read_results
 from wfsobs.campaign.sweep import MOST_SEEDS, SweepResults, parse_axis, plan_sweep, run_sweep
 from wfsobs.cli.options import json_option, observer_option, scenario_options
@@ -156,10 +155,6 @@ def print_together(folder: Path, only: Sequence[str], target: str | None, mode: 
         out.writerows([["" if value != value else value for value in astuple(row)] for row in rows])  # NaN is not known
         return
     title = f"{state.plan.name}: {state.n_done} of {state.plan.n_runs} runs, {len(cells)} of {len(state.plan.cells)} scenarios"
-    show_table(_table(rows, title))
-
-
-def _table(rows: Sequence[TogetherRow], title: str) -> Table:
     caption = "wins: scenarios with the smallest error, and how many of them are significant"
     out = new_table(("Target", "Mode", "Name"), NUMBERS, no_wrap=False, title=title, caption=caption)
     before = None
@@ -178,7 +173,7 @@ def _table(rows: Sequence[TogetherRow], title: str) -> Table:
             "" if row.failures is None else str(row.failures),
         )
         before = key
-    return out
+    show_table(out)
 
 
 def _above(row: TogetherRow) -> str:
@@ -290,11 +285,14 @@ def run(plan_file: str, out: str, workers: int | None, scheduler: str | None, sh
     with _bar(plan.name) as bar:
         place = DaskCluster(scheduler, print_note) if scheduler else Processes(workers or usable_processors())
         task = bar.add_task("runs", total=None)
-
-        def tell(state: State) -> None:
-            bar.update(task, completed=state.n_done, total=state.total)
-
-        state = run_campaign(plan, Path(out), place, shard=share, report=tell, must_stop=stop)
+        state = run_campaign(
+            plan,
+            Path(out),
+            place,
+            shard=share,
+            report=lambda it: bar.update(task, completed=it.n_done, total=it.total),
+            must_stop=stop,
+        )
     if as_json:
         print_json(
             {"total": state.total, "done": state.n_done, "before": state.before, "runs": state.runs, "breaks": state.breaks}

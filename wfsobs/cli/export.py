@@ -7,6 +7,7 @@ import click
 from wfsobs.campaign.sweep import MOST_SEEDS
 from wfsobs.cli.options import (
     RECORD_OPTIONS,
+    DeclaredFile,
     FiniteRange,
     load_declared,
     needing,
@@ -27,7 +28,6 @@ from wfsobs.plot.paper import NUMBERS, draw_paper_figure, observers_in
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import MOST, parse_variation
 from wfsobs.settings.group import SettingError
-from wfsobs.telemetry.intake import DeclaredFormat
 
 
 @click.command()
@@ -83,8 +83,7 @@ def export(
 def figure(
     name: str,
     scenario: Scenario,
-    declaration: DeclaredFormat,
-    sha256: str | None,
+    declaration: DeclaredFile,
     train: str | None,
     train_until: float | None,
     out: str,
@@ -100,7 +99,7 @@ def figure(
     if record_file is None:
         refuse_options((*RECORD_OPTIONS, "train", "train_until"), "only with --record")
     names = observers_in(name)
-    record = load_declared(record_file, scenario, declaration, sha256) if record_file else None
+    record = load_declared(record_file, scenario, declaration) if record_file else None
     with progress_bar() as watch:
         if record is None:
             result = run(scenario, observers=names, watch=watch)

@@ -14,6 +14,7 @@ import numpy as np
 
 from wfsobs.cli.options import (
     RECORD_OPTIONS,
+    DeclaredFile,
     FiniteRange,
     controller_option,
     json_option,
@@ -43,7 +44,6 @@ from wfsobs.settings.group import SettingError
 from wfsobs.streams.network import is_address
 from wfsobs.streams.shared_image import stream_path
 from wfsobs.telemetry.formats import WRITTEN
-from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.records import save_record
 from wfsobs.units import micrometres_per
 
@@ -79,8 +79,7 @@ def live(
     ngs: str | None,
     ngs_modes: str | None,
     ngs_lag: int,
-    declaration: DeclaredFormat,
-    sha256: str | None,
+    declaration: DeclaredFile,
     observers: tuple[str, ...],
     controllers: tuple[str, ...],
     no_controllers: bool,
@@ -100,7 +99,7 @@ def live(
     for file, endings in ((record_file, WRITTEN), (log_file, ())):
         if file:
             check_writable(file, replay_file, *declaration.files, endings=endings)
-    source = _source(scenario, replay_file, stream, modes, declaration, sha256)
+    source = _source(scenario, replay_file, stream, modes, declaration)
     if not isinstance(source, SimulatedLoop):
         scenario = scenario.before_events
     acts_of(scenario)
@@ -162,12 +161,11 @@ def _source(
     replay_file: str | None,
     stream: str | None,
     modes: str | None,
-    declaration: DeclaredFormat,
-    sha256: str | None,
+    declaration: DeclaredFile,
 ) -> LiveSource:
     """Return the source that the options name. Raises SettingError, RecordError."""
     if replay_file:
-        return Replay(load_declared(replay_file, scenario, declaration, sha256))
+        return Replay(load_declared(replay_file, scenario, declaration))
     if not stream:
         return SimulatedLoop(scenario)
     elements = stream_elements(modes, len(scenario.modes))

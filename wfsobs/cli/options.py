@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import dataclass, fields, replace
 from functools import wraps
 from math import erfc, isfinite, sqrt
 from typing import Any
@@ -41,7 +41,15 @@ class FiniteRange(click.FloatRange):
 POSITIVE = FiniteRange(0, min_open=True)
 """Type of options that take a number above 0."""
 
-RECORD_OPTIONS = (*(field.name for field in fields(DeclaredFormat)), "sha256")
+
+@dataclass(frozen=True)
+class DeclaredFile(DeclaredFormat):
+    """What the user says of a record file; sha256 : its SHA-256, where it is to have a certain one."""
+
+    sha256: str | None = None
+
+
+RECORD_OPTIONS = tuple(field.name for field in fields(DeclaredFile))
 """Parameters of the options of `record_options`."""
 
 
@@ -161,33 +169,26 @@ def ngs_options(command: Callable) -> Callable:
 
 
 def record_options(command: Callable) -> Callable:
-    """Add what is stated of a record file, from --unit to --trust, received as `declaration`, and --sha256."""
+    """Add what is stated of a record file, from --unit to --trust, and --sha256, received as `declaration`."""
 
     @wraps(command)
-    def with_declaration(
-        *,
-        command_sign: str | None,
-        columns: Sequence[str],
-        command_gain: str | None,
-        reconstructor: str | None,
-        command_modes: str | None,
-        **values: Any,
-    ) -> Any:
+    def with_declaration(**values: Any) -> Any:
+        stated = {field.name: values.pop(field.name) for field in fields(DeclaredFile)}
         config = click.get_current_context().params.get("config")
         roles = {} if config is None else configfile.load_columns(config)
-        for text in columns:
+        for text in stated["columns"]:
             role, equals, name = text.partition("=")
             if not equals:
                 raise SettingError(f"--column {text}: takes ROLE=NAME, such as y_lgs/tip=slope_x")
             roles[role.strip()] = name
+        sign, gain = stated["command_sign"], stated["command_gain"]
         try:
-            gain = tuple(map(float, command_gain.split(","))) if command_gain else None
+            gains = tuple(map(float, gain.split(","))) if gain else None
         except ValueError:
-            raise SettingError(f"--command-gain {command_gain}: takes a number, or one per mode with commas") from None
-        stated = {name: values.pop(name) for name in ("unit", "command_delay", "rate", "trust", "rail", "open_loop")}
-        sign = int(command_sign) if command_sign else None
-        stated |= {"reconstructor": read_loop_matrix(reconstructor), "command_modes": read_loop_matrix(command_modes)}
-        return command(declaration=DeclaredFormat(command_sign=sign, columns=roles, command_gain=gain, **stated), **values)
+            raise SettingError(f"--command-gain {gain}: takes a number, or one per mode with commas") from None
+        stated |= {name: read_loop_matrix(stated[name]) for name in ("reconstructor", "command_modes")}
+        stated |= {"columns": roles, "command_sign": int(sign) if sign else None, "command_gain": gains}
+        return command(declaration=DeclaredFile(**stated), **values)
 
     return add_options(
         with_declaration,
@@ -261,13 +262,13 @@ def training_options(command: Callable) -> Callable:
 
 
 def training(
-    train: str | None, train_until: float | None, record: Record, scenario: Scenario, declaration: DeclaredFormat
+    train: str | None, train_until: float | None, record: Record, scenario: Scenario, declaration: DeclaredFile
 ) -> Record | float | None:
     """Read and check what --train and --train-until name, and say it on standard error. Raises SettingError, RecordError."""
     if train is not None and train_until is not None:
         raise SettingError("--train and --train-until: give one of them")
     if train is not None:
-        other = training_part(record, load_declared(train, scenario, declaration), scenario)
+        other = training_part(record, load_declared(train, scenario, replace(declaration, sha256=None)), scenario)
         print_note(f"training data: {train}, {other.n_steps * other.dt:g} s; no score is of it")
         return other
     if train_until is not None:
@@ -277,9 +278,9 @@ def training(
     return train_until
 
 
-def load_declared(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None = None) -> Record:
+def load_declared(record_file: str, scenario: Scenario, declaration: DeclaredFile) -> Record:
     """Read the record of a file; print its interpretation on standard error. Raises RecordError, of constants as well."""
-    record = load_with_delay(record_file, scenario, declaration, sha256)[0]
+    record = load_with_delay(record_file, scenario, declaration)[0]
     if len(_still(record)) == record.n_modes:
         raise RecordError(f"{record_file}: y_lgs is one value all the time; a measurement has noise")
     return record
@@ -290,11 +291,9 @@ def _still(record: Record) -> list[str]:
     return [name for name, y in zip(MODE_NAMES, record.y_lgs.T, strict=False) if np.fmax.reduce(y) == np.fmin.reduce(y)]
 
 
-def load_with_delay(
-    record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None
-) -> tuple[Record, float]:
+def load_with_delay(record_file: str, scenario: Scenario, declaration: DeclaredFile) -> tuple[Record, float]:
     """As `load_declared`, and the delay of the commands with its fraction [steps]."""
-    with open_record(record_file, sha256) as (file, name):
+    with open_record(record_file, declaration.sha256) as (file, name):
         record, delay = read_with_delay(file, name, scenario, declaration)
     if record.origin:
         print_note(f"{record_file}: read as {record.origin}")

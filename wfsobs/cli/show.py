@@ -257,15 +257,11 @@ def budget_table(budgets: Sequence[Budget]) -> Table:
         if last != (it.target, it.mode):
             out.add_section()
         last = (it.target, it.mode)
-        cells = (f"{_one_digit(it.terms[name] * 1e6)} {round(100.0 * it.terms[name] / it.total):4d} %" for name in TERMS)
+        parts = [(round(it.terms[name] * 1e6, 1) + 0.0, it.terms[name] / it.total) for name in TERMS]  # zero without a sign
+        cells = (f"{part:.1f} {round(100.0 * share):4d} %" for part, share in parts)
         bound = "-" if it.bound is None else f"{it.bound * 1e6:.1f}"
         out.add_row(*last, row_label(it.observer), f"{sqrt(it.total) * 1e3:.2f}", f"{it.total * 1e6:.1f}", *cells, bound)
     return out
-
-
-def _one_digit(x: float) -> str:
-    """One digit, without the sign of what rounds to zero."""
-    return f"{round(x, 1) + 0.0:.1f}"
 
 
 def show(all_rows: list[Row], as_json: bool) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from statistics import mean, median
+from statistics import mean
 
 import click
 import numpy as np
@@ -13,6 +13,7 @@ from rich.table import Table
 from wfsobs.cli.options import (
     POSITIVE,
     RECORD_OPTIONS,
+    DeclaredFile,
     controller_option,
     json_option,
     load_declared,
@@ -57,7 +58,6 @@ from wfsobs.settings.values import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.formats import WRITTEN
 from wfsobs.telemetry.formats.psd import load_psd
-from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.records import save_record
 from wfsobs.tuning import EnvelopeGoal, tuned_envelope
 from wfsobs.units import UNITS
@@ -103,16 +103,10 @@ def loop_table(rows: Sequence[Row]) -> Table:
             median_text(same, "gain", 3),
             linear(same, _margins(same[0])),
             linear(same, median_text(same, "delay_margin_ms", 2)),
-            _share(same),
+            median_text(same, "limited", 2, 100.0),
         )
     out.caption = no_theory(rows) or None
     return out
-
-
-def _share(same: Sequence[Row]) -> str:
-    """Share of the limited steps in per cent, the median over seeds."""
-    shares = [100.0 * r["limited"] for r in same if r["limited"] is not None]
-    return f"{median(shares):.2f}" if shares else "-"
 
 
 def _margins(row: Row) -> str:
@@ -215,8 +209,7 @@ def loop(
     controllers: tuple[str, ...],
     seeds: int,
     record_file: str | None,
-    declaration: DeclaredFormat,
-    sha256: str | None,
+    declaration: DeclaredFile,
     train: str | None,
     train_until: float | None,
     with_envelope: bool,
@@ -231,7 +224,7 @@ def loop(
     else:
         if seeds > 1:
             raise SettingError("--seeds: only for simulated records, not with --record")
-        record = load_declared(record_file, scenario, declaration, sha256)
+        record = load_declared(record_file, scenario, declaration)
         scenario = as_stated(record, scenario)
         learnt = training(train, train_until, record, scenario, declaration)
         record, start = record if learnt is None else with_training(record, learnt, scenario), trained_until(learnt)

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, replace
 
 import click
 import numpy as np
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from wfsobs.cli.options import (
     POSITIVE,
+    DeclaredFile,
     FiniteRange,
     controller_option,
     json_option,
@@ -54,6 +53,7 @@ from wfsobs.priors_from.controllers import plant_of
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.zernike import HIGHEST_ORDER, modes_up_to
+from wfsobs.settings.values import errors_of
 from wfsobs.spectral.search import LOWEST
 from wfsobs.telemetry.check import Check, check_record
 from wfsobs.telemetry.intake import DeclaredFormat, to_record
@@ -66,13 +66,13 @@ from wfsobs.telemetry.records import load_record, name_differences, open_record,
 @click.argument("out", metavar="OUT")
 @scenario_options
 @record_options
-def convert(record_file: str, out: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None) -> None:
+def convert(record_file: str, out: str, scenario: Scenario, declaration: DeclaredFile) -> None:
     """Write a record in another format: .npz, .aot.fits, .fits, .h5, .mat, .csv or .parquet.
 
     What is written is read back and compared; parts that the format has no place for are named.
     """
     check_writable(out, record_file, *declaration.files)
-    record = load_with_delay(record_file, scenario, declaration, sha256)[0]
+    record = load_with_delay(record_file, scenario, declaration)[0]
     save_record(out, record)
     if lost := name_differences(record, load_record(out, scenario, DeclaredFormat(trust=True))):
         print_note(f"{out}: has no place for {', '.join(lost)}")
@@ -90,13 +90,9 @@ def identification_table(result: Identification) -> Table:
     for m in result.modes:
         out.add_section()
         for what, frequency, damping, rms in mode_rows(m):
-            numbers = (frequency, damping, None if rms is None else _nm(rms))
+            numbers = (frequency, damping, None if rms is None else Number(rms.value * 1e3, rms.std * 1e3))
             out.add_row(m.name, what, *("" if n is None else format_number(n) for n in numbers))
     return out
-
-
-def _nm(n: Number) -> Number:
-    return Number(n.value * 1e3, n.std * 1e3)
 
 
 @record_command
@@ -108,8 +104,7 @@ def _nm(n: Number) -> Number:
 def observe(
     record_file: str,
     scenario: Scenario,
-    declaration: DeclaredFormat,
-    sha256: str | None,
+    declaration: DeclaredFile,
     train: str | None,
     train_until: float | None,
     observers: tuple[str, ...],
@@ -121,7 +116,7 @@ def observe(
     if out:
         check_writable(out, record_file, train, *declaration.files, endings=(".npz",))
     scenario = told_scenario(prior, scenario)
-    record = load_declared(record_file, scenario, declaration, sha256)
+    record = load_declared(record_file, scenario, declaration)
     learnt = training(train, train_until, record, scenario, declaration)
     with progress_bar() as watch:
         told = None if prior is None else scenario
@@ -157,8 +152,7 @@ def observe(
 def identify(
     record_file: str,
     scenario: Scenario,
-    declaration: DeclaredFormat,
-    sha256: str | None,
+    declaration: DeclaredFile,
     level: float,
     lowest: float,
     out: str | None,
@@ -167,8 +161,8 @@ def identify(
     """Find noise, turbulence and vibration peaks in a record (docs/identification.md)."""
     if out:
         check_writable(out, record_file, *declaration.files)
-    record = load_declared(record_file, scenario, declaration, sha256)
-    with errors_of(record_file), progress_bar("sweeps") as watch:
+    record = load_declared(record_file, scenario, declaration)
+    with errors_of(record_file, RecordError), progress_bar("sweeps") as watch:
         result = identify_record(record, level=level, lowest=lowest, watch=watch)
     if out:
         write_text(out, identification_toml(result, result.scenario(as_stated(record, scenario))))
@@ -180,21 +174,12 @@ def identify(
         click.echo(line)
 
 
-@contextmanager
-def errors_of(what: str) -> Iterator[None]:
-    """Prefix the message of a RecordError, such as with the name of a file."""
-    try:
-        yield
-    except RecordError as error:
-        raise RecordError(f"{what}: {error}") from None
-
-
 @record_command
 @json_option()
-def plant(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None, as_json: bool) -> None:
+def plant(record_file: str, scenario: Scenario, declaration: DeclaredFile, as_json: bool) -> None:
     """Identify what the commands of a closed loop do: delay, gain and rotation."""
-    record = load_declared(record_file, scenario, declaration.as_commanded, sha256)
-    with errors_of(record_file), progress_bar("groups of modes") as watch:
+    record = load_declared(record_file, scenario, declaration.as_commanded)
+    with errors_of(record_file, RecordError), progress_bar("groups of modes") as watch:
         groups = identify_plant(record, watch)
     if as_json:
         print_json(plant_dict(groups))
@@ -213,18 +198,16 @@ def plant(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha
 @record_command
 @click.option("--prior", metavar="FOUND.toml", help="Also the gain by these spectra: the file of `wfsobs identify --out`.")
 @json_option()
-def gain(
-    record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None, prior: str | None, as_json: bool
-) -> None:
+def gain(record_file: str, scenario: Scenario, declaration: DeclaredFile, prior: str | None, as_json: bool) -> None:
     """Find the integrator's optimal gain from closed-loop telemetry (docs/closed_loop.md)."""
-    whole, delay = load_with_delay(record_file, scenario, declaration, sha256)
+    whole, delay = load_with_delay(record_file, scenario, declaration)
     record = whole.without_outliers
     scenario = as_stated(record, told_scenario(prior, scenario)).replace({"control.delay": delay})
     mirror, leak = plant_of(scenario).mirror, scenario.control.leak
     laws = design(scenario, ["integrator"]).laws["integrator"] if prior else ()
     rows = []
     for mode, name in enumerate(m.name for m in modes_up_to(HIGHEST_ORDER)[: record.n_modes]):
-        with errors_of(f"{record_file}: {name}"):
+        with errors_of(f"{record_file}: {name}", RecordError):
             found = gain_from_telemetry(record.z[record.delay :, mode], mirror, leak)
         left = float(np.sqrt(np.nanmean(np.square(record.y_lgs[:, mode]))))
         law = laws[mode].law if laws else None
@@ -251,16 +234,15 @@ def gain(
 def promise(
     record_file: str,
     scenario: Scenario,
-    declaration: DeclaredFormat,
-    sha256: str | None,
+    declaration: DeclaredFile,
     controllers: tuple[str, ...],
     after: str | None,
     as_json: bool,
 ) -> None:
     """State what controllers will leave of a loop, before one of them is switched on (docs/trust.md)."""
-    record = load_declared(record_file, scenario, declaration.as_commanded, sha256)
-    later = None if after is None else load_declared(after, scenario, declaration.as_commanded)
-    with errors_of(record_file), progress_bar("controllers") as watch:
+    record = load_declared(record_file, scenario, declaration.as_commanded)
+    later = None if after is None else load_declared(after, scenario, replace(declaration.as_commanded, sha256=None))
+    with errors_of(record_file, RecordError), progress_bar("controllers") as watch:
         result = make_promise(record, scenario, controllers=controllers or None, watch=watch)
     found = None if later is None else result.left_in(later)
     if as_json:
@@ -320,10 +302,10 @@ COLOURS = {"ok": "green", "note": "yellow", "undecided": "yellow", "excluded": "
 
 @record_command
 @json_option()
-def check(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None, as_json: bool) -> None:
+def check(record_file: str, scenario: Scenario, declaration: DeclaredFile, as_json: bool) -> None:
     """Check a record: what was read, and what of it can be relied on."""
-    with open_record(record_file, sha256) as (file, name):
-        with errors_of(record_file):
+    with open_record(record_file, declaration.sha256) as (file, name):
+        with errors_of(record_file, RecordError):
             contents = read_contents(file, name, declaration.columns)
             record, raw = (to_record(contents, scenario, way) for way in (declaration, declaration.as_commanded))
     reading = read_off(record, contents, declaration, scenario)
@@ -355,9 +337,7 @@ def check(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha
 
 def check_table(result: Check, name: str) -> Table:
     """Return the findings of a check, a row each."""
-    out = Table(title=name, title_justify="left", show_edge=False)
-    for column in ("", "What", "Found"):
-        out.add_column(column, no_wrap=column == "")
+    out = Table(Column(no_wrap=True), "What", "Found", title=name, title_justify="left", show_edge=False)
     for f in result.findings:
         out.add_row(Text(f.verdict, COLOURS[f.verdict]), f.subject, Text(f.text))
     return out

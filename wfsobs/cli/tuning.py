@@ -11,6 +11,7 @@ from rich.table import Table
 from wfsobs.cli.options import (
     POSITIVE,
     RECORD_OPTIONS,
+    DeclaredFile,
     FiniteRange,
     json_option,
     load_declared,
@@ -28,7 +29,6 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario
 from wfsobs.settings.values import SettingError
-from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.tuning import EnvelopeGoal
 from wfsobs.tuning import tune as search
 from wfsobs.tuning.records import judged_by
@@ -152,8 +152,7 @@ def tune(
     evaluations: int,
     validation: float | None,
     record_file: str | None,
-    declaration: DeclaredFormat,
-    sha256: str | None,
+    declaration: DeclaredFile,
     out: str | None,
     as_json: bool,
 ) -> None:
@@ -171,7 +170,7 @@ def tune(
     else:
         if validation is not None:
             raise SettingError("--validation: only for simulated records, not with --record")
-        record = load_declared(record_file, scenario, declaration, sha256)
+        record = load_declared(record_file, scenario, declaration)
         is_known = target and not on_envelope and name in OBSERVERS and target in OBSERVERS[name].targets
         if target and is_known and (judged := judged_by(record, name, target)[0]) != target:
             raise SettingError(f"--target {target}: the record has no truth; {name} is tuned by its {judged}")

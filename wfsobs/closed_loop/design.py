@@ -235,8 +235,8 @@ def exact_residuals(controller: str, scenario: Scenario) -> list[PeriodicError]:
             raise ValueError(f"{controller}: the exact residual is that of a stable linear law: {found.note or 'it has none'}")
         spectra = true_spectra(scenario, mode)
         ratio = spectra.ngs.ratio
-        fast, slow = _responses(found.law, plan.mirror, ratio, spectra.n // (2 * ratio) * ratio)
-        out.append(PeriodicError(variance_of(fast, slow, TOTAL, spectra)))
+        taps = np.stack(_responses(found.law, plan.mirror, ratio, spectra.n // (2 * ratio) * ratio))
+        out.append(PeriodicError(variance_of(taps, TOTAL, spectra)))
     return out
 
 

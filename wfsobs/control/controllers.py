@@ -112,7 +112,8 @@ def _matched_noise(settings: Any) -> tuple[Part, ...]:
 
 
 def _offline_used(settings: Any) -> Plain:
-    return of_z(settings.gpr_offline).effective_values()
+    own = of_z(settings.gpr_offline)
+    return {name: value for name, value in own.to_dict().items() if name not in own.idle()}
 
 
 def _online_used(settings: Any) -> Plain:

@@ -329,15 +329,14 @@ def least_errors_of_both(spectra: TrueSpectra, ahead: int = 0, stars: StarSpectr
     if stars is None:
         gained = variance_from_frames(wanted, known.whitener, frames)
     else:
-
-        def with_frames(i: int) -> Complex:
-            return advance_spectrum(stars.pair(NGS, FIRST + i) * exposure, 1)
-
-        def with_axis(i: int) -> Complex:
-            return advance_spectrum(stars.pair(AXIS, FIRST + i), 1 + ahead)
-
-        others = FastSensors(stars.n_differences, stars.between, lambda i: stars.pair(FIRST + i, LGS), with_frames)
-        targets = [(one, with_axis if name == TURBULENCE else None) for name, one in zip(parts, wanted, strict=True)]
+        others = FastSensors(
+            stars.n_differences,
+            stars.between,
+            lambda i: stars.pair(FIRST + i, LGS),
+            lambda i: advance_spectrum(stars.pair(NGS, FIRST + i) * exposure, 1),
+        )
+        on_axis = {TURBULENCE: lambda i: advance_spectrum(stars.pair(AXIS, FIRST + i), 1 + ahead)}
+        targets = [(one, on_axis.get(name)) for name, one in zip(parts, wanted, strict=True)]
         gained = variance_from_sensors(targets, known.whitener, others, frames)
     alone = {name: circle_mean(known.estimate(*parts[of], ahead=ahead).error) for name, of in _sums(parts).items()}
     left = {name: alone[name] - gained[:, of, of].sum(axis=(1, 2)) for name, of in _sums(parts).items()}

@@ -34,7 +34,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 from math import sqrt
 from time import monotonic
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -48,7 +48,6 @@ from wfsobs.progress import QUIET
 from wfsobs.record import TOTAL, Measurements, Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.autoregressive import Ar3Fits
-from wfsobs.signal.sensor_array import SlowSensor
 from wfsobs.signal.spectrum import expected_psd, psd
 from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean, square
 from wfsobs.simulation.flow_spectra import TurbulenceSpectra
@@ -64,17 +63,6 @@ SHORTEST = 2**11
 
 START = 1000
 """Steps before the first impulse where there are frames of the NGS: gains are those that repeat."""
-
-
-class SensorResponse(NamedTuple):
-    """Response of an estimate to the LGS and to the frames of the NGS.
-
-    fast, slow : h_p of z and g_p of the frames, (ratio, length); of an observer of the LGS alone (1, length), and None. Or their
-        transforms c_l and d_l, (ratio, n // 2 + 1)
-    """
-
-    fast: Array | Complex
-    slow: Array | Complex | None = None
 
 
 @dataclass(frozen=True)
@@ -100,23 +88,10 @@ class TargetSpectra:
     spectra: TrueSpectra
 
     @cached_property
-    def _ngs(self) -> tuple[SlowSensor, Complex]:
-        return ngs_frames(self.spectra)
-
-    @cached_property
-    def frames(self) -> Array:
-        """Spectrum of the NGS with the noise of a frame."""
-        return self._ngs[0].spectrum + self._ngs[0].noise
-
-    @property
-    def frames_by_z(self) -> Complex:
-        """Cross spectrum of the NGS with z."""
-        return self._ngs[0].cross
-
-    @cached_property
-    def by_frames(self) -> Complex:
-        """Cross spectrum of s with the NGS."""
-        return self.ngs_cross * self._ngs[1].conj()
+    def of_frames(self) -> tuple[Array, Complex, Complex]:
+        """Spectrum of the NGS with the noise of a frame, its cross spectrum with z, and that of s with it."""
+        ngs, exposure = ngs_frames(self.spectra)
+        return ngs.spectrum + ngs.noise, ngs.cross, self.ngs_cross * exposure.conj()
 
 
 def target_spectra(spectra: TrueSpectra, target: str) -> TargetSpectra:
@@ -136,7 +111,7 @@ def impulse_responses(
     most: int,
     first: int = SHORTEST,
     left: float = SETTLED,
-) -> dict[str, SensorResponse]:
+) -> dict[str, Array]:
     """Compute the coefficients of a linear observer's estimates, in one mode, from one record of impulses one after the other.
 
     Parameters
@@ -158,8 +133,8 @@ def impulse_responses(
 
     Returns
     -------
-    dict of str to SensorResponse
-        Target -> coefficients.
+    dict of str to Array
+        Target -> h_p of z and g_p of the frames, (2, ratio, length); of an observer of the LGS alone h of z, (1, 1, length).
     """
     has_frames = "ngs" in observer.sensors
     ratio = ratio if has_frames else 1
@@ -173,7 +148,7 @@ def impulse_responses(
         z[at[:ratio]] = frames[at[ratio:]] = 1.0
         sensors = {"y_ngs": frames, "ratio": ratio} if has_frames else {}
         found = observer.estimate(Measurements(z, np.zeros_like(z), dt, **sensors), prior, settings, QUIET)
-        out, settled = dict[str, SensorResponse](), True
+        out, settled = dict[str, Array](), True
         for target, values in found.items():
             taps, late = np.zeros((2, ratio, length)), np.arange(length)
             rest = np.nan_to_num(values[at[0] - ratio : at[0], 0])  # over the cycle before the first impulse
@@ -181,33 +156,31 @@ def impulse_responses(
                 response = np.nan_to_num(values[step : step + length, 0]) - rest[(late + step - at[0]) % ratio]
                 settled &= bool(np.abs(response[-length // 8 :]).max() <= left * np.abs(response).max())
                 taps[i // ratio, (i + late) % ratio, late] = response
-            out[target] = SensorResponse(*taps[: 1 + has_frames])
+            out[target] = taps[: 1 + has_frames]
         if settled or length == longest:
             return out
         length = min(2 * length, longest)
 
 
-def over_cycle(taps: SensorResponse, n: int) -> SensorResponse:
-    """Return the transforms of coefficients over n steps."""
-    phases = np.arange(len(taps.fast))
+def over_cycle(taps: Array, n: int) -> Complex:
+    """Return the transforms c_l and d_l of coefficients over n steps, (1 or 2, ratio, n // 2 + 1)."""
+    phases = np.arange(taps.shape[1])
     places = np.exp(-2j * np.pi * np.outer(phases, phases) / phases.size) / phases.size
-    return SensorResponse(*(places @ np.fft.rfft(h, n) for h in taps if h is not None))
+    return places @ np.fft.rfft(taps, n)
 
 
-def cycle_spectra(response: SensorResponse, sensors: TargetSpectra) -> tuple[Array, Array]:
-    """Return the spectra of an estimate and of its error on average over the cycle, (n // 2 + 1,).
+def cycle_spectra(response: Complex, sensors: TargetSpectra) -> tuple[Array, Array]:
+    """Return the spectra of an estimate and of its error on average over the cycle, (n // 2 + 1,); response : of `over_cycle`.
 
     What moves to a frequency between those of the DFT is at the nearest one.
     """
-    ratio, n = len(response.fast), 2 * (sensors.z.size - 1)
-    pairs = list(zip(response.fast, [None] * ratio if response.slow is None else response.slow, strict=True))
-    if ratio == 1:
-        power = _estimate_power(*pairs[0], sensors)
-        return power, power + _rest_of_error(*pairs[0], sensors)
+    ratio, n = response.shape[1], 2 * (sensors.z.size - 1)
     out = np.zeros((2, 2 * n))
-    for wave, (c, d) in enumerate(pairs):
-        power = _estimate_power(c, d, sensors)
-        parts = np.stack([power, power + _rest_of_error(c, d, sensors) if wave == 0 else power])
+    for wave in range(ratio):
+        power = _estimate_power(response[:, wave], sensors)
+        parts = np.stack([power, power + _rest_of_error(response[:, wave], sensors) if wave == 0 else power])
+        if ratio == 1:
+            return parts[0], parts[1]
         shift = round(wave * n / ratio)
         parts[:, [0, -1]] *= 0.5  # these are their own at negative frequencies
         out[:, shift : shift + parts.shape[1]] += parts
@@ -216,16 +189,23 @@ def cycle_spectra(response: SensorResponse, sensors: TargetSpectra) -> tuple[Arr
     return signal, error
 
 
-def _estimate_power(c: Complex, d: Complex | None, sensors: TargetSpectra) -> Array:
-    """Return the spectrum of an estimate from its responses to z and to the frames."""
+def _estimate_power(response: Complex, sensors: TargetSpectra) -> Array:
+    """Return the spectrum of an estimate from its responses to z and to the frames, if it has any, (1 or 2, n // 2 + 1)."""
+    c, *of_frames = response
     power = square(c) * sensors.z
-    return power if d is None else power + square(d) * sensors.frames + 2.0 * _real_product(d * sensors.frames_by_z, c)
+    for d in of_frames:
+        frames, frames_by_z, _ = sensors.of_frames
+        power = power + square(d) * frames + 2.0 * _real_product(d * frames_by_z, c)
+    return power
 
 
-def _rest_of_error(c: Complex, d: Complex | None, sensors: TargetSpectra) -> Array:
+def _rest_of_error(response: Complex, sensors: TargetSpectra) -> Array:
     """Return the spectrum of its error less that of the estimate."""
+    c, *of_frames = response
     shared = _real_product(sensors.by_z, c)
-    return sensors.signal - 2.0 * (shared if d is None else shared + _real_product(sensors.by_frames, d))
+    for d in of_frames:
+        shared = shared + _real_product(sensors.of_frames[2], d)
+    return sensors.signal - 2.0 * shared
 
 
 def _real_product(a: Complex, b: Complex) -> Array:
@@ -272,25 +252,22 @@ def exact_errors(
         prior, ratio = prior_of(scenario, None, observer.parts(settings), modes=[mode]), known.ngs.ratio
         taps = impulse_responses(observer, prior, settings, scenario.dt, ratio, known.measurement.size, left=EXACT)
         if len(taps) > 1:
-            taps[TOTAL] = SensorResponse(*(np.sum(h, axis=0) for h in zip(*taps.values(), strict=True) if h[0] is not None))
-        variances = {target: variance_of(*pair, target, known) for target, pair in taps.items()}
+            taps[TOTAL] = np.sum([*taps.values()], axis=0)
+        variances = {target: variance_of(of, target, known) for target, of in taps.items()}
         out.append({target: PeriodicError(np.repeat(x, ratio // x.size)) for target, x in variances.items()})
     return out
 
 
-def variance_of(fast: Array, slow: Array | None, target: str, spectra: TrueSpectra) -> Array:
-    """Return the variance of the error [um^2] at every place in the cycle, (ratio,); fast, slow : h_p, g_p (ratio, length).
-
-    slow : None for an observer of the LGS alone
-    """
-    known = spectra.without_lines
+def variance_of(taps: Array, target: str, spectra: TrueSpectra) -> Array:
+    """Return the variance of the error [um^2] at every place in the cycle, (ratio,); taps : of `impulse_responses`."""
+    known, (fast, *of_frames) = spectra.without_lines, taps
     sensors = target_spectra(known, target)
-    pairs = zip(np.fft.rfft(fast, known.n), [None] * len(fast) if slow is None else np.fft.rfft(slow, known.n), strict=True)
-    out = [circle_mean(_estimate_power(c, d, sensors) + _rest_of_error(c, d, sensors)) for c, d in pairs]
+    places = np.fft.rfft(taps, known.n).swapaxes(0, 1)
+    out = [circle_mean(_estimate_power(at, sensors) + _rest_of_error(at, sensors)) for at in places]
     for frequency, variance in spectra.pure:
-        turn = np.exp(-2j * np.pi * frequency * np.arange(fast.shape[1]))
+        turn = np.exp(-2j * np.pi * frequency * np.arange(taps.shape[-1]))
         seen = spectra.gain * turn[1] * (fast @ turn)
-        if slow is not None:
+        for slow in of_frames:
             seen = seen + turn[1 : spectra.ngs.ratio + 1].mean() * (slow @ turn)
         out += variance * np.abs((target != TURBULENCE) - seen) ** 2
     return np.array(out)
@@ -467,7 +444,7 @@ class Theory:
             response = None if observer is None else self._response(observer, scenario, mode, target, known.n)
             key = self._key("spectra"), self._key(f"response {name}"), n_steps, of_error
 
-            def make(name: str = name, response: SensorResponse | None = response) -> Prediction:
+            def make(name: str = name, response: Complex | None = response) -> Prediction:
                 if response is None:
                     signal = error = sensors.signal if name == TRUTH else known.without_lines.estimate(target).error
                 else:
@@ -499,14 +476,14 @@ class Theory:
         n = min(n_frequencies(scenario, mode), self.most or MOST)
         return self._keep("air", (mode, n, _groups(scenario, *AIR)), lambda: turbulence_spectra(scenario, mode, n))
 
-    def _response(self, observer: Observer, scenario: Scenario, mode: int, target: str, n: int) -> SensorResponse:
+    def _response(self, observer: Observer, scenario: Scenario, mode: int, target: str, n: int) -> Complex:
         settings, ratio, name = observer_settings(observer, scenario), scenario.sensors.exposure_ratio, observer.id
         prior, length = self._prior(observer, scenario, mode), (name, self.left)
 
-        def make() -> dict[str, SensorResponse]:
+        def make() -> dict[str, Array]:
             first = self._lengths.get(length, SHORTEST)
             found = impulse_responses(observer, prior, settings, scenario.dt, ratio, n, first, self.left)
-            self._lengths[length] = found[target].fast.shape[1]
+            self._lengths[length] = found[target].shape[-1]
             return found
 
         key = prior, settings, scenario.dt, n, self.left, ratio

@@ -407,7 +407,8 @@ def _score_error(
         size / scale if scale > 0 else None,
         None if value is None else lag(signal, value[samples], dt),
         seconds,
-        *stretch_of(samples, dt),
+        float(np.argmax(samples) * dt),  # of the first sample
+        float((samples.size - np.argmax(samples[::-1])) * dt),  # of the end of the last
         apart,
         interval=rms_interval(size, pieces[:, :1]),
         calibration=None if sd is None else calibration(error, sd[samples]),
@@ -500,11 +501,6 @@ def common_samples(samples: Sequence[Array]) -> list[tuple[Array, bool]]:
         else:
             apart.add(i)
     return [(samples[i] if i in apart else shared, i in apart) for i in range(len(samples))]
-
-
-def stretch_of(samples: Array, dt: float) -> tuple[float, float]:
-    """Return the time [s] of the first sample and of the end of the last."""
-    return float(np.argmax(samples) * dt), float((samples.size - np.argmax(samples[::-1])) * dt)
 
 
 def batch_means(values: Array) -> Array:

@@ -7,7 +7,7 @@ extremes of bins. `mode` is the name of a mode, by default the first.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import singledispatch
+from dataclasses import dataclass
 from typing import Any
 
 import holoviews as hv
@@ -38,7 +38,7 @@ from wfsobs.plot.elements import (
 from wfsobs.plot.looks import TERM_COLOURS, look
 from wfsobs.record import Record, hold_last
 from wfsobs.scenario.configfile import Variation
-from wfsobs.sensors.zernike import HIGHEST_ORDER, modes_up_to
+from wfsobs.sensors.zernike import MODE_NAMES
 from wfsobs.signal.spectrum import psd
 from wfsobs.typing import Array
 from wfsobs.units import unit_text
@@ -57,37 +57,37 @@ SIGNALS = {
 }
 """What is drawn of a record."""
 
-Samples = tuple[float, float | None]
+Selection = Sequence[str] | None
+"""Ids of what is drawn; None for all that there is."""
 
 
+@dataclass(frozen=True)
 class RecordPlots:
     """Figures of a record: `record.plot`."""
 
-    def __init__(self, record: Record):
-        self.record = record
-        self.names: list[str] = [m.name for m in modes_up_to(HIGHEST_ORDER)][: record.n_modes]
+    record: Record
 
     def traces(self, *, mode: str | None = None, start: float = 0.0, stop: float | None = None) -> hv.Overlay:
         """Draw measurements and truth over time, from `start` to `stop` [s]."""
-        name, dt = _one_of(self.names, mode, "mode"), self.record.dt
+        (name, column), dt = _mode_of(self.record.n_modes, mode), self.record.dt
         y, part = quantity(f"signal {name}", "nm", name), _samples(self.record, start, stop)
-        return overlay(draw_trace(NM * x, dt, y, SIGNALS[key], part) for key, x in self._signals(name).items())
+        return overlay(draw_trace(NM * x, dt, y, SIGNALS[key], part) for key, x in self._signals(column).items())
 
     def spectra(self, *, mode: str | None = None) -> hv.Overlay:
         """Draw power spectral densities of measurements and truth; a missing sample has the value of the one before."""
-        name, dt = _one_of(self.names, mode, "mode"), self.record.dt
+        (name, column), dt = _mode_of(self.record.n_modes, mode), self.record.dt
         y, lines = quantity(f"PSD {name}", "nm²/Hz", f"PSD, {name}"), []
-        for key, x in self._signals(name).items() if self.record.n_steps >= FEWEST else ():
+        for key, x in self._signals(column).items() if self.record.n_steps >= FEWEST else ():
             frequency, density = psd(hold_last(x[:, None]), dt)
             lines.append(draw_line(frequency[1:], NM**2 * density[1:, 0], (FREQUENCY, y), SIGNALS[key]))
         return overlay(_some(lines, f"spectrum of fewer than {FEWEST} samples"), log="xy")
 
-    def _signals(self, mode: str) -> dict[str, Array]:
-        column = self.names.index(mode)
+    def _signals(self, column: int) -> dict[str, Array]:
         every = {key: getattr(self.record, key) for key in SIGNALS}
         return {key: x[:, column] for key, x in every.items() if x is not None}
 
 
+@dataclass(frozen=True)
 class ResultPlots:
     """Figures of a result: `result.plot`.
 
@@ -95,14 +95,12 @@ class ResultPlots:
     the other.
     """
 
-    def __init__(self, result: Result):
-        self.result = result
-        self.names: list[str] = [m.name for m in result.scenario.modes][: result.record.n_modes]
+    result: Result
 
     def traces(
         self,
         *,
-        observers: Sequence[str] | None = None,
+        observers: Selection = None,
         target: str | None = None,
         mode: str | None = None,
         of_error: bool = False,
@@ -110,17 +108,17 @@ class ResultPlots:
         stop: float | None = None,
     ) -> hv.Layout:
         """Draw truth and estimates over time, or the errors of the estimates, from `start` to `stop` [s]."""
-        name, dt, figures = _one_of(self.names, mode, "mode"), self.result.record.dt, []
+        (name, column), record, figures = _mode_of(self.result.record.n_modes, mode), self.result.record, []
         for of, signals in self._signals(observers, target, of_error).items():
             y = quantity(f"{of} {name} {of_error}", "nm", f"{'error of ' if of_error else ''}{of}, {name}")
-            column, part = self.names.index(name), _samples(self.result.record, start, stop)
-            figures.append(overlay(draw_trace(NM * x[:, column], dt, y, key, part) for key, x in signals.items()))
+            part = _samples(record, start, stop)
+            figures.append(overlay(draw_trace(NM * x[:, column], record.dt, y, key, part) for key, x in signals.items()))
         return stack(figures)
 
     def spectra(
         self,
         *,
-        observers: Sequence[str] | None = None,
+        observers: Selection = None,
         target: str | None = None,
         mode: str | None = None,
         of_error: bool = False,
@@ -131,7 +129,7 @@ class ResultPlots:
     def cumulative(
         self,
         *,
-        observers: Sequence[str] | None = None,
+        observers: Selection = None,
         target: str | None = None,
         mode: str | None = None,
         of_error: bool = True,
@@ -141,9 +139,9 @@ class ResultPlots:
             "cumulative rms", "nm", lambda f, density: NM * cumulative_rms(f, density), observers, target, mode, of_error
         )
 
-    def errors(self, *, observers: Sequence[str] | None = None, target: str | None = None, mode: str | None = None) -> hv.Layout:
+    def errors(self, *, observers: Selection = None, target: str | None = None, mode: str | None = None) -> hv.Layout:
         """Draw the errors of the table as bars, the least on top, each with its 95 % interval; limits among them."""
-        name, figures = _one_of(self.names, mode, "mode"), []
+        (name, _), figures = _mode_of(self.result.record.n_modes, mode), []
         self._check(observers)
         for of in dict.fromkeys(s.target for s in self.result.scores):
             rows = [s for s in self.result.scores if (s.target, s.mode) == (of, name)]
@@ -158,12 +156,12 @@ class ResultPlots:
                 figures.append(overlay([draw_bars(of_rows, x), draw_intervals(ends, x)], rows=len(rows)))
         return stack(_some(figures, f"error of {target or 'any target'}"))
 
-    def budget(self, *, observers: Sequence[str] | None = None, target: str | None = None, mode: str | None = None) -> hv.Layout:
+    def budget(self, *, observers: Selection = None, target: str | None = None, mode: str | None = None) -> hv.Layout:
         """Draw the error budgets as stacked bars of mean squares, the least on top, and the limit of each as a line.
 
         Those that are not linear have one only where they are named in `observers`. Raises ValueError where there is none.
         """
-        name, figures = _one_of(self.names, mode, "mode"), []
+        (name, _), figures = _mode_of(self.result.record.n_modes, mode), []
         self._check(observers)
         found = [it for it in error_budget(self.result, observers=observers, mode=name) if it.terms]
         for of in dict.fromkeys(it.target for it in found):
@@ -177,7 +175,7 @@ class ResultPlots:
                 figures.append(overlay([draw_bars(boxes, x), draw_marks(at, x), *legend], rows=len(rows)))
         return stack(_some(figures, f"error budget of {target or 'any target'}"))
 
-    def _signals(self, observers: Sequence[str] | None, target: str | None, of_error: bool) -> dict[str, dict[str, Array]]:
+    def _signals(self, observers: Selection, target: str | None, of_error: bool) -> dict[str, dict[str, Array]]:
         """Return target -> what is drawn of it -> (n_steps, n_modes) [um]: the truth, last and so on top, where there is one."""
         out: dict[str, dict[str, Array]] = {}
         self._check(observers)
@@ -195,7 +193,7 @@ class ResultPlots:
             raise ValueError(f"nothing to draw: there is no estimate of {target or 'any target'}")
         return {of: signals for of, signals in out.items() if signals}
 
-    def _check(self, observers: Sequence[str] | None) -> None:
+    def _check(self, observers: Selection) -> None:
         """Raise ValueError for an observer that has neither an estimate nor a score."""
         _check(observers, list(dict.fromkeys(it.observer for it in (*self.result.estimates, *self.result.scores))), "observer")
 
@@ -204,17 +202,17 @@ class ResultPlots:
         what: str,
         unit: str,
         curve: Any,
-        observers: Sequence[str] | None,
+        observers: Selection,
         target: str | None,
         mode: str | None,
         of_error: bool,
     ) -> hv.Layout:
-        name, dt, figures = _one_of(self.names, mode, "mode"), self.result.record.dt, []
+        (name, column), dt, figures = _mode_of(self.result.record.n_modes, mode), self.result.record.dt, []
         for of, signals in self._signals(observers, target, of_error).items():
             y = quantity(f"{what} {of} {name}", unit, f"{what}{' of error' if of_error else ''}\n{of}, {name}")
             lines = []
             for key, x in signals.items():
-                known = x[round(self.result.scenario.run.warm_up / dt) :, self.names.index(name)]
+                known = x[round(self.result.scenario.run.warm_up / dt) :, column]
                 known = known[~np.isnan(known)]
                 if known.size >= FEWEST:
                     frequency, density = psd(known[:, None], dt)
@@ -223,21 +221,21 @@ class ResultPlots:
         return stack(figures)
 
 
+@dataclass(frozen=True)
 class IdentificationPlots:
     """Figures of an identification: `identification.plot`."""
 
-    def __init__(self, identification: Identification):
-        self.identification = identification
+    identification: Identification
 
     def spectra(self, record: Record | None = None, *, mode: str | None = None) -> hv.Overlay:
         """Draw the spectrum of the model and its peaks, over that of z where the record is given."""
-        it, names = self.identification, [m.name for m in self.identification.modes]
-        name = _one_of(names, mode, "mode")
-        found = it.modes[names.index(name)]
+        it = self.identification
+        name, column = _mode_of(len(it.modes), mode)
+        found = it.modes[column]
         y, lines = quantity(f"PSD of z {name}", "nm²/Hz", f"PSD of z, {name}"), []
         if record is not None:
             frequency, density = psd(hold_last(record.z[record.delay :]), record.dt)
-            lines.append(draw_line(frequency[1:], NM**2 * density[1:, names.index(name)], (FREQUENCY, y), "measured"))
+            lines.append(draw_line(frequency[1:], NM**2 * density[1:, column], (FREQUENCY, y), "measured"))
         peaks = np.array([p.frequency.value for p in found.peaks])
         f = np.unique(np.concatenate([np.geomspace(1.0 / it.duration, 0.5 / it.dt, 4000), peaks]))
         lines.append(draw_line(f, NM**2 * found.spectrum.psd(f), (FREQUENCY, y), "fitted"))
@@ -246,13 +244,13 @@ class IdentificationPlots:
         return overlay([*lines, style(points, color=look("found").light, bokeh=shape[0], matplotlib=shape[1])], log="xy")
 
 
+@dataclass(frozen=True)
 class SweepPlots:
     """Figures of a sweep: `results.plot`."""
 
-    def __init__(self, results: SweepResults):
-        self.results = results
+    results: SweepResults
 
-    def errors(self, *, observers: Sequence[str] | None = None, target: str = "vibration", mode: str | None = None) -> hv.Overlay:
+    def errors(self, *, observers: Selection = None, target: str = "vibration", mode: str | None = None) -> hv.Overlay:
         """Draw mean errors over the setting, each with its 95 % interval; over two settings, the best observer and its error."""
         known = self.results.known_keys()
         name = _one_of(list(dict.fromkeys(key[2] for key in known)), mode, "mode")
@@ -297,41 +295,40 @@ class SweepPlots:
         return overlay([field, names], **x_ticks, **y_ticks)
 
 
+@dataclass(frozen=True)
 class LoopPlots:
     """Figures of a closed loop: `loop.plot`. `controllers` are ids, by default all for which there is something to draw."""
 
-    def __init__(self, loop: ClosedLoop):
-        self.loop = loop
-        self.names: list[str] = [m.name for m in loop.scenario.modes]
+    loop: ClosedLoop
 
-    def residuals(self, *, controllers: Sequence[str] | None = None, mode: str | None = None) -> hv.Overlay:
+    def residuals(self, *, controllers: Selection = None, mode: str | None = None) -> hv.Overlay:
         """Draw power spectral densities of what every controller left."""
-        name, dt = self._mode(controllers, mode), self.loop.record.dt
+        (name, column), dt = self._mode(controllers, mode), self.loop.record.dt
         y, lines = quantity(f"PSD of residual {name}", "nm²/Hz", f"PSD of residual\n{name}"), []
         for it in self.loop.outcomes:
             if it.residual is not None and (controllers is None or it.controller in controllers):
                 frequency, density = psd(it.residual[round(self.loop.design.start / dt) :], dt)
-                lines.append(draw_line(frequency[1:], NM**2 * density[1:, self.names.index(name)], (FREQUENCY, y), it.controller))
+                lines.append(draw_line(frequency[1:], NM**2 * density[1:, column], (FREQUENCY, y), it.controller))
         return overlay(_some(lines, "residual"), log="xy")
 
-    def errors(self, *, controllers: Sequence[str] | None = None, mode: str | None = None) -> hv.Overlay:
+    def errors(self, *, controllers: Selection = None, mode: str | None = None) -> hv.Overlay:
         """Draw the rms of what every controller left as bars, the least on top."""
-        name = self._mode(controllers, mode)
+        name, column = self._mode(controllers, mode)
         left = {it.controller: residual_rms(it, self.loop.record, self.loop.design.start) for it in self.loop.outcomes}
-        known = {key: NM * rms[self.names.index(name)] for key, rms in left.items() if rms is not None}
+        known = {key: NM * rms[column] for key, rms in left.items() if rms is not None}
         known = {key: known[key] for key in sorted(known, key=known.__getitem__) if controllers is None or key in controllers}
         x = quantity(f"rms of residual {name}", "nm", f"rms of residual, {name}")
         _some(list(known), "residual")
         return overlay([draw_bars([(look(k).label, [v], [look(k).light]) for k, v in known.items()], x)], rows=len(known))
 
-    def rejection(self, *, controllers: Sequence[str] | None = None, mode: str | None = None) -> hv.Overlay:
+    def rejection(self, *, controllers: Selection = None, mode: str | None = None) -> hv.Overlay:
         """Draw the gain from the disturbance to the residual of every time-invariant loop."""
         y = quantity("rejection", "dB")
         found = self._curves(controllers, mode).items()
         lines = [draw_line(c.frequency, 20.0 * np.log10(np.abs(c.rejection)), (FREQUENCY, y), key) for key, c in found]
         return overlay(_some(lines, "time-invariant loop"), log="x")
 
-    def nyquist(self, *, controllers: Sequence[str] | None = None, mode: str | None = None) -> hv.Overlay:
+    def nyquist(self, *, controllers: Selection = None, mode: str | None = None) -> hv.Overlay:
         """Draw the loop gain of every time-invariant loop in the complex plane, around the point -1."""
         axes = quantity("loop gain, real", ""), quantity("loop gain, imaginary", "")
         parts: list[Any] = []
@@ -343,32 +340,31 @@ class LoopPlots:
         style(point, color="black", bokeh={"marker": "star", "size": 9}, matplotlib={"marker": "*", "s": 30})
         return overlay([*parts, point], xlim=(-3.0, 1.5), ylim=(-2.0, 2.0))
 
-    def _mode(self, controllers: Sequence[str] | None, mode: str | None) -> str:
+    def _mode(self, controllers: Selection, mode: str | None) -> tuple[str, int]:
         _check(controllers, [it.controller for it in self.loop.outcomes], "controller")
-        return _one_of(self.names, mode, "mode")
+        return _mode_of(len(self.loop.scenario.modes), mode)
 
-    def _curves(self, controllers: Sequence[str] | None, mode: str | None) -> dict[str, Curves]:
-        column, plan = self.names.index(self._mode(controllers, mode)), self.loop.design
+    def _curves(self, controllers: Selection, mode: str | None) -> dict[str, Curves]:
+        (_, column), plan = self._mode(controllers, mode), self.loop.design
         laws = {key: of[column] for key, of in plan.laws.items() if controllers is None or key in controllers}
         known = {key: it.law.poles for key, it in laws.items() if it.law and it.margins}
         return {key: curves(plan.loop(key, column), poles, self.loop.record.dt) for key, poles in known.items()}
 
 
+@dataclass(frozen=True)
 class EnvelopePlots:
     """Figures of controllers over an uncertain plant: `envelope.plot`."""
 
-    def __init__(self, envelope: PlantEnvelope):
-        self.envelope = envelope
-        self.names: list[str] = [m.name for m in envelope.scenario.modes]
+    envelope: PlantEnvelope
 
-    def residuals(self, *, over: str = "delay", controllers: Sequence[str] | None = None, mode: str | None = None) -> hv.Overlay:
+    def residuals(self, *, over: str = "delay", controllers: Selection = None, mode: str | None = None) -> hv.Overlay:
         """Draw the rms of the residual against one error of the plant: the mean and the largest of the stable plants of a bin.
 
         over : "delay", "gain", "rotation" or "resonance"
         """
-        of, column = self.envelope, self.names.index(_one_of(self.names, mode, "mode"))
+        of, (mode, column) = self.envelope, _mode_of(len(self.envelope.scenario.modes), mode)
         over, unit = _one_of(list(of.errors), over, "error"), {"delay": "frames", "rotation": "deg"}.get(over, "")
-        x, y = quantity(f"error of {over}", unit), quantity(f"rms {self.names[column]}", "nm", f"residual, {self.names[column]}")
+        x, y = quantity(f"error of {over}", unit), quantity(f"rms {mode}", "nm", f"residual, {mode}")
         lines, found = list[Any](), of.curves(over, column)
         _check(controllers, list(found), "controller")
         for name, (at, mean, most) in found.items():
@@ -380,21 +376,27 @@ class EnvelopePlots:
         return overlay(_some(lines, "stable plant"), log="y")
 
 
-@singledispatch
-def plots_of(source: object) -> Any:
-    """Return the figures of an object."""
-    raise TypeError(f"no figures of {type(source).__name__}")
-
-
-for _kind, _plots in {
+PLOTS_OF = {
     Record: RecordPlots,
     Result: ResultPlots,
     Identification: IdentificationPlots,
     SweepResults: SweepPlots,
     ClosedLoop: LoopPlots,
     PlantEnvelope: EnvelopePlots,
-}.items():
-    plots_of.register(_kind, _plots)
+}
+"""Kind of an object -> its figures."""
+
+
+def plots_of(source: Any) -> Any:
+    """Return the figures of an object of one of these kinds."""
+    return PLOTS_OF[type(source)](source)
+
+
+def _mode_of(n_modes: int, name: str | None) -> tuple[str, int]:
+    """Return the name of one of so many modes, by default of the first, and its column. Raises ValueError."""
+    names = MODE_NAMES[:n_modes]
+    name = _one_of(names, name, "mode")
+    return name, names.index(name)
 
 
 def _one_of(names: Sequence[str], name: str | None, what: str) -> str:
@@ -411,7 +413,7 @@ def _some(parts: list[Any], what: str) -> list[Any]:
     return parts
 
 
-def _check(selection: Sequence[str] | None, names: Sequence[str], what: str) -> None:
+def _check(selection: Selection, names: Sequence[str], what: str) -> None:
     """Raise ValueError for a name that is not there."""
     for name in selection or ():
         _one_of(names, name, what)

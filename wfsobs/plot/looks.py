@@ -15,19 +15,18 @@ from types import MappingProxyType
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.budget import CONE, LAG, LINES, MISMATCH, NOISE
 from wfsobs.evaluation.exact_errors import TRUTH
-from wfsobs.evaluation.scores import BOUND, BOUND_ASTERISM, BOUND_BOTH, BOUND_BOTH_MODES, BOUND_MODES, BOUND_STARS
+from wfsobs.evaluation.result import NOT_OBSERVERS
+from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import PLAIN, Look
+
+DASHES = (1, 2), (6, 2, 1, 2), (10, 2, 1, 2, 1, 2), (1, 4), (6, 4, 1, 4), (14, 2, 1, 2, 1, 2)
+"""Of the bounds."""
 
 LOOKS: Mapping[str, Look] = MappingProxyType(
     {
         TRUTH: Look("Truth", "#606060", "#C8C8C8", (6, 3)),
-        BOUND: Look("Theoretical limit, mean of the LGS", "#202020", "#E8E8E8", (1, 2)),
-        BOUND_BOTH: Look("Theoretical limit, LGS and NGS", "#202020", "#E8E8E8", (6, 2, 1, 2)),
-        BOUND_STARS: Look("Theoretical limit, every LGS apart, and NGS", "#202020", "#E8E8E8", (10, 2, 1, 2, 1, 2)),
-        BOUND_MODES: Look("Theoretical limit, mean of the LGS in all modes", "#202020", "#E8E8E8", (1, 4)),
-        BOUND_BOTH_MODES: Look("Theoretical limit, LGS and NGS in all modes", "#202020", "#E8E8E8", (6, 4, 1, 4)),
-        BOUND_ASTERISM: Look("Theoretical limit, every LGS in all modes, and NGS", "#202020", "#E8E8E8", (14, 2, 1, 2, 1, 2)),
+        **{name: Look(NOT_OBSERVERS[name], "#202020", "#E8E8E8", dash) for name, dash in zip(BOUNDS, DASHES, strict=True)},
         "measured": Look("Measured", "#606060", "#C8C8C8"),
         "highest": Look("Highest", "#8A8A8A", "#9A9A9A"),
         "fitted": Look("Model", "#E04E00", "#FF8533", width=2.2),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
@@ -13,10 +13,10 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
-from wfsobs.files import write_whole
+from wfsobs.files import write_text
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.values import Plain, SettingError, leaves
+from wfsobs.settings.values import Plain, SettingError, errors_of, leaves
 
 DEEPEST = 8
 """Maximum depth of nested tables and lists; settings have four levels."""
@@ -111,25 +111,23 @@ def from_toml(text: str, base: Scenario | None = None, where: str = "TOML") -> S
     A table [columns], which is of a record's file, is left alone. Without `base`, a top-level `preset = "name"` gives the base,
     else the defaults. Lists are replaced as a whole. Raises SettingError, its line starting with `where`.
     """
-    try:
+    with errors_of(where):
         values = parse_toml(text)
         name, _ = values.pop("preset", None), values.pop("columns", None)
         scenario = base.copy() if base is not None else preset(name) if name is not None else Scenario()
         scenario.update(values)
-    except SettingError as error:
-        raise SettingError(f"{where}: {error}") from None
     return scenario
 
 
 def load_scenario(path: str | Path, base: Scenario | None = None) -> Scenario:
     """Return the scenario of a TOML file (see `from_toml`). Raises SettingError, also where it cannot be read."""
-    return from_toml(_text(path), base, str(path))
+    return from_toml(read_text(path), base, str(path))
 
 
 def load_columns(path: str | Path) -> dict[str, str]:
     """Return the table [columns] of a TOML file, {role: name in a record's file}. Raises SettingError."""
     try:
-        columns = parse_toml(_text(path)).get("columns", {})
+        columns = parse_toml(read_text(path)).get("columns", {})
         if not isinstance(columns, dict) or not all(isinstance(name, str) for name in columns.values()):
             raise SettingError(f'{path}: columns: takes a table such as "y_lgs/tip" = "slope_x"')
     except NotToml as error:
@@ -137,7 +135,8 @@ def load_columns(path: str | Path) -> dict[str, str]:
     return columns
 
 
-def _text(path: str | Path) -> str:
+def read_text(path: str | Path) -> str:
+    """Return the text of a file. Raises SettingError."""
     try:
         return Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -146,7 +145,7 @@ def _text(path: str | Path) -> str:
 
 def save_scenario(scenario: Scenario, path: str | Path) -> None:
     """Write every setting to a TOML file. Raises OSError."""
-    write_whole(path, lambda file: file.write(to_toml(scenario).encode()))
+    write_text(path, to_toml(scenario))
 
 
 @cache
@@ -166,10 +165,8 @@ def preset_name(name: str | None, config: str | Path | None) -> str:
     """Return the preset that `scenario_from` starts from. Raises SettingError where the file cannot be read."""
     if name is not None or config is None:
         return name or "paper"
-    try:
-        return parse_toml(_text(config)).get("preset", "paper")
-    except SettingError as error:
-        raise SettingError(f"{config}: {error}") from None
+    with errors_of(str(config)):
+        return parse_toml(read_text(config)).get("preset", "paper")
 
 
 def parse_assignment(text: str) -> tuple[str, Any]:
@@ -276,30 +273,22 @@ def scenarios(base: Scenario, variations: Sequence[Variation]) -> list[Scenario]
 
     Raises SettingError where there are more than MOST, where two are the same, and for a value that a setting refuses.
     """
-    _check_number(variations)
+    paths, counts = [v.path for v in variations], [len(v.values) for v in variations]
+    for i, path in enumerate(paths):
+        if path in paths[:i]:
+            raise SettingError(f"--vary {path}: is given twice; put all its values into one list")
+    if prod(counts) > MOST:
+        raise SettingError(f"--vary: {' x '.join(map(str, counts))} = {prod(counts)} combinations, at most {MOST} can be run")
     out: list[Scenario] = []
     seen: list[Plain] = []
     for values in product(*(v.values for v in variations)):
-        changes = {v.path: value for v, value in zip(variations, values, strict=True)}
+        changes = dict(zip(paths, values, strict=True))
         one = base.replace(changes)
         one.validate()
         plain = one.to_dict()
         if plain in seen:
-            raise SettingError(f"--vary: {_join_changes(changes.items())} gives the same settings as another combination")
+            listed = ", ".join(f"{path} = {value}" for path, value in changes.items())
+            raise SettingError(f"--vary: {listed} gives the same settings as another combination")
         seen.append(plain)
         out.append(one)
     return out
-
-
-def _check_number(variations: Sequence[Variation]) -> None:
-    paths = [v.path for v in variations]
-    for i, path in enumerate(paths):
-        if path in paths[:i]:
-            raise SettingError(f"--vary {path}: is given twice; put all its values into one list")
-    counts = [len(v.values) for v in variations]
-    if prod(counts) > MOST:
-        raise SettingError(f"--vary: {' x '.join(map(str, counts))} = {prod(counts)} combinations, at most {MOST} can be run")
-
-
-def _join_changes(changes: Iterable[tuple[str, Any]]) -> str:
-    return ", ".join(f"{path} = {value}" for path, value in changes)

@@ -6,6 +6,7 @@ import math
 import re
 import reprlib
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,15 @@ import param
 
 class SettingError(ValueError):
     """Error: a setting that cannot be used; one line naming the setting, its value and what is allowed."""
+
+
+@contextmanager
+def errors_of(what: str, kind: type[ValueError] = SettingError) -> Iterator[None]:
+    """Prefix the message of an error, such as with the name of a file."""
+    try:
+        yield
+    except kind as error:
+        raise kind(f"{what}: {error}") from None
 
 
 _WORDS = reprlib.Repr()  # stops at a depth, where `repr` would end in a RecursionError
@@ -212,7 +222,5 @@ def declared_settings(cls: type[param.Parameterized]) -> dict[str, param.Paramet
     return {name: p for name, p in cls.param.objects("existing").items() if name != "name"}
 
 
-@cache
-def settings_once(cls: type[param.Parameterized]) -> dict[str, param.Parameter[Any]]:
-    """Return `declared_settings` of a class that gets no more of them: asked some thousand times for a change of one."""
-    return declared_settings(cls)
+settings_once = cache(declared_settings)
+"""Return `declared_settings` of a class that gets no more of them: asked some thousand times for a change of one."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -76,7 +77,7 @@ class DeclaredFormat:
         return [split_source(one.source)[0] for one in (self.reconstructor, self.command_modes) if one]
 
     @property
-    def as_commanded(self) -> DeclaredFormat:
+    def as_commanded(self) -> Self:
         """What is stated but for delay and gain of the mirror: with it the commands are read as they were given."""
         return replace(self, command_delay=1.0, command_gain=None, trust=True)
 
