@@ -49,7 +49,8 @@ class Field(ABC):
         self.idle: str = ""
         self._note_html = ""
         self.widgets: Final = self._widgets()
-        self.view: Final = pn.Column(self._row(), min_height=self.height, **WIDE)
+        row = self.widgets[0] if len(self.widgets) == 1 else pn.Row(*self.widgets, **WIDE)
+        self.view: Final = pn.Column(row, min_height=self.height, **WIDE)
         self.refresh()
         store.param.watch(self.refresh, ["scenario", "errors"])
 
@@ -88,9 +89,6 @@ class Field(ABC):
 
     @abstractmethod
     def _widgets(self) -> list[Any]: ...
-
-    def _row(self) -> Any:
-        return self.widgets[0]
 
     def _names(self) -> dict[str, Any]:
         return {
@@ -246,7 +244,8 @@ class SliderField(TextField):
         low, high = self._place(low), self._place(high)
         names = self._names()
         kind = pmui.IntSlider if whole and not self.is_log else pmui.FloatSlider
-        options: dict[str, Any] = {"step": p.step or (1 if whole else _step(low, high))}
+        hundredth = 10.0 ** math.floor(math.log10((high - low) / 100.0))  # a round one, about a two-hundredth of the range
+        options: dict[str, Any] = {"step": p.step or (1 if whole else hundredth)}
         if self.is_log:
             options = {"step": 0.01, "format": CustomJSTickFormatter(code="return Number((10 ** tick).toPrecision(3))")}
         slider = kind(start=low, end=high, value=low, show_value=False, size="small", **options, **names, **ROOM)
@@ -275,9 +274,6 @@ class SliderField(TextField):
         """Type a text, or the number for which the slider stands."""
         super().enter(value if isinstance(value, str) else self._value_at(float(value)))
 
-    def _row(self) -> Any:
-        return pn.Row(*self.widgets, **WIDE)
-
     def _on_release(self, event: Any) -> None:
         if event.new is None or (self._value is not None and event.new == self._place(self._value)):
             return  # put there by `show`
@@ -298,11 +294,6 @@ class SliderField(TextField):
         low, high, place = (self._place(at) for at in (*self.parameter.softbounds, value))
         with param.edit_constant(slider):  # value_throttled too: releasing at its old value must count as news
             slider.param.update(start=min(low, place), end=max(high, place), value=place, value_throttled=place)
-
-
-def _step(low: float, high: float) -> float:
-    """Choose a round step, about a two-hundredth of the range."""
-    return 10.0 ** math.floor(math.log10((high - low) / 100.0))
 
 
 class RowTable(HtmlComponent):
