@@ -192,7 +192,7 @@ def test_an_uncertain_plant_adds_columns_a_sentence_and_a_figure(page: ClosedLoo
         loop.until(lambda: box.work.state == DONE)
     assert page.results is not None
     expected = plant_envelope(page.results.result.scenario, points=few)
-    assert box.finding is not None and box.finding.rows() == expected.rows()
+    assert box.work.result is not None and box.work.result.rows() == expected.rows()
     assert "Worst [nm]" in page.table.html and box.room.visible
     for line in expected.sentences(1e3, "nm", 0):
         assert line.replace("+-", "±").replace(" deg", "°") in page.verdict.html
@@ -204,7 +204,7 @@ def test_an_uncertain_plant_adds_columns_a_sentence_and_a_figure(page: ClosedLoo
     dashboard.store.replace({"turbulence.wind_speed": 9.0})
     loop.until(lambda: page.run.result is not None and page.run.result.scenario.turbulence.wind_speed == 9.0)
     done(page, loop)
-    assert box.finding is None and not box.room.visible and "Worst [" not in page.table.html, "it was of other results"
+    assert box.work.result is None and not box.room.visible and "Worst [" not in page.table.html, "it was of other results"
 
 
 def test_an_uncertain_plant_stops_when_told(page: ClosedLoopPage) -> None:
@@ -221,4 +221,4 @@ def test_an_uncertain_plant_stops_when_told(page: ClosedLoopPage) -> None:
         box.starter.start.clicks += 1
         assert begun.wait(60.0)
         box.starter.cancel.clicks += 1
-    assert box.work.state == CANCELLED and box.finding is None
+    assert box.work.state == CANCELLED and box.work.result is None

@@ -71,7 +71,7 @@ def test_only_what_counts_is_in_the_drawer(make_store: Callable[..., Store]) -> 
     controls.view()  # has what is at hand
     for topic in ("events", "vibration", "turbulence"):
         controls.open_topic(topic)
-    table, store = controls.lists["events"].table, controls.store
+    table, store = controls.fields["events"].table, controls.store
     keys = [column["key"] for column in table.columns]
     for row, event in zip(table.rows, EVENTS, strict=True):
         own = [key for key, text in zip(keys, row, strict=True) if text is not None]
@@ -79,28 +79,28 @@ def test_only_what_counts_is_in_the_drawer(make_store: Callable[..., Store]) -> 
     assert [key for names in OF_KIND.values() for key in names] == list(Event.settings())[3:]
 
     def seen(path: str) -> bool:
-        return dict(controls.parts)[path].visible
+        return controls.fields[path].view.visible
 
     source = "Used only where Source is "
-    assert controls.fields["vibration.cutoff"].idle == "" and controls.lists["vibration.peaks"].idle == ""
+    assert controls.fields["vibration.cutoff"].idle == "" and controls.fields["vibration.peaks"].idle == ""
     grey = {"vibration.spectrum": "measured", "vibration.part": "measured", "turbulence.r0": "frozen-flow"}
     for path, value in grey.items():
         field = controls.fields[path]
         assert field.idle == source + value and seen(path) and all(widget.disabled for widget in field.widgets)
-    assert controls.lists["turbulence.layers"].idle == source + "frozen-flow"
-    assert source + "psd" in controls.headings["vibration.psd"][1].html and not seen("vibration.psd.tip")
+    assert controls.fields["turbulence.layers"].idle == source + "frozen-flow"
+    assert source + "psd" in controls.headings["vibration.psd"].html and not seen("vibration.psd.tip")
     store.load(store.scenario.replace({"events": [], "vibration.source": "measured", "turbulence.source": "frozen-flow"}))
     assert not any(controls.fields[path].idle or controls.fields[path].widgets[0].disabled for path in grey)
-    assert controls.lists["turbulence.layers"].idle == "" and controls.lists["vibration.peaks"].idle == source + "peaks or ar2"
+    assert controls.fields["turbulence.layers"].idle == "" and controls.fields["vibration.peaks"].idle == source + "peaks or ar2"
 
 
 def test_a_kind_that_needs_a_duration_waits_for_it(make_store: Callable[..., Store]) -> None:
     controls = Controls(make_store())
     controls.open_topic("events")
-    editor = controls.lists["events"]
-    editor.handle({"action": "edit", "key": "1.kind", "name": "laser"})
+    editor = controls.fields["events"]
+    editor.enter({"action": "edit", "key": "1.kind", "name": "laser"})
     (reason,) = editor.table.errors.values()
     assert reason["reason"] == "Event 2: duration = 0: takes a number above 0 s, for kind laser" and reason["text"] == "laser"
-    editor.handle({"action": "edit", "key": "1.duration", "name": "0.2"})
+    editor.enter({"action": "edit", "key": "1.duration", "name": "0.2"})
     assert editor.table.errors == {} and controls.store.scenario.events[1].kind == "laser"
     assert json.dumps(editor.table.rows)  # as it goes to the browser

@@ -20,7 +20,7 @@ from wfsobs.app.jobs import FAILED, RUNNING, Job
 from wfsobs.app.limits import NONE
 from wfsobs.app.live_work import record_saves
 from wfsobs.app.pages.live import LivePage, events_html, peaks_html, ranking
-from wfsobs.app.pages.live_figures import LiveMarks, Painter
+from wfsobs.app.pages.live_figures import LiveMarks
 from wfsobs.app.pages.pages import EXPLORE, LIVE
 from wfsobs.app.render import number
 from wfsobs.app.serve import opens_on_live
@@ -181,15 +181,15 @@ def test_changes_between_two_pictures_are_all_sent(page: LivePage, monkeypatch: 
     for model in (fig, source):
         doc.add_root(model)
     monkeypatch.setattr(page.pulse, "_send_msg", sent.append)
-    painter = Painter(page.pulse)
+    pulse = page.pulse
     page.pulse._handle_msg({"painted": 0})
     for act in (
-        lambda: painter.data(fig, source, {"x": np.array([1.0])}),
-        lambda: painter.update(fig, fig.x_range, start=2.0),
-        lambda: painter.data(fig, source, {"x": np.array([3.0])}),
+        lambda: pulse.draw(fig, source, {"x": np.array([1.0])}),
+        lambda: pulse.move(fig, fig.x_range, start=2.0),
+        lambda: pulse.draw(fig, source, {"x": np.array([3.0])}),
     ):
         act()
-        painter.send()
+        pulse.flush()
     page.pulse.beat()
     told = [(step[1], step[4], numbers.tolist()) for it in sent[:-1] for [step], numbers in [it["changes"]]]
     assert told == [(source.id, [], [1.0]), (fig.x_range.id, [["start", 2.0]], []), (source.id, [], [3.0])]

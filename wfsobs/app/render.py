@@ -44,6 +44,11 @@ WHY_NOTHING: Mapping[str, str] = {
 """Heading of a column, without its unit -> why a cell of it may have no number."""
 
 
+def why_nothing(heading: str) -> str:
+    """Return why a cell below a heading may have no number; empty where it always has one."""
+    return WHY_NOTHING.get(re.split(r" \[| at ", heading)[0], "")
+
+
 def number(value: float | None, digits: int = 3) -> str:
     """Write a number with some significant digits, without an exponent where it is of common size; a dash for none, or NaN."""
     if value is None or isnan(value):
@@ -132,8 +137,7 @@ def table(
     label: str, columns: Mapping[str, str], rows: Iterable[Row] = (), *, groups: Iterable[tuple[str, Iterable[Row]]] = ()
 ) -> str:
     """Write a table that scrolls sideways; columns: heading -> explanation, groups: in place of rows, title and rows of each."""
-    why = [WHY_NOTHING.get(re.split(r" \[| at ", name)[0], "") for name in list(columns)[1:]]
-    return str(macro("table", label, columns, groups or [("", rows)], NOTHING, why))
+    return str(macro("table", label, columns, groups or [("", rows)]))
 
 
 def matrix(entries: ArrayLike) -> Markup:
@@ -168,4 +172,6 @@ ENVIRONMENT = Environment(
     lstrip_blocks=True,
 )
 ENVIRONMENT.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-ENVIRONMENT.filters.update(number=number, hundredths=hundredths, short=short, matrix=matrix, tex=tex, py=repr)
+ENVIRONMENT.filters.update(
+    number=number, hundredths=hundredths, short=short, matrix=matrix, tex=tex, py=repr, why_nothing=why_nothing
+)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from html import escape
 from typing import Any, Final
 
@@ -21,7 +21,7 @@ from bokeh.models import CustomJSTickFormatter
 from wfsobs.app.display import label_of
 from wfsobs.app.render import render
 from wfsobs.app.store import Store
-from wfsobs.app.style import WIDE, HtmlComponent, html, script, sheets
+from wfsobs.app.style import WIDE, HtmlComponent, HtmlText, html, script, sheets
 from wfsobs.scenario.names import column_of, name_settings
 from wfsobs.sensors.zernike import TIP_TILT
 from wfsobs.settings.group import Group
@@ -39,7 +39,7 @@ class Field(ABC):
 
     has_help = False
     """Whether its box has a line of help, which says why it has no effect; else a line below does."""
-    height = 45
+    height: int | None = 45
     """Of its row [px], kept from the first: rows come one after the other, and what is clicked must not move away."""
 
     def __init__(self, store: Store, path: str, p: param.Parameter[Any]):
@@ -49,16 +49,22 @@ class Field(ABC):
         self.idle: str = ""
         self._note_html = ""
         self.widgets: Final = self._widgets()
-        self.view: Final = pn.Column(self._row(), min_height=self.height, **WIDE)
+        row = self.widgets[0] if len(self.widgets) == 1 else pn.Row(*self.widgets, **WIDE)
+        self.view: Final = pn.Column(row, min_height=self.height, **WIDE)
         self.refresh()
         store.param.watch(self.refresh, ["scenario", "errors"])
 
     def refresh(self, *_: object) -> None:
         """Show the accepted value, or leave what was refused and say why."""
         reason = self.store.errors.get(self.path, "")
-        if not reason:
+        note = "" if self.has_help else idle_html(self.idle)
+        if reason:
+            note = f'<div role="alert" style="color:#d93025;font-size:12px">{escape(name_settings(reason))}</div>'
+        else:
             self.show(self.store.value(self.path))
-        self._note(error_html(name_settings(reason)) or ("" if self.has_help else idle_html(self.idle)))
+        if note != self._note_html:
+            self._note_html = note
+            self.view[1:] = [html(note, margin=(0, 0, 6, 0))] if note else []
         for widget in self.widgets:
             if "error_state" in widget.param:
                 widget.error_state = bool(reason)
@@ -73,15 +79,9 @@ class Field(ABC):
                 self.widgets[-1].helper_text = why
             self.refresh()
 
-    def _note(self, words: str) -> None:
-        """Show a line below the widgets; none where it is empty."""
-        if words != self._note_html:
-            self._note_html = words
-            self.view[1:] = [html(words, margin=(0, 0, 6, 0))] if words else []
-
-    @abstractmethod
     def show(self, value: Any) -> None:
         """Put a value into the widgets."""
+        self.widgets[0].value = value
 
     def enter(self, value: Any) -> None:
         """Do as if a value had been typed or chosen. Raises ValueError where that cannot be."""
@@ -89,9 +89,6 @@ class Field(ABC):
 
     @abstractmethod
     def _widgets(self) -> list[Any]: ...
-
-    def _row(self) -> Any:
-        return self.widgets[0]
 
     def _names(self) -> dict[str, Any]:
         return {
@@ -101,14 +98,19 @@ class Field(ABC):
         }
 
 
-def error_html(reason: str) -> str:
-    """Write the reason of a refusal, to stand beside its setting."""
-    return f'<div role="alert" style="color:#d93025;font-size:12px">{escape(reason)}</div>' if reason else ""
-
-
 def idle_html(why: str) -> str:
     """Write why a setting has no effect, to stand below it."""
     return f'<div style="font-size:12px;opacity:0.75">{escape(why)}</div>' if why else ""
+
+
+def heading_html(title: str, why: str = "") -> str:
+    """Write the name of settings, and why they have no effect."""
+    return f"<b>{escape(title)}</b>{idle_html(why)}"
+
+
+def heading(title: str, why: str = "", below: int = 0) -> HtmlText:
+    """Make such a name. below : room below it [px]."""
+    return html(heading_html(title, why), margin=(8, 0, below, 0), styles={"font-size": "13px"})
 
 
 NUMBER_WIDTH = 92
@@ -164,10 +166,6 @@ class SwitchField(Field):
         widget = self._make()
         widget.param.watch(lambda event: self.store.change(self.path, event.new), "value")
         return [widget]
-
-    def show(self, value: Any) -> None:
-        """Put a value into the widget."""
-        self.widgets[0].value = value
 
 
 class ChoiceField(SwitchField):
@@ -246,7 +244,8 @@ class SliderField(TextField):
         low, high = self._place(low), self._place(high)
         names = self._names()
         kind = pmui.IntSlider if whole and not self.is_log else pmui.FloatSlider
-        options: dict[str, Any] = {"step": p.step or (1 if whole else _step(low, high))}
+        hundredth = 10.0 ** math.floor(math.log10((high - low) / 100.0))  # a round one, about a two-hundredth of the range
+        options: dict[str, Any] = {"step": p.step or (1 if whole else hundredth)}
         if self.is_log:
             options = {"step": 0.01, "format": CustomJSTickFormatter(code="return Number((10 ** tick).toPrecision(3))")}
         slider = kind(start=low, end=high, value=low, show_value=False, size="small", **options, **names, **ROOM)
@@ -275,9 +274,6 @@ class SliderField(TextField):
         """Type a text, or the number for which the slider stands."""
         super().enter(value if isinstance(value, str) else self._value_at(float(value)))
 
-    def _row(self) -> Any:
-        return pn.Row(*self.widgets, **WIDE)
-
     def _on_release(self, event: Any) -> None:
         if event.new is None or (self._value is not None and event.new == self._place(self._value)):
             return  # put there by `show`
@@ -298,24 +294,6 @@ class SliderField(TextField):
         low, high, place = (self._place(at) for at in (*self.parameter.softbounds, value))
         with param.edit_constant(slider):  # value_throttled too: releasing at its old value must count as news
             slider.param.update(start=min(low, place), end=max(high, place), value=place, value_throttled=place)
-
-
-def make_field(store: Store, path: str, p: param.Parameter[Any]) -> Field:
-    """Make the field that fits a setting."""
-    if isinstance(p, param.Boolean):
-        return SwitchField(store, path, p)
-    if isinstance(p, param.Selector):
-        return ChoiceField(store, path, p)
-    if isinstance(p, Reals):
-        return NumbersField(store, path, p)
-    if isinstance(p, param.Number) and p.softbounds:
-        return SliderField(store, path, p)
-    return TextField(store, path, p)
-
-
-def _step(low: float, high: float) -> float:
-    """Choose a round step, about a two-hundredth of the range."""
-    return 10.0 ** math.floor(math.log10((high - low) / 100.0))
 
 
 class RowTable(HtmlComponent):
@@ -339,74 +317,68 @@ class RowTable(HtmlComponent):
         self.html = render("rows.html", rows=rows, errors=errors, columns=self.columns, noun=self.noun)
 
 
-class RowEditor:
-    """The table of one list of groups, kept in step with the store."""
+class RowEditor(Field):
+    """The table of one list of groups, of which only the name is left where the list has no effect."""
 
-    def __init__(self, store: Store, path: str, p: param.List):
-        self.store = store
-        self.path = path
-        assert isinstance(p.item_type, type) and issubclass(p.item_type, Group)
-        self._kind: type[Group] = p.item_type
+    height = None
+
+    def _widgets(self) -> list[Any]:
         self._texts: dict[str, str] = {}
-        self.table: Final = RowTable(
-            self.handle,
-            self._kind.__name__.lower(),
-            _columns(self._kind),
-            tags=[TAG + path],
-            sizing_mode="stretch_width",
-            margin=(0, 0, 8, 0),
-        )
-        self.label: Final = str(p.label)
-        self.idle: str = ""
-        self.view: Final = pn.Column(self.table, **WIDE)
-        self.refresh()
-        store.param.watch(self.refresh, ["scenario", "errors"])
+        self.kind: type[Group] = self.parameter.item_type  # type: ignore[attr-defined]
+        options = {"sizing_mode": "stretch_width", "margin": (0, 0, 8, 0)}
+        self.table = RowTable(self.enter, self.kind.__name__.lower(), _columns(self.kind), tags=[TAG + self.path], **options)
+        return [self.table]
 
     def rest(self, why: str) -> None:
         """Leave the name of a list without effect, and say why; with an empty text the table comes back."""
         if why != self.idle:
             self.idle = why
-            name = f"<b>{escape(self.label)}</b>{idle_html(why)}"
-            self.view[:] = [html(name, margin=(8, 0), styles={"font-size": "13px"})] if why else [self.table]
+            self.view[:] = [heading(str(self.parameter.label), why, 8) if why else self.table]
 
-    def handle(self, msg: dict[str, Any]) -> None:
-        """Do what a message of the table says."""
-        action, (row, _, key) = msg.get("action"), str(msg.get("key", "")).partition(".")
-        if action == "add":
-            self.add()
+    def enter(self, value: Any) -> None:
+        """Do what a message of the table says. Raises ValueError, TypeError or IndexError where that cannot be."""
+        message = dict(value)
+        action, (row, _, key) = message.get("action"), str(message.get("key", "")).partition(".")
+        items = [item.to_dict() for item in self.store.value(self.path)]
+        if action == "edit":  # a cell; of a list of numbers, rms.0 is the first
+            path = f"{self.path}.{int(row)}.{key}"
+            self._texts[path] = str(message["name"])
+            self.store.change(path, parse_number(self._texts[path]))
+        elif action == "add":
+            self.store.change(self.path, [*items, self.kind().to_dict()])
         elif action == "remove":
-            self.remove(int(row))
-        elif action == "edit":
-            self.edit(int(row), key, str(msg["name"]))
-
-    def add(self) -> None:
-        """One more item, with the defaults."""
-        self.store.change(self.path, [*self._plain(), self._kind().to_dict()])
-
-    def remove(self, row: int) -> None:
-        """One item less."""
-        items = self._plain()
-        del items[row]
-        self.store.change(self.path, items)
-
-    def edit(self, row: int, key: str, text: str) -> None:
-        """Set one cell; `key` is the setting within the item, rms.0 for the first of a list of numbers."""
-        path = f"{self.path}.{row}.{key}"
-        self._texts[path] = text
-        self.store.change(path, parse_number(text))
+            del items[int(row)]
+            self.store.change(self.path, items)
 
     def refresh(self, *_: object) -> None:
         """Show the accepted items and what was refused."""
-        items = self.store.value(self.path)
-        rows = [[None if c["key"] in item.idle() else _cell(item, c["key"]) for c in self.table.columns] for item in items]
-        errors: dict[str, dict[str, str]] = {}
-        for path, reason in self.store.errors.items():
-            if f"{path}.".startswith(f"{self.path}."):
-                errors[path.removeprefix(f"{self.path}.")] = {"text": self._texts.get(path, ""), "reason": name_settings(reason)}
+        self.show(self.store.value(self.path))
+
+    def show(self, value: list[Group]) -> None:
+        """Put the items into the table."""
+        rows = [[None if c["key"] in item.idle() else _cell(item, c["key"]) for c in self.table.columns] for item in value]
+        errors = {
+            path.removeprefix(f"{self.path}."): {"text": self._texts.get(path, ""), "reason": name_settings(reason)}
+            for path, reason in self.store.errors.items()
+            if f"{path}.".startswith(f"{self.path}.")
+        }
         self.table.show(rows, errors)
 
-    def _plain(self) -> list[dict[str, Any]]:
-        return [item.to_dict() for item in self.store.value(self.path)]
+
+KINDS: Mapping[Any, type[Field]] = {
+    param.Boolean: SwitchField,
+    param.Selector: ChoiceField,
+    Reals: NumbersField,
+    param.List: RowEditor,
+    param.Number: SliderField,
+}
+"""Kind of a setting -> its field; others are typed."""
+
+
+def make_field(store: Store, path: str, p: param.Parameter[Any]) -> Field:
+    """Make the field that fits a setting; a number without a usual range is typed."""
+    kind = next((field for of, field in KINDS.items() if isinstance(p, of)), TextField)
+    return (TextField if kind is SliderField and not p.softbounds else kind)(store, path, p)
 
 
 def _columns(kind: type[Group]) -> list[dict[str, Any]]:

@@ -5,19 +5,18 @@ from __future__ import annotations
 import contextlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from html import escape
 from typing import Any, Final
 
 import panel as pn
 import panel_material_ui as pmui
 import param
 
-from wfsobs.app.controls.fields import NUMBER_WIDTH, ROOM, TAG, Field, RowEditor, SliderField, idle_html, make_field
+from wfsobs.app.controls.fields import NUMBER_WIDTH, ROOM, TAG, Field, SliderField, heading, heading_html, make_field
 from wfsobs.app.controls.topics import TopicList
 from wfsobs.app.display import label_of
 from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.store import Store
-from wfsobs.app.style import PRIMARY, WIDE, Component, HtmlText, html, make_button, script, sheets
+from wfsobs.app.style import PRIMARY, WIDE, Component, HtmlText, html, make_button, script, sheets, watch
 from wfsobs.app.views.plots import AFTERWARDS_MS, once
 from wfsobs.app.work import RunResults
 from wfsobs.scenario import Scenario
@@ -25,7 +24,6 @@ from wfsobs.scenario.configfile import changed_settings
 from wfsobs.scenario.names import preset_line, preset_title, setting_name
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.scenario.scenario import idle_settings
-from wfsobs.settings.group import Group
 
 ON_BAR = {
     "color": "#fff",
@@ -110,7 +108,7 @@ class Search(Component):
     _esm = script("page", "search")
     _stylesheets = sheets("base", "search")
 
-    def __init__(self, reveal: Callable[[str], None], **params: Any):
+    def __init__(self, reveal: Callable[[str], object], **params: Any):
         """Make the box. reveal : opens the topic of the setting of a path."""
         self._reveal = reveal
         super().__init__(self._take, **params)
@@ -122,13 +120,18 @@ class Search(Component):
             self._reveal(path)
 
 
-def settings_found() -> list[dict[str, str]]:
-    """List every setting and every list of settings, by its name and its topic."""
-    scenario, topics = Scenario(), Scenario.settings()
+def drawer_settings(scenario: Scenario) -> dict[str, param.Parameter[Any]]:
+    """Return path -> declaration of every list of groups, and of every setting that is not in one."""
     lists = dict(scenario.lists())
     inner = tuple(f"{path}." for path in lists)
-    known = [*lists.items(), *((path, p) for path, _, p in scenario.walk() if not path.startswith(inner))]
-    return [{"path": path, "name": f"{label_of(p)} · {topics[topic_of(path)].label}"} for path, p in known]
+    return {**lists, **{path: p for path, _, p in scenario.walk() if not path.startswith(inner)}}
+
+
+def settings_found() -> list[dict[str, str]]:
+    """List every setting and every list of settings, by its name and its topic."""
+    topics = Scenario.settings()
+    known = drawer_settings(Scenario())
+    return [{"path": path, "name": f"{label_of(p)} · {topics[topic_of(path)].label}"} for path, p in known.items()]
 
 
 FIRST: Mapping[str, Sequence[str]] = {
@@ -169,9 +172,7 @@ class Controls:
     def __init__(self, store: Store):
         self.store = store
         self.fields: dict[str, Field] = {}
-        self.lists: dict[str, RowEditor] = {}
-        self.parts: list[tuple[str, Any]] = []
-        self.headings: dict[str, tuple[str, HtmlText]] = {}
+        self.headings: dict[str, HtmlText] = {}
         self.preset: Final = pmui.Select(
             label="Preset",
             tags=[TAG + PRESET],
@@ -193,15 +194,28 @@ class Controls:
             "Cancel", store.run.cancel, icon="stop", variant="outlined", margin=(0, 10, 0, 6), sx=ON_BAR
         )
         self.status: Final = Status(sizing_mode="stretch_width", max_width=200, margin=0, stylesheets=[STATUS_ON_BAR])
-        self.search: Final = Search(self.open_setting, sizing_mode="stretch_width", margin=(8, 0, 4, 0))
         self.effect_of: Callable[[RunResults, RunResults], str] = lambda _before, _now: ""
         self._effect = html(stylesheets=[EFFECT])
         self._before: RunResults | None = None
-        self._changed_part: Field | RowEditor | None = None
-        self.topics: Final = _names()
-        self.rooms: Final = {name: pn.Column(sizing_mode="stretch_width", margin=(4, 8, 12, 8)) for name in self.topics}
+        self._changed_part: Field | None = None
+        self._settings = drawer_settings(store.scenario)
+        groups = Scenario.settings()
+        self.topics: Final = {name: str(groups[name].label) for name in dict.fromkeys((*TOPICS, *groups))}
+        self.rooms: Final[dict[str, pn.Column]] = {}
         self.topic_list: Final = TopicList(self.topics, self.open_topic)
-        self._watch()
+        self.search: Final = Search(
+            lambda path: path in AT_HAND or self.topic_list.open(topic_of(path)),
+            sizing_mode="stretch_width",
+            margin=(8, 0, 4, 0),
+        )
+        self.preset.param.watch(lambda event: event.new == store.preset or store.choose(event.new), "value")
+        watch(self._refresh_preset, (store, ["preset", "can_undo", "can_redo"]))
+        watch(once(self._count_changes, AFTERWARDS_MS), (store, ["scenario", "preset"]))
+        watch(self._refresh_parts, (store, ["scenario", "source"]))
+        watch(self._refresh_run, (store, ["errors", "waiting"]), (store.session, "doing"))
+        store.run.param.watch(self._show_effect, "state")
+        # Last, so that "Done" is said of what has been drawn.
+        store.run.param.watch(self._refresh_run, ["state", "progress", "place", "message"], precedence=2)
         self._refresh_run()
         self._refresh_preset()
         self._count_changes()
@@ -210,8 +224,8 @@ class Controls:
         """Make the contents of the drawer."""
         first: list[Any] = []
         for title, paths in FIRST.items():
-            first += [html(f"<b>{title}</b>", margin=(8, 0, 0, 0), styles={"font-size": "13px"})] if title else []
-            first += [self._part(path).view for path in paths]
+            first += [heading(title)] if title else []
+            first += [self._field(path).view for path in paths]
         self._refresh_parts()
         return pn.Column(
             self.preset,
@@ -227,98 +241,55 @@ class Controls:
         """Return what stays in sight: the buttons of the run, and how it is going."""
         return pn.Row(self.run, self.cancel, self.status, **WIDE, stylesheets=[BAR])
 
-    def open_setting(self, path: str) -> None:
-        """Open the topic of a setting."""
-        if path not in AT_HAND:
-            self.topic_list.open(topic_of(path))
-
     def open_topic(self, name: str) -> pn.Column:
         """Return a topic's room, filled with its fields the first time it is opened."""
-        column = self.rooms[name]
-        if len(column):
-            return column
-        own = [path for path, _ in self.store.scenario.lists() if topic_of(path) == name and path not in AT_HAND]
-        views = [*((path, self._part(path).view) for path in own), *self._fields_of(name)]
-        self.parts += views
-        self._refresh_parts()
-        column[:] = [view for _, view in views]
-        return column
+        if name not in self.rooms:
+            views: list[Any] = []
+            group = name
+            for path in self._settings:
+                if topic_of(path) != name or path in AT_HAND:
+                    continue
+                above = path.rpartition(".")[0] or name
+                if above != group:
+                    group = above
+                    self.headings[group] = heading("")
+                    views.append(self.headings[group])
+                views.append(self._field(path).view)
+            self.rooms[name] = pn.Column(*views, sizing_mode="stretch_width", margin=(4, 8, 12, 8))
+            self._refresh_parts()
+        return self.rooms[name]
 
     def take(self, change: dict[str, Any]) -> None:
         """Make a change of the visitor's that did not arrive: {setting, value} of a box, {setting, message} of a table.
 
         One that makes no sense, or none any more, is left.
         """
-        path, value, message = (change.get(key) for key in ("setting", "value", "message"))
+        path, value = change.get("setting"), change.get("value")
         with contextlib.suppress(ValueError, TypeError, KeyError, IndexError):
             if path == PRESET:
                 self.preset.value = value
-            elif isinstance(path, str) and topic_of(path) in self.rooms:
+            elif isinstance(path, str) and topic_of(path) in self.topics:
                 self.open_topic(topic_of(path))
-                part = self._part(path)
-                if isinstance(part, Field):
-                    part.enter(value)
-                elif isinstance(message, dict):
-                    part.handle(message)
+                self._field(path).enter(change.get("message", value))
 
     def _refresh_parts(self, *_: object) -> None:
         """Grey what has no effect for the settings as they are, and say why; of groups and tables only the name is left."""
-        idle = idle_settings(self.store.scenario, is_simulated=self.store.source is None)
+        scenario = self.store.scenario
+        idle = idle_settings(scenario, is_simulated=self.store.source is None)
+        gone = tuple(f"{path}." for path in idle if path in self.headings)
         with pn.io.hold():
-            for path, view in self.parts:
-                view.visible = not any(path.startswith(f"{group}.") for group in idle if group != topic_of(group))
             for path, field in self.fields.items():
+                field.view.visible = not path.startswith(gone)
                 field.rest(idle.get(path, idle.get(topic_of(path), "")))
-            for path, editor in self.lists.items():
-                editor.rest(idle.get(path, ""))
-            for path, (title, pane) in self.headings.items():
-                pane.html = f"<b>{title}</b>{idle_html(idle.get(path, ''))}"
+            for path, pane in self.headings.items():
+                topic, name = path.split(".", 1)
+                pane.html = heading_html(str(getattr(scenario, topic).settings()[name].label), idle.get(path, ""))
 
-    def _fields_of(self, name: str) -> list[tuple[str, Any]]:
-        """Make the fields of a topic under the headings of its groups, with the paths of both; none where it is a list."""
-        group = getattr(self.store.scenario, name)
-        if not isinstance(group, Group):
-            return []
-        views: list[tuple[str, Any]] = []
-        heading = name
-        for setting, _, _ in group.walk(f"{name}."):
-            if setting in AT_HAND or any(setting.startswith(f"{listed}.") for listed, _ in self.store.scenario.lists()):
-                continue
-            *_, above, _name = setting.split(".")
-            if above != heading:
-                heading = above
-                pane = html(margin=(8, 0, 0, 0), styles={"font-size": "13px"})
-                self.headings[f"{name}.{above}"] = escape(str(group.settings()[above].label)), pane
-                views.append((f"{name}.{above}", pane))
-            views.append((setting, self._part(setting).view))
-        return views
-
-    def _part(self, path: str) -> Field | RowEditor:
+    def _field(self, path: str) -> Field:
         """Return the field of a setting or the table of a list, made when first wanted. Raises KeyError where there is none."""
-        known = self.fields.get(path) or self.lists.get(path)
-        if known is None:
-            lists = dict(self.store.scenario.lists())
-            if path in lists:
-                known = self.lists[path] = RowEditor(self.store, path, lists[path])
-            else:
-                settings = {where: p for where, _, p in self.store.scenario.walk()}
-                known = self.fields[path] = make_field(self.store, path, settings[path])
-        return known
-
-    def _watch(self) -> None:
-        self.preset.param.watch(self._on_choice, "value")
-        self.store.param.watch(self._refresh_preset, ["preset", "can_undo", "can_redo"])
-        self.store.param.watch(once(self._count_changes, AFTERWARDS_MS), ["scenario", "preset"])
-        self.store.param.watch(self._refresh_parts, ["scenario", "source"])
-        self.store.param.watch(self._refresh_run, ["errors", "waiting"])
-        self.store.session.param.watch(self._refresh_run, "doing")
-        self.store.run.param.watch(self._show_effect, "state")
-        # Last, so that "Done" is said of what has been drawn.
-        self.store.run.param.watch(self._refresh_run, ["state", "progress", "place", "message"], precedence=2)
-
-    def _on_choice(self, event: Any) -> None:
-        if event.new != self.store.preset:
-            self.store.choose(event.new)
+        if path not in self.fields:
+            self.fields[path] = make_field(self.store, path, self._settings[path])
+        return self.fields[path]
 
     def _refresh_preset(self, *_: object) -> None:
         self.preset.value = self.store.preset
@@ -342,7 +313,7 @@ class Controls:
             return
         before, self._before = self._before, now
         changed = [*changed_settings(now.scenario, before.scenario)] if before else []
-        part = (self.fields.get(changed[0]) or self.lists.get(changed[0])) if len(changed) == 1 else None
+        part = self.fields.get(changed[0]) if len(changed) == 1 else None
         line = self.effect_of(before, now) if before and part else ""
         self._effect.param.update(
             html=f'<div title="{line}">{line}</div>' if line else "", styles=IN_GAP if isinstance(part, SliderField) else {}
@@ -360,9 +331,3 @@ class Controls:
 def topic_of(path: str) -> str:
     """Return the topic of a setting."""
     return path.split(".")[0]
-
-
-def _names() -> dict[str, str]:
-    """Topic -> title, in the order of the drawer."""
-    settings = {name: str(p.label) for name, p in Scenario.settings().items()}
-    return {name: settings[name] for name in dict.fromkeys((*TOPICS, *settings))}

@@ -15,22 +15,22 @@ import panel_material_ui as pmui
 from wfsobs.app.controls.panel import Status
 from wfsobs.app.display import Display
 from wfsobs.app.jobs import BATCH, FAILED, RUNNING, Job, Work
-from wfsobs.app.pages.parts import WIDE, LinkedFields, Page, box, boxes, html, line, text
-from wfsobs.app.pages.sweep import ErrorLines, SweepMap, line_of
+from wfsobs.app.pages.parts import WIDE, LinkedFields, Page, box, boxes, html, line, render_part, text
+from wfsobs.app.pages.sweep import ErrorLines, SweepMap
 from wfsobs.app.pages.sweep_views import DECIDED, LEFT_OUT, OPEN, WAITING, map_square, verdict_text
-from wfsobs.app.render import NOTHING, number, table
+from wfsobs.app.render import NOTHING, number
 from wfsobs.app.service import BackgroundTask
-from wfsobs.app.share import CAMPAIGN, EXPLORED, CopiedTask
+from wfsobs.app.share import CAMPAIGN, CopiedTask
 from wfsobs.app.store import Store
-from wfsobs.app.style import look, make_select, named_row
+from wfsobs.app.style import look, make_select
 from wfsobs.campaign.compare import CampaignErrors
-from wfsobs.campaign.follow import UNTESTED, CampaignState, TogetherRow, progress_text, standings
+from wfsobs.campaign.follow import UNTESTED, CampaignState, progress_text, standings
 from wfsobs.campaign.plan import SCENARIO, PlanAxis, condition, plan_axes
 from wfsobs.campaign.report import name_label
 from wfsobs.evaluation.result import target_title
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.names import setting_label, value_of
+from wfsobs.scenario.names import name_settings, setting_label, value_of
 from wfsobs.settings.values import SettingError
 from wfsobs.typing import Array
 
@@ -65,41 +65,19 @@ def value_names(axis: PlanAxis) -> list[str]:
 
 def standings_html(view: CampaignView, display: Display) -> str:
     """Write the table of all observers over the scenarios shown, best first."""
-    scale, several = view.scale(display), len(view.errors.known_cells(view.cells)) > 1
-    columns = {
-        "Observer": "",
-        f"Error [{display.unit_label}]": "rms over the seeds; over scenarios the geometric mean",
-        "Error / limit": "geometric mean over the scenarios; the lowest theoretical limit of each",
-        "95 %": "of error / limit, over the scenarios",
-        "Above the best [%]": f"paired over the {'scenarios' if several else 'seeds'}, with its interval of 95 %",
-        "Rank": f"best: all others differ significantly; tied: not significantly different from the best; {NOTHING}: not tested",
-        "Wins": "scenarios with the smallest error, and how many of them are significant",
-        "Records": "",
-        "Failed": "runs without an estimate",
-    }
-    rows, shown = [], standings(view.state, view.target, view.mode, view.cells)
-    for s in shown:
-        low, high = s.over_bound_low, s.over_bound_high
-        cells_of = [
-            number(scale * s.rms_nm),
-            number(s.over_bound),
-            f"{number(float(low))} – {number(float(high))}" if np.isfinite(low) and np.isfinite(high) else NOTHING,
-            _above(s),
-            NOTHING if s.rank == UNTESTED else s.rank,
-            NOTHING if s.wins is None else f"{s.wins} ({s.decided_wins})",
-            str(s.records),
-            NOTHING if s.failures is None else str(s.failures),
-        ]
-        rows.append(named_row(s.name, name_label(s.name), display.dark, cells_of))
+    shown = standings(view.state, view.target, view.mode, view.cells)
     lost = {name for name, n in view.state.failures.items() if n[view.cells].any()} - {s.name for s in shown}
-    names = escape(", ".join(map(name_label, sorted(lost))))
-    why = f"<p>Without errors: {names}; <code>wfsobs campaign table</code> says why.</p>" if lost else ""
-    return table("Observers of the campaign", columns, rows) + why
-
-
-def _above(s: TogetherRow) -> str:
-    around = "" if np.isnan(s.above_low) else f" ({number(100 * s.above_low, 2)} to {number(100 * s.above_high, 2)})"
-    return number(100 * s.above, 2) + around
+    return render_part(
+        "standings",
+        display,
+        shown=shown,
+        lost=[name_label(name) for name in sorted(lost)],
+        scale=view.scale(display),
+        paired_over="scenarios" if len(view.errors.known_cells(view.cells)) > 1 else "seeds",
+        untested=UNTESTED,
+        isfinite=np.isfinite,
+        label=name_label,
+    )
 
 
 def winners_grid(view: CampaignView, x: PlanAxis, y: PlanAxis | None, display: Display) -> dict[str, Any]:
@@ -188,9 +166,11 @@ class CampaignPage(Page):
     def __init__(self, store: Store, display: Display, explore: Callable[[], None]):
         """Make the page. explore : turns to the page that shows a scenario."""
         super().__init__(store, display)
+        folder = store.session.service.campaign
+        assert folder is not None  # else there is no such page
+        self.folder: Final = folder
         self._explore = explore
         self.work: Final = BackgroundTask(store.session)
-        self.folder: Final = store.session.service.campaign
         self.status: Final = Status(label="Progress of the campaign", sizing_mode="stretch_width", margin=(4, 0))
         self.failure: Final = html()
         self.room: Final = boxes()
@@ -219,19 +199,15 @@ class CampaignPage(Page):
     @property
     def task(self) -> CopiedTask:
         """To print the table as it is shown; its folder is named as a loaded record is: without where it lies."""
-        folder, state = self.folder, self.state
-        if folder is None:
-            return EXPLORED
-        target = [self.target.value] if state is not None and self._targets else []
-        mode = [self._mode(state, *target)] if state is not None and target else []
+        state, name = self.state, self.folder.folder.resolve().name
+        target, mode = ([self.target.value], [self._mode(state)]) if state is not None and self._targets else ([], [])
         only = [condition(self.axes[path], i) for path, i in self._choices().items()]
-        return CopiedTask(CAMPAIGN, {"folder": folder.folder.resolve().name, "target": target, "mode": mode, "only": only})
+        return CopiedTask(CAMPAIGN, {"folder": name, "target": target, "mode": mode, "only": only})
 
     def tick(self) -> None:
         """Read what is new, unless that is under way."""
-        folder = self.folder
-        if folder is not None and self.work.state != RUNNING:
-            work: Work = lambda watch, _tell: folder.read(watch)  # noqa: E731
+        if self.work.state != RUNNING:
+            work: Work = lambda watch, _tell: self.folder.read(watch)  # noqa: E731
             self.work.start(Job("campaign", work, priority=BATCH, refusal=SettingError, quiet=True))
 
     @property
@@ -248,19 +224,15 @@ class CampaignPage(Page):
     def load(self, cell: int) -> None:
         """Open the scenario of a cell in Explore, with the first seed of the campaign."""
         state = self.state
-        if state is None or not 0 <= cell < len(state.plan.cells):
-            return
-        try:
-            self.store.run_on(None, state.plan.cells[cell].scenario().replace({"run.seed": state.plan.seeds.start}))
-        except SettingError as error:
-            self._refuse(line_of(error))
-        else:
-            self._explore()
+        if state is not None and 0 <= cell < len(state.plan.cells):
+            seed = {"run.seed": state.plan.seeds.start}
+            if self.work.attempt(lambda: self.store.run_on(None, state.plan.cells[cell].scenario().replace(seed))):
+                self._explore()
 
     def _take(self, *_: object) -> None:
-        if self.work.state == FAILED and self.folder is not None:
+        if self.work.state == FAILED:
             elsewhere = f"{self.folder.folder.parent}{os.sep}"  # no business of a visitor
-            self._refuse(line_of(SettingError(self.work.message.replace(elsewhere, ""))))
+            self._refuse(name_settings(self.work.message.replace(elsewhere, "")))
         state = self.state
         if state is not None:
             self._make(state)
@@ -273,10 +245,10 @@ class CampaignPage(Page):
     def _say(self, *_: object) -> None:
         """Describe how far the campaign is."""
         state, work = self.state, self.work
-        text, progress = work.line("Reading"), work.progress
-        if state is not None:
-            text, progress = progress_text(state), state.n_done / state.plan.n_runs
-        self.status.param.update(text=text, progress=progress)
+        if state is None:
+            self.status.param.update(text=work.line("Reading"), progress=work.progress)
+        else:
+            self.status.param.update(text=progress_text(state), progress=state.n_done / state.plan.n_runs)
 
     def _make(self, state: CampaignState) -> None:
         """Make the fields when the first results are there, and anew where there are errors of something else."""
@@ -284,10 +256,9 @@ class CampaignPage(Page):
         if targets == self._targets:
             return
         self._targets = targets
-        base = state.plan.cells[0].scenario()
-        self.base: Scenario = base
+        self.base: Scenario = state.plan.cells[0].scenario()
         self.axes = {axis.path: axis for axis in plan_axes(state.plan)}
-        names = {axis_name(axis, base): path for path, axis in self.axes.items()}
+        names = {axis_name(axis, self.base): path for path, axis in self.axes.items()}
         first, second, *_ = [*self.axes, None, None]
         self.target = make_select("Errors of", {target_title(t): t for t in targets}, targets[0], 300)
         self.across = make_select("Across", names, first, 300)
@@ -303,8 +274,8 @@ class CampaignPage(Page):
         self.lines = pmui.MultiChoice(
             label="Lines", options={name_label(name): name for name in (*known, *bounds)}, value=[*best, *bounds], **WIDE
         )
-        only = {f"only.{path}": field for path, field in self.filters.items()}
-        linked = {"target": self.target, "across": self.across, "down": self.down, **only, "lines": self.lines}
+        linked = {"target": self.target, "across": self.across, "down": self.down}
+        linked |= {f"only.{path}": field for path, field in self.filters.items()} | {"lines": self.lines}
         if refused := self._fields.make(linked):
             self._refuse(f"Not used from the link: {', '.join(refused)}")
         for field in linked.values():
@@ -317,23 +288,20 @@ class CampaignPage(Page):
 
     def view_of(self, state: CampaignState) -> CampaignView | None:
         """Return what is shown by the fields and the mode of the page; None where there is nothing."""
-        target = self.target.value
         cells = np.arange(len(state.plan.cells))
         for path, i in self._choices().items():
             cells = cells[self.axes[path].of_cell[cells] == i]
-        if not len(cells):
-            return None
-        mode = self._mode(state, target)
-        return CampaignView(state, target, mode, state.errors[target, mode], cells, self.base)
+        target, mode = self.target.value, self._mode(state)
+        return CampaignView(state, target, mode, state.errors[target, mode], cells, self.base) if len(cells) else None
 
     def _choices(self) -> dict[str, int]:
         """Return the conditions that the fields leave one value of: path -> position of the value."""
         chosen = {path: field.value for path, field in self.filters.items() if field.value != ALL}
         return {path: value_names(self.axes[path]).index(value) for path, value in chosen.items()}
 
-    def _mode(self, state: CampaignState, target: str) -> str:
+    def _mode(self, state: CampaignState) -> str:
         """Return the mode of the page, or where there is none of it the first."""
-        modes = [mode for known, mode in state.errors if known == target]
+        modes = [mode for target, mode in state.errors if target == self.target.value]
         return self.display.mode if self.display.mode in modes else modes[0]
 
     def draw(self) -> None:

@@ -10,16 +10,14 @@ from typing import Any, Final
 import numpy as np
 import panel as pn
 from bokeh.models import ColumnDataSource, DataRange1d, Range1d
-from markupsafe import Markup
 
 from wfsobs.app.display import Display
 from wfsobs.app.downloads import residuals_csv, table_csv
-from wfsobs.app.glossary import NEEDS, STREHL, TERMS
+from wfsobs.app.glossary import TERMS
 from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING, Job
 from wfsobs.app.loop_work import LoopResults, compute, cost, seconds, uncertain, uncertain_seconds
 from wfsobs.app.pages.parts import (
     EDITED,
-    HALVES,
     SMALL_LABEL,
     TALL,
     WIDE,
@@ -28,18 +26,20 @@ from wfsobs.app.pages.parts import (
     box,
     boxes,
     figure_with_caption,
+    halves,
     html,
     line,
+    render_part,
     text,
     tick,
     zoom_buttons,
 )
-from wfsobs.app.render import NOTHING, Row, macro, number, signs, table
+from wfsobs.app.render import signs
 from wfsobs.app.service import IDLE, BackgroundTask
 from wfsobs.app.share import LOOP, CopiedTask
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
-from wfsobs.app.style import look, named_row
+from wfsobs.app.style import look
 from wfsobs.app.views.errors import Cards, card_of, error_fields
 from wfsobs.app.views.gain_editor import GainEditor, decibel, plane
 from wfsobs.app.views.plots import (
@@ -61,8 +61,6 @@ from wfsobs.evaluation.verdict import Verdict
 from wfsobs.settings.values import SettingError
 from wfsobs.signal.envelope import envelope, envelope_times
 
-UNSTABLE = macro("tag", "above", "unstable")
-
 LINEAR = tuple(c.id for c in CONTROLLERS.values() if c.law and not c.predict)
 
 PLANT_INTRO = (
@@ -71,25 +69,6 @@ PLANT_INTRO = (
     f"where the mirror has one, resonance (±{100.0 * Uncertainty.resonance:g} %), of which they know nothing."
 )
 PLANT_ABOUT = "The worst plant bold, the mean faint, against the error of the delay; all other errors as they come."
-
-
-def uncertain_columns(unit: str) -> dict[str, str]:
-    """Return the columns of a table of controllers that an envelope adds: heading -> explanation."""
-    return {
-        f"95 % [{unit}]": "of the stable ones of the uncertain plants are below, by theory",
-        f"Worst [{unit}]": "of the uncertain plants and of the corners of their range",
-        "Unstable [%]": "of the uncertain plants",
-    }
-
-
-def uncertain_cells(envelope: PlantEnvelope, column: int, scale: float) -> dict[str, list[str]]:
-    """Return the cells of these columns by controller; scale : of [um]."""
-    out = {}
-    for spread in envelope.spreads:
-        (_, most), worst = spread.summary(column), spread.worst[column]
-        cells = [UNSTABLE if x is None or np.isinf(x) else number(scale * x) for x in (most, worst)]
-        out[spread.controller] = [*cells, number(100.0 * spread.unstable / len(spread.points), 2)]
-    return out
 
 
 class DelayFigure(PairedLines):
@@ -124,16 +103,6 @@ class UncertainPlant:
         """Return the box."""
         return box("Uncertain plant", text(PLANT_INTRO), line(*self.starter.view()), self.starter.status, self.room)
 
-    @property
-    def finding(self) -> PlantEnvelope | None:
-        """What there is so far."""
-        return self.work.result
-
-    @property
-    def complete(self) -> bool:
-        """Whether all controllers are in it."""
-        return self.work.state == DONE and self.finding is not None
-
     def _start(self) -> None:
         of = self.store.run.result
         if of is None or isinstance(of.source, LoadedRecord):
@@ -148,7 +117,7 @@ class UncertainPlant:
 
     def draw(self, hidden_names: list[str]) -> None:
         """Draw what there is."""
-        envelope = self.finding
+        envelope: PlantEnvelope | None = self.work.result
         self.room.visible = envelope is not None
         if envelope is not None:
             self.figure.draw(envelope, self.display)
@@ -316,31 +285,24 @@ def of_mode(results: LoopResults, display: Display) -> list[Score]:
 
 def loop_html(results: LoopResults, display: Display, envelope: PlantEnvelope | None = None) -> str:
     """Residual and Strehl of every controller, and the bounds; with an envelope, what an uncertain plant does to them."""
-    unit = display.unit_label
-    added = {} if envelope is None else uncertain_columns(unit)
-    columns = {
-        "Controller": "",
-        f"Residual [{unit}]": "rms after the warm-up",
-        f"Theory [{unit}]": "from the true spectra, for an endless record",
-        **added,
-        f"Strehl at {results.result.scenario.control.wavelength:g} µm": TERMS[STREHL],
-        "Gain": "of the integrator",
-        "At a limit [%]": "steps in which a limit of the mirror changed the command",
-        "Prior knowledge": TERMS[NEEDS],
-    }
     rows = of_mode(results, display)
     ranked = (r["controller"] for r in rows if r["controller"] not in BOUNDS and r["residual_rms_nm"] is not None and r["ranked"])
-    smallest = next(ranked, None)
-    scale = 1e-3 * display.scale(results.result.scenario)
-    more = uncertain_cells(envelope, display.column, 1e3 * scale) if envelope is not None else {}
-    empty = [NOTHING] * len(added)
-    body = [_row(r, display, scale, r["controller"] == smallest, more.get(r["controller"], empty)) for r in rows]
-    noted = {r["note"]: r for r in reversed(rows) if r["note"] not in ("", LIMITED)}.values()
-    kinds = [("text", [r for r in noted if r["residual_rms_nm"] is not None])]
-    kinds += [("failure", [r for r in noted if r["residual_rms_nm"] is None])]
-    notes = "".join(macro("texts", kind, [f"{label(r['controller'])}: {r['note']}" for r in some]) for kind, some in kinds)
-    said = no_theory(rows)
-    return table("Controllers", columns, body) + (f"<p>{said}</p>" if said else "") + notes
+    return render_part(
+        "controllers",
+        display,
+        rows=rows,
+        smallest=next(ranked, None),
+        noted=[*{r["note"]: r for r in reversed(rows) if r["note"] not in ("", LIMITED)}.values()],
+        said=no_theory(rows),
+        spreads={} if envelope is None else {spread.controller: spread for spread in envelope.spreads},
+        envelope=envelope,
+        scale=1e-3 * display.scale(results.result.scenario),
+        wavelength=results.result.scenario.control.wavelength,
+        terms=TERMS,
+        limited=LIMITED,
+        not_applicable=NOT_APPLICABLE,
+        label=label,
+    )
 
 
 def loop_verdict_html(
@@ -355,40 +317,9 @@ def loop_verdict_html(
     return f'<p class="verdict">{escape(" ".join(said))}</p>' if said else ""
 
 
-def _row(row: Score, display: Display, scale: float, smallest: bool, more: Sequence[str]) -> Row:
-    def scaled(key: str) -> str:
-        return number(row[key] and row[key] * scale)
-
-    residual = UNSTABLE if row["stable"] is False else scaled("residual_rms_nm")
-    why_none = Markup('<span title="{}">{}</span>').format(LIMITED, NOT_APPLICABLE)
-    cells = [
-        (macro("tag", "smallest", "smallest") if smallest else "") + residual,
-        why_none if row["limited"] else scaled("predicted_rms_nm"),
-        *more,
-        NOTHING if row["strehl"] is None else f"{row['strehl']:.4f}",
-        number(row["gain"]),
-        NOTHING if row["limited"] is None else number(100.0 * row["limited"], 2),
-        row["needs"],
-    ]
-    return _line(row, display, cells)
-
-
 def margins_html(results: LoopResults, display: Display) -> str:
     """Margins of the loops that have a transfer function."""
-    columns = {
-        "Controller": "",
-        "Gain margin [dB]": "factor that the loop gain can rise by before the loop is unstable",
-        "Phase margin [°]": "phase lag that can be added before the loop is unstable",
-        "Delay margin [ms]": "delay that can be added before the loop is unstable",
-    }
-    rows = [r for r in of_mode(results, display) if r["phase_margin_deg"] is not None]
-    keys = ("gain_margin_db", "phase_margin_deg", "delay_margin_ms")
-    return table("Margins", columns, [_line(r, display, [number(r[key]) for key in keys]) for r in rows])
-
-
-def _line(row: Score, display: Display, cells: list[str]) -> Row:
-    name = row["controller"]
-    return named_row(name, label(name), display.dark, cells, "controller")
+    return render_part("margins", display, rows=of_mode(results, display), label=label)
 
 
 FIRST_S, ZOOM_S = 2.0, 0.5
@@ -420,10 +351,7 @@ class ClosedLoopPage(Page):
         self._of = object()
         self._verdict: Verdict | None = None
         self._rooms = list[pn.viewable.Viewable]()
-        self.note: Final = html()
-        self.verdict: Final = html()
-        self.table: Final = html()
-        self.margins: Final = html()
+        self.note, self.verdict, self.table, self.margins = (html() for _ in range(4))
         self.cards: Final = Cards("controllers")
         self.link = self.lines = LineChoice("hide", CONTROLLERS)
         self.lines.tie(self.cards)
@@ -448,15 +376,15 @@ class ClosedLoopPage(Page):
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""
-        named = {"Residual": self.trace, "Spectrum of the residual": self.spectrum, "Residual, zoomed": self.zoom}
-        rooms = [figure_with_caption(title, drawn.figure, tall=True) for title, drawn in named.items()]
-        figures = pn.Column(*rooms, self.room, **WIDE, stylesheets=[HALVES])
-        margins = pn.Column(text(ABOUT), self.margins, **WIDE)
-        stability = pn.Column(self.stability, margins, **WIDE, stylesheets=[HALVES])
+        titles = "Residual", "Spectrum of the residual", "Residual, zoomed"
+        drawn = zip(titles, (self.trace, self.spectrum, self.zoom), strict=True)
+        rooms = [figure_with_caption(title, of.figure, tall=True) for title, of in drawn]
+        stability = halves(self.stability, pn.Column(text(ABOUT), self.margins, **WIDE))
         edit = tick(self.display, "editing", stylesheets=[SMALL_LABEL])
         switch = pn.FlexBox(*zoom_buttons(self.trace.zoom, {"All": None, f"{FIRST_S:g} s": FIRST_S}), edit, **WIDE)
-        parts = (switch, figures, box("Controllers", self.table), self.uncertain.view(), box("Stability", stability))
-        self._rooms = [pn.Column(part, **WIDE) for part in parts]  # a grid by its own style is shown even where it is not visible
+        below = box("Controllers", self.table), self.uncertain.view(), box("Stability", stability)
+        # A grid by its own style is shown even where it is not visible.
+        self._rooms = [pn.Column(part, **WIDE) for part in (switch, halves(*rooms, self.room), *below)]
         residual = box("Residual in closed loop", text(INTRO), self.note, self.verdict, self.cards, *self._rooms[:2])
         return boxes(residual, *self._rooms[2:])
 
@@ -522,8 +450,8 @@ class ClosedLoopPage(Page):
             for drawn in (self.trace, self.zoom, self.spectrum):
                 drawn.fit(self.lines.hidden_lines)
             if self.results is not None:
-                envelope = self.uncertain.finding
-                known = envelope if self.uncertain.complete else None
+                envelope = self.uncertain.work.result
+                known = envelope if self.uncertain.work.state == DONE else None
                 self.verdict.html = loop_verdict_html(self.results, self._verdict, self.display, known)
                 self.table.html = loop_html(self.results, self.display, envelope)
                 self.uncertain.draw(self.lines.hidden_lines)

@@ -14,7 +14,6 @@ from wfsobs.app.idle_work import Budgets, SeedRuns
 from wfsobs.app.pages.parts import (
     BELOW_FIGURES,
     EDITED,
-    HALVES,
     SMALL_LABEL,
     TALL,
     WIDE,
@@ -23,6 +22,7 @@ from wfsobs.app.pages.parts import (
     caption,
     caption_html,
     grid_style,
+    halves,
     tick,
     zoom_buttons,
 )
@@ -117,7 +117,7 @@ class Explore(Page):
         above = follow_html(self._above_spectrum, (self.run, "result")) if target == VIBRATION else caption("Spectrum")
         traces = pn.Column(caption("Time trace"), self.traces.pane(target), **TALL)
         self.rooms[target] = pn.Column(above, self.spectra.pane(target), **TALL)
-        figures = pn.Column(traces, self.rooms[target], **WIDE, stylesheets=[HALVES])
+        figures = halves(traces, self.rooms[target])
         window = [self._tick("window_spectra")] if target == TARGETS[0] else []
         below = pn.Row(self.stretches[target].pane, *window, **WIDE, stylesheets=[WRAPPED])
         head = pn.Column(self.verdicts[target].pane, cards, **WIDE, stylesheets=[HEAD, BELOW_FIGURES])

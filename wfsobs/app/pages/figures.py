@@ -10,7 +10,7 @@ from bokeh.models import BoxAnnotation
 
 from wfsobs.app.compared import find_score
 from wfsobs.app.display import Display
-from wfsobs.app.pages.parts import WIDE, Page, boxes
+from wfsobs.app.pages.parts import WIDE, Page, boxes, pane
 from wfsobs.app.render import number, render, short
 from wfsobs.app.store import Store
 from wfsobs.app.style import HtmlText, html, look, sheets, swatch
@@ -53,7 +53,7 @@ class _Sheet:
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""
-        panes = [pn.pane.Bokeh(drawn.figure, **WIDE) for drawn in self.plots]
+        panes = [pane(drawn.figure) for drawn in self.plots]
         return pn.Column(self.head, *panes, self.caption, **WIDE, stylesheets=sheets("box"))
 
     def draw(self, results: RunResults, display: Display) -> None:
@@ -69,20 +69,16 @@ class _Sheet:
             drawn.draw(results, display)
 
     def _errors(self, results: RunResults, display: Display) -> str:
-        """List the RMS errors of the lines, mode by mode."""
+        """List the RMS errors of the lines, mode by mode, behind each the one that the paper states."""
         scale, parts = display.scale(results.scenario), []
+        stated = {name: f" (paper {number(error * scale)})" for name, error in self.figure.paper_errors}
         for column in sorted({plot.column for plot in self.figure.plots}):
             mode = TIP_TILT[column].name
             scores = {name: find_score(results.result.scores, name, self.figure.target, mode) for name in self.figure.observers}
-            found = ", ".join(f"{_label(n)} {number(s.rms * scale)}{self._paper_error(n, scale)}" for n, s in scores.items() if s)
+            found = [f"{_label(n)} {number(s.rms * scale)}{stated.get(n, '')}" for n, s in scores.items() if s]
             if found:
-                parts.append(f"RMS error of {mode} [{display.unit_label}]: {found}.")
+                parts.append(f"RMS error of {mode} [{display.unit_label}]: {', '.join(found)}.")
         return " ".join(parts)
-
-    def _paper_error(self, name: str, scale: float) -> str:
-        """Write the error that the paper states, to stand behind the one of the run."""
-        error = dict(self.figure.paper_errors).get(name)
-        return "" if error is None else f" (paper {number(error * scale)})"
 
 
 class _PlotLines(FigureLines):

@@ -25,11 +25,13 @@ from wfsobs.app.pages.parts import (
     legend,
     line,
     number_field,
+    pane,
     read_number,
+    render_part,
     text,
     warning,
 )
-from wfsobs.app.render import Row, macro, table
+from wfsobs.app.render import render
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.share import IDENTIFY, CopiedTask
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, record_key
@@ -151,55 +153,38 @@ class SpectrumFigure:
             return
         self.total.data = {"x": of.frequency, "y": scale * of.total}
         self.parts.data = {"xs": [of.frequency] * len(of.parts), "ys": [scale * part for part in of.parts]}
-        self.spikes.data = {
-            "x": [f for f, _, _ in of.lines],
-            "low": [scale * low for _, low, _ in of.lines],
-            "high": [scale * high for *_, high in of.lines],
-        }
-        tops = {f: high for f, _, high in of.lines}
+        x, low, high = np.array(of.lines).reshape(-1, 3).T
+        self.spikes.data = {"x": x, "low": scale * low, "high": scale * high}
+        tops = dict(zip(x.tolist(), high.tolist(), strict=True))
         at = [p.frequency.value for p in mode.peaks]
-        height = [tops.get(f) or float(np.interp(f, of.frequency, of.total)) for f in at]
         self.peaks.data = {
             "x": at,
-            "y": [1.6 * scale * y for y in height],
+            "y": [1.6 * scale * (tops.get(f) or float(np.interp(f, of.frequency, of.total))) for f in at],
             "text": [f"{'line' if p.pure else 'resonance'} {p.frequency.value:.5g} Hz" for p in mode.peaks],
         }
 
 
-WHITE, COLOURED = macro("tag", "best", "white"), macro("tag", "above", "not white")
-
-
 def identification_html(mode: IdentifiedMode, display: Display, scale: float) -> str:
     """Noise, turbulence and peaks of a mode, each number with its standard deviation. scale : of micrometres."""
-    columns = {
-        "What": "by frequency",
-        "Frequency [Hz]": "natural frequency; of turbulence the corner",
-        "Damping": "0 for a line",
-        f"Rms [{display.unit_label}]": "standard deviation of it in z; of a peak within this record",
-    }
-    body = []
-    for what, frequency, damping, rms in mode_rows(mode):
-        scaled = None if rms is None else Number(rms.value * scale, rms.std * scale)
-        body.append(Row(what, ["" if n is None else deviation_text(n) for n in (frequency, damping, scaled)]))
-    return table(f"Identified in {mode.name}", columns, body)
+    return render_part("identified", display, mode=mode, rows=mode_rows(mode), deviation=deviation_text, scale=scale)
 
 
-def deviation_text(number: Number) -> str:
-    """Write a number and its standard deviation, where there is one.
+def deviation_text(number: Number | None, scale: float = 1.0) -> str:
+    """Write a number and its standard deviation, where there is one; nothing for none.
 
     >>> deviation_text(Number(47.43812, 0.0264)), deviation_text(Number(1.9, float("nan")))
     ('47.438 ± 0.026', '1.9')
     """
-    return format_number(number).replace("+-", "±").replace("-", "−").removesuffix(" ± −")
+    if number is None:
+        return ""
+    text = format_number(Number(number.value * scale, number.std * scale))
+    return text.replace("+-", "±").replace("-", "−").removesuffix(" ± −")
 
 
 def verdict_html(result: Identification) -> str:
     """Whether anything is left, mode by mode."""
-    lines = [
-        (WHITE if mode.whiteness.white else COLOURED) + f"{line}."
-        for mode, line in zip(result.modes, whiteness_lines(result), strict=True)
-    ]
-    return f'<div role="status">{macro("texts", "text", lines)}</div>'
+    is_white = [mode.whiteness.white for mode in result.modes]
+    return render("pages/whiteness.html", lines=list(zip(is_white, whiteness_lines(result), strict=True)))
 
 
 INTRO = (
@@ -234,17 +219,14 @@ class IdentifyPage(Page):
     def __init__(self, store: Store, display: Display):
         super().__init__(store, display)
         self.work: Final = BackgroundTask(store.session, title="Identification")
-        uses = {"Filters only": self.tell_filters, "As a new simulation": self.simulate}
+        uses = {"Filters only": self.tell_filters, "As a new simulation": partial(self._take, None)}
         words = "Identify the record", "Progress of the identification"
         self.starter: Final = Starter(self.work, self._start, *words, uses=uses)
         self.level: Final = number_field("Level", LEVEL, 120)
         self.lowest: Final = number_field("Lowest peak [Hz]", LOWEST, 120)
         self.link = LinkedFields({"level": self.level, "lowest": self.lowest})
         self.figure: Final = SpectrumFigure()
-        self.legend: Final = html()
-        self.table: Final = html()
-        self.verdict: Final = html()
-        self.note: Final = html()
+        self.legend, self.table, self.verdict, self.note = (html() for _ in range(4))
         self.stale: Final = warning(EARLIER)
         self.of: RecordSpectrum | None = None
         self.measuring: Final = BackgroundTask(store.session)
@@ -259,7 +241,7 @@ class IdentifyPage(Page):
         row = line(self.level, self.lowest, *self.starter.view())
         return boxes(
             box("Identification", text(INTRO), row, self.starter.status, self.stale, self.verdict),
-            box("Spectrum", self.legend, self.note, pn.pane.Bokeh(self.figure.figure, **WIDE)),
+            box("Spectrum", self.legend, self.note, pane(self.figure.figure)),
             box("Model", self.table, text(ABOUT)),
         )
 
@@ -279,10 +261,6 @@ class IdentifyPage(Page):
             return False
         result, record = found
         return same_content(record, shown.result.record) and result.scenario(self.store.scenario) == self.store.scenario
-
-    def simulate(self) -> None:
-        """Take the model into the settings, and simulate it in place of the record."""
-        self._take(None)
 
     @property
     def task(self) -> CopiedTask:
@@ -328,14 +306,14 @@ class IdentifyPage(Page):
         self.figure.draw_measured(of, self.display, scale**2)
         if self.work.result is None:
             self.figure.draw_fit(None, None, 1.0)
-        else:
-            result, record = self.work.result
-            mode = result.modes[column] if column < len(result.modes) else None
-            self.figure.draw_fit(mode, fitted_spectrum(mode, result) if mode else None, scale**2)
-            self.verdict.html = verdict_html(result)
-            self.table.html = identification_html(mode, self.display, scale) if mode else ""
-            replaced = self.store.source is None and self._scenario == self.store.scenario
-            self.stale.param.update(object=REPLACED if replaced else EARLIER, visible=not same_content(record, of.record))
+            return
+        result, record = self.work.result
+        mode = result.modes[column] if column < len(result.modes) else None
+        self.figure.draw_fit(mode, fitted_spectrum(mode, result) if mode else None, scale**2)
+        self.verdict.html = verdict_html(result)
+        self.table.html = identification_html(mode, self.display, scale) if mode else ""
+        replaced = self.store.source is None and self._scenario == self.store.scenario
+        self.stale.param.update(object=REPLACED if replaced else EARLIER, visible=not same_content(record, of.record))
 
 
 NEXT = "Next: identify noise, turbulence and vibration peaks in this record, as prior knowledge of the observers."
@@ -366,14 +344,17 @@ class Suggestion:
         self._refresh()
 
     def _refresh(self, *_: object) -> None:
-        work = self.page.work if self.page else None
-        if work and self.page and self._waits and work.state != RUNNING:
-            self._waits = False
-            if work.state == DONE:
-                self.page.work.attempt(self.page.tell_filters)
-        running, used = bool(work and work.state == RUNNING), bool(self.page and self.page.is_used)
-        said = IDENTIFIED if used else work.line("Identifying") if work and running else (work and work.message) or NEXT
+        said, is_running, used = NEXT, False, False
+        if self.page is not None:
+            work = self.page.work
+            is_running = work.state == RUNNING
+            if self._waits and not is_running:
+                self._waits = False
+                if work.state == DONE:
+                    work.attempt(self.page.tell_filters)
+            used = self.page.is_used
+            said = IDENTIFIED if used else work.line("Identifying") if is_running else work.message or NEXT
         with pn.io.hold():
             self.words.html = f'<p class="text" role="status">{escape(said)}</p>'
-            self.button.param.update(visible=not used, disabled=running or self.store.run.state != DONE)
+            self.button.param.update(visible=not used, disabled=is_running or self.store.run.state != DONE)
             self.view.visible = isinstance(self.store.source, LoadedRecord)

@@ -12,34 +12,33 @@ from typing import Any, Final
 import numpy as np
 import panel as pn
 import panel_material_ui as pmui
-from markupsafe import Markup
 
 from wfsobs.app.compared import name_of_difference
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs import FAILED, RUNNING
 from wfsobs.app.live_work import live_job, record_saves
-from wfsobs.app.pages.live_figures import MEASUREMENT, Painter, Pulse, RollingSpectra, RollingTraces, Stars, Waterfall
+from wfsobs.app.pages.live_figures import MEASUREMENT, Pulse, RollingSpectra, RollingTraces, Stars, Waterfall
 from wfsobs.app.pages.parts import (
-    HALVES,
-    WIDE,
     LinkedFields,
     Page,
     box,
     boxes,
     example,
     figure_with_caption,
+    halves,
     legend,
     line,
+    render_part,
     text,
     tick,
 )
-from wfsobs.app.render import NOTHING, Row, number, table
+from wfsobs.app.render import NOTHING, render
 from wfsobs.app.service import IDLE, BackgroundTask
 from wfsobs.app.share import LIVE, CopiedTask
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
-from wfsobs.app.style import bare, look, make_select, named_row
+from wfsobs.app.style import bare, look, make_button, make_select
 from wfsobs.app.views.spectrum_editor import Frames, SpectrumEditor
 from wfsobs.app.views.switches import group
 from wfsobs.app.views.traces import WINDOW_S
@@ -48,13 +47,13 @@ from wfsobs.closed_loop.run import strehl
 from wfsobs.evaluation.exact_errors import Theory
 from wfsobs.evaluation.result import row_label, target_title
 from wfsobs.evaluation.scores import BOUNDS
-from wfsobs.live.board import ADAPTIVE, NEXT, SCORED, SHARED, SLOTS, LiveView
+from wfsobs.live.board import ADAPTIVE, NEXT, SHARED, SLOTS, LiveView
 from wfsobs.live.checks import can_control, can_run, has_error, speed_of
 from wfsobs.live.crew import SEATS, USUAL
-from wfsobs.live.finding import Bounds, Change, PeakFinding, moves_of
+from wfsobs.live.finding import Bounds, Change, moves_of
 from wfsobs.live.loop import LiveLoop, LiveOrder
 from wfsobs.live.simulated import SimulatedLoop
-from wfsobs.live.source import ALARM, SIMULATION, STREAM, LiveEvent, LiveSource, Replay
+from wfsobs.live.source import ALARM, SIMULATION, STREAM, LiveEvent, Replay
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.record import TOTAL
@@ -76,38 +75,21 @@ def ranking(view: LiveView, names: Iterable[str], target: str, column: int) -> l
 
 def live_html(loop: LiveLoop, view: LiveView, target: str, display: Display, scale: float, bounds: Bounds) -> str:
     """Write the table of all observers that run."""
-    unit, seconds = display.unit_label, view.n * view.dt
-    columns = {
-        "Observer": "",
-        f"RMS error [{unit}]": f"over the last {seconds:.1f} s",
-        f"Since its start [{unit}]": "after its warm-up",
-        "Error / limit": "the lower theoretical limit of the two",
-        "Step, median [µs]": "update and estimate of all modes",
-        "99.9 % [µs]": "",
-        "Longer than a frame": "steps",
-    }
     of = {name: by_target[target][display.column] for name, by_target in bounds.items() if target in by_target}
-    least = min(of.values(), default=float("nan"))
-    rows = [
-        _row(loop, name, rms, target, display, scale, least)
-        for name, rms in ranking(view, loop.board.active(), target, display.column)
-    ]
-    rows += [named_row(name, row_label(name), display.dark, [number(scale * rms), *[NOTHING] * 5]) for name, rms in of.items()]
-    return table("Live", columns, rows)
-
-
-def _row(loop: LiveLoop, name: str, rms: float, target: str, display: Display, scale: float, least: float) -> Row:
-    counts = loop.board[name]
-    whole = float(counts.rms(target)[display.column]) if target in SCORED else float("nan")
-    lacks = [one for one in ((target,) if target in TARGETS else TARGETS) if one not in OBSERVERS[name].targets]
-    cells = [
-        Markup('<span title="it has no {}">{}</span>').format(lacks[0], NOTHING) if lacks else number(scale * rms),
-        number(scale * whole),
-        number(rms / least),
-        *(number(1e6 * counts.latencies.quantile(share)) for share in (0.5, 0.999)),
-        str(int(counts.late[0])),
-    ]
-    return named_row(name, look(name).label, display.dark, cells)
+    return render_part(
+        "live_observers",
+        display,
+        ranked=ranking(view, loop.board.active(), target, display.column),
+        limits=of,
+        least=min(of.values(), default=float("nan")),
+        board=loop.board,
+        observers=OBSERVERS,
+        target=target,
+        wanted=(target,) if target in TARGETS else TARGETS,
+        seconds=view.n * view.dt,
+        scale=scale,
+        row_label=row_label,
+    )
 
 
 def control_html(loop: LiveLoop, seconds: float, display: Display) -> str:
@@ -115,53 +97,31 @@ def control_html(loop: LiveLoop, seconds: float, display: Display) -> str:
     left = loop.control_view(seconds)
     if left is None or not loop.controllers:
         return ""
-    c, diameter, column = loop.scenario.control, loop.scenario.telescope.diameter, display.column
-    of = "the disturbance" if loop.source.has_truth else "what its sensor would see, with its noise"
-    columns = {
-        "Controller": "",
-        "Residual [nm]": f"rms of {of}, over the last {seconds:g} s, in the mode shown",
-        "Residual [mas]": "the same; tip and tilt alone",
-        "Since its start [nm]": "after its warm-up",
-        f"Strehl at {c.wavelength:g} µm": f"of all modes together, over the last {seconds:g} s",
-        "Strehl since its start": "after its warm-up",
-    }
-    mas = per_micrometre("mas", diameter) if loop.scenario.modes[column].radial_order == 1 else float("nan")
-    found = {name: (left.rms(name), left.rms_since_start(name)) for name in loop.controllers}
+    scenario, column = loop.scenario, display.column
+    wavelength = scenario.control.wavelength
+    mas = per_micrometre("mas", scenario.telescope.diameter) if scenario.modes[column].radial_order == 1 else float("nan")
+    found = [(name, left.rms(name), left.rms_since_start(name)) for name in loop.controllers]
 
-    def cells(now: Array, whole: Array) -> list[str]:
-        ratios = [NOTHING if np.isnan(rms).any() else f"{strehl(rms.tolist(), c.wavelength):.4f}" for rms in (now, whole)]
-        return [*map(number, (1e3 * now[column], mas * now[column], 1e3 * whole[column])), *ratios]
+    def strehl_text(rms: Array) -> str:
+        return NOTHING if np.isnan(rms).any() else f"{strehl(rms.tolist(), wavelength):.4f}"
 
-    order = sorted(found, key=lambda name: inf if isnan(found[name][0][column]) else found[name][0][column])
-    rows = [named_row(name, look(name).label, display.dark, cells(*found[name]), "controller") for name in order]
-    return table("Controllers of the live loop", columns, rows)
+    return render_part(
+        "live_controllers",
+        display,
+        found=sorted(found, key=lambda one: inf if isnan(one[1][column]) else one[1][column]),
+        has_truth=loop.source.has_truth,
+        mas=mas,
+        seconds=seconds,
+        strehl=strehl_text,
+        wavelength=wavelength,
+    )
 
 
 def peaks_html(change: Change | None, scale: float, unit: str) -> str:
     """Write the peaks of the last identification, and how far each is from where the one before had it."""
     if change is None:
         return ""
-    columns = {
-        "Peak [Hz]": "",
-        "± [Hz]": "standard deviation",
-        "Moved by [Hz]": "since the identification before; nothing where that did not find it",
-        "Damping": "",
-        f"RMS [{unit}]": "of the mode that has most of it",
-    }
-    was = {**change.same, **moves_of(change)}
-
-    def moved(peak: PeakFinding) -> str:
-        if peak not in was:
-            return "new" if peak in change.new else NOTHING
-        by = round(peak.frequency - was[peak].frequency, 2)
-        return f"{by:+.2f}".replace("-", "−") if by else "0"
-
-    rows = [
-        Row(number(p.frequency, 4), [number(p.frequency_std), moved(p), number(p.damping), number(scale * p.rms)])
-        for p in change.peaks
-    ]
-    title = "Peaks of the last minute"
-    return f'<div class="caption apart">{title}</div>{table(title, columns, rows)}'
+    return render("pages/peaks.html", change=change, was={**change.same, **moves_of(change)}, scale=scale, unit=unit)
 
 
 def status_line(loop: LiveLoop, view: LiveView) -> str:
@@ -185,14 +145,7 @@ def status_line(loop: LiveLoop, view: LiveView) -> str:
 def events_html(events: Iterable[LiveEvent], dt: float) -> str:
     """List the latest events, by time, the last one first."""
     latest = sorted(list(events)[-SHOWN_EVENTS:], key=lambda event: event.frame)[::-1]  # some are told late
-    lines = [f"<li>{event.frame * dt:.2f} s: {_event_html(event)}</li>" for event in latest]
-    return f'<ul class="text" tabindex="0" aria-label="Events">{"".join(lines)}</ul>' if lines else ""
-
-
-def _event_html(event: LiveEvent) -> str:
-    """Write an event; an alarm stands out, and what runs has the name that it has everywhere on the page."""
-    line = escape(event.text(look(event.about).label if event.about else ""))
-    return f"<strong>{line}</strong>" if event.kind == ALARM else line
+    return render("pages/events.html", latest=latest, dt=dt, look=look, alarm=ALARM)
 
 
 SPEEDS = {f"{speed:g} ×": speed for speed in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)}
@@ -206,59 +159,52 @@ MAIN = ("kf-multi", "multirate-multi", "gpr-online")
 """Observers whose lines are shown first."""
 LOOP_FIELDS = ("observers", "controllers", "speed")
 """Fields of a link that are of the loop; the others are of the page."""
-APART: dict[str, Any] = {**WIDE, "margin": (10, 0, 4, 0)}
-"""As wide as the page, its label clear of the row above."""
-BUTTONS = {
-    "Start": "play_arrow",
-    "Pause": "pause",
-    "Step": "skip_next",
-    "Stop": "stop",
-    "Redesign now": "build",
-    "Identify": "search",
-    "Record": "fiber_manual_record",
-}
-"""Button -> its icon."""
+
+
+def choice_of(label: str, names: Iterable[str], usual: Iterable[str]) -> pmui.MultiChoice:
+    """Make a list of observers or controllers to choose from, as wide as the page, its label clear of the row above."""
+    options = {look(name).label: name for name in names}
+    return pmui.MultiChoice(label=label, options=options, value=list(usual), sizing_mode="stretch_width", margin=(10, 0, 4, 0))
 
 
 class LiveControls:
-    """Buttons and fields."""
+    """The fields."""
 
     def __init__(self) -> None:
-        self.buttons: Final = {
-            name: pmui.Button(label=name, icon=icon, color="primary" if name == "Start" else "default", size="small", margin=0)
-            for name, icon in BUTTONS.items()
-        }
         self.speed: Final = make_select("Speed", SPEEDS, 1.0, 100)
         self.window: Final = make_select("Window", WINDOWS, 5.0, 100)
         self.target: Final = make_select("Errors of", QUANTITIES, TARGETS[0], 300)
         self.lasers, self.ngs = (pmui.Checkbox(label=name, value=True, size="small", margin=0) for name in ("Lasers", "NGS"))
         self.losses: Final = make_select("Frame loss", LOSSES, 0.0, 160)
-        self.running: Final = pmui.MultiChoice(
-            label="Observers", options={look(name).label: name for name in SLOTS}, value=list(FIRST), **APART
-        )
-        self.controllers: Final = pmui.MultiChoice(
-            label="Controllers", options={look(name).label: name for name in SEATS}, value=list(USUAL), **APART
-        )
+        self.running: Final = choice_of("Observers", SLOTS, FIRST)
+        self.controllers: Final = choice_of("Controllers", SEATS, USUAL)
         self.whose: Final = make_select("Redesign", {"All that run": ALL}, ALL, 230)
         for field in (self.running, self.controllers):
             field.param.watch(self._offer, "value")
         self._offer()
         waterfall = {"the measurement": MEASUREMENT} | {f"error of {label}": name for label, name in self.running.options.items()}
         self.waterfall: Final = make_select("Waterfall of", waterfall, MEASUREMENT, 260)
-        self.lines: Final = pmui.MultiChoice(label="Lines", options=self.running.options, value=list(MAIN), **APART)
-
-        linked = {"errors": self.target, "window": self.window}
-        linked |= {"observers": self.running, "controllers": self.controllers, "speed": self.speed}
+        self.lines: Final = choice_of("Lines", SLOTS, MAIN)
+        linked = {"errors": self.target, "window": self.window, "observers": self.running}
+        linked |= {"controllers": self.controllers, "speed": self.speed}
         self.link: Final = LinkedFields(linked, {"speed": lambda text: self._offer_speed(speed_of(text))})
 
     def tell(self, loop: LiveLoop) -> None:
-        """Show what runs."""
+        """Show what runs, and offer those fields alone that act: a simulation loses frames, a stream keeps its own clock."""
+        source = loop.source
         self.running.value = loop.board.active()
         self._offer_speed(loop.speed)
         self.speed.value = loop.speed
-        self.lines.value = choose_lines(self.lines.value, [name for name in self.running.value if has_error(name, loop.source)])
+        self.lines.value = choose_lines(self.lines.value, [name for name in self.running.value if has_error(name, source)])
         self.controllers.value = [name for name in SEATS if name in loop.controllers]
-        self._allow(loop.source)
+        for field in (self.lasers, self.ngs, self.losses):
+            field.disabled = source.name != SIMULATION
+        self.speed.disabled = source.name == STREAM
+        if source.has_truth and self.target.disabled:
+            self.target.value = TARGETS[0]
+        if not source.has_truth:
+            self.target.value = NEXT
+        self.target.disabled = not source.has_truth
 
     def _offer_speed(self, speed: float) -> None:
         """Have a speed among the usual ones."""
@@ -274,27 +220,6 @@ class LiveControls:
         names = [*self.running.value, *self.controllers.value]
         self.whose.value = self.whose.value if self.whose.value in names else ALL
         self.whose.options = {"All that run": ALL} | {look(name).label: name for name in names}
-
-    def _allow(self, source: LiveSource) -> None:
-        """Have those alone at hand that the source has: a simulation loses frames, a stream keeps its own clock."""
-        for field in (self.lasers, self.ngs, self.losses):
-            field.disabled = source.name != SIMULATION
-        self.speed.disabled = source.name == STREAM
-        if source.has_truth and self.target.disabled:
-            self.target.value = TARGETS[0]
-        if not source.has_truth:
-            self.target.value = NEXT
-        self.target.disabled = not source.has_truth
-
-    def view(self) -> list[Any]:
-        """Return the rows of controls; those of the figures stand by them."""
-        b = self.buttons
-        return [
-            line(b["Start"], b["Pause"], b["Step"], self.speed, b["Stop"]),
-            line(self.lasers, self.ngs, self.losses, b["Record"]),
-            line(self.whose, b["Redesign now"], b["Identify"]),
-            self.running,
-        ]
 
 
 def choose_lines(choice: Sequence[str], running: Sequence[str]) -> list[str]:
@@ -320,14 +245,13 @@ class LiveRoom:
         self.display = display
         self.store = store
         self.controls = controls
-        self._painter = painter = Painter(pulse)
-        self.traces: Final = RollingTraces(painter)
-        self.spectra: Final = RollingSpectra(painter)
+        self.pulse = pulse
+        self.traces: Final = RollingTraces(pulse)
+        self.spectra: Final = RollingSpectra(pulse)
         self.waterfall: Final = Waterfall()
-        self.stars: Final = Stars(painter)
-        self.table, self.control_table, self.news, self.peaks = (bare() for _ in range(4))
+        self.stars: Final = Stars(pulse)
+        self.table, self.control_table, self.news, self.peaks, self.legend = (bare() for _ in range(5))
         self.editor: SpectrumEditor | None = None
-        self.legend: Final = bare()
         self._second = 0
         self._bounds: Bounds = {}
         self._spectra_room = figure_with_caption("Spectra", self.spectra.figure)
@@ -335,15 +259,13 @@ class LiveRoom:
     def view(self) -> list[pn.Column]:
         """Return the boxes."""
         c = self.controls
-        seconds, waterfall = (
-            figure_with_caption(title, of.figure)
-            for title, of in (("The last seconds", self.traces), ("Waterfall", self.waterfall))
-        )
-        figures = [seconds, self._spectra_room, pn.Column(waterfall, **WIDE, styles={"grid-column": "1 / -1"})]
+        seconds = figure_with_caption("The last seconds", self.traces.figure)
+        waterfall = figure_with_caption("Waterfall", self.waterfall.figure)
+        waterfall.styles = {"grid-column": "1 / -1"}
         shown = [group(self.display, name) for name in ("show", "spectrum")]
         switches = line(c.window, c.target, *shown, c.waterfall, tick(self.display, "editing"))
         return [
-            box("Now", switches, c.lines, self.legend, pn.Column(*figures, **WIDE, stylesheets=[HALVES])),
+            box("Now", switches, c.lines, self.legend, halves(seconds, self._spectra_room, waterfall)),
             box("Observers", self.table, self.peaks),
             box("Controllers on the same disturbance", c.controllers, self.control_table, self.stars.row),
             box("Events", self.news),
@@ -352,7 +274,7 @@ class LiveRoom:
     def draw(self, loop: LiveLoop, view: LiveView) -> None:
         """Send the present."""
         display, dark = self.display, self.display.dark
-        target = self._target(loop)
+        target = self.controls.target.value if loop.source.has_truth else NEXT  # without truth, of the next measurement
         scale = display.scale(loop.scenario)
         active = loop.board.active()
         names = [name for name in active if name in self.controls.lines.value]
@@ -371,11 +293,7 @@ class LiveRoom:
         if (second := int(monotonic() / SLOW)) != self._second or not loop.is_playing:  # all pages at the same time
             self._second = second
             self._draw_tables(loop, view, target, scale)
-        self._painter.send()
-
-    def _target(self, loop: LiveLoop) -> str:
-        """Return what errors are shown of: without truth, of the next measurement."""
-        return self.controls.target.value if loop.source.has_truth else NEXT
+        self.pulse.flush()
 
     def _draw_tables(self, loop: LiveLoop, view: LiveView, target: str, scale: float) -> None:
         self._bounds = loop.workshop.bounds(loop.scenario)
@@ -420,7 +338,6 @@ class LivePage(Page):
         super().__init__(store, display, "mode", "unit", "dark", "show", "spectrum", "editing")
         self.work: Final = BackgroundTask(store.session)
         self.controls = c = LiveControls()
-        self.buttons: Final = c.buttons
         self.link = c.link
         c.link.left_alone = lambda: LOOP_FIELDS if self.loop else ()
         self.intro: Final = text(INTRO)
@@ -431,23 +348,19 @@ class LivePage(Page):
         self.picture: LiveRoom | None = None
         self._known_loop: LiveLoop | None = None
         self.repeat(self.tick, SHARED)
-        self._watch()
-        self._say()
-
-    def _watch(self) -> None:
-        c = self.controls
-        does: dict[str, Callable[[LiveLoop], None]] = {
-            "Pause": lambda loop: loop.pause() if loop.is_playing else loop.play(),
-            "Step": lambda loop: loop.step(),
-            "Stop": lambda _: self.work.cancel(),
-            "Redesign now": lambda loop: loop.redesign(c.names_to_design),
-            "Identify": lambda loop: loop.identify(c.names_to_design),
-            "Record": self._toggle_recording,
+        does: dict[str, tuple[str, Callable[[LiveLoop], None]]] = {
+            "Pause": ("pause", lambda loop: loop.pause() if loop.is_playing else loop.play()),
+            "Step": ("skip_next", lambda loop: loop.step()),
+            "Stop": ("stop", lambda _: self.work.cancel()),
+            "Redesign now": ("build", lambda loop: loop.redesign(c.names_to_design)),
+            "Identify": ("search", lambda loop: loop.identify(c.names_to_design)),
+            "Record": ("fiber_manual_record", self._toggle_recording),
         }
-        self.buttons["Start"].on_click(lambda _event: self.start())
-        for name, act in does.items():
-            self.buttons[name].on_click(lambda _event, act=act: self._do(act))
-        self.controls.speed.param.watch(lambda event: self._do(lambda loop: loop.set_speed(event.new)), "value")
+        start = make_button("Start", self.start, icon="play_arrow", color="primary")
+        self.buttons: Final = {"Start": start} | {
+            name: make_button(name, partial(self._do, act), icon=icon, color="default") for name, (icon, act) in does.items()
+        }
+        c.speed.param.watch(lambda event: self._do(lambda loop: loop.set_speed(event.new)), "value")
         for field in (c.lasers, c.ngs, c.losses):
             field.param.watch(
                 lambda _: self._do(lambda loop: loop.lose(lgs=c.lasers.value, ngs=c.ngs.value, loss=c.losses.value)), "value"
@@ -455,15 +368,18 @@ class LivePage(Page):
         c.running.param.watch(partial(self._switch, LiveLoop.switch), "value")
         c.controllers.param.watch(partial(self._switch, LiveLoop.control), "value")
         self.work.param.watch(self._say, ["state", "place", "message", "latest"])
-        self.store.param.watch(self._follow, "scenario")
+        store.param.watch(self._follow, "scenario")
         for field in (c.window, c.target, c.lines, c.waterfall):
             field.param.watch(self.redraw, "value")
+        self._say()
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""
-        return boxes(
-            box("Live loop", self.intro, *self.controls.view(), self.status, self.pulse), example("live", self.room), self.room
-        )
+        b, c = self.buttons, self.controls
+        run = line(b["Start"], b["Pause"], b["Step"], c.speed, b["Stop"])
+        sensors, designs = line(c.lasers, c.ngs, c.losses, b["Record"]), line(c.whose, b["Redesign now"], b["Identify"])
+        loop = box("Live loop", self.intro, run, sensors, designs, c.running, self.status, self.pulse)
+        return boxes(loop, example("live", self.room), self.room)
 
     def show(self, visible: bool) -> None:
         """Draw while visible; the loop goes on when the page is left."""

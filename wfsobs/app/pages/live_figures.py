@@ -15,7 +15,7 @@ from bokeh.palettes import Viridis256
 from bokeh.plotting import figure
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.pages.parts import WIDE, grid_style
+from wfsobs.app.pages.parts import WIDE, grid_style, pane
 from wfsobs.app.style import Component, bare, look, script
 from wfsobs.app.views.plots import FigureLines, Points, call, new_figure, new_spectrum
 from wfsobs.app.views.traces import WINDOW_S
@@ -36,7 +36,11 @@ PATIENCE = 10.0
 
 
 class Pulse(Component):
-    """Has the browser make the changes of a picture, and tells when it has painted it."""
+    """Collects changes of figures, has the browser make them as one picture, and tells when it has painted it.
+
+    Changes of models that the browser has not seen are made here; once it makes them, the models of the server keep the values of
+    before.
+    """
 
     _esm = script("pulse")
 
@@ -45,6 +49,8 @@ class Pulse(Component):
         self.picture: int = 0
         self._time = 0.0
         self._waiting: Callable[[], None] | None = None
+        self._steps: list[list[Any]] = []
+        self._numbers: list[Array] = []
         super().__init__(self._take, **params)
 
     def _take(self, data: dict[str, Any]) -> None:
@@ -52,11 +58,6 @@ class Pulse(Component):
             self.answer = number
             if self._waiting is not None and self.is_free:
                 self.when_free(self._waiting)
-
-    @property
-    def is_seen(self) -> bool:
-        """Whether the browser has drawn the page."""
-        return self.answer >= 0
 
     @property
     def is_free(self) -> bool:
@@ -75,47 +76,30 @@ class Pulse(Component):
         self.picture += 1
         self._send_msg({"picture": self.picture})
 
-    def change(self, steps: list[list[Any]], numbers: Array) -> None:
-        """Send the changes of a `Painter`: by message, since setting a property of a component costs as much as a figure."""
-        self._send_msg({"changes": [steps, numbers]})
-
-
-class Painter:
-    """Collects changes of models, and has the browser make them; those of models that it has not seen are made here.
-
-    Once the browser makes them the models of the server keep the values of before.
-    """
-
-    def __init__(self, pulse: Pulse):
-        self._pulse = pulse
-        self._steps: list[list[Any]] = []
-        self._numbers: list[Array] = []
-
-    def data(self, fig: figure, source: ColumnDataSource, columns: Mapping[str, Array]) -> None:
+    def draw(self, fig: figure, source: ColumnDataSource, columns: Mapping[str, Array]) -> None:
         """Have a source of a figure hold these numbers, columns of one length, in single precision."""
         numbers = {name: np.asarray(x, dtype=np.float32) for name, x in columns.items()}
-        if not self._reaches(source):
+        if self._reaches(source):
+            self._steps.append([fig.id, source.id, list(numbers), len(next(iter(numbers.values()))), []])
+            self._numbers += numbers.values()
+        else:
             source.data = {**numbers}
-            return
-        self._steps.append([fig.id, source.id, list(numbers), len(next(iter(numbers.values()))), []])
-        self._numbers += numbers.values()
 
-    def update(self, fig: figure, model: Model, **values: float) -> None:
+    def move(self, fig: figure, model: Model, **values: float) -> None:
         """Set properties of a part of a figure that are numbers."""
         if self._reaches(model):
             self._steps.append([fig.id, model.id, [], 0, [list(pair) for pair in values.items()]])
         else:
             model.update(**values)
 
-    def send(self) -> None:
-        """Send what has been collected."""
+    def flush(self) -> None:
+        """Send what has been collected: by message, since setting a property of a component costs as much as a figure."""
         if self._steps:
-            numbers = np.concatenate(self._numbers) if self._numbers else np.empty(0, dtype=np.float32)
-            self._pulse.change(self._steps, numbers)
+            self._send_msg({"changes": [self._steps, np.concatenate([np.empty(0, dtype=np.float32), *self._numbers])]})
             self._steps, self._numbers = [], []
 
     def _reaches(self, model: Model) -> bool:
-        return self._pulse.is_seen and model.document is not None
+        return self.answer >= 0 and model.document is not None
 
 
 BINS = 300
@@ -132,17 +116,17 @@ NAMES = (TRUTH, *BOUNDS, *SLOTS)
 
 
 class LiveFigure(FigureLines):
-    """A figure with a line per observer, whose changes a painter sends."""
+    """A figure with a line per observer, whose changes are sent as part of a picture."""
 
-    def __init__(self, fig: figure, painter: Painter):
+    def __init__(self, fig: figure, pulse: Pulse):
         super().__init__(fig, NAMES)
-        self.painter = painter
+        self.pulse = pulse
         self._lines_shown: tuple[bool, set[str]] = (False, set())
 
     def paint(self, data: Mapping[str, Points], dark: bool) -> None:
         """Show these lines, x and y by name, and no others."""
         for name, (x, y) in data.items():
-            self.painter.data(self.figure, self.sources[name], {"x": x, "y": y})
+            self.pulse.draw(self.figure, self.sources[name], {"x": x, "y": y})
         if (shown := (dark, set(data))) != self._lines_shown:
             self._lines_shown = shown
             self.restyle(dark, [name for name in NAMES if name not in data])
@@ -186,8 +170,8 @@ def short_line(event: LiveEvent) -> str:
 class RollingTraces(LiveFigure):
     """The last seconds of errors, or of estimates and truth."""
 
-    def __init__(self, painter: Painter) -> None:
-        super().__init__(new_figure((0.0, 1.0), (-1.0, 1.0), "time of the loop [s]"), painter)
+    def __init__(self, pulse: Pulse) -> None:
+        super().__init__(new_figure((0.0, 1.0), (-1.0, 1.0), "time of the loop [s]"), pulse)
         self._marks = LiveMarks(self.figure)
 
     def draw(
@@ -206,14 +190,15 @@ class RollingTraces(LiveFigure):
         first = max(view.first, last - n)
         times = envelope_times(first, last, BINS, view.dt)
 
-        def trace(x: Array) -> Array:
+        def trace(name: str) -> Array:
+            x = shown_signal(view, name, target, display)
             if display.running:
                 x = trailing_rms(x, min(round(WINDOW_S / view.dt), len(x)))
             return envelope(x[first - view.first :, display.column], BINS)
 
         def drawn(name: str) -> Points:
             key = ("trace", name, target, display.column, display.show, first)
-            return times, scale * view.once(key, lambda: trace(shown_signal(view, name, target, display)))
+            return times, scale * view.once(key, partial(trace, name))
 
         data = {name: drawn(name) for name in ([] if display.error else [TRUTH]) + [*names]}
         top = 1.1 * max((float(np.nanmax(np.abs(y))) for _, y in data.values() if np.isfinite(y).any()), default=1.0) or 1.0
@@ -221,8 +206,8 @@ class RollingTraces(LiveFigure):
             ends = times[[0, -1]]
             data |= {name: (ends, np.full(2, scale * of[target][display.column])) for name, of in bounds.items() if target in of}
         self.paint(data, display.dark)
-        self.painter.update(self.figure, self.figure.x_range, start=first * view.dt, end=last * view.dt)
-        self.painter.update(self.figure, self.figure.y_range, start=0.0 if display.running else -top, end=top)
+        self.pulse.move(self.figure, self.figure.x_range, start=first * view.dt, end=last * view.dt)
+        self.pulse.move(self.figure, self.figure.y_range, start=0.0 if display.running else -top, end=top)
         what = "running rms of error of" if display.running else "error of" if display.error else ""
         self.figure.yaxis.axis_label = f"{what} {display.mode_label} [{display.unit_label}]".strip()
         self._marks.draw([event for event in events if first <= event.frame <= last], view.dt, CLOSE * n * view.dt)
@@ -231,8 +216,8 @@ class RollingTraces(LiveFigure):
 class RollingSpectra(LiveFigure):
     """Spectra of the errors, averaged over time with weights that fade."""
 
-    def __init__(self, painter: Painter) -> None:
-        super().__init__(new_spectrum((1.0, 500.0)), painter)
+    def __init__(self, pulse: Pulse) -> None:
+        super().__init__(new_spectrum((1.0, 500.0)), pulse)
         self._sums: dict[str, Array] = {}
         self._of: tuple[object, ...] = ()
         self._last = 0
@@ -331,16 +316,13 @@ class Waterfall:
     def _take(self, view: LiveView, hop: int, newest: int) -> None:
         """Move the spectra to the left, and add those of which the view has all frames."""
         step = min(newest - self._number, COLUMNS)
-        if step:
-            self.columns[:, : -step or None] = self.columns[:, step:] if step < COLUMNS else np.nan
-            self.columns[:, COLUMNS - step :] = np.nan
+        self.columns[:] = np.hstack([self.columns[:, step:], np.full((ROWS, step), np.nan)])
         self._number = newest
         for back in range(step):
             stop = (newest - back) * hop - view.first
             if stop < round(LENGTH / view.dt):
                 return
-            spectrum = view.once(("second", stop, *self._of), partial(self._spectrum, view, stop))
-            self.columns[:, COLUMNS - 1 - back] = spectrum
+            self.columns[:, COLUMNS - 1 - back] = view.once(("second", stop, *self._of), partial(self._spectrum, view, stop))
 
     def _spectrum(self, view: LiveView, stop: int) -> Array:
         """Return the spectrum of the second before a frame of the view."""
@@ -383,29 +365,28 @@ class Detector:
         The figure under its caption.
     """
 
-    def __init__(self, name: str, painter: Painter):
-        self.painter = painter
+    def __init__(self, name: str, pulse: Pulse):
+        self.pulse = pulse
         self.name = name
-        self.label: Final = look("none" if name == TRUTH else name).label
+        label = look("none" if name == TRUTH else name).label
         self.figure: figure = new_figure((-1.0, 1.0), (-1.0, 1.0), "mas")
         self.figure.update(height=None, aspect_ratio=1.0, min_width=SIDE, min_border_left=36, toolbar_location=None)
         for axis in self.figure.axis:
             ticker = BasicTicker(desired_num_ticks=3)
             axis.update(major_label_text_font_size="10px", minor_tick_line_color=None, ticker=ticker)
         self.figure.xaxis.update(axis_label_text_font_size="10px", axis_label_standoff=2)
-        call(self.figure, f"Star: {self.label}")
+        call(self.figure, f"Star: {label}")
         self._trail, self._spot = (ColumnDataSource({"x": [], "y": []}) for _ in range(2))
         self._line = self.figure.line("x", "y", source=self._trail, line_alpha=0.5).glyph
         self._core = self.figure.circle("x", "y", radius=1.0, source=self._spot, fill_alpha=0.6).glyph
         self._style: tuple[float, float, str] | None = None
-        caption = bare(f'<div class="caption">{self.label}</div>')
-        self.view: Final = pn.Column(caption, pn.pane.Bokeh(self.figure, sizing_mode=self.figure.sizing_mode, margin=0), **WIDE)
+        self.view: Final = pn.Column(bare(f'<div class="caption">{label}</div>'), pane(self.figure), **WIDE)
 
     def draw(self, points: Array, reach: float, radius: float, dark: bool) -> None:
         """Send the last instants (n, 2), the newest last; reach : of the axes;  radius : of the core, all in mas."""
         points = points[~np.isnan(points).any(axis=1)]
         for source, shown in ((self._trail, points), (self._spot, points[-1:])):
-            self.painter.data(self.figure, source, {"x": shown[:, 0], "y": shown[:, 1]})
+            self.pulse.draw(self.figure, source, {"x": shown[:, 0], "y": shown[:, 1]})
         colour = look(self.name).colour(dark)
         if (style := (reach, radius, colour)) == self._style:
             return
@@ -419,8 +400,8 @@ class Detector:
 class Stars:
     """The detectors, of one scale."""
 
-    def __init__(self, painter: Painter) -> None:
-        self._painter = painter
+    def __init__(self, pulse: Pulse) -> None:
+        self._pulse = pulse
         self.row: Final = pn.Column(**{**WIDE, "margin": (12, 0, 0, 0)}, stylesheets=[GRID])
         self._detectors: dict[str, Detector] = {}
         self._reach = 1.0
@@ -433,7 +414,7 @@ class Stars:
         if left is not None:
             signals |= {name: left.residual(name) for name in names if not CONTROLLERS[name].is_idle}
         if list(signals) != list(self._detectors):
-            self._detectors = {name: self._detectors.get(name) or Detector(name, self._painter) for name in signals}
+            self._detectors = {name: self._detectors.get(name) or Detector(name, self._pulse) for name in signals}
             self.row[:] = [detector.view for detector in self._detectors.values()]
         reach = 1.1 * float(np.nanmax(np.abs(scale * signals[TRUTH][:, :2]), initial=1e-3))
         if not self._reach / 1.6 < reach < self._reach:

@@ -88,14 +88,14 @@ class Pages(param.Parameterized):
             self._makers[CAMPAIGN] = partial(CampaignPage, explore=explored)
         self.suggestion: Final = Suggestion(store, self._identify_page)
         known = {title: name for title, name in TITLES.items() if name == EXPLORE or name in self._makers}
-        self.param["current"].objects = [*known.values()]
+        self.param["current"].objects = known
         self.by_name: dict[str, Page] = {EXPLORE: explore}
         self.rooms: Final = {
             EXPLORE: pn.Column(explore.view(), **WIDE),
             **{name: pn.Column(sizing_mode="stretch_width", margin=0, styles=AWAY) for name in self._makers},
         }
         self.switch: Final = pmui.RadioButtonGroup.from_param(
-            self.param.current, options=known, size="small", margin=0, css_classes=["tabs"], sx=TABS, stylesheets=[HEARD]
+            self.param.current, size="small", margin=0, css_classes=["tabs"], sx=TABS, stylesheets=[HEARD]
         )
         self.view: Final = pn.Column(*self.rooms.values(), **WIDE)
         self.param.watch(self._turn, "current")

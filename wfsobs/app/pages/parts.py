@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from html import escape
 from typing import Any, Final
@@ -21,7 +21,7 @@ from wfsobs.app.render import render
 from wfsobs.app.service import IDLE, BackgroundTask
 from wfsobs.app.share import EXPLORED, CopiedTask
 from wfsobs.app.store import Store
-from wfsobs.app.style import WIDE, HtmlText, bare, html, make_button, sheets, swatch
+from wfsobs.app.style import WIDE, HtmlText, bare, html, look, make_button, sheets, swatch, watch
 from wfsobs.app.views.plots import call
 from wfsobs.app.views.switches import LineChoice, not_known
 from wfsobs.app.work import RunResults
@@ -46,21 +46,21 @@ class LinkedFields:
     def __init__(self, fields: Mapping[str, Any] | None, offers: Mapping[str, Callable[[str], object]] = {}):
         self._offers = offers
         self.left_alone: Callable[[], Collection[str]] = tuple
+        self.fresh: dict[str, str] = {}
         self._acts: list[Callable[..., object]] = []
         self._waiting: Mapping[str, str] = {}
-        self._is_made = False
+        self._fields: dict[str, tuple[Any, str]] | None = None
         if fields is not None:
             self.make(fields)
 
     def make(self, fields: Mapping[str, Any]) -> list[str]:
         """Take fields, in place of those before, with their texts or those that wait; return a line for each that is refused."""
-        before = self.texts() if self._is_made else self._waiting
-        self._is_made = True
+        before = self.texts()
         self._fields = {name: field if isinstance(field, tuple) else (field, "value") for name, field in fields.items()}
-        self.fresh: dict[str, str] = {name: _text(getattr(*field)) for name, field in self._fields.items()}
+        self.fresh = {name: _text(getattr(*field)) for name, field in self._fields.items()}
         refused = self.open(before) if before else []
         for act in self._acts:
-            self._watch(act)
+            watch(act, *self._fields.values())
             act()
         return refused
 
@@ -71,37 +71,29 @@ class LinkedFields:
 
     def texts(self) -> dict[str, str]:
         """Return the texts that differ from those of a fresh page, or those that wait."""
-        if not self._is_made:
+        if self._fields is None:
             return {**self._waiting}
-        now = {name: _text(getattr(*field)) for name, field in self._active_fields()}
+        now = {name: _text(getattr(*field)) for name, field in self._fields.items() if is_active(*field)}
         return {name: text for name, text in now.items() if text != self.fresh[name]}
 
     def open(self, texts: Mapping[str, str]) -> list[str]:
         """Fill in texts in the order of the fields, of which one may change the next; return a line for each that is refused."""
-        if not self._is_made:
+        if self._fields is None:
             self._waiting = {**texts}
             return []
         refused = not_known(name for name in texts if name not in self._fields)
-        for name, (of, attribute) in self._active_fields():
-            if name not in self.left_alone():
-                lines = self._fill_in(name, of, attribute, texts.get(name, self.fresh[name]))
-                if lines and not isinstance(getattr(of, attribute), list):
-                    self._fill_in(name, of, attribute, self.fresh[name])
+        for name, field in self._fields.items():
+            if is_active(*field) and name not in self.left_alone():
+                lines = self._fill_in(name, *field, texts.get(name, self.fresh[name]))
+                if lines and not isinstance(getattr(*field), list):
+                    self._fill_in(name, *field, self.fresh[name])
                 refused += lines
         return refused
 
     def watch(self, act: Callable[..., object]) -> None:
         """Call a function after every change."""
         self._acts.append(act)
-        if self._is_made:
-            self._watch(act)
-
-    def _watch(self, act: Callable[..., object]) -> None:
-        for of, attribute in self._fields.values():
-            of.param.watch(act, attribute)
-
-    def _active_fields(self) -> Iterator[tuple[str, tuple[Any, str]]]:
-        return (item for item in self._fields.items() if not getattr(item[1][0], "disabled", False))
+        watch(act, *(self._fields or {}).values())
 
     def _fill_in(self, name: str, of: Any, attribute: str, text: str) -> list[str]:
         if name in self._offers:
@@ -127,6 +119,11 @@ class LinkedFields:
             value = int(text)
         setattr(of, attribute, value)
         return []
+
+
+def is_active(of: Any, _attribute: str) -> bool:
+    """Whether a field, or what has a parameter, is not disabled."""
+    return not getattr(of, "disabled", False)
 
 
 LinkPart = LinkedFields | LineChoice
@@ -330,7 +327,12 @@ def figure_with_caption(title: str, fig: figure, *, tall: bool = False) -> pn.Co
     call(fig, title)
     if tall:
         fig.sizing_mode = "stretch_both"
-    return pn.Column(caption(title), pn.pane.Bokeh(fig, sizing_mode=fig.sizing_mode, margin=0), **(TALL if tall else WIDE))
+    return pn.Column(caption(title), pane(fig), **(TALL if tall else WIDE))
+
+
+def pane(fig: figure) -> pn.pane.Bokeh:
+    """Lay out a figure as wide as its room, and as high where the figure is."""
+    return pn.pane.Bokeh(fig, sizing_mode=fig.sizing_mode, margin=0)
 
 
 def grid_style(columns: str, narrow: str = "minmax(0, 1fr)") -> str:
@@ -342,8 +344,12 @@ def grid_style(columns: str, narrow: str = "minmax(0, 1fr)") -> str:
 """
 
 
+def halves(*parts: Any) -> pn.Column:
+    """Lay out parts two by two beside each other, on a narrow window one below the other."""
+    return pn.Column(*parts, **WIDE, stylesheets=[HALVES])
+
+
 HALVES = grid_style("minmax(0, 1fr) minmax(0, 1fr)")
-"""Two figures beside each other."""
 
 
 def caption_html(words: str, marks: str = "") -> str:
@@ -359,6 +365,11 @@ def caption(words: str) -> HtmlText:
 def tick(display: Display, name: str, **options: Any) -> pmui.Checkbox:
     """Make the box of one switch of the display."""
     return pmui.Checkbox.from_param(display.param[name], size="small", margin=0, **options)
+
+
+def render_part(template: str, display: Display, **values: Any) -> str:
+    """Fill a template of a page, which may draw the swatch of a line."""
+    return render(f"pages/{template}.html", display=display, swatch=partial(swatch, dark=display.dark), look=look, **values)
 
 
 def legend(names: Mapping[str, str], dark: bool) -> str:

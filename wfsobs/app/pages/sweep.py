@@ -14,6 +14,7 @@ import panel_material_ui as pmui
 import param
 
 from wfsobs.app.cache import key_of
+from wfsobs.app.controls.panel import drawer_settings, topic_of
 from wfsobs.app.display import Display
 from wfsobs.app.downloads import table_csv
 from wfsobs.app.idle_work import SeedScores
@@ -32,6 +33,7 @@ from wfsobs.app.pages.parts import (
     legend,
     line,
     number_field,
+    pane,
     read_number,
     text,
     warning,
@@ -132,11 +134,6 @@ class SweepTask(BackgroundTask):
             self._go_on()
 
 
-def line_of(error: SettingError) -> str:
-    """Return the first line of an error, with the names of settings as the page has them."""
-    return name_settings(str(error).removeprefix("--over ").partition("\n")[0])
-
-
 def read_axis(path: str, values: str) -> Variation:
     """Read the values of a setting as they were typed. Raises SettingError."""
     if not values.strip():
@@ -146,14 +143,13 @@ def read_axis(path: str, values: str) -> Variation:
 
 def sweep_settings(scenario: Scenario) -> dict[str, str]:
     """Name -> path of every setting that a sweep can be over; those of lists, and those with one choice, are left out."""
-    lists = tuple(f"{path}." for path, _ in scenario.lists())
     kinds = (param.Number, param.Selector, param.Boolean)
     topics = Scenario.settings()
     out = {}
-    for path, _, p in scenario.walk():
+    for path, p in drawer_settings(scenario).items():
         several = not isinstance(p, param.Selector) or len(p.objects) > 1
-        if path != SEED and isinstance(p, kinds) and several and not path.startswith(lists):
-            topic, name = str(topics[path.split(".")[0]].label), setting_label(scenario, path)
+        if path != SEED and isinstance(p, kinds) and several:
+            topic, name = str(topics[topic_of(path)].label), setting_label(scenario, path)
             out[name if name.startswith(f"{topic}:") else f"{topic}: {name}"] = path
     return out
 
@@ -180,11 +176,11 @@ class AxisFields:
         """The setting that is chosen; NONE for none."""
         return self.select.value
 
-    def offer(self, path: str) -> bool:
-        """Have a setting among those to choose from; return whether there is one of that path."""
-        if path not in self.select.options.values() and self.store.scenario.parameter(path) is not None:
-            self.select.options = {**self.select.options, setting_label(self.store.scenario, path): path}
-        return path in self.select.options.values()
+    def offer(self, path: str) -> None:
+        """Have a setting among those to choose from, if there is one of that path."""
+        scenario = self.store.scenario
+        if path not in self.select.options.values() and scenario.parameter(path) is not None:
+            self.select.options = {**self.select.options, setting_label(scenario, path): path}
 
     def _suggest(self, event: Any) -> None:
         if event.new != NONE:
@@ -241,8 +237,7 @@ class ErrorLines:
         if self.lines is None or of != self._of:
             self.lines, self._of = SweepLines(part), of
             self.lines.figure.sizing_mode = "stretch_both"
-            figure = pn.pane.Bokeh(self.lines.figure, sizing_mode="stretch_both", margin=0)
-            self.view[:] = [self.legend, pn.Column(figure, **TALL)]
+            self.view[:] = [self.legend, pn.Column(pane(self.lines.figure), **TALL)]
         self.lines.draw(part, dark)
         self.legend.html = legend({name: label(name) for name in part["errors"]}, dark)
 
@@ -322,10 +317,9 @@ class SweepPage(Page):
     def load(self, cell: int) -> None:
         """Take the scenario of a cell into the drawer, and show it."""
         results = self.results
-        if results is None or not 0 <= cell < len(results.sweep.cells):
-            return
-        if self.work.attempt(lambda: self.store.run_on(None, results.sweep.scenario(cell))):
-            self._explore()
+        if results is not None and 0 <= cell < len(results.sweep.cells):
+            if self.work.attempt(lambda: self.store.run_on(None, results.sweep.scenario(cell))):
+                self._explore()
 
     @property
     def results(self) -> SweepResults | None:
@@ -347,25 +341,23 @@ class SweepPage(Page):
         """Say what would be run, or why it cannot be."""
         if not self.visible:
             return
+        kind = "text"
         try:
             sweep = self.plan()
         except SettingError as error:
-            said, kind = line_of(error), "failure"
+            said, kind = name_settings(str(error).removeprefix("--over ").partition("\n")[0]), "failure"
         else:
             counts = " × ".join(str(len(axis.values)) for axis in sweep.axes)
             seeds = f"{sweep.seeds} seed{'s' * (sweep.seeds > 1)}"
             said = f"{counts} scenarios × {seeds} = {sweep.n_runs} runs, about {max(sweep.seconds, 1.0):.0f} s"
-            kind = "text"
         self.starter.start.disabled = kind == "failure"
         self.estimate.html = f'<p class="{kind}" role="status">{escape(said)}</p>'
 
     def _so_far(self) -> str:
-        results = self.results
-        if results is None:
+        if (results := self.results) is None:
             return ""
-        left = self.work.seconds_left
-        said = f" · {results.n_done} of {results.sweep.n_runs} runs"
-        return f"{said}, about {left:.0f} s left" if left and self.work.state == RUNNING else said
+        left = self.work.seconds_left if self.work.state == RUNNING else 0.0
+        return f" · {results.n_done} of {results.sweep.n_runs} runs" + (f", about {left:.0f} s left" if left else "")
 
     def _take(self, *_: object) -> None:
         """Draw what has come, not too often."""

@@ -171,23 +171,18 @@ def report_part(results: SweepResults) -> dict[str, Any]:
         "maps": [map_grid(results, target, display) for target, display in shown],
         "lines": [line_part(results, target, display) for target, display in shown] if len(axes) == 1 else [],
         "columns": [*(setting_label(results.sweep.base, path) for path in axes), *REPORT_COLUMNS],
-        "rows": [[*(value_of(row[path]) for path in axes), *_report_cells(row)] for row in rows[:MOST_ROWS]],
+        "rows": [
+            [
+                *(value_of(row[path]) for path in axes),
+                *(row["target"], row["mode"], row_label(row["observer"]), str(row["seeds"]), number(row["mean_rms_nm"])),
+                "" if row["low_nm"] is None else f"{number(row['low_nm'])} – {number(row['high_nm'])}",
+                row["rank"],
+            ]
+            for row in rows[:MOST_ROWS]
+        ],
         "left_out": max(0, len(rows) - MOST_ROWS),
         "shades": legend_of_shades(),
     }
-
-
-def _report_cells(row: dict[str, Any]) -> list[str]:
-    interval = "" if row["low_nm"] is None else f"{number(row['low_nm'])} – {number(row['high_nm'])}"
-    return [
-        row["target"],
-        row["mode"],
-        row_label(row["observer"]),
-        str(row["seeds"]),
-        number(row["mean_rms_nm"]),
-        interval,
-        row["rank"],
-    ]
 
 
 def _cell(results: SweepResults, cell: int, target: str, display: Display) -> dict[str, Any]:

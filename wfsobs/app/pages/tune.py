@@ -5,21 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from html import escape
-from itertools import groupby
 from time import monotonic
 from typing import Any, Final
 
 import numpy as np
 import panel as pn
 from bokeh.models import ColumnDataSource, DataRange1d
-from markupsafe import Markup
 
 from wfsobs.app.controls.fields import parse_number
 from wfsobs.app.display import NO_ANGLE, UNITS, Display, per_micrometre
 from wfsobs.app.downloads import table_csv
 from wfsobs.app.jobs import INTERVAL, RUNNING, Tell
 from wfsobs.app.pages.parts import (
-    WIDE,
     LinkedFields,
     Page,
     Starter,
@@ -30,11 +27,13 @@ from wfsobs.app.pages.parts import (
     legend,
     line,
     number_field,
+    pane,
     read_number,
+    render_part,
     text,
     warning,
 )
-from wfsobs.app.render import NOTHING, Row, change, macro, number, table
+from wfsobs.app.render import change, number
 from wfsobs.app.service import BackgroundTask
 from wfsobs.app.share import TUNE, CopiedTask
 from wfsobs.app.store import Store
@@ -154,26 +153,24 @@ def unit_for(result: TuningResult | None, display: Display) -> str:
 
 def tuning_html(result: TuningResult, display: Display, diameter: float) -> str:
     """Write settings, errors and likelihoods before and after."""
-    unit = unit_for(result, display)
-    scale = per_micrometre(unit, diameter)
-    groups = [
-        (
-            TITLES[section].format(measure=result.measure, unit=UNITS[unit]),
-            [_row(result.after.scenario, *row, scale) for row in found],
-        )
-        for section, found in groupby(tuning_rows(result), key=lambda row: row[0])
-    ]
-    columns = {"What": "", "Before": "", "After": "", "Change [%]": ""}
-    notes = [f"{line[0].upper()}{line[1:]}." for line in tuning_remarks(result) if "likelihood" not in line]
-    return f"{table('Before and after', columns, groups=groups)}{macro('texts', 'text', notes)}"
-
-
-def _row(scenario: Scenario, section: str, name: str, before: float | str | None, after: float | str | None, scale: float) -> Row:
-    error, name = section in (VALIDATION, TEST, OTHER), setting_label(scenario, name) if section == SETTING else name
-    scale = scale if error else 1.0
-    cells = [x if isinstance(x, str) else NOTHING if x is None else number(x * scale, 4) for x in (before, after)]
-    cells.append(change(before, after) if error and isinstance(before, float) and isinstance(after, float) else "")
-    return Row(Markup("<b>{}</b>").format(name) if name == TOGETHER else name, cells, {"section": section})
+    unit, sections = unit_for(result, display), dict[str, list[tuple[object, ...]]]()
+    for section, *row in tuning_rows(result):
+        sections.setdefault(section, []).append(tuple(row))
+    return render_part(
+        "tuning",
+        display,
+        sections=sections,
+        titles=TITLES,
+        measure=result.measure,
+        unit=UNITS[unit],
+        scale=per_micrometre(unit, diameter),
+        errors=(VALIDATION, TEST, OTHER),
+        setting=SETTING,
+        setting_label=partial(setting_label, result.after.scenario),
+        together=TOGETHER,
+        change=change,
+        notes=[f"{line[0].upper()}{line[1:]}." for line in tuning_remarks(result) if "likelihood" not in line],
+    )
 
 
 INTRO = (
@@ -210,10 +207,8 @@ class TunePage(Page):
         self.evaluations: Final = number_field("Evaluations", EVALUATIONS, 110)
         self.figure: Final = HistoryFigure()
         self.measure = MEASURES[TRUTH]
-        self.search_space: Final = html()
-        self.legend: Final = html()
-        self.table: Final = html()
-        self.history: Final = box("History", self.legend, pn.pane.Bokeh(self.figure.figure, **WIDE))
+        self.search_space, self.legend, self.table = (html() for _ in range(3))
+        self.history: Final = box("History", self.legend, pane(self.figure.figure))
         self.outcome: Final = box("Before and after", self.table)
         self.history.visible = self.outcome.visible = False
         self.stale: Final = warning(EARLIER)
