@@ -145,6 +145,22 @@ def test_a_clean_record_with_an_early_gap_loses_nothing(paper: Sequence[Record],
         assert (gate.outliers - len(hit)).max() <= 4, "of 1 % outliers the level is the lowest: 1 of noise is expected"
 
 
+@pytest.fixture(scope="module", params=["paper", "ut4"])
+def clean(request: pytest.FixtureRequest) -> Array:
+    return wfsobs.simulate(wfsobs.PRESETS[request.param]().replace({"run.duration": 9.0, "run.warm_up": 1.0})).z
+
+
+@pytest.mark.parametrize("length", [RUN, ORDER, 300, 1000, 3000])
+def test_a_clean_record_with_a_gap_loses_nothing_after_it(clean: Array, length: int) -> None:
+    """The prediction over it decays to the first sample, the disturbance does not: that is no step of what comes."""
+    for start in range(2500, 4500, 400):
+        z = clean[2 : start + length + 1000].copy()
+        z[start : start + length, 0] = np.nan
+        gate = OutlierGate(2, REJECT)
+        gate.check_all(z)
+        assert gate.outliers.max() <= 1, (start, "as without the gap: one in 5,000 may be noise")
+
+
 def test_samples_until_the_first_fit_are_counted_for_every_mode() -> None:
     """A gap delays the first fit of its mode alone, and one after that does not delay what has been."""
     z = np.random.default_rng(8).standard_normal((10 * BLOCK, 3))

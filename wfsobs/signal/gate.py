@@ -120,6 +120,8 @@ class OutlierGate:
         expected = self._offset + np.einsum("mi,mi->m", self._weights, self._past[:, k : k + ORDER])
         error, is_there = z - expected, ~np.isnan(z)
         is_after_gap = is_there & (self._gap >= RUN)
+        for mode in np.flatnonzero(is_after_gap).tolist():
+            self._bridge(mode, k, error[mode])
         self._open = np.where(is_after_gap, OPEN, self._open)
         self._settling = np.where(is_after_gap, OPEN, np.maximum(self._settling - 1, 0))
         self._gap = np.where(is_there, 0, self._gap + 1)
@@ -199,6 +201,12 @@ class OutlierGate:
         self._open = np.where(lasting, OPEN, np.maximum(self._open - 1, 0))
         self._out_count = np.where(lasting, 0.0, self._out_count)
         self._deviation = np.where(lasting, 2.0, 1.0) * self._deviation
+
+    def _bridge(self, mode: int, k: int, error: float) -> None:
+        """Spread the error of the prediction after a gap over the predictions that stand for what is missing: no step is left."""
+        gap = int(self._gap[mode])
+        n = min(gap, ORDER + k)
+        self._past[mode, ORDER + k - n : ORDER + k] += error * np.arange(gap - n + 1, gap + 1) / (gap + 1)
 
     def _pass(self, z: Array) -> int:
         """Take samples (n, n_modes) of one block up to the first that is an outlier or missing; return how many."""

@@ -134,6 +134,12 @@ static void fit(wfsobs_gate *g, mode *m)
     for (int i = 0; i < ORDER; i++) m->past[i] = m->past[BLOCK + i];
 }
 
+/* Spread the error of the prediction after a gap over the predictions that stand for what is missing: no step is left. */
+static void bridge(mode *m, double error, int k)
+{
+    for (int j = ORDER + k, left = m->gap; j > 0 && left > 0; left--) m->past[--j] += error * left / (m->gap + 1);
+}
+
 void wfsobs_gate_check(wfsobs_gate *g, wfsobs_real *z)
 {
     const int k = (int)(g->call % BLOCK);
@@ -149,7 +155,10 @@ void wfsobs_gate_check(wfsobs_gate *g, wfsobs_real *z)
         limit = m->level * m->deviation;
         error = is_there ? (double)z[i] - m->offset - expected : 0;
         if (m->settling > 0) m->settling--;
-        if (is_there && m->gap >= RUN) m->open = m->settling = OPEN; /* after a gap the prediction is worth little */
+        if (is_there && m->gap >= RUN) { /* the prediction is worth little */
+            m->open = m->settling = OPEN;
+            bridge(m, error, k);
+        }
         m->gap = is_there ? 0 : m->gap + 1;
         is_outlier = is_there && m->is_known && !m->open && size_of(error) > limit;
         m->errors[k] = error;
