@@ -404,7 +404,7 @@ class Cards(HtmlComponent):
         self.is_open: bool = False
         self._among: list[str] = []
         """What is hidden again once a line is no longer alone."""
-        self._asked: list[str] = []
+        self._own_choice: list[str] = []
         super().__init__(self._take, **WIDE)
         self.show([])
 
@@ -421,7 +421,7 @@ class Cards(HtmlComponent):
     @param.depends("hidden_lines", watch=True)
     def _follow(self) -> None:
         """Mark the rows; a click moves none of them."""
-        if self.hidden_lines == self._asked:
+        if self.hidden_lines == self._own_choice:
             self._draw()
         else:
             self._fold()
@@ -429,13 +429,13 @@ class Cards(HtmlComponent):
     def _fold(self) -> None:
         """Fold away the rows that are not of the main lines and not shown."""
         minor = [it for it in self.items if not it.get("main") and (it["name"] in self.hidden_lines or it["value"] == NOTHING)]
-        self._folded = [] if self.is_open else [it["name"] for it in minor]
+        self._minor_rows = [] if self.is_open else [it["name"] for it in minor]
         self._draw()
 
     def _draw(self) -> None:
         of = {name: getattr(self, name) for name in ("kind", "items", "heads", "legend", "is_open")}
-        longest = max((max(it["size"], it["limit"]) for it in self.items if it["name"] not in self._folded), default=0.0)
-        values = {"hidden": self.hidden_lines, "folded": self._folded, "longest": longest, "terms": TERMS, "truth": TRUTH}
+        longest = max((max(it["size"], it["limit"]) for it in self.items if it["name"] not in self._minor_rows), default=0.0)
+        values = {"hidden": self.hidden_lines, "folded": self._minor_rows, "longest": longest, "terms": TERMS, "truth": TRUTH}
         self.html = render("strip.html", **of, **values)
 
     def _take(self, data: dict[str, Any]) -> None:
@@ -463,7 +463,7 @@ class Cards(HtmlComponent):
         self._hide([it for it in dict.fromkeys([*self.hidden_lines, *names]) if it != name])
 
     def _hide(self, names: list[str]) -> None:
-        self._asked = self.hidden_lines = names
+        self._own_choice = self.hidden_lines = names
 
 
 def card_of(name: str, dark: bool, note: str, value: str = NOTHING, **fields: Any) -> dict[str, Any]:
