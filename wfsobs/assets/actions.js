@@ -18,7 +18,8 @@ export function render({model, view, el}) {
       if (words === model.message) model.send_msg({action: "read", text: words})
     }, SAID_MS)
   }
-  model.on(["message", "notes"], () => say(model.message))
+  model.on("message", () => say(model.message))
+  model.on("notes", () => { if (model.notes.length) say(model.message) })
   say(model.message)
   model.on("msg:custom", (event) => {
     const {name, kind, content} = event.data ?? event
