@@ -59,6 +59,7 @@ export function render({model, view, el}) {
     if (newState === "open" && target.id === "File") target.append(...figures().map(itemOf))
   }, true)
   bar.addEventListener("click", ({target}) => {
+    if (target.dataset.do === "dismiss") target.parentElement.hidden = true // at once, also where the server does not hear it
     if (!target.matches(".menu > button")) return
     target.parentElement.hidePopover()
     const {event, copy: what, do: does} = target.dataset
