@@ -440,7 +440,7 @@ class Cards(HtmlComponent):
 
     def _take(self, data: dict[str, Any]) -> None:
         """Take a click: on a row, or the wish for the main rows, all rows or all lines."""
-        name, names, hidden = data.get("name"), [it["name"] for it in self.items], self.hidden_lines
+        name, names, hidden = str(data.get("name")), [str(it["name"]) for it in self.items], self.hidden_lines
         match data.get("action"):
             case "main" | "all" as rows:
                 self.is_open = rows == "all"
