@@ -17,6 +17,10 @@ export function render({model, el}) {
   for (const type of ["pointerover", "focusin", "focusout"]) el.addEventListener(type, tell)
   el.onpointerleave = () => tell({target: el})
 
+  el.onclick = ({target}) => { // at once; what the server says of it follows
+    const row = rowAt(target)
+    if (row) row.ariaPressed = row.ariaPressed !== "true"
+  }
   const showAlone = ({target}) => { if (rowAt(target)) model.send_msg({action: "solo", name: rowAt(target).value}) }
   el.ondblclick = showAlone
   el.onkeydown = (event) => { if (keyAlone(event).toLowerCase() === "s") showAlone(event) }
