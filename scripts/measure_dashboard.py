@@ -190,7 +190,7 @@ def _ready(browser: Any, url: str) -> Page:
     page.goto(url)
     page.get_by_role("slider").first.wait_for()
     page.wait_for_function("() => wfsobsStatus().startsWith('Done')", polling=100)
-    while (rows := page.locator("[data-rows=all]:visible")).count():  # of all observers, not of the main ones alone
+    while (rows := page.locator("[data-do=all]:visible")).count():  # of all observers, not of the main ones alone
         rows.first.click()
     card = page.locator(".card[data-name=gpr-offline]").first  # whose line tells when all but those that learn are drawn
     if card.get_attribute("aria-pressed") != "true":

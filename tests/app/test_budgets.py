@@ -104,7 +104,8 @@ def test_the_legend_has_the_causes_of_every_row_and_the_scale_holds_the_limit(pa
     page.budgets.by_observer = {"ridge": [Budget("ridge", "vibration", "tip", 5.0, dict.fromkeys(TERMS, 1.0), limit**2)]}
     assert not page.row("ridge")["main"]
     assert [label for _, label in page.strip.cards.legend] == [*TERMS.values(), "limit"]
-    assert f'data-size="{1e3 * limit}"' in page.strip.cards.html, "of the longer of both: the mark stands inside its column"
+    page.strip.cards._handle_msg({"action": "all"})
+    assert f"--longest: {1e3 * limit}" in page.strip.cards.html, "of the longer of both: the mark stands inside its column"
 
 
 def test_those_that_are_not_linear_have_budgets_if_they_are_main_ones_or_all_are_asked_for(page: Page, loop: Any) -> None:

@@ -111,7 +111,7 @@ def test_the_lines_that_matter_come_first_until_others_are_chosen(page: ClosedLo
     page.cards.hidden_lines = []
     dashboard.display.mode = "tilt"
     assert shown() == set(page.trace.lines) - {"none"}, "chosen lines stay"
-    page.cards._handle_msg({"main": True})
+    page.cards._handle_msg({"action": "main"})
     assert shown() == named() >= {"integrator", "lqg-kf-lgs", best("tilt")}
 
 

@@ -111,7 +111,7 @@ class TestChoice:
         dashboard.display.mode = "tilt"
         assert dashboard.display.hidden_lines["vibration"] == ["truth", "kf-lgs"]
         dashboard.display.mode = "tip"
-        dashboard.explore.strips["vibration"].cards._handle_msg({"main": True})
+        dashboard.explore.strips["vibration"].cards._handle_msg({"action": "main"})
         scores = dashboard.store.run.result.result.scores
         assert set(hidden(dashboard, "vibration")) == {*observers_of("vibration")} - {*main_observers(scores, "vibration", "tip")}
         assert at_first
@@ -136,17 +136,27 @@ class TestChoice:
         for target in TARGETS:
             assert display.hidden_lines[target] == others_of(whole.result.scores, target)
 
-    def test_a_click_that_crosses_a_result_counts(self, dashboard: Dashboard) -> None:
-        """The browser asks; what the page sends meanwhile does not undo it, and it hears what became of it."""
+    def test_a_click_turns_its_line_alone(self, dashboard: Dashboard) -> None:
+        """The browser says what was clicked; a double click is two clicks, which undo each other, and the wish for one alone."""
         cards = dashboard.explore.strips["vibration"].cards
         told: list[list[str]] = []
         cards.param.watch(lambda event: told.append(event.new), "hidden_lines")
-        cards._handle_msg({"hidden": ["truth", "kf-lgs"], "number": 7})
-        assert cards.last_arrival == 7
-        assert told == [["truth", "kf-lgs"]] and dashboard.display.hidden_lines["vibration"] == ["truth", "kf-lgs"]
-        for wrong in ("main", {"hidden": "truth"}, None):
+        at_first = cards.hidden_lines
+        shown = [card["name"] for card in cards.items if card["name"] not in at_first]
+        for _ in range(2):
+            cards._handle_msg({"action": "toggle", "name": "kf-lgs"})
+        assert told == [[*at_first, "kf-lgs"], at_first]
+        cards._handle_msg({"action": "solo", "name": "kf-lgs"})
+        assert dashboard.display.hidden_lines["vibration"] == told[-1] == hidden(dashboard, "vibration")
+        assert {card["name"] for card in cards.items} - {*told[-1]} == {"kf-lgs"}
+        assert not re.findall(f'folded"[^>]*data-name="(?:{"|".join(shown)})"', cards.html), "a click moves no row"
+        cards._handle_msg({"action": "solo", "name": "kf-lgs"})
+        assert told[-1] == at_first
+        for wrong in ("main", {"action": "toggle", "name": ["truth"]}, {"action": "solo", "name": "none"}, {"action": []}, None):
             cards._handle_msg(wrong)
-        assert told == [["truth", "kf-lgs"]]
+        assert len(told) == 4
+        cards._handle_msg({"action": "lines"})
+        assert told[-1] == []
 
     def test_the_axis_fits_the_lines_that_are_shown(self, dashboard: Dashboard) -> None:
         view = dashboard.explore.traces.traces["vibration"]

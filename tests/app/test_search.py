@@ -34,11 +34,11 @@ class TestSearch:
         search, controls = dashboard.controls.search, dashboard.controls
         search._handle_msg({"open": True})
         assert "kalman.vibration_rms" not in controls.fields
-        search._handle_msg({"path": "kalman.vibration_rms"})
+        search._handle_msg({"find": "kalman.vibration_rms"})
         assert "kalman.vibration_rms" in controls.fields
         assert controls.topic_list.open_topics == ["kalman"]
-        search._handle_msg({"path": "no.such"})
-        search._handle_msg({"path": "turbulence.wind_speed"})
+        for text in ("no.such", 3, "wind speed"):
+            search._handle_msg({"find": text})
         assert controls.topic_list.open_topics == ["kalman"], "nothing to open: unknown, or above the topics"
 
 

@@ -246,9 +246,9 @@ class TestNumbers:
         assert cards[TRUTH]["value"] == number(1e3 * score.truth_rms)
         assert "zero" not in cards
         html = dashboard.explore.strips["vibration"].cards.html
-        assert re.findall('class="card" data-name="([^"]+)"', html) == [*cards]
-        minor = re.findall('data-name="([^"]+)"[^>]* data-minor', html)
-        assert minor == [name for name, card in cards.items() if not card["main"]]
+        assert re.findall('class="card.*? data-name="([^"]+)"', html) == [*cards]
+        folded = re.findall('class="card folded".*? data-name="([^"]+)"', html)
+        assert folded == [name for name, card in cards.items() if not card["main"]]
 
     def test_before_the_first_result(self, enter: Any, loop: Any, short: Any) -> None:
         dashboard = Dashboard(loop.queue.put, enter(), short)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from tests.browser.conftest import PATIENCE, QUICK, finished, until
+from tests.browser.conftest import PATIENCE, QUICK, eventually, finished, until
 from wfsobs.observers import OBSERVERS
 
 TOPICS_AT = """() => [...(window.Bokeh?.index?.query((it) => it.model.class_name === "Headings") ?? [])]
@@ -94,7 +94,7 @@ def test_a_setting_is_found_and_gets_the_focus(wide: Page) -> None:
     box.focus()
     page.keyboard.type("no such thing")
     page.keyboard.press("Enter")
-    assert box.evaluate("it => it.validationMessage") == "No setting of that name"
+    eventually(page, lambda: box.evaluate("it => it.validationMessage") == "No setting of that name")
     box.fill("Seed · Run")  # as when it is chosen from the list
     expect(page.get_by_role("slider", name="Seed", exact=True)).to_be_focused()
 

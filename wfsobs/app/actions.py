@@ -52,16 +52,17 @@ class Menus(HtmlComponent):
     )
     saves: param.List[list[Any]] = param.List([], doc="What the page can save beside the data, as it is called in the menu.")
 
-    _esm = script("page", "patch", "markup", "figures", "actions")
+    _esm = script("page", "markup", "figures", "actions")
     _stylesheets = sheets("base", "bare", "actions")
 
     def save(self, name: str, kind: str, content: bytes) -> None:
         """Have the browser save a file."""
         self._send_msg({"name": name, "kind": kind, "content": content})
 
-    @param.depends("ready", "reporting", "saves", watch=True, on_init=True)
+    @param.depends("ready", "reporting", "saves", "notes", watch=True, on_init=True)
     def _draw(self) -> None:
-        self.html = render("toolbar.html", ready=self.ready, reporting=self.reporting, saves=self.saves)
+        names = "ready", "reporting", "saves", "notes"
+        self.html = render("toolbar.html", **{name: getattr(self, name) for name in names})
 
 
 class Actions:

@@ -287,7 +287,7 @@ class Sheet(HtmlComponent):
 
     open: param.Boolean[bool] = param.Boolean(False, doc="Whether it is seen.")
 
-    _esm = script("page", "patch", "markup", "history")
+    _esm = script("page", "markup", "history")
     _stylesheets = sheets("base", "history")
 
 

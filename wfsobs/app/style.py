@@ -169,17 +169,17 @@ NO_ROOM: Mapping[str, Any] = {"width": 0, "height": 0, "margin": 0}
 class HtmlText(HtmlComponent):
     """HTML that is updated in place, so that focus and open definitions survive new numbers."""
 
-    _esm = script("patch", "text")
+    _esm = script("markup", "buttons")
 
 
 def html(content: str = "", **params: Any) -> HtmlText:
     """HTML in the page's style."""
-    return HtmlText(html=content, **{**WIDE, "stylesheets": sheets("style"), **params})
+    return HtmlText(html=content, **{**WIDE, "stylesheets": sheets("base", "style"), **params})
 
 
 def bare(content: str = "", **params: Any) -> HtmlText:
     """HTML in the page's style that is always visible and has no box of its own, so that it costs no layout where it grows."""
-    return html(content, **{"stylesheets": sheets("style", "bare"), **params})
+    return html(content, **{"stylesheets": sheets("base", "style", "bare"), **params})
 
 
 def watch(act: Callable[..., object], *sources: tuple[Any, str | list[str]]) -> None:

@@ -61,7 +61,7 @@ class Picker(HtmlComponent):
     largest: param.Integer[int] = param.Integer(LARGEST, doc="The largest file that is sent [bytes].")
     part: param.Integer[int] = param.Integer(PART, doc="How much is sent at a time [bytes].")
 
-    _esm = script("page", "patch", "markup", "upload")
+    _esm = script("page", "markup", "upload")
     _stylesheets = sheets("base", "bare", "upload")
 
     @param.depends("message", "source_title", "back", watch=True, on_init=True)

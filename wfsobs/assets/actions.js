@@ -5,9 +5,8 @@ const SAID_MS = 6_000 // for which something that was done is told
 
 export function render({model, view, el}) {
   el.innerHTML = `<div class="bar"></div><span class="said" role="status"></span>
-    <label class="text" popover>Copy this by hand<textarea readonly></textarea></label>
-    <div class="notes" hidden><div role="alert"></div><button type="button">Dismiss</button></div>`
-  const [bar, said, text, notes] = el.children
+    <label class="text" popover>Copy this by hand<textarea readonly></textarea></label>`
+  const [bar, said, text] = el.children
 
   // What was done, in words of the browser, or of the server, which is told when they have been read.
   let over
@@ -20,22 +19,13 @@ export function render({model, view, el}) {
     }, SAID_MS)
   }
   model.on("message", () => say(model.message))
+  model.on("notes", () => { if (model.notes.length) say(model.message) })
   say(model.message)
   model.on("msg:custom", (event) => {
     const {name, kind, content} = event.data ?? event
     save(name, new Blob([content], {type: kind}))
     say(`Saved ${name}.`)
   })
-
-  const note = () => {
-    notes.hidden = model.notes.length === 0
-    notes.firstChild.replaceChildren(...model.notes.map((it) => Object.assign(document.createElement("p"), {textContent: it})))
-    if (!notes.hidden) say(model.message)
-  }
-  const dismiss = () => { notes.hidden = true; model.send_msg({action: "dismiss"}) }
-  notes.querySelector("button").onclick = dismiss
-  model.on("notes", note)
-  note()
 
   const here = () => {
     const query = [model.query, model.view].filter(Boolean).join("&")
@@ -62,22 +52,20 @@ export function render({model, view, el}) {
   const itemOf = ([name, view]) => Object.assign(document.createElement("button"), {
     type: "button", className: "figure", textContent: `Save ${name} as SVG`, act: () => saveFigure(name, view)})
 
-  const draw = () => setMarkup(bar, model.html)
-  model.on("html", draw)
-  draw()
-  tellActions(bar, model)
+  showMarkup(bar, model)
   bar.addEventListener("beforetoggle", ({target, newState}) => {
     if (target.matches(":focus-within")) target.previousElementSibling.focus()  // the browser knows the host of the shadow alone
     for (const it of target.querySelectorAll(".figure")) it.remove()
     if (newState === "open" && target.id === "File") target.append(...figures().map(itemOf))
   }, true)
   bar.addEventListener("click", ({target}) => {
+    if (target.dataset.do === "dismiss") target.parentElement.hidden = true // at once, also where the server does not hear it
     if (!target.matches(".menu > button")) return
     target.parentElement.hidePopover()
     const {event, copy: what, do: does} = target.dataset
     if (event) document.dispatchEvent(new Event(event))
     if (what) copy(what)
-    if (does) { notes.hidden = true; say(does === "report" ? "Making the report …" : "Preparing the file …") }
+    if (does) say(does === "report" ? "Making the report …" : "Preparing the file …")
     target.act?.()
   })
 

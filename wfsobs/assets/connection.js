@@ -51,23 +51,26 @@ function refuse(event) {
   if (!event.data.includes('"ACK"')) event.target.close()
 }
 
-// The path of the setting that a component, or what holds its data, stands for.
-function settingOf(model) {
-  const of = model?.data ? model : [...model?.document?.all_models ?? []].find((it) => it.data === model)
-  return tagOf(of)?.slice(TAG.length)
-}
-
-const tagOf = (model) => model?.tags?.find((tag) => tag.startsWith?.(TAG))
+// The path of the setting that a component stands for.
+const settingOf = (model) => model?.tags?.find((tag) => tag.startsWith?.(TAG))?.slice(TAG.length)
 
 // A line below a setting that comes while it is being drawn is not seen.
 function areSettingsDrawn() {
-  const fields = [...Bokeh.index.query((it) => tagOf(it.model))]
+  const fields = [...Bokeh.index.query((it) => settingOf(it.model))]
   return fields.length > 0 && fields.every((it) => it.has_finished())
 }
 
 class Link {
+  state = "connected"
+  asked = 0
+  unsent = []
+  kept = new Set()
+  refused = 0
+  wait = 0
+  ticks = 0
+
   constructor(doc) {
-    Object.assign(this, {doc, state: "connected", asked: 0, unsent: [], kept: new Set(), socket: null, connection: null, refused: 0, wait: 0, ticks: 0})
+    this.doc = doc
     doc.on_change((event) => this.changed(event))
     doc.on_event("connection_lost", (_, event) => this.lost(event.connection.deref()))
     window.addEventListener("offline", () => {
@@ -81,10 +84,9 @@ class Link {
 
   // The document is drawn, for the first time or anew.
   attach(model, draw) {
-    const again = this.model !== undefined
+    if (this.model === undefined) this.restore()
     Object.assign(this, {model, draw, session: model.session, arrived: model.last_arrival})
     model.on("last_arrival", () => this.answered(model.last_arrival))
-    if (!again) this.restore()
     this.due = true
     this.deliver()
     this.turn("connected")
@@ -206,7 +208,8 @@ class Link {
     if (!event.sync) return
     const number = this.asked + 1
     if (event.kind === "ModelChanged" && TYPED.includes(event.attr)) {
-      const {id} = event.model, setting = settingOf(event.model)
+      const {id} = event.model, holder = [...this.doc.all_models].find((it) => it.data === event.model)
+      const setting = settingOf(holder ?? event.model)
       this.unsent = this.unsent.filter((it) => (setting ? it.setting !== setting : it.id !== id) || it.message)
       this.note({number, id, setting, attr: event.attr, value: event.value})
     } else if (event.kind === "MessageSent") {
@@ -257,17 +260,11 @@ export function render({model, view, el}) {
   el.innerHTML = `<div class="banner" popover="manual" role="alert"><span></span><button type="button">Start again with these settings</button></div>`
   const box = el.firstChild, [text, button] = box.children
   button.onclick = () => doc.wfsobs.again()
-  let hiding
   const draw = (said, state) => {
-    clearTimeout(hiding)
     box.dataset.state = state
     text.textContent = said
     button.hidden = state !== "gone"
     box.togglePopover(said !== "")
-    if (state === "connected") requestAnimationFrame(() => { // from when it is seen
-      clearTimeout(hiding)
-      hiding = setTimeout(() => { if (box.dataset.state === "connected") box.hidePopover() }, 3_000)
-    })
   }
   doc.wfsobs ??= new Link(doc)
   doc.wfsobs.attach(model, draw)

@@ -10,8 +10,8 @@ const KEYS = {
 const DEAD = 3  // px that a pointer may tremble
 
 export function render({model, el}) {
-  el.innerHTML = `<div class="root"><div class="marks"></div><div class="bar"></div></div>`
-  const root = el.firstChild, [marks, bar] = root.children
+  patchHtml(el, model.html)
+  const root = el.firstElementChild, [marks, bar] = root.children
   let view = null, number = 0, waiting = 0, newest = null, settle = 0
   let move = null  // {handle, frequency, strength, damping}; by pointer also where it was taken and how far it is from there
   let adding = 0  // how many handles there are with the one that is being added
@@ -22,13 +22,13 @@ export function render({model, el}) {
   const send = (message) => {
     if (!waiting) model.send_msg({...message, number: waiting = ++number})
     else if (!newest?.last || message.last) newest = message
-    root.classList.add("pending")
+    el.classList.add("pending")
   }
   const hear = () => {
     if (!waiting || model.frame.answered < waiting) return
     const next = newest
     waiting = newest = null
-    root.classList.remove("pending")
+    el.classList.remove("pending")
     if (next) send(next)
   }
   const wish = (action) => {
@@ -54,24 +54,26 @@ export function render({model, el}) {
   }
 
   const find = () => {
-    const [found] = Bokeh.index.query((it) => it.model.type === "Figure" && it.model.name === model.figure)
+    const found = figureViews().find((it) => it.model.name === model.figure)
     if (!found?.frame?.bbox?.width) return setTimeout(find, 50)
     view = found
     for (const range of [view.model.x_range, view.model.y_range]) range.change.connect(soon)
     new ResizeObserver(soon).observe(view.el)
     place()
   }
-  let isAsked = false
+  let asked = 0
   const soon = () => {
-    if (!isAsked) requestAnimationFrame(() => { isAsked = false; place() })
-    isAsked = true
+    cancelAnimationFrame(asked)
+    asked = requestAnimationFrame(place)
   }
   const place = () => {
     if (!view) return
     const here = root.getBoundingClientRect(), there = view.el.getBoundingClientRect()
     const {bbox: box, x_scale, y_scale} = view.frame
-    handles().forEach((handle, i) => {
-      const it = marks.children[i], own = {model: box.bottom - 28, band: box.bottom - 9}[handle.kind]
+    for (const it of marks.children) {
+      const handle = handleOf(it)
+      if (!handle) continue
+      const own = {model: box.bottom - 28, band: box.bottom - 9}[handle.kind]
       let sx = x_scale.compute(handle.frequency)
       let sy = own ?? (Number.isFinite(handle.y) ? y_scale.compute(handle.y) : (box.top + box.bottom) / 2)
       if (move?.changed && move.from && move.handle.id === handle.id) {
@@ -81,20 +83,14 @@ export function render({model, el}) {
       it.hidden = sx < box.left - 1 || sx > box.right + 1
       it.style.left = `${there.left - here.left + sx}px`
       it.style.top = `${there.top - here.top + Math.min(Math.max(sy, box.top + 6), box.bottom - 6)}px`
-    })
+    }
   }
 
   const draw = () => {
-    while (marks.children.length > handles().length) marks.lastChild.remove()
-    for (const [i, handle] of handles().entries()) {
-      const it = marks.children[i] ?? marks.appendChild(Object.assign(document.createElement("div"), {tabIndex: 0, role: "slider"}))
-      Object.assign(it, {
-        className: `handle ${handle.kind}`, title: `${handle.label}: ${handle.text}`, ariaLabel: handle.label, ariaValueText: handle.text,
-        ariaValueNow: handle.frequency, ariaValueMin: model.frame.limits[0], ariaValueMax: handle.highest ?? model.frame.limits[1]})
-    }
+    patchHtml(el, model.html)
     hear()
     place()
-    if (!adding || handles().length < adding) return
+    if (!adding || marks.children.length < adding) return
     marks.children[handles().findIndex(({id}) => id === model.frame.added)]?.focus()
     adding = 0
   }
@@ -146,10 +142,7 @@ export function render({model, el}) {
     send({action: "add", last: true, frequency: Math.sqrt(start * end)})
   }
 
-  const write = () => patchHtml(bar, model.html)
-  model.on("frame", draw)
-  model.on("html", write)
-  write()
+  model.on(["frame", "html"], draw)
   draw()
   find()
 }

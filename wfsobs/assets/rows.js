@@ -13,13 +13,6 @@ export function render({model, el}) {
       for (const it of line.querySelectorAll("[data-do]")) it.tabIndex = isTable && i !== current ? -1 : 0
     })
   }
-  const draw = () => {
-    setMarkup(el, model.html)
-    turn(current)
-    next?.()?.focus()
-    next = null
-  }
-  tellActions(el, model)
   el.addEventListener("click", ({target}) => {
     const does = target.closest("[data-do]")?.dataset.do, at = lines().indexOf(target.closest("tr, fieldset")), n = lines().length
     if (does === "add") next = () => cells(lines()[n] ?? el)[0]
@@ -36,6 +29,9 @@ export function render({model, el}) {
     event.preventDefault()
     cells(to)[Math.max(0, cells(line).indexOf(event.target))].focus()
   })
-  model.on("html", draw)
-  draw()
+  showMarkup(el, model, () => {
+    turn(current)
+    next?.()?.focus()
+    next = null
+  })
 }

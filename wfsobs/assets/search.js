@@ -6,40 +6,24 @@ export function render({model, el}) {
   el.innerHTML = `<input type="search" placeholder="Find a setting" autocomplete="off" spellcheck="false" list="found"
     aria-label="Find a setting"><datalist id="found"></datalist>`
   const [box, list] = el.children
-  const choose = (item) => {
-    box.value = ""
-    model.send_msg({path: item.path})
-    go(item.path)
-  }
-  // The one of a name, or the first in which every word stands; those first whose names begin with them.
-  const find = () => {
-    const text = box.value.trim().toLowerCase(), words = text.split(/\s+/)
-    const all = model.items.filter((it) => words.every((word) => `${it.name} ${it.path}`.toLowerCase().includes(word)))
-    return all.find((it) => it.name.toLowerCase().startsWith(text)) ?? all[0]
-  }
-
-  let isEntered = false // before the settings have come, which they do when the box is first used
-  const enter = () => {
-    isEntered = !model.items.length
-    if (isEntered) return
-    const found = find()
-    if (found) return choose(found)
-    box.setCustomValidity("No setting of that name")
-    box.reportValidity()
-  }
-  const fill = () => {
-    list.replaceChildren(...model.items.map(({name, path}) => new Option(path, name)))
-    if (isEntered) enter()
-  }
+  const find = () => model.send_msg({find: box.value})
+  const fill = () => list.replaceChildren(...model.items.map(({name, path}) => new Option(path, name)))
   box.onfocus = () => model.send_msg({open: true})
   box.oninput = () => {
-    isEntered = false
     box.setCustomValidity("")
-    const chosen = model.items.find(({name}) => name === box.value)
-    if (chosen) choose(chosen)
+    if (model.items.some(({name}) => name === box.value)) find() // chosen from the list
   }
-  box.onkeydown = ({key}) => { if (key === "Enter" && box.value.trim()) enter() }
+  box.onkeydown = ({key}) => { if (key === "Enter" && box.value.trim()) find() }
   model.on("items", fill)
+  model.on("msg:custom", (event) => {
+    const {path} = event.data ?? event
+    if (path) {
+      box.value = ""
+      return go(path)
+    }
+    box.setCustomValidity("No setting of that name")
+    box.reportValidity()
+  })
   fill()
   listen(model, {keydown: (event) => {
     if (keyAlone(event) !== "/") return

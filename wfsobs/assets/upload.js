@@ -12,15 +12,11 @@ async function send(model, file) {
 }
 
 export function render({model, el}) {
-  const draw = () => {
-    setMarkup(el, model.html)
-    el.style.position = model.source_title || model.message ? "" : "absolute"
-  }
-  model.on(["html", "source_title", "message"], draw)  // which come one after the other
-  draw()
+  const place = () => { el.style.position = model.source_title || model.message ? "" : "absolute" }
+  showMarkup(el, model, place)
+  model.on(["source_title", "message"], place)  // which come one after the other
   const [input, sheet, pick] = ["input", "#load", ".pick"].map((it) => el.querySelector(it))
   const take = ([file]) => { if (file) send(model, file) }
-  tellActions(el, model)
   pick.onclick = () => input.click()
   input.onchange = () => { take(input.files); input.value = "" }
 

@@ -299,7 +299,7 @@ class SliderField(TextField):
 class RowTable(HtmlComponent):
     """The table in the browser; messages {action, key, name} up, where the key is a row, or a row and a column."""
 
-    _esm = script("patch", "markup", "rows")
+    _esm = script("markup", "rows")
     _stylesheets = sheets("base", "rows")
 
     def __init__(self, on_message: Callable[[dict[str, Any]], object], noun: str, columns: list[dict[str, Any]], **params: Any):

@@ -101,7 +101,7 @@ def waiting_text(seconds: float) -> str:
 
 
 class Search(Component):
-    """The box in the browser; it gets the settings when it is first used, and says which one has been chosen."""
+    """The box in the browser; it gets the settings when it is first used, and asks where what is chosen or typed stands."""
 
     items: param.List[list[Any]] = param.List([], doc="{path, name} of every setting.")
 
@@ -116,8 +116,10 @@ class Search(Component):
     def _take(self, data: dict[str, Any]) -> None:
         if data.get("open"):
             self.items = settings_found()
-        elif (path := str(data.get("path", ""))) in {item["path"] for item in self.items}:
-            self._reveal(path)
+        elif isinstance(text := data.get("find"), str):
+            if path := find_setting(text):
+                self._reveal(path)
+            self._send_msg({"path": path})
 
 
 def drawer_settings(scenario: Scenario) -> dict[str, param.Parameter[Any]]:
@@ -132,6 +134,18 @@ def settings_found() -> list[dict[str, str]]:
     topics = Scenario.settings()
     known = drawer_settings(Scenario())
     return [{"path": path, "name": f"{label_of(p)} · {topics[topic_of(path)].label}"} for path, p in known.items()]
+
+
+def find_setting(text: str) -> str:
+    """Return the path of the setting in whose name or path every word stands, one whose name begins with them first; or nothing.
+
+    >>> find_setting("outer scale"), find_setting("no such thing")
+    ('turbulence.outer_scale', '')
+    """
+    text = text.strip().lower()
+    found = [it for it in settings_found() if all(word in f"{it['name']} {it['path']}".lower() for word in text.split())]
+    found.sort(key=lambda it: not it["name"].lower().startswith(text))
+    return found[0]["path"] if found else ""
 
 
 FIRST: Mapping[str, Sequence[str]] = {

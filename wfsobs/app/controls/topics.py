@@ -14,7 +14,7 @@ from wfsobs.app.style import WIDE, HtmlComponent, script, sheets
 class Headings(HtmlComponent):
     """Names of topics below each other in the browser; a click on one tells its key."""
 
-    _esm = script("patch", "markup", "buttons")
+    _esm = script("markup", "buttons")
     _stylesheets = sheets("base", "topics")
 
 

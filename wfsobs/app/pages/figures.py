@@ -124,7 +124,7 @@ class ModelPage(Page):
 
     def __init__(self, store: Store, display: Display):
         super().__init__(store, display, "mode", "dark")
-        self.pane: Final = html(stylesheets=sheets("style", "model"))
+        self.pane: Final = html(stylesheets=sheets("base", "style", "model"))
         store.param.watch(self.redraw, "scenario")
 
     def view(self) -> HtmlText:

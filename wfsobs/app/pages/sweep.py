@@ -205,7 +205,7 @@ REDRAW = 0.3
 class SweepMap(HtmlComponent):
     """The map in the browser; a click on a cell asks for its scenario."""
 
-    _esm = script("patch", "markup", "buttons")
+    _esm = script("markup", "buttons")
     _stylesheets = sheets("base", "sweep")
 
     def __init__(self, load: Callable[[int], None], **params: Any):

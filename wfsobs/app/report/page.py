@@ -45,7 +45,7 @@ from wfsobs.app.report.sections import (
     state_table,
     summary,
 )
-from wfsobs.app.style import PRIMARY, asset, look, observers_of
+from wfsobs.app.style import PRIMARY, asset, look, observers_of, sheets
 from wfsobs.app.views.plots import MODEL, PEAKS, add_line, add_marks, model_mark, new_figure, new_spectrum, peak_marks
 from wfsobs.app.views.traces import EVENT, EVENTS, add_event_marks, event_columns
 from wfsobs.app.work import TRUTH, RunResults
@@ -85,7 +85,7 @@ def page(report: Report, date: datetime) -> str:
         summary=summary(report, date),
         policy=_policy(*scripts.values()),
         scripts={name: Markup(script) for name, script in scripts.items()},
-        sheets={"shared": Markup(asset("style.css")), "own": Markup(asset("report.css"))},
+        sheets={"shared": Markup("".join(sheets("base", "style"))), "own": Markup(asset("report.css"))},
         primary=PRIMARY,
         looks={name: look(name) for name in _line_names()} | {EVENTS: EVENT},
         lines=_lines(report),

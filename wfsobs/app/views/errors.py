@@ -389,19 +389,22 @@ LIMIT = "limit"
 
 
 class Cards(HtmlComponent):
-    """A row per line in the browser; a click on one hides or shows its line, a double click shows it alone."""
+    """A row per line; a click on one hides or shows its line, a double click, whose clicks undo each other, shows it alone."""
 
     hidden_lines: param.List[list[Any]] = param.List([], doc="Names of the rows whose lines are hidden.")
-    last_arrival: param.Integer[int] = param.Integer(0, doc="Number of the last click that has arrived, and all before it.")
 
-    _esm = script("patch", "strip")
-    _stylesheets = sheets("style", "strip", "bare")
+    _esm = script("page", "markup", "strip")
+    _stylesheets = sheets("base", "style", "strip", "bare")
 
     def __init__(self, kind: str = "observers"):
         """Make the table. kind : what the rows are of."""
         self.kind = kind
         self.on_main: Callable[[], None] = lambda: None
         self.on_all: Callable[[], None] = lambda: None
+        self.is_open: bool = False
+        self._among: list[str] = []
+        """What is hidden again once a line is no longer alone."""
+        self._own_choice: list[str] = []
         super().__init__(self._take, **WIDE)
         self.show([])
 
@@ -413,21 +416,54 @@ class Cards(HtmlComponent):
         heads : headings of the columns value, note, change and bar; legend : (colour, label) of the pieces of bars
         """
         self.items, self.heads, self.legend = items, heads or {}, legend
-        values = {"kind": self.kind, "terms": TERMS, "truth": TRUTH, "nothing": NOTHING}
-        self.html = render("strip.html", items=items, heads=self.heads, legend=legend, **values)
+        self._fold()
+
+    @param.depends("hidden_lines", watch=True)
+    def _follow(self) -> None:
+        """Mark the rows; a click moves none of them."""
+        if self.hidden_lines == self._own_choice:
+            self._draw()
+        else:
+            self._fold()
+
+    def _fold(self) -> None:
+        """Fold away the rows that are not of the main lines and not shown."""
+        minor = [it for it in self.items if not it.get("main") and (it["name"] in self.hidden_lines or it["value"] == NOTHING)]
+        self._minor_rows = [] if self.is_open else [it["name"] for it in minor]
+        self._draw()
+
+    def _draw(self) -> None:
+        of = {name: getattr(self, name) for name in ("kind", "items", "heads", "legend", "is_open")}
+        longest = max((max(it["size"], it["limit"]) for it in self.items if it["name"] not in self._minor_rows), default=0.0)
+        values = {"hidden": self.hidden_lines, "folded": self._minor_rows, "longest": longest, "terms": TERMS, "truth": TRUTH}
+        self.html = render("strip.html", **of, **values)
 
     def _take(self, data: dict[str, Any]) -> None:
-        """Take a click: the names to hide, or the wish for the main rows or all."""
-        if data.get("main"):
-            self.on_main()
-        elif data.get("all"):
-            self.on_all()
-        elif isinstance(names := data.get("hidden"), list):
-            number = data.get("number")
-            self.param.update(
-                hidden_lines=[name for name in names if isinstance(name, str)],
-                last_arrival=number if isinstance(number, int) else self.last_arrival,
-            )
+        """Take a click: on a row, or the wish for the main rows, all rows or all lines."""
+        name, names, hidden = str(data.get("name")), [str(it["name"]) for it in self.items], self.hidden_lines
+        match data.get("action"):
+            case "main" | "all" as rows:
+                self.is_open = rows == "all"
+                (self.on_all if self.is_open else self.on_main)()
+                self._fold()
+            case "lines":
+                self._hide([])
+            case "toggle" if name in names:
+                self._hide([it for it in hidden if it != name] if name in hidden else [*hidden, name])
+            case "solo" if name in names:
+                self._show_alone(name, names)
+
+    def _show_alone(self, name: str, names: list[str]) -> None:
+        """Hide all lines but one, or, where it is alone, those that were hidden before; one without a row stays hidden."""
+        shown = [it for it in names if it not in self.hidden_lines]
+        if shown == [name]:
+            return self._hide(self._among)
+        if len(shown) != 1:
+            self._among = self.hidden_lines
+        self._hide([it for it in dict.fromkeys([*self.hidden_lines, *names]) if it != name])
+
+    def _hide(self, names: list[str]) -> None:
+        self._own_choice = self.hidden_lines = names
 
 
 def card_of(name: str, dark: bool, note: str, value: str = NOTHING, **fields: Any) -> dict[str, Any]:

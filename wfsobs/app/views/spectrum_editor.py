@@ -237,12 +237,14 @@ class HandleLayer(HtmlComponent):
         {}, doc="What is shown: handles, numbers, a note, and the number of the message that is answered."
     )
 
-    _esm = script("patch", "handles")
+    _esm = script("page", "markup", "handles")
     _stylesheets = sheets("base", "handles")
 
     @param.depends("frame", watch=True, on_init=True)
     def _draw(self) -> None:
-        self.html = render("handles.html", frame={"note": "", "hint": "", "numbers": [], "add": None, **self.frame})
+        self.html = render(
+            "handles.html", frame={"note": "", "hint": "", "handles": [], "numbers": [], "add": None, **self.frame}
+        )
 
 
 class SpectrumEditor:

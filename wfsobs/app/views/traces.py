@@ -531,7 +531,7 @@ class Stretch:
         self.run: Final = traces.run
         self.display: Final = traces.display
         sources = (self.run, "result"), (self.display, ["mode", "unit", "hidden_lines", "dark"])
-        self.pane: Final = follow_html(self.html, *sources, stylesheets=[*sheets("style", "bare"), FLEXIBLE])
+        self.pane: Final = follow_html(self.html, *sources, stylesheets=[*sheets("base", "style", "bare"), FLEXIBLE])
         on_settle([traces.x_range, spectra.x_range], lambda: setattr(self.pane, "html", self.html()))
 
     def html(self) -> str:
