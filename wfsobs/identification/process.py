@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.fft import rfft
 
-from wfsobs.identification.one_mode import OneMode
+from wfsobs.identification.one_mode import NO_NEARER, OneMode
 from wfsobs.signal.autoregressive import Ar2, Ar3
 from wfsobs.spectral.model import HIGHEST, Spectrum
 from wfsobs.spectral.search import Sinusoid, line_in_record, short_taper
-from wfsobs.spectral.whittle import NO_NEARER, spectrum_information
+from wfsobs.spectral.whittle import spectrum_information
 from wfsobs.typing import Array
 
 
