@@ -494,7 +494,7 @@ def read_mode(name: str, mode: OneMode, whiteness: Whiteness) -> IdentifiedMode:
     A resonance of the continuum is not a peak; an observer receives it as turbulence.
     """
     std, s = mode.errors(), mode.spectrum
-    noise = with_reliable_std(scale_number(Number(1.0, float(std[0])), s.noise))
+    noise = with_reliable_std(Number(s.noise, float(std[0]) * s.noise))
     found = [read_process(p, std[start:]) for start, p in zip(s.starts, s.processes, strict=False)]
     turbulence, background = (None if p is None else found.pop(0) for p in (s.turbulence, s.background))
     if turbulence is not None and turbulence.frequency.value < SLOWEST * mode.f[0]:
