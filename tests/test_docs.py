@@ -279,7 +279,7 @@ def test_the_new_format_brings_a_record_back(tmp_path: Path) -> None:
         names["write"](file, arrays)
         size = file.seek(0, 2)
         file.seek(0)
-        back = names["read"](file, size).contents.arrays
+        back = names["read"](file, size).arrays
         assert back.keys() == arrays.keys()
         assert all(np.array_equal(back[name], arrays[name], equal_nan=True) for name in arrays)
         file.seek(0)

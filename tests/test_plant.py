@@ -84,7 +84,7 @@ def test_response_of_a_mirror(damping: float) -> None:
         w = np.linspace(0.01, 3.0, 50)
         expected = TruePlant(np.eye(1), dead, resonance=omega, damping=damping).response(w)
         assert np.allclose(np.exp(-1j * np.outer(w, 1.0 + np.arange(len(taps)))) @ taps, expected, rtol=0, atol=1e-8)
-    for response in (taps, few_lags(3)(np.array([late, 0.2, -0.1])), few_lags(1)(np.array([late, 0.2, -0.1]))):
+    for response in (taps, few_lags(3, np.array([late, 0.2, -0.1])), few_lags(1, np.array([late, 0.2, -0.1]))):
         assert response.sum() == pytest.approx(1.0, abs=1e-9)
         assert response @ (1.0 + np.arange(len(response))) == pytest.approx(late, abs=1e-8)
 

@@ -365,35 +365,21 @@ def frozen_flow(
         for i, view in enumerate(views):
             seen.setdefault((id(view.sensor), view.footprints[number]), []).append(i)
         beams = [(views[which[0]].sensor, footprint) for (_, footprint), which in seen.items()]
-        made = layer_signals(layer, outer_scale, diameter, beams, n_steps, dt, stream, watch)
-        for values, which in zip(made, seen.values(), strict=True):
+        grid = FrequencyGrid.of(layer, outer_scale, diameter, n_steps, dt)
+        amplitudes = [np.zeros((sensor.n_outputs, grid.f.size), complex) for sensor, _ in beams]
+        reaches = [sensor.reach / max(footprint.scale, NARROWEST) for sensor, footprint in beams]
+        for part, wave in waves(grid, layer, outer_scale, diameter, stream, max(reaches)):
+            watch.check()
+            exposure = np.sinc(grid.f[part] * dt)
+            least = wave.ky[wave.ky.size // 2]
+            for (sensor, footprint), reach, amplitude in zip(beams, reaches, amplitudes, strict=True):
+                if least <= max(reach, CORE / (0.5 * diameter)):
+                    amplitude[:, part] += sensor.measure(wave, footprint) * exposure
+        for amplitude, which in zip(amplitudes, seen.values(), strict=True):
+            values = grid.signal(amplitude, n_steps)
             for i in which:
                 signals[i] += values
     return [np.ascontiguousarray(x.T) for x in signals]
-
-
-def layer_signals(
-    layer: TurbulenceLayer,
-    outer_scale: float,
-    diameter: float,
-    beams: Sequence[tuple[Sensor, Footprint]],
-    n_steps: int,
-    dt: float,
-    rng: np.random.Generator,
-    watch: Watch = QUIET,
-) -> list[Array]:
-    """Simulate the signal of each beam through one layer, [(n_outputs, n_steps) um]."""
-    grid = FrequencyGrid.of(layer, outer_scale, diameter, n_steps, dt)
-    amplitudes = [np.zeros((sensor.n_outputs, grid.f.size), complex) for sensor, _ in beams]
-    reaches = [sensor.reach / max(footprint.scale, NARROWEST) for sensor, footprint in beams]
-    for part, wave in waves(grid, layer, outer_scale, diameter, rng, max(reaches)):
-        watch.check()
-        exposure = np.sinc(grid.f[part] * dt)
-        least = wave.ky[wave.ky.size // 2]
-        for (sensor, footprint), reach, amplitude in zip(beams, reaches, amplitudes, strict=True):
-            if least <= max(reach, CORE / (0.5 * diameter)):
-                amplitude[:, part] += sensor.measure(wave, footprint) * exposure
-    return [grid.signal(amplitude, n_steps) for amplitude in amplitudes]
 
 
 def waves(

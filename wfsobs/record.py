@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 DELAY = 2
 """The paper's delay: a command is computed once y_lgs[k] is known, acts during step k + 1, and is seen at k + 2."""
 
+OF_MODES = ("y_lgs", "u", "y_ngs", "open_loop_y", "turbulence", "vibration")
+"""Signals of a record, (n_steps, n_modes)."""
+
 SENSORS = ("lgs", "ngs")
 """Whose measurements a record has."""
 
@@ -179,7 +182,7 @@ class Record(Signals):
 
     def __post_init__(self) -> None:
         """Take lists, tables and numbers of any kind. Raises RecordError where they are no record."""
-        for name in ("y_lgs", "u", "y_ngs", "open_loop_y", "turbulence", "vibration", "y_stars"):
+        for name in (*OF_MODES, "y_stars"):
             if (values := getattr(self, name)) is not None:
                 object.__setattr__(self, name, numbers := _numbers(name, values))
                 if self.y_lgs.ndim != 2:
@@ -233,8 +236,7 @@ class Record(Signals):
         ImportError
             xarray is not installed.
         """
-        names = ("y_lgs", "u", "y_ngs", "open_loop_y", "turbulence", "vibration")
-        signals = {name: (("time", "mode"), x, {"units": "um"}) for name in names if (x := getattr(self, name)) is not None}
+        signals = {name: (("time", "mode"), x, {"units": "um"}) for name in OF_MODES if (x := getattr(self, name)) is not None}
         stars = {} if self.y_stars is None else {"y_stars": (("time", "star", "mode"), self.y_stars, {"units": "um"})}
         coordinates = {
             "time": ("time", self.dt * np.arange(self.n_steps), {"units": "s"}),

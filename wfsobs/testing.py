@@ -158,11 +158,11 @@ class Runs(NamedTuple):
             self.check(found, measurements, then)
         return found
 
-    def compare(self, got: Estimates, base: Estimates, what: str, stop: int | None = None, *, exact: bool = False) -> None:
-        """Raise CheckError where two results differ before a step by more than rounding."""
+    def compare(self, got: Estimates, base: Estimates, what: str, steps: slice = slice(None), *, exact: bool = False) -> None:
+        """Raise CheckError where two results differ in some steps by more than rounding."""
         for name, values in base.items():
             bound = 0.0 if exact else SAME * float(np.nanstd(values))
-            if not np.allclose(got[name][:stop], values[:stop], rtol=0.0, atol=bound, equal_nan=True):
+            if not np.allclose(got[name][steps], values[steps], rtol=0.0, atol=bound, equal_nan=True):
                 raise CheckError(f"{self.name}: {what} ({name})")
 
     def check_twice(self, inputs: Sequence[Any], base: Estimates) -> None:
@@ -176,7 +176,7 @@ class Runs(NamedTuple):
         for k in steps_to_check(measured.n_steps):
             what = f"looks ahead: measurements after step {k} change what it gives at that step or an earlier one"
             later = changed_after(measured, k, commands_from=commands_from)
-            self.compare(self.run(later, *rest), base, what, stop=k + 1)
+            self.compare(self.run(later, *rest), base, what, slice(k + 1))
 
     def check_alone(self, inputs: Sequence[Any], base: Estimates) -> None:
         """Check that the result is the same in a process that is started for it and receives the arguments alone."""
@@ -228,7 +228,7 @@ def step_difference(observer: Observer, measurements: Measurements, prior: Prior
     return worst
 
 
-def check_steps(observer: Observer, measurements: Measurements, prior: Prior, settings: Any, watch: Watch = QUIET) -> None:
+def check_steps(runs: Runs, observer: Observer, measurements: Measurements, prior: Prior, settings: Any) -> None:
     """Check an observer that can run frame by frame.
 
     After every frame its estimate is that of its run over the record, without gaps and with. It goes on from a saved state as if
@@ -242,30 +242,23 @@ def check_steps(observer: Observer, measurements: Measurements, prior: Prior, se
     if observer.step is None:
         return
     broken, half = with_gap(measurements), measurements.n_steps // 2
-    with report_errors(observer.id, watch, STEPS):
+    by_frame = partial(report_errors, runs.name, runs.watch, STEPS)
+    with by_frame():
         differences = [step_difference(observer, seen, prior, settings) for seen in (measurements, broken)]
-    measurements = broken
-    if not max(differences) <= SAME:
-        raise CheckError(f"{observer.id}: frame by frame its estimate is not that of its run over the record")
-    with report_errors(observer.id, watch, STEPS):
-        ours, other = (observer.design(prior, settings, measurements.sampling) for _ in range(2))
-        base = run_steps(ours, measurements)
-    with report_errors(observer.id, watch, STEPS):
-        run_steps(other, measurements, range(half))
+        if not max(differences) <= SAME:
+            raise CheckError(f"{runs.name}: frame by frame its estimate is not that of its run over the record")
+    with by_frame():
+        ours, other = (observer.design(prior, settings, broken.sampling) for _ in range(2))
+        base = run_steps(ours, broken)
+    with by_frame():
+        run_steps(other, broken, range(half))
         ours.reset()
         ours.load_state_dict(other.state_dict())
-        got = run_steps(ours, measurements, range(half, measurements.n_steps))
-    _compare(observer, got, base, half, "from a saved state it goes on elsewhere")
-    with report_errors(observer.id, watch, STEPS):
+        got = run_steps(ours, broken, range(half, broken.n_steps))
+        runs.compare(got, base, "from a saved state it goes on elsewhere", slice(half, None), exact=True)
+    with by_frame():
         ours.reset()
-        got = run_steps(ours, measurements)
-    _compare(observer, got, base, 0, "after a reset it is not what it was at the start")
-
-
-def _compare(observer: Observer, got: Estimates, base: Estimates, start: int, what: str) -> None:
-    for target in observer.targets:
-        if not np.array_equal(got[target][start:], base[target][start:], equal_nan=True):
-            raise CheckError(f"{observer.id}: {what} ({target})")
+        runs.compare(run_steps(ours, broken), base, "after a reset it is not what it was at the start", exact=True)
 
 
 def check_observer(observer: Observer, scenario: Scenario | None = None, alone: bool = True, *, watch: Watch = QUIET) -> None:
@@ -311,7 +304,7 @@ def check_observer(observer: Observer, scenario: Scenario | None = None, alone: 
     if observer.causal:
         runs.check_causal(given, base)
     _check_recovery(runs, *given)
-    check_steps(observer, *given, watch=watch)
+    check_steps(runs, observer, *given)
     if alone:
         runs.check_alone(again, base)
 

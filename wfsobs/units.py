@@ -39,13 +39,17 @@ UNITS = ("um", "nm", "mas", "arcsec", "rad")
 """Units that a user can give for a file."""
 
 _SYNONYMS = {
-    **dict.fromkeys(("µm", "\u03bcm", "micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"), "um"),
-    **dict.fromkeys(("meter", "meters", "metre", "metres"), "m"),
-    **dict.fromkeys(("nanometer", "nanometers", "nanometre", "nanometres"), "nm"),
-    **dict.fromkeys(("radian", "radians"), "rad"),
-    **dict.fromkeys(("µrad", "\u03bcrad", "microradian", "microradians"), "urad"),
-    **dict.fromkeys(("arcsecond", "arcseconds"), "arcsec"),
-    **dict.fromkeys(("milliarcsec", "milliarcsecond", "milliarcseconds"), "mas"),
+    name: unit
+    for unit, names in {
+        "um": "µm \u03bcm micron microns micrometer micrometers micrometre micrometres",
+        "m": "meter meters metre metres",
+        "nm": "nanometer nanometers nanometre nanometres",
+        "rad": "radian radians",
+        "urad": "µrad \u03bcrad microradian microradians",
+        "arcsec": "arcsecond arcseconds",
+        "mas": "milliarcsec milliarcsecond milliarcseconds",
+    }.items()
+    for name in names.split()
 }
 
 

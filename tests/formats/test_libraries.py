@@ -287,7 +287,7 @@ def test_what_is_no_part_of_a_record_has_no_room_where_it_is_large(name: str, tm
         np.savez(tmp_path / name, y_lgs=Z, u=U, pixels=pixels)
     content = (tmp_path / name).read_bytes()
     found = read_columns(io.BytesIO(content), name, 2 * pixels.size)
-    np.testing.assert_array_equal(found.contents.arrays["y_lgs"], Z)
+    np.testing.assert_array_equal(found.arrays["y_lgs"], Z)
     assert not any("pixels" in column.lower() for column in found.columns)
 
 

@@ -54,16 +54,8 @@ CLEAR, MATTERS = 4.0, 0.05
 """Minimum standard deviations of a mean over a band, and minimum difference from one, of a remark."""
 
 
-def remarks(f: Array, ratio: Array, e: Array, dt: float) -> tuple[str, ...]:
-    """Return remarks on a residual that is not white, one clause each.
-
-    f, ratio (bins,) : frequencies [Hz] and I / S; e (n,) : innovations of the Kalman filter of S, every dt [s]
-    """
-    found = [*_bands(f, ratio), *in_time(e, dt), *_memory(e, dt)]
-    return tuple(found or ["no band, lag or time stands out: it is a little of everything"])
-
-
 def _bands(f: Array, ratio: Array) -> list[str]:
+    """Return the bands [Hz] in which I / S, (bins,), is not one on average."""
     out = []
     for low, high in pairwise(BANDS):
         inside = ratio[(f >= low) & (f < high)]
@@ -169,10 +161,10 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
     for column in z.T:
         watch.check()
         modes.append(OneMode(column, record.dt, lowest))
-    add_peaks(modes, level, lowest, watch)
-    left = count_unexplained(modes, level, lowest)
+    add_peaks(modes, level, watch)
+    left = count_unexplained(modes, level)
     tests = map(check_whiteness, modes, left)
-    found = (read_mode(name, mode, lowest, test) for name, mode, test in zip(MODE_NAMES, modes, tests, strict=False))
+    found = (read_mode(name, mode, test) for name, mode, test in zip(MODE_NAMES, modes, tests, strict=False))
     found = tuple(replace(mode, outlying=int(count)) for mode, count in zip(found, outlying.sum(axis=0), strict=True))
     y_lgs = record.y_lgs.copy()
     y_lgs[record.delay :][: len(z)][outlying] = np.nan
@@ -185,17 +177,17 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
     return Identification(found, record.dt, len(z), level)
 
 
-def add_peaks(modes: Sequence[OneMode], level: float, lowest: float, watch: Watch) -> None:
+def add_peaks(modes: Sequence[OneMode], level: float, watch: Watch) -> None:
     """Add peaks to the modes, one to each at a time, until no test finds more; then polish, and search once more."""
     for again in (False, True):  # the first spectra are rough: they say what not to fit, not what is a peak
-        find_candidates(modes, level, lowest)
+        find_candidates(modes, level)
         for mode in modes:
             mode.refit(reshape=again)
     polished = False
     for sweep in range(3 * MOST_PEAKS):
         watch.step(1.0 - 1.0 / (1.0 + 0.1 * sweep))
         seen = False
-        for mode, best in zip(modes, find_candidates(modes, level, lowest), strict=True):
+        for mode, best in zip(modes, find_candidates(modes, level), strict=True):
             if best is None or mode.peaks >= MOST_PEAKS:
                 continue
             seen = True
@@ -210,22 +202,22 @@ def add_peaks(modes: Sequence[OneMode], level: float, lowest: float, watch: Watc
         polished = not seen
 
 
-def find_candidates(modes: Sequence[OneMode], level: float, lowest: float) -> list[Candidate | None]:
+def find_candidates(modes: Sequence[OneMode], level: float) -> list[Candidate | None]:
     """Return the strongest candidate of every mode, if any; bins that would spoil the next fit are excluded from it."""
     out = []
-    for mode, found in zip(modes, search_modes(modes, level, lowest), strict=True):
+    for mode, found in zip(modes, search_modes(modes, level), strict=True):
         mode.strong = np.logical_or.reduce([one.strong for one in found])
         out.append(max((one.best for one in found if one.best), key=lambda c: c.strength, default=None))
     return out
 
 
-def search_modes(modes: Sequence[OneMode], level: float, lowest: float) -> list[list[SearchResult]]:
+def search_modes(modes: Sequence[OneMode], level: float) -> list[list[SearchResult]]:
     """Return the search results of every mode, alone and with all the others."""
     whitened = [mode.whiten() for mode in modes]
-    n, dt, several = modes[0].n, modes[0].dt, len(modes) > 1
-    alone = ALONE * level if several else level
+    n, dt, lowest = modes[0].n, modes[0].dt, modes[0].lowest
+    alone = ALONE * level if len(modes) > 1 else level
     out = [[search_peaks(fine, n, dt, 1, alone / len(modes), lowest)] for fine in whitened]
-    if several:
+    if len(modes) > 1:
         together = search_peaks(sum(whitened, np.zeros_like(whitened[0])), n, dt, len(modes), level - alone, lowest)
         for own, fine in zip(out, whitened, strict=True):
             if together.best is not None and _has_part(fine, n * dt, together.best.frequency, together.best.width):
@@ -242,13 +234,13 @@ def _has_part(fine: Array, T: float, frequency: float, width: int) -> bool:
     return bool(bins.sum() > gamma.isf(JOINT, width))
 
 
-def count_unexplained(modes: Sequence[OneMode], level: float, lowest: float) -> list[int]:
+def count_unexplained(modes: Sequence[OneMode], level: float) -> list[int]:
     """Return per mode the number of refused candidates that the search still finds."""
     refused = [mode.rejections for mode in modes]
     for mode in modes:
         mode.rejections = []
     out = []
-    for mode, were, found in zip(modes, refused, search_modes(modes, level, lowest), strict=True):
+    for mode, were, found in zip(modes, refused, search_modes(modes, level), strict=True):
         flagged = mode.f[np.logical_or.reduce([one.above_limit for one in found])]
         out.append(sum(bool(np.any(np.abs(flagged - c.frequency) <= (c.width + 1) * mode.f[0])) for c in were))
         mode.rejections = were
@@ -263,8 +255,11 @@ def check_whiteness(mode: OneMode, left: int) -> Whiteness:
         e = innovations(mode.complete, mode.spectrum)
     except RiccatiError as error:  # of what is no noise at all
         return Whiteness(cumulated, 0.0, left, (str(error),))
-    result = Whiteness(cumulated, autocorrelation_test(e, len(mode.spectrum.vector)), left)
-    return replace(result, remarks=tuple(in_time(e, mode.dt)) if result.white else remarks(mode.f, ratio, e, mode.dt))
+    result, found = Whiteness(cumulated, autocorrelation_test(e, mode.spectrum.starts[-1]), left), in_time(e, mode.dt)
+    if not result.white:
+        found = [*_bands(mode.f, ratio), *found, *_memory(e, mode.dt)]
+        found = found or ["no band, lag or time stands out: it is a little of everything"]
+    return replace(result, remarks=tuple(found))
 
 
 def identification_dict(result: Identification) -> dict[str, Any]:

@@ -194,17 +194,17 @@ def _check_start(name: str, value: Any) -> None:
 
 
 def _fit_mode(name: str, parts: dict[str, tuple[Kernel, ...]], noise: float, dt: float, z: Array, watch: Watch) -> KernelFit:
-    places = [
-        (part, i, field) for part, all_ in parts.items() for i, kernel in enumerate(all_) for field in fitted_numbers(kernel)
-    ]
-    if not places:
+    numbered = [(f"{part}.{i}", kernel) for part, all_ in parts.items() for i, kernel in enumerate(all_)]
+    if not numbered:
         raise ValueError("there is no kernel to fit")
-    start = np.log([*(getattr(parts[part][i], field) for part, i, field in places), noise])
+    begin = {f"{place}.{field}": getattr(kernel, field) for place, kernel in numbered for field in fitted_numbers(kernel)}
+    begin["noise"] = noise
+    start = np.log([*begin.values()])
 
     def at(x: Array) -> dict[str, tuple[Kernel, ...]]:
-        values = dict(zip(places, np.exp(x[:-1]).tolist(), strict=True))
+        values = iter(np.exp(x).tolist())  # in the order of `begin`
         return {
-            part: tuple(replace(k, **{f: values[part, i, f] for f in fitted_numbers(k)}) for i, k in enumerate(all_))
+            part: tuple(replace(kernel, **{field: next(values) for field in fitted_numbers(kernel)}) for kernel in all_)
             for part, all_ in parts.items()
         }
 
@@ -218,12 +218,10 @@ def _fit_mode(name: str, parts: dict[str, tuple[Kernel, ...]], noise: float, dt:
 
     bounds = [(x - np.log(FARTHEST), x + np.log(FARTHEST)) for x in start]
     found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds)
-    best, std = found.x, _standard_deviations(lambda x: cost(x)[1], found.x)
-    numbers = [Number(exp(value), exp(value) * spread) for value, spread in zip(best.tolist(), std.tolist(), strict=True)]
-    named = {f"{part}.{i}.{field}": number for (part, i, field), number in zip(places, numbers, strict=False)}
-    return KernelFit(
-        name, noise=numbers[-1], numbers=named | {"noise": numbers[-1]}, log_likelihood=-float(found.fun), **at(best)
-    )
+    std = _standard_deviations(lambda x: cost(x)[1], found.x)
+    best = zip(begin, found.x.tolist(), std.tolist(), strict=True)
+    numbers = {number: Number(exp(value), exp(value) * spread) for number, value, spread in best}
+    return KernelFit(name, noise=numbers["noise"], numbers=numbers, log_likelihood=-float(found.fun), **at(found.x))
 
 
 def _standard_deviations(gradient: Callable[[Array], Array], x: Array) -> Array:

@@ -8,6 +8,7 @@ rise: where a fitted spectrum is too high, its shape is wrong, and it is as like
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from math import pi
 
@@ -26,8 +27,7 @@ from wfsobs.spectral.whittle import (
     inflation,
     periodogram,
     periodogram_frequencies,
-    spectrum_negative_log_likelihood,
-    standard_deviations,
+    spectrum_information,
 )
 from wfsobs.typing import Array
 
@@ -45,25 +45,20 @@ def choose_order(spectrum: Spectrum, cells: Cells, third: bool = False) -> Spect
     if t is None or (third and isinstance(t, Ar3)):
         return spectrum
     if isinstance(t, Ar3):
-        lower, higher = _smooth(replace(spectrum, turbulence=Ar2(t.omega, t.damping, t.rms, t.dt)), cells), spectrum
+        lower, higher = _smooth([replace(spectrum, turbulence=Ar2(t.omega, t.damping, t.rms, t.dt))], cells), spectrum
     else:
         starts = [replace(spectrum, turbulence=Ar3(t.omega, t.damping, k * t.omega, t.rms, t.dt)) for k in STARTS]
-        lower, higher = (
-            spectrum,
-            min((_smooth(s, cells) for s in starts), key=lambda s: spectrum_negative_log_likelihood(s, cells)),
-        )
-    gain = spectrum_negative_log_likelihood(lower, cells) - spectrum_negative_log_likelihood(higher, cells)
-    return higher if third or gain > ORDER_WORTH else lower
+        lower, higher = spectrum, _smooth(starts, cells)
+    return higher if third or cells.misfit(lower) - cells.misfit(higher) > ORDER_WORTH else lower
 
 
 def with_background(spectrum: Spectrum, cells: Cells) -> Spectrum:
     """Return a fitted spectrum with a background if that is worth it, else without."""
     if spectrum.background:
-        without, wide = _smooth(replace(spectrum, background=None), cells), spectrum
+        without, wide = _smooth([replace(spectrum, background=None)], cells), spectrum
     else:
-        shapes = [_smooth(with_first_guess(spectrum, reach), cells) for reach in BACKGROUND_REACHES]
-        without, wide = spectrum, min(shapes, key=lambda s: spectrum_negative_log_likelihood(s, cells))
-    gain = spectrum_negative_log_likelihood(without, cells) - spectrum_negative_log_likelihood(wide, cells)
+        without, wide = spectrum, _smooth([with_first_guess(spectrum, reach) for reach in BACKGROUND_REACHES], cells)
+    gain = cells.misfit(without) - cells.misfit(wide)
     return wide if gain > BACKGROUND_WORTH and _beyond_turbulence(wide) else without
 
 
@@ -81,11 +76,9 @@ def without_vibration(spectrum: Spectrum, cells: Cells, lowest: float) -> Spectr
         rest = replace(rest, resonances=(*rest.resonances, peak))
     rest = fit_spectrum(rest, cells)
     starts = [Ar2(2.0 * pi * corner, 0.7, t.rms, t.dt) for corner in (3.0 * cells.bin_width, 0.5 * lowest)]
-    shapes = [_smooth(replace(rest, turbulence=one), cells) for one in starts]
-    best = min(shapes, key=lambda s: spectrum_negative_log_likelihood(s, cells))
-    gain = spectrum_negative_log_likelihood(rest, cells) - spectrum_negative_log_likelihood(best, cells)
+    best = _smooth([replace(rest, turbulence=one) for one in starts], cells)
     slow = best.turbulence is not None and is_continuum(best, best.turbulence, lowest)
-    return best if slow and gain > BACKGROUND_WORTH else rest
+    return best if slow and cells.misfit(rest) - cells.misfit(best) > BACKGROUND_WORTH else rest
 
 
 def without_sway(spectrum: Spectrum) -> Spectrum:
@@ -105,10 +98,10 @@ def _beyond_turbulence(spectrum: Spectrum) -> bool:
     return spectrum.turbulence is None or spectrum.background.omega > APART * spectrum.turbulence.omega
 
 
-def _smooth(spectrum: Spectrum, cells: Cells) -> Spectrum:
-    """Fit the smooth part, without changing resonances."""
-    spectrum = spectrum.with_vector(spectrum.vector)  # within the bounds of its numbers
-    return fit_spectrum(spectrum, cells, range(spectrum.starts[len(spectrum.processes) - len(spectrum.resonances)]))
+def _smooth(starts: Sequence[Spectrum], cells: Cells) -> Spectrum:
+    """Fit the smooth part from every start, without changing resonances, and return the likeliest."""
+    inside = (s.with_vector(s.vector) for s in starts)  # within the bounds of its numbers
+    return min((fit_spectrum(s, cells, range(s.starts[len(s.continuum)])) for s in inside), key=cells.misfit)
 
 
 NEIGHBOURS = 4.0
@@ -155,20 +148,12 @@ def add_resonance(spectrum: Spectrum, f: Array, I: Array, candidate: Candidate) 
     near = np.abs(f - f0) <= max(half, f[0])
     excess = np.maximum(I[near] - spectrum.psd(f[near]), 0.0)
     power, f0 = float(excess.sum() * f[0]), float(excess @ f[near] / excess.sum()) if excess.any() else f0
-    keep = np.where(window_about(candidate, f), 1.0, 0.0)
-    best: tuple[float, Spectrum] | None = None
-    for share in (0.15, 0.5):
-        damping = min(max(share * half / f0, 1e-6), 0.5)
-        new = Ar2(2.0 * pi * f0, damping, np.sqrt(max(power, 1e-16)), spectrum.dt)
-        wider = replace(spectrum, resonances=(*spectrum.resonances, new))
-        cells = Cells(f, I, keep, [p.frequency for p in wider.resonances])
-        count = len(wider.vector)
-        shape = fit_spectrum(wider, cells, range(count - 3, count))
-        value = spectrum_negative_log_likelihood(shape, cells)
-        if best is None or value < best[0]:
-            best = value, shape
-    assert best is not None
-    return best[1]
+    dampings = (min(max(share * half / f0, 1e-6), 0.5) for share in (0.15, 0.5))
+    peaks = (Ar2(2.0 * pi * f0, damping, np.sqrt(max(power, 1e-16)), spectrum.dt) for damping in dampings)
+    wider = [replace(spectrum, resonances=(*spectrum.resonances, p)) for p in peaks]
+    cells = Cells(f, I, window_about(candidate, f), [p.frequency for p in wider[0].resonances])
+    count = wider[0].starts[-1]
+    return min((fit_spectrum(s, cells, range(count - 3, count)) for s in wider), key=cells.misfit)
 
 
 def split_resonance(spectrum: Spectrum, f: Array, I: Array, p: Ar2) -> Spectrum | None:  # noqa: E741
@@ -182,12 +167,12 @@ def split_resonance(spectrum: Spectrum, f: Array, I: Array, p: Ar2) -> Spectrum 
         return None
     two = [Ar2(2 * pi * (f0 + sign * 0.7 * half), 0.4 * p.damping, p.rms / np.sqrt(2.0), spectrum.dt) for sign in (-1, 1)]
     start = replace(spectrum, resonances=(*spectrum.without(p).resonances, *two))
-    keep = np.where(window_about(Candidate(f0, int(4.0 * half / f[0]), 0.0), f), 1.0, 0.0)
+    keep = window_about(Candidate(f0, int(4.0 * half / f[0]), 0.0), f)
     cells = Cells(f, I, keep, [q.frequency for q in (*start.resonances, p)])
-    count = len(start.vector)
+    count = start.starts[-1]
     shape = fit_spectrum(start, cells, range(count - 6, count))
-    gain = spectrum_negative_log_likelihood(spectrum, cells) - spectrum_negative_log_likelihood(shape, cells)
-    return shape if gain > SPLIT and all(is_peak(q, f[0]) for q in shape.resonances[-2:]) else None
+    is_worth = cells.misfit(spectrum) - cells.misfit(shape) > SPLIT
+    return shape if is_worth and all(is_peak(q, f[0]) for q in shape.resonances[-2:]) else None
 
 
 WIDTH = 27
@@ -241,6 +226,9 @@ WORTH = 6.0
 KEPT = 8.0
 """Minimum gain of log-likelihood by a resonance once all parameters are fitted, somewhat below that which the search requires
 among some thousand bins. Spurious ones beside a strong peak, found before its width was fitted, gain 2 to 6."""
+
+NO_NEARER = 1.1
+"""Minimum third corner, over the first two, for its standard deviation."""
 
 SETTLED = 0.01
 """Remaining error of repeated filling and fitting: each round leaves about the share that is missing."""
@@ -370,7 +358,7 @@ class OneMode:
         trials: list[tuple[list[Sinusoid], Spectrum]] = []
         if not beside and not any(abs(p.frequency - candidate.frequency) < reach for p in spectrum.resonances):
             shape = add_resonance(spectrum, self.f, self.I, candidate)
-            at = shape.resonances[-1].omega / (2 * pi)  # its own skirt may have been the candidate
+            at = shape.resonances[-1].frequency  # its own skirt may have been the candidate
             beside = [line for line in lines if abs(line.frequency - at) < NEIGHBOURS * self.f[0]]
             if not beside:
                 trials.append((lines, shape))
@@ -438,18 +426,12 @@ class OneMode:
         Only those are tested whose rms is below SURE standard deviations, and they stay where they gain more than KEPT: the rms
         of a narrow one is uncertain because its width is, however high it stands.
         """
-        std, first = self.errors(), len(self.spectrum.processes) - len(self.spectrum.resonances)
-        unsure = [
-            (float(std[start + RMS]), p)
-            for start, p in zip(self.spectrum.starts[first:-1], self.spectrum.resonances, strict=True)
-            if std[start + RMS] * SURE >= 1.0
-        ]
-        whole, before = self.spectrum, misfit_of(self.spectrum, self.f, self.I)
-        for _, p in sorted(unsure, key=lambda pair: pair[0], reverse=True):
-            rest = whole.without(p)
+        std, whole, before = self.errors(), self.spectrum, misfit_of(self.spectrum, self.f, self.I)
+        errors = [(float(std[i + RMS]), p) for i, p in zip(whole.starts[len(whole.continuum) :], whole.resonances, strict=False)]
+        for _, p in sorted((one for one in errors if one[0] * SURE >= 1.0), key=lambda one: one[0], reverse=True):
+            rest, frequency = whole.without(p), p.frequency
             if misfit_of(fit_spectrum(rest, self.cells(everything=True)), self.f, self.I) - before > KEPT:
                 continue
-            frequency = p.frequency
             self.spectrum: Spectrum = rest
             self.removals.append(frequency)
             self.rejections.append(Candidate(frequency, max(round(2.0 * p.damping * frequency / self.f[0]), WIDEST_LINE), 0.0))
@@ -458,8 +440,17 @@ class OneMode:
         return False
 
     def errors(self) -> Array:
-        """Return the standard deviations of the spectrum's parameters, see `standard_deviations`."""
-        return standard_deviations(self.spectrum, self.cells(everything=True), inflation(self.n))
+        """Return the standard deviations of the spectrum's parameters, with that of the damping in place of its logit, (p,)."""
+        spectrum = self.spectrum
+        if isinstance(t := spectrum.turbulence, Ar3):  # at its bound the corner's own number says nothing
+            spectrum = replace(spectrum, turbulence=replace(t, corner=max(t.corner, NO_NEARER * t.omega)))
+        std = np.zeros(spectrum.starts[-1])
+        information = spectrum_information(spectrum, self.cells(everything=True), spectrum.free_parameters)
+        covariance = np.linalg.inv(information + 1e-12 * np.eye(len(information)))
+        std[spectrum.free_parameters] = np.sqrt(np.maximum(np.diag(covariance) * inflation(self.n), 0.0))
+        for start, p in zip(spectrum.starts, spectrum.processes, strict=False):
+            std[start + 1] *= p.damping * (1.0 - p.damping)
+        return std
 
 
 BROAD = 0.1

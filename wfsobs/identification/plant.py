@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,6 @@ from wfsobs.identification.plant_likelihood import (
     LONGEST,
     MOST_PEAKS,
     SHAPES,
-    STEPS,
     PlantFit,
     PlantLikelihood,
     Response,
@@ -293,28 +293,28 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
     spectra: Sequence[Spectrum] = ()
     for delay in STARTS:
         start = np.concatenate([np.full(k, delay), guess[k:]])
-        fits.append(data.fit(data.with_spectra(start, spectra), pooled, STEPS))
+        fits.append(data.fit(data.with_spectra(start, spectra), pooled))
         spectra = fits[-1].spectra
     first, *others = sorted(fits, key=lambda fit: fit.criterion)
     fits = [first, *(fit for fit in others if abs(fit.theta[0] - first.theta[0]) > SAME)][:REFINED]
     gains = np.column_stack([pooled[:, 0], np.eye(len(pooled))[:, k:]])
     for again in range(REFINEMENTS):
-        more = [data.fit(data.with_spectra(fit.theta, fit.spectra, MOST_PEAKS), gains, STEPS) for fit in fits]
+        more = [data.fit(data.with_spectra(fit.theta, fit.spectra, MOST_PEAKS), gains) for fit in fits]
         better = [new.criterion < old.criterion - 1.0 for old, new in zip(fits, more, strict=True)]
-        before = fits if again else [data.fit(fit, gains, STEPS) for fit in fits]  # with gains of their own as well
-        fits = [min(pair, key=lambda fit: fit.criterion) for pair in zip(before, more, strict=True)]
+        before = fits if again else [data.fit(fit, gains) for fit in fits]  # with gains of their own as well
+        fits = [_likeliest(*pair) for pair in zip(before, more, strict=True)]
         if not any(better):
             break
-    each = min(fits, key=lambda fit: fit.criterion)
+    each = _likeliest(*fits)
     coloured = data.with_spectra(each.theta, each.spectra, MOST_PEAKS, plain=False)
     if any(s.background for s in coloured.spectra):
-        each = min(each, data.fit(coloured, gains, STEPS), key=lambda fit: fit.criterion)
+        each = _likeliest(each, data.fit(coloured, gains))
     for corner in THIRD:
         third = [_third_order(s, corner) for s in each.spectra]
-        each = min(each, data.fit(replace(each, spectra=third), gains, STEPS), key=lambda fit: fit.criterion)
-    apart = data.fit(each, np.eye(len(pooled)), STEPS)
+        each = _likeliest(each, data.fit(replace(each, spectra=third), gains))
+    apart = data.fit(each, np.eye(len(pooled)))
     together = np.append(np.full(k, apart.theta[:k].mean()), apart.theta[k:])
-    each = min(each, data.fit(replace(apart, theta=together), gains, STEPS), key=lambda fit: fit.criterion)
+    each = _likeliest(each, data.fit(replace(apart, theta=together), gains))
     one_delay = each.value - apart.value <= 0.5 * chi2.isf(DIFFERS, 1)
     rivals = [fit.theta - each.theta for fit in fits if fit.criterion - each.criterion < RIVAL]
     both = np.column_stack([pooled[:, 0], np.eye(len(pooled))[:, 1:]])
@@ -342,13 +342,12 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
         near = all(abs(rival[i]) <= APART * sd for rival in rivals)
         return PlantNumber(value, sd) if near and 0.0 < sd < widest and chance >= OTHERWISE else PlantNumber()
 
-    def positive(n: PlantNumber) -> PlantNumber:
-        return n if n.value is None else replace(n, value=abs(n.value))
-
     delay, gain = tuple(number(each, i) for i in range(k)), tuple(number(each, k + i) for i in range(k))
     rotation = number(each, 2 * k) if k == 2 else None
     common_delay = number(common, 0) if one_delay else PlantNumber()
-    common_gain = positive(number(common, k)) if one_delay and one_gain else PlantNumber()
+    common_gain = number(common, k) if one_delay and one_gain else PlantNumber()
+    if common_gain.value is not None:
+        common_gain = replace(common_gain, value=abs(common_gain.value))
     if rotation is not None and rotation.value is not None:
         rotation = replace(rotation, value=float(-((np.pi - rotation.value) % (2.0 * np.pi) - np.pi)))
     is_known = all(n.value is not None for n in (*delay, *gain))
@@ -357,6 +356,11 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
     numbers = delay, gain, rotation, common_delay, common_gain
     swinging = swinging if rigid < OTHERWISE <= chance else None
     return GroupPlant(names, *numbers, uncertainty, peaks, coloured, excited, each.covariance, chance, rigid, swinging)
+
+
+def _likeliest(*fits: PlantFit) -> PlantFit:
+    """Return the fit with the best criterion."""
+    return min(fits, key=lambda fit: fit.criterion)
 
 
 def _with_dynamics(data: PlantLikelihood, fit: PlantFit, ties: Array) -> tuple[PlantFit, PlantFit | None]:
@@ -368,9 +372,9 @@ def _with_dynamics(data: PlantLikelihood, fit: PlantFit, ties: Array) -> tuple[P
     ties = block_diag(ties, np.eye(2))
 
     def of(mirror: Response, shape: Sequence[float]) -> PlantFit:
-        return data.fit(replace(fit, theta=np.append(fit.theta, shape), mirror=mirror), ties, STEPS)
+        return data.fit(replace(fit, theta=np.append(fit.theta, shape), mirror=mirror), ties)
 
-    few = of(few_lags(int(fit.theta[: data.k].mean())), (0.0, 0.0))
+    few = of(partial(few_lags, int(fit.theta[: data.k].mean())), (0.0, 0.0))
     swinging = min((of(second_order, shape) for shape in SHAPES), key=lambda one: one.value)
     better = few.value - swinging.value
     return swinging if better > SWINGS else few, swinging if better > -RIVAL else None
@@ -390,7 +394,7 @@ def _over_delays(data: PlantLikelihood, fit: PlantFit, ties: Array) -> PlantFit:
             continue
         theta = fit.theta.copy()
         theta[:k] = lower + frame + (place or theta[:k] - lower)
-        top = data.fit(replace(fit, theta=theta), ties, STEPS, stays=True)
+        top = data.fit(replace(fit, theta=theta), ties, stays=True)
         tops.append(top)
         if top.value - min(one.value for one in tops) < NEGLIGIBLE:
             points += _along(data, top, ties[:, 1:], lower + frame)
@@ -415,7 +419,7 @@ def _along(data: PlantLikelihood, top: PlantFit, rest: Array, lower: Array) -> l
     def at(near: PlantFit, shift: float) -> PlantFit:
         theta = near.theta.copy()
         theta[:k] = np.clip(theta[:k] + shift, lower, lower + 1.0)
-        return data.fit(replace(near, theta=theta), rest, STEPS)
+        return data.fit(replace(near, theta=theta), rest)
 
     found = {0: at(top, 0.0)}
     for way in (-1, 1):
@@ -489,14 +493,14 @@ def _contradiction_of(data: PlantLikelihood, delay: int, statement: tuple[int, f
         new = _nearest(data, np.concatenate([np.full(k, np.mean(guess[:k])), guess[k:]]), ties)
     if (_is_far(new) and not is_turned) or not _what_is_off(new, stated, names, ways):
         return ""
-    new = data.fit(data.with_spectra(new.theta, new.spectra, MOST_PEAKS, plain=False), ties, STEPS)
+    new = data.fit(data.with_spectra(new.theta, new.spectra, MOST_PEAKS, plain=False), ties)
     # where nothing excites the loop, a plant is known as well as the form of the background
     rests_on_form = any(s.background for s in new.spectra) and excited < EXCITED and not is_turned
     none = np.concatenate([stated[:k], np.full(k, 1e-9), stated[2 * k :]])
-    first = {i: data.with_spectra(x).spectra for i, x in enumerate((stated, none))}
-    again = (data.with_spectra(x, first[i], MOST_PEAKS, plain=False) for i, x in enumerate((stated, none)))
-    old, idle = (data.fit(one, ties[:, :0], STEPS) for one in again)
-    worth, better = min(old.criterion, idle.criterion) - new.criterion, _what_is_off(new, stated, names, ways)
+    starts = [data.with_spectra(theta) for theta in (stated, none)]  # both before the gaps are filled for either
+    again = (data.with_spectra(one.theta, one.spectra, MOST_PEAKS, plain=False) for one in starts)
+    old = _likeliest(*(data.fit(one, ties[:, :0]) for one in again))
+    worth, better = old.criterion - new.criterion, _what_is_off(new, stated, names, ways)
     if not worth > CLEAR * (FORM if rests_on_form else 1.0) or not better:
         return ""
     return f"command {better[0]} is excluded by the data, which are likelier by {worth:.0f} (log-likelihood) with {better[1]}"
@@ -507,7 +511,7 @@ def _nearest(data: PlantLikelihood, theta: Array, ties: Array) -> PlantFit:
     begin = data.with_spectra(theta)
     if any(missing.any for missing in data.missing):  # no longer filled by straight lines
         begin = data.with_spectra(theta, begin.spectra)
-    return data.fit(begin, ties, STEPS)
+    return data.fit(begin, ties)
 
 
 def _is_far(fit: PlantFit) -> bool:

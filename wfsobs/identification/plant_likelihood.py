@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from math import sqrt
 
 import numpy as np
@@ -45,7 +44,6 @@ from wfsobs.spectral.whittle import (
     find_outlying,
     inflation,
     periodogram_frequencies,
-    spectrum_negative_log_likelihood,
     taper,
 )
 from wfsobs.typing import Array
@@ -63,15 +61,11 @@ Response = Callable[[Array], Array]
 """From delay [frames] and shape, (3,), to the response, (LAGS,)."""
 
 
-def few_lags(base: int) -> Response:
-    """Return the responses over four lags around a delay of `base` whole frames.
+def few_lags(base: int, x: Array) -> Array:
+    """Return the response over four lags around a delay of `base` whole frames, (LAGS,).
 
-    The shape is the size of two second differences, which change neither gain nor group delay at low frequency.
+    x : delay [frames], and the sizes of two second differences, which change neither gain nor group delay at low frequency, (3,)
     """
-    return partial(_few_lags, base)
-
-
-def _few_lags(base: int, x: Array) -> Array:
     out, first, part = np.zeros(LAGS), max(base - 1, 1) - 1, x[0] - base
     out[base - 1 : base + 1] = 1.0 - part, part
     for i, size in enumerate(x[1:]):
@@ -229,7 +223,7 @@ class PlantLikelihood:
         by_shape = [-matrix @ slopes[:, i] for i in range(1, slopes.shape[1])]
         return self.Y - matrix @ m, np.array(by_delay + by_gain + by_angle + by_shape)
 
-    def fit(self, start: PlantFit, ties: Array, steps: int, *, stays: bool = False) -> PlantFit:
+    def fit(self, start: PlantFit, ties: Array, *, stays: bool = False) -> PlantFit:
         """Take damped Newton steps with the expected second derivatives.
 
         ties : theta by its free numbers (p, q);  stays : delays do not go beyond the whole numbers on either side
@@ -237,14 +231,14 @@ class PlantLikelihood:
         theta, spectra, mirror = start.theta, list(start.spectra), start.mirror
         cells = [Cells(self.f, np.zeros_like(self.f), np.ones_like(self.f), [p.frequency for p in s.resonances]) for s in spectra]
         lower, held = np.minimum(theta[: self.k].astype(int), LONGEST), 1e-3
-        best, F = np.inf, np.zeros((0, 0))
+        best, F, q = np.inf, np.zeros((0, 0)), ties.shape[1]
         theta_there, spectra_there, lower_there = theta, spectra, lower
-        step = gradient = np.zeros(0)
-        for _ in range(steps):
+        gradient = np.zeros(0)
+        for _ in range(STEPS):
             Z, dZ = self.z(theta_there, lower_there, mirror)
             for cell, z in zip(cells, Z, strict=True):
-                cell.mean = _means(np.abs(z) ** 2, cell)
-            there = sum(spectrum_negative_log_likelihood(s, cell) for s, cell in zip(spectra_there, cells, strict=True))
+                cell.mean = np.add.reduceat(np.abs(z) ** 2, _edges(cell)) / cell.count
+            there = sum(cell.misfit(s) for s, cell in zip(spectra_there, cells, strict=True))
             gain = best - there
             crossed = (lower_there != lower).any()
             if gain >= 0:
@@ -257,7 +251,6 @@ class PlantLikelihood:
                 if held > 1e4:
                     break
             step = np.linalg.solve(F + np.diag(held * np.diag(F) + 1e-9), -gradient)
-            q = ties.shape[1]
             theta_there = theta + np.clip(ties @ step[:q], -REACH, REACH)
             if mirror is None:
                 theta_there, lower_there = self._within(theta_there, lower, stays)
@@ -265,11 +258,11 @@ class PlantLikelihood:
                 theta_there[-2:] = np.clip(theta_there[-2:], *RANGE)
             spectra_there, at = [], q
             for s in spectra:
-                vector, free = s.vector.copy(), _free(s)
+                vector, free = s.vector, s.free_parameters
                 vector[free] += np.clip(step[at : at + len(free)], -1.0, 1.0)
                 at += len(free)
                 spectra_there.append(s.with_vector(vector))
-        covariance = np.linalg.inv(F)[: ties.shape[1], : ties.shape[1]] * inflation(self.n)
+        covariance = np.linalg.inv(F)[:q, :q] * inflation(self.n)
         covariance /= 1.0 - max(missing.is_missing.mean() for missing in self.missing)  # filled ones tell nothing
         return PlantFit(theta, spectra, float(best), ties @ covariance @ ties.T, self.f.size, mirror)
 
@@ -289,10 +282,10 @@ class PlantLikelihood:
         """Return the expected second derivatives and the gradient of - log L by the free numbers of plant and spectra."""
         dZ = np.tensordot(ties.T, dZ, 1)
         q = len(dZ)
-        size = q + sum(len(_free(s)) for s in spectra)
+        size = q + sum(len(s.free_parameters) for s in spectra)
         F, gradient, at = np.zeros((size, size)), np.zeros(size), q
         for i, (s, cell) in enumerate(zip(spectra, cells, strict=True)):
-            S, free = s.psd(cell.frequency), _free(s)
+            S, free = s.psd(cell.frequency), s.free_parameters
             slopes, own = s.slopes(cell.frequency, free) / S, slice(at, at + len(free))
             weighted = dZ[:, i] / np.repeat(S, cell.count.astype(int))
             by_cell = 2.0 * np.add.reduceat(np.real(np.conj(Z[i]) * weighted), _edges(cell), axis=1)
@@ -358,21 +351,8 @@ def rotation_matrix(angle: float) -> Array:
     return np.array([[c, -s], [s, c]])
 
 
-def _angle(matrix: Array) -> float:
-    """Return the angle of the rotation that is nearest to a matrix (2, 2)."""
-    return float(np.arctan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1]))
-
-
-def _free(s: Spectrum) -> list[int]:
-    return [i for i in range(s.starts[-1]) if i not in s.fixed_parameters]
-
-
 def _edges(cells: Cells) -> Array:
     return np.concatenate([[0], np.cumsum(cells.count)[:-1]]).astype(int)
-
-
-def _means(x: Array, cells: Cells) -> Array:
-    return np.add.reduceat(x, _edges(cells)) / cells.count
 
 
 def prediction_errors(y: Array, u: Array, rows: Array | None = None) -> tuple[Array, Array]:
@@ -416,8 +396,11 @@ def guess_plant(data: PlantLikelihood) -> tuple[Array, float, Array]:
     h, g = (np.array([x[ORDER + i : ORDER + i + len(source)].T @ source @ inverse for i in range(SPAN + 1)]) for x in (y, u))
     if excited >= 0.5:  # commands of their own: what they do is seen directly
         turn = max(h[1:], key=np.linalg.norm)
-    flip = np.diag([1.0, np.sign(np.linalg.det(turn))]) if k == 2 else np.sign(turn)
-    angle = _angle(turn @ flip) if k == 2 else 0.0
+    flip, angle = np.sign(turn), 0.0
+    if k == 2:
+        flip = np.diag([1.0, np.sign(np.linalg.det(turn))])
+        near = turn @ flip  # the nearest rotation
+        angle = float(np.arctan2(near[1, 0] - near[0, 1], near[0, 0] + near[1, 1]))
     R = rotation_matrix(angle)[:k, :k] @ flip
 
     def rough(x: Array) -> Array:
@@ -487,12 +470,9 @@ def design_probe(scenario: Scenario, seconds: float, accuracy: Mapping[str, floa
     Probe
         The one whose lowest frequency, of LOW over the rate, costs least.
     """
-    modes = range(2)
-    spectra = [true_spectra(scenario, mode) for mode in modes]
-    probes = []
+    spectra, probes = [true_spectra(scenario, mode) for mode in range(2)], []
     for share in LOW:
-        information, rotation, excess = np.zeros((5, 5)), 0.0, []
-        density = []
+        information, rotation, excess, density = np.zeros((5, 5)), 0.0, [], []
         for s in spectra:
             omega = np.pi * np.arange(s.measurement.size) / (s.measurement.size - 1)
             forgets = 1.0 - scenario.loop.leak * np.exp(-1j * omega)

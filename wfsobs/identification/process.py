@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.fft import rfft
 
-from wfsobs.identification.one_mode import OneMode
+from wfsobs.identification.one_mode import NO_NEARER, OneMode
 from wfsobs.signal.autoregressive import Ar2, Ar3
 from wfsobs.spectral.model import HIGHEST, Spectrum
 from wfsobs.spectral.search import Sinusoid, line_in_record, short_taper
-from wfsobs.spectral.whittle import NO_NEARER, spectrum_information
+from wfsobs.spectral.whittle import spectrum_information
 from wfsobs.typing import Array
 
 
@@ -119,9 +119,9 @@ def read_process(p: Ar2 | Ar3, std: Array) -> IdentifiedProcess:
     beyond = p.corner / p.omega - 1.0 if isinstance(p, Ar3) else 0.0
     third = Number(1.0 + beyond, max(beyond, NO_NEARER - 1.0) * float(std[3])) if isinstance(p, Ar3) else None
     return IdentifiedProcess(
-        with_reliable_std(scale_number(Number(1.0, float(std[0])), p.frequency)),
+        with_reliable_std(Number(p.frequency, float(std[0]) * p.frequency)),
         with_reliable_std(Number(p.damping, nan if at_bound else float(std[1]))),
-        with_reliable_std(scale_number(Number(1.0, float(std[2])), p.rms)),
+        with_reliable_std(Number(p.rms, float(std[2]) * p.rms)),
         third and with_reliable_std(third),
     )
 

@@ -291,11 +291,6 @@ def without_error(turbulence: tuple[Ar2 | Ar3, ...], error: Ar2 | None) -> tuple
     return replace(first, rms=sqrt(max(first.rms**2 - error.rms**2, LEFT * first.rms**2))), *others
 
 
-def error_of_a_star(difference: SensorDifference, stars: int) -> Number:
-    """Return the rms of the slow error of one of so many LGS [um], 0 where none was found."""
-    return Number(0.0, nan) if difference.error is None else scale_number(difference.error.rms, sqrt(stars))
-
-
 SLOWEST = 10.0
 """Minimum periods of turbulence in a record for a standard deviation of its corner: a slower one is not resolved."""
 LARGEST = 100.0
@@ -451,7 +446,8 @@ class Identification:
     def shared_settings(self, scenario: Scenario) -> dict[str, Number]:
         """Return dotted path -> number of the settings that all modes share, within the limits of the settings."""
         modes = [*zip(self.modes, scenario.modes, strict=False)]
-        noises = [scale_number(m.noise, sqrt(scenario.sensors.lgs_count)) for m in self.modes]
+        stars = sqrt(scenario.sensors.lgs_count)
+        noises = [scale_number(m.noise, stars) for m in self.modes]
         out = {"sensors.lgs_noise": _within(mean(noises), 0.0, 10.0)}
         seen = [(i, m.turbulence, mode.radial_order) for i, (m, mode) in enumerate(modes) if m.turbulence]
         if seen:
@@ -465,7 +461,7 @@ class Identification:
             out["turbulence.rms"] = _within(mean(strengths), 0.0, LARGEST)
         differences = [m.difference for m in self.modes if m.difference is not None]
         if differences:
-            slow = [error_of_a_star(d, scenario.sensors.lgs_count) for d in differences]
+            slow = [scale_number(d.error.rms, stars) if d.error else Number(0.0, nan) for d in differences]  # of one star
             slow = [scale_number(e, 1.0 / relative_cone_error(scenario, i)) for i, e in enumerate(slow)]
             out["sensors.lgs_low_frequency_rms"] = _within(mean(slow), 0.0, 10.0)
             out["sensors.ngs_noise"] = _within(mean([d.noise for d in differences]), 0.0, 10.0)
@@ -492,35 +488,28 @@ def mode_rows(mode: IdentifiedMode) -> list[Row]:
     return out + [("line" if p.pure else "resonance", p.frequency, p.damping, p.rms) for p in mode.peaks]
 
 
-def read_mode(name: str, mode: OneMode, lowest: float, whiteness: Whiteness) -> IdentifiedMode:
+def read_mode(name: str, mode: OneMode, whiteness: Whiteness) -> IdentifiedMode:
     """Return the numbers of a mode and their standard deviations, where they hold.
 
-    A resonance of the continuum is not a peak; an observer receives it as turbulence. lowest : minimum frequency of peaks [Hz]
+    A resonance of the continuum is not a peak; an observer receives it as turbulence.
     """
-    std = mode.errors()
-    noise = scale_number(Number(1.0, float(std[0])), mode.spectrum.noise)
-    found = [read_process(p, std[start:]) for start, p in zip(mode.spectrum.starts, mode.spectrum.processes, strict=False)]
-    turbulence, background = (None if p is None else found.pop(0) for p in (mode.spectrum.turbulence, mode.spectrum.background))
+    std, s = mode.errors(), mode.spectrum
+    noise = with_reliable_std(Number(s.noise, float(std[0]) * s.noise))
+    found = [read_process(p, std[start:]) for start, p in zip(s.starts, s.processes, strict=False)]
+    turbulence, background = (None if p is None else found.pop(0) for p in (s.turbulence, s.background))
     if turbulence is not None and turbulence.frequency.value < SLOWEST * mode.f[0]:
         turbulence = replace(turbulence, frequency=Number(turbulence.frequency.value, nan))
-    smooth = [is_continuum(mode.spectrum, p, lowest) for p in mode.spectrum.resonances]
-    broad = [p for p, is_smooth in zip(found, smooth, strict=True) if is_smooth]
-    seen = [
-        read_resonance(mode, p, one)
-        for p, one, is_smooth in zip(mode.spectrum.resonances, found, smooth, strict=True)
-        if not is_smooth
-    ]
-    seen += [read_line(mode, line) for line in mode.lines]
-    peaks = sorted((p for p in seen if p.frequency.value >= lowest), key=lambda p: p.frequency.value)
-    s = mode.spectrum
-    shapes = (p for p, is_smooth in zip(s.resonances, smooth, strict=True) if is_smooth)
-    prior = Lines(
-        s.noise,
-        s.dt,
-        tuple(p for p in (s.turbulence, s.background, *shapes) if p is not None),
-        tuple(Line(p.frequency.value, p.damping.value, (p.ensemble_rms or p.rms).value) for p in peaks),
-    )
-    return IdentifiedMode(name, with_reliable_std(noise), turbulence, background, tuple(peaks), tuple(broad), s, prior, whiteness)
+    shapes, broad, seen = [*s.continuum], [], [read_line(mode, line) for line in mode.lines]
+    for p, one in zip(s.resonances, found, strict=True):
+        if is_continuum(s, p, mode.lowest):
+            shapes.append(p)
+            broad.append(one)
+        else:
+            seen.append(read_resonance(mode, p, one))
+    peaks = sorted((p for p in seen if p.frequency.value >= mode.lowest), key=lambda p: p.frequency.value)
+    lines = tuple(Line(p.frequency.value, p.damping.value, (p.ensemble_rms or p.rms).value) for p in peaks)
+    prior = Lines(s.noise, s.dt, tuple(shapes), lines)
+    return IdentifiedMode(name, noise, turbulence, background, tuple(peaks), tuple(broad), s, prior, whiteness)
 
 
 def _within(n: Number, low: float, high: float) -> Number:

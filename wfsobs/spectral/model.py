@@ -141,9 +141,10 @@ class Spectrum:
         return list(accumulate((3 + isinstance(p, Ar3) for p in self.processes), initial=1))
 
     @property
-    def fixed_parameters(self) -> list[int]:
-        """Indices in `vector` that no fit changes: the damping of the background, which is flat up to its corner."""
-        return [] if self.background is None else [self.starts[0 if self.turbulence is None else 1] + 1]
+    def free_parameters(self) -> list[int]:
+        """Indices in `vector` that fits change: all but the damping of the background, which is flat up to its corner."""
+        fixed = self.starts[self.turbulence is not None] + 1 if self.background else -1
+        return [i for i in range(self.starts[-1]) if i != fixed]
 
     def with_vector(self, vector: Array) -> Spectrum:
         """Return the spectrum with this parameter `vector`."""
@@ -156,9 +157,9 @@ class Spectrum:
     def slopes(self, f: Array, indices: Sequence[int]) -> Array:
         """Return the derivatives of the density by parameters, in the order of `indices`, (len(indices), len(f)) [um^2/Hz]."""
         rows = {0: np.full_like(f, 4.0 * self.dt * self.noise**2)}
-        moved = [(start, p) for start, p in zip(self.starts, self.processes, strict=False) if _any_of(p, start, indices)]
-        second = [(start, p) for start, p in moved if isinstance(p, Ar2)]
-        if second:
+        ranges = zip(pairwise(self.starts), self.processes, strict=True)
+        moved = [(start, p) for (start, end), p in ranges if any(start <= i < end for i in indices)]
+        if second := [(start, p) for start, p in moved if isinstance(p, Ar2)]:
             density, slopes = densities(np.array([_vector(p) for _, p in second]), self.dt, f)
             slopes *= density[:, None]
             rows |= {start + i: slopes[k, i] for k, (start, _) in enumerate(second) for i in range(3)}
@@ -166,10 +167,6 @@ class Spectrum:
             if isinstance(p, Ar3):
                 rows |= {start + i: row for i, row in enumerate(_slopes_of_third_order(p, f))}
         return np.array([rows[i] for i in indices])
-
-
-def _any_of(p: Ar2 | Ar3, start: int, indices: Sequence[int]) -> bool:
-    return any(start <= i < start + 3 + isinstance(p, Ar3) for i in indices)
 
 
 def _slopes_of_third_order(p: Ar3, f: Array) -> Array:

@@ -293,9 +293,7 @@ def _limits(count: int, T: float, width: int, modes: int, share: float, n: int, 
     Biometrika 74, 33, 1987).
     """
     j = np.geomspace(1, count, 200)
-    highest = count / T
-    spacing = 1.0 / T if width == 1 else max(width // OVERLAP, 1) / T
-    probability = share * spacing * _prior(j / T, lowest, highest)
+    probability = share * (max(width // OVERLAP, 1) / T) * _prior(j / T, lowest, count / T)
     shape = width * modes / (1.0 if width == 1 else inflation(n))
     if width == 1:  # PAD frequencies to a bin, and the factor above: by iteration
         probability = probability * PAD

@@ -11,7 +11,6 @@ ends at the maximum of Whittle's likelihood of the samples.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
 from math import ceil, log
@@ -26,7 +25,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 from scipy.special import logit
 
 from wfsobs.signal import whittle
-from wfsobs.signal.autoregressive import Ar2, Ar3
+from wfsobs.signal.autoregressive import Ar2
 from wfsobs.spectral.model import Spectrum
 from wfsobs.typing import Array
 
@@ -133,6 +132,10 @@ class Cells:
         self.mean = np.bincount(cell, keep * I)[used] / self.count
         self.share = np.bincount(cell, keep * share)[used] / self.count
 
+    def misfit(self, spectrum: Spectrum) -> float:
+        """Return - log L of a spectrum, without a constant."""
+        return whittle.negative_log_likelihood(spectrum.psd(self.frequency), self.mean, self.count)
+
 
 STEPS = 40
 """Maximum number of steps of a fit."""
@@ -142,13 +145,6 @@ NOISE, TURBULENCE, BACKGROUND, RESONANCE = 3.0, (2.0, 8.0, 4.0, 3.0), (1.5, 0.0,
 """Maximum distance of parameters from their start: a resonance stays near its frequency."""
 NARROWEST = 0.2
 """Minimum half width of a resonance in bins: bins tell nothing of a smaller one, between two of which it would become a line."""
-NO_NEARER = 1.1
-"""Minimum third corner, over the first two, for its standard deviation."""
-
-
-def spectrum_negative_log_likelihood(spectrum: Spectrum, cells: Cells) -> float:
-    """Return - log L of a spectrum, without a constant."""
-    return whittle.negative_log_likelihood(spectrum.psd(cells.frequency), cells.mean, cells.count)
 
 
 def spectrum_information(spectrum: Spectrum, cells: Cells, indices: Sequence[int] | None = None) -> Array:
@@ -182,9 +178,9 @@ def fit_spectrum(spectrum: Spectrum, cells: Cells, free: Sequence[int] | None = 
         The fit.
     """
     start = spectrum.vector
-    index = [i for i in (range(len(start)) if free is None else free) if i not in spectrum.fixed_parameters]
-    first = () if spectrum.turbulence is None else TURBULENCE[: spectrum.starts[1] - 1]
-    second = () if spectrum.background is None else BACKGROUND
+    index = [i for i in spectrum.free_parameters if free is None or i in free]
+    first = TURBULENCE[: spectrum.starts[1] - 1] if spectrum.turbulence else ()
+    second = BACKGROUND if spectrum.background else ()
     reach = np.array([NOISE, *first, *second, *RESONANCE * len(spectrum.resonances)])
 
     def moved(x: Array) -> Spectrum:
@@ -203,20 +199,6 @@ def fit_spectrum(spectrum: Spectrum, cells: Cells, free: Sequence[int] | None = 
         least = logit(min(NARROWEST * cells.bin_width * 2.0 * np.pi / p.omega, 0.5))
         bounds[i + 1] = np.maximum(bounds[i + 1], [least, least + 1.0])
     return moved(whittle.whittle_fit(density, log_slopes, start[index], bounds[index], cells.mean, cells.count, TOLERANCE, STEPS))
-
-
-def standard_deviations(spectrum: Spectrum, cells: Cells, inflation: float) -> Array:
-    """Return the standard deviations of the parameters, with that of the damping in place of its logit, (p,)."""
-    t = spectrum.turbulence
-    if isinstance(t, Ar3):  # at its bound the corner's own number says nothing
-        spectrum = replace(spectrum, turbulence=replace(t, corner=max(t.corner, NO_NEARER * t.omega)))
-    std = np.zeros(spectrum.starts[-1])
-    free = [i for i in range(len(std)) if i not in spectrum.fixed_parameters]
-    covariance = np.linalg.inv(spectrum_information(spectrum, cells, free) + 1e-12 * np.eye(len(free)))
-    std[free] = np.sqrt(np.maximum(np.diag(covariance) * inflation, 0.0))
-    for start, p in zip(spectrum.starts, spectrum.processes, strict=False):
-        std[start + 1] *= p.damping * (1.0 - p.damping)
-    return std
 
 
 def first_guess(f: Array, I: Array, dt: float, starts: int = 4) -> Spectrum:  # noqa: E741

@@ -85,11 +85,11 @@ def to_contents(file: FileColumns, roles: Mapping[str, str]) -> Contents:
                 f"it has {', '.join([*file.columns][:20])}" if file.columns else "columns of its format have names of their own"
             )
             raise RecordError(f"has no column {name[:80]!r}; {there}")
-        found[role] = file.columns[name], "" if role == FRAME else stated_unit(name, file.units.get(name, ""))
+        found[role] = file.columns[name], "" if role == FRAME else stated_unit(name, file.column_units.get(name, ""))
     unused = []
     for name, values in file.columns.items():
-        role, unit = parse_heading(name, file.units.get(name, "")) or ("", "")
-        if name in roles.values() or name.split("[")[0].lower() in file.contents.arrays:
+        role, unit = parse_heading(name, file.column_units.get(name, "")) or ("", "")
+        if name in roles.values() or name.split("[")[0].lower() in file.arrays:
             continue
         if not role or role in roles:
             unused.append(name)
@@ -98,16 +98,16 @@ def to_contents(file: FileColumns, roles: Mapping[str, str]) -> Contents:
         else:
             found[role] = values, unit
     contents = from_columns(found)
-    contents.units |= {name: unit for name, unit in file.contents.units.items() if name not in contents.arrays}
-    contents.arrays = file.contents.arrays | contents.arrays
-    contents.guesses = [*file.contents.guesses, *contents.guesses]
+    contents.units |= {name: unit for name, unit in file.units.items() if name not in contents.arrays}
+    contents.arrays = file.arrays | contents.arrays
+    contents.guesses = [*file.guesses, *contents.guesses]
     n_rows = len(contents.arrays["y_lgs"]) if np.ndim(contents.arrays.get("y_lgs", 0)) else 0
     counters = [name for name in unused if _has_counter_name(name) and is_counter(file.columns[name], n_rows)]
     if FRAME not in found and len(counters) == 1:
         unused.remove(counters[0])
         contents.arrays[FRAME] = file.columns[counters[0]]
         contents.guesses.append(f"frames counted by {counters[0]}")
-    stated = found.get(TIME, (None, ""))[1] or file.units.get(TIME, "")
+    stated = found.get(TIME, (None, ""))[1] or file.column_units.get(TIME, "")
     by_step = "" if stated or TIME not in contents.arrays else _unit_of_steps(contents.arrays[TIME])
     for name in [clock for clock in CLOCKS if clock in contents.arrays]:
         if unit := _guess_unit(contents.arrays[name]) or by_step:
@@ -182,7 +182,7 @@ def join_clock(file: FileColumns) -> FileColumns:
         if (whole := names.get((match["stem"] + match["word"]).lower())) is not None:
             parts = PARTS[match["unit"].lower()] * file.columns.pop(match[0])
             file.columns[f"{TIME}_s"] = file.columns.pop(whole) + parts
-            file.contents.guesses.append(f"time by {whole} and {match[0]}")
+            file.guesses.append(f"time by {whole} and {match[0]}")
             break
     return file
 

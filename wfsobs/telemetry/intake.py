@@ -133,9 +133,7 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
         signals[APART] = _stars_apart(arrays[APART], n, n_modes)
     delay = stated_delay(contents, declaration)
     mirror = modes + _limit(signals, declaration)
-    origin, sign = _into_micrometres(signals, contents, declaration, scenario.telescope.diameter)
-    for name in {"u", "training_u"} & signals.keys():
-        signals[name] *= sign
+    origin = _into_micrometres(signals, contents, declaration, scenario.telescope.diameter)
     if STARS in arrays:
         signals[STARS] = star_counts(arrays[STARS], n).astype(np.float64)[:, None]
     dt, ratio, timing = _apply_timestamps(signals, contents, declaration)
@@ -145,13 +143,14 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
     if np.isnan(signals["y_lgs"]).all(axis=0).any():
         raise RecordError("y_lgs holds no measurement of one of its modes")
     fields = {name: signals[name] for name in (*FAST, NGS) if name in signals}
-    stars = np.nan_to_num(signals[STARS][:, 0]).astype(int) if STARS in signals else None
-    apart = signals[APART].reshape(len(signals["y_lgs"]), -1, n_modes) if APART in signals else None
-    beside = {"lgs_stars": stars, "y_stars": apart}
-    record = Record(**fields, dt=dt, ratio=ratio, training=_training(signals), delay=int(delay + WHOLE), origin=origin, **beside)
-    record = replace(record, gate=scenario.gate)
-    is_told = np.isnan(record.z[record.delay :]).any()
-    return record if stars is not None or is_told else without_bridged(record)
+    if STARS in signals:
+        fields[STARS] = np.nan_to_num(signals[STARS][:, 0]).astype(int)
+    if APART in signals:
+        fields[APART] = signals[APART].reshape(len(signals["y_lgs"]), -1, n_modes)
+    training, steps = _training(signals), int(delay + WHOLE)
+    record = Record(**fields, dt=dt, ratio=ratio, training=training, delay=steps, origin=origin, gate=scenario.gate)
+    is_told = STARS in signals or np.isnan(record.z[steps:]).any()
+    return record if is_told else without_bridged(record)
 
 
 def _signal(name: str, raw: Array) -> Array:
@@ -176,10 +175,8 @@ def _stars_apart(raw: Array, n: int, n_modes: int) -> Array:
     return _signal(APART, raw.reshape(n, -1))
 
 
-def _into_micrometres(
-    signals: dict[str, Array], contents: Contents, declaration: DeclaredFormat, diameter: float
-) -> tuple[str, int]:
-    """Scale every signal to um; return (unit, sign and aperture as one line, sign of the commands)."""
+def _into_micrometres(signals: dict[str, Array], contents: Contents, declaration: DeclaredFormat, diameter: float) -> str:
+    """Scale every signal to um, commands with their sign; return unit, sign and aperture as one line."""
     arrays, own = contents.arrays, contents.units
     if "unit" in arrays:
         if (unit := parse_unit(str(arrays["unit"]))) is None:
@@ -200,10 +197,12 @@ def _into_micrometres(
     for name, unit in units.items():
         signals[name] *= micrometres_per(unit, diameter)
     sign = stated_sign(contents, declaration)
+    for name in {"u", "training_u"} & signals.keys():
+        signals[name] *= sign
     said = [f"unit {unit}" for unit in dict.fromkeys(units.values()) if unit != "um"]
     said += [f"aperture {diameter:g} m"] * bool(set(units.values()) & set(ANGLES))
     said += ["command sign -1"] if sign < 0 else []
-    return ", ".join([*([str(arrays["origin"])] if "origin" in arrays else []), *said]), sign
+    return ", ".join([*([str(arrays["origin"])] if "origin" in arrays else []), *said])
 
 
 def _name_unused(columns: Sequence[str]) -> str:
@@ -239,7 +238,8 @@ def _apply_timestamps(
     if steps is not None:
         for name, values in signals.items():
             if name not in TRAINING and values.shape[0] == n:
-                signals[name] = place_rows(values, steps)
+                signals[name] = np.full((steps[-1] + 1, values.shape[1]), np.nan)
+                signals[name][steps] = values
     if dt is None:
         there = f": which column is the time? It has {', '.join(contents.leftovers[:20])}" if contents.leftovers else ""
         there = contents.hint if "--column" in contents.hint else there
@@ -523,13 +523,6 @@ def _medians(x: Array) -> Array:
     """Return the medians of successive blocks; of all where there are few."""
     n = max(x.size // BLOCK, 1)
     return np.array([np.median(part) for part in np.array_split(x, n)])
-
-
-def place_rows(values: Array, steps: Array) -> Array:
-    """Return an array with the rows at their steps, NaN where a step has none."""
-    out = np.full((steps[-1] + 1, values.shape[1]), np.nan)
-    out[steps] = values
-    return out
 
 
 def place_frames(frames: Array, n: int, ratio: int) -> Array:

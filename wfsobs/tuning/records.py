@@ -336,20 +336,11 @@ def piece(record: Record, start: int, stop: int) -> Record:
         y_ngs = record.z_ngs[start:stop] + frame_mean(delay_signal(u, record.delay - 1), record.ratio)
         y_ngs[:1] = np.nan  # a frame that began before the piece
 
-    def part(x: Array | None) -> Array | None:
-        return None if x is None else x[start:stop]
-
-    return replace(
-        record,
-        y_lgs=record.z[start:stop] + delay_signal(u, record.delay),
-        u=u,
-        y_ngs=y_ngs,
-        turbulence=part(record.turbulence),
-        vibration=part(record.vibration),
-        open_loop_y=part(record.open_loop_y),
-        lgs_stars=part(record.lgs_stars),
-        y_stars=None if record.y_stars is None else record.z_stars[start:stop] + delay_signal(u, record.delay)[:, None],
-    )
+    seen = delay_signal(u, record.delay)
+    y_stars = None if record.y_stars is None else record.z_stars[start:stop] + seen[:, None]
+    others = ("turbulence", "vibration", "open_loop_y", "lgs_stars")
+    parts = {name: x[start:stop] for name in others if (x := getattr(record, name)) is not None}
+    return replace(record, y_lgs=record.z[start:stop] + seen, u=u, y_ngs=y_ngs, y_stars=y_stars, **parts)
 
 
 def reference(record: Record, scenario: Scenario) -> Array:

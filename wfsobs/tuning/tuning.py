@@ -38,7 +38,6 @@ from wfsobs.settings.values import SettingError
 from wfsobs.simulation.true_spectra import TrueSpectra
 from wfsobs.tuning.records import DESIGN, MEASURES, P95, TRUTH, WORST, cut_record, simulate_records, space, stream
 from wfsobs.tuning.trials import Errors, Evaluation, RecordTrials, Stage, Trials, minimise, target_of
-from wfsobs.typing import Array
 
 if TYPE_CHECKING:
     import pandas
@@ -307,13 +306,13 @@ def tuning_dict(result: TuningResult) -> dict[str, Any]:
 
     def stage(s: Stage) -> dict[str, Any]:
         return {
-            "validation_rms_um": s.validation.rms if s.validation else None,
-            "validation_um": _modes(s.validation),
-            "test_rms_um": s.test.rms if s.test else None,
-            "test_um": _modes(s.test),
-            "other_target_test_um": _modes(s.other),
-            "log_marginal_likelihood": list(s.likelihood) if s.likelihood else None,
-            "envelope": dict(zip(("searched", "others"), map(_spread, s.spreads), strict=True)) if s.spreads else None,
+            "validation_rms_um": s.validation and s.validation.rms,
+            "validation_um": s.validation and dict(s.validation.modes),
+            "test_rms_um": s.test and s.test.rms,
+            "test_um": s.test and dict(s.test.modes),
+            "other_target_test_um": s.other and dict(s.other.modes),
+            "log_marginal_likelihood": s.likelihood and list(s.likelihood),
+            "envelope": s.spreads and dict(zip(("searched", "others"), map(_spread, s.spreads), strict=True)),
         }
 
     return {
@@ -325,23 +324,15 @@ def tuning_dict(result: TuningResult) -> dict[str, Any]:
         "before": stage(result.before),
         "after": stage(result.after),
         "evaluations": [
-            {"settings": e.changes, "rms_um": e.errors.rms if e.errors else None, "reason": e.reason or None}
-            for e in result.history
+            {"settings": e.changes, "rms_um": e.errors and e.errors.rms, "reason": e.reason or None} for e in result.history
         ],
     }
 
 
 def _spread(of: Spread) -> dict[str, Any]:
-    left = {name: _finite(getattr(of, name)) for name in ("nominal", "p95", "worst")}
-    return {**{f"{name}_um": x for name, x in left.items()}, "unstable": of.unstable, "plants": len(of.points)}
-
-
-def _finite(rms: Array) -> list[float] | None:
-    return rms.tolist() if np.isfinite(rms).all() else None
-
-
-def _modes(errors: Errors | None) -> dict[str, float] | None:
-    return dict(errors.modes) if errors else None
+    left = {f"{name}_um": getattr(of, name) for name in ("nominal", "p95", "worst")}
+    known = {name: x.tolist() if np.isfinite(x).all() else None for name, x in left.items()}
+    return {**known, "unstable": of.unstable, "plants": len(of.points)}
 
 
 def settings(result: TuningResult) -> list[tuple[str, str, str]]:

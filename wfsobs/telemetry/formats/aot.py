@@ -21,7 +21,6 @@ from wfsobs.record import DELAY, RecordError
 from wfsobs.telemetry.formats.contents import (
     MEAN_SLOPES,
     NUMBERS,
-    Contents,
     FileColumns,
     TooLargeError,
     import_library,
@@ -58,8 +57,7 @@ def read(file: IO[bytes], most: int) -> FileColumns:
         reader = aotpy.AOTFITSReader(
             io.BytesIO(read_at_most(file, most)), externals="disallow", exception_level=critical, log_level=critical
         )
-        loop = _first_loop(system := reader.get_system(), aotpy)
-        return FileColumns(contents=_contents(system, loop, aotpy), matrices=_matrices(loop))
+        return _contents(reader.get_system(), aotpy)
     except RecordError:
         raise
     except Exception as error:  # of many kinds, by what a file lacks
@@ -110,15 +108,8 @@ def _check_lists(hdu: Any, most: int) -> None:
                 raise TooLargeError(most)
 
 
-def _first_loop(system: Any, aotpy: Any) -> Any:
-    for loop in system.loops:
-        if isinstance(loop, aotpy.ControlLoop) and loop.input_sensor is not None and loop.input_sensor.measurements is not None:
-            return loop
-    raise RecordError("has no control loop with measurements")
-
-
-def _rows(image: Any) -> Array | None:
-    """Return an image (m, ...) as a matrix, (m, n)."""
+def _rows(image: Any) -> Any:
+    """Return an image (m, ...) as a matrix, (m, n), None where there is none."""
     return None if image is None else np.asarray(image.data, dtype=np.float64).reshape(len(image.data), -1)
 
 
@@ -136,25 +127,23 @@ def _matrices(loop: Any) -> dict[str, Array]:
     return {name: matrix for name, matrix in found.items() if matrix is not None}
 
 
-def _contents(system: Any, loop: Any, aotpy: Any) -> Contents:
-    sensor, contents = loop.input_sensor, Contents()
+def _contents(system: Any, aotpy: Any) -> FileColumns:
+    loops = (loop for loop in system.loops if isinstance(loop, aotpy.ControlLoop))
+    loop = next((loop for loop in loops if getattr(loop.input_sensor, "measurements", None) is not None), None)
+    if loop is None:
+        raise RecordError("has no control loop with measurements")
+    sensor, contents = loop.input_sensor, FileColumns(matrices=_matrices(loop))
     measured = sensor.measurements
     _take(contents, "y_lgs", measured, _rows(loop.measurements_to_modes))
     if loop.modal_coefficients is not None:
         _take(contents, "u", loop.modal_coefficients, None)
     elif loop.commands is not None:
         _take(contents, "u", loop.commands, _rows(loop.commands_to_modes))
-    other = next(
-        (
-            s
-            for s in system.wavefront_sensors
-            if s is not sensor and s.measurements is not None and isinstance(s.source, aotpy.NaturalGuideStar)
-        ),
-        None,
-    )
-    if other is not None:
-        _take(contents, "y_ngs", other.measurements, None)
-    for name, clock in (("time", measured.time or loop.time), ("time_ngs", other and other.measurements.time)):
+    natural = (s for s in system.wavefront_sensors if s is not sensor and isinstance(s.source, aotpy.NaturalGuideStar))
+    frames = next((s.measurements for s in natural if s.measurements is not None), None)
+    if frames is not None:
+        _take(contents, "y_ngs", frames, None)
+    for name, clock in (("time", measured.time or loop.time), ("time_ngs", frames and frames.time)):
         if clock is not None and clock.timestamps:
             contents.arrays[name] = np.asarray(clock.timestamps, dtype=np.float64)
     if loop.framerate:
@@ -169,13 +158,10 @@ def _contents(system: Any, loop: Any, aotpy: Any) -> Contents:
     return contents
 
 
-def _take(contents: Contents, name: str, image: Any, matrix: Array | None) -> None:
+def _take(contents: FileColumns, name: str, image: Any, matrix: Array | None) -> None:
     """Read the rows of an image as modes, through a matrix (m, ...) where there is one."""
-    data = np.asarray(image.data, dtype=np.float64)
-    rows = data.reshape(data.shape[0], -1)
-    if matrix is not None:
-        rows = rows @ matrix.T
-    contents.arrays[name] = rows
+    rows = _rows(image)
+    contents.arrays[name] = rows = rows if matrix is None else rows @ matrix.T
     are_modes = name != "y_lgs" or rows.shape[1] <= 2 or parse_unit(image.unit or "")  # slopes may be in pixels
     if image.unit and matrix is None and are_modes:
         contents.state_unit(name, image.unit)

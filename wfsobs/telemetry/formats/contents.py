@@ -82,28 +82,26 @@ class Contents:
     hint: str = ""
 
     def state_unit(self, name: str, text: str) -> None:
-        """Note the unit of a signal, whatever it is. Raises RecordError where it differs from that of its other modes."""
+        """Note the unit of a signal, if there is one. Raises RecordError where it differs from that of its other modes."""
         unit = parse_unit(text) or text.strip()
-        if self.units.setdefault(name, unit) != unit:
+        if text and self.units.setdefault(name, unit) != unit:
             raise RecordError(f"{name} is in {self.units[name]} and in {unit}")
 
 
 @dataclass
-class FileColumns:
-    """What a file holds under its own names, whatever its format.
+class FileColumns(Contents):
+    """What a file holds, whatever its format: whole arrays, numbers and texts of the names of a record, and all under its own.
 
     Attributes
     ----------
     columns : dict of str to Array
         Name in the file -> values, (n,).
-    units : dict of str to str
+    column_units : dict of str to str
         Name in the file -> unit beside it, as written.
     texts : dict of str to str
         Name in the file -> why it holds no numbers.
     numbers : dict of str to float
         Name in the file -> number that stands alone.
-    contents : Contents
-        Whole arrays, numbers and texts of the names of a record (NAMES).
     matrices : dict of str to Array
         Matrices of a loop from slopes to modes, the first choice first, and from modes to commands.
     most : float
@@ -111,10 +109,9 @@ class FileColumns:
     """
 
     columns: dict[str, Array] = field(default_factory=dict)
-    units: dict[str, str] = field(default_factory=dict)
+    column_units: dict[str, str] = field(default_factory=dict)
     texts: dict[str, str] = field(default_factory=dict)
     numbers: dict[str, float] = field(default_factory=dict)
-    contents: Contents = field(default_factory=Contents)
     matrices: dict[str, Array] = field(default_factory=dict)
     most: float = math.inf
     _bytes: int = 0
@@ -142,7 +139,7 @@ class FileColumns:
         elif known in (*NUMBERS, *TEXTS):
             if values.size > 1 and not (values == values.flat[0]).all():
                 raise RecordError(f"{known} holds {values.size} numbers that differ; it takes one")
-            self.contents.arrays[known] = values.flat[0].reshape(())
+            self.arrays[known] = values.flat[0].reshape(())
         elif values.size == 1 and known not in NAMES and not parse_heading(name):
             self.numbers[name] = float(values.item())
         else:
@@ -158,27 +155,24 @@ class FileColumns:
                 return self.leave(name, f"there is no room for {name}")
             raise TooLargeError(self.most)
         self._bytes += size
-        if known in self.contents.arrays:
+        if known in self.arrays:
             raise RecordError(f"two parts are named {known}")
         if known in CLOCKS:
-            self.contents.arrays[known] = values.reshape(rows.shape if rows.shape[1] > 1 else -1) * seconds_per(known, unit)
+            self.arrays[known] = values.reshape(rows.shape if rows.shape[1] > 1 else -1) * seconds_per(known, unit)
         elif known in SIGNALS:
-            self.contents.arrays[known] = values if values.ndim == 2 else rows
-            if unit:
-                self.contents.state_unit(known, unit)
+            self.arrays[known] = values if values.ndim == 2 else rows
+            self.state_unit(known, unit)
         elif known in (STARS, APART):
-            self.contents.arrays[known] = rows.ravel() if known == STARS else values
+            self.arrays[known] = rows.ravel() if known == STARS else values
         for i, column in enumerate(rows.T[:MOST_COLUMNS]):
             key = f"{name}[{i}]" if rows.shape[1] > 1 else name
-            self.columns[key] = column.astype(np.float64)
-            if unit:
-                self.units[key] = unit
+            self.columns[key], self.column_units[key] = column.astype(np.float64), unit
 
     def _add_texts(self, name: str, texts: list[str]) -> None:
         if name.lower() in TEXTS and len(texts) == 1:
-            self.contents.arrays[name.lower()] = np.array(texts[0])
-        elif UNIT.fullmatch(name) and len(texts) == 1 and "unit" not in self.contents.arrays and parse_unit(texts[0]):
-            self.contents.arrays["unit"] = np.array(texts[0])
+            self.arrays[name.lower()] = np.array(texts[0])
+        elif UNIT.fullmatch(name) and len(texts) == 1 and "unit" not in self.arrays and parse_unit(texts[0]):
+            self.arrays["unit"] = np.array(texts[0])
         elif len(texts) > 1 and STAMP.fullmatch(texts[0].strip()):
             self.add(name, np.array([parse_cell(text) for text in texts]), "s")
         else:
@@ -280,14 +274,14 @@ def from_columns(columns: Mapping[str, tuple[Array, str]]) -> Contents:
     """
     contents = Contents()
     found: dict[str, dict[str, Array]] = {}
+    columns_of: dict[str, list[Array]] = {}
     for role, (values, unit) in columns.items():
         name, _, mode = role.partition("/")
         if not mode:
             contents.arrays[name] = values * seconds_per(name, unit)  # a counter has no unit
             continue
         found.setdefault(name, {})[mode] = values
-        if unit:
-            contents.state_unit(name, unit)
+        contents.state_unit(name, unit)
     first = [mode.name for mode in TIP_TILT]
 
     def in_order(modes: Iterable[str]) -> list[str]:
@@ -301,19 +295,13 @@ def from_columns(columns: Mapping[str, tuple[Array, str]]) -> Contents:
             raise RecordError(f"{name} has the modes {', '.join(by_mode)}; y_lgs has {', '.join(modes)}")
         if name == "y_lgs" and modes == first[1:]:
             contents.guesses.append(f"{modes[0]} alone, called {first[0]}")
-        longest = max(map(len, by_mode.values()))
-        contents.arrays[name] = np.column_stack([_pad(by_mode[mode], longest) for mode in modes])
-    _pad_fast(contents)
+        columns_of[name] = [by_mode[mode] for mode in modes]
+    fast = [len(x) for name in FAST for x in columns_of.get(name, ())]
+    longest = max([len(contents.arrays.get(TIME, ())), *fast])
+    for name, values in columns_of.items():  # what ends early has missing samples there
+        n = longest if name in FAST else max(map(len, values))
+        contents.arrays[name] = np.column_stack([np.pad(x, (0, n - len(x)), constant_values=np.nan) for x in values])
     return contents
-
-
-def _pad_fast(contents: Contents) -> None:
-    """Extend all fast signals to the length of the longest: what ends early has missing samples there."""
-    fast = [name for name in FAST if name in contents.arrays]
-    n = max((len(contents.arrays[name]) for name in (*fast, *((TIME,) if TIME in contents.arrays else ()))), default=0)
-    for name in fast:
-        values = contents.arrays[name]
-        contents.arrays[name] = np.pad(values, ((0, n - len(values)), (0, 0)), constant_values=np.nan)
 
 
 def to_columns(arrays: Mapping[str, Array]) -> dict[str, Array]:
@@ -335,10 +323,6 @@ def numbers_and_texts(arrays: Mapping[str, Array], encoding: str = "utf-8") -> d
     """Return all that is neither a signal nor a clock, as plain values; what the encoding has no letter for is `?`."""
     plain = {name: np.asarray(arrays[name]).item() for name in (*NUMBERS, *TEXTS) if name in arrays}
     return {name: x.encode(encoding, "replace").decode(encoding) if isinstance(x, str) else x for name, x in plain.items()}
-
-
-def _pad(x: Array, n: int) -> Array:
-    return np.concatenate([x, np.full(n - len(x), np.nan)])
 
 
 class TooLargeError(RecordError):

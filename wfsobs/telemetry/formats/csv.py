@@ -57,7 +57,7 @@ def read(file: IO[bytes], most: int) -> FileColumns:
         file.seek(0)
         file = io.BytesIO(file.read(most).decode("utf-16", "replace").encode())
     file.seek(0)
-    heading, separator, rows, named = _head(file, out.contents)
+    heading, separator, rows, named = _head(file, out)
     seen = set[str]()
     for i, name in enumerate(heading):
         if name in seen and parse_heading(name):
@@ -68,7 +68,7 @@ def read(file: IO[bytes], most: int) -> FileColumns:
     cells_of, ends = {i: array("d") for i in range(width)}, [0] * width
     first = next(rows, None)
     if first and any(cell.strip() for cell in first[1]) and all(x.strip() in ("", *SECONDS) or parse_unit(x) for x in first[1]):
-        out.units = {name: cell.strip() for name, cell in zip(heading, first[1], strict=False)}
+        out.column_units = {name: cell.strip() for name, cell in zip(heading, first[1], strict=False)}
     elif first:
         rows = chain([first], rows)
     for step, (line, cells) in enumerate(rows):
@@ -92,11 +92,11 @@ def read(file: IO[bytes], most: int) -> FileColumns:
                 del cells_of[i]
                 continue
             if STAMP.fullmatch(text):
-                out.units[heading[i]] = "s"
-            commas |= "," in text and heading[i] not in out.units
+                out.column_units[heading[i]] = "s"
+            commas |= "," in text and heading[i] not in out.column_units
     out.columns = {heading[i]: np.array(column[: ends[i]]) for i, column in cells_of.items() if heading[i] or ends[i]}
-    out.contents.guesses += ["heading of the comment above"] * named
-    out.contents.guesses += [f"cells separated by {separator}"] * (separator != "commas") + ["decimal commas"] * commas
+    out.guesses += ["heading of the comment above"] * named
+    out.guesses += [f"cells separated by {separator}"] * (separator != "commas") + ["decimal commas"] * commas
     return out
 
 

@@ -80,9 +80,9 @@ def tables_and_images(hdus: HDUList, most: float) -> FileColumns:
     for number, hdu in enumerate(hdus):
         for key, keyword in KEYWORDS.items():
             if keyword in hdu.header and not (key == "unit" and hdu.is_image and hdu.data is not None):  # of one image alone
-                out.contents.arrays[key] = np.array(hdu.header[keyword])
+                out.arrays[key] = np.array(hdu.header[keyword])
         if EXACT in hdu.header:
-            out.contents.arrays["dt"] = np.array(float(hdu.header[EXACT]))
+            out.arrays["dt"] = np.array(float(hdu.header[EXACT]))
         data: Any = hdu.data
         if isinstance(hdu, fits.BinTableHDU):
             for column in hdu.columns:

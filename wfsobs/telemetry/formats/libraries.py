@@ -169,47 +169,38 @@ def read_hdf5(file: IO[bytes], most: int) -> FileColumns:
         with np.load(io.BytesIO(done.stdout), allow_pickle=False) as found:
             said = json.loads(str(found["said"]))
             arrays = {key: found[key] for key in found}
-    if "error" in said:
+    if said["error"]:
         raise TooLargeError(most) if said["error"] == "large" else RecordError(said["error"])
-    for key, (name, unit) in said["arrays"].items():
-        out.add(name, arrays[key], unit)
-    for name, why in said["left"]:
-        out.leave(name, why)
+    for i, (name, text) in enumerate(said["parts"]):
+        if (key := f"part {i}") in arrays:
+            out.add(name, arrays[key], text)
+        else:
+            out.leave(name, text)
     return out
 
 
-class _Parts:
-    """What a file holds, on its way to another process."""
-
-    def __init__(self) -> None:
-        self.arrays: dict[str, Array] = {}
-        self.names: dict[str, tuple[str, str]] = {}
-        self.left: list[tuple[str, str]] = []
-
-    def add(self, name: str, data: object, unit: str = "") -> None:
-        self.names[key := f"a{len(self.names)}"] = name, unit
-        self.arrays[key] = np.asarray(data)
-
-    def leave(self, name: str, why: str) -> None:
-        self.left.append((name, why))
+Part = tuple[str, object, str]
+"""Name, values and unit, or for what is left out name, None and the reason."""
 
 
 def send_hdf5(most: int) -> None:
     """Write what the HDF5 file on the standard input holds to the standard output, as `.npz`."""
-    parts = _Parts()
+    parts, arrays, error = list[tuple[str, str]](), dict[str, Array](), ""
     try:
-        _read_parts(parts, io.BytesIO(sys.stdin.buffer.read()), most)
-        said: dict[str, Any] = {"arrays": parts.names, "left": parts.left}
+        for name, values, text in _read_parts(io.BytesIO(sys.stdin.buffer.read()), most):
+            if values is not None:
+                arrays[f"part {len(parts)}"] = np.asarray(values)
+            parts.append((name, text))
     except TooLargeError:
-        said = {"error": "large"}
-    except RecordError as error:
-        said = {"error": str(error)}
+        error = "large"
+    except RecordError as refusal:
+        error = str(refusal)
     content = io.BytesIO()
-    np.savez(content, allow_pickle=False, said=np.array(json.dumps(said)), **parts.arrays)
+    np.savez(content, allow_pickle=False, said=np.array(json.dumps({"error": error, "parts": parts})), **arrays)
     sys.stdout.buffer.write(content.getvalue())
 
 
-def _read_parts(out: _Parts, file: IO[bytes], most: int) -> None:
+def _read_parts(file: IO[bytes], most: int) -> Iterator[Part]:
     h5py = import_library("h5py", "hdf5")
     room, paths = most, ["/"]
     with refuse_damage(DAMAGED), h5py.File(file, "r") as source:
@@ -217,41 +208,40 @@ def _read_parts(out: _Parts, file: IO[bytes], most: int) -> None:
             if count > MOST_PARTS:  # also where a group is within itself
                 raise RecordError(f"has more than {MOST_PARTS} groups and arrays")
             item = source[path]
-            _add_attributes(out, item)
+            yield from _attributes(item)
             if isinstance(item, h5py.Dataset):
                 room -= max(item.size or 0, prod(item.chunks or ())) * max(item.dtype.itemsize, 8)
                 if room < 0:
                     raise TooLargeError(most)
                 is_text = h5py.check_string_dtype(item.dtype) is not None and item.size == 1
-                _add_dataset(out, path[1:], item, is_text or not item.dtype.hasobject)
+                yield _dataset(path[1:], item, is_text or not item.dtype.hasobject)
             elif isinstance(item, h5py.Group):
                 for name in item:
                     if isinstance(item.get(name, getlink=True), h5py.HardLink):
                         paths.append(f"{path.rstrip('/')}/{name}")
                     else:
-                        out.leave(name, f"{name} is a link, which is not followed")
+                        yield name, None, f"{name} is a link, which is not followed"
 
 
-def _add_attributes(out: _Parts, item: Any) -> None:
-    """Add the numbers and texts of a record, or its rate, among the attributes of a group or of an array."""
+def _attributes(item: Any) -> Iterator[Part]:
+    """Yield the numbers and texts of a record, or its rate, among the attributes of a group or of an array."""
     for key in item.attrs:
         is_text = key.lower() in TEXTS and item.name == "/"
         if (is_text or key.lower() in NUMBERS or is_rate(key)) and item.attrs.get_id(key).shape in ((), (1,)):
-            out.add(key, item.attrs[key])
+            yield key, item.attrs[key], ""
 
 
-def _add_dataset(out: _Parts, name: str, item: Any, is_plain: bool) -> None:
+def _dataset(name: str, item: Any, is_plain: bool) -> Part:
     if item.external or item.is_virtual:
-        out.leave(name, f"{name} lies in another file, which is not opened")
-    elif item.shape is None or not is_plain:
-        out.leave(name, f"{name} holds objects or references, not numbers")
-    else:
-        values, of_matlab = item[()], _text(item.attrs.get("MATLAB_class", ""))
-        if item.dtype.hasobject:
-            values = _text(np.ravel(values)[0])
-        if of_matlab == "char":
-            values = "".join(map(chr, np.transpose(values).ravel().tolist()))
-        out.add(name, np.transpose(values) if of_matlab else values, _text(item.attrs.get("units", item.attrs.get("unit", ""))))
+        return name, None, f"{name} lies in another file, which is not opened"
+    if item.shape is None or not is_plain:
+        return name, None, f"{name} holds objects or references, not numbers"
+    values, of_matlab = item[()], _text(item.attrs.get("MATLAB_class", ""))
+    if item.dtype.hasobject:
+        values = _text(np.ravel(values)[0])
+    if of_matlab == "char":
+        values = "".join(map(chr, np.transpose(values).ravel().tolist()))
+    return name, np.transpose(values) if of_matlab else values, _text(item.attrs.get("units", item.attrs.get("unit", "")))
 
 
 def _text(value: object) -> str:

@@ -38,12 +38,13 @@ def read(file: IO[bytes], most: int) -> FileColumns:
             raise TooLargeError(most)
         if size > LARGE and size > PACKED * packed:
             raise RecordError(f"unpacks from {packed / 1e6:.3g} to {size / 1e6:.4g} MB, as no measurements do")
-        for name, info in known.items():
-            out.add(name, _array(archive, info, name))
-        for name, info in members.items():
-            if name not in known and info.file_size <= room and _is_table(archive, info):
+        for name, info in (known | members).items():
+            if name not in known:
+                if info.file_size > room or not _is_table(archive, info):
+                    continue
                 room -= info.file_size
-                out.add(name, _array(archive, info, name))
+            with archive.open(info) as stream:
+                out.add(name, _values(stream, info.file_size, name))
     return out
 
 
@@ -63,13 +64,8 @@ def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
     return read_header(stream, max_header_size=HEADER)
 
 
-def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str) -> Array:
-    """Return an array whose header agrees with the size in the directory: a read without a size would unpack everything."""
-    with archive.open(info) as stream:
-        return _values(stream, info.file_size, name)
-
-
 def _values(stream: IO[bytes], length: int, name: str) -> Array:
+    """Return an array whose header agrees with the length of its file: a read without a size would unpack everything."""
     shape, fortran, dtype = _header(stream)
     if dtype.hasobject:
         raise RecordError(DAMAGED)
