@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import select
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from itertools import pairwise
 from multiprocessing import resource_tracker
@@ -215,7 +215,7 @@ class Ring(Rows):
         return LiveFrame(rows[:, 0], *(rows[:, a:b] for a, b in pairwise(self._parts)))
 
 
-def merged_rows(traces: list[Rows], first: int, stop: int, width: int | None = None) -> Array:
+def merged_rows(traces: Iterable[Rows], first: int, stop: int, width: int | None = None) -> Array:
     """Return what the crews together have in the rows first ... stop - 1, (n, width): the longest delay, every estimate.
 
     A row that is not that of its frame holds what was there before: it is NaN, but for its number.

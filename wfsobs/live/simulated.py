@@ -30,7 +30,7 @@ from wfsobs.live.source import (
     Command,
     Desk,
     LiveSource,
-    Staff,
+    Worker,
     enter_process,
     may_go_first,
     receive,
@@ -315,14 +315,12 @@ class SimulatedLoop:
         """Modes, step and NGS ratio."""
         return sampling_of(self.scenario)
 
-    def staff(self, context: SpawnContext, desk: Desk) -> Staff:
-        """Return its processes."""
+    def staff(self, context: SpawnContext, desk: Desk) -> list[Worker]:
+        """Begin its processes."""
         ready = context.Queue(round(AHEAD / self.scenario.dt) // piece_length(self.scenario) + 1)
-        inbox, outbox = context.Pipe(duplex=False)
         settings = self.scenario.to_dict()
-        maker = context.Process(target=_make, args=(settings, inbox, ready), name="the simulation", daemon=True)
-        sender = context.Process(target=_send, args=(settings, ready, desk), name="the source", daemon=True)
-        return Staff(sender, [maker], [outbox], ready)
+        maker = Worker(context, "the simulation", _make, settings, ready)
+        return [maker, Worker(context, "the source", _send, settings, ready, desk)]
 
 
 def piece_length(scenario: Scenario) -> int:
@@ -331,7 +329,7 @@ def piece_length(scenario: Scenario) -> int:
     return max(1, PIECE // (8 * 4 * len(scenario.modes) * ratio)) * ratio
 
 
-def _make(settings: dict[str, Any], inbox: Connection, ready: Queue[Piece]) -> None:
+def _make(settings: dict[str, Any], ready: Queue[Piece], inbox: Connection) -> None:
     """Make blocks ahead of time; when the settings change, those of the new ones.
 
     It gives way to the other processes of the loop where those cannot go first.
@@ -363,10 +361,11 @@ def _put(ready: Queue[Piece], piece: Piece, inbox: Connection | None) -> bool:
     return False
 
 
-def _send(settings: dict[str, Any], ready: Queue[Piece], desk: Desk) -> None:
+def _send(settings: dict[str, Any], ready: Queue[Piece], desk: Desk, inbox: Connection) -> None:
     enter_process(turn=SOURCE)
     scenario = Scenario.from_dict(settings)
-    send_frames(desk, SimulatedFrames(scenario, ready), scenario.dt)
+    frames = SimulatedFrames(scenario, ready)
+    send_frames(desk, inbox, frames.next_row, frames.take, scenario.dt)
 
 
 class SimulatedFrames:
@@ -405,7 +404,7 @@ class SimulatedFrames:
         z, ngs = (x if draw >= self._losses[name] else self._missing for name, x in (("lgs", z), ("ngs", ngs)))
         return np.concatenate((z, ngs, self._loop.command(z), *truth))
 
-    def take(self, command: Command, number: int) -> str:
+    def take(self, command: Command) -> str:
         """Follow "settings", for which frames of another generation are to be expected, and "losses"."""
         self._losses = command.get("losses", self._losses)
         if "settings" in command:

@@ -35,10 +35,6 @@ class Latencies:
     def __init__(self, counts: NDArray[np.int64] | None = None) -> None:
         self.counts: NDArray[np.int64] = np.zeros(len(EDGES) + 1, dtype=np.int64) if counts is None else counts
 
-    def clear(self) -> None:
-        """Begin anew."""
-        self.counts[:] = 0
-
     def add(self, latency: float | NDArray[np.float64]) -> None:
         """Count a latency, or several [s]."""
         np.add.at(self.counts, np.searchsorted(EDGES, latency), 1)
