@@ -251,20 +251,11 @@ class LiveView:
         """Number of modes."""
         return self.frames.z.shape[1]
 
-    @property
-    def delays(self) -> Array:
-        """Time from when a frame was due to when every observer had an estimate of it, (n,) [s]."""
-        return self._traces[:, 1]
-
     def truth(self, target: str) -> Array:
         """Return the truth of a target or of both together, (n, n_modes) [um]; of the next measurement, the measurements."""
         if target == TOTAL:
             return self.frames.turbulence + self.frames.vibration
         return self.frames.z if target == NEXT else getattr(self.frames, target)
-
-    def steps(self, observer: str) -> Array:
-        """Return the times of an observer's steps, (n,) [s]; NaN while it is off."""
-        return self._of(observer)[:, 0]
 
     def estimate(self, observer: str, target: str) -> Array:
         """Return what an observer has estimated of a target or of both together, (n, n_modes) [um]; NaN where nothing."""

@@ -273,7 +273,11 @@ class LiveProcesses:
 
     def failure(self) -> str:
         """Return one line that names the processes that have ended otherwise than by themselves; "" without one."""
-        lines = [f"the process of {p.name} ({p.pid}) was ended by {_cause(p.exitcode)}" for p in self.processes if p.exitcode]
+        lines = []
+        for process in self.processes:
+            if status := process.exitcode:
+                cause = f"an error, exit status {status}" if status > 0 else f"signal {-status} ({Signals(-status).name})"
+                lines.append(f"the process of {process.name} ({process.pid}) was ended by {cause}")
         if self._tracker.is_gone:
             lines.append("the resource tracker of Python was killed")
         return f"live: {'; '.join(lines)}" if lines else ""
@@ -312,11 +316,6 @@ class LiveProcesses:
         self.workshop.stop()
         self.feed.stop()
         self.board.release()
-
-
-def _cause(status: int) -> str:
-    """Return what has ended a process of this exit status."""
-    return f"an error, exit status {status}" if status > 0 else f"signal {-status} ({Signals(-status).name})"
 
 
 class SideProcess:

@@ -397,7 +397,9 @@ class SimulatedFrames:
             self._old, self._new = self._new, None
         row = self._next_of(self._old)
         if self._new is not None:
-            row = self._mix(row, self._next_of(self._new))
+            new, weight = self._next_of(self._new), self._weight[self._new_at]
+            if self._new_at:  # the first frame is an old one alone, as a first block has no NGS measurement there
+                row = np.sqrt(1.0 - weight**2) * row + weight * new
             self._new_at += 1
         z, ngs, *truth = row.reshape(4, -1)
         draw = self._rng.random()  # one for both: they are lost together
@@ -411,11 +413,6 @@ class SimulatedFrames:
             self._loop.take(Scenario.from_dict(command["settings"]))
             self._target += command["is_new"]
         return command.get("line", "")
-
-    def _mix(self, row: Array, new: Array) -> Array:
-        """Fade; the first frame is an old one alone, as a first block has no NGS measurement there."""
-        weight = self._weight[self._new_at]
-        return np.sqrt(1.0 - weight**2) * row + weight * new if self._new_at else row
 
     def _look_for_new(self) -> None:
         """Begin to fade once rows of the newest settings have come; those of the present ones may be needed until then."""
