@@ -265,7 +265,9 @@ def endless_blocks(scenario: Scenario, rng: np.random.Generator, length: float =
     before = _record(scenario, 2 * half, rng)
     while True:
         after = _record(scenario, 2 * half, rng)
-        yield _fade(before[half:], after[:half], weight)
+        block = np.sqrt(1.0 - weight**2) * before[half:]
+        block[1:] += weight[1:] * after[1:half]  # the first sample of a record may have no NGS measurement
+        yield block
         before = after
 
 
@@ -274,13 +276,6 @@ def _record(scenario: Scenario, n_steps: int, rng: np.random.Generator) -> Array
     disturbance = make_disturbance(scenario, n_steps, disturbance_rng)
     seen = measure_open_loop(scenario, disturbance, sensor_rng)
     return np.hstack([seen.lgs, seen.ngs, disturbance.turbulence, disturbance.vibration])
-
-
-def _fade(before: Array, after: Array, weight: Array) -> Array:
-    """Fade from one record to the next; the first sample is that of the one before alone, where the next may have none."""
-    out = np.sqrt(1.0 - weight**2) * before
-    out[1:] += weight[1:] * after[1:]
-    return out
 
 
 AHEAD = 40.0

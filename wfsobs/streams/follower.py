@@ -413,10 +413,8 @@ class StreamFollower(ABC):
             self._say(f"{self._source.path}: no frame for {self._wiring.stuck:g} s")
             self._fall_back("stuck")
             self._send(self.safe)
-        if not self._source.is_current:
-            self._follow_new_file()
-
-    def _follow_new_file(self) -> None:
+        if self._source.is_current:
+            return
         try:
             new = self._source.reopen()
         except StreamError:
