@@ -214,7 +214,7 @@ class _Tables:
 
     def step(self, gain: Gain) -> str:
         """Return the initialiser of a step: sparse A, then a row of C and a column of L for each of two sensors."""
-        dense = [self.numbers("real", x) for pair in zip(gain.C, gain.L.T, strict=True) for x in pair]
+        dense = (self.numbers("real", x) for pair in zip(gain.C, gain.L.T, strict=True) for x in pair)
         return _initialiser(*self.sparse("real", gain.A), *dense, *("0", "0") * (2 - len(gain.C)))
 
     def sparse(self, kind: str, A: Array) -> list[str]:
