@@ -50,8 +50,8 @@ def test_new_settings_fade_in_without_a_seam():
     put(ready, 0, 1.0, 2000, 3)
     frames = SimulatedFrames(paper(), ready)
     rows = [frames.next_row(k) for k in range(503)]
-    assert "peak" in frames.take({"settings": paper().to_dict(), "is_new": 1, "line": "a peak"}, 503)
-    frames.take({"settings": paper().to_dict(), "is_new": 1}, 503)
+    assert "peak" in frames.take({"settings": paper().to_dict(), "is_new": 1, "line": "a peak"})
+    frames.take({"settings": paper().to_dict(), "is_new": 1})
     rows += [frames.next_row(k) for k in range(503, 603)]
     put(ready, 1, 7.0, 2000, 1, first=True)
     put(ready, 2, 100.0, 2000, 6, first=True)
@@ -91,7 +91,7 @@ def test_first_block_of_new_settings_is_whole(monkeypatch):
 
     def make():
         with suppress(EOFError):
-            simulated._make(scenario.to_dict(), inbox, ready)
+            simulated._make(scenario.to_dict(), ready, inbox)
 
     maker = threading.Thread(target=make)
     maker.start()
@@ -122,10 +122,10 @@ def test_lost_frames_hold_the_command():
     put(ready, 0, 1.0, 2000, 2)
     frames = SimulatedFrames(paper(), ready)
     before = [frames.next_row(k) for k in range(50)][-1]
-    frames.take({"losses": {"lgs": 1.0, "ngs": 0.0}}, 50)
+    frames.take({"losses": {"lgs": 1.0, "ngs": 0.0}})
     out = np.array([frames.next_row(k) for k in range(50, 60)])
     assert np.isnan(out[:, :2]).all() and np.all(out[:, 4] == before[4]) and not np.isnan(out[:, 6:]).any()
-    frames.take({"losses": {"lgs": 0.3, "ngs": 0.3}}, 60)
+    frames.take({"losses": {"lgs": 0.3, "ngs": 0.3}})
     lost = np.isnan([frames.next_row(k)[0] for k in range(60, 1560)]).mean()
     assert lost == pytest.approx(0.3, abs=5 * np.sqrt(0.3 * 0.7 / 1500))  # 5 standard deviations of 1500 draws
 
@@ -331,7 +331,12 @@ def test_a_frame_is_taken_once_all_crews_have_it_and_late_by_the_last():
         now = time.monotonic()
         for due in (now - 0.5, now + 9, now - 0.5, now + 9, now + 9):
             ring.send(np.full(11, due))
-        delivery = Delivery(ring, board, lambda: [steady, learning], lambda: min(steady.count, learning.count))
+
+        def parts():
+            board.progress[:2] = steady.count, learning.count
+            return dict(enumerate((steady, learning)))
+
+        delivery = Delivery(ring, board, parts)
         for k, delay in enumerate((0.0001, 0.0002, 0.003, 0.0001, 0.0001)):
             steady.write(np.array([k, delay, 1.0, np.nan]))
         delivery.collect()

@@ -31,7 +31,7 @@ class Night(LoopInProcess):
         super().__init__(told.before_events, sampling_of(told), True)
         maker = Maker(self.scenario)
         source = SimulatedFrames(self.scenario, maker)
-        programme = Programme(told, lambda command: self.say(source.take(maker.tell(command), self.newest)))
+        programme = Programme(told, lambda command: self.say(source.take(maker.tell(command))))
         shadow = Shadow(self.say, self)
         for k in range(round((told.run.duration + 2.0) / self.sampling.dt)):
             if k % 200 == 0:

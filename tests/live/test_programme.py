@@ -145,7 +145,7 @@ def test_live_numbers_are_those_of_the_recording():
     names, told = ("kf-multi", "multirate-multi", "gp-both", "kf-ngs"), scenario.before_events
     maker, board, out = Maker(scenario), Board(2), []
     frames = SimulatedFrames(told, maker)
-    programme = Programme(scenario, lambda command: frames.take(maker.tell(command), 0))
+    programme = Programme(scenario, lambda command: frames.take(maker.tell(command)))
     try:
         site = Site(told.to_dict(), wfsobs.stepping.sampling_of(told), "", "", queue.Queue())
         crew = made_crew(site, board, 0, names)

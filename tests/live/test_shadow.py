@@ -31,7 +31,7 @@ class Loop(LoopInProcess):
         source = StreamSource(self.image.path, (0, 1), 1.0, 1e-3)
         super().__init__(paper(), source.sampling, False)
         inbox = Inbox()
-        self.stream = StreamFrames(source, Desk(self.ring.name, 2, inbox, self.news, 1.0, None))
+        self.stream = StreamFrames(source, Desk(self.ring.name, 2, self.news, 1.0, None), inbox)
         self.stream._look()
         inbox.waiting.append({"play": True})
         self.stream._follow_commands()

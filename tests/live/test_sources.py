@@ -15,7 +15,7 @@ from wfsobs.live.attached import SPELL, StreamFrames, StreamSource
 from wfsobs.live.board import LONG_STEPS
 from wfsobs.live.checks import observers_on
 from wfsobs.live.ring import LiveFrame, Ring, open_loop_record
-from wfsobs.live.source import Desk, RecordFrames, Replay, frame_rows
+from wfsobs.live.source import Desk, Replay, frame_rows
 from wfsobs.scenario.presets import paper
 from wfsobs.streams.shared_image import SharedImage
 from wfsobs.streams.wiring import NgsWiring
@@ -36,15 +36,12 @@ class Inbox:
 
 def test_frames_of_a_record_are_those_of_the_record():
     record = wfsobs.simulate(paper().replace({"run.duration": 1.5}))
-    frames = RecordFrames(frame_rows(record))
-    rows = np.array([frames.next_row(k) for k in range(record.n_steps)])
-    assert frames.next_row(record.n_steps) is None
-    parts = np.split(rows, 5, axis=1)
+    parts = np.split(frame_rows(record), 5, axis=1)
     for part, expected in zip(parts, (record.z, record.z_ngs, record.u, record.turbulence, record.vibration), strict=True):
         np.testing.assert_array_equal(part, expected)
     source = Replay(record)
     assert source.has_truth and source.sampling == record.sampling
-    again = open_loop_record(LiveFrame(np.zeros(len(rows)), *parts), record.sampling)
+    again = open_loop_record(LiveFrame(np.zeros(record.n_steps), *parts), record.sampling)
     np.testing.assert_array_equal(again.z, record.z)
     np.testing.assert_array_equal(again.z_ngs[1:], record.z_ngs[1:])
 
@@ -55,7 +52,7 @@ def stream(tmp_path):
     image = SharedImage.create(path, (4,), dtype="float64")
     ring, inbox, news = Ring(2), Inbox(), queue.Queue()
     source = StreamSource(str(path), (2, 0), 1e-3, 1e-3)
-    frames = StreamFrames(source, Desk(ring.name, 2, inbox, news, 1.0, None))
+    frames = StreamFrames(source, Desk(ring.name, 2, news, 1.0, None), inbox)
     frames._look()
     yield path, image, ring, inbox, news, frames
     frames._ring.release()
@@ -129,7 +126,7 @@ def test_a_stream_by_network_is_followed_and_its_next_program_too():
     publisher = threading.Thread(target=publish)
     publisher.start()
     inbox = Inbox()
-    frames = StreamFrames(source, Desk(ring.name, 2, inbox, news, 1.0, None))
+    frames = StreamFrames(source, Desk(ring.name, 2, news, 1.0, None), inbox)
     inbox.waiting.append({"play": True})
     while frames._stream is None:
         frames._look()
@@ -194,7 +191,7 @@ def test_two_streams_by_network_are_the_rows_of_the_record(is_late_to_look):
     lgs, ngs = Publisher(context), Publisher(context)
     ring, inbox, news = Ring(2), Inbox(), queue.Queue()
     source = StreamSource(lgs.address, (0, 1), 1.0, 1e-3, ngs.address, NgsWiring((0, 1), 1.0, 5, 0, stuck=60.0))
-    frames = StreamFrames(source, Desk(ring.name, 2, inbox, news, 1.0, None))
+    frames = StreamFrames(source, Desk(ring.name, 2, news, 1.0, None), inbox)
     while frames._stream is None:
         frames._look()
     lgs.heard_by(frames._stream)
@@ -237,7 +234,7 @@ def test_two_streams_are_the_rows_of_the_record(tmp_path, lag, jitter):
     ring, inbox, news = Ring(2), Inbox(), queue.Queue()
     source = StreamSource(lgs.path, (0, 1), 1.0, 1e-3, ngs.path, NgsWiring((0, 1), 1.0, 5, lag))
     assert source.sampling.ratio == 5 and "multirate-multi" in observers_on(source, paper())
-    frames = StreamFrames(source, Desk(ring.name, 2, inbox, news, 1.0, None))
+    frames = StreamFrames(source, Desk(ring.name, 2, news, 1.0, None), inbox)
     frames._look()
     inbox.waiting.append({"play": True})
     frames._follow_commands()
@@ -268,7 +265,7 @@ def test_a_gap_ends_with_the_last_frame_that_was_asked_for(tmp_path):
     """Else more would have been delivered than that, and fewer than none lost."""
     stream = SharedImage.create(tmp_path / "lgs.im.shm", (2,), dtype="float64")
     ring, inbox = Ring(2), Inbox()
-    frames = StreamFrames(StreamSource(stream.path, (0, 1), 1.0, 1e-3), Desk(ring.name, 2, inbox, queue.Queue(), 1.0, 5))
+    frames = StreamFrames(StreamSource(stream.path, (0, 1), 1.0, 1e-3), Desk(ring.name, 2, queue.Queue(), 1.0, 5), inbox)
     frames._look()
     inbox.waiting.append({"play": True})
     frames._follow_commands()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from wfsobs.signal.gate import RUN, GateSettings
-from wfsobs.streams.attach import SafeGate
+from wfsobs.streams.follower import SafeGate
 from wfsobs.streams.wiring import Safety, Watchdog, Wiring
 
 NONE = np.full(2, np.nan)

@@ -378,7 +378,9 @@ def _outcome(
                 stepper = controller.assemble(laws, prior, plan.plant, settings, measured.sampling)
                 acting = stepper if supervision is None else SupervisedController(stepper, supervision)
                 true = plan.true or full_plant_of(plan.scenario)
-                u, correction = drive(acting, measured, true, _plant_generator(plan.scenario), alone)
+                # the same for every controller, none of the random numbers of the record
+                rng = np.random.default_rng(plan.scenario.run.seed).spawn(3)[2]
+                u, correction = drive(acting, measured, true, rng, alone)
                 if isinstance(acting, SupervisedController):
                     alarms = tuple((frame * record.dt, reason) for frame, reason in acting.alarms)
     except (Cancelled, MemoryError):
@@ -400,8 +402,3 @@ def _outcome(
         alarms=alarms,
         own_from=learns * record.dt,
     )
-
-
-def _plant_generator(scenario: Scenario) -> np.random.Generator:
-    """Return the generator of the plant's random numbers: the same for every controller, none of those of the record."""
-    return np.random.default_rng(scenario.run.seed).spawn(3)[2]

@@ -62,10 +62,10 @@ def margins(T: Response, omega: Array, dt: float) -> Margins:
     at_unit = T(unit)
     lag = np.angle(-at_unit / (1.0 - at_unit)) % (2.0 * np.pi)  # to -1 by turning clockwise, as a delay does
     return Margins(
-        _least(factors[(factors > 1.0) & np.isfinite(factors)]),
+        min(factors[(factors > 1.0) & np.isfinite(factors)].tolist(), default=None),
         max(factors[(factors >= 0.0) & (factors < 1.0)].tolist(), default=None),
-        _least(np.minimum(lag, 2.0 * np.pi - lag)),
-        _least(lag / unit * dt),
+        min(np.minimum(lag, 2.0 * np.pi - lag).tolist(), default=None),
+        min((lag / unit * dt).tolist(), default=None),
         disk_margin(T, omega),
     )
 
@@ -81,10 +81,6 @@ def disk_margin(T: Response, omega: Array) -> float:
     ends = omega[max(i - 1, 0)], omega[min(i + 1, omega.size - 1)]
     found = minimize_scalar(lambda w: -abs(T(np.array([w]))[0] - 0.5), bounds=ends, method="bounded", options={"xatol": 1e-12})
     return 1.0 / max(float(size[i]), -float(found.fun))
-
-
-def _least(x: Array) -> float | None:
-    return float(x.min()) if x.size else None
 
 
 def crossings(f: Callable[[Array], Array], x: Array, values: Array) -> Array:

@@ -42,13 +42,8 @@ class Mirror:
     @property
     def taps(self) -> Array:
         """Weights of u[k], u[k-1], ... in y[k]; the first is 0, their sum 1."""
-        n = int(self.delay)
-        f = self.delay - n
-        out = np.zeros(n + 2 if f > 0 else n + 1)
-        out[n] = 1.0 - f
-        if f > 0:
-            out[n + 1] = f
-        return out
+        f = self.delay % 1.0
+        return np.array([0.0] * int(self.delay) + ([1.0 - f, f] if f else [1.0]))
 
     @property
     def has_limits(self) -> bool:

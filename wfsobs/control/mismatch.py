@@ -26,6 +26,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import pi
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
@@ -135,14 +136,14 @@ class SensorSpectra:
     """What the measurements of one mode hold, evenly spaced from 0 to half the rate, (n,) [um^2 per sample].
 
     disturbance, measurement : of phi_dist, and of z;  cross : between phi_dist[k] and z[k + 1]
-    ngs : (of the signal s of the NGS, between s[k] and z[k + 1], between phi_dist[k] and s[k]); None without
+    ngs : (of the signal s of the NGS, between s[k] and z[k + 1], between phi_dist[k] and s[k]), each (n,) or (1,)
     ngs_noise : variance of a frame [um^2]
     """
 
     disturbance: Array
     measurement: Array
     cross: Complex | Array
-    ngs: tuple[Array, Complex | Array, Complex | Array] | None = None
+    ngs: tuple[Array, Complex | Array, Complex | Array] = (np.zeros(1), np.zeros(1), np.zeros(1))
     ngs_noise: float = 0.0
 
 
@@ -162,7 +163,6 @@ class Loops:
     K (modes, n, c, c) : from z to -u;  ngs (modes, n, c) : from an NGS frame to -u
     """
 
-    laws: tuple[Law, ...]
     nominal: Mirror
     omega: Array
     K: Complex
@@ -220,26 +220,28 @@ class Loops:
                 density = w.measurement * (np.abs(lgs) ** 2).sum(axis=-2)
                 if i == j:
                     density = density + w.disturbance - 2.0 * (np.einsum("...mm->...m", lgs) * np.conj(w.cross)).real
-                if w.ngs is not None:
-                    signal, shared, truth = w.ngs
-                    power = (np.abs(slow) ** 2).sum(axis=-1)
-                    density = density + power[..., None] * (np.abs(self.exposure) ** 2 * signal + w.ngs_noise[..., None])
-                    mixed = np.einsum("...ml,...m->...l", lgs, np.conj(slow))
-                    density = density + 2.0 * (mixed * np.conj(step * self.exposure * shared)).real
-                    if i == j:
-                        density = density - 2.0 * (slow * step * self.exposure * np.conj(truth)).real
+                power = (np.abs(slow) ** 2).sum(axis=-1)
+                density = density + power[..., None] * (np.abs(self.exposure) ** 2 * w.signal + w.ngs_noise[..., None])
+                mixed = np.einsum("...ml,...m->...l", lgs, np.conj(slow))
+                density = density + 2.0 * (mixed * np.conj(step * self.exposure * w.to_next)).real
+                if i == j:
+                    density = density - 2.0 * (slow * step * self.exposure * np.conj(w.to_truth)).real
                 out[..., i] += density.sum(axis=(-1, -2))
         return out
 
 
-@dataclass(frozen=True)
-class Weights:
-    """`SensorSpectra` as sums over the frequencies of loops and their images, (..., n, c); all else is straight between these."""
+class Weights(NamedTuple):
+    """`SensorSpectra` as sums over the frequencies of loops and their images, (..., n, c); all else is straight between these.
+
+    signal, to_next, to_truth : `ngs` of these spectra
+    """
 
     disturbance: Array
     measurement: Array
     cross: Complex
-    ngs: tuple[Array, Complex, Complex] | None
+    signal: Array
+    to_next: Complex
+    to_truth: Complex
     ngs_noise: Array
 
 
@@ -253,8 +255,8 @@ def loops(laws: Sequence[Law], nominal: Mirror, is_coarse: bool = False) -> Loop
 
 def loops_at(laws: Sequence[Law], nominal: Mirror, omega: Array) -> Loops:
     """Return the loops at these frequencies [rad per step]."""
-    found = [_images_of(law, omega) for law in laws]
-    return Loops(tuple(laws), nominal, omega, np.array([K for K, _ in found]), np.array([N for _, N in found]))
+    K, ngs = zip(*(_images_of(law, omega) for law in laws), strict=True)
+    return Loops(nominal, omega, np.array(K), np.array(ngs))
 
 
 def _images_of(law: Law, omega: Array) -> tuple[Complex, Complex]:
@@ -302,27 +304,22 @@ def weigh(spectra: SensorSpectra, of: Loops) -> Weights:
         real, imaginary = np.broadcast_to(np.real(x), n), np.broadcast_to(np.imag(x), n)
         return np.asarray(total(real) + 1j * total(np.where(turned, -imaginary, imaginary)), dtype=complex)
 
-    ngs = None if spectra.ngs is None else (both(spectra.ngs[0]), both(spectra.ngs[1]), both(spectra.ngs[2]))
+    signal, to_next, to_truth = map(both, spectra.ngs)
     even = np.convolve(np.diff(grid), [0.5, 0.5]) / (grid[-1] - grid[0])
     return Weights(
         total(spectra.disturbance),
         total(spectra.measurement),
         both(spectra.cross),
-        ngs and (ngs[0].real, ngs[1], ngs[2]),
+        signal.real,
+        to_next,
+        to_truth,
         spectra.ngs_noise * even / c,
     )
 
 
 def stack_weights(weights: Sequence[Weights]) -> Weights:
     """Return the weights of a mode in several plants as one, with the plants first."""
-    ngs = [w.ngs for w in weights if w.ngs is not None]
-    return Weights(
-        np.array([w.disturbance for w in weights]),
-        np.array([w.measurement for w in weights]),
-        np.array([w.cross for w in weights]),
-        (np.array([x[0] for x in ngs]), np.array([x[1] for x in ngs]), np.array([x[2] for x in ngs])) if ngs else None,
-        np.array([w.ngs_noise for w in weights]),
-    )
+    return Weights(*map(np.array, zip(*weights, strict=True)))
 
 
 def one_loop(laws: Sequence[Law], nominal: Mirror, plant: TruePlant, columns: Sequence[int], mode: int) -> Response:

@@ -92,10 +92,10 @@ class KalmanLaws(StepLaw):
     state_names: tuple[str, ...] = ("filters",)
 
     def __init__(self, laws: Sequence[Law]):
-        self.laws, known = tuple(laws), [law for law in laws if law.filter is not None and law.row is not None]
-        self.filters: KalmanEstimator = KalmanEstimator([law.filter for law in known if law.filter is not None])
+        self.laws = tuple(laws)
+        self.filters: KalmanEstimator = KalmanEstimator([law.filter for law in laws if law.filter is not None])
         self._rows = np.zeros_like(self.filters.bank.x)
-        for row, law in zip(self._rows, known, strict=True):
+        for row, law in zip(self._rows, laws, strict=True):
             assert law.row is not None
             row[: len(law.row)] = law.row
         self.mark_start()
@@ -142,7 +142,21 @@ class Integrators(StepLaw):
         self._own[0] += difference
 
 
-class MixedLaws(StepLaw):
+class BesideIntegrators(StepLaw):
+    """Laws beside which integrators run, which a limit of the mirror stops."""
+
+    integrators: Integrators
+
+    def tell(self, command: Array, forward: Array) -> None:
+        """Have the integrators go on from what the mirror took."""
+        self.integrators.tell(command, forward)
+
+    def amend(self, difference: Array) -> None:
+        """Go on from a command that differs by this from the one told last."""
+        self.integrators.amend(difference)
+
+
+class MixedLaws(BesideIntegrators):
     """Integrators in some modes, which a limit of the mirror stops, and filters of z in the others."""
 
     state_names: tuple[str, ...] = ("filters", "integrators")
@@ -158,14 +172,6 @@ class MixedLaws(StepLaw):
         of_filters = self.filters.command(z, ngs, forward)
         return np.where(self._integrates, self.integrators.command(z, ngs, forward), of_filters)
 
-    def tell(self, command: Array, forward: Array) -> None:
-        """Have the integrators go on from what the mirror took."""
-        self.integrators.tell(command, forward)
-
-    def amend(self, difference: Array) -> None:
-        """Go on from a command that differs by this from the one told last."""
-        self.integrators.amend(difference)
-
     def take_over(self, old: Any) -> None:
         """Go on from laws of the same kinds."""
         if not isinstance(old, MixedLaws) or not np.array_equal(old._integrates, self._integrates):
@@ -174,7 +180,7 @@ class MixedLaws(StepLaw):
         self.integrators.take_over(old.integrators)
 
 
-class PredictionLaws(StepLaw):
+class PredictionLaws(BesideIntegrators):
     """Minus what an observer predicts that needs time until it does; until then integrators."""
 
     state_names: tuple[str, ...] = ("estimator", "integrators")
@@ -189,14 +195,6 @@ class PredictionLaws(StepLaw):
         self.estimator.advance(np.round(z, DECIMALS), None if ngs is None else np.round(ngs, DECIMALS), None)
         ahead = sum((tap * self.estimator.predict(k, target)[0] for k, tap in self._taps for target in TARGETS), -forward)
         return np.where(np.isnan(ahead), self.integrators.command(z, ngs, forward), -ahead)
-
-    def tell(self, command: Array, forward: Array) -> None:
-        """Have the integrators go on from what the mirror took."""
-        self.integrators.tell(command, forward)
-
-    def amend(self, difference: Array) -> None:
-        """Go on from a command that differs by this from the one told last."""
-        self.integrators.amend(difference)
 
     def take_over(self, old: Any) -> None:
         """Go on from what the old observer knows."""

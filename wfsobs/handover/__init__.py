@@ -20,6 +20,7 @@ residual of the loop, so that the commands which the pseudo-open-loop measuremen
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -212,16 +213,9 @@ class _Tables:
         return self._names[key]
 
     def step(self, gain: Gain) -> str:
-        """Return the initialiser of a step: sparse A, then rows of C and columns of L."""
-        second = len(gain.C) > 1
-        parts = [
-            *self.sparse("real", gain.A),
-            self.numbers("real", gain.C[0]),
-            self.numbers("real", gain.L[:, 0]),
-            self.numbers("real", gain.C[1]) if second else "0",
-            self.numbers("real", gain.L[:, 1]) if second else "0",
-        ]
-        return "{" + ", ".join(parts) + "}"
+        """Return the initialiser of a step: sparse A, then a row of C and a column of L for each of two sensors."""
+        dense = (self.numbers("real", x) for pair in zip(gain.C, gain.L.T, strict=True) for x in pair)
+        return _initialiser(*self.sparse("real", gain.A), *dense, *("0", "0") * (2 - len(gain.C)))
 
     def sparse(self, kind: str, A: Array) -> list[str]:
         """Return the names of the non-zero elements of a matrix row by row, their columns, and where each row starts."""
@@ -233,83 +227,66 @@ class _Tables:
     def gap_step(self, step: Step, posterior: Array) -> str:
         """Return the initialiser of a step near a gap: sparse A and Q, C, the variances of the noise, the steady covariance."""
         A, C, Q, R = step
-        dense = (C, np.diag(R), posterior)
-        return (
-            "{"
-            + ", ".join([*self.sparse("double", A), *self.sparse("double", Q), *(self.numbers("double", x) for x in dense)])
-            + "}"
-        )
+        dense = (self.numbers("double", x) for x in (C, np.diag(R), posterior))
+        return _initialiser(*self.sparse("double", A), *self.sparse("double", Q), *dense)
 
     def gaps(self, gaps: GapGains | None, name: str) -> str:
         """Return the initialiser of the gains near gaps, with their covariance."""
         if gaps is None:
-            return "{0, 0, 0, 0, 0, 0}"
-        steps = ", ".join(map(self.gap_step, gaps.cycle, gaps.posteriors))
-        n = len(gaps.weights)
-        self.lines.append(f"static const struct gap_step {name}_steps[] = {{{steps}}};")
-        counts, first = f"{len(gaps.cycle)}, {len(gaps.cycle[0][1])}", self.n_covariances
-        self.n_covariances += n * n
-        return f"{{{counts}, {name}_steps, {self.numbers('double', gaps.weights)}, {gaps.most!r}, {first}}}"
+            return _initialiser(*[0] * 6)
+        steps = _initialiser(*map(self.gap_step, gaps.cycle, gaps.posteriors))
+        self.lines.append(f"static const struct gap_step {name}_steps[] = {steps};")
+        weights, first = self.numbers("double", gaps.weights), self.n_covariances
+        self.n_covariances += len(gaps.weights) ** 2
+        return _initialiser(len(gaps.cycle), len(gaps.cycle[0][1]), f"{name}_steps", weights, repr(gaps.most), first)
 
     def filter(self, gains: GainCycle | None, name: str) -> str:
         """Return the initialiser of a filter, its state behind those before it."""
         if gains is None:
-            return "{0, 0, 0, 0, 0}"
-        steps = ([] if gains.first is None else [gains.first]) + list(gains.steps)
-        n = len(steps[0].A)
-        self.lines.append(f"static const struct step {name}_steps[] = {{{', '.join(map(self.step, steps))}}};")
-        first, self.n_states, self.most = self.n_states, self.n_states + n, max(self.most, n)
-        return f"{{{n}, {len(steps)}, {int(gains.first is not None)}, {name}_steps, {first}}}"
+            return _initialiser(*[0] * 5)
+        steps = [*filter(None, [gains.first]), *gains.steps]
+        n, first = len(steps[0].A), self.n_states
+        self.lines.append(f"static const struct step {name}_steps[] = {_initialiser(*map(self.step, steps))};")
+        self.n_states, self.most = first + n, max(self.most, n)
+        return _initialiser(n, len(steps), int(gains.first is not None), f"{name}_steps", first)
 
 
-GATE_NUMBERS = (
-    "ORDER",
-    "BLOCK",
-    "RUN",
-    "OPEN",
-    "FORGET",
-    "LASTING",
-    "EARLY",
-    "EARLIEST",
-    "MEDIAN",
-    "RIDGE",
-    "FIRST",
-    "PACE",
-    "USUAL",
-    "RAREST",
-    "START",
-)
-"""Numbers of the gate that its source has."""
+def _initialiser(*parts: object) -> str:
+    return f"{{{', '.join(map(str, parts))}}}"
 
 
 def source(design: LinearDesign, gate_settings: GateSettings) -> Mapping[str, str]:
-    """Return the text files of the design by name."""
+    """Return the text files of the design by name: templates in which @NAME@ is a word of below, or a number of the gate."""
     tables, modes = _Tables(), []
     for i, mode in enumerate(design.modes):
-        parts = [
+        parts = (
             tables.filter(mode.gains, f"u{i}"),
             tables.filter(mode.lgs, f"z{i}"),
             tables.filter(mode.ngs if design.ratio else None, f"s{i}"),
             tables.gaps(mode.gaps, f"g{i}"),
             tables.numbers("real", mode.row),
-        ]
-        modes.append("{" + ", ".join(parts) + "}")
-    words = {
-        "@CONVENTIONS@": "\n".join(f"   {line}" for line in design.conventions(True)),
-        "@TEXT@": "\n".join(design.conventions(True)),
-        "@MODES@": str(len(modes)),
-        "@RATIO@": str(design.ratio),
-        "@X@": str(tables.n_states),
-        "@P@": str(max(tables.n_covariances, 1)),
-        "@STATES@": str(tables.most),
-        "@PRODUCT@": str(tables.most**2 if tables.n_covariances else 1),
-        "@TABLES@": "\n".join(tables.lines),
-        "@FILTERS@": ",\n    ".join(modes),
-        "@LEVEL@": repr(float(gate_settings.level)),
-        "@MEMORY@": repr(1.0 - 1.0 / gate.MEMORY),
-        **{f"@{name}@": repr(getattr(gate, name)) for name in GATE_NUMBERS},
+        )
+        modes.append(_initialiser(*parts))
+    lines = design.conventions(True)
+    words: dict[str, object] = {
+        "CONVENTIONS": "\n".join(f"   {line}" for line in lines),
+        "TEXT": "\n".join(lines),
+        "MODES": len(modes),
+        "RATIO": design.ratio,
+        "X": tables.n_states,
+        "P": max(tables.n_covariances, 1),
+        "STATES": tables.most,
+        "PRODUCT": tables.most**2 if tables.n_covariances else 1,
+        "TABLES": "\n".join(tables.lines),
+        "FILTERS": ",\n    ".join(modes),
+        "LEVEL": float(gate_settings.level),
+        "MEMORY": 1.0 - 1.0 / gate.MEMORY,
     }
-    return {name: _fill((TEMPLATES / name).read_text(encoding="utf-8"), words) for name in TEXTS}
+
+    def word(place: re.Match[str]) -> str:
+        return str(words[place[1]] if place[1] in words else getattr(gate, place[1]))
+
+    return {name: re.sub("@([A-Z]+)@", word, (TEMPLATES / name).read_text(encoding="utf-8")) for name in TEXTS}
 
 
 TEXTS: Sequence[str] = (
@@ -321,12 +298,6 @@ TEXTS: Sequence[str] = (
     "Makefile",
     "README.txt",
 )
-
-
-def _fill(text: str, words: Mapping[str, str]) -> str:
-    for word, value in words.items():
-        text = text.replace(word, value)
-    return text
 
 
 def write_c99(path: str | Path, design: LinearDesign, vectors: Vectors, gate_settings: GateSettings) -> None:
@@ -374,7 +345,11 @@ def arrays(design: LinearDesign) -> dict[str, Array]:
 
 def write_npz(path: str | Path, design: LinearDesign) -> None:
     """Write the arrays to an NPZ file. Raises OSError."""
-    write_whole(path, lambda file: np.savez_compressed(file, allow_pickle=False, **arrays(design)))
+    _write_arrays(path, arrays(design))
+
+
+def _write_arrays(path: str | Path, values: Mapping[str, Array]) -> None:
+    write_whole(path, lambda file: np.savez_compressed(file, allow_pickle=False, **values))
 
 
 def write_mat(path: str | Path, design: LinearDesign) -> None:
@@ -399,6 +374,12 @@ def state_space(design: LinearDesign) -> tuple[Array, Array, Array, Array]:
     modes = [mode.gains.filter(mode.row[None]).steps[0] for mode in design.modes]
     A, B, C, D = (block_diag(*parts) for parts in zip(*modes, strict=True))
     return A, B, C, D
+
+
+def _history(design: LinearDesign) -> tuple[Array, Array, Array]:
+    """Return of the last commands of all modes: what the mirror does by them, how they grow older, and where the newest goes."""
+    m, q = len(design.modes), len(design.taps) - 1
+    return np.kron(design.taps[None, 1:], np.eye(m)), np.eye(m * q, k=-m), np.eye(m * q, m)
 
 
 MODULE = '''"""{conventions}
@@ -436,13 +417,10 @@ def closed_system(design: LinearDesign) -> tuple[Array, Array, Array, Array]:
     controller that changes from step to step.
     """
     A, B, C, D = state_space(design)
-    m, q = len(C), len(design.taps) - 1
-    taken = np.kron(design.taps[None, 1:], np.eye(m))  # what the mirror did of y, out of the history
-    keep = np.eye(m * q, k=-m)
-    to_u, new = np.hstack([C, -D @ taken]), np.eye(m * q, m)
-    above = np.hstack([A, -B @ taken])
-    below = np.hstack([np.zeros((m * q, len(A))), keep]) + new @ to_u
-    return np.vstack([above, below]), np.vstack([B, new @ D]), to_u, D
+    taken, keep, new = _history(design)
+    to_u = np.hstack([C, -D @ taken])
+    below = np.pad(keep, ((0, 0), (len(A), 0))) + new @ to_u
+    return np.vstack([np.hstack([A, -B @ taken]), below]), np.vstack([B, new @ D]), to_u, D
 
 
 def estimator_system(design: LinearDesign) -> tuple[Array, Array, Array]:
@@ -454,13 +432,10 @@ def estimator_system(design: LinearDesign) -> tuple[Array, Array, Array]:
     steps = [mode.gains.estimator().steps[0] for mode in design.modes]
     F, L = (block_diag(*(step[i] for step in steps)) for i in (0, 1))
     row = block_diag(*(mode.row[None] for mode in design.modes))
-    m, q = len(row), len(design.taps) - 1
-    taken = np.kron(design.taps[None, 1:], np.eye(m))
+    taken, keep, new = _history(design)
     estimate = np.hstack([F, -L @ taken])
-    keep = np.hstack([np.zeros((m * q, len(F))), np.eye(m * q, k=-m)])
-    new = np.eye(m * q, m)
-    A = np.vstack([estimate, keep + new @ row @ estimate])
-    return A, np.vstack([L, new @ row @ L]), np.hstack([row, np.zeros((m, m * q))])
+    A = np.vstack([estimate, np.pad(keep, ((0, 0), (len(F), 0))) + new @ row @ estimate])
+    return A, np.vstack([L, new @ row @ L]), np.pad(row, ((0, 0), (0, len(keep))))
 
 
 def conventions(design: LinearDesign, lines: tuple[str, ...]) -> list[str]:
@@ -505,18 +480,16 @@ def write_specula(path: str | Path, design: LinearDesign) -> None:
 def write_compass(path: str | Path, design: LinearDesign) -> None:
     """Write the matrices of COMPASS's `generic_linear` to an NPZ file. Raises StepError, OSError."""
     A, L, K = estimator_system(design)
-    text = np.array("\n".join(conventions(design, COMPASS)))
-    values = {"A": A, "L": L, "K": K, "F": np.eye(len(K))}
-    matrices = {name: np.asarray(x, np.float32) for name, x in values.items()}
-    write_whole(path, lambda file: np.savez_compressed(file, allow_pickle=False, conventions=text, **matrices))
+    matrices = {name: np.asarray(x, np.float32) for name, x in {"A": A, "L": L, "K": K, "F": np.eye(len(K))}.items()}
+    _write_arrays(path, {"conventions": np.array("\n".join(conventions(design, COMPASS))), **matrices})
 
-
-FORMATS = ("c99", "compass", "control", "mat", "npz", "specula")
-"""What a design can be written as."""
 
 ARRAYS = {"compass": write_compass, "control": write_control, "mat": write_mat, "npz": write_npz, "specula": write_specula}
 ENDINGS = {"compass": ".npz", "control": ".py", "mat": ".mat", "npz": ".npz", "specula": ".fits"}
 """Of the files that these write."""
+
+FORMATS = ("c99", *ARRAYS)
+"""What a design can be written as."""
 
 
 def write_design(name: str, scenario: Scenario, form: str, path: str | Path) -> None:

@@ -7,13 +7,14 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import inf
+from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext
 from time import monotonic, sleep
 
 import numpy as np
 
 from wfsobs.live.ring import Ring
-from wfsobs.live.source import SOURCE, STREAM, Desk, Staff, enter_process, receive
+from wfsobs.live.source import SOURCE, STREAM, Desk, Worker, enter_process, receive
 from wfsobs.record import Sampling
 from wfsobs.signal.gate import GateSettings, OutlierGate, frame_mean_of
 from wfsobs.streams.follower import LONGEST_GAP
@@ -138,15 +139,15 @@ class StreamSource:
         """Modes and step, and NGS ratio where there is one."""
         return Sampling(len(self.elements), self.dt, None if self.ngs is None else self.ngs.ratio)
 
-    def staff(self, context: SpawnContext, desk: Desk) -> Staff:
-        """Return its process."""
-        return Staff(context.Process(target=_send, args=(self, desk), name="the source", daemon=True))
+    def staff(self, context: SpawnContext, desk: Desk) -> list[Worker]:
+        """Begin its process."""
+        return [Worker(context, "the source", _send, self, desk)]
 
 
-def _send(source: StreamSource, desk: Desk) -> None:
+def _send(source: StreamSource, desk: Desk, inbox: Connection) -> None:
     enter_process(turn=SOURCE)
     gc.freeze()
-    StreamFrames(source, desk).run()
+    StreamFrames(source, desk, inbox).run()
 
 
 class StreamFrames:
@@ -157,11 +158,13 @@ class StreamFrames:
     source : StreamSource
         The stream.
     desk : Desk
-        Where the ring is, and the commands.
+        Where the ring is.
+    inbox : Connection
+        Commands.
     """
 
-    def __init__(self, source: StreamSource, desk: Desk):
-        self._source, self._desk, self._elements = source, desk, np.array(source.elements)
+    def __init__(self, source: StreamSource, desk: Desk, inbox: Connection):
+        self._source, self._desk, self._inbox, self._elements = source, desk, inbox, np.array(source.elements)
         self._ring = Ring(desk.n_modes, desk.ring_name)
         self._nothing = np.full(desk.n_modes, np.nan)
         self._row = np.full(1 + 5 * desk.n_modes, np.nan)
@@ -257,8 +260,8 @@ class StreamFrames:
             gate.reset()
 
     def _follow_commands(self) -> None:
-        while self._desk.inbox.poll():
-            command = receive(self._desk.inbox)
+        while self._inbox.poll():
+            command = receive(self._inbox)
             was_playing = self._is_playing
             self._is_playing = command.get("play", self._is_playing)
             self._steps += command.get("step", 0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from threading import Lock
 from time import monotonic
@@ -55,26 +55,25 @@ class Counts(NamedTuple):
 
     squares, samples : sums of squared errors [um^2] and their numbers, (4, n_modes) for turbulence, vibration, the next
         measurement, and turbulence and vibration together
-    latencies : histogram of its steps
+    histogram : of the latencies of its steps, as `Latencies` counts them
     late, frames, since : steps longer than a frame, steps, first frame, (1,); `since` is -1 while it is off
     """
 
     squares: Array
     samples: Integers
-    latencies: Latencies
+    histogram: Integers
     late: Integers
     frames: Integers
     since: Integers
 
-    def copy(self) -> Counts:
-        """Return a copy in memory of its own."""
-        latencies = Latencies(self.latencies.counts.copy())
-        return Counts(self.squares.copy(), self.samples.copy(), latencies, *(part.copy() for part in self[3:]))
+    @property
+    def latencies(self) -> Latencies:
+        """Latencies of its steps."""
+        return Latencies(self.histogram)
 
     def clear(self) -> None:
-        """Begin anew."""
-        self.latencies.clear()
-        for part in (self.squares, self.samples, self.late, self.frames):
+        """Begin anew; `since` stays."""
+        for part in self[:-1]:
             part[:] = 0
 
     def rms(self, quantity: str) -> Array:
@@ -105,40 +104,41 @@ class Board(SharedNumbers):
     ----------
     losses, is_ready, progress : Integers
         Of the crews: frames lost, whether the observers are ready, and the number of the first frame not counted, (len(CREWS),).
-    squares, samples, histograms, late, frames : array
+    squares, samples, histogram, late, frames : array
         As in `Counts`, of all observers, in the order of SLOTS.
     """
 
-    losses: Array
-    is_ready: Array
-    progress: Array
+    losses: Integers
+    is_ready: Integers
+    progress: Integers
     squares: Array
-    samples: Array
-    histograms: Array
-    late: Array
-    frames: Array
+    samples: Integers
+    histogram: Integers
+    late: Integers
+    frames: Integers
 
     def __init__(self, n_modes: int, name: str | None = None):
-        n, scored, bins = len(SLOTS), len(SCORED) * n_modes, len(EDGES) + 1
-        size = 3 * len(CREWS) + n * (2 * scored + bins + 3)
-        super().__init__(8 * size, name)
-        whole = np.ndarray(size, dtype=np.int64, buffer=self._memory.buf)
-        self.losses, self.is_ready, self.progress = whole[: 3 * len(CREWS)].reshape(3, -1)
-        slots, shape = whole[3 * len(CREWS) :].reshape(n, -1), (n, len(SCORED), n_modes)
-        self.squares, self.samples = (
-            slots[:, :scored].view(np.float64).reshape(shape),
-            slots[:, scored : 2 * scored].reshape(shape),
+        n, scored, whole = len(SLOTS), (len(SLOTS), len(SCORED), n_modes), np.int64
+        kind = np.dtype(
+            [
+                *((part, whole, len(CREWS)) for part in ("losses", "is_ready", "progress")),
+                ("squares", np.float64, scored),
+                ("samples", whole, scored),
+                ("histogram", whole, (n, len(EDGES) + 1)),
+                *((part, whole, (n, 1)) for part in ("late", "frames", "since")),
+            ]
         )
-        self.histograms = slots[:, 2 * scored : -3]
-        self.late, self.frames, self._since = slots[:, -3:].T
-        self._counts = {slot: self._counts_in(i) for i, slot in enumerate(SLOTS)}
+        super().__init__(kind.itemsize, name)
+        self._look_at(np.ndarray((), kind, self._memory.buf))
         if self._owner:
             self._since[:] = -1
 
-    def _counts_in(self, slot: int) -> Counts:
-        own = slice(slot, slot + 1)
-        counts = self.late[own], self.frames[own], self._since[own]
-        return Counts(self.squares[slot], self.samples[slot], Latencies(self.histograms[slot]), *counts)
+    def _look_at(self, parts: NDArray[np.void]) -> None:
+        self._parts = parts
+        self.losses, self.is_ready, self.progress = parts["losses"], parts["is_ready"], parts["progress"]
+        of_slots = [parts[name] for name in Counts._fields]
+        self.squares, self.samples, self.histogram, self.late, self.frames, self._since = of_slots
+        self._counts = {slot: Counts(*(part[i] for part in of_slots)) for i, slot in enumerate(SLOTS)}
 
     def __getitem__(self, observer: str) -> Counts:
         return self._counts[observer]
@@ -149,9 +149,7 @@ class Board(SharedNumbers):
 
     def release(self) -> None:
         """Give the memory back; the counts stay as they are."""
-        self._counts = {name: counts.copy() for name, counts in self._counts.items()}
-        self.losses, self.is_ready, self.progress = self.losses.copy(), self.is_ready.copy(), self.progress.copy()
-        self.squares = self.samples = self.histograms = self.late = self.frames = self._since = np.empty(0, dtype=np.int64)
+        self._look_at(self._parts.copy())
         super().release()
 
 
@@ -167,20 +165,18 @@ class Delivery:
         The frames.
     board : Board
         Where the crews count what they lose.
-    traces : callable
-        Returns the rows of the crews that take part.
-    count : callable
-        Returns the number of the first frame that one of them has not counted.
+    parts : callable
+        Returns the rows of the crews that take part, by their places in CREWS.
     """
 
-    def __init__(self, ring: Ring, board: Board, traces: Callable[[], list[Rows]], count: Callable[[], int]):
-        self._ring, self._board, self._traces, self._count, self._lock = ring, board, traces, count, Lock()
+    def __init__(self, ring: Ring, board: Board, parts: Callable[[], Mapping[int, Rows]]):
+        self._ring, self._board, self._parts, self._lock = ring, board, parts, Lock()
         self._next = self._n_delays = self._n_late = 0
 
     @property
     def count(self) -> int:
         """Frames that every observer has taken, or lost."""
-        return self._count()
+        return min(int(self._board.progress[place]) for place in self._parts())
 
     @property
     def losses(self) -> int:
@@ -206,7 +202,7 @@ class Delivery:
         """Count what has come since the last call; rows that have been overwritten meanwhile are not known."""
         with self._lock:
             stop = self.count
-            delays = merged_rows(self._traces(), self._next, stop, 2)[:, 1]
+            delays = merged_rows(self._parts().values(), self._next, stop, 2)[:, 1]
             self._next = stop
             self._n_delays += int((~np.isnan(delays)).sum())
             self._n_late += int((delays > LATE).sum())
@@ -255,32 +251,23 @@ class LiveView:
         """Number of modes."""
         return self.frames.z.shape[1]
 
-    @property
-    def delays(self) -> Array:
-        """Time from when a frame was due to when every observer had an estimate of it, (n,) [s]."""
-        return self._traces[:, 1]
-
     def truth(self, target: str) -> Array:
         """Return the truth of a target or of both together, (n, n_modes) [um]; of the next measurement, the measurements."""
         if target == TOTAL:
             return self.frames.turbulence + self.frames.vibration
         return self.frames.z if target == NEXT else getattr(self.frames, target)
 
-    def steps(self, observer: str) -> Array:
-        """Return the times of an observer's steps, (n,) [s]; NaN while it is off."""
-        return self._of(observer)[:, 0]
-
     def estimate(self, observer: str, target: str) -> Array:
         """Return what an observer has estimated of a target or of both together, (n, n_modes) [um]; NaN where nothing."""
         own, m = self._of(observer), self.n_modes
         if target == TOTAL:
             return own[:, 1 : 1 + m] + own[:, 1 + m : 1 + 2 * m]
-        if target != NEXT:
-            at = 1 + TARGETS.index(target) * m
-            return own[:, at : at + m]
-        out = np.full((self.n, m), np.nan)
-        out[1:] = own[:-1, 1 : 1 + m] + own[:-1, 1 + m : 1 + 2 * m]
-        return out
+        if target == NEXT:
+            out = np.full((self.n, m), np.nan)
+            out[1:] = self.estimate(observer, TOTAL)[:-1]
+            return out
+        at = 1 + TARGETS.index(target) * m
+        return own[:, at : at + m]
 
     def error(self, observer: str, target: str) -> Array:
         """Return the error of an estimate, (n, n_modes) [um]."""

@@ -13,7 +13,7 @@ from wfsobs.live.board import ADAPTIVE, LONG_STEPS, SLOTS
 from wfsobs.live.crew import SEATS, Beside
 from wfsobs.live.source import STREAM, LiveSource
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import TARGETS, Observer
+from wfsobs.observers.base import TARGETS
 from wfsobs.observers.step import StepObserver
 from wfsobs.prior import Training
 from wfsobs.priors_from.controllers import full_plant_of, supervision_of
@@ -67,7 +67,7 @@ def can_run(observer: str, source: LiveSource, scenario: Scenario) -> bool:
     return (
         has_frames
         and has_prior(it, scenario, source.sampling.n_modes)
-        and (source.name != STREAM or not learns_beforehand(it, scenario))
+        and (source.name != STREAM or Training not in it.parts(observer_settings(it, scenario)))  # there is no record of it
     )
 
 
@@ -79,11 +79,6 @@ def has_error(observer: str, source: LiveSource) -> bool:
 def can_control(controller: str, source: LiveSource) -> bool:
     """Return whether a source has what a controller needs."""
     return source.sampling.ratio is not None or not CONTROLLERS[controller].ngs
-
-
-def learns_beforehand(observer: Observer, scenario: Scenario) -> bool:
-    """Return whether an observer is made from a training record."""
-    return Training in observer.parts(observer_settings(observer, scenario))
 
 
 def speed_of(text: str) -> float:

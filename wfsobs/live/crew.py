@@ -26,8 +26,7 @@ from wfsobs.record import Sampling, fuse_frames
 from wfsobs.streams.follower import EDGES
 from wfsobs.typing import Array
 
-D = TypeVar("D")
-M = TypeVar("M")
+D = TypeVar("D", StepObserver, "Beside")
 
 TRUTHS = (*TARGETS, NEXT, "ngs")
 """What errors are against: that of both targets together is the sum of theirs, that of the next measurement is from both."""
@@ -59,8 +58,8 @@ def warm_up_of(site: Site) -> int:
     return round(site.settings["run"]["warm_up"] / site.sampling.dt)
 
 
-class Crew(ABC, Generic[D, M]):
-    """What runs in one process: designs D, as the members M of the crew.
+class Crew(ABC, Generic[D]):
+    """What runs in one process, by id.
 
     Parameters
     ----------
@@ -76,7 +75,7 @@ class Crew(ABC, Generic[D, M]):
 
     def __init__(self, sampling: Sampling, warm_up: int, say: Callable[[LiveEvent], None]):
         self.ratio, self._warm_up, self._say = sampling.ratio or 1, warm_up, say
-        self._active: dict[str, M] = {}
+        self._active: dict[str, D] = {}
         self._waiting: dict[str, D] = {}
 
     def follow(self, command: Command, number: int) -> None:
@@ -84,18 +83,19 @@ class Crew(ABC, Generic[D, M]):
         name, design = command["id"], command["design"]
         if design is None:
             self._waiting.pop(name, None)
-            if (member := self._active.pop(name, None)) is not None:
-                self._clear(name, member)
+            if self._active.pop(name, None) is not None:
+                self._clear(name)
                 self._say(LiveEvent(number, "{} off", name))
-        elif (member := self._active.get(name)) is None:
+        elif (before := self._active.get(name)) is None:
             self._waiting[name] = design
         else:
             try:
-                self._swap(name, member, design)
+                design.take_over(before)
             except StepError as error:
                 self._waiting[name] = design
                 self._say(LiveEvent(number, "{} restarted", name, f": {error}"))
             else:
+                self._active[name] = design
                 self._say(LiveEvent(number, "{} has a new design", name))
 
     def _start_waiting(self, number: int) -> None:
@@ -111,43 +111,11 @@ class Crew(ABC, Generic[D, M]):
         """Let a design follow from a frame on."""
 
     @abstractmethod
-    def _swap(self, name: str, member: M, design: D) -> None:
-        """Have a design go on where a member is. Raises StepError."""
-
-    @abstractmethod
-    def _clear(self, name: str, member: M) -> None:
+    def _clear(self, name: str) -> None:
         """Clear what one had that is off."""
 
 
-class Follower:
-    """One observer on a source.
-
-    Parameters
-    ----------
-    observer : StepObserver
-        Before its first frame.
-    slot : int
-        Its place in SLOTS.
-    estimates : Array
-        Where its estimates go, (len(TARGETS), n_modes) [um].
-    """
-
-    observer: StepObserver
-    slot: int
-
-    def __init__(self, observer: StepObserver, slot: int, estimates: Array):
-        self.observer, self.slot = observer, slot
-        self._outs = [(target, estimates[TARGETS.index(target)]) for target in observer.targets]
-
-    def take(self, z: Array, ngs: Array | None, u: Array) -> None:
-        """Update and estimate; `u` goes to those alone that need it, and no NGS measurement to a first frame."""
-        observer = self.observer
-        observer.update(z, ngs if observer.frame else None, u if observer.estimator.needs_command else None)
-        for target, out in self._outs:
-            out[:] = observer.predict(0, target)[0]
-
-
-class ObserverCrew(Crew[StepObserver, Follower]):
+class ObserverCrew(Crew[StepObserver]):
     """The observers that follow in one process: each takes every frame, all are scored together.
 
     Parameters
@@ -182,10 +150,14 @@ class ObserverCrew(Crew[StepObserver, Follower]):
         self._start_waiting(number)
         ngs = None if np.isnan(frame.ngs[0]) else frame.ngs
         before = monotonic()
-        for follower in self._active.values():
-            follower.take(frame.z, ngs, frame.u)
+        for slot, observer in zip(self._running, self._active.values(), strict=True):
+            # u goes to those alone that need it, and no NGS measurement to a first frame
+            u = frame.u if observer.estimator.needs_command else None
+            observer.update(frame.z, ngs if observer.frame else None, u)
+            for target in observer.targets:
+                self._estimates[slot, TARGETS.index(target)] = observer.predict(0, target)[0]
             now = monotonic()
-            self._times[follower.slot], before = now - before, now
+            self._times[slot], before = now - before, now
         self._row[:2] = number, before - float(frame.due)
         self._rows[self._waits].reshape(-1)[:], truth = self._row[2:], self._truth[self._waits]
         truth[0], truth[1], truth[2], truth[3] = frame.turbulence, frame.vibration, frame.z, frame.ngs
@@ -194,8 +166,8 @@ class ObserverCrew(Crew[StepObserver, Follower]):
 
     def settle(self) -> None:
         """Have those learn that learn from every frame."""
-        for follower in self._active.values():
-            follower.observer.settle()
+        for observer in self._active.values():
+            observer.settle()
 
     def count(self) -> None:
         """Count latencies and squared errors of the frames that wait for it; what is NaN is not known.
@@ -210,8 +182,8 @@ class ObserverCrew(Crew[StepObserver, Follower]):
             return
         rows = self._rows[:n, running]
         spent, estimates = rows[:, :, 0], rows[:, :, 1:].reshape(n, len(running), len(TARGETS), -1)
-        np.add.at(board.histograms, (running, np.searchsorted(EDGES, spent)), 1)
-        board.late[running] += (spent > self._dt).sum(axis=0)
+        np.add.at(board.histogram, (running, np.searchsorted(EDGES, spent)), 1)
+        board.late[running, 0] += (spent > self._dt).sum(axis=0)
         board.frames[running] += n
         errors = self._errors(estimates, self._truth[:n])
         is_known = errors == errors
@@ -234,8 +206,8 @@ class ObserverCrew(Crew[StepObserver, Follower]):
         np.subtract(totals[:-1], seen[:, None], out=out[:, :, 2])
         np.add(out[:, :, 0], out[:, :, 1], out=out[:, :, 3])
         self._past[:, running], self._past_z = totals[len(truth) :], z[len(truth) :]
-        for at, follower in enumerate(self._active.values()):
-            out[: max(0, len(z) - max(0, follower.observer.frame - self._warm_up)), at] = np.nan
+        for at, observer in enumerate(self._active.values()):
+            out[: max(0, len(z) - max(0, observer.frame - self._warm_up)), at] = np.nan
         return out
 
     def lose(self, count: int) -> None:
@@ -244,36 +216,33 @@ class ObserverCrew(Crew[StepObserver, Follower]):
         self._board.losses[self._place] += count
         self._board.progress[self._place] += count
         self._past[:] = self._past_z[:] = np.nan
-        for follower in self._active.values():
-            follower.observer.reset()
+        for observer in self._active.values():
+            observer.reset()
 
     def follow(self, command: Command, number: int) -> None:
         """Switch an observer off, or a new design on, which goes on where the one before is."""
         self.count()
         super().follow(command, number)
 
-    def _clear(self, name: str, member: Follower) -> None:
-        self._estimates[member.slot] = self._times[member.slot] = self._past[:, member.slot] = np.nan
+    def _clear(self, name: str) -> None:
+        slot = SLOTS.index(name)
+        self._estimates[slot] = self._times[slot] = self._past[:, slot] = np.nan
         self._board[name].since[0] = -1
         self._list_running()
-
-    def _swap(self, name: str, member: Follower, design: StepObserver) -> None:
-        design.take_over(member.observer)
-        member.observer = design
 
     def start(self, name: str, design: StepObserver, number: int) -> None:
         """Let an observer follow from a frame on."""
         self.count()
-        counts, slot = self._board[name], SLOTS.index(name)
+        counts = self._board[name]
         counts.clear()
         counts.since[0] = number
-        self._past[:, slot] = np.nan
-        self._active[name] = Follower(design, slot, self._estimates[slot])
+        self._past[:, SLOTS.index(name)] = np.nan
+        self._active[name] = design
         self._active = {slot: self._active[slot] for slot in SLOTS if slot in self._active}
         self._list_running()
 
     def _list_running(self) -> None:
-        self._running = np.array([follower.slot for follower in self._active.values()], dtype=np.intp)
+        self._running = np.array([SLOTS.index(name) for name in self._active], dtype=np.intp)
 
 
 class Beside:
@@ -289,6 +258,11 @@ class Beside:
         Of delays and losses of commands.
     supervision : Supervision or None
         When an integrator takes over; None for never.
+
+    Attributes
+    ----------
+    loop : ActingLoop
+        It.
     """
 
     controller: StepController
@@ -298,7 +272,7 @@ class Beside:
         self.controller, self._rng = controller, rng
         self.supervisor = SupervisedController(controller, supervision) if supervision else None
         self._plant = plant
-        self._loop = self._at_rest()
+        self.loop: ActingLoop = self._at_rest()
 
     def _at_rest(self) -> ActingLoop:
         return ActingLoop(self.supervisor or self.controller, self._plant, self.controller.sampling.ratio)
@@ -313,20 +287,10 @@ class Beside:
         """Why an integrator closes the loop; "" while the controller does."""
         return self.supervisor.reason if self.supervisor else ""
 
-    @property
-    def has_diverged(self) -> bool:
-        """Whether the command is so large that the loop is unstable."""
-        return self._loop.has_diverged
-
-    @property
-    def correction(self) -> Array:
-        """What the mirror does in the last frame, phi_corr, (n_modes,) [um]."""
-        return self._loop.correction
-
     def take(self, z: Array, ngs: Array | None) -> None:
         """Take the measurements of the disturbance alone of a frame, (n_modes,) [um]."""
         late, is_lost = self._plant.jitter * self._rng.uniform(-1.0, 1.0), self._rng.uniform() < self._plant.loss
-        self._loop.take(z, ngs if self.controller.frame else None, late=late, is_lost=is_lost)
+        self.loop.take(z, ngs if self.controller.frame else None, late=late, is_lost=is_lost)
         self.controller.settle()
 
     def take_over(self, old: Beside) -> None:
@@ -337,12 +301,12 @@ class Beside:
             raise StepError("its supervision is another")
         else:
             self.controller.take_over(old.controller)
-        self._loop.go_on(old._loop)
+        self.loop.go_on(old.loop)
 
     def reset(self) -> None:
         """Start anew, the mirror at rest."""
         (self.supervisor or self.controller).reset()
-        self._loop = self._at_rest()
+        self.loop = self._at_rest()
 
 
 LOOK = 0.05
@@ -369,7 +333,7 @@ def seat_width(n_modes: int) -> int:
     return 2 * n_modes + 1
 
 
-class ControlCrew(Crew[Beside, Beside]):
+class ControlCrew(Crew[Beside]):
     """The controllers of one process."""
 
     def __init__(self, sampling: Sampling, warm_up: int, say: Callable[[LiveEvent], None]):
@@ -393,14 +357,14 @@ class ControlCrew(Crew[Beside, Beside]):
         self._row[0] = number
         for name, member in list(self._active.items()):
             seat, controller = SEATS.index(name), member.controller
-            measured = frame.z + member.correction
+            measured = frame.z + member.loop.correction
             member.take(frame.z, ngs)
             self._tell_reason(name, member, number)
-            if member.has_diverged:
+            if member.loop.has_diverged:
                 self.follow({"id": name, "design": None}, number)
                 self._say(LiveEvent(number, "{} diverges", name, kind=ALARM))
                 continue
-            left = disturbance + member.correction
+            left = disturbance + member.loop.correction
             # without truth, what its sensor would have seen
             self._left[seat] = left = np.where(np.isnan(left), measured, left)
             if controller.frame > self._warm_up and not np.isnan(left).any():
@@ -427,11 +391,7 @@ class ControlCrew(Crew[Beside, Beside]):
         self._fill(name, 0.0)
         self._active[name] = design
 
-    def _swap(self, name: str, member: Beside, design: Beside) -> None:
-        design.take_over(member)
-        self._active[name] = design
-
-    def _clear(self, name: str, member: Beside) -> None:
+    def _clear(self, name: str) -> None:
         self._reasons.pop(name, None)
         self._fill(name, np.nan)
 

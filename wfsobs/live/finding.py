@@ -227,9 +227,10 @@ class Change:
         before, now = findings[-2:][0], findings[-1]
         known: list[PeakFinding] = []
         for minute in findings[-2::-1]:
-            known += [peak for peak in distinct_peaks(minute) if not any(is_close(peak, one) for one in known)]
+            known += [peak for peak in distinct_peaks(minute) if not any(_is_near(peak, one) for one in known)]
         self.peaks: tuple[PeakFinding, ...] = distinct_peaks(now)
-        self.same: dict[PeakFinding, PeakFinding] = paired_peaks(known, self.peaks)
+        near = [(peak, one) for peak in self.peaks for one in known if _is_near(one, peak)]
+        self.same: dict[PeakFinding, PeakFinding] = paired_peaks(near)
         self.drifts: dict[PeakFinding, PeakFinding] = {
             peak: one for peak, one in self.same.items() if _has_drifted(peak, one, before, now)
         }
@@ -264,14 +265,13 @@ def moves_of(last: Change, before: Change | None = None) -> dict[PeakFinding, Pe
     A peak that was new the minute `before` is a place to have moved to as well.
     """
     just_new = [] if before is None else [peak for peak, one in last.same.items() if one in before.new]
-    pairs = [(abs(one.frequency - peak.frequency), peak, one) for peak in (*last.new, *just_new) for one in last.losses]
-    moves: dict[PeakFinding, PeakFinding] = {}
-    for _, peak, one in sorted(pairs, key=lambda pair: pair[0]):
+
+    def may_have_moved(peak: PeakFinding, one: PeakFinding) -> bool:
         was = one if before is None else before.same.get(one, one)
-        is_it = _is_near(one, peak, REACH) and (_are_alike(one, peak) or _are_alike(was, peak))
-        if is_it and peak not in moves and one not in moves.values():
-            moves[peak] = one
-    return moves
+        return _is_near(one, peak, REACH) and (_are_alike(one, peak) or _are_alike(was, peak))
+
+    pairs = [(peak, one) for peak in (*last.new, *just_new) for one in last.losses]
+    return paired_peaks([pair for pair in pairs if may_have_moved(*pair)])
 
 
 def _has_drifted(peak: PeakFinding, was: PeakFinding, before: Finding, now: Finding) -> bool:
@@ -327,22 +327,16 @@ def _joint_peak(peaks: Sequence[PeakFinding]) -> PeakFinding:
     return replace(strongest, frequency=middle, frequency_std=sqrt(float(share @ variances)))
 
 
-def paired_peaks(before: Sequence[PeakFinding], now: Sequence[PeakFinding]) -> dict[PeakFinding, PeakFinding]:
-    """Return peak -> the one before in its place, the nearest ones first."""
-    near = [(abs(one.frequency - peak.frequency), peak, one) for peak in now for one in before if is_close(one, peak)]
+def paired_peaks(near: Sequence[tuple[PeakFinding, PeakFinding]]) -> dict[PeakFinding, PeakFinding]:
+    """Return peak -> the one before of some pairs of both, the nearest ones first, each of them once."""
     pairs: dict[PeakFinding, PeakFinding] = {}
-    for _, peak, one in sorted(near, key=lambda pair: pair[0]):
+    for peak, one in sorted(near, key=lambda pair: abs(pair[1].frequency - pair[0].frequency)):
         if peak not in pairs and one not in pairs.values():
             pairs[peak] = one
     return pairs
 
 
-def is_close(one: PeakFinding, other: PeakFinding) -> bool:
-    """Return whether two peaks are in one place."""
-    return _is_near(one, other, CLOSE)
-
-
-def _is_near(one: PeakFinding, other: PeakFinding, share: float) -> bool:
+def _is_near(one: PeakFinding, other: PeakFinding, share: float = CLOSE) -> bool:
     return abs(one.frequency - other.frequency) <= share * other.frequency
 
 

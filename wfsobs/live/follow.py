@@ -79,7 +79,10 @@ def follow(
     if log_file:
         loop.watch(log_file)
     try:
-        _await_observers(loop)
+        while not loop.is_ready:
+            if reason := loop.failure():
+                raise SettingError(reason)
+            sleep(PAUSE)
         loop.play()
         with suppress(KeyboardInterrupt):  # what has run counts
             _drain(loop, n_frames, keep, report, say)
@@ -115,14 +118,6 @@ def _row(counts: Counts, targets: Sequence[str], modes: Sequence[str]) -> dict[s
 
 def _times(factor: float, x: float) -> float | None:
     return factor * float(x) if isfinite(x) else None
-
-
-def _await_observers(loop: LiveLoop) -> None:
-    """Wait until the observers are designed. Raises SettingError with the reason where one cannot be."""
-    while not loop.is_ready:
-        if reason := loop.failure():
-            raise SettingError(reason)
-        sleep(PAUSE)
 
 
 def _drain(

@@ -5,14 +5,16 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext
 from multiprocessing.process import BaseProcess
+from queue import Empty
 from signal import Signals
 from threading import Event, Lock, RLock
 from time import monotonic, sleep
-from typing import Any, Final
+from typing import Any
 
 from wfsobs.live.board import CREWS, SLOTS, Board, Delivery, LiveView, crew_of, last_frames, read_view, trace_width
 from wfsobs.live.crew import ROOM, ControlView, ObserverCrew, Site, control_frames, row_width, warm_up_of
@@ -24,12 +26,10 @@ from wfsobs.live.source import (
     LiveEvent,
     LiveSource,
     SourceProcess,
-    end_process,
+    Worker,
     enter_process,
     go_first,
     receive,
-    send_command,
-    take_all,
 )
 from wfsobs.scenario import Scenario
 from wfsobs.stepping import design
@@ -45,7 +45,7 @@ LOOK = 0.01
 
 
 def observe_frames(
-    site: Site, traces_name: str, inbox: Connection, place: int, observers: tuple[str, ...], joins_late: bool
+    site: Site, traces_name: str, place: int, observers: tuple[str, ...], joins_late: bool, inbox: Connection
 ) -> None:
     """Follow a ring until the process is ended.
 
@@ -55,14 +55,14 @@ def observe_frames(
         What all have in common.
     traces_name : str
         Shared memory of the estimates.
-    inbox : Connection
-        Commands.
     place : int
         Of the crew in CREWS.
     observers : tuple of str
         Ids of those that run from the start.
     joins_late : bool
         Whether it begins with the newest frame, as others run already; else with the first.
+    inbox : Connection
+        Commands.
     """
     enter_process(turn=SOURCE - 1 - place)
     sampling = site.sampling
@@ -132,19 +132,17 @@ class Pause:
         sleep(REST if wait < -10 * REST else max(wait, POLL))
 
 
-class CrewProcess:
+class CrewProcess(Worker):
     """A process that follows the frames: observers or controllers.
 
     Parameters
     ----------
-    context : SpawnContext
-        By which it is made.
-    name : str
-        For people.
+    context, name
+        As of a Worker.
     width : int
         Of a row of what it writes.
     work : callable
-        Receives site, name of the rows, inbox, and the further arguments.
+        Receives site, name of the rows, the further arguments, and its end of a pipe.
     site : Site
         Where.
     *more
@@ -154,23 +152,15 @@ class CrewProcess:
     ----------
     rows : Rows
         Its estimates or residuals.
-    process : BaseProcess
-        It.
     """
 
     def __init__(self, context: SpawnContext, name: str, width: int, work: Callable[..., None], site: Site, *more: object):
         self.rows: Rows = Rows(width, ROOM)
-        inbox, self._outbox = context.Pipe(duplex=False)
-        self.process: Final = context.Process(target=work, args=(site, self.rows.name, inbox, *more), name=name, daemon=True)
-        self.process.start()
-
-    def tell(self, command: Command) -> None:
-        """Give it a command."""
-        send_command(self._outbox, command)
+        super().__init__(context, name, work, site, self.rows.name, *more)
 
     def stop(self) -> None:
         """End it and give the memory back."""
-        end_process(self.process)
+        super().stop()
         self.rows.release()
 
 
@@ -211,9 +201,10 @@ class LiveProcesses:
     board: Board
 
     def __init__(self, source: LiveSource, scenario: Scenario, observers: tuple[str, ...], speed: float, n_frames: int | None):
-        self._context, self._tracker = get_context("spawn"), Tracker()
-        self.feed, self.is_over, self._lock = SourceProcess(source, speed, n_frames), Event(), RLock()
-        self.board, news = Board(source.sampling.n_modes), self._context.Queue()
+        self._context, self._tracker, self.is_over, self._lock = get_context("spawn"), Tracker(), Event(), RLock()
+        news = self._context.Queue()
+        self.feed = SourceProcess(source, self._context, news, speed, n_frames)
+        self.board = Board(source.sampling.n_modes)
         self._site = Site(scenario.to_dict(), source.sampling, self.feed.ring.name, self.board.name, news)
         self.crews: dict[int, CrewProcess] = {}
         self._late: set[int] = set()
@@ -222,7 +213,7 @@ class LiveProcesses:
             own = tuple(name for name in observers if crew_of(name) == place)
             if own or not place:
                 self._start_crew(place, own)
-        self.delivery: Delivery = Delivery(self.feed.ring, self.board, self.traces, self.count)
+        self.delivery: Delivery = Delivery(self.feed.ring, self.board, self._parts)
         self.workshop: SideProcess = SideProcess(self._context)
 
     def _start_crew(self, place: int, observers: tuple[str, ...], *, joins_late: bool = False) -> CrewProcess:
@@ -233,17 +224,13 @@ class LiveProcesses:
         self.crews[place] = crew
         return crew
 
-    def _parts(self) -> dict[int, CrewProcess]:
-        """Return the crews without which no frame is taken by all: those that began late once they are ready."""
-        return {k: crew for k, crew in list(self.crews.items()) if self.board.is_ready[k] or k not in self._late}
+    def _parts(self) -> dict[int, Rows]:
+        """Return the estimates of the crews without which no frame is taken by all: those that began late once they are ready."""
+        return {k: crew.rows for k, crew in list(self.crews.items()) if self.board.is_ready[k] or k not in self._late}
 
     def traces(self) -> list[Rows]:
         """Return the estimates of the crews that take part."""
-        return [crew.rows for crew in self._parts().values()]
-
-    def count(self) -> int:
-        """Return the number of the first frame that a crew which takes part has not counted."""
-        return min(int(self.board.progress[place]) for place in self._parts())
+        return list(self._parts().values())
 
     def frames(self, seconds: float) -> tuple[int, LiveFrame]:
         """Return the number of the first of the last so many seconds of frames that the source has sent, and these frames."""
@@ -278,7 +265,7 @@ class LiveProcesses:
     @property
     def processes(self) -> list[BaseProcess]:
         """All that have begun."""
-        return [*self.feed.processes, *(crew.process for crew in self._followers()), *filter(None, [self.workshop.process])]
+        return [worker.process for worker in (*self.feed.workers, *self._followers(), *filter(None, [self.workshop.worker]))]
 
     def _followers(self) -> list[CrewProcess]:
         """Return all that follow the frames."""
@@ -286,7 +273,11 @@ class LiveProcesses:
 
     def failure(self) -> str:
         """Return one line that names the processes that have ended otherwise than by themselves; "" without one."""
-        lines = [f"the process of {p.name} ({p.pid}) was ended by {_cause(p.exitcode)}" for p in self.processes if p.exitcode]
+        lines = []
+        for process in self.processes:
+            if status := process.exitcode:
+                cause = f"an error, exit status {status}" if status > 0 else f"signal {-status} ({Signals(-status).name})"
+                lines.append(f"the process of {process.name} ({process.pid}) was ended by {cause}")
         if self._tracker.is_gone:
             lines.append("the resource tracker of Python was killed")
         return f"live: {'; '.join(lines)}" if lines else ""
@@ -308,7 +299,11 @@ class LiveProcesses:
 
     def news(self) -> list[LiveEvent]:
         """Return the events since the last call."""
-        return [*self.feed.news(), *take_all(self._site.news)]
+        out = []
+        with suppress(Empty):
+            while True:
+                out.append(self._site.news.get_nowait())
+        return out
 
     def release(self) -> None:
         """End the processes and give the memory back."""
@@ -323,11 +318,6 @@ class LiveProcesses:
         self.board.release()
 
 
-def _cause(status: int) -> str:
-    """Return what has ended a process of this exit status."""
-    return f"an error, exit status {status}" if status > 0 else f"signal {-status} ({Signals(-status).name})"
-
-
 class SideProcess:
     """A process at low priority that computes one thing after the other; it begins with the first.
 
@@ -338,14 +328,13 @@ class SideProcess:
 
     Attributes
     ----------
-    process : BaseProcess or None
+    worker : Worker or None
         It, once it has begun.
     """
 
     def __init__(self, context: SpawnContext):
-        self.process: BaseProcess | None = None
+        self.worker: Worker | None = None
         self._context, self._lock, self._asker = context, Lock(), ThreadPoolExecutor(1, "wfsobs-live-side")
-        self._pipe, self._theirs = context.Pipe()
         self._has_ended = False
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
@@ -354,30 +343,29 @@ class SideProcess:
             if self._has_ended:
                 (ended := Future[Any]()).cancel()
                 return ended
-            if self.process is None:
-                self.process = self._context.Process(target=compute, args=(self._theirs,), name="the designs", daemon=True)
-                self.process.start()
-                self._theirs.close()
-            return self._asker.submit(self._ask, function, arguments)
-
-    def _ask(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
-        """Return the result of a function. Raises what it raises, and EOFError where the process has ended."""
-        try:
-            self._pipe.send((function, arguments))
-            answer = self._pipe.recv()
-        except OSError:
-            raise EOFError from None
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
+            if self.worker is None:
+                self.worker = Worker(self._context, "the designs", compute)
+            return self._asker.submit(_ask, self.worker.pipe, function, arguments)
 
     def stop(self) -> None:
         """End it."""
         with self._lock:
             self._has_ended = True
             self._asker.shutdown(wait=False, cancel_futures=True)
-            if self.process is not None:
-                end_process(self.process)
+            if self.worker is not None:
+                self.worker.stop()
+
+
+def _ask(pipe: Connection, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+    """Return the result of a function. Raises what it raises, and EOFError where the process has ended."""
+    try:
+        pipe.send((function, arguments))
+        answer = pipe.recv()
+    except OSError:
+        raise EOFError from None
+    if isinstance(answer, Exception):
+        raise answer
+    return answer
 
 
 def compute(pipe: Connection) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import select
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from itertools import pairwise
 from multiprocessing import resource_tracker
@@ -102,11 +102,6 @@ class Rows(SharedNumbers):
     def skip_to(self, index: int) -> None:
         """Go on with the row of this number; those between are not written, and hold what was there."""
         self._head[0] = index
-
-    def read_row(self, index: int) -> Array | None:
-        """Return a copy of a row, (width,); None where it has been overwritten."""
-        row = self._rows[index % self.capacity].copy()
-        return None if self._head[0] - index > self.capacity - 1 else row
 
     def read_rows(self, first: int, stop: int, width: int | None = None) -> Array:
         """Return copies of the rows first ... stop - 1, (n, width); NaN where they have been overwritten or are yet to come."""
@@ -206,8 +201,10 @@ class Ring(Rows):
 
     def read(self, index: int) -> LiveFrame | None:
         """Return the frame of this number, None where it has been overwritten."""
-        row = self.read_row(index)
-        return None if row is None else LiveFrame(float(row[0]), *(row[a:b] for a, b in pairwise(self._parts)))
+        row = self._rows[index % self.capacity].copy()
+        if self._head[0] - index > self.capacity - 1:  # perhaps while it was copied
+            return None
+        return LiveFrame(float(row[0]), *(row[a:b] for a, b in pairwise(self._parts)))
 
     def read_frames(self, first: int, stop: int) -> LiveFrame:
         """Return the frames first ... stop - 1, each part (n, n_modes), the times (n,); NaN where there is none any more."""
@@ -215,7 +212,7 @@ class Ring(Rows):
         return LiveFrame(rows[:, 0], *(rows[:, a:b] for a, b in pairwise(self._parts)))
 
 
-def merged_rows(traces: list[Rows], first: int, stop: int, width: int | None = None) -> Array:
+def merged_rows(traces: Iterable[Rows], first: int, stop: int, width: int | None = None) -> Array:
     """Return what the crews together have in the rows first ... stop - 1, (n, width): the longest delay, every estimate.
 
     A row that is not that of its frame holds what was there before: it is NaN, but for its number.
@@ -244,12 +241,13 @@ class Recording:
     sampling : Sampling
         NGS ratio, and time step.
     look_back : float
-        Time before now that is kept, too [s].
+        Time before now that is kept, too, as far as it is there still [s].
     """
 
     def __init__(self, ring: Ring, sampling: Sampling, look_back: float):
-        self._ring, self._sampling = ring, sampling
-        self._next = self._first = first_frame(ring, sampling, look_back)
+        self._ring, ratio = ring, sampling.ratio or 1
+        there = min(round(look_back / sampling.dt), CAPACITY - ratio - 2)
+        self._next = self._first = -(-max(0, ring.count - there) // ratio) * ratio  # it has an NGS measurement
         self._parts: list[LiveFrame] = []
 
     def collect(self) -> bool:
@@ -333,13 +331,6 @@ class Recorder:
         if record is None:
             raise SettingError("no frame has come yet")
         return record
-
-
-def first_frame(ring: Ring, sampling: Sampling, seconds: float) -> int:
-    """Return the first frame of the last so many seconds that is there still, and has an NGS measurement."""
-    ratio = sampling.ratio or 1
-    there = min(round(seconds / sampling.dt), CAPACITY - ratio - 2)
-    return -(-max(0, ring.count - there) // ratio) * ratio
 
 
 def open_loop_record(frames: LiveFrame, sampling: Sampling) -> Record:

@@ -30,7 +30,7 @@ from wfsobs.live.source import (
     Command,
     Desk,
     LiveSource,
-    Staff,
+    Worker,
     enter_process,
     may_go_first,
     receive,
@@ -265,7 +265,9 @@ def endless_blocks(scenario: Scenario, rng: np.random.Generator, length: float =
     before = _record(scenario, 2 * half, rng)
     while True:
         after = _record(scenario, 2 * half, rng)
-        yield _fade(before[half:], after[:half], weight)
+        block = np.sqrt(1.0 - weight**2) * before[half:]
+        block[1:] += weight[1:] * after[1:half]  # the first sample of a record may have no NGS measurement
+        yield block
         before = after
 
 
@@ -274,13 +276,6 @@ def _record(scenario: Scenario, n_steps: int, rng: np.random.Generator) -> Array
     disturbance = make_disturbance(scenario, n_steps, disturbance_rng)
     seen = measure_open_loop(scenario, disturbance, sensor_rng)
     return np.hstack([seen.lgs, seen.ngs, disturbance.turbulence, disturbance.vibration])
-
-
-def _fade(before: Array, after: Array, weight: Array) -> Array:
-    """Fade from one record to the next; the first sample is that of the one before alone, where the next may have none."""
-    out = np.sqrt(1.0 - weight**2) * before
-    out[1:] += weight[1:] * after[1:]
-    return out
 
 
 AHEAD = 40.0
@@ -315,14 +310,12 @@ class SimulatedLoop:
         """Modes, step and NGS ratio."""
         return sampling_of(self.scenario)
 
-    def staff(self, context: SpawnContext, desk: Desk) -> Staff:
-        """Return its processes."""
+    def staff(self, context: SpawnContext, desk: Desk) -> list[Worker]:
+        """Begin its processes."""
         ready = context.Queue(round(AHEAD / self.scenario.dt) // piece_length(self.scenario) + 1)
-        inbox, outbox = context.Pipe(duplex=False)
         settings = self.scenario.to_dict()
-        maker = context.Process(target=_make, args=(settings, inbox, ready), name="the simulation", daemon=True)
-        sender = context.Process(target=_send, args=(settings, ready, desk), name="the source", daemon=True)
-        return Staff(sender, [maker], [outbox], ready)
+        maker = Worker(context, "the simulation", _make, settings, ready)
+        return [maker, Worker(context, "the source", _send, settings, ready, desk)]
 
 
 def piece_length(scenario: Scenario) -> int:
@@ -331,7 +324,7 @@ def piece_length(scenario: Scenario) -> int:
     return max(1, PIECE // (8 * 4 * len(scenario.modes) * ratio)) * ratio
 
 
-def _make(settings: dict[str, Any], inbox: Connection, ready: Queue[Piece]) -> None:
+def _make(settings: dict[str, Any], ready: Queue[Piece], inbox: Connection) -> None:
     """Make blocks ahead of time; when the settings change, those of the new ones.
 
     It gives way to the other processes of the loop where those cannot go first.
@@ -363,10 +356,11 @@ def _put(ready: Queue[Piece], piece: Piece, inbox: Connection | None) -> bool:
     return False
 
 
-def _send(settings: dict[str, Any], ready: Queue[Piece], desk: Desk) -> None:
+def _send(settings: dict[str, Any], ready: Queue[Piece], desk: Desk, inbox: Connection) -> None:
     enter_process(turn=SOURCE)
     scenario = Scenario.from_dict(settings)
-    send_frames(desk, SimulatedFrames(scenario, ready), scenario.dt)
+    frames = SimulatedFrames(scenario, ready)
+    send_frames(desk, inbox, frames.next_row, frames.take, scenario.dt)
 
 
 class SimulatedFrames:
@@ -398,25 +392,22 @@ class SimulatedFrames:
             self._old, self._new = self._new, None
         row = self._next_of(self._old)
         if self._new is not None:
-            row = self._mix(row, self._next_of(self._new))
+            new, weight = self._next_of(self._new), self._weight[self._new_at]
+            if self._new_at:  # the first frame is an old one alone, as a first block has no NGS measurement there
+                row = np.sqrt(1.0 - weight**2) * row + weight * new
             self._new_at += 1
         z, ngs, *truth = row.reshape(4, -1)
         draw = self._rng.random()  # one for both: they are lost together
         z, ngs = (x if draw >= self._losses[name] else self._missing for name, x in (("lgs", z), ("ngs", ngs)))
         return np.concatenate((z, ngs, self._loop.command(z), *truth))
 
-    def take(self, command: Command, number: int) -> str:
+    def take(self, command: Command) -> str:
         """Follow "settings", for which frames of another generation are to be expected, and "losses"."""
         self._losses = command.get("losses", self._losses)
         if "settings" in command:
             self._loop.take(Scenario.from_dict(command["settings"]))
             self._target += command["is_new"]
         return command.get("line", "")
-
-    def _mix(self, row: Array, new: Array) -> Array:
-        """Fade; the first frame is an old one alone, as a first block has no NGS measurement there."""
-        weight = self._weight[self._new_at]
-        return np.sqrt(1.0 - weight**2) * row + weight * new if self._new_at else row
 
     def _look_for_new(self) -> None:
         """Begin to fade once rows of the newest settings have come; those of the present ones may be needed until then."""

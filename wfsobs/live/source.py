@@ -5,15 +5,14 @@ from __future__ import annotations
 import gc
 import os
 import signal
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from multiprocessing import get_context, parent_process
+from multiprocessing import parent_process
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext
 from multiprocessing.process import BaseProcess
 from multiprocessing.queues import Queue
-from queue import Empty
 from threading import Thread
 from time import monotonic, sleep
 from typing import Any, NamedTuple, Protocol
@@ -87,7 +86,6 @@ class Desk:
     """Where a process of a source finds its work, and says what happens.
 
     ring_name, n_modes : of the ring that it writes
-    inbox : commands
     news  : events
     speed : at the start, 1 is real time
     n_frames : after which it ends; None for no end
@@ -95,7 +93,6 @@ class Desk:
 
     ring_name: str
     n_modes: int
-    inbox: Connection
     news: Queue[LiveEvent]
     speed: float
     n_frames: int | None
@@ -105,31 +102,49 @@ class Desk:
         self.news.put(LiveEvent(number, what, origin=origin))
 
 
-class Staff(NamedTuple):
-    """The processes of a source.
+class Worker:
+    """A process of a live loop.
 
-    sender   : writes the ring
-    others   : work for it
-    outboxes : by which the others are told of new settings
-    queue    : between them; its locks live as long as it is kept
+    Parameters
+    ----------
+    context : SpawnContext
+        By which it is made.
+    name : str
+        For people.
+    work : callable
+        Receives the arguments, and last its end of a pipe.
+    *arguments
+        Kept as long as the worker is: the locks of a queue live no longer than it.
+
+    Attributes
+    ----------
+    process : BaseProcess
+        It.
+    pipe : Connection
+        This end of its pipe.
     """
 
-    sender: BaseProcess
-    others: Sequence[BaseProcess] = ()
-    outboxes: Sequence[Connection] = ()
-    queue: object = None
+    process: BaseProcess
+    pipe: Connection
 
+    def __init__(self, context: SpawnContext, name: str, work: Callable[..., None], *arguments: object):
+        self.pipe, theirs = context.Pipe()
+        self._arguments = arguments
+        self.process = context.Process(target=work, args=(*arguments, theirs), name=name, daemon=True)
+        self.process.start()
 
-class PacedFrames(Protocol):
-    """Frames of a source that has no clock of its own."""
+    def tell(self, command: Command) -> None:
+        """Give it a command; where it has ended, nothing."""
+        with suppress(OSError):
+            self.pipe.send(command)
 
-    def next_row(self, number: int) -> Array | None:
-        """Return z, ngs, u, turbulence and vibration of the next frame, (5 n_modes,) [um]; None after the last one."""
-        ...
-
-    def take(self, command: Command, number: int, /) -> str:
-        """Follow a command about the frames, from this number on; return a line for the list of events, or ""."""
-        ...
+    def stop(self) -> None:
+        """End it, and wait for it."""
+        self.process.terminate()
+        self.process.join(5)
+        if self.process.is_alive():
+            self.process.kill()
+            self.process.join(5)
 
 
 class Pace:
@@ -174,19 +189,33 @@ class Pace:
         self._steps = max(0, self._steps - 1)
 
 
-def send_frames(desk: Desk, frames: PacedFrames, dt: float) -> None:
-    """Write frames to the ring when they are due, until there are no more."""
+def send_frames(
+    desk: Desk, inbox: Connection, next_row: Callable[[int], Array | None], take: Callable[[Command], str], dt: float
+) -> None:
+    """Write frames of a source without a clock to the ring when they are due, until there are no more.
+
+    Parameters
+    ----------
+    desk, inbox
+        What there is to do, and commands.
+    next_row : callable
+        Returns z, ngs, u, turbulence and vibration of the frame of a number, (5 n_modes,) [um]; None after the last one.
+    take : callable
+        Follows a command about the frames to come; returns a line for the list of events, or "".
+    dt : float
+        Time between two frames at the speed 1 [s].
+    """
     ring, pace, number = Ring(desk.n_modes, desk.ring_name), Pace(dt, desk.speed), 0
-    row, rest = np.empty(1 + 5 * desk.n_modes), frames.next_row(0)
+    row, rest = np.empty(1 + 5 * desk.n_modes), next_row(0)
     gc.collect()
     gc.freeze()
     look = 0.0
     while number != desk.n_frames and rest is not None:
         if not pace.runs or monotonic() >= look:
-            while desk.inbox.poll(0 if pace.runs else IDLE):
-                command = receive(desk.inbox)
+            while inbox.poll(0 if pace.runs else IDLE):
+                command = receive(inbox)
                 pace.take(command)
-                if line := frames.take(command, number):
+                if line := take(command):
                     desk.say(number, line)
             look = monotonic() + LOOK
         if not pace.runs:
@@ -198,7 +227,7 @@ def send_frames(desk: Desk, frames: PacedFrames, dt: float) -> None:
         ring.send(row)
         number += 1
         pace.advance()
-        rest = frames.next_row(number)
+        rest = next_row(number)
     if rest is None:
         desk.say(number, "the record has ended")
     ring.close_writer()
@@ -282,8 +311,8 @@ class LiveSource(Protocol):
         """Modes, step and NGS ratio."""
         ...
 
-    def staff(self, context: SpawnContext, desk: Desk) -> Staff:
-        """Return its processes."""
+    def staff(self, context: SpawnContext, desk: Desk) -> list[Worker]:
+        """Begin its processes; that which writes the ring is the last one."""
         ...
 
 
@@ -294,6 +323,10 @@ class SourceProcess:
     ----------
     source : LiveSource
         Which.
+    context : SpawnContext
+        By which its processes are made.
+    news : queue
+        Receives events.
     speed : float
         1 is real time.
     n_frames : int or None
@@ -303,68 +336,33 @@ class SourceProcess:
     ----------
     ring : Ring
         Its frames.
-    processes : list of BaseProcess
+    workers : list of Worker
         That which writes the ring is the last one.
     """
 
     ring: Ring
 
-    def __init__(self, source: LiveSource, speed: float, n_frames: int | None):
+    def __init__(self, source: LiveSource, context: SpawnContext, news: Queue[LiveEvent], speed: float, n_frames: int | None):
         os.environ["OPENBLAS_NUM_THREADS"] = "1"  # read by the processes
-        context = get_context("spawn")
         n_modes = source.sampling.n_modes
-        self.ring, self._news = Ring(n_modes), context.Queue()
-        inbox, self._outbox = context.Pipe(duplex=False)
-        desk = Desk(self.ring.name, n_modes, inbox, self._news, speed, n_frames)
-        self._staff = source.staff(context, desk)
-        self.processes: list[BaseProcess] = [*self._staff.others, self._staff.sender]
-        for process in self.processes:
-            process.start()
+        self.ring = Ring(n_modes)
+        self.workers: list[Worker] = source.staff(context, Desk(self.ring.name, n_modes, news, speed, n_frames))
 
     def tell(self, command: Command) -> None:
         """Give a command to the process that sends; new settings to the others as well."""
-        for pipe in (*self._staff.outboxes, self._outbox) if command.get("is_new") else (self._outbox,):
-            send_command(pipe, command)
-
-    def news(self) -> list[LiveEvent]:
-        """Return the events since the last call."""
-        return take_all(self._news)
+        for worker in self.workers if command.get("is_new") else self.workers[-1:]:
+            worker.tell(command)
 
     @property
     def is_alive(self) -> bool:
         """Whether frames may follow."""
-        return self.processes[-1].is_alive() and not self.ring.is_closed
+        return self.workers[-1].process.is_alive() and not self.ring.is_closed
 
     def stop(self) -> None:
         """End the processes and give the memory back."""
-        for process in self.processes:
-            end_process(process)
+        for worker in self.workers:
+            worker.stop()
         self.ring.release()
-
-
-def send_command(outbox: Connection, command: Command) -> None:
-    """Send a command to a process; to one that has ended, nothing."""
-    with suppress(OSError):
-        outbox.send(command)
-
-
-def take_all(queue: Queue[LiveEvent]) -> list[LiveEvent]:
-    """Return all that is in a queue."""
-    out = []
-    while True:
-        try:
-            out.append(queue.get_nowait())
-        except Empty:
-            return out
-
-
-def end_process(process: BaseProcess) -> None:
-    """End a process, and wait for it."""
-    process.terminate()
-    process.join(5)
-    if process.is_alive():
-        process.kill()
-        process.join(5)
 
 
 @dataclass(frozen=True)
@@ -390,10 +388,9 @@ class Replay:
         """Modes, step and NGS ratio."""
         return self.record.sampling
 
-    def staff(self, context: SpawnContext, desk: Desk) -> Staff:
-        """Return its process."""
-        rows = frame_rows(self.record)
-        return Staff(context.Process(target=_send, args=(rows, self.record.dt, desk), name="the source", daemon=True))
+    def staff(self, context: SpawnContext, desk: Desk) -> list[Worker]:
+        """Begin its process."""
+        return [Worker(context, "the source", _send, frame_rows(self.record), self.record.dt, desk)]
 
 
 def frame_rows(record: Record) -> Array:
@@ -405,27 +402,13 @@ def frame_rows(record: Record) -> Array:
     return np.hstack([record.z, ngs, record.u, *truth])
 
 
-def _send(rows: Array, dt: float, desk: Desk) -> None:
+def _send(rows: Array, dt: float, desk: Desk, inbox: Connection) -> None:
     enter_process(turn=SOURCE)
-    send_frames(desk, RecordFrames(rows), dt)
 
+    def next_row(number: int) -> Array | None:
+        return rows[number] if number < len(rows) else None
 
-class RecordFrames:
-    """The frames of a record.
+    def refuse(command: Command) -> str:
+        return "a record cannot be changed" if "line" in command else ""
 
-    Parameters
-    ----------
-    rows : Array
-        Of `frame_rows`.
-    """
-
-    def __init__(self, rows: Array):
-        self._rows = rows
-
-    def next_row(self, number: int) -> Array | None:
-        """Return a frame; None after the last one."""
-        return self._rows[number] if number < len(self._rows) else None
-
-    def take(self, command: Command, _number: int) -> str:
-        """Follow nothing: a record is as it is."""
-        return "" if "line" not in command else "a record cannot be changed"
+    send_frames(desk, inbox, next_row, refuse, dt)

@@ -17,72 +17,10 @@ from wfsobs.control.supervisor import SupervisedController
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.step import StepObserver
 from wfsobs.record import Sampling
-from wfsobs.signal.gate import OutlierGate, frame_mean_of
+from wfsobs.signal.gate import frame_mean_of
 from wfsobs.streams.follower import LONGEST_GAP, StreamFollower
 from wfsobs.streams.wiring import FrameStream, NgsStream, SinkStream, SourceStream, Watchdog, Wiring, check_elements
 from wfsobs.typing import Array
-
-FAR = 6.0
-"""Rms of a measurement by the prior beyond the largest estimate that may be sent: what is farther is never taken."""
-
-
-class SafeGate:
-    """Keeps outliers, and numbers far beyond any estimate that may be sent, from an observer.
-
-    Parameters
-    ----------
-    wiring : Wiring
-        Gate, rms of a measurement, largest estimate.
-    recent : int
-        Measurements that are kept.
-
-    Attributes
-    ----------
-    history : Array
-        The last measurements as they have passed, the newest first, (recent, n_modes) [um].
-    outliers : Array of int
-        How many there were, (n_modes,).
-    beyond : int
-        How many there were in a row in a mode, the last one among them.
-    """
-
-    history: Array
-    outliers: Array
-    beyond: int
-
-    def __init__(self, wiring: Wiring, recent: int = 1):
-        n = wiring.spread.size
-        self.history = np.full((recent, n), np.nan)
-        self._gate = None if wiring.gate is None else OutlierGate(n, wiring.gate)
-        self._possible, self.outliers = wiring.largest + FAR * wiring.spread, np.zeros(n, dtype=int)
-        self.restart()
-
-    def restart(self) -> None:
-        """Begin anew with an observer that does."""
-        self._row, self.beyond = np.zeros(self._possible.size, dtype=int), 0
-        if self._gate is not None:
-            self._gate.reset()
-
-    def accept(self, z: Array, beside: Array | None = None) -> Array:
-        """Return a measurement, any numbers (n_modes,) [um], with outliers NaN, or clipped; `settle` has to follow.
-
-        beside : what a faster sensor has measured meanwhile
-        """
-        taken = np.where(np.abs(z) <= self._possible, z, np.nan)
-        if self._gate is not None:
-            expected = np.zeros_like(taken) if beside is None else beside
-            taken = self._gate.check_beside(taken, expected, settles=False)
-        self.history[1:], self.history[0] = self.history[:-1], taken
-        is_out = ~np.isnan(z) & (taken != z)
-        self.outliers += is_out
-        self._row = np.where(is_out, self._row + 1, np.where(np.isnan(z), self._row, 0))
-        self.beyond = int(self._row.max())
-        return taken
-
-    def settle(self) -> None:
-        """Do what can wait until an estimate is out."""
-        if self._gate is not None:
-            self._gate.settle()
 
 
 class CommandStream:
@@ -188,7 +126,6 @@ class Attachment(StreamFollower):
         super().__init__(source, sink, wiring, observer, say, ngs)
         self._observer, self._forecast = observer, self._missing
         self._watchdog = Watchdog(wiring.largest, wiring.safety, say, wiring.warm_up)
-        self._gate, self._ngs_gate = SafeGate(wiring, 2 * ngs.ratio if ngs else 1), SafeGate(wiring)
         self._commands = commands
 
     @property
@@ -238,8 +175,7 @@ class Attachment(StreamFollower):
 
     def _restart_gates(self) -> None:
         self._forecast = self._missing
-        self._gate.restart()
-        self._ngs_gate.restart()
+        super()._restart_gates()
 
     def _start_anew(self, count: int, reason: str) -> None:
         if self._commands is not None:
@@ -361,10 +297,9 @@ class ControllerAttachment(StreamFollower):
         ngs: NgsStream | None = None,
     ):
         self._sender = SendingController(controller, np.nan_to_num(start) * wiring.unit * gain)
-        super().__init__(source, sink, wiring, self._sender, say, ngs)
+        super().__init__(source, sink, replace(wiring, gate=None), self._sender, say, ngs)
         self._controller, self._gain = controller, gain
         self._alarms: list[tuple[int, str]] = []
-        self._gate, self._ngs_gate = SafeGate(replace(wiring, gate=None)), SafeGate(replace(wiring, gate=None))
 
     @property
     def reason(self) -> str:
@@ -378,10 +313,6 @@ class ControllerAttachment(StreamFollower):
 
     def _fall_back(self, reason: str) -> None:
         self._say(f"{reason}: on from the last command")
-
-    def _restart_gates(self) -> None:
-        for gate in (self._gate, self._ngs_gate):
-            gate.restart()
 
     def _answer(self, arrival: float, measurement: Array, missing: int) -> None:
         before, known, first = self.reason, len(self._controller.alarms), self._controller.frame

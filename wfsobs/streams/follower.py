@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from wfsobs.signal.gate import OutlierGate
 from wfsobs.streams.shared_image import Semaphore, StreamError
 from wfsobs.streams.wiring import GoingBack, NgsStream, SinkStream, SourceStream, StateObserver, Wiring, check_elements
 from wfsobs.typing import Array
@@ -34,10 +35,6 @@ class Latencies:
 
     def __init__(self, counts: NDArray[np.int64] | None = None) -> None:
         self.counts: NDArray[np.int64] = np.zeros(len(EDGES) + 1, dtype=np.int64) if counts is None else counts
-
-    def clear(self) -> None:
-        """Begin anew."""
-        self.counts[:] = 0
 
     def add(self, latency: float | NDArray[np.float64]) -> None:
         """Count a latency, or several [s]."""
@@ -181,6 +178,69 @@ LONGEST_GAP = 1000
 """Missing frames that an observer is taken through; after more of them it starts anew."""
 
 
+FAR = 6.0
+"""Rms of a measurement by the prior beyond the largest estimate that may be sent: what is farther is never taken."""
+
+
+class SafeGate:
+    """Keeps outliers, and numbers far beyond any estimate that may be sent, from an observer.
+
+    Parameters
+    ----------
+    wiring : Wiring
+        Gate, rms of a measurement, largest estimate.
+    recent : int
+        Measurements that are kept.
+
+    Attributes
+    ----------
+    history : Array
+        The last measurements as they have passed, the newest first, (recent, n_modes) [um].
+    outliers : Array of int
+        How many there were, (n_modes,).
+    beyond : int
+        How many there were in a row in a mode, the last one among them.
+    """
+
+    history: Array
+    outliers: Array
+    beyond: int
+
+    def __init__(self, wiring: Wiring, recent: int = 1):
+        n = wiring.spread.size
+        self.history = np.full((recent, n), np.nan)
+        self._gate = None if wiring.gate is None else OutlierGate(n, wiring.gate)
+        self._possible, self.outliers = wiring.largest + FAR * wiring.spread, np.zeros(n, dtype=int)
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew with an observer that does."""
+        self._row, self.beyond = np.zeros(self._possible.size, dtype=int), 0
+        if self._gate is not None:
+            self._gate.reset()
+
+    def accept(self, z: Array, beside: Array | None = None) -> Array:
+        """Return a measurement, any numbers (n_modes,) [um], with outliers NaN, or clipped; `settle` has to follow.
+
+        beside : what a faster sensor has measured meanwhile
+        """
+        taken = np.where(np.abs(z) <= self._possible, z, np.nan)
+        if self._gate is not None:
+            expected = np.zeros_like(taken) if beside is None else beside
+            taken = self._gate.check_beside(taken, expected, settles=False)
+        self.history[1:], self.history[0] = self.history[:-1], taken
+        is_out = ~np.isnan(z) & (taken != z)
+        self.outliers += is_out
+        self._row = np.where(is_out, self._row + 1, np.where(np.isnan(z), self._row, 0))
+        self.beyond = int(self._row.max())
+        return taken
+
+    def settle(self) -> None:
+        """Do what can wait until an estimate is out."""
+        if self._gate is not None:
+            self._gate.settle()
+
+
 class StreamFollower(ABC):
     """Follows a stream and writes an answer to each of its frames to another one.
 
@@ -225,6 +285,7 @@ class StreamFollower(ABC):
         self._is_stuck = self._is_overtaken = False
         self._ngs, self._frames = ngs, GoingBack(observer)
         self._restart = observer.reset
+        self._gate, self._ngs_gate = SafeGate(wiring, 2 * ngs.ratio if ngs else 1), SafeGate(wiring)
         self.tally: Tally = Tally(observer.sampling.dt)
 
     @property
@@ -240,10 +301,6 @@ class StreamFollower(ABC):
     @abstractmethod
     def _fall_back(self, reason: str) -> None:
         """Send the safe output for a while, and say why."""
-
-    @abstractmethod
-    def _restart_gates(self) -> None:
-        """Reset the gates; the observer or controller has been reset."""
 
     @abstractmethod
     def _answer(self, arrival: float, measurement: Array, missing: int) -> None:
@@ -356,10 +413,8 @@ class StreamFollower(ABC):
             self._say(f"{self._source.path}: no frame for {self._wiring.stuck:g} s")
             self._fall_back("stuck")
             self._send(self.safe)
-        if not self._source.is_current:
-            self._follow_new_file()
-
-    def _follow_new_file(self) -> None:
+        if self._source.is_current:
+            return
         try:
             new = self._source.reopen()
         except StreamError:
@@ -381,6 +436,11 @@ class StreamFollower(ABC):
         self._count = count
         self._say(reason)
         self._fall_back(reason)
+
+    def _restart_gates(self) -> None:
+        """Reset the gates; the observer or controller has been reset."""
+        self._gate.restart()
+        self._ngs_gate.restart()
 
     def _send(self, answer: Array) -> None:
         if self._sink is not None:

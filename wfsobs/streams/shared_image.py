@@ -183,7 +183,10 @@ def read_header(path: str, buffer: memoryview) -> Header:
     StreamError
         Another version, numbers other than float32 or float64, data on a GPU, or a file shorter than it says.
     """
-    layout = _layout_of(path, buffer)
+    version = bytes(buffer[:32]).split(b"\0")[0].decode("ascii", "replace").strip()
+    if version not in LAYOUTS:
+        raise StreamError(f"{path}: version {version!r} of ImageStreamIO; takes {', '.join(LAYOUTS)}")
+    layout = LAYOUTS[version]
     if len(buffer) < layout.header:
         raise StreamError(f"{path}: {len(buffer)} bytes are less than a header of version {layout.version} ({layout.header})")
     n_axes, datatype = buffer[AXES], buffer[DATATYPE]
@@ -201,13 +204,6 @@ def read_header(path: str, buffer: memoryview) -> Header:
         raise StreamError(f"{path}: its header says {n_elements} numbers, the file has {len(buffer)} bytes")
     name = bytes(buffer[NAME : NAME + LONGEST_NAME]).split(b"\0")[0].decode("ascii", "replace").strip()
     return Header(layout, name, shape, dtype, *_semaphores(path, layout, buffer, end))
-
-
-def _layout_of(path: str, buffer: memoryview) -> Layout:
-    text = bytes(buffer[:32]).split(b"\0")[0].decode("ascii", "replace").strip()
-    if text not in LAYOUTS:
-        raise StreamError(f"{path}: version {text!r} of ImageStreamIO; takes {', '.join(LAYOUTS)}")
-    return LAYOUTS[text]
 
 
 def _semaphores(path: str, layout: Layout, buffer: memoryview, end: int) -> tuple[int, int | None, int | None]:
@@ -251,8 +247,6 @@ SUFFIX = ".im.shm"
 FOLDERS = ("/milk/shm", "/dev/shm", "/tmp")
 """Where streams are, the first that exists, unless the environment variable MILK_SHM_DIR says another folder."""
 
-ALL = slice(None)
-"""Every number of a frame."""
 WRITING = 2e-3
 """Time after which a frame that is still being written is given up [s]."""
 YIELD = 1e-6
@@ -382,7 +376,7 @@ class SharedImage:
                 return None
             time.sleep(YIELD)
 
-    def write(self, values: Array, elements: Array | slice = ALL) -> None:
+    def write(self, values: Array, elements: Array | slice = slice(None)) -> None:
         """Write a frame, (n,), or these elements of it, raise the counter and wake who waits."""
         self._writing[0] = 1
         self._values[elements] = values
