@@ -22,7 +22,7 @@ from wfsobs.evaluation.budget import Budget, budget_row, error_budget
 from wfsobs.evaluation.evidence import Evidence
 from wfsobs.evaluation.exact_errors import cumulative_rms, spectra
 from wfsobs.evaluation.result import Result, Row, score_rows
-from wfsobs.evaluation.scores import SCORED
+from wfsobs.evaluation.scores import RESIDUAL, SCORED
 from wfsobs.evaluation.verdict import verdict
 from wfsobs.observers.base import TARGETS
 from wfsobs.priors_from.scenario import usual_observers
@@ -126,6 +126,11 @@ class State:
     seeds: Mapping[str, Any] = field(default_factory=dict)
     verdicts: Sequence[tuple[str, str, list[str]]] = ()
     main: Mapping[str, list[str]] = field(default_factory=dict)
+
+    @property
+    def is_truthless(self) -> bool:
+        """Whether errors are those of predicting the next measurement."""
+        return any(row["target"] == RESIDUAL for row in self.rows)
 
 
 @dataclass(frozen=True)
