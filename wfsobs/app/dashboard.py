@@ -25,7 +25,7 @@ from wfsobs.app.pages.pages import AWAY, EXPLORE, LIVE, SHOWN, Pages, ViewState
 from wfsobs.app.pages.parts import ON_ONE_LINE, warning
 from wfsobs.app.service import Post, Session
 from wfsobs.app.store import Store
-from wfsobs.app.style import NO_ROOM, WIDE, Component, labels, script, sheets, theme
+from wfsobs.app.style import NO_ROOM, THEME, WIDE, Component, labels, script, sheets, theme
 from wfsobs.app.upload import Upload
 from wfsobs.app.views.errors import effect_line
 from wfsobs.app.views.switches import ModeSwitch, UnitSwitch
@@ -92,17 +92,6 @@ BODY = ":host { gap: 10px; max-height: none !important; } .scroll-button { displ
 """As long as its contents: the toolkit's limit is the window, which all boxes inside take over, and longer ones overlap."""
 
 STALE = "These results are not those of the settings."
-
-BAR = {
-    "& .MuiToolbar-root": {"minHeight": "56px !important"},
-    "@media (max-width: 1239.95px)": {
-        "& .MuiToolbar-root": {"minHeight": "92px !important"},
-        "& .header .MuiToolbar-root": {"alignItems": "flex-start", "paddingTop": "6px", "boxSizing": "border-box"},
-    },
-    "@media (max-width: 600px)": {"& .header a:has(.title)": {"display": "none !important"}},
-}
-"""The bar at the top, and the rooms under it that are as high; on a phone it has room for the run, not for the name."""
-
 
 UNSEEN = {"position": "absolute", "width": "1px", "height": "1px", "overflow": "hidden", "clip-path": "inset(50%)"}
 """Of the page's heading: for screen readers."""
@@ -190,7 +179,7 @@ class Dashboard:
             sidebar=[self.drawer],
             sidebar_width=340,
             theme_config=theme(),
-            sx=BAR,
+            sx=THEME["bar"],
             favicon=None,
             main=[pn.pane.HTML("<h1>wfsobs: disturbance observers for adaptive optics</h1>", margin=0, styles=UNSEEN), self.body],
         )

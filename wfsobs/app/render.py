@@ -140,4 +140,4 @@ ENVIRONMENT = Environment(
     lstrip_blocks=True,
 )
 ENVIRONMENT.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-ENVIRONMENT.filters.update(number=number, hundredths=hundredths, short=short, matrix=matrix, tex=tex, py=repr)
+ENVIRONMENT.filters.update(number=number, change=change, hundredths=hundredths, short=short, matrix=matrix, tex=tex, py=repr)

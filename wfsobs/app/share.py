@@ -65,15 +65,11 @@ def record_fields(record: NamedRecord) -> dict[str, str]:
     """Write a record as fields of a link."""
     said = {key: getattr(record.declaration, part) for key, (part, _) in STATEMENTS.items()}
     fields = {"name": record.name, "sha256": record.sha256}
-    fields |= {key: _write(value) for key, value in said.items() if value not in (None, False)}
+    fields |= {
+        key: str(value) if value is True else value_text(value) for key, value in said.items() if value not in (None, False)
+    }
     fields |= {COLUMN + role: name for role, name in record.declaration.columns.items()}
     return {PREFIX + key: text for key, text in fields.items()}
-
-
-def _write(value: Any) -> str:
-    return (
-        ",".join(map(_write, value)) if isinstance(value, tuple) else f"{value:.17g}" if isinstance(value, float) else str(value)
-    )
 
 
 def read_record_fields(fields: Mapping[str, str]) -> tuple[NamedRecord | None, dict[str, str]]:
@@ -137,7 +133,7 @@ class Link:
 
     scenario: Scenario
     preset: str
-    errors: tuple[str, ...] = field(default=())
+    errors: tuple[str, ...] = ()
     simulation: Scenario | None = None
     record: NamedRecord | None = None
 
@@ -214,10 +210,10 @@ def has_settings(query: str) -> bool:
 
 def value_text(value: Any) -> str:
     """Write a setting's plain value as a link has it."""
-    if isinstance(value, list) and value and isinstance(value[0], dict):
-        return ";".join(",".join(map(value_text, item.values())) for item in value)
-    if isinstance(value, list):
-        return ",".join(map(value_text, value))
+    if isinstance(value, (list, tuple)):
+        return (";" if value and isinstance(value[0], dict) else ",").join(map(value_text, value))
+    if isinstance(value, dict):
+        return ",".join(map(value_text, value.values()))
     if isinstance(value, bool):
         return "true" if value else "false"
     return repr(value).removesuffix(".0") if isinstance(value, float) else str(value)
@@ -248,12 +244,11 @@ def _item(text: str, settings: Mapping[str, param.Parameter[Any]]) -> Any:
 def _apply(base: Scenario, fields: Mapping[str, str], check: Check) -> tuple[Scenario, list[str]]:
     """Every field that can be applied, whatever their order, and a line for every other."""
     known = {path: p for path, _, p in base.walk()} | dict(base.lists())
-    values, refused = {}, {}
+    values, refused = {path: read_value(path, text, known) for path, text in fields.items()}, {}
     scenario = base.copy()
-    for path, text in fields.items():
-        values[path] = read_value(path, text, known)
+    for path, value in values.items():
         try:
-            _set(scenario, path, values[path])
+            _set(scenario, path, value)
         except SettingError as error:
             refused[path] = str(error)
     if _clash(scenario, check):
