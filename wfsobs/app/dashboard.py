@@ -147,7 +147,7 @@ class Dashboard:
         self.upload: Final = Upload(self.store, self.actions)
         self.connection: Final = Connection(self.controls.take, **NO_ROOM)
         self.drawer: Final = pn.Column(**WIDE)
-        self.frame: Final = Frame(**NO_ROOM)
+        self.frame: Final = Frame(stale=self.store.param.stale, dark=self.display.param.dark, **NO_ROOM)
         self.keyboard: Final = Keyboard(**NO_ROOM, styles={"position": "absolute"})
         self.alert: Final = pmui.Alert(object="", severity="error", visible=False, **WIDE)
         self.stale: Final = warning(STALE)
@@ -189,7 +189,6 @@ class Dashboard:
         with edit_readonly(page):
             # Tied to what all sessions do, each change walks all models of the page, and the page outlives its session.
             page.busy = Idle().param.busy
-        self.display.param.watch(lambda event: setattr(self.frame, "dark", event.new), "dark")
         self.display.dark = page.dark_theme  # Panel has it from the address
         page.param.watch(self._on_theme, "dark_theme")
         self.frame.param.watch(lambda event: self._post(partial(setattr, page, "dark_theme", event.new)), "wants_dark")
@@ -254,4 +253,3 @@ class Dashboard:
         if self.store.waiting:
             texts.append(f"{waiting_text(self.store.waiting)}.")
         self.stale.param.update(object=" ".join(texts), visible=bool(texts) and run.state != "running")
-        self.frame.stale = self.store.stale

@@ -189,7 +189,9 @@ class _Spectrum(TargetFigure):
         self.name_ends(drawn, display.dark)
         self.figure.yaxis.axis_label = display.curve_label(" of error" if error else "")
         if self.marks:
-            self._draw_marks(results)
+            found = {"peaks": drawn_peaks(results), "model": [model_mark(results.scenario)]}
+            for name, marks in found.items():
+                send(self.marks[name].data_source, {"x": [x for x, _ in marks], "text": [text for _, text in marks]})
 
     def _fit(self, lines: list[Array], cumulative: bool) -> None:
         """Have the axis hold every line, but for what lies too far below the highest."""
@@ -198,11 +200,6 @@ class _Spectrum(TargetFigure):
             low, high = min(float(np.quantile(y, 0.02)) for y in positive), max(float(y.max()) for y in positive)
             room, decades = (1.5, DECADES / 2) if cumulative else (3.0, DECADES)
             self.figure.y_range.update(start=max(low / room, high * 10.0**-decades), end=high * room)
-
-    def _draw_marks(self, results: RunResults) -> None:
-        found = {"peaks": drawn_peaks(results), "model": [model_mark(results.scenario)]}
-        for name, marks in found.items():
-            send(self.marks[name].data_source, {"x": [x for x, _ in marks], "text": [text for _, text in marks]})
 
 
 def drawn_peaks(results: RunResults) -> list[tuple[float, str]]:
