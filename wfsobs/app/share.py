@@ -23,7 +23,7 @@ import param
 from wfsobs.app.controls.fields import parse_number
 from wfsobs.app.render import render
 from wfsobs.app.session_file import SHA256, SessionError, read_declaration
-from wfsobs.app.sources import LoadedRecord, NamedRecord, SimulatedRecord, Source
+from wfsobs.app.sources import LoadedRecord, NamedRecord, Source
 from wfsobs.app.store import FIRST_PRESET
 from wfsobs.live.loop import LiveOrder
 from wfsobs.live.source import STREAM
@@ -328,13 +328,6 @@ def stated_options(source: LoadedRecord) -> list[str]:
     return source.declaration.options({"sha256": source.sha256} if source.sha256 else {})
 
 
-def record_code(source: LoadedRecord) -> str:
-    """Write the line of Python that loads a record."""
-    stated = "".join(f"{name}={value!r}, " for name, value in vars(source.declaration).items() if value not in (None, {}, False))
-    check = f", sha256={source.sha256!r}" if source.sha256 else ""
-    return f"record = load_record({source.name!r}, scenario, DeclaredFormat({stated.removesuffix(', ')}){check})"
-
-
 def scenario_code(scenario: Scenario, preset: str, file: str) -> str:
     """Write the settings as an expression of Python, or the loading of a file of them where they are long."""
     lines = [f"    {json.dumps(path)}: {value!r},\n" for path, value in changes(scenario, preset).items()]
@@ -398,13 +391,12 @@ def _live_command(scenario: Scenario, preset: str, source: Source | None, order:
 
 def to_python(scenario: Scenario, preset: str, source: Source | None = None, task: CopiedTask = EXPLORED) -> str:
     """Write a script that computes and prints what a page shows."""
-    if task.what == SWEEP or (task.what == LIVE and not isinstance(source, LoadedRecord)):  # they simulate the settings
-        source = None
+    simulation = source.simulation if source and task.what not in (SWEEP, LIVE) else None  # these simulate the settings
     return render(
         "script.txt",
         what=task.what,
         scenario=scenario_code(scenario, preset, FILE),
-        record=record_code(source) if isinstance(source, LoadedRecord) else "",
-        simulation=scenario_code(source.simulation, preset, SIMULATION) if isinstance(source, SimulatedRecord) else "",
+        record=source if isinstance(source, LoadedRecord) and task.what != SWEEP else None,
+        simulation=scenario_code(simulation, preset, SIMULATION) if simulation else "",
         **task.arguments,
     )

@@ -292,25 +292,6 @@ def add_event_marks(fig: figure) -> list[GlyphRenderer[Any]]:
     return [fig.add_glyph(source, it, name=EVENTS, level=level) for it, level in ((strip, "underlay"), (text, "overlay"))]
 
 
-class EventMarks:
-    """The marks in one figure, none until there is an event."""
-
-    def __init__(self, fig: figure):
-        self.figure = fig
-        self.marks: list[GlyphRenderer[Any]] = []
-
-    def draw(self, results: RunResults, dark: bool) -> None:
-        """Show those of the results."""
-        events = events_of(results)
-        if not events and not self.marks:
-            return
-        self.marks = self.marks or add_event_marks(self.figure)
-        _, top = in_view(self.figure.y_range)
-        strip, text = self.marks
-        send(strip.data_source, {**event_columns(events, results.scenario), "top": [top] * len(events)})
-        strip.glyph.line_color = strip.glyph.fill_color = text.glyph.text_color = EVENT.colour(dark)
-
-
 BINS = 500
 """Pairs of extremes per figure, about one per pixel."""
 
@@ -414,7 +395,7 @@ class _Trace(TargetFigure):
         self.figure.add_tools(crosshair)
         self.warm_up = BoxAnnotation(left=0, right=0, fill_color="#808080", fill_alpha=0.10, line_width=0, level="underlay")
         self.figure.add_layout(self.warm_up)
-        self.events = EventMarks(self.figure)
+        self.event_marks: list[GlyphRenderer[Any]] = []  # none until there is an event
         self.band = _Band(self.figure)
 
     def draw(self, results: RunResults, display: Display, first: int, last: int) -> None:
@@ -431,10 +412,16 @@ class _Trace(TargetFigure):
         settled = warm_up + WINDOW_S * display.running
         error = shows_error(results, self.target, display)
         extra = self._draw_runs(display, error, data["x"]) + self._draw_band(results, display, first, last, data["x"])
-        above = levels(events_of(results), results.scenario.run.duration)
+        events = events_of(results)
+        above = levels(events, results.scenario.run.duration)
         self._fit(data, settled, extra, 0.1 * (1 + max(above, default=-1)))
         self.name_ends({name: (data["x"], data[name]) for name, line in self.lines.items() if line.visible}, display.dark)
-        self.events.draw(results, display.dark)
+        if events or self.event_marks:
+            self.event_marks = self.event_marks or add_event_marks(self.figure)
+            strip, text = self.event_marks
+            top = [in_view(self.figure.y_range)[1]] * len(events)
+            send(strip.data_source, event_columns(events, results.scenario) | {"top": top})
+            strip.glyph.line_color = strip.glyph.fill_color = text.glyph.text_color = EVENT.colour(display.dark)
         what = f"{'running rms of ' if error and display.running else ''}{'error of ' if error else ''}{display.mode_label}"
         self.figure.yaxis.axis_label = f"{what} [{display.unit_label}]"
 
