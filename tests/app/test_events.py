@@ -57,7 +57,7 @@ def test_running_rms_and_marks(dashboard: Dashboard, loop: Any) -> None:
 def the_marks_are_those_of_the_scenario(dashboard: Dashboard) -> None:
     for trace in dashboard.explore.traces.traces.values():
         top = trace.figure.y_range.end
-        (marks,) = {mark.data_source for mark in trace.events.marks}  # type: ignore[attr-defined]
+        (marks,) = {mark.data_source for mark in trace.event_marks}  # type: ignore[attr-defined]
         assert list(marks.data["start"]) == [1.5, 1.6, 1.7, 1.9]
         assert list(marks.data["end"]) == pytest.approx([1.5, 1.8, 1.8, 1.95])
         assert list(marks.data["text"]) == ["5.96 Hz peak −3 Hz × 2", "wind × 2", "25 % LGS lost", "1 LGS out"]

@@ -13,7 +13,7 @@ from wfsobs.app.display import AT_LIMIT
 from wfsobs.app.render import number
 from wfsobs.app.report.data import Report, State, state_of
 from wfsobs.app.report.page import page
-from wfsobs.app.report.sections import budget_state_table
+from wfsobs.app.report.sections import budget_groups
 from wfsobs.evaluation.budget import TERMS, error_budget
 from wfsobs.evaluation.evidence import gather_evidence
 from wfsobs.evaluation.result import Result, row_label, target_title
@@ -54,7 +54,7 @@ def test_every_linear_observer_has_its_terms_in_the_page(result: Result, short: 
 
 
 def bar(state: State, target: str, mode: str, observer: str) -> dict[str, Any]:
-    (group,) = (g for g in budget_state_table(state, "")["groups"] if (g["target"], g["mode"]) == (target, mode))
+    (group,) = (g for g in budget_groups(state) if (g["target"], g["mode"]) == (target, mode))
     (row,) = (row for row in group["rows"] if row["observer"] == observer)
     return row | {"marks": group["marks"]}
 

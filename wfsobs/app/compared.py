@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wfsobs.app.render import NOTHING, change, number
 from wfsobs.app.sources import LoadedRecord, Step, give_same_record
 from wfsobs.app.style import observers_of
 from wfsobs.app.work import TRUTH, Key, RunResults, SignalAndError
@@ -191,21 +190,19 @@ def _thin(values: Array) -> NDArray[np.float32]:
 
 
 def comparison_of(runs: Sequence[ComparedRun], result: Result, evidence: Evidence | None) -> dict[str, Any] | None:
-    """Return what a report has of compared runs: their names, and a table per target and mode [nm]; None where there are none.
+    """Return what a report has of compared runs; None where there are none.
+
+    These are the runs, and by the title of a target and mode the rows: what they are of, the error, and the one of every run
+    with that of this result over the same seeds [um].
 
     evidence : errors of the result over several seeds
     """
     if not runs:
         return None
-    groups: dict[tuple[str, str], list[list[str]]] = {}
+    groups: dict[str, list[tuple[str, float, Any]]] = {}
     for now in result.scores:
         pairs = [run.beside(result.scores, evidence, (now.observer, now.target, now.mode)) for run in runs]
         if any(before is not None for before, _ in pairs):
-            cells = [NOTHING if old is None else f"{number(1e3 * old)} ({change(old, new)} %)" for old, new in pairs]
             rms = (evidence.over_seeds(now) if evidence else now).rms
-            groups.setdefault((now.target, now.mode), []).append([row_label(now.observer), number(1e3 * rms), *cells])
-    return {
-        "runs": [[run.letter, run.name] for run in runs],
-        "columns": ["Observer", "shown [nm]", *(f"{run.letter} [nm]" for run in runs)],
-        "groups": [[f"{target_title(target)}, {mode}", rows] for (target, mode), rows in groups.items()],
-    }
+            groups.setdefault(f"{target_title(now.target)}, {now.mode}", []).append((row_label(now.observer), rms, pairs))
+    return {"runs": runs, "groups": groups}

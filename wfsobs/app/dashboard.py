@@ -25,7 +25,7 @@ from wfsobs.app.pages.pages import AWAY, EXPLORE, LIVE, SHOWN, Pages, ViewState
 from wfsobs.app.pages.parts import ON_ONE_LINE, warning
 from wfsobs.app.service import Post, Session
 from wfsobs.app.store import Store
-from wfsobs.app.style import NO_ROOM, WIDE, Component, labels, script, sheets, theme
+from wfsobs.app.style import NO_ROOM, THEME, WIDE, Component, labels, script, sheets, theme
 from wfsobs.app.upload import Upload
 from wfsobs.app.views.errors import effect_line
 from wfsobs.app.views.switches import ModeSwitch, UnitSwitch
@@ -93,17 +93,6 @@ BODY = ":host { gap: 10px; max-height: none !important; } .scroll-button { displ
 
 STALE = "These results are not those of the settings."
 
-BAR = {
-    "& .MuiToolbar-root": {"minHeight": "56px !important"},
-    "@media (max-width: 1239.95px)": {
-        "& .MuiToolbar-root": {"minHeight": "92px !important"},
-        "& .header .MuiToolbar-root": {"alignItems": "flex-start", "paddingTop": "6px", "boxSizing": "border-box"},
-    },
-    "@media (max-width: 600px)": {"& .header a:has(.title)": {"display": "none !important"}},
-}
-"""The bar at the top, and the rooms under it that are as high; on a phone it has room for the run, not for the name."""
-
-
 UNSEEN = {"position": "absolute", "width": "1px", "height": "1px", "overflow": "hidden", "clip-path": "inset(50%)"}
 """Of the page's heading: for screen readers."""
 
@@ -158,7 +147,7 @@ class Dashboard:
         self.upload: Final = Upload(self.store, self.actions)
         self.connection: Final = Connection(self.controls.take, **NO_ROOM)
         self.drawer: Final = pn.Column(**WIDE)
-        self.frame: Final = Frame(**NO_ROOM)
+        self.frame: Final = Frame(stale=self.store.param.stale, dark=self.display.param.dark, **NO_ROOM)
         self.keyboard: Final = Keyboard(**NO_ROOM, styles={"position": "absolute"})
         self.alert: Final = pmui.Alert(object="", severity="error", visible=False, **WIDE)
         self.stale: Final = warning(STALE)
@@ -190,7 +179,7 @@ class Dashboard:
             sidebar=[self.drawer],
             sidebar_width=340,
             theme_config=theme(),
-            sx=BAR,
+            sx=THEME["bar"],
             favicon=None,
             main=[pn.pane.HTML("<h1>wfsobs: disturbance observers for adaptive optics</h1>", margin=0, styles=UNSEEN), self.body],
         )
@@ -200,7 +189,6 @@ class Dashboard:
         with edit_readonly(page):
             # Tied to what all sessions do, each change walks all models of the page, and the page outlives its session.
             page.busy = Idle().param.busy
-        self.display.param.watch(lambda event: setattr(self.frame, "dark", event.new), "dark")
         self.display.dark = page.dark_theme  # Panel has it from the address
         page.param.watch(self._on_theme, "dark_theme")
         self.frame.param.watch(lambda event: self._post(partial(setattr, page, "dark_theme", event.new)), "wants_dark")
@@ -265,4 +253,3 @@ class Dashboard:
         if self.store.waiting:
             texts.append(f"{waiting_text(self.store.waiting)}.")
         self.stale.param.update(object=" ".join(texts), visible=bool(texts) and run.state != "running")
-        self.frame.stale = self.store.stale

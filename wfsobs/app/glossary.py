@@ -86,21 +86,6 @@ def explain_first(text: str, word: str, name: str) -> Markup:
     return escape(before) + term(name, word) + escape(after) if found else escape(text)
 
 
-SHORTCUTS: Mapping[str, str] = {
-    "?": "This help",
-    "/": "Find a setting",
-    "H": "The history: every result of the session",
-    "Ctrl+Z, Ctrl+Shift+Z": "Undo and redo a change of the settings",
-    "Enter or Space on a row beside the verdict": "Hide or show its line",
-    "S on such a row": "Its line alone, and those before again",
-    "Double click on a figure": "All of it again, after a zoom",
-    "Arrows, Page up and down on a handle": "Move it (Shift: further), change its damping; Escape gives up",
-    "Arrow keys": "Choose in a switch, go from line to line in a table",
-    "Tab": "The first stop of the page leads to the figures",
-}
-"""Key -> what it does."""
-
-
 class Help(HtmlComponent):
     """The button at the top, and what it opens."""
 
@@ -108,4 +93,4 @@ class Help(HtmlComponent):
     _stylesheets = sheets("base", "bare", "help")
 
     def __init__(self, **params: Any):
-        super().__init__(html=render("help.html", shortcuts=SHORTCUTS, terms=TERMS), width=36, margin=0, **params)
+        super().__init__(html=render("help.html", terms=TERMS), width=36, margin=0, **params)

@@ -140,9 +140,7 @@ class History(param.Parameterized):
         entry, name = self.find(key), " ".join(name.split())[:LONGEST_NAME]
         if entry is not None and name:
             entry.name, entry.own_name = name, True
-            self.display.compared_runs = [
-                replace(run, name=name) if run.key == key else run for run in self.display.compared_runs
-            ]
+            self._update_run(key, name=name)
         self.param.trigger("entries")
 
     def star(self, key: str) -> None:
@@ -232,10 +230,13 @@ class History(param.Parameterized):
         if evidence is None or entry is None or not all(score in entry.scores for score in evidence.record.values()):
             return
         entry.evidence = evidence
-        if any(run.key == entry.key for run in self.display.compared_runs):
-            self.display.compared_runs = [
-                replace(run, evidence=evidence) if run.key == entry.key else run for run in self.display.compared_runs
-            ]
+        self._update_run(entry.key, evidence=evidence)
+
+    def _update_run(self, key: str, **values: Any) -> None:
+        """Change what is said of an entry where it is compared."""
+        runs = self.display.compared_runs
+        if any(run.key == key for run in runs):
+            self.display.compared_runs = [replace(run, **values) if run.key == key else run for run in runs]
 
     def compare_none(self) -> None:
         """Compare nothing any more."""
@@ -269,12 +270,10 @@ class History(param.Parameterized):
         if self.task.state != DONE or results is None:
             return
         key = run_key(results.scenario, results.source)
-        runs, entry = self.display.compared_runs, self.find(key)
         self.task.result = None
-        if entry is not None:
+        if (entry := self.find(key)) is not None:
             entry.results = results
-            lines = thin_lines(results)
-            self.display.compared_runs = [replace(run, lines=lines) if run.key == key else run for run in runs]
+            self._update_run(key, lines=thin_lines(results))
             self._put(self.entries)
         self._make_lines()
 

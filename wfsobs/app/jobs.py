@@ -6,12 +6,12 @@ import contextlib
 import ctypes
 import itertools
 import logging
-import math
 import sys
 import threading
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
+from math import inf
 from time import monotonic
 from typing import Any, ClassVar
 
@@ -65,7 +65,7 @@ class Job:
     key: str = ""
     cost: float = 0.0
     priority: int = -1
-    time_limit: float = math.inf
+    time_limit: float = inf
     refusal: type[Exception] = ValueError
     endless: bool = False
     quiet: bool = False
@@ -139,32 +139,32 @@ class Job:
                 told = now
                 self.tell(progress=min(max(fraction, 0.0), 1.0))
 
-        def stopped() -> bool:
-            return self._is_unwanted or closing()
+        end = ""  # that it comes to before it is done
 
-        gave_way = False
-
-        def gives_way() -> bool:
-            nonlocal gave_way
-            gave_way = gave_way or (self.priority == IDLE_TIME and busy())
-            return gave_way
+        def stops() -> bool:
+            nonlocal end
+            if self._is_unwanted or closing():
+                end = "cancelled"
+            elif not end and self.priority == IDLE_TIME and busy():
+                end = "gave way"
+            elif not end and monotonic() - start > self.time_limit:
+                end = "late"
+            return bool(end)
 
         said, news = "failed", {"state": FAILED}
         try:
-            result = self.work(
-                Watch(progress, lambda: stopped() or gives_way() or monotonic() - start > self.time_limit), self.tell
-            )
+            result = self.work(Watch(progress, stops), self.tell)
             if self.key:
                 keep(self.key, result)
             said, news = "done", {"state": DONE, "progress": 1.0, "result": result}
         except Cancelled:
-            if gave_way and not stopped():
-                said = "gave way"
+            said = end if stops() else "cancelled"
+            if said == "gave way":
                 return True
-            if stopped() or monotonic() - start <= self.time_limit:
-                said, news = "cancelled", {"state": CANCELLED}
+            if said == "late":
+                news["message"] = f"It took more than {self.time_limit:g} s, which is what this server allows"
             else:
-                said, news["message"] = "late", f"It took more than {self.time_limit:g} s, which is what this server allows"
+                news = {"state": CANCELLED}
         except self.refusal as error:
             said, news["message"] = "refused", str(error)
         except (Exception, SystemExit) as error:  # a bug, but the server goes on
@@ -201,7 +201,7 @@ class JobQueue:
         self._running: list[Job] = []
         self._shared_jobs: dict[str, Job] = {}
         self._turn = 0  # the latest that has begun
-        self._last_answer = -math.inf  # when something was last handed over, which is to be drawn
+        self._last_answer = -inf  # when something was last handed over, which is to be drawn
         self._change = threading.Condition()
         self._threads = [threading.Thread(target=self._work, name=f"wfsobs-work-{i}", daemon=True) for i in range(workers)]
         for thread in self._threads:
@@ -313,7 +313,7 @@ class JobQueue:
             while not self.closing:
                 job, rest = next(filter(self._has_room, self._line()), None), 0.0
                 if job is not None and job.priority == IDLE_TIME:
-                    rest = math.inf if self.is_busy() else self._last_answer + self.rest - monotonic()
+                    rest = inf if self.is_busy() else self._last_answer + self.rest - monotonic()
                 if job is not None and rest <= 0.0:
                     self._waiting.remove(job)
                     self._running.append(job)
@@ -321,7 +321,7 @@ class JobQueue:
                     job.tell_place(0)
                     self._tell_places()
                     return job
-                self._change.wait(rest if 0.0 < rest < math.inf else None)
+                self._change.wait(rest if 0.0 < rest < inf else None)
             return None
 
     def _line(self) -> list[Job]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from math import inf
 
 from wfsobs.app.jobs import Job, Work
 from wfsobs.cost import run_bytes, run_seconds
@@ -27,16 +27,16 @@ class Limits:
     live_seconds  : how long a live loop goes on [s]
     """
 
-    duration: float = math.inf
-    steps: float = math.inf
-    training_size: float = math.inf
-    depth: float = math.inf
-    items: float = math.inf
-    seconds: float = math.inf
-    megabytes: float = math.inf
-    sessions: float = math.inf
-    sweep_seconds: float = math.inf
-    live_seconds: float = math.inf
+    duration: float = inf
+    steps: float = inf
+    training_size: float = inf
+    depth: float = inf
+    items: float = inf
+    seconds: float = inf
+    megabytes: float = inf
+    sessions: float = inf
+    sweep_seconds: float = inf
+    live_seconds: float = inf
 
     def check(self, scenario: Scenario) -> None:
         """Raise SettingError, one line, where a run of this scenario is more than the server allows."""

@@ -16,38 +16,6 @@ from numpy.typing import ArrayLike
 NOTHING = "–"
 """In place of a number that there is not."""
 
-WHY_NOTHING: Mapping[str, str] = {
-    "Since its start": "no sample after the warm-up yet, or not an observer",
-    "Error / limit": "no theoretical limit is known, or no error yet",
-    "Step, median": "a theoretical limit is not a filter and takes no time",
-    "99.9 %": "a theoretical limit is not a filter and takes no time",
-    "Longer than a frame": "a theoretical limit is not a filter and takes no time",
-    "Moved by": "the identification before did not find it",
-    "±": "the uncertainty could not be determined",
-    "Residual": "no stable residual, or no sample in view yet",
-    "Theory": "the controller has no frequency response, or the true spectra are not known",
-    "Strehl": "a mode has no residual",
-    "Strehl since its start": "no sample after the warm-up yet",
-    "Gain": "this controller has no gain to choose",
-    "At a limit": "a theoretical limit is not run on the record",
-    "Gain margin": "no change of the gain makes this loop unstable",
-    "Delay margin": "no delay makes this loop unstable",
-    "95 %": "needs several scenarios",
-    "Above the best": "the best itself, or too few seeds",
-    "Rank": "not tested: too few seeds",
-    "Wins": "counted over several scenarios",
-    "Failed": "a theoretical limit is not run on the records",
-    "Before": "not computed for this observer",
-    "After": "not computed for this observer",
-    "Change": "not defined: the value before is zero",
-}
-"""Heading of a column, without its unit -> why a cell of it may have no number."""
-
-
-def why_nothing(heading: str) -> str:
-    """Return why a cell below a heading may have no number; empty where it always has one."""
-    return WHY_NOTHING.get(re.split(r" \[| at ", heading)[0], "")
-
 
 def number(value: float | None, digits: int = 3) -> str:
     """Write a number with some significant digits, without an exponent where it is of common size; a dash for none, or NaN."""
@@ -172,6 +140,4 @@ ENVIRONMENT = Environment(
     lstrip_blocks=True,
 )
 ENVIRONMENT.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-ENVIRONMENT.filters.update(
-    number=number, hundredths=hundredths, short=short, matrix=matrix, tex=tex, py=repr, why_nothing=why_nothing
-)
+ENVIRONMENT.filters.update(number=number, change=change, hundredths=hundredths, short=short, matrix=matrix, tex=tex, py=repr)

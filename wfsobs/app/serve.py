@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import gc
 import logging
 import os
@@ -125,7 +124,7 @@ class Poster:
         if self._loop is None:
             self._schedule(function)
         else:  # several threads post, and a document is not made for that: one of two callbacks may be lost
-            with contextlib.suppress(RuntimeError):  # the server has stopped
+            with suppress(RuntimeError):  # the server has stopped
                 self._loop.call_soon_threadsafe(self._schedule, function)
 
     def deliver(self) -> None:

@@ -161,7 +161,7 @@ class Session(param.Parameterized):
         self.post: Post = lambda function: function()
         self.tasks: list[BackgroundTask] = []
         self.is_closed: bool = False
-        self._jobs: list[tuple[Job, Listener]] | None = []
+        self._waiting: dict[Listener, Job] | None = {}
         self._leave: dict[Listener, Callable[[], None]] = {}
         self._since = monotonic()
 
@@ -169,17 +169,17 @@ class Session(param.Parameterized):
         """Have the visitor come, and what waited for them done. Raises Full."""
         self.number = self.service.count_session()
         self._since = monotonic()
-        jobs, self._jobs = self._jobs or [], None
-        for job, listener in jobs:
+        waiting, self._waiting = self._waiting or {}, None
+        for listener, job in waiting.items():
             self._leave[listener] = self.submit(job, listener)
 
     def submit(self, job: Job, listener: Listener, before: Callable[[], None] = lambda: None) -> Callable[[], None]:
         """Have a job done when its turn comes, in place of the one before; how to take it back."""
         if self.is_closed:
             return lambda: None
-        if self._jobs is not None and job.key not in self.service.cache:
+        if self._waiting is not None and job.key not in self.service.cache:
             before()
-            self._jobs.append((job, listener))
+            self._waiting[listener] = job
             return partial(self._take_back, listener)
         if job.priority != IDLE_TIME:
             self.service.note_wish()
@@ -191,14 +191,14 @@ class Session(param.Parameterized):
             self.is_closed = True
             for task in self.tasks:
                 task.close()
-            if self._jobs is None:
+            if self._waiting is None:
                 self.service.end_session()
                 event("session-end", session=self.number, seconds=monotonic() - self._since, sessions=self.service.sessions)
 
     def _take_back(self, listener: Listener) -> None:
         """Take back what waited, or what has become of it."""
-        if self._jobs is not None:
-            self._jobs = [it for it in self._jobs if it[1] is not listener]
+        if self._waiting is not None:
+            self._waiting.pop(listener, None)
         elif (leave := self._leave.pop(listener, None)) is not None:
             leave()
 
@@ -237,8 +237,7 @@ class BackgroundTask(param.Parameterized):
         session.tasks.append(self)
         self._lock = threading.Lock()
         self._generation = 0
-        self._news: dict[str, Any] = {}
-        self._is_posted = False
+        self._news: dict[str, Any] = {}  # while there is any, it is posted that it lands
         self._leave: Callable[[], None] = lambda: None
 
     def start(self, job: Job) -> None:
@@ -293,18 +292,17 @@ class BackgroundTask(param.Parameterized):
         with self._lock:
             if generation != self._generation:
                 return
+            is_posted = bool(self._news)
             self._news |= news
-            if self._is_posted:
-                return
-            self._is_posted = True
-        self.session.post(self._land)
+        if not is_posted:
+            self.session.post(self._land)
 
     def _land(self) -> None:
         with self._lock:
-            news, self._news, self._is_posted = self._news, {}, False
+            news, self._news = self._news, {}
             if self._drawn_first and news.get("state") == DONE and "result" in news:
-                self._news, self._is_posted = {"state": news.pop("state")}, True
-            again = self._is_posted
+                self._news = {"state": news.pop("state")}
+            again = bool(self._news)
         if news:
             self.param.update(**news)
         if again:

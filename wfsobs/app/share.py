@@ -23,7 +23,7 @@ import param
 from wfsobs.app.controls.fields import parse_number
 from wfsobs.app.render import render
 from wfsobs.app.session_file import SHA256, SessionError, read_declaration
-from wfsobs.app.sources import LoadedRecord, NamedRecord, SimulatedRecord, Source
+from wfsobs.app.sources import LoadedRecord, NamedRecord, Source
 from wfsobs.app.store import FIRST_PRESET
 from wfsobs.live.loop import LiveOrder
 from wfsobs.live.source import STREAM
@@ -65,15 +65,11 @@ def record_fields(record: NamedRecord) -> dict[str, str]:
     """Write a record as fields of a link."""
     said = {key: getattr(record.declaration, part) for key, (part, _) in STATEMENTS.items()}
     fields = {"name": record.name, "sha256": record.sha256}
-    fields |= {key: _write(value) for key, value in said.items() if value not in (None, False)}
+    fields |= {
+        key: str(value) if value is True else value_text(value) for key, value in said.items() if value not in (None, False)
+    }
     fields |= {COLUMN + role: name for role, name in record.declaration.columns.items()}
     return {PREFIX + key: text for key, text in fields.items()}
-
-
-def _write(value: Any) -> str:
-    return (
-        ",".join(map(_write, value)) if isinstance(value, tuple) else f"{value:.17g}" if isinstance(value, float) else str(value)
-    )
 
 
 def read_record_fields(fields: Mapping[str, str]) -> tuple[NamedRecord | None, dict[str, str]]:
@@ -137,7 +133,7 @@ class Link:
 
     scenario: Scenario
     preset: str
-    errors: tuple[str, ...] = field(default=())
+    errors: tuple[str, ...] = ()
     simulation: Scenario | None = None
     record: NamedRecord | None = None
 
@@ -214,10 +210,10 @@ def has_settings(query: str) -> bool:
 
 def value_text(value: Any) -> str:
     """Write a setting's plain value as a link has it."""
-    if isinstance(value, list) and value and isinstance(value[0], dict):
-        return ";".join(",".join(map(value_text, item.values())) for item in value)
-    if isinstance(value, list):
-        return ",".join(map(value_text, value))
+    if isinstance(value, (list, tuple)):
+        return (";" if value and isinstance(value[0], dict) else ",").join(map(value_text, value))
+    if isinstance(value, dict):
+        return ",".join(map(value_text, value.values()))
     if isinstance(value, bool):
         return "true" if value else "false"
     return repr(value).removesuffix(".0") if isinstance(value, float) else str(value)
@@ -248,12 +244,11 @@ def _item(text: str, settings: Mapping[str, param.Parameter[Any]]) -> Any:
 def _apply(base: Scenario, fields: Mapping[str, str], check: Check) -> tuple[Scenario, list[str]]:
     """Every field that can be applied, whatever their order, and a line for every other."""
     known = {path: p for path, _, p in base.walk()} | dict(base.lists())
-    values, refused = {}, {}
+    values, refused = {path: read_value(path, text, known) for path, text in fields.items()}, {}
     scenario = base.copy()
-    for path, text in fields.items():
-        values[path] = read_value(path, text, known)
+    for path, value in values.items():
         try:
-            _set(scenario, path, values[path])
+            _set(scenario, path, value)
         except SettingError as error:
             refused[path] = str(error)
     if _clash(scenario, check):
@@ -333,13 +328,6 @@ def stated_options(source: LoadedRecord) -> list[str]:
     return source.declaration.options({"sha256": source.sha256} if source.sha256 else {})
 
 
-def record_code(source: LoadedRecord) -> str:
-    """Write the line of Python that loads a record."""
-    stated = "".join(f"{name}={value!r}, " for name, value in vars(source.declaration).items() if value not in (None, {}, False))
-    check = f", sha256={source.sha256!r}" if source.sha256 else ""
-    return f"record = load_record({source.name!r}, scenario, DeclaredFormat({stated.removesuffix(', ')}){check})"
-
-
 def scenario_code(scenario: Scenario, preset: str, file: str) -> str:
     """Write the settings as an expression of Python, or the loading of a file of them where they are long."""
     lines = [f"    {json.dumps(path)}: {value!r},\n" for path, value in changes(scenario, preset).items()]
@@ -403,13 +391,12 @@ def _live_command(scenario: Scenario, preset: str, source: Source | None, order:
 
 def to_python(scenario: Scenario, preset: str, source: Source | None = None, task: CopiedTask = EXPLORED) -> str:
     """Write a script that computes and prints what a page shows."""
-    if task.what == SWEEP or (task.what == LIVE and not isinstance(source, LoadedRecord)):  # they simulate the settings
-        source = None
+    simulation = source.simulation if source and task.what not in (SWEEP, LIVE) else None  # these simulate the settings
     return render(
         "script.txt",
         what=task.what,
         scenario=scenario_code(scenario, preset, FILE),
-        record=record_code(source) if isinstance(source, LoadedRecord) else "",
-        simulation=scenario_code(source.simulation, preset, SIMULATION) if isinstance(source, SimulatedRecord) else "",
+        record=source if isinstance(source, LoadedRecord) and task.what != SWEEP else None,
+        simulation=scenario_code(simulation, preset, SIMULATION) if simulation else "",
         **task.arguments,
     )

@@ -5,6 +5,7 @@ Colours of observers and controllers are `wfsobs.plot.looks`.
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from importlib.resources import files
@@ -78,59 +79,21 @@ BOUND_MARKS: Mapping[str, tuple[str, str, str]] = {
 HEARD = ".MuiFormLabel-root { position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%); }"
 """Style of a switch whose name is heard but not seen."""
 
-PRIMARY = "#0B4F6C"
 
-_COMPONENTS = {
-    "MuiAppBar": {"styleOverrides": {"root": {"backgroundColor": f"{PRIMARY} !important", "color": "#fff !important"}}},
-    "MuiButton": {"styleOverrides": {"root": {"textTransform": "none", "letterSpacing": 0, "minWidth": "32px"}}},
-    # The drawer over a narrow page is open when the page comes, until the browser has closed it (frame.js). It is no lighter than
-    # what is in it in dark mode.
-    "MuiDrawer": {
-        "styleOverrides": {
-            "modal": {"@media (max-width: 999.95px)": {"visibility": "var(--wfsobs-drawer, hidden)"}},
-            "paper": {"backgroundImage": "none !important"},
-        }
-    },
-    # Why a setting has no effect is to be read, though its box is grey.
-    "MuiFormHelperText": {"styleOverrides": {"root": {"&.Mui-disabled": {"color": "inherit", "opacity": 0.75}}}},
-    # Above the line of its mark: beside it is the box with the number that is being changed.
-    "MuiTooltip": {
-        "styleOverrides": {
-            "popper": {"pointerEvents": "none !important"},  # it would keep the pointer from the button that it covers
-            "tooltipPlacementRight": {"transform": "translateY(calc(-50% - 12px)) !important"},
-            "arrow": {"display": "none"},
-        }
-    },
-    "MuiToggleButton": {
-        "styleOverrides": {
-            # On the grey that is under the pointer the words would be too faint.
-            "root": {
-                "textTransform": "none",
-                "letterSpacing": 0,
-                "whiteSpace": "nowrap",
-                "&:hover:not(.Mui-selected)": {"color": "inherit"},
-                "&.MuiToggleButton-sizeSmall": {"padding": "5px 6px"},
-            }
-        }
-    },
-}
+def asset(name: str) -> str:
+    """Text of a file of the package's assets."""
+    return files("wfsobs.assets").joinpath(name).read_text(encoding="utf-8")
 
 
-_BREAKPOINTS = {"values": {"xs": 0, "sm": 1000, "md": 1100, "lg": 1200, "xl": 1536}}
-"""Widths [px]; below `sm` the drawer lies over the page: beside it, at a zoom of 200 %, there is no room for a figure."""
+THEME: Mapping[str, Any] = tomllib.loads(asset("theme.toml"))
+"""Colours in light and dark mode, what is common to both, and the style of the bar."""
 
-
-_TYPOGRAPHY = {"body1": {"fontSize": 14}, "body2": {"fontSize": 14}, "button": {"fontSize": 14}, "caption": {"fontSize": 12}}
-"""Few sizes of text [px]."""
+PRIMARY: str = THEME["light"]["palette"]["primary"]["main"]
 
 
 def theme() -> dict[str, Any]:
-    """Return the page's colours in light and dark mode; units are written as they are, not in capitals."""
-    common = {"components": _COMPONENTS, "breakpoints": _BREAKPOINTS, "typography": _TYPOGRAPHY, "chart_style": "classic"}
-    return {
-        "light": {"palette": {"primary": {"main": PRIMARY}}, **common},
-        "dark": {"palette": {"primary": {"main": "#6FB7D6", "dark": "#8CC9E2"}}, **common},
-    }
+    """Return the page's theme in light and dark mode."""
+    return {mode: THEME[mode] | THEME["common"] for mode in ("light", "dark")}
 
 
 def labels() -> dict[str, str]:
@@ -145,11 +108,6 @@ def observers_of(target: str, with_zero: bool = False) -> list[str]:
     """
     wanted = set(TARGETS if target == TOTAL else (target,))
     return [o.id for o in OBSERVERS.values() if wanted <= set(o.targets) and (with_zero or o.id != NO_ESTIMATE)]
-
-
-def asset(name: str) -> str:
-    """Text of a file of the package's assets."""
-    return files("wfsobs.assets").joinpath(name).read_text(encoding="utf-8")
 
 
 def script(*names: str) -> str:

@@ -157,7 +157,12 @@ class _Work:
             stated.validate()
         self.record, self.known_estimates = record, RecordMemo(self.memo, record)
         self.usual = usual_observers(stated, record)
-        self.bounds = _Bounds() if self.simulation is None else self.memo.get(self._name_of_bounds(self.simulation, record))
+        simulation, bounds_name = self.simulation, ""
+        if simulation is not None:  # bounds depend on it, whatever its seed
+            settings = record_settings(simulation)
+            del settings["run"]["seed"]
+            bounds_name = digest("bounds", settings, record.n_steps, record.n_modes, joint_observers(simulation, self.usual))
+        self.bounds = self.memo.get(bounds_name) if bounds_name else _Bounds()
         self._add_truth(record)
         known = self.known_estimates
         for item in each_estimate(record, stated, self.watch, on_partial=self._grow, memo=known):
@@ -168,23 +173,18 @@ class _Work:
                     self._add(record, item)
                 self.news = self.news or item.observer not in known.known_observers
                 left = self._left()
-                due = (stage := _stage(left)) > self.stage and (left or self.bounds is None)
+                # how many of the weights nothing lighter is left of
+                stage = bisect(WEIGHTS, min((OBSERVERS[name].weight for name in left), default=SLOW))
+                due = stage > self.stage and (left or self.bounds is None)
                 self.stage = stage
                 shown = self._deliver(record) if due else None
             if shown is not None:
                 self.report(self.fraction)
                 self.tell(result=shown)
                 self._let_draw()
-                if stage == len(WEIGHTS) and self.bounds is None and self.simulation is not None:
-                    bounds = _Bounds(record_bounds(self.simulation, record, self.usual))
-                    self.bounds = self.memo.put(self._name_of_bounds(self.simulation, record), bounds)
+                if stage == len(WEIGHTS) and self.bounds is None and simulation is not None:
+                    self.bounds = self.memo.put(bounds_name, _Bounds(record_bounds(simulation, record, self.usual)))
         return self._so_far(record)
-
-    def _name_of_bounds(self, simulation: Scenario, record: Record) -> str:
-        """Name the bounds by what they depend on: the simulation, whatever its seed."""
-        settings = record_settings(simulation)
-        del settings["run"]["seed"]
-        return digest("bounds", settings, record.n_steps, record.n_modes, joint_observers(simulation, self.usual))
 
     def _left(self) -> set[str]:
         """List the observers that have not delivered everything."""
@@ -259,8 +259,3 @@ class _Work:
         """Over the samples that count for the scores; None where there are too few."""
         found = spectra(record, target, values, self.scenario.run.warm_up)
         return SignalAndError(*found) if found else None
-
-
-def _stage(left: set[str]) -> int:
-    """Count the weights that nothing lighter is left of."""
-    return bisect(WEIGHTS, min((OBSERVERS[name].weight for name in left), default=SLOW))

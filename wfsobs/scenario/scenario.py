@@ -345,8 +345,8 @@ def why_idle_at(path: str, idle: Mapping[str, str]) -> str:
 
 def used_settings(scenario: Scenario) -> Plain:
     """Return the settings that have an effect, as nested plain values."""
-    tree = scenario.to_dict()
-    for path in (*RECORD_ONLY, *dict(_within(scenario, "")), *dict(_across(scenario))):
+    tree = scenario.effective_values()
+    for path in (*RECORD_ONLY, *(path for path, _ in _across(scenario))):
         *above, name = path.split(".")
         node: Any = tree
         for key in above:

@@ -81,6 +81,11 @@ class Group(param.Parameterized):
             if getattr(self, other) not in values
         }
 
+    def effective_values(self) -> Plain:
+        """Return the tree as nested plain values, without the settings that have no effect."""
+        idle = self.idle()
+        return {name: _effective(getattr(self, name)) for name in self.settings() if name not in idle}
+
     def __repr__(self) -> str:
         changed = self._changed_settings()
         shown = ", ".join(f"{path}={value}" for path, value in changed[:SHOWN])
@@ -242,6 +247,13 @@ class Group(param.Parameterized):
                 yield from value.lists(f"{prefix}{name}.")
             elif isinstance(p, param.List) and holds_groups(p):
                 yield f"{prefix}{name}", p
+
+
+def _effective(value: Any) -> Any:
+    """Return a value as plain values, without settings that have no effect."""
+    if isinstance(value, Group):
+        return value.effective_values()
+    return [_effective(v) for v in value] if isinstance(value, list) else _plain(value)
 
 
 def _plain(value: Any) -> Any:

@@ -22,7 +22,7 @@ from wfsobs.evaluation.budget import Budget, budget_row, error_budget
 from wfsobs.evaluation.evidence import Evidence
 from wfsobs.evaluation.exact_errors import cumulative_rms, spectra
 from wfsobs.evaluation.result import Result, Row, score_rows
-from wfsobs.evaluation.scores import SCORED
+from wfsobs.evaluation.scores import RESIDUAL, SCORED
 from wfsobs.evaluation.verdict import verdict
 from wfsobs.observers.base import TARGETS
 from wfsobs.priors_from.scenario import usual_observers
@@ -127,6 +127,11 @@ class State:
     verdicts: Sequence[tuple[str, str, list[str]]] = ()
     main: Mapping[str, list[str]] = field(default_factory=dict)
 
+    @property
+    def is_truthless(self) -> bool:
+        """Whether errors are those of predicting the next measurement."""
+        return any(row["target"] == RESIDUAL for row in self.rows)
+
 
 @dataclass(frozen=True)
 class Report:
@@ -177,8 +182,7 @@ def state_of(
     record, scenario = result.record, result.scenario
     names = [m.name for m in scenario.modes][: record.n_modes]
     lines: dict[str, Floats] = {}
-    shown = {(target, name) for target in TARGETS for name in observers_of(target)}
-    drawn = {(e.target, e.observer): e.values for e in result.estimates if (e.target, e.observer) in shown}
+    drawn = {(e.target, e.observer): e.values for e in result.estimates if e.observer in observers_of(e.target)}
     grid = Grid(record.n_steps, record.dt, bins_for(states, len(drawn), len(names)))
     truths = {target: record.truth(target) for target in TARGETS}
     drawn |= {(target, TRUTH): truth for target, truth in truths.items() if truth is not None}
@@ -193,7 +197,7 @@ def state_of(
             lines |= {f"{kind}/{where}": grid.thin(signal[:, i]) for kind, signal in signals.items()}
             if found:
                 lines |= _frequencies(found[0])
-                for suffix, density in zip(("", "-error") if "error" in signals else ("",), found[1:], strict=False):
+                for suffix, density in zip(("", "-error"), found[1 : 1 + len(signals)], strict=False):
                     lines[f"psd{suffix}/{where}"], lines[f"cumulative{suffix}/{where}"] = _spectra(found[0], density[:, i])
     scores = [evidence.over_seeds(score) for score in result.scores] if evidence else result.scores
     rows = score_rows(scores, scenario.run.seed, source=result.prior_source)

@@ -34,25 +34,16 @@ from wfsobs.app.glossary import sentence_on
 from wfsobs.app.pages.sweep_views import SweepLines
 from wfsobs.app.render import render
 from wfsobs.app.report.data import Report, State, state_of, window_of
-from wfsobs.app.report.sections import (
-    budget_key,
-    budget_state_table,
-    loop_state_table,
-    meaning_values,
-    origin_values,
-    scenario_values,
-    state_name,
-    state_table,
-    summary,
-)
-from wfsobs.app.style import PRIMARY, asset, look, observers_of, sheets
+from wfsobs.app.report.sections import budget_groups, meaning_values, scenario_values, state_names, state_table
+from wfsobs.app.style import BOUND_MARKS, PRIMARY, TERM_COLOURS, asset, look, observers_of, sheets
 from wfsobs.app.views.plots import MODEL, PEAKS, add_line, add_marks, model_mark, new_figure, new_spectrum, peak_marks
 from wfsobs.app.views.traces import EVENT, EVENTS, add_event_marks, event_columns
 from wfsobs.app.work import TRUTH, RunResults
-from wfsobs.closed_loop.run import LIMITED, NOT_APPLICABLE
+from wfsobs.bench.measure import machine
+from wfsobs.closed_loop.run import LIMITED, NOT_APPLICABLE, label
 from wfsobs.evaluation.budget import TERMS
 from wfsobs.evaluation.evidence import Evidence, gather_evidence
-from wfsobs.evaluation.result import Result
+from wfsobs.evaluation.result import Result, row_label
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.files import check_writable, write_whole
 from wfsobs.observers import OBSERVERS
@@ -74,16 +65,17 @@ def page(report: Report, date: datetime) -> str:
     """Write the whole file; date: now, in the zone to write it in."""
     bokeh = (bokehjs_path() / "js/bokeh.min.js").read_text(encoding="utf-8") + "\nBokeh.set_log_level('warn')"
     scripts = {"start": START, "bokeh": bokeh, "page": asset("report.js")}
-    names = [state_name(report, state, i) or "All modes" for i, state in enumerate(report.states)]
-    states = list(zip(report.states, names, strict=True))
+    names = state_names(report)
     # what varies, and the rows of `wfsobs run --json` with the computing time
-    rows = [{"state": state_name(report, state, i), "rows": state.rows} for i, state in enumerate(report.states)]
+    rows = [{"state": name, "rows": state.rows} for name, state in zip(names, report.states, strict=True)]
     return render(
         "report/page.html",
         version=__version__,
         report=report,
-        summary=summary(report, date),
-        policy=_policy(*scripts.values()),
+        machine=machine(("bokeh",)),
+        date=date,
+        # checksums of the scripts, which alone may run
+        sums=[base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts.values()],
         scripts={name: Markup(script) for name, script in scripts.items()},
         sheets={"shared": Markup("".join(sheets("base", "style"))), "own": Markup(asset("report.css"))},
         primary=PRIMARY,
@@ -97,26 +89,19 @@ def page(report: Report, date: datetime) -> str:
         modes={name: name[0].upper() + name[1:] for name in _modes(report)},
         units=UNITS,
         sweeps={i: setting_label(report.base, report.variations[i].path) for i in _sweeps(report)},
-        errors=[state_table(*of) for of in states],
-        loops=[loop_state_table(*of) for of in states] if any(state.loop for state in report.states) else [],
-        budgets=[budget_state_table(*of) for of in states] if any(state.budgets for state in report.states) else [],
-        budget_key=budget_key(),
+        names=[name or "All modes" for name in names],
+        errors=[state_table(state) for state in report.states],
+        budgets=[budget_groups(state) for state in report.states],
+        term_colours=TERM_COLOURS,
+        bound_marks=BOUND_MARKS,
+        observer_label=row_label,
+        controller_label=label,
         terms=TERMS,
         not_applicable=NOT_APPLICABLE,
         limited=LIMITED,
         embedded={"rows": rows, "data": _data(report), "figures": _figures(report)},
         **scenario_values(report),
         **meaning_values(report),
-        **origin_values(report, date),
-    )
-
-
-def _policy(*scripts: str) -> str:
-    """Write the content security policy: the page may show itself and run these scripts."""
-    sums = " ".join(f"'sha256-{base64.b64encode(hashlib.sha256(s.encode()).digest()).decode()}'" for s in scripts)
-    return (
-        f"default-src 'none'; script-src {sums}; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'; "
-        "form-action 'none'"
     )
 
 

@@ -270,23 +270,20 @@ class ScoreWriter:
         interval, time, lag, sd = row["interval_um"], row[TIME], row["lag_s"], row["sd_um"]
         is_bound, is_worse = row["observer"] in BOUNDS, target in SCORED and (row["normalised_rms"] or 0.0) > 1.0
         no_lag = "estimate or truth is constant" if target in SCORED else "not compared with a truth"
+        error = self.length(row["rms_um"])  # last, so that numbers stand below each other
+        if mark:
+            error = macro("tag", mark, mark) + error
+        if interval is not None:
+            known = macro("interval", *map(self.length, interval), IN_MOST if is_bound else over(self.n_seeds))
+            error = (macro("note", "interval unknown") if is_unknown(row["rms_um"], interval) else known) + " " + error
         return [
-            # The number last, so that numbers stand below each other.
-            self._interval(row["rms_um"], interval, IN_MOST if is_bound else over(self.n_seeds))
-            + (macro("tag", mark, mark) if mark else "")
-            + self.length(row["rms_um"]),
+            error,
             (ABOVE if is_worse else "") + _or_why(row["normalised_rms"], f"{_base(target)} is 0"),
             _or_why(None if lag is None else 1e3 * lag, "a limit has none" if is_bound else no_lag),
             _or_why(time, "nothing is computed"),
             _or_why(None if time is None else 1e-6 * time / self.dt, "nothing is computed"),
             missing("it predicts no sigma of this error") if sd is None else self.length(sd),
         ]
-
-    def _interval(self, rms: float, interval: Sequence[float] | None, meaning: str) -> str:
-        if interval is None:
-            return ""
-        unknown = is_unknown(rms, interval)
-        return (macro("note", "interval unknown") if unknown else macro("interval", *map(self.length, interval), meaning)) + " "
 
 
 def _base(target: str) -> str:

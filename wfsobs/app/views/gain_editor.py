@@ -256,6 +256,5 @@ class GainEditor:
             values.append(("phase-margin", "phase margin", f"{degrees(margins.phase):.0f}", "°"))
         colour = look(INTEGRATOR).colour(self.display.dark)
         return [
-            {"name": name, "label": label, "colour": colour, "value": value, "unit": unit, "was": ""}
-            for name, label, value, unit in values
+            {"name": name, "label": label, "colour": colour, "value": value, "unit": unit} for name, label, value, unit in values
         ]

@@ -301,7 +301,8 @@ class EndLabels:
             if seen.size:
                 places[name] = (float(scale(np.median(seen))) - low) / (high - low)
         names = sorted(places, key=places.__getitem__)
-        texts = [_in_two_lines(look(name).label) for name in names]
+        labels = [look(name).label for name in names]
+        texts = [label.replace(" ", "\n", 1) if len(label) > 10 else label for label in labels]
         apart = spread([places[name] for name in names], [ROOM_OF_NAME["\n" in text] for text in texts])
         at = [low + (high - low) * place for place in apart]
         self.labels.update(text_color="#E8E8E8" if dark else "#202020")
@@ -315,10 +316,6 @@ class EndLabels:
                 "dash": [list(look(name).dash) for name in names],
             },
         )
-
-
-def _in_two_lines(text: str) -> str:
-    return text.replace(" ", "\n", 1) if len(text) > 10 else text
 
 
 LAST = 20

@@ -174,14 +174,20 @@ def _turbulence(s: Scenario, mode: int) -> Iterator[Handle]:
         yield Handle(CORNER, 0, "Corner of the turbulence", corner, None if t.source == "frozen-flow" else t.rms)
 
 
+def find_handle(scenario: Scenario, target: str, mode: int, name: object) -> Handle:
+    """Find a handle by its name in messages. Raises SettingError where there is no such handle."""
+    for handle in handles_of(scenario, target, mode):
+        if handle.id == name:
+            return handle
+    raise SettingError("this handle is no longer there")
+
+
 def changes_of(scenario: Scenario, target: str, mode: int, to: Handle) -> dict[str, Any]:
     """Return the settings, dotted path -> value, that bring the handle of the same name to where `to` is.
 
     Raises SettingError where there is no such handle.
     """
-    now = next((h for h in handles_of(scenario, target, mode) if h.id == to.id), None)
-    if now is None:
-        raise SettingError(f"there is no {to.id} to move")
+    now = find_handle(scenario, target, mode, to.id)
     if to.kind == BAND:
         bands = [*scenario.butterworth.frequencies]
         bands[to.index] = to.frequency
@@ -307,21 +313,15 @@ class SpectrumEditor:
     def _changes(self, base: Scenario, message: Mapping[str, Any]) -> dict[str, Any]:
         """Return the settings that a message is about; none for one that gives up. Raises SettingError, ValueError."""
         action, mode = message.get("action"), self.display.column
-        if action in ("drag", "release"):
-            handle = self._handle(base, message)
-            frequency, strength, damping = (positive(message[name]) for name in ("frequency", "strength", "damping"))
-            return changes_of(base, self.target, mode, handle.at(frequency, strength, damping))
         if action == "add":
             return with_new_peak(base, mode, positive(message["frequency"]))
+        if action not in ("drag", "release", "remove"):
+            return {}
+        handle = find_handle(base, self.target, mode, message.get("id"))
         if action == "remove":
-            return without_peak(base, self._handle(base, message).index)
-        return {}
-
-    def _handle(self, scenario: Scenario, message: Mapping[str, Any]) -> Handle:
-        found = [h for h in handles_of(scenario, self.target, self.display.column) if h.id == message.get("id")]
-        if not found:
-            raise SettingError("this handle is no longer there")
-        return found[0]
+            return without_peak(base, handle.index)
+        frequency, strength, damping = (positive(message[name]) for name in ("frequency", "strength", "damping"))
+        return changes_of(base, self.target, mode, handle.at(frequency, strength, damping))
 
     def _follow(self, *_: object) -> None:
         """Take over settings that have changed, here or elsewhere."""

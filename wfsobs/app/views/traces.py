@@ -189,7 +189,9 @@ class _Spectrum(TargetFigure):
         self.name_ends(drawn, display.dark)
         self.figure.yaxis.axis_label = display.curve_label(" of error" if error else "")
         if self.marks:
-            self._draw_marks(results)
+            found = {"peaks": drawn_peaks(results), "model": [model_mark(results.scenario)]}
+            for name, marks in found.items():
+                send(self.marks[name].data_source, {"x": [x for x, _ in marks], "text": [text for _, text in marks]})
 
     def _fit(self, lines: list[Array], cumulative: bool) -> None:
         """Have the axis hold every line, but for what lies too far below the highest."""
@@ -198,11 +200,6 @@ class _Spectrum(TargetFigure):
             low, high = min(float(np.quantile(y, 0.02)) for y in positive), max(float(y.max()) for y in positive)
             room, decades = (1.5, DECADES / 2) if cumulative else (3.0, DECADES)
             self.figure.y_range.update(start=max(low / room, high * 10.0**-decades), end=high * room)
-
-    def _draw_marks(self, results: RunResults) -> None:
-        found = {"peaks": drawn_peaks(results), "model": [model_mark(results.scenario)]}
-        for name, marks in found.items():
-            send(self.marks[name].data_source, {"x": [x for x, _ in marks], "text": [text for _, text in marks]})
 
 
 def drawn_peaks(results: RunResults) -> list[tuple[float, str]]:
@@ -293,25 +290,6 @@ def add_event_marks(fig: figure) -> list[GlyphRenderer[Any]]:
     strip = VStrip(x0="start", x1="end", fill_alpha=0.13, line_width=1.5, line_dash=[6, 3])
     text = Text(x="start", y="top", text="text", x_offset=4, y_offset="below", text_baseline="top", text_font_size="11px")
     return [fig.add_glyph(source, it, name=EVENTS, level=level) for it, level in ((strip, "underlay"), (text, "overlay"))]
-
-
-class EventMarks:
-    """The marks in one figure, none until there is an event."""
-
-    def __init__(self, fig: figure):
-        self.figure = fig
-        self.marks: list[GlyphRenderer[Any]] = []
-
-    def draw(self, results: RunResults, dark: bool) -> None:
-        """Show those of the results."""
-        events = events_of(results)
-        if not events and not self.marks:
-            return
-        self.marks = self.marks or add_event_marks(self.figure)
-        _, top = in_view(self.figure.y_range)
-        strip, text = self.marks
-        send(strip.data_source, {**event_columns(events, results.scenario), "top": [top] * len(events)})
-        strip.glyph.line_color = strip.glyph.fill_color = text.glyph.text_color = EVENT.colour(dark)
 
 
 BINS = 500
@@ -417,7 +395,7 @@ class _Trace(TargetFigure):
         self.figure.add_tools(crosshair)
         self.warm_up = BoxAnnotation(left=0, right=0, fill_color="#808080", fill_alpha=0.10, line_width=0, level="underlay")
         self.figure.add_layout(self.warm_up)
-        self.events = EventMarks(self.figure)
+        self.event_marks: list[GlyphRenderer[Any]] = []  # none until there is an event
         self.band = _Band(self.figure)
 
     def draw(self, results: RunResults, display: Display, first: int, last: int) -> None:
@@ -434,10 +412,16 @@ class _Trace(TargetFigure):
         settled = warm_up + WINDOW_S * display.running
         error = shows_error(results, self.target, display)
         extra = self._draw_runs(display, error, data["x"]) + self._draw_band(results, display, first, last, data["x"])
-        above = levels(events_of(results), results.scenario.run.duration)
+        events = events_of(results)
+        above = levels(events, results.scenario.run.duration)
         self._fit(data, settled, extra, 0.1 * (1 + max(above, default=-1)))
         self.name_ends({name: (data["x"], data[name]) for name, line in self.lines.items() if line.visible}, display.dark)
-        self.events.draw(results, display.dark)
+        if events or self.event_marks:
+            self.event_marks = self.event_marks or add_event_marks(self.figure)
+            strip, text = self.event_marks
+            top = [in_view(self.figure.y_range)[1]] * len(events)
+            send(strip.data_source, event_columns(events, results.scenario) | {"top": top})
+            strip.glyph.line_color = strip.glyph.fill_color = text.glyph.text_color = EVENT.colour(display.dark)
         what = f"{'running rms of ' if error and display.running else ''}{'error of ' if error else ''}{display.mode_label}"
         self.figure.yaxis.axis_label = f"{what} [{display.unit_label}]"
 
