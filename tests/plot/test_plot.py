@@ -28,7 +28,7 @@ from wfsobs.evaluation.exact_errors import cumulative_rms, spectra
 from wfsobs.identification.result import Identification
 from wfsobs.observers import OBSERVERS
 from wfsobs.plot.elements import BINS, save_figure, to_matplotlib
-from wfsobs.plot.figures import PLOTS_OF
+from wfsobs.plot.figures import plots_of
 from wfsobs.plot.looks import look
 from wfsobs.plot.paper import NUMBERS, draw_paper_figure, observers_in, samples_of
 from wfsobs.record import Estimate
@@ -93,7 +93,7 @@ PLOTS: dict[str, Callable[..., Any]] = {
     **{
         f"{source} {method}": lambda it, source=source, method=method: getattr(it(source).plot, method)()
         for kind, source in SOURCES.items()
-        for method in vars(PLOTS_OF[kind])
+        for method in vars(plots_of.registry[kind])
         if not method.startswith("_")
     },
     "record tilt": lambda it: it("record").plot.spectra(mode="tilt"),
@@ -105,7 +105,9 @@ PLOTS: dict[str, Callable[..., Any]] = {
 
 
 def test_everything_that_has_figures_is_drawn_here() -> None:
-    assert SOURCES.keys() == PLOTS_OF.keys()
+    assert SOURCES.keys() == plots_of.registry.keys() - {object}
+    with pytest.raises(TypeError, match="no figures of int"):
+        plots_of(3)
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import singledispatch
 from typing import Any
 
 import holoviews as hv
@@ -376,20 +377,21 @@ class EnvelopePlots:
         return overlay(_some(lines, "stable plant"), log="y")
 
 
-PLOTS_OF = {
+@singledispatch
+def plots_of(source: object) -> Any:
+    """Return the figures of an object."""
+    raise TypeError(f"no figures of {type(source).__name__}")
+
+
+for _kind, _plots in {
     Record: RecordPlots,
     Result: ResultPlots,
     Identification: IdentificationPlots,
     SweepResults: SweepPlots,
     ClosedLoop: LoopPlots,
     PlantEnvelope: EnvelopePlots,
-}
-"""Kind of an object -> its figures."""
-
-
-def plots_of(source: Any) -> Any:
-    """Return the figures of an object of one of these kinds."""
-    return PLOTS_OF[type(source)](source)
+}.items():
+    plots_of.register(_kind, _plots)
 
 
 def _mode_of(n_modes: int, name: str | None) -> tuple[str, int]:
