@@ -219,6 +219,24 @@ def test_an_observer_that_ends_in_an_error_is_a_failure_of_its_own(monkeypatch):
     assert len([r for r in rows if r["name"] == "kf-lgs" and r["rms_nm"]]) == 6  # of either target and of both, two modes
 
 
+def test_settings_that_no_observer_can_use_are_a_failure_of_each(monkeypatch):
+    from wfsobs.campaign import run
+    from wfsobs.campaign.plan import parse_plan
+    from wfsobs.settings.values import SettingError
+
+    calls = []
+
+    def refuse(*_):
+        calls.append(1)
+        raise SettingError("a.b = 'x  y': is refused")
+
+    monkeypatch.setattr(run, "record_bounds", refuse)
+    plan = parse_plan(TINY.format(seeds=1), Path())
+    rows = run.run_rows(plan.cells[0], 1, plan.observers, ())
+    assert {r["name"]: r["note"] for r in rows} == dict.fromkeys(plan.observers, "a.b = 'x  y': is refused")
+    assert len(calls) == 1  # the others are not run one by one: they would meet the same
+
+
 def test_the_file_for_data_frames_has_the_settings(undisturbed, tmp_path):
     import pyarrow.parquet as pq
 

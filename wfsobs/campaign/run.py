@@ -149,13 +149,16 @@ def _rows_of_all(
 
 
 def _observer_rows(record: Record, ready: _Ready, observers: Sequence[str]) -> list[Row]:
-    """Return the rows of observers and of their bounds."""
-    items = list(each_estimate(record, ready.scenario, observers=observers))
-    estimates = [item for item in items if isinstance(item, Estimate)]
-    if ready.bounds is None:
-        ready.bounds = record_bounds(ready.scenario, record, {item.observer for item in estimates})
-    failures = [item for item in items if isinstance(item, Failure)]
-    result = collect(ready.scenario, record, estimates, failures, least=ready.bounds)
+    """Return the rows of observers and of their bounds; each is a failure where the settings of all cannot be used."""
+    try:
+        items = list(each_estimate(record, ready.scenario, observers=observers))
+        estimates = [item for item in items if isinstance(item, Estimate)]
+        if ready.bounds is None:
+            ready.bounds = record_bounds(ready.scenario, record, {item.observer for item in estimates})
+        failures = [item for item in items if isinstance(item, Failure)]
+        result = collect(ready.scenario, record, estimates, failures, least=ready.bounds)
+    except SettingError as error:
+        return [_failure(name, str(error)) for name in observers]
     rows = [
         {
             "name": row["observer"],
