@@ -112,8 +112,7 @@ def _matched_noise(settings: Any) -> tuple[Part, ...]:
 
 
 def _offline_used(settings: Any) -> Plain:
-    own = of_z(settings.gpr_offline)
-    return {name: value for name, value in own.to_dict().items() if name not in own.idle()}
+    return of_z(settings.gpr_offline).effective_values()
 
 
 def _online_used(settings: Any) -> Plain:
