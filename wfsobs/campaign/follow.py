@@ -292,11 +292,11 @@ def standings(state: CampaignState, target: str, mode: str, cells: Sequence[int]
     state : of `wfsobs.campaign.follow.CampaignFolder`;  cells : of `wfsobs.campaign.plan.cells_where`
     """
     errors = state.errors[target, mode]
-    limits, places = errors.over_bound(cells), errors.standings(cells)
+    ratio, low, high = errors.over_bound(cells)
+    places = errors.standings(cells)
     out = []
     for s in places:
         i = errors.names.index(s.name)
-        over, over_low, over_high = (float(x[i]) for x in limits)
         won = [v for cell in cells if (v := errors.winners.get(int(cell))) is not None and v.best.name == s.name]
         can_win, failed = errors.eligible[cells, i].any(), state.failures.get(s.name)
         out.append(
@@ -305,13 +305,13 @@ def standings(state: CampaignState, target: str, mode: str, cells: Sequence[int]
                 mode,
                 s.name,
                 s.rms,
-                over,
-                over_low,
-                over_high,
-                s.above,
-                s.low,
-                s.high,
-                _rank(s, places),
+                over_bound=float(ratio[i]),
+                over_bound_low=float(low[i]),
+                over_bound_high=float(high[i]),
+                above=s.above,
+                above_low=s.low,
+                above_high=s.high,
+                rank=_rank(s, places),
                 wins=len(won) if can_win else None,
                 decided_wins=sum(v.is_decided for v in won) if can_win else None,
                 records=int(errors.count[cells, i].sum()),
