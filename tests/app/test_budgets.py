@@ -7,16 +7,19 @@ from typing import Any
 import pytest
 
 from tests.app.conftest import OneSeed, compute_once
+from wfsobs.app import idle_work
 from wfsobs.app.display import Display
-from wfsobs.app.idle_work import Budgets
+from wfsobs.app.idle_work import Budgets, compute_budgets
 from wfsobs.app.render import number
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.style import TERM_COLOURS
 from wfsobs.app.views.errors import MainLines, Strip, VerdictLine
+from wfsobs.app.work import RunResults
 from wfsobs.evaluation.budget import TERMS, Budget
 from wfsobs.evaluation.result import own_bound
 from wfsobs.observers import OBSERVERS
+from wfsobs.progress import Cancelled, Watch
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import simulate
 
@@ -51,6 +54,34 @@ def short(short: Scenario) -> Scenario:
 @pytest.fixture
 def page(make_store: Any) -> Page:
     return Page(make_store(compute_once))
+
+
+def test_work_that_gave_way_goes_on_where_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is begun anew, with what it has found so far."""
+    begun: list[str] = []
+    told: list[list[str]] = []
+    is_busy = True
+
+    def budget(_result: object, observers: list[str], watch: Watch) -> list[Budget]:
+        begun.extend(observers)
+        if is_busy and len(begun) == 3:
+            raise Cancelled
+        return []
+
+    monkeypatch.setattr(idle_work, "error_budget", budget)
+    monkeypatch.setattr(RunResults, "result", None, raising=False)
+    known: dict[str, list[Budget]] = {}
+    results = object.__new__(RunResults)
+
+    def work() -> None:
+        compute_budgets(results, ["a", "b", "c"], known, Watch(), lambda latest: told.append([*latest]))
+
+    with pytest.raises(Cancelled):
+        work()
+    is_busy = False
+    work()
+    assert begun == ["a", "b", "c", "c"]
+    assert told == [["a"], ["a", "b"], ["a", "b", "c"]]
 
 
 def test_terms_add_up_to_the_scores_in_every_mode(page: Page, loop: Any) -> None:

@@ -147,7 +147,9 @@ class TestChoice:
             cards._handle_msg({"action": "toggle", "name": "kf-lgs"})
         assert told == [[*at_first, "kf-lgs"], at_first]
         cards._handle_msg({"action": "solo", "name": "kf-lgs"})
-        assert dashboard.display.hidden_lines["vibration"] == told[-1] == hidden(dashboard, "vibration")
+        lines = dashboard.explore.traces.traces["vibration"].lines
+        assert dashboard.display.hidden_lines["vibration"] == told[-1]
+        assert [name for name, line in lines.items() if line.visible] == ["kf-lgs"]
         assert {card["name"] for card in cards.items} - {*told[-1]} == {"kf-lgs"}
         assert not re.findall(f'folded"[^>]*data-name="(?:{"|".join(shown)})"', cards.html), "a click moves no row"
         cards._handle_msg({"action": "solo", "name": "kf-lgs"})

@@ -279,6 +279,20 @@ def test_a_task_shows_one_job_at_a_time(service: Service, loop: Any, caplog: Any
     assert loop.queue.empty(), "nothing of what was cancelled lands"
 
 
+def test_a_result_is_drawn_before_its_end_also_where_another_job_was_left(service: Service) -> None:
+    session, posted = service.enter(), []
+    session.post = posted.append
+    task = BackgroundTask(session, drawn_first=True)
+    task._hear(task._generation, {"progress": 0.5})
+    task.close()
+    task._hear(task._generation, {"state": DONE, "result": 1})
+    (land,) = posted
+    land()
+    assert task.result == 1 and task.state != DONE
+    posted[1]()
+    assert task.state == DONE and len(posted) == 2
+
+
 def test_a_session_that_ends_takes_its_jobs_out_of_the_line(service: Service, loop: Any) -> None:
     log = Log()
     busy = Asked(log, "a").into(service.queue)

@@ -192,6 +192,7 @@ class Budgets(param.Parameterized):
         self.main = main
         self.task: Final = BackgroundTask(seeds.store.session)
         self._of: RunResults | None = None
+        self._budgets: ByObserver = {}
         self._names: list[str] = []
         watch(self._follow, (self.run, ["state", "result"]), (self, "every"), (seeds, ["evidence", "count"]))
         self.task.param.watch(self._take, ["latest", "state"])
@@ -214,12 +215,12 @@ class Budgets(param.Parameterized):
         """Begin anew with what is shown, once it is complete."""
         shown = self.run.result if self.run.state == DONE and self.possible else None
         if shown is not self._of:
-            self._of, self._names, self.by_observer = shown, [], {}
+            self._of, self._budgets, self._names, self.by_observer = shown, {}, [], {}
         if shown is None:
             self.task.close()
         elif not set(wanted := self._order(shown)) <= set(self._names):
             self._names = wanted
-            work = partial(compute_budgets, shown, wanted, self.by_observer)
+            work = partial(compute_budgets, shown, wanted, self._budgets)
             self.task.start(Job("budgets", work, cost=run_seconds(shown.scenario), priority=IDLE_TIME))
 
     def _order(self, results: RunResults) -> list[str]:
@@ -237,9 +238,8 @@ class Budgets(param.Parameterized):
 
 
 def compute_budgets(results: RunResults, names: Sequence[str], budgets: ByObserver, watch: Watch, tell: Tell) -> None:
-    """Compute the budgets of observers, and tell them with those there are already."""
+    """Compute the budgets of observers; budgets : those there are already, to which it adds."""
     for name in names:
         if name not in budgets:
-            found = error_budget(results.result, observers=[name], watch=Watch(is_cancelled=watch.is_cancelled))
-            budgets = {**budgets, name: found}
-            tell(latest=budgets)
+            budgets[name] = error_budget(results.result, observers=[name], watch=Watch(is_cancelled=watch.is_cancelled))
+            tell(latest=dict(budgets))

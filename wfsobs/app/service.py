@@ -237,7 +237,8 @@ class BackgroundTask(param.Parameterized):
         session.tasks.append(self)
         self._lock = threading.Lock()
         self._generation = 0
-        self._news: dict[str, Any] = {}  # while there is any, it is posted that it lands
+        self._news: dict[str, Any] = {}
+        self._is_posted = False  # also where the news was of a job that has been left
         self._leave: Callable[[], None] = lambda: None
 
     def start(self, job: Job) -> None:
@@ -292,17 +293,18 @@ class BackgroundTask(param.Parameterized):
         with self._lock:
             if generation != self._generation:
                 return
-            is_posted = bool(self._news)
             self._news |= news
-        if not is_posted:
-            self.session.post(self._land)
+            if self._is_posted:
+                return
+            self._is_posted = True
+        self.session.post(self._land)
 
     def _land(self) -> None:
         with self._lock:
-            news, self._news = self._news, {}
+            news, self._news, self._is_posted = self._news, {}, False
             if self._drawn_first and news.get("state") == DONE and "result" in news:
-                self._news = {"state": news.pop("state")}
-            again = bool(self._news)
+                self._news, self._is_posted = {"state": news.pop("state")}, True
+            again = self._is_posted
         if news:
             self.param.update(**news)
         if again:

@@ -6,11 +6,15 @@ const STEP = 0.01, LEAP = 0.1 // of the width, for an arrow key alone and with S
 export function render({model, el}) {
   el.innerHTML = `<div class="mark" popover="manual"></div><div class="values" popover="manual"></div>`
   const [mark, box] = el.children
+  const views = new WeakMap() // to find one walks all of the page
   let at = null // {view, share of the width} by keyboard
 
   const viewOf = (event) => {
     const figure = event.composedPath().find((it) => it.classList?.contains("bk-Figure"))
-    return figure && figureViews().find((it) => it.el === figure)
+    if (figure && !views.has(figure)) {
+      for (const view of figureViews()) views.set(view.el, view)
+    }
+    return views.get(figure)
   }
 
   const hide = () => {

@@ -16,7 +16,8 @@ export function render({model, el}) {
   box.onkeydown = ({key}) => { if (key === "Enter" && box.value.trim()) find() }
   model.on("items", fill)
   model.on("msg:custom", (event) => {
-    const {path} = event.data ?? event
+    const {path, text} = event.data ?? event
+    if (text !== box.value) return // other words are in it meanwhile
     if (path) {
       box.value = ""
       return go(path)

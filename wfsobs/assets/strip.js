@@ -17,11 +17,19 @@ export function render({model, el}) {
   for (const type of ["pointerover", "focusin", "focusout"]) el.addEventListener(type, tell)
   el.onpointerleave = () => tell({target: el})
 
-  el.onclick = ({target}) => { // at once; what the server says of it follows
-    const row = rowAt(target)
+  // Rows are marked at once; what the server says of it follows.
+  el.onclick = ({target}) => {
+    const row = rowAt(target), areAll = target.dataset.do === "lines"
     if (row) row.ariaPressed = row.ariaPressed !== "true"
+    for (const it of areAll ? el.querySelectorAll(".card") : []) it.ariaPressed = true
   }
-  const showAlone = ({target}) => { if (rowAt(target)) model.send_msg({action: "solo", name: rowAt(target).value}) }
+  const showAlone = ({target}) => {
+    const row = rowAt(target)
+    if (!row) return
+    const isAlone = el.querySelectorAll("[aria-pressed=true]").length === 1 && row.ariaPressed === "true"
+    for (const it of isAlone ? [] : el.querySelectorAll(".card")) it.ariaPressed = it === row
+    model.send_msg({action: "solo", name: row.value})
+  }
   el.ondblclick = showAlone
   el.onkeydown = (event) => { if (keyAlone(event).toLowerCase() === "s") showAlone(event) }
   showMarkup(el, model, describe)

@@ -119,7 +119,7 @@ class Search(Component):
         elif isinstance(text := data.get("find"), str):
             if path := find_setting(text):
                 self._reveal(path)
-            self._send_msg({"path": path})
+            self._send_msg({"path": path, "text": text})
 
 
 def drawer_settings(scenario: Scenario) -> dict[str, param.Parameter[Any]]:

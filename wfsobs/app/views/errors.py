@@ -457,7 +457,7 @@ class Cards(HtmlComponent):
             return self._hide(self._among)
         if len(shown) != 1:
             self._among = self.hidden_lines
-        self._hide([it for it in dict.fromkeys([*self.hidden_lines, *names]) if it != name])
+        self._hide([*(it for it in self.hidden_lines if it not in names), *(it for it in names if it != name)])
 
     def _hide(self, names: list[str]) -> None:
         self._own_choice = self.hidden_lines = names
