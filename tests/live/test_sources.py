@@ -11,6 +11,7 @@ import pytest
 import zmq
 
 import wfsobs
+from wfsobs.live import source as live_source
 from wfsobs.live.attached import SPELL, StreamFrames, StreamSource
 from wfsobs.live.board import LONG_STEPS
 from wfsobs.live.checks import observers_on
@@ -44,6 +45,23 @@ def test_frames_of_a_record_are_those_of_the_record():
     again = open_loop_record(LiveFrame(np.zeros(record.n_steps), *parts), record.sampling)
     np.testing.assert_array_equal(again.z, record.z)
     np.testing.assert_array_equal(again.z_ngs[1:], record.z_ngs[1:])
+
+
+@pytest.mark.parametrize(("n_frames", "count", "last"), [(None, 7, [(7, "the record has ended")]), (3, 3, [])])
+def test_a_record_is_sent_until_its_end_or_what_was_asked_for(monkeypatch, n_frames, count, last):
+    ring, inbox, news, opened = Ring(2), Inbox(), queue.Queue(), []
+    monkeypatch.setattr(live_source, "enter_process", lambda **_: None)
+    monkeypatch.setattr(live_source, "Ring", lambda *of: opened.append(Ring(*of)) or opened[-1])
+    rows = np.arange(70.0).reshape(7, 10)
+    inbox.waiting.append({"play": True, "line": "a setting"})
+    try:
+        live_source._send(rows, 1e-4, Desk(ring.name, 2, news, 1.0, n_frames), inbox)
+        assert ring.is_closed and ring.count == count
+        np.testing.assert_array_equal(np.hstack(ring.read_frames(0, count)[1:]), rows[:count])
+    finally:
+        for one in (*opened, ring):
+            one.release()
+    assert [(event.frame, event.what) for event in news.queue] == [(0, "a record cannot be changed"), *last]
 
 
 @pytest.fixture

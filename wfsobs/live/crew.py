@@ -140,7 +140,8 @@ class ObserverCrew(Crew[StepObserver]):
         slots = self._row[2:].reshape(n, slot_width(m))
         self._times, self._estimates = slots[:, 0], slots[:, 1:].reshape(n, len(TARGETS), m)  # views of the row
         self._rows, self._truth, self._waits = np.empty((COUNTED, *slots.shape)), np.empty((COUNTED, len(TRUTHS), m)), 0
-        self._running, self._has_ngs = np.empty(0, dtype=np.intp), sampling.ratio is not None
+        self._has_ngs = sampling.ratio is not None
+        self._list_running()
         self._past, self._past_z = np.full((self.ratio, n, m), np.nan), np.full((self.ratio - 1, m), np.nan)
 
     def take(self, frame: LiveFrame, number: int) -> Array:
@@ -150,12 +151,12 @@ class ObserverCrew(Crew[StepObserver]):
         self._start_waiting(number)
         ngs = None if np.isnan(frame.ngs[0]) else frame.ngs
         before = monotonic()
-        for slot, observer in zip(self._running, self._active.values(), strict=True):
+        for slot, observer, outs in self._followers:
             # u goes to those alone that need it, and no NGS measurement to a first frame
             u = frame.u if observer.estimator.needs_command else None
             observer.update(frame.z, ngs if observer.frame else None, u)
-            for target in observer.targets:
-                self._estimates[slot, TARGETS.index(target)] = observer.predict(0, target)[0]
+            for target, out in outs:
+                out[:] = observer.predict(0, target)[0]
             now = monotonic()
             self._times[slot], before = now - before, now
         self._row[:2] = number, before - float(frame.due)
@@ -223,12 +224,12 @@ class ObserverCrew(Crew[StepObserver]):
         """Switch an observer off, or a new design on, which goes on where the one before is."""
         self.count()
         super().follow(command, number)
+        self._list_running()
 
     def _clear(self, name: str) -> None:
         slot = SLOTS.index(name)
         self._estimates[slot] = self._times[slot] = self._past[:, slot] = np.nan
         self._board[name].since[0] = -1
-        self._list_running()
 
     def start(self, name: str, design: StepObserver, number: int) -> None:
         """Let an observer follow from a frame on."""
@@ -242,7 +243,13 @@ class ObserverCrew(Crew[StepObserver]):
         self._list_running()
 
     def _list_running(self) -> None:
-        self._running = np.array([SLOTS.index(name) for name in self._active], dtype=np.intp)
+        """Note the slots of those that run, and where each writes its estimates."""
+        slots = [SLOTS.index(name) for name in self._active]
+        self._running = np.array(slots, dtype=np.intp)
+        self._followers = [
+            (slot, observer, [(target, self._estimates[slot, TARGETS.index(target)]) for target in observer.targets])
+            for slot, observer in zip(slots, self._active.values(), strict=True)
+        ]
 
 
 class Beside:

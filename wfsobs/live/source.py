@@ -114,7 +114,7 @@ class Worker:
     work : callable
         Receives the arguments, and last its end of a pipe.
     *arguments
-        Kept as long as the worker is: the locks of a queue live no longer than it.
+        Of these, queues are kept as long as the worker is: their locks live no longer than they do.
 
     Attributes
     ----------
@@ -129,7 +129,7 @@ class Worker:
 
     def __init__(self, context: SpawnContext, name: str, work: Callable[..., None], *arguments: object):
         self.pipe, theirs = context.Pipe()
-        self._arguments = arguments
+        self._queues = [it for it in arguments if isinstance(it, Queue)]
         self.process = context.Process(target=work, args=(*arguments, theirs), name=name, daemon=True)
         self.process.start()
 

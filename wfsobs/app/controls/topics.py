@@ -53,17 +53,19 @@ class TopicList:
 
     def _draw(self) -> None:
         """Write the names, in one piece up to each topic that is open."""
+        pieces: list[list[str]] = [[]]
+        for name in self.titles:
+            pieces[-1].append(name)
+            if name in self.open_topics:
+                pieces.append([])
+        pieces = [piece for piece in pieces if piece]
+        self._headings += [Headings(self._toggle, **WIDE) for _ in pieces[len(self._headings) :]]
         parts: list[Any] = []
-        piece: dict[str, str] = {}
-        for name, title in self.titles.items():
-            piece[name] = title
-            is_open = name in self.open_topics
-            if is_open or name == next(reversed(self.titles)):
-                if len(parts) == 2 * len(self._headings):
-                    self._headings.append(Headings(self._toggle, **WIDE))
-                headings = self._headings[len(parts) // 2]
-                headings.html = render("topics.html", titles=piece, opened=name if is_open else "")
-                parts += [headings, self._room_of(name)] if is_open else [headings]
-                piece = {}
+        for piece, headings in zip(pieces, self._headings, strict=False):
+            is_open = piece[-1] in self.open_topics
+            headings.html = render(
+                "topics.html", titles={name: self.titles[name] for name in piece}, opened=piece[-1] if is_open else ""
+            )
+            parts += [headings, self._room_of(piece[-1])] if is_open else [headings]
         if parts != self.view.objects:
             self.view[:] = parts
