@@ -46,10 +46,22 @@ MUSE_LAYERS = (
     (14000.0, 0.05, 17.5, 0.0),
 )
 
+NIGHT_EVENTS: tuple[dict[str, str | float], ...] = (
+    {"kind": "wind", "start": 15.0, "duration": 6.0, "wind_factor": 2.0},
+    {"kind": "laser", "start": 30.0, "duration": 2.0, "lasers": 2},
+    {"kind": "wind", "start": 36.0, "duration": 6.0, "wind_factor": 0.5},
+    {"kind": "frames", "start": 48.0, "duration": 5.0, "sensor": "lgs", "share": 0.1},
+    {"kind": "peak", "start": 60.0, "peak": 2, "frequency_shift": 3.0},
+    {"kind": "frames", "start": 90.0, "duration": 5.0, "sensor": "ngs", "share": 0.5},
+)
+"""Two minutes of the preset night."""
+
 
 def _system() -> Scenario:
     """Return the paper's system, with records made like those of the other presets."""
-    return paper().replace({"vibration.synthesis": "gaussian"})
+    s = paper()
+    s.update({"vibration": {"synthesis": "gaussian"}})
+    return s
 
 
 def paper() -> Scenario:
@@ -68,15 +80,17 @@ def paper() -> Scenario:
       matched, the filter's RMS error is 14.9e-3; with 0.06 it is the 16.6e-3 of the paper, and "overshoots the reference
       regularly" as the paper says of it. The reproduction page shows both.
     """
-    return Scenario().replace(
+    s = Scenario()
+    s.update(
         {
-            "vibration.synthesis": "random-phase",
-            "vibration.peaks": [{"frequency": f, "damping": xi, "rms": [tip, tilt]} for f, xi, tip, tilt in MAVIS_PEAKS],
-            "kalman.process_noise": "manual",
-            "kalman.turbulence_rms": 0.5,
-            "kalman.vibration_rms": 0.06,
+            "vibration": {
+                "synthesis": "random-phase",
+                "peaks": [{"frequency": f, "damping": xi, "rms": [tip, tilt]} for f, xi, tip, tilt in MAVIS_PEAKS],
+            },
+            "kalman": {"process_noise": "manual", "turbulence_rms": 0.5, "vibration_rms": 0.06},
         }
     )
+    return s
 
 
 def ut4() -> Scenario:
@@ -89,24 +103,23 @@ def ut4() -> Scenario:
       the multi-peak one with turbulence of third order, and lines 0.02 Hz wide: the true ones are narrower, but what is sure of
       a line takes long to settle (docs/observers.md).
     """
-    return Scenario().replace(
+    s = Scenario()
+    s.update(
         {
-            "turbulence.source": "frozen-flow",
-            "vibration.source": "measured",
-            "vibration.spectrum": "eris-ut4",
-            "vibration.part": "lines",
-            "vibration.cutoff": 100.0,
-            "kalman.frequency": 48.31,
-            "kalman.damping": 0.001,
-            "multipeak.turbulence_order": 3,
-            "multipeak.line_width": 0.02,
+            "turbulence": {"source": "frozen-flow"},
+            "vibration": {"source": "measured", "spectrum": "eris-ut4", "part": "lines", "cutoff": 100.0},
+            "kalman": {"frequency": 48.31, "damping": 0.001},
+            "multipeak": {"turbulence_order": 3, "line_width": 0.02},
         }
     )
+    return s
 
 
 def ut4_floor() -> Scenario:
     """Frozen flow, and the whole ERIS spectrum of VLT UT4, synthetic floor included."""
-    return ut4().replace({"vibration.part": "all"})
+    s = ut4()
+    s.update({"vibration": {"part": "all"}})
+    return s
 
 
 def strong_turbulence() -> Scenario:
@@ -116,7 +129,9 @@ def strong_turbulence() -> Scenario:
     `gpr_offline.inputs_filter` = high-pass the offline one comes back; the online one does not, since what the causal
     Butterworth bank gives it as targets has turbulence in it, too (docs/reproduction.md).
     """
-    return _system().replace({"turbulence.rms": 2.0, "kalman.process_noise": "matched"})
+    s = _system()
+    s.update({"turbulence": {"rms": 2.0}, "kalman": {"process_noise": "matched"}})
+    return s
 
 
 def galacsi_nfm() -> Scenario:
@@ -127,20 +142,23 @@ def galacsi_nfm() -> Scenario:
     through what the LGS have corrected; here nothing is corrected, they would see coma for tip, and the NGS has 40 x 40. A
     layer's wind is a multiple of `turbulence.wind_speed` = 10 m/s. Noise is the default, vibration that of `ut4`.
     """
-    return ut4().replace(
+    s = ut4()
+    s.update(
         {
-            "telescope.zenith_angle": 24.0,
-            "turbulence.r0": 0.151,
-            "turbulence.outer_scale": 27.44,
-            "turbulence.wind_speed": 10.0,
-            "turbulence.layers": [
-                {"height": h, "fraction": share, "wind_factor": wind / 10.0, "wind_direction": to}
-                for h, share, wind, to in MUSE_LAYERS
-            ],
-            "sensors.lgs_count": 4,
-            "sensors.lgs_radius": 7.5,
+            "telescope": {"zenith_angle": 24.0},
+            "turbulence": {
+                "r0": 0.151,
+                "outer_scale": 27.44,
+                "wind_speed": 10.0,
+                "layers": [
+                    {"height": h, "fraction": share, "wind_factor": wind / 10.0, "wind_direction": to}
+                    for h, share, wind, to in MUSE_LAYERS
+                ],
+            },
+            "sensors": {"lgs_count": 4, "lgs_radius": 7.5},
         }
     )
+    return s
 
 
 def galacsi_wfm() -> Scenario:
@@ -149,7 +167,9 @@ def galacsi_wfm() -> Scenario:
     The radius is that of Stroebele et al., "GALACSI system design and analysis", Proc. SPIE 8447 (2012); MUSE-PSFR (Fusco et al.,
     A&A 635, A208, 2020; musevlt/muse-psfr) takes 63".
     """
-    return galacsi_nfm().replace({"sensors.lgs_radius": 64.0})
+    s = galacsi_nfm()
+    s.update({"sensors": {"lgs_radius": 64.0}})
+    return s
 
 
 def higher_orders() -> Scenario:
@@ -157,7 +177,9 @@ def higher_orders() -> Scenario:
 
     The paper expects more of its multi-rate filter on orders above tip and tilt, where the LGS is no handicap.
     """
-    return ut4().replace({"telescope.radial_order": 4})
+    s = ut4()
+    s.update({"telescope": {"radial_order": 4}})
+    return s
 
 
 def peak_jump() -> Scenario:
@@ -169,29 +191,30 @@ def peak_jump() -> Scenario:
     - one Butterworth band from 40 to 60 Hz, of equal phase at the old frequency and the new one: the online GPR learns from that
       band, and what jumps out of it is lost to it (docs/events.md).
     """
-    return _system().replace(
+    s = _system()
+    s.update(
         {
-            "vibration.peaks": [
-                {"frequency": 17.25, "damping": 0.013, "rms": [0.003, 0.003]},
-                {"frequency": 23.87, "damping": 0.011, "rms": [0.002, 0.003]},
-                {"frequency": 47.5, "damping": 0.0, "rms": [0.03, 0.02]},
-            ],
-            "kalman.frequency": 47.5,
-            "kalman.damping": 0.003,
-            "kalman.process_noise": "matched",
-            "butterworth.frequencies": [50.0],
-            "butterworth.bandwidth_offline": 20.0,
-            "butterworth.bandwidth_online": 20.0,
-            "run.duration": 20.0,
+            "vibration": {
+                "peaks": [
+                    {"frequency": 17.25, "damping": 0.013, "rms": [0.003, 0.003]},
+                    {"frequency": 23.87, "damping": 0.011, "rms": [0.002, 0.003]},
+                    {"frequency": 47.5, "damping": 0.0, "rms": [0.03, 0.02]},
+                ]
+            },
+            "kalman": {"frequency": 47.5, "damping": 0.003, "process_noise": "matched"},
+            "butterworth": {"frequencies": [50.0], "bandwidth_offline": 20.0, "bandwidth_online": 20.0},
+            "run": {"duration": 20.0},
             "events": [{"kind": "peak", "start": 8.0, "peak": 2, "frequency_shift": 3.0}],
         }
     )
+    return s
 
 
 def peak_drift() -> Scenario:
     """The line of peak-jump drifts by 3 Hz in 10 s instead."""
-    drift = {"kind": "peak", "start": 5.0, "duration": 10.0, "peak": 2, "frequency_shift": 3.0}
-    return peak_jump().replace({"events": [drift]})
+    s = peak_jump()
+    s.update({"events": [{"kind": "peak", "start": 5.0, "duration": 10.0, "peak": 2, "frequency_shift": 3.0}]})
+    return s
 
 
 def wind_change() -> Scenario:
@@ -199,8 +222,9 @@ def wind_change() -> Scenario:
 
     As `ut4`; the filters' turbulence stays that of 15 m/s.
     """
-    change = {"kind": "wind", "start": 9.0, "duration": 2.0, "wind_factor": 2.0}
-    return ut4().replace({"run.duration": 20.0, "events": [change]})
+    s = ut4()
+    s.update({"run": {"duration": 20.0}, "events": [{"kind": "wind", "start": 9.0, "duration": 2.0, "wind_factor": 2.0}]})
+    return s
 
 
 def laser_dropout() -> Scenario:
@@ -208,30 +232,34 @@ def laser_dropout() -> Scenario:
 
     With one LGS its noise and its slow error are no longer halved; without any there are NGS frames alone.
     """
-    return _system().replace(
+    s = _system()
+    s.update(
         {
-            "kalman.process_noise": "matched",
-            "run.duration": 20.0,
+            "kalman": {"process_noise": "matched"},
+            "run": {"duration": 20.0},
             "events": [
                 {"kind": "laser", "start": 6.0, "duration": 4.0, "lasers": 1},
                 {"kind": "laser", "start": 15.0, "duration": 1.0, "lasers": 2},
             ],
         }
     )
+    return s
 
 
 def lost_frames() -> Scenario:
     """The paper's system; it loses half the LGS frames for 5 s, later half the NGS frames."""
-    return _system().replace(
+    s = _system()
+    s.update(
         {
-            "kalman.process_noise": "matched",
-            "run.duration": 20.0,
+            "kalman": {"process_noise": "matched"},
+            "run": {"duration": 20.0},
             "events": [
                 {"kind": "frames", "start": 5.0, "duration": 5.0, "sensor": "lgs", "share": 0.5},
                 {"kind": "frames", "start": 13.0, "duration": 5.0, "sensor": "ngs", "share": 0.5},
             ],
         }
     )
+    return s
 
 
 def night() -> Scenario:
@@ -241,19 +269,9 @@ def night() -> Scenario:
     is lost for 5 s. In the second the line is at 50.5 Hz, and half of the NGS frames are lost for 5 s. So the two minutes differ
     in what is identified.
     """
-    return peak_jump().replace(
-        {
-            "run.duration": 120.0,
-            "events": [
-                {"kind": "wind", "start": 15.0, "duration": 6.0, "wind_factor": 2.0},
-                {"kind": "laser", "start": 30.0, "duration": 2.0, "lasers": 2},
-                {"kind": "wind", "start": 36.0, "duration": 6.0, "wind_factor": 0.5},
-                {"kind": "frames", "start": 48.0, "duration": 5.0, "sensor": "lgs", "share": 0.1},
-                {"kind": "peak", "start": 60.0, "peak": 2, "frequency_shift": 3.0},
-                {"kind": "frames", "start": 90.0, "duration": 5.0, "sensor": "ngs", "share": 0.5},
-            ],
-        }
-    )
+    s = peak_jump()
+    s.update({"run": {"duration": 120.0}, "events": list(NIGHT_EVENTS)})
+    return s
 
 
 PRESETS: dict[str, Callable[[], Scenario]] = {

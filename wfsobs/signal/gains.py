@@ -70,8 +70,17 @@ def posteriors_of_gains(cycle: Sequence[Step], gains: Sequence[Array]) -> list[A
     RiccatiError
         The filter is not stable.
     """
-    states = _around(cycle, np.zeros_like(cycle[0][2]), gains)
-    return [one.posterior for one in _around(cycle, lyapunov(*_carry_around(cycle, states)), gains)]
+    F, W = np.eye(len(cycle[0][0])), np.zeros_like(cycle[0][0])
+    for (A, C, Q, R), L in zip(cycle, gains, strict=True):
+        reduced = np.eye(len(A)) - L @ C
+        W = A @ (reduced @ W @ reduced.T + L @ R @ L.T) @ A.T + Q
+        F = A @ reduced @ F
+    P, out = lyapunov(F, W), []
+    for (A, C, Q, R), L in zip(cycle, gains, strict=True):
+        reduced = np.eye(len(A)) - L @ C
+        out.append(reduced @ P @ reduced.T + L @ R @ L.T)
+        P = A @ out[-1] @ A.T + Q
+    return out
 
 
 def lyapunov(F: Array, W: Array) -> Array:
@@ -257,15 +266,12 @@ def _power_of_map(m: Map, times: int) -> Map:
     return _compose(both, m) if times % 2 else both
 
 
-def _around(cycle: Sequence[Step], P: Array, gains: Sequence[Array] | None = None) -> list[SteadyState]:
-    """Return gains and covariances around one cycle from the prediction covariance P, and the residual after it.
-
-    gains : filter gain of every step, by default the best
-    """
+def _around(cycle: Sequence[Step], P: Array) -> list[SteadyState]:
+    """Return gains and covariances around one cycle from the prediction covariance P, and the residual after it."""
     found: list[tuple[Array, Array, Array, Array]] = []
     start = P
-    for (A, C, Q, R), given in zip(cycle, gains or [None] * len(cycle), strict=True):
-        L = np.linalg.solve(C @ P @ C.T + R, C @ P).T if given is None else given
+    for A, C, Q, R in cycle:
+        L = np.linalg.solve(C @ P @ C.T + R, C @ P).T
         # Joseph form: a sum of squares, so the covariance stays symmetric and non-negative.
         reduced = np.eye(len(A)) - L @ C
         filtered = reduced @ P @ reduced.T + L @ R @ L.T

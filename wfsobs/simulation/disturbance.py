@@ -1,16 +1,12 @@
-"""Turbulence of one run, simulated from a scenario, on the axis and in the beams of the stars.
+"""Turbulence and vibration of one run, simulated from a scenario: on the axis, and turbulence in the beams of the stars.
 
-A new source is one more function in `SOURCES`, under the name of the scenario's `turbulence.source` setting.
+A new source of turbulence is one more function in `SOURCES`, under the name of the scenario's `turbulence.source` setting; one of
+vibration is one more in `VIBRATION`, under the name of `vibration.source`.
 
 A record made by an inverse DFT of its own length is a sum of lines at multiples of 1 / T: it is periodic, so T seconds of it
 determine the rest. A record is therefore cut from a period many times as long. The width of lines determines how well
 they can be predicted; a record of T resolves none narrower than about 1 / T. Damped peaks and tables therefore get
 at least the width `line_width`, in the record as in the bound. Lines are sines of their own.
-
-Turbulence and vibration of one run, simulated from a scenario.
-
-A new source of vibration is one more function in `VIBRATION`, under the name of the scenario's `source`
-setting; turbulence has a module of its own.
 
 Events of a scenario change the disturbance and the measurements. A peak is shifted through its analytic signal x_a, which has its
 positive frequencies alone,

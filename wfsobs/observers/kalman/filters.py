@@ -1,4 +1,6 @@
-"""Steady-state Kalman filters on LGS or NGS measurements (paper, section 2.2).
+"""Steady-state Kalman filters, of one sensor and of both (paper, section 2.2).
+
+Of LGS or NGS measurements alone, `kf-lgs` and `kf-ngs`:
 
     x_pred[k+1] = A x_hat[k],    x_hat[k] = x_pred[k] + L (z[k] - C x_pred[k])
 
@@ -8,9 +10,7 @@ y up to k - 1. Here phi_hat[k] uses y[k] too, like the GPR. The mirror's part is
 `kf-multi` is the same filter with one AR(2) per line of the vibration, which the paper expects to help (its conclusion), and, as
 an option, turbulence of third order.
 
-Multi-rate Kalman filters: LGS at every step, NGS at every n-th.
-
-The paper's, `multirate` (section 2.2.1):
+Multi-rate: LGS at every step, NGS at every n-th. The paper's, `multirate` (section 2.2.1):
 
     x_pred[k+1] = A x_hat[k]
     x_hat[k] = x_pred[k] + L_j (z_j[k] - C_j x_pred[k])        (eq. 11)

@@ -19,16 +19,14 @@ frames takes for it what all states told of it.
 The states are those of the independent filter of a mode and running means, of the mean of the LGS in all modes, then of each
 difference; and those of the filter and the means of the NGS frames, mode after mode.
 
-The coupled filter: every mode of frozen flow is estimated from the measurements of all modes.
-
-The wind carries what one mode measures into another, and the LGS see through their narrower beams as one mode what is several.
+`kf-coupled`, without an NGS, and `multirate-coupled`, with one, are the same filter on one star. Every mode of frozen flow is
+estimated from the measurements of all modes: the wind carries what one mode measures into another, and the LGS see through their
+narrower beams as one mode what is several.
 The states of the independent filters of `kf-multi`, one per mode, and running means of every measurement over 0, 3, 9, ...
 243 steps are put together by the weights of least variance under the matrix of spectra in the prior (`signal.joint_states`).
 Longer means gain a little in an endless record, and lose more in its first seconds. Since the estimates of the independent
-filters are among what is weighed, it is no worse than they are where it is told the truth. It is the filter of `kalman.joint` on
-one star: `kf-coupled` without an NGS, `multirate-coupled` with one.
-
-Where modes tell nothing of one another, the prior has no such matrix: there is nothing to couple, and the observer refuses.
+filters are among what is weighed, it is no worse than they are where it is told the truth. Where modes tell nothing of one
+another, the prior has no such matrix: there is nothing to couple, and the observer refuses.
 """
 
 from __future__ import annotations

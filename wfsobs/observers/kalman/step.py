@@ -1,6 +1,6 @@
-"""The Kalman filter of one mode: its model, its gains, and how sure it is.
+"""The Kalman filter of one mode: its model, its gains, and how sure it is; and those of all modes together.
 
-Kalman filters of all modes: frame by frame, with gaps, and over a record at once where nothing is missing.
+They run frame by frame, with gaps, and over a record at once where nothing is missing.
 
 A process of poles exp(s_i T) with the continuous-time s_i goes on for f frames by A^f, the matrix power. With S the covariance of
 the model and P that of the estimate after a measurement, the error of the prediction has the covariance
