@@ -18,9 +18,8 @@ import numpy as np
 import wfsobs
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.kalman.filters import steady_filter
-from wfsobs.observers.kalman.step import by_target
 from wfsobs.priors_from.scenario import measurement_noise, modelled_processes
-from wfsobs.record import Record, Training
+from wfsobs.record import Record, Training, by_name
 from wfsobs.signal.autoregressive import Ar2
 from wfsobs.signal.spectrum import bandpass_bank, filter_causal, filter_zero_phase, rms
 from wfsobs.signal.statespace import disturbance_model
@@ -170,7 +169,7 @@ def all_peaks() -> None:
             kalman, _ = steady_filter(disturbance_model([turbulence], peaks), measurement_noise(scenario, mode)[0])
             columns.append(kalman.run(record.z[:, [mode]]))
         start = round(scenario.run.warm_up / record.dt)
-        error = (by_target(columns)["vibration"] - record.vibration)[start:]
+        error = (by_name(np.stack(columns, axis=-1))["vibration"] - record.vibration)[start:]
         for mode, name in enumerate(found):
             found[name].append(rms(error[:, mode]) * 1e3)
     table(("", "tip", "tilt"), [("LGS KF, all 15 peaks modelled", middle(found["tip"]), middle(found["tilt"]))])

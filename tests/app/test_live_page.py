@@ -340,7 +340,8 @@ def test_the_table_of_peaks_says_how_far_each_has_moved() -> None:
 
 def test_alarms_stand_out_in_the_list_of_events() -> None:
     html = events_html([LiveEvent(1000, "wind 20 m/s"), LiveEvent(2000, "noise up", detail=": 3 < 4", kind=ALARM)], 1e-3)
-    assert "<li>2.00 s: <strong>ALARM noise up: 3 &lt; 4</strong></li><li>1.00 s: wind 20 m/s</li>" in html
+    lines = ["<li>2.00 s: <strong>ALARM noise up: 3 &lt; 4</strong></li>", "<li>1.00 s: wind 20 m/s</li>"]
+    assert re.findall("<li>.*?</li>", html) == lines
 
 
 @pytest.mark.parametrize("name", ["kf-multi", "lqg-kf-multi", "none"])

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from tests.test_plant import closed_loop as loop_of_plant
 from tests.test_plant import rotation
 from wfsobs.cli import main
-from wfsobs.cli.options import load_declared
+from wfsobs.cli.options import DeclaredFile, load_declared
 from wfsobs.identification.plant import contradiction
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
@@ -137,7 +137,7 @@ def test_commands_beyond_a_rail(rate: float, tmp_path: Path, capsys: pytest.Capt
     shown = preview(path.read_bytes(), path.name).reading.lines()
     assert [line for line in shown if "do nothing" in line] == lines, "on the page"
     assert preview(path.read_bytes(), path.name, declaration=DeclaredFormat(rail=0.6)).reading.limits == []
-    load_declared(str(path), Scenario(), DeclaredFormat())
+    load_declared(str(path), Scenario(), DeclaredFile())
     said = capsys.readouterr().err
     assert all(f"wfsobs: {path}: {line}\n" in said for line in lines), "on the command line"
 

@@ -72,7 +72,7 @@ def test_code_of_wfsobs_that_an_observer_uses_counts(monkeypatch: pytest.MonkeyP
     before = [code_version(OBSERVERS[name]) for name in names]
     digest = identity._digest
     assert all(before)
-    for changed, same in (("single.py", [False, True]), ("sessions.py", [True, True])):
+    for changed, same in (("filters.py", [False, True]), ("sessions.py", [True, True])):
         monkeypatch.setattr(identity, "_digest", lambda path, changed=changed: b"x" if path.name == changed else digest(path))
         assert [code_version(OBSERVERS[name]) == was for name, was in zip(names, before, strict=True)] == same
 
