@@ -110,7 +110,7 @@ def test_regression_on_a_long_record_finds_the_same() -> None:
     s = ASTERISM.replace({"vibration.source": "none", "sensors.lgs_radius": 60.0})
     n, n_steps, taps, phase = s.sensors.exposure_ratio, 100_000, 100, 2
     rng = np.random.default_rng(1)
-    _, ngs, lgs = SOURCES["frozen-flow"](s, n_steps, rng, Watch())
+    on_axis, ngs, lgs = SOURCES["frozen-flow"](s, n_steps, rng, Watch())
     assert lgs is not None and ngs is not None
     stars = np.array([signal[:-1, 0] for signal in lgs])
     stars = stars + s.sensors.lgs_noise * rng.standard_normal(stars.shape)  # of step k, measured at k + 1
@@ -119,7 +119,7 @@ def test_regression_on_a_long_record_finds_the_same() -> None:
     at = np.arange(2 * taps // n * n + phase, n_steps - 1, n)
     fast = [star[at[:, None] - 1 - np.arange(taps)] for star in stars]
     inputs = np.hstack([*fast, frames[((at - phase) // n - 1)[:, None] - np.arange(-(-(taps - phase) // n))]])
-    truth, half = air.on_axis[at, 0], len(at) // 2
+    truth, half = on_axis[at, 0], len(at) // 2
     found = np.linalg.lstsq(inputs[:half], truth[:half], rcond=None)[0]
     error = np.sqrt(np.mean((inputs[half:] @ found - truth[half:]) ** 2))
     expected = exact_errors(star_spectra(s, 0, true_spectra(s, 0)), taps, phase, 0)["turbulence"]
