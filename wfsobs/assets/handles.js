@@ -72,6 +72,7 @@ export function render({model, el}) {
     const {bbox: box, x_scale, y_scale} = view.frame
     for (const it of marks.children) {
       const handle = handleOf(it)
+      it.hidden = !handle
       if (!handle) continue
       const own = {model: box.bottom - 28, band: box.bottom - 9}[handle.kind]
       let sx = x_scale.compute(handle.frequency)
@@ -90,7 +91,7 @@ export function render({model, el}) {
     patchHtml(el, model.html)
     hear()
     place()
-    if (!adding || marks.children.length < adding) return
+    if (!adding || Math.min(marks.children.length, handles().length) < adding) return  // HTML and frame come one after the other
     marks.children[handles().findIndex(({id}) => id === model.frame.added)]?.focus()
     adding = 0
   }
