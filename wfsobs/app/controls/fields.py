@@ -324,7 +324,9 @@ class RowEditor(Field):
 
     def _widgets(self) -> list[Any]:
         self._texts: dict[str, str] = {}
-        self.kind: type[Group] = self.parameter.item_type  # type: ignore[attr-defined]
+        kind = self.parameter.item_type if isinstance(self.parameter, param.List) else None
+        assert isinstance(kind, type) and issubclass(kind, Group)
+        self.kind: type[Group] = kind
         options = {"sizing_mode": "stretch_width", "margin": (0, 0, 8, 0)}
         self.table = RowTable(self.enter, self.kind.__name__.lower(), _columns(self.kind), tags=[TAG + self.path], **options)
         return [self.table]
