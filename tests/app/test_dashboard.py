@@ -8,6 +8,10 @@ import weakref
 from typing import Any
 
 import pytest
+from bokeh.document import Document
+from bokeh.models import ImportedStyleSheet
+from panel.io.document import _cleanup_doc
+from panel.io.state import set_curdoc
 
 from wfsobs.app import dashboard as module
 from wfsobs.app.dashboard import Dashboard
@@ -43,6 +47,24 @@ def test_a_page_that_cannot_be_assembled(monkeypatch: pytest.MonkeyPatch, loop: 
     assert "ValueError: no page" in session_page(build)[0].object
     assert made[0].store.run.state == "idle"
     made[0].store.session.leave()
+
+
+def test_a_session_made_anew_needs_no_other_host(loop: Any, short: Scenario, enter: Any) -> None:
+    """Where a browser connects so late that the page's session is gone, the next is made without its page."""
+    doc = Document()
+    with set_curdoc(doc):
+        made: list[Dashboard] = []
+
+        def build(post: Any) -> Dashboard:
+            made.append(Dashboard(loop.queue.put, enter(), short))
+            return made[0]
+
+        session_page(build).server_doc(doc)
+        addresses = {str(model.url) for model in doc.models if isinstance(model, ImportedStyleSheet)}
+    made[0].store.session.leave()
+    _cleanup_doc(doc)
+    assert "static/extensions/panel/css/loading.css" in {address.partition("?")[0] for address in addresses}
+    assert not [address for address in addresses if "//" in address]
 
 
 def test_a_failing_run_shows_inline(loop: Any, short: Scenario, enter: Any) -> None:

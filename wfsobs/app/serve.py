@@ -34,6 +34,7 @@ from bokeh.server.views.autoload_js_handler import AutoloadJsHandler
 from bokeh.server.views.metadata_handler import MetadataHandler
 from bokeh.util.token import generate_jwt_token, generate_secret_key, generate_session_id
 from panel.io.application import build_applications
+from panel.io.resources import get_dist_path
 from panel.io.server import DocHandler, get_server
 from tornado.httputil import HTTPHeaders, HTTPServerRequest, RequestStartLine
 from tornado.ioloop import IOLoop, PeriodicCallback
@@ -60,6 +61,8 @@ log = logging.getLogger(__name__)
 def session_page(build: Callable[[Post], Dashboard]) -> Any:
     """Build the page of a new session; one with the error where it cannot be built."""
     try:
+        if pn.state.curdoc is not None:  # Panel says so with the page alone: a session made anew would ask another host
+            pn.state.curdoc.template_variables["dist_url"] = get_dist_path()
         post = Poster()
         dashboard = build(post)
         query = page_query()
