@@ -29,6 +29,7 @@ from wfsobs.live.source import (
     Worker,
     enter_process,
     go_first,
+    may_go_first,
     receive,
 )
 from wfsobs.scenario import Scenario
@@ -369,8 +370,11 @@ def _ask(pipe: Connection, function: Callable[..., Any], arguments: tuple[Any, .
 
 
 def compute(pipe: Connection) -> None:
-    """Answer (function, arguments) with the result, or the exception, until the process is ended."""
-    enter_process(10)
+    """Answer (function, arguments) with the result, or the exception, until the process is ended.
+
+    It gives way to the processes of the loop where those cannot go first; where they do, it would never have its turn beside others.
+    """
+    enter_process(0 if may_go_first() else 10)
     while True:
         function, arguments = receive(pipe)
         try:
