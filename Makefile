@@ -8,6 +8,8 @@ BIN := $(VENV)/bin
 
 # One BLAS thread: at the sizes of the observers two are slower.
 export OPENBLAS_NUM_THREADS ?= 1
+# Bytecode is kept: the tests start hundreds of processes, each of which would compile all modules first.
+unexport PYTHONDONTWRITEBYTECODE
 # Without this, pyright asks for its newest version at each start.
 export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 

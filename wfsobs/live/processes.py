@@ -65,7 +65,7 @@ def observe_frames(
     inbox : Connection
         Commands.
     """
-    enter_process(turn=SOURCE - 1 - place)
+    enter_process()
     sampling = site.sampling
     ring, board = Ring(sampling.n_modes, site.ring_name), Board(sampling.n_modes, site.board_name)
     traces = Rows(trace_width(sampling.n_modes), ROOM, traces_name)
@@ -76,6 +76,7 @@ def observe_frames(
         return
     gc.collect()
     gc.freeze()
+    go_first(SOURCE - 1 - place)  # only now: designs are for the others to be in time beside
     number = -(-ring.count // crew.ratio) * crew.ratio if joins_late else 0
     traces.skip_to(number)
     board.progress[place] = number
