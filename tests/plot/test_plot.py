@@ -140,7 +140,7 @@ def test_both_backends_draw_every_figure_with_units(name: str, drawn: Callable[[
         labels = " ".join(str(axis.axis_label) for axis in (*one.xaxis, *one.yaxis))
         assert one.renderers and ("[" in labels or name in ("map", "loop nyquist")), labels
     paper = to_matplotlib(figure)
-    paper.savefig(BytesIO())  # which places its axes
+    paper.draw_without_rendering()  # which places its axes
     assert paper.get_size_inches()[0] == pytest.approx(88.0 / 25.4)  # as it is set, to rounding
     axes = [a for a in paper.axes if a.get_subplotspec() is not None]
     assert len(axes) == len(overlays)
@@ -425,7 +425,7 @@ def test_what_is_composed_begins_a_row_where_it_does_not_fit(result: wfsobs.Resu
     traces, bars = result.plot.traces() + result.plot.spectra(), result.plot.errors() + result.plot.budget()
     for figure, width, columns in ((traces, 88.0, 2), (traces, 180.0, 4), (bars, 88.0, 1), (bars, 180.0, 2)):
         paper = to_matplotlib(figure, width)
-        paper.savefig(BytesIO())  # which warns where there is no room
+        paper.draw_without_rendering()  # which warns where there is no room
         for axes in paper.axes:
             place = axes.get_subplotspec()
             assert place is not None and place.get_gridspec().ncols == columns
