@@ -373,7 +373,7 @@ def _ask(pipe: Connection, function: Callable[..., Any], arguments: tuple[Any, .
 def compute(pipe: Connection) -> None:
     """Answer (function, arguments) with the result, or the exception, until the process is ended.
 
-    It gives way to the processes of the loop where those cannot go first; where they do, it would never have its turn beside others.
+    It gives way to the processes of the loop where those cannot go first; where they can, it would hardly have its turn.
     """
     enter_process(0 if may_go_first() else 10)
     while True:
