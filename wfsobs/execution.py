@@ -22,7 +22,7 @@ from wfsobs.scenario.scenario import used_settings
 from wfsobs.settings.values import Plain, error_line
 from wfsobs.typing import Array
 
-log = logging.getLogger(__name__)
+log: logging.Logger = logging.getLogger(__name__)
 
 
 def each_estimate(

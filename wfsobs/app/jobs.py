@@ -19,7 +19,7 @@ from wfsobs.app.cache import Cache
 from wfsobs.app.logs import event
 from wfsobs.progress import Cancelled, Watch
 
-log = logging.getLogger(__name__)
+log: logging.Logger = logging.getLogger(__name__)
 
 RUNNING, DONE, CANCELLED, FAILED = "running", "done", "cancelled", "failed"
 

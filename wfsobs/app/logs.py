@@ -10,7 +10,7 @@ from typing import Any, TextIO
 
 from tornado.websocket import WebSocketClosedError
 
-log = logging.getLogger("wfsobs.serve")
+log: logging.Logger = logging.getLogger("wfsobs.serve")
 
 FORMAT = "%(asctime)s %(levelname)s %(message)s"
 

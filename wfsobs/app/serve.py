@@ -55,7 +55,7 @@ from wfsobs.live.source import prefer
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.values import SettingError
 
-log = logging.getLogger(__name__)
+log: logging.Logger = logging.getLogger(__name__)
 
 
 def session_page(build: Callable[[Post], Dashboard]) -> Any:

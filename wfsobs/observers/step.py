@@ -294,6 +294,7 @@ class StepObserver(StepBase):
         What differs from observer to observer.
     """
 
+    frame: int
     targets: tuple[str, ...]
     estimator: Estimator
 

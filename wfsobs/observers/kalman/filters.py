@@ -63,9 +63,9 @@ if TYPE_CHECKING:
 NGS = ("y_ngs", "ratio")
 """Fields that a record with NGS frames has."""
 
-linear_filter = partial(Observer, linear=True, takes_missing=True)
+linear_filter: partial[Observer] = partial(Observer, linear=True, takes_missing=True)
 """A linear filter that takes missing measurements as missing."""
-filter_of_both = partial(linear_filter, needs=NGS, sensors=("lgs", "ngs"))
+filter_of_both: partial[Observer] = partial(linear_filter, needs=NGS, sensors=("lgs", "ngs"))
 """One of both sensors."""
 
 MODEL = ("kalman.frequency", "kalman.damping", "kalman.turbulence_rms", "kalman.vibration_rms")

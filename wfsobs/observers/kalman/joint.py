@@ -136,7 +136,7 @@ class AsterismModel:
             raise ValueError(f"the prior has an NGS frame every {asterism.ratio} steps, the loop every {ratio}")
         self._again = partial(AsterismModel, prior, settings, ratio, means, frame_means)
         sees = [lgs_mean(prior, mode, has_slow_error=True) for mode in range(len(prior.lines))]
-        self.all_stars = len(sees[0].noise)
+        self.all_stars: int = len(sees[0].noise)
         white = asterism.noise * [one.noise[stars - 1] for one in sees]
         self.basis, self.ratio, self._asterism = asterism.basis, asterism.ratio, replace(asterism, noise=white)
         self._age, self._steps = age, range(age, age + asterism.ratio)
