@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 from bokeh.document import Document
 from bokeh.models import ImportedStyleSheet
-from panel.io.document import _cleanup_doc
 from panel.io.state import set_curdoc
 
 from wfsobs.app import dashboard as module
@@ -62,7 +61,6 @@ def test_a_session_made_anew_needs_no_other_host(loop: Any, short: Scenario, ent
         session_page(build).server_doc(doc)
         addresses = {str(model.url) for model in doc.models if isinstance(model, ImportedStyleSheet)}
     made[0].store.session.leave()
-    _cleanup_doc(doc)
     assert "static/extensions/panel/css/loading.css" in {address.partition("?")[0] for address in addresses}
     assert not [address for address in addresses if "//" in address]
 

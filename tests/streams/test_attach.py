@@ -454,7 +454,7 @@ def on_the_way(fallback: Fallback, largest: float | None, ngs: bool) -> tuple[Wa
     largest=st.sampled_from([None, 0.3, 40.0]),
     ngs=st.booleans(),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=150, deadline=None)
 def test_nothing_above_the_limit_goes_out_whatever_comes_in(frames, fallback: Fallback, largest: float | None, ngs: bool) -> None:
     """Any doubles in both streams, gaps of any length, as often as wanted in a row, between frames as they should be."""
     way, before = deepcopy(on_the_way(fallback, largest, ngs))

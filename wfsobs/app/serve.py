@@ -61,7 +61,7 @@ log: logging.Logger = logging.getLogger(__name__)
 def session_page(build: Callable[[Post], Dashboard]) -> Any:
     """Build the page of a new session; one with the error where it cannot be built."""
     try:
-        if pn.state.curdoc is not None:  # Panel says so with the page alone: a session made anew would ask another host
+        if pn.state.curdoc is not None:  # Panel sets it with the HTML, which a session made anew does without
             pn.state.curdoc.template_variables["dist_url"] = get_dist_path()
         post = Poster()
         dashboard = build(post)

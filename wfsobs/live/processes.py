@@ -76,7 +76,7 @@ def observe_frames(
         return
     gc.collect()
     gc.freeze()
-    go_first(SOURCE - 1 - place)  # only now: designs are for the others to be in time beside
+    go_first(SOURCE - 1 - place)  # after the designs, which must not delay the crews that run
     number = -(-ring.count // crew.ratio) * crew.ratio if joins_late else 0
     traces.skip_to(number)
     board.progress[place] = number
@@ -373,7 +373,7 @@ def _ask(pipe: Connection, function: Callable[..., Any], arguments: tuple[Any, .
 def compute(pipe: Connection) -> None:
     """Answer (function, arguments) with the result, or the exception, until the process is ended.
 
-    It gives way to the processes of the loop where those cannot go first; where they can, it would hardly have its turn.
+    Its niceness is 10 only where the processes of the loop have no real-time priority: below both, it would hardly run.
     """
     enter_process(0 if may_go_first() else 10)
     while True:
