@@ -99,17 +99,25 @@ def test_a_file_that_cannot_be_written_is_named_before_anything_is_computed(tmp_
         "tune --observer kf-lgs --record night.npz --out night.npz",
         "live --headless --replay night.npz --record night.npz",
         "run --vibration-psd night.npz --save night.npz",
+        "identify none.npz --config own.toml --out own.toml",
+        "observe none.npz --prior night.npz --out night.npz",
+        "tune --observer kf-lgs --config own.toml --out own.toml",
+        "sweep --over turbulence.wind_speed=10,12 --config own.toml --csv own.toml",
+        "export own.toml --config own.toml",
+        "design --controller integrator --to npz --prior night.npz --out night.npz",
     ],
 )
 def test_a_file_that_is_read_is_not_replaced(arguments: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     np.savez("night.npz", R=np.eye(2))
     Path("link.npz").symlink_to("night.npz")
-    before = Path("night.npz").read_bytes()
+    Path("own.toml").write_text("run.seed = 5\n")
+    out = arguments.split()[-1]
+    before = Path(out).read_bytes()
     result = CliRunner().invoke(main, arguments.split())
-    out = "link.npz" if "link" in arguments else "night.npz"
-    assert (result.exit_code, result.output) == (2, f"wfsobs: {out}: is read by this command; write to another file\n")
-    assert Path("night.npz").read_bytes() == before
+    says = "is also named as another file of this command; write to another"
+    assert (result.exit_code, result.output) == (2, f"wfsobs: {out}: {says}\n")
+    assert Path(out).read_bytes() == before
 
 
 @pytest.mark.parametrize(

@@ -57,15 +57,13 @@ def _write_and_rename(path: Path, write: Callable[[IO[bytes]], object]) -> None:
             raise
 
 
-def check_writable(path: str | Path, *inputs: str | Path | None, endings: tuple[str, ...] = ()) -> None:
-    """Raise OSError where `write_whole` could not write to `path`, or would replace one of the files that are read.
+def check_writable(path: str | Path, endings: tuple[str, ...] = ()) -> None:
+    """Raise OSError where `write_whole` could not write to `path`.
 
     endings : those that its name takes; any where there are none
     """
     if _is_device(path):
         return
-    if any(os.path.samefile(path, one) for one in inputs if one and os.path.exists(one) and os.path.exists(path)):
-        raise OSError(errno.EEXIST, "is read by this command; write to another file", str(path))
     named = str(path)
     path = Path(os.path.realpath(path) if os.path.islink(path) else path)
     folder = path.parent

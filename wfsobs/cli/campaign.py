@@ -28,12 +28,12 @@ from wfsobs.campaign.pools import DaskCluster, Processes, usable_processors
 from wfsobs.campaign.run import BATCH, run_campaign, run_cost, run_rows
 from wfsobs.campaign.store import RESULTS, add_settings, finished_runs, folder_plan, need_pyarrow, present_rows, read_results
 from wfsobs.campaign.sweep import MOST_SEEDS, SweepResults, parse_axis, plan_sweep, run_sweep
-from wfsobs.cli.options import json_option, observer_option, scenario_options
+from wfsobs.cli.options import check_output, json_option, observer_option, scenario_options
 from wfsobs.cli.show import new_table, print_json, print_note, progress_bar, show_table
 from wfsobs.evaluation.evidence import FEWEST
 from wfsobs.evaluation.result import NOT_OBSERVERS, row_label
 from wfsobs.evaluation.scores import COMMON_BOUNDS, SCORED
-from wfsobs.files import check_writable, write_text
+from wfsobs.files import write_text
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
 from wfsobs.settings.values import SettingError
@@ -427,7 +427,7 @@ def sweep(
     """Run a scenario over the values of one or two settings and print the best observer in each (docs/sweeps.md)."""
     plan = plan_sweep(scenario, [parse_axis(text) for text in axes], seeds, observers or None)
     if csv_file:
-        check_writable(csv_file)
+        check_output(csv_file)
     print_note(f"{len(plan.cells)} scenarios x {seeds} seeds = {plan.n_runs} runs, about {plan.seconds:.2g} s")
     with progress_bar("runs") as watch:
         results = run_sweep(plan, watch)

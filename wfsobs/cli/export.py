@@ -9,6 +9,7 @@ from wfsobs.cli.options import (
     RECORD_OPTIONS,
     DeclaredFile,
     FiniteRange,
+    check_output,
     load_declared,
     needing,
     observer_option,
@@ -21,7 +22,6 @@ from wfsobs.cli.options import (
     training_options,
 )
 from wfsobs.cli.show import print_note, progress_bar, warn
-from wfsobs.files import check_writable
 from wfsobs.handover import FORMATS, write_design
 from wfsobs.pipeline import observe, run
 from wfsobs.plot.paper import NUMBERS, draw_paper_figure, observers_in
@@ -55,6 +55,7 @@ def export(
     seeds: int,
 ) -> None:
     """Write a report: one HTML file with figures and numbers that opens without a network."""
+    check_output(out)
     variations = [parse_variation(text) for text in vary]
     with needing("export: a report needs", "app"):
         from wfsobs.app.report.page import export as write
@@ -95,7 +96,7 @@ def figure(
     with needing("figure: needs", "plot"):
         from wfsobs.plot.elements import check_suffix, save_figure
     check_suffix(out)
-    check_writable(out)
+    check_output(out)
     if record_file is None:
         refuse_options((*RECORD_OPTIONS, "train", "train_until"), "only with --record")
     names = observers_in(name)
@@ -118,6 +119,8 @@ def figure(
 @click.option("--out", required=True, metavar="PATH", help="File to write; for c99 a new directory.")
 def design(scenario: Scenario, prior: str | None, name: str, form: str, out: str) -> None:
     """Write a controller for a program elsewhere: C99 with a test, arrays, python-control."""
+    if form != "c99":
+        check_output(out)
     scenario = told_scenario(prior, scenario)
     try:
         write_design(name, scenario, form, out)

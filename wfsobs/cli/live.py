@@ -16,6 +16,7 @@ from wfsobs.cli.options import (
     RECORD_OPTIONS,
     DeclaredFile,
     FiniteRange,
+    check_output,
     controller_option,
     json_option,
     load_declared,
@@ -30,7 +31,6 @@ from wfsobs.cli.options import (
     stream_elements,
 )
 from wfsobs.cli.show import new_table, print_json, print_note, progress_bar, show_table
-from wfsobs.files import check_writable
 from wfsobs.live.attached import StreamSource
 from wfsobs.live.checks import can_control, check_slot, observers_on
 from wfsobs.live.crew import USUAL
@@ -98,7 +98,7 @@ def live(
     _check_options(replay_file, stream, ngs, headless)
     for file, endings in ((record_file, WRITTEN), (log_file, ())):
         if file:
-            check_writable(file, replay_file, *declaration.files, endings=endings)
+            check_output(file, endings)
     source = _source(scenario, replay_file, stream, modes, declaration)
     if not isinstance(source, SimulatedLoop):
         scenario = scenario.before_events

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
@@ -15,6 +17,7 @@ from click.core import ParameterSource
 
 from wfsobs.cli.show import print_note
 from wfsobs.closed_loop.envelope import Uncertainty
+from wfsobs.files import check_writable
 from wfsobs.priors_from.telemetry import told_by, training_part
 from wfsobs.record import DELAY, Record, RecordError
 from wfsobs.scenario import Scenario, configfile
@@ -22,6 +25,7 @@ from wfsobs.scenario.presets import PRESETS
 from wfsobs.sensors.zernike import MODE_NAMES
 from wfsobs.settings.values import SettingError
 from wfsobs.streams.wiring import STUCK, NgsWiring
+from wfsobs.telemetry.columns import split_source
 from wfsobs.telemetry.command_response import saturation_lines
 from wfsobs.telemetry.intake import LONGEST_DELAY, DeclaredFormat
 from wfsobs.telemetry.records import open_record, read_loop_matrix, read_with_delay
@@ -40,6 +44,18 @@ class FiniteRange(click.FloatRange):
 
 POSITIVE = FiniteRange(0, min_open=True)
 """Type of options that take a number above 0."""
+
+
+def check_output(path: str, endings: tuple[str, ...] = ()) -> None:
+    """Raise OSError where the file cannot be written, or where another parameter of the command names it, too."""
+    check_writable(path, endings)
+    given = click.get_current_context().params.values()
+    texts = [text for value in given for text in (value if isinstance(value, tuple) else (value,)) if isinstance(text, str)]
+    names = [name for text in texts for name in {text, split_source(text)[0]}]
+    if [os.path.realpath(name) for name in names].count(os.path.realpath(path)) > 1 and (
+        os.path.isfile(path) or not os.path.exists(path)
+    ):
+        raise OSError(errno.EEXIST, "is also named as another file of this command; write to another", path)
 
 
 @dataclass(frozen=True)

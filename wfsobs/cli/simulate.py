@@ -14,6 +14,7 @@ from wfsobs.cli.options import (
     POSITIVE,
     RECORD_OPTIONS,
     DeclaredFile,
+    check_output,
     controller_option,
     json_option,
     load_declared,
@@ -47,7 +48,6 @@ from wfsobs.closed_loop.run import rows as loop_rows
 from wfsobs.evaluation.budget import Budget, budget_row, error_budget
 from wfsobs.evaluation.evidence import FEWEST, gather_evidence, seeds_interval
 from wfsobs.evaluation.result import Result, Row, interval_text, score_rows
-from wfsobs.files import check_writable
 from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import as_stated
 from wfsobs.pipeline import observe as observe_record
@@ -148,7 +148,7 @@ def run(
     if save and seeds > 1:
         raise SettingError("--save: saves one record; leave --seeds at 1")
     if save:
-        check_writable(save, vibration_psd, endings=WRITTEN)
+        check_output(save, WRITTEN)
     if (budget or budget_of) and (seeds > 1 or over_time):
         raise SettingError("--budget: is of one record, without --over-time; leave --seeds at 1")
     if unknown := set(budget_of) - set(OBSERVERS):

@@ -14,6 +14,7 @@ from wfsobs.cli.options import (
     POSITIVE,
     DeclaredFile,
     FiniteRange,
+    check_output,
     controller_option,
     json_option,
     load_declared,
@@ -33,7 +34,7 @@ from wfsobs.closed_loop.promise import make_promise
 from wfsobs.closed_loop.run import label
 from wfsobs.control.laws import gain_from_telemetry
 from wfsobs.evaluation.result import score_rows
-from wfsobs.files import check_writable, write_text
+from wfsobs.files import write_text
 from wfsobs.identification import identify as identify_record
 from wfsobs.identification.identification import (
     LEVEL,
@@ -71,7 +72,7 @@ def convert(record_file: str, out: str, scenario: Scenario, declaration: Declare
 
     What is written is read back and compared; parts that the format has no place for are named.
     """
-    check_writable(out, record_file, *declaration.files)
+    check_output(out)
     record = load_with_delay(record_file, scenario, declaration)[0]
     save_record(out, record)
     if lost := name_differences(record, load_record(out, scenario, DeclaredFormat(trust=True))):
@@ -114,7 +115,7 @@ def observe(
 ) -> None:
     """Run the observers on a record of any format (by default preset paper)."""
     if out:
-        check_writable(out, record_file, train, *declaration.files, endings=(".npz",))
+        check_output(out, (".npz",))
     scenario = told_scenario(prior, scenario)
     record = load_declared(record_file, scenario, declaration)
     learnt = training(train, train_until, record, scenario, declaration)
@@ -160,7 +161,7 @@ def identify(
 ) -> None:
     """Find noise, turbulence and vibration peaks in a record (docs/identification.md)."""
     if out:
-        check_writable(out, record_file, *declaration.files)
+        check_output(out)
     record = load_declared(record_file, scenario, declaration)
     with errors_of(record_file, RecordError), progress_bar("sweeps") as watch:
         result = identify_record(record, level=level, lowest=lowest, watch=watch)
@@ -279,7 +280,7 @@ def promise(
 def probe(scenario: Scenario, seconds: float, delay: float, gain: float, rotation: float, out: str | None, as_json: bool) -> None:
     """Design a probe: commands by which delay, gain and rotation of a loop are known better (by default preset paper)."""
     if out:
-        check_writable(out, endings=(".npz",))
+        check_output(out, (".npz",))
     wanted = {"delay_frames": delay, "gain": gain, "rotation_deg": rotation}
     found = design_probe(scenario, seconds, wanted)
     if out:

@@ -13,6 +13,7 @@ from wfsobs.cli.options import (
     RECORD_OPTIONS,
     DeclaredFile,
     FiniteRange,
+    check_output,
     json_option,
     load_declared,
     record_options,
@@ -24,7 +25,7 @@ from wfsobs.cli.show import new_table, print_json, progress_bar, show_table
 from wfsobs.closed_loop.envelope import Uncertainty
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.scores import PREDICTION
-from wfsobs.files import check_writable, write_text
+from wfsobs.files import write_text
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario
@@ -164,7 +165,7 @@ def tune(
     if not on_envelope and goal != EnvelopeGoal():
         raise SettingError("--delay, --gain, --rotation, --resonance, --by, --loss: only with --envelope")
     if out:
-        check_writable(out, record_file, *declaration.files)
+        check_output(out)
     if record_file is None:
         refuse_options(RECORD_OPTIONS, "only with --record")
     else:

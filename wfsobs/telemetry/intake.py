@@ -19,7 +19,7 @@ from wfsobs.record import DELAY, Record, RecordError, Training, star_counts
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.zernike import order_of
 from wfsobs.telemetry.bridged import without_bridged
-from wfsobs.telemetry.columns import LoopMatrix, apply_matrices, split_source
+from wfsobs.telemetry.columns import LoopMatrix, apply_matrices
 from wfsobs.telemetry.formats.contents import APART, FAST, FRAME, LARGEST, NGS, SIGNALS, STARS, TIME, TRAINING, Contents
 from wfsobs.typing import Array
 from wfsobs.units import ANGLES, SECONDS, UNITS, micrometres_per, parse_unit
@@ -70,11 +70,6 @@ class DeclaredFormat:
     open_loop: bool = False
     reconstructor: LoopMatrix | None = None
     command_modes: LoopMatrix | None = None
-
-    @property
-    def files(self) -> list[str]:
-        """Files of the matrices."""
-        return [split_source(one.source)[0] for one in (self.reconstructor, self.command_modes) if one]
 
     @property
     def as_commanded(self) -> Self:
