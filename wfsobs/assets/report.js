@@ -150,6 +150,9 @@ function drawTable() {
   document.getElementById("table").replaceChildren(copy)
 }
 
+// What the axes are set by.
+const framed = (it) => [it?.length, it?.dt, it?.events.start[0]].join()
+
 function drawAxes() {
   const [target] = data.targets, {length} = state, f = axis("frequency")
   const view = Math.min(VIEW, length), middle = state.events.start[0] ?? length / 2
@@ -179,7 +182,7 @@ function draw() {
   }
   for (const it of all("[data-verdict]")) it.hidden = it.dataset.verdict !== `${shown.state}` || it.dataset.mode !== shown.mode
   drawTable()
-  if (before?.length !== state.length || before.dt !== state.dt) drawAxes()
+  if (framed(before) !== framed(state)) drawAxes()
 }
 
 try {
