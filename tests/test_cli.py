@@ -284,7 +284,7 @@ def test_loop_takes_seeds_or_a_record():
 def test_the_file_of_an_identification_is_all_that_telemetry_needs(tmp_path):
     """As a prior it gives what it gives as settings; who is told nothing is as without it."""
     record, found = str(tmp_path / "night.npz"), str(tmp_path / "found.toml")
-    light = [*QUICK, "--set", "run.duration=3"]
+    light = [*QUICK, "--set", "run.duration=2"]
     call("run", *light, "--save", record, "--observer", "zero")
     call("identify", record, *light, "--out", found)
 

@@ -15,6 +15,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -43,6 +44,8 @@ DOCS = ROOT / "docs"
 PAGES = [README, *sorted(DOCS.glob("**/*.md"))]
 COMMANDS = [p for p in PAGES if p.stem != "read-your-telemetry"]
 """Pages whose commands stand alone; those of the other go with its code."""
+ALONE = set[tuple[str, ...]]()
+"""Commands that have run, and neither read nor wrote a file: they need not again, on another page."""
 NOTEBOOKS = sorted(DOCS.glob("tutorials/*.ipynb"))
 SHORT = (
     "--set",
@@ -145,6 +148,7 @@ def test_named_settings_exist(page: Path) -> None:
             assert path.replace(".N.", ".0.") in paths | dict(Scenario().lists()).keys(), path
 
 
+@cache
 def names_of(file: Path) -> set[str]:
     """Top-level names of a module, and Class.member."""
     out: set[str] = set()
@@ -180,22 +184,28 @@ def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         if words[0] != "wfsobs":
             continue
         words, out = (words[:-2], words[-1]) if ">" in words else (words, None)
-        if "--seeds" in words:
-            words[words.index("--seeds") + 1] = "2"
+        for option, value in (("--seeds", "2"), ("--seconds", "0.1")):
+            if option in words:
+                words[words.index(option) + 1] = value
         if "--vary" in words:  # the first and the last value of each
             words = [re.sub(r"^([\w.]+=[^,]+,).*,", r"\1", word) for word in words]
         short = SHORT if words[1] in ("run", "observe", "tune", "loop", "export", "sweep") else ()
         short = ("--seconds", "0.1") if words[1] == "attach" else short
         if words[1] == "tune":
-            short = (*short, "--evaluations", "3")
+            short = (*short, "--evaluations", "2")
         if words[1] == "loop" and "--controller" not in words:
             short = (*short, "--controller", "integrator", "--controller", "lqg-kf-multi")
         if words[1] == "envelope":
             short = ("--points", "8", *(() if "--controller" in words else ("--controller", "lqg-kf-lgs")))
         if words[1] in ("run", "observe", "export", "sweep", "live") and "--observer" not in words:
             short = (*short, *FEW)
-        result = CliRunner().invoke(main, [*words[1:], *short])
+        before, words = {*tmp_path.iterdir()}, [*words[1:], *short]
+        if tuple(words) in ALONE:
+            continue
+        result = CliRunner().invoke(main, words)
         assert result.exit_code == 0, (line, result.output)
+        if {*tmp_path.iterdir()} == before and not any(Path(word).exists() for word in words):
+            ALONE.add(tuple(words))
         if out:
             Path(out).write_text(result.stdout, encoding="utf-8")
 

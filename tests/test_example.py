@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +26,11 @@ SHORT = (
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
 
-@pytest.fixture
-def python(example: Path, tmp_path: Path) -> Run:
+@pytest.fixture(scope="module")
+def python(example: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Runs Python with the package installed, in a folder of its own."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (example, ROOT)))}
-    options: dict[str, Any] = {"cwd": tmp_path, "env": environment, "capture_output": True, "text": True}
+    options: dict[str, Any] = {"cwd": tmp_path_factory.mktemp("run"), "env": environment, "capture_output": True, "text": True}
     return lambda *arguments: subprocess.run([sys.executable, *arguments], **options)
 
 
@@ -38,6 +39,7 @@ def said(done: subprocess.CompletedProcess[str]) -> str:
     return done.stdout
 
 
+@cache
 def errors(python: Run, *more: str) -> dict[str, float]:
     """RMS error of tip turbulence of the observer and of two of ours."""
     names = ("low-pass", "persistence", "kf-lgs")

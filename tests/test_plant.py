@@ -106,10 +106,9 @@ def test_of_a_loop_without_a_probe(delay: float, gain: tuple[float, float], angl
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [7, 8])
-def test_both_sides_of_a_whole_number_of_frames_count(seed: int) -> None:
-    """A maximum above it, where the likelihood is steep, is no better than one below: 2.01 and 2.04 +- 0.03 by that one alone."""
-    (found,) = identify_plant(closed_loop(20_000, 1.85, np.eye(2), seed=seed, gain=0.2))
+def test_both_sides_of_a_whole_number_of_frames_count() -> None:
+    """A maximum above it, where the likelihood is steep, is no better than one below: 2.04 +- 0.03 by that one alone."""
+    (found,) = identify_plant(closed_loop(20_000, 1.85, np.eye(2), seed=8, gain=0.2))
     assert right(found.common_delay, 1.85, 3.0) and all(right(n, 1.0, 3.0) for n in found.gain)
     assert found.common_delay.sd is not None and found.common_delay.sd < 0.2
 
@@ -176,7 +175,8 @@ def test_what_no_mirror_of_second_order_does_is_not_identifiable() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("flip", "name"), [((1.0, -1.0), "tilt"), ((-1.0, 1.0), "tip")])
 def test_a_flipped_axis(flip: tuple[float, float], name: str) -> None:
-    (found,) = identify_plant(closed_loop(10_000, 2.0, np.diag(flip)))
+    """Of 3 s the angle is known to 0.03 rad, and a flip is half a turn away."""
+    (found,) = identify_plant(closed_loop(3000, 2.0, np.diag(flip)))
     assert found.flipped_mode == name
 
 
