@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import queue
 from collections.abc import Callable, Iterator
 from math import inf
 from time import monotonic
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,7 +25,9 @@ from wfsobs.app.sources import LoadedRecord, Source
 from wfsobs.app.store import Store
 from wfsobs.app.work import RunResults, compute
 from wfsobs.closed_loop.run import Outcome
+from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.dependence import Memo
+from wfsobs.priors_from import scenario as priors
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -65,12 +69,26 @@ class Loop:
         self.until(lambda: store.run.state != RUNNING)
 
 
-@pytest.fixture(scope="session", autouse=True)
-def frozen() -> Iterator[None]:
-    """The end of a session looks through what was made in it, not through what was there before all tests."""
+SESSIONS = 8
+"""So many sessions leave their pages to the collector before it looks for them."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def unhurried() -> Iterator[Callable[[], None]]:
+    """No run waits for a drawing; what sessions leave is collected now and then, among what is new, not as each ends."""
+    sessions, thresholds = itertools.count(), gc.get_threshold()
+
+    def collect() -> None:
+        if next(sessions) % SESSIONS == 0:
+            gc.collect()
+            gc.freeze()
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gc, "unfreeze", lambda: None)
-        yield
+        patch.setattr("wfsobs.app.service.gc", SimpleNamespace(collect=int, freeze=lambda: None, unfreeze=lambda: None))
+        patch.setattr("wfsobs.app.work.DRAWING", 0.0)
+        gc.set_threshold(20_000, 20, 10**6)
+        yield collect
+    gc.set_threshold(*thresholds)
 
 
 @pytest.fixture(autouse=True)
@@ -93,8 +111,9 @@ def short() -> Scenario:
 
 
 @pytest.fixture
-def enter() -> Iterator[Callable[..., Session]]:
+def enter(unhurried: Callable[[], None]) -> Iterator[Callable[..., Session]]:
     """A session of a server of its own, which keeps no results."""
+    unhurried()
     services: list[Service] = []
 
     def enter(work: Any = compute, limits: Limits = NONE, workers: int = 2, memo: Memo | None = None) -> Session:
@@ -120,17 +139,28 @@ MOST = 12
 KEPT: dict[str, RunResults] = {}
 """The last MOST results of simulations by what they are of, their arrays read-only."""
 
+KNOWN = Memo()
+"""Of what is kept, as a server knows it of its sessions."""
+
 
 def compute_once(scenario: Scenario, watch: Watch, tell: Tell, source: Source | None = None) -> RunResults:
     """`compute`, and what it gave the last time where that is kept; records that are loaded have any key in the tests."""
     if isinstance(source, LoadedRecord):
-        return compute(scenario, watch, tell, source)
-    key = run_key(scenario, source)
-    shown = KEPT.pop(key, None) or freeze(compute(scenario, watch, tell, source))
+        return compute(scenario, watch, tell, source, KNOWN)
+    key = f"{run_key(scenario, source)} {priors.usual_observers(scenario)}"
+    shown = KEPT.pop(key, None) or freeze(compute(scenario, watch, tell, source, KNOWN))
     KEPT[key] = shown
     for oldest in list(KEPT)[:-MOST]:
         KEPT.pop(oldest, None)
     return shown
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody learns during the run, which takes two thirds of the time of observers and nearly all of that of controllers."""
+    is_usual, learners = priors.is_usual, ("lqg-kf-adaptive", "lqg-multirate-adaptive", "integrator+gpr-online")
+    monkeypatch.setattr(priors, "is_usual", lambda observer, *of: not observer.slow and is_usual(observer, *of))
+    monkeypatch.setattr(CONTROLLERS, "_entries", {name: it for name, it in CONTROLLERS.items() if name not in learners})
 
 
 class Outcomes(Memo):
@@ -149,17 +179,49 @@ class Outcomes(Memo):
 OUTCOMES = Outcomes()
 
 
-@pytest.fixture
-def dashboard(loop: Loop, short: Scenario, enter: Callable[..., Session]) -> Dashboard:
+def open_dashboard(loop: Loop, session: Session, scenario: Scenario) -> Dashboard:
     """A dashboard whose first run is done; what waits for idle time is never done, as on a server that is never idle."""
-    session = enter(compute_once, memo=OUTCOMES)
     session.service.queue.rest = inf
-    dashboard = Dashboard(loop.queue.put, session, short)
+    dashboard = Dashboard(loop.queue.put, session, scenario)
     loop.closing.append(dashboard)
     dashboard.page()
     dashboard.start()
     loop.finish(dashboard.store)
     return dashboard
+
+
+@pytest.fixture
+def dashboard(loop: Loop, short: Scenario, enter: Callable[..., Session]) -> Dashboard:
+    return open_dashboard(loop, enter(compute_once, memo=OUTCOMES), short)
+
+
+@pytest.fixture(scope="module")
+def shared_loop() -> Iterator[Loop]:
+    loop = Loop()
+    yield loop
+    for dashboard in loop.closing:
+        dashboard.store.session.leave()
+        dashboard.store.session.service.close(20.0)
+
+
+@pytest.fixture(scope="module")
+def shared_board(shared_loop: Loop) -> Dashboard:
+    session = Service(NONE, 2, 0, compute_once, OUTCOMES).enter()
+    return open_dashboard(shared_loop, session, PRESETS["paper"]().replace(SHORT))
+
+
+@pytest.fixture
+def shared(shared_board: Dashboard) -> Iterator[Dashboard]:
+    """A dashboard for all tests of a module that change no setting; what is displayed is put back after each."""
+    board, display, frequencies = shared_board, shared_board.display, shared_board.explore.spectra.x_range
+    scenario, whole = board.store.scenario, (frequencies.start, frequencies.end)
+    values = {name: value for name, value in display.param.values().items() if name != "name"}
+    yield board
+    board.upload.discard()
+    board.view_state.open("")
+    display.param.update(dark=False, editing=False)
+    frequencies.update(start=whole[0], end=whole[1])
+    assert board.store.scenario is scenario and display.param.values().items() >= values.items()
 
 
 class OneSeed(SeedRuns):

@@ -30,13 +30,23 @@ from wfsobs.telemetry.records import load_record, read_record
 WIND = "turbulence.wind_speed"
 
 
-@pytest.fixture
-def actions(dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch) -> Actions:
-    """The row of a dashboard whose first run is done; what it sends is kept in `sent`."""
+def row_of(dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch) -> Actions:
+    """The row of a dashboard; what it sends is kept in `sent`."""
     sent: list[dict[str, Any]] = []
     monkeypatch.setattr(dashboard.actions.toolbar, "_send_msg", sent.append)
     dashboard.actions.sent = sent  # type: ignore[attr-defined]
     return dashboard.actions
+
+
+@pytest.fixture
+def actions(dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch) -> Actions:
+    return row_of(dashboard, monkeypatch)
+
+
+@pytest.fixture
+def shared_actions(shared: Dashboard, monkeypatch: pytest.MonkeyPatch) -> Actions:
+    shared.actions.toolbar.param.update(message="", notes=[])
+    return row_of(shared, monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +64,7 @@ def shown() -> RunResults:
     return compute(scenario, QUIET, lambda **_: None)
 
 
+@pytest.mark.usefixtures("quick")
 def test_texts_follow_the_settings(actions: Actions) -> None:
     toolbar, store = actions.toolbar, actions.store
     store.change(WIND, 20)
@@ -63,6 +74,7 @@ def test_texts_follow_the_settings(actions: Actions) -> None:
     assert toolbar.query == "preset=ut4" and toolbar.command == "wfsobs run --preset ut4"
 
 
+@pytest.mark.usefixtures("quick")
 def test_undo_and_redo_by_message(actions: Actions) -> None:
     actions.store.change(WIND, 20)
     actions.handle({"action": "undo"})
@@ -73,6 +85,7 @@ def test_undo_and_redo_by_message(actions: Actions) -> None:
     actions.handle({})
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_link_is_one_step_and_names_what_it_could_not_use(actions: Actions) -> None:
     before = actions.store.scenario
     actions.open_link(f"?preset=ut4&{WIND}=25&loop.gain=9&run.seed=3")
@@ -83,6 +96,7 @@ def test_a_link_is_one_step_and_names_what_it_could_not_use(actions: Actions) ->
     assert store.scenario == before and store.preset == "paper"
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_file_is_one_step(actions: Actions, loop: Any) -> None:
     before = actions.store.scenario
     actions.open_file("mine.toml", 'preset = "ut4"\nloop.gain = 0.2')
@@ -94,6 +108,7 @@ def test_a_file_is_one_step(actions: Actions, loop: Any) -> None:
     assert store.scenario == before
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_bad_file_changes_nothing_and_has_one_line(actions: Actions, loop: Any, subtests: pytest.Subtests) -> None:
     texts: list[Any] = ["loop.gain = 9", "nonsense", "run.warm_up = 20", "#" * (LARGEST + 1), None, 3]
     for text in texts:
@@ -108,6 +123,7 @@ def test_a_bad_file_changes_nothing_and_has_one_line(actions: Actions, loop: Any
             loop.until(lambda: actions.toolbar.notes == [])
 
 
+@pytest.mark.usefixtures("quick")
 def test_the_scenario_file(actions: Actions, loop: Any) -> None:
     actions.store.change(WIND, 20)
     actions.handle({"action": "toml"})
@@ -119,27 +135,27 @@ def test_the_scenario_file(actions: Actions, loop: Any) -> None:
 
 
 @pytest.mark.parametrize(("action", "make"), [("csv", data_csv), ("npz", data_npz)])
-def test_data_is_made_aside_and_sent(actions: Actions, loop: Any, action: str, make: Any) -> None:
-    actions.handle({"action": action})
-    loop.until(lambda: actions.sent)  # type: ignore[attr-defined]
-    (file,) = actions.sent  # type: ignore[attr-defined]
+def test_data_is_made_aside_and_sent(shared_actions: Actions, shared_loop: Any, action: str, make: Any) -> None:
+    shared_actions.handle({"action": action})
+    shared_loop.until(lambda: shared_actions.sent)  # type: ignore[attr-defined]
+    (file,) = shared_actions.sent  # type: ignore[attr-defined]
     content = file["content"]
-    assert file["name"] == f"wfsobs.{action}" and len(content) == len(make(actions.store.run.result))
+    assert file["name"] == f"wfsobs.{action}" and len(content) == len(make(shared_actions.store.run.result))
 
 
 def test_a_report_is_made_aside_of_what_is_shown_one_at_a_time(
-    actions: Actions,
-    loop: Any,
+    shared_actions: Actions,
+    shared_loop: Any,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked: list[tuple[Any, str]] = []
     monkeypatch.setattr(module, "make", lambda shown, preset, *_, **__: asked.append((shown, preset)) or b"<!doctype html>")
-    shown = actions.store.run.result
-    actions.handle({"action": "report"})
-    assert actions.toolbar.reporting
-    actions.handle({"action": "report"})
-    loop.until(lambda: not actions.toolbar.reporting)
-    (file,) = actions.sent  # type: ignore[attr-defined]
+    shown = shared_actions.store.run.result
+    shared_actions.handle({"action": "report"})
+    assert shared_actions.toolbar.reporting
+    shared_actions.handle({"action": "report"})
+    shared_loop.until(lambda: not shared_actions.toolbar.reporting)
+    (file,) = shared_actions.sent  # type: ignore[attr-defined]
     assert file["name"] == "wfsobs-report.html" and file["content"] == b"<!doctype html>"
     assert shown is not None and asked == [(shown, "paper")]
 
@@ -148,8 +164,8 @@ def test_a_report_is_made_aside_of_what_is_shown_one_at_a_time(
     ("error", "line"), [(ValueError("no room"), "Report: no room"), (KeyError("x"), "Report: KeyError: 'x'")]
 )
 def test_a_report_that_fails_is_one_line(
-    actions: Actions,
-    loop: Any,
+    shared_actions: Actions,
+    shared_loop: Any,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
     error: Exception,
@@ -159,33 +175,34 @@ def test_a_report_that_fails_is_one_line(
         raise error
 
     monkeypatch.setattr(module, "make", fail)
-    actions.handle({"action": "report"})
-    loop.until(lambda: actions.toolbar.notes)
-    assert actions.toolbar.notes == [line] and not actions.toolbar.reporting
+    shared_actions.handle({"action": "report"})
+    shared_loop.until(lambda: shared_actions.toolbar.notes)
+    assert shared_actions.toolbar.notes == [line] and not shared_actions.toolbar.reporting
     assert ("Traceback" in caplog.text) == isinstance(error, KeyError), "the log says more of what nobody expected"
-    assert not actions.sent  # type: ignore[attr-defined]
+    assert not shared_actions.sent  # type: ignore[attr-defined]
 
 
-def test_too_much_data_is_refused_with_a_line(actions: Actions, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_much_data_is_refused_with_a_line(shared_actions: Actions, shared_loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(downloads, "MOST", 1000)
     with pytest.raises(TooLarge):
-        data_csv(actions.store.run.result)  # type: ignore[arg-type]
-    actions.handle({"action": "npz"})
-    loop.until(lambda: actions.toolbar.notes)
-    assert "wfsobs run --save" in actions.toolbar.notes[0]
+        data_csv(shared_actions.store.run.result)  # type: ignore[arg-type]
+    shared_actions.handle({"action": "npz"})
+    shared_loop.until(lambda: shared_actions.toolbar.notes)
+    assert "wfsobs run --save" in shared_actions.toolbar.notes[0]
 
 
-def test_what_was_read_is_taken_back_and_nothing_that_came_meanwhile(actions: Actions) -> None:
-    toolbar = actions.toolbar
+def test_what_was_read_is_taken_back_and_nothing_that_came_meanwhile(shared_actions: Actions) -> None:
+    toolbar = shared_actions.toolbar
     toolbar.param.update(message="Opened b.toml.", notes=["a.toml: no"])
-    actions.handle({"action": "read", "text": "Opened a.toml."})
+    shared_actions.handle({"action": "read", "text": "Opened a.toml."})
     assert toolbar.message == "Opened b.toml."
-    actions.handle({"action": "read", "text": "Opened b.toml."})
+    shared_actions.handle({"action": "read", "text": "Opened b.toml."})
     assert toolbar.message == "" and toolbar.notes == ["a.toml: no"]
-    actions.handle({"action": "dismiss"})
+    shared_actions.handle({"action": "dismiss"})
     assert toolbar.notes == []
 
 
+@pytest.mark.usefixtures("quick")
 def test_settings_too_long_for_a_link(actions: Actions) -> None:
     many = [1.0 + i / 100 for i in range(3000)]
     actions.store.change("vibration.psd.frequency", many)

@@ -53,7 +53,9 @@ def short(short: Scenario) -> Scenario:
 
 @pytest.fixture
 def page(make_store: Any) -> Page:
-    return Page(make_store(compute_once))
+    store = make_store(compute_once)
+    store.session.service.queue.rest = 0.0
+    return Page(store)
 
 
 def test_work_that_gave_way_goes_on_where_it_was(monkeypatch: pytest.MonkeyPatch) -> None:

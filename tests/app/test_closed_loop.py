@@ -115,6 +115,7 @@ def test_the_lines_that_matter_come_first_until_others_are_chosen(page: ClosedLo
     assert shown() == named() >= {"integrator", "lqg-kf-lgs", best("tilt")}
 
 
+@pytest.mark.usefixtures("quick")
 def test_marks_hiding_colours_and_reasons(page: ClosedLoopPage, dashboard: Dashboard) -> None:
     the_marks_lie_on_the_curves_where_the_margins_are(page)
     before = top(page)
@@ -138,12 +139,13 @@ def the_marks_lie_on_the_curves_where_the_margins_are(page: ClosedLoopPage) -> N
         assert abs(point) == pytest.approx(1.0) if marker == "square" else -1.0 < point.real < 0.0 == point.imag
 
 
+@pytest.mark.usefixtures("quick")
 def test_it_follows_the_settings_while_it_is_seen(page: ClosedLoopPage, dashboard: Dashboard, loop: Any) -> None:
     dashboard.store.change("control.integrator", "manual")
     dashboard.store.change("control.gain", 1.5)
     loop.finish(dashboard.store)
     done(page, loop)
-    assert page.table.html.count("unstable</span>") == 3
+    assert page.table.html.count("unstable</span>") == sum("integrator" in name for name in CONTROLLERS)
     assert {c["note"] for c in page.cards.items if "integrator" in c["name"]} == {"unstable"}
     assert not len(page.trace.sources["integrator"].data["x"])
     dashboard.pages.current = EXPLORE
@@ -155,6 +157,7 @@ def test_it_follows_the_settings_while_it_is_seen(page: ClosedLoopPage, dashboar
     assert "unstable</span>" not in page.table.html
 
 
+@pytest.mark.usefixtures("quick")
 def test_it_comes_back_as_the_switches_are_by_then(page: ClosedLoopPage, dashboard: Dashboard) -> None:
     dashboard.pages.current = EXPLORE
     dashboard.display.param.update(mode="tilt", unit="mas")
@@ -162,8 +165,9 @@ def test_it_comes_back_as_the_switches_are_by_then(page: ClosedLoopPage, dashboa
     assert page.trace.figure.yaxis.axis_label == "residual tilt [mas]"
 
 
+@pytest.mark.usefixtures("quick")
 def test_more_modes_than_tip_and_tilt(page: ClosedLoopPage, dashboard: Dashboard, loop: Any) -> None:
-    dashboard.store.load(dashboard.store.scenario.replace({"telescope.radial_order": 2, "run.duration": 1.0}))
+    dashboard.store.load(dashboard.store.scenario.replace({"telescope.radial_order": 2, "run.duration": 0.7}))
     loop.finish(dashboard.store)
     done(page, loop)
     dashboard.display.mode = "defocus"
@@ -183,15 +187,16 @@ def test_what_would_take_minutes_is_left_out(dashboard: Dashboard, loop: Any, mo
     assert page.run.session.is_closed, "a session that ends takes its loop with it"
 
 
+@pytest.mark.usefixtures("quick")
 def test_an_uncertain_plant_adds_columns_a_sentence_and_a_figure(page: ClosedLoopPage, dashboard: Dashboard, loop: Any) -> None:
-    few, box = 12, page.uncertain
+    box, envelope_of = page.uncertain, partial(plant_envelope, controllers=["integrator", "lqg-kf-lgs", "h2-fir"], points=6)
     assert "Worst [" not in page.table.html and not box.room.visible
     with pytest.MonkeyPatch.context() as m:
-        m.setattr(loop_work, "plant_envelope", partial(plant_envelope, points=few))
+        m.setattr(loop_work, "plant_envelope", envelope_of)
         box.starter.start.clicks += 1
         loop.until(lambda: box.work.state == DONE)
     assert page.results is not None
-    expected = plant_envelope(page.results.result.scenario, points=few)
+    expected = envelope_of(page.results.result.scenario)
     assert box.work.result is not None and box.work.result.rows() == expected.rows()
     assert "Worst [nm]" in page.table.html and box.room.visible
     for line in expected.sentences(1e3, "nm", 0):
@@ -207,6 +212,7 @@ def test_an_uncertain_plant_adds_columns_a_sentence_and_a_figure(page: ClosedLoo
     assert box.work.result is None and not box.room.visible and "Worst [" not in page.table.html, "it was of other results"
 
 
+@pytest.mark.usefixtures("quick")
 def test_an_uncertain_plant_stops_when_told(page: ClosedLoopPage) -> None:
     begun, box = Event(), page.uncertain
 

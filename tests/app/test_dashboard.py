@@ -12,10 +12,12 @@ from bokeh.document import Document
 from bokeh.models import ImportedStyleSheet
 from panel.io.state import set_curdoc
 
+from tests.app.conftest import compute_once
 from wfsobs.app import dashboard as module
+from wfsobs.app import service
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.serve import session_page
-from wfsobs.app.work import RunResults, compute
+from wfsobs.app.work import RunResults
 from wfsobs.scenario import Scenario
 
 
@@ -65,11 +67,12 @@ def test_a_session_made_anew_needs_no_other_host(loop: Any, short: Scenario, ent
     assert not [address for address in addresses if "//" in address]
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_failing_run_shows_inline(loop: Any, short: Scenario, enter: Any) -> None:
     def work(scenario: Scenario, *how: Any) -> RunResults:
         if scenario.loop.gain == 0.1:
             raise RuntimeError("no *such* <luck>")
-        return compute(scenario, *how)
+        return compute_once(scenario, *how)
 
     dashboard = Dashboard(loop.queue.put, enter(work), short)
     loop.closing.append(dashboard)
@@ -87,13 +90,14 @@ def test_a_failing_run_shows_inline(loop: Any, short: Scenario, enter: Any) -> N
     assert not dashboard.alert.visible and not dashboard.stale.visible and not faded(dashboard)
 
 
+@pytest.mark.usefixtures("quick")
 def test_results_are_marked_stale_until_new_ones_land(loop: Any, short: Scenario, enter: Any) -> None:
     gate = threading.Event()
 
     def work(scenario: Scenario, *how: Any) -> RunResults:
         if scenario.loop.gain == 0.1:
             assert gate.wait(20)
-        return compute(scenario, *how)
+        return compute_once(scenario, *how)
 
     dashboard = Dashboard(loop.queue.put, enter(work), short)
     loop.closing.append(dashboard)
@@ -107,6 +111,7 @@ def test_results_are_marked_stale_until_new_ones_land(loop: Any, short: Scenario
     assert not faded(dashboard)
 
 
+@pytest.mark.usefixtures("quick")
 def test_done_is_said_of_what_stands_in_the_table(dashboard: Dashboard, loop: Any) -> None:
     status, table, seen = dashboard.controls.status, dashboard.explore.table, list[tuple[str, str]]()
     status.param.watch(lambda event: seen.append((event.new, table.pane.html)), "text")
@@ -141,7 +146,9 @@ def test_importing_the_package_imports_no_panel() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_a_session_that_has_ended_leaves_nothing_behind(short: Scenario, enter: Any) -> None:
+def test_a_session_that_has_ended_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch, short: Scenario, enter: Any) -> None:
+    monkeypatch.setattr(service, "gc", gc)
+    monkeypatch.setattr(gc, "unfreeze", lambda: None)  # of what was there before
     dashboard = Dashboard(lambda function: function(), enter(), short)
     page = dashboard.page()
     dashboard.store.session.leave()

@@ -31,6 +31,8 @@ from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.values import SettingError
 from wfsobs.simulation.disturbance import turbulence_process
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 def moved(scenario: Scenario, target: str, name: str, mode: int = 0, **by: float) -> Scenario:
     handle = next(h for h in handles_of(scenario, target, mode) if h.id == name)

@@ -60,6 +60,7 @@ def identified(page: IdentifyPage, loop: Any) -> Identification:
     return page.work.result[0]
 
 
+@pytest.mark.usefixtures("quick")
 def test_it_shows_what_the_core_finds(page: IdentifyPage, dashboard: Dashboard, loop: Any) -> None:
     of = dashboard.store.run.result
     assert of is not None and page.of is not None and not len(page.figure.total.data["x"]) and page.starter.uses[0].disabled
@@ -142,6 +143,7 @@ def test_filters_only(page: IdentifyPage, dashboard: Dashboard, loop: Any) -> No
     assert store.source is None, "a preset is a start"
 
 
+@pytest.mark.usefixtures("quick")
 def test_as_a_new_simulation(page: IdentifyPage, dashboard: Dashboard, loop: Any) -> None:
     before = dashboard.store.scenario
     expected = identified(page, loop).scenario(before)
@@ -180,6 +182,7 @@ def load_record(dashboard: Dashboard, loop: Any, scenario: Scenario) -> Record:
     return loaded
 
 
+@pytest.mark.usefixtures("quick")
 def test_the_first_suggestion_for_a_loaded_record(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
     """One button identifies it, has the observers use the model, and says so; undo brings the suggestion back."""
     it = dashboard.pages.suggestion
@@ -202,6 +205,7 @@ def test_the_first_suggestion_for_a_loaded_record(dashboard: Dashboard, loop: An
     assert it.button.visible and NEXT in it.words.html
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_loaded_record_stays(page: IdentifyPage, dashboard: Dashboard, loop: Any, short: Scenario) -> None:
     loaded = load_record(dashboard, loop, short)
     identified(page, loop)
@@ -212,6 +216,7 @@ def test_a_loaded_record_stays(page: IdentifyPage, dashboard: Dashboard, loop: A
     assert shown.scenario.kalman.process_noise == "matched" and not page.stale.visible
 
 
+@pytest.mark.usefixtures("quick")
 def test_what_cannot_be_done_is_said_in_one_line(page: IdentifyPage, loop: Any) -> None:
     for level, lowest, reason in (
         ("2", "5", "Level = '2': takes a number from 1e-09 to 0.5"),
@@ -225,6 +230,7 @@ def test_what_cannot_be_done_is_said_in_one_line(page: IdentifyPage, loop: Any) 
         assert page.starter.uses[0].disabled
 
 
+@pytest.mark.usefixtures("quick")
 def test_limits_of_a_public_server(loop: Any, short: Scenario, enter: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """By the estimate, and by the time that it takes after all."""
     dashboard = Dashboard(loop.queue.put, enter(limits=Limits(seconds=5.0)), short)
@@ -247,6 +253,7 @@ def test_limits_of_a_public_server(loop: Any, short: Scenario, enter: Any, monke
     PUBLIC.job("identify", "identification", lambda _watch, _tell: None, seconds(longest))
 
 
+@pytest.mark.usefixtures("quick")
 def test_it_comes_back_as_the_switches_are_by_then(page: IdentifyPage, dashboard: Dashboard) -> None:
     """Theme, mode and unit may be changed while another page is shown."""
     dashboard.pages.current = EXPLORE

@@ -77,6 +77,7 @@ def begin(page: LivePage, loop: Any) -> LiveLoop:
     return live
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_loop_from_start_to_the_end_of_the_session(page: LivePage, dashboard: Dashboard, loop: Any) -> None:
     assert page.picture is None and page.loop is None and not page.draw(), "nothing before it is asked for"
     live = begin(page, loop)
@@ -272,6 +273,7 @@ def test_which_page_an_address_opens_with(query: str, is_shared: bool, is_live: 
     assert opens_on_live(query, is_shared) == is_live
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_record_that_is_loaded_is_played(page: LivePage, dashboard: Dashboard, loop: Any) -> None:
     """Without NGS frames and without truth: those that need them do not run, and the errors are of the next measurement."""
     scenario = dashboard.store.scenario

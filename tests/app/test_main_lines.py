@@ -28,8 +28,8 @@ from wfsobs.scenario import Scenario
 
 
 @pytest.fixture
-def scores(dashboard: Dashboard) -> tuple[Score, ...]:
-    return dashboard.store.run.result.result.scores
+def scores(shared: Dashboard) -> tuple[Score, ...]:
+    return shared.store.run.result.result.scores
 
 
 def hidden(dashboard: Dashboard, target: str) -> list[str]:
@@ -90,19 +90,20 @@ class TestRule:
         for target in TARGETS:
             assert {*observers_of(target)} == {o.id for o in OBSERVERS.values() if target in o.targets} - {NO_ESTIMATE}
 
-    def test_what_runs_has_a_card(self, dashboard: Dashboard) -> None:
-        shown = dashboard.store.run.result
+    def test_what_runs_has_a_card(self, shared: Dashboard) -> None:
+        shown = shared.store.run.result
         for target in TARGETS:
             ran = [name for name in observers_of(target) if shown.result.estimate(name, target) is not None]
-            assert [card["name"] for card in dashboard.explore.strips[target].cards.items] == ["truth", *ran]
+            assert [card["name"] for card in shared.explore.strips[target].cards.items] == ["truth", *ran]
             assert not {"kf-coupled", "kf-asterism"} & {*ran}, "there is nothing to run them on"
 
 
 class TestChoice:
-    def test_the_others_are_hidden(self, dashboard: Dashboard, scores: tuple[Score, ...]) -> None:
+    def test_the_others_are_hidden(self, shared: Dashboard, scores: tuple[Score, ...]) -> None:
         for target in TARGETS:
-            assert set(hidden(dashboard, target)) == {*observers_of(target)} - {*main_observers(scores, target, "tip")}
+            assert set(hidden(shared, target)) == {*observers_of(target)} - {*main_observers(scores, target, "tip")}
 
+    @pytest.mark.usefixtures("quick")
     def test_a_choice_stays_until_the_main_ones_are_asked_for(self, dashboard: Dashboard, loop: Any) -> None:
         at_first = hidden(dashboard, "vibration")
         dashboard.explore.strips["vibration"].cards.hidden_lines = ["truth", "kf-lgs"]
@@ -116,17 +117,17 @@ class TestChoice:
         assert set(hidden(dashboard, "vibration")) == {*observers_of("vibration")} - {*main_observers(scores, "vibration", "tip")}
         assert at_first
 
-    def test_a_link_that_says_it_of_one_target_leaves_the_main_ones_of_the_other(self, dashboard: Dashboard) -> None:
+    def test_a_link_that_says_it_of_one_target_leaves_the_main_ones_of_the_other(self, shared: Dashboard) -> None:
         run, display = Run(), Display()
         MainLines(display, run).choices["vibration"].choose(["truth"])  # type: ignore[arg-type]
-        run.result = dashboard.store.run.result
+        run.result = shared.store.run.result
         assert display.hidden_lines["vibration"] == ["truth"]
         assert display.hidden_lines["turbulence"] == others_of(run.result.result.scores, "turbulence")
 
-    def test_the_first_choice_of_a_run_gives_way_to_that_of_all_results(self, dashboard: Dashboard) -> None:
+    def test_the_first_choice_of_a_run_gives_way_to_that_of_all_results(self, shared: Dashboard) -> None:
         run, display = Run(), Display()
         lines = MainLines(display, run)  # type: ignore[arg-type]
-        whole = dashboard.store.run.result
+        whole = shared.store.run.result
         few = tuple(s for s in whole.result.scores if s.observer in ("kf-lgs", "kf-ngs", "multirate"))
         run.result = replace(whole, result=replace(whole.result, scores=few))
         assert display.hidden_lines["turbulence"] == others_of(few, "turbulence") != others_of(whole.result.scores, "turbulence")
@@ -136,9 +137,9 @@ class TestChoice:
         for target in TARGETS:
             assert display.hidden_lines[target] == others_of(whole.result.scores, target)
 
-    def test_a_click_turns_its_line_alone(self, dashboard: Dashboard) -> None:
+    def test_a_click_turns_its_line_alone(self, shared: Dashboard) -> None:
         """The browser says what was clicked; a double click is two clicks, which undo each other, and the wish for one alone."""
-        cards = dashboard.explore.strips["vibration"].cards
+        cards = shared.explore.strips["vibration"].cards
         told: list[list[str]] = []
         cards.param.watch(lambda event: told.append(event.new), "hidden_lines")
         at_first = cards.hidden_lines
@@ -147,8 +148,8 @@ class TestChoice:
             cards._handle_msg({"action": "toggle", "name": "kf-lgs"})
         assert told == [[*at_first, "kf-lgs"], at_first]
         cards._handle_msg({"action": "solo", "name": "kf-lgs"})
-        lines = dashboard.explore.traces.traces["vibration"].lines
-        assert dashboard.display.hidden_lines["vibration"] == told[-1]
+        lines = shared.explore.traces.traces["vibration"].lines
+        assert shared.display.hidden_lines["vibration"] == told[-1]
         assert [name for name, line in lines.items() if line.visible] == ["kf-lgs"]
         assert {card["name"] for card in cards.items} - {*told[-1]} == {"kf-lgs"}
         assert not re.findall(f'folded"[^>]*data-name="(?:{"|".join(shown)})"', cards.html), "a click moves no row"
@@ -160,21 +161,22 @@ class TestChoice:
         cards._handle_msg({"action": "lines"})
         assert told[-1] == []
 
-    def test_the_axis_fits_the_lines_that_are_shown(self, dashboard: Dashboard) -> None:
-        view = dashboard.explore.traces.traces["vibration"]
-        dashboard.explore.strips["vibration"].cards.hidden_lines = [
+    def test_the_axis_fits_the_lines_that_are_shown(self, shared: Dashboard) -> None:
+        view = shared.explore.traces.traces["vibration"]
+        shared.explore.strips["vibration"].cards.hidden_lines = [
             n for n in ("truth", *observers_of("vibration")) if n != "kf-multi"
         ]
         counted = np.asarray(view.source.data["kf-multi"])[np.asarray(view.source.data["x"]) >= 0.5]
         low, high = counted.min(), counted.max()
         # 5 % of its height are left on either side of a line
         assert view.figure.y_range.end == pytest.approx(high + 0.05 * (high - low), rel=1e-4)
-        spectrum = dashboard.explore.spectra.spectra["vibration"]
+        spectrum = shared.explore.spectra.spectra["vibration"]
         density = spectrum.sources["kf-multi"].data["y"]
         assert spectrum.figure.y_range.end == pytest.approx(3.0 * density.max()), "half a decade above it"
 
 
 class TestFirstWindow:
+    @pytest.mark.usefixtures("quick")
     def test_two_seconds_in_the_middle_of_what_counts(self, dashboard: Dashboard, loop: Any) -> None:
         assert first_window(dashboard.store.run.result) == (0.0, 2.0), "a record of two seconds"
         dashboard.store.change("run.duration", 4.0)
@@ -182,6 +184,7 @@ class TestFirstWindow:
         assert first_window(dashboard.store.run.result) == (1.25, 3.25)
         assert dashboard.explore.stretches["vibration"].html() == "", "the cards say it of the whole record"
 
+    @pytest.mark.usefixtures("quick")
     def test_around_the_first_event(self, dashboard: Dashboard, loop: Any, short: Scenario) -> None:
         events = [{"kind": "wind", "start": 2.5, "wind_factor": 2.0}]
         dashboard.store.load(short.replace({"run.duration": 4.0, "events": events}))
@@ -190,15 +193,15 @@ class TestFirstWindow:
 
 
 class TestNamesAndGrey:
-    def test_names_stand_at_the_ends_of_the_lines_and_apart(self, dashboard: Dashboard) -> None:
-        for figures in (dashboard.explore.traces.traces, dashboard.explore.spectra.spectra):
+    def test_names_stand_at_the_ends_of_the_lines_and_apart(self, shared: Dashboard) -> None:
+        for figures in (shared.explore.traces.traces, shared.explore.spectra.spectra):
             for target, view in figures.items():
                 source, axis = view.names_at_end.source.data, view.figure.y_range
                 shown = [look(name).label for name, line in view.lines.items() if line.visible]
                 names = [text.replace("\n", " ") for text in source["text"]]
                 assert {*names} <= {*shown} and look("kf-lgs").label in names
                 assert set(source["x"]) == {view.figure.x_range.end}, target
-                scale = np.log10 if view is dashboard.explore.spectra.spectra[target] else np.asarray
+                scale = np.log10 if view is shared.explore.spectra.spectra[target] else np.asarray
                 low, high = scale(axis.start), scale(axis.end)
                 places = (scale(source["y"]) - low) / (high - low)
                 assert 0.0 < places.min() and places.max() < 1.0
@@ -206,18 +209,19 @@ class TestNamesAndGrey:
                 sizes /= max(sizes.sum(), 1.0)
                 assert (np.diff(places) >= 0.5 * (sizes[1:] + sizes[:-1]) - 1e-9).all()
 
-    def test_of_many_lines_those_that_the_verdict_does_not_name_recede(self, dashboard: Dashboard) -> None:
-        main = dashboard.display.named_lines["vibration"]
+    def test_of_many_lines_those_that_the_verdict_does_not_name_recede(self, shared: Dashboard) -> None:
+        main = shared.display.named_lines["vibration"]
         other = next(name for name in observers_of("vibration") if name not in main)
-        lines = dashboard.explore.traces.traces["vibration"].lines
-        dashboard.explore.lines.choices["vibration"].choose([])
+        lines = shared.explore.traces.traces["vibration"].lines
+        shared.explore.lines.choices["vibration"].choose([])
         assert [name for name, line in lines.items() if not line.recedes] == [TRUTH, *main]
         grey = lines[other].renderer
         assert grey is not None and grey.glyph.line_color == GREY[False] and grey.tags == [look(other).light]
         few = [*main[: MOST_COLOURED - 2], other]
-        dashboard.explore.lines.choices["vibration"].choose([name for name in observers_of("vibration") if name not in few])
+        shared.explore.lines.choices["vibration"].choose([name for name in observers_of("vibration") if name not in few])
         assert not any(line.recedes for line in lines.values()) and grey.glyph.line_color == look(other).light
 
+    @pytest.mark.usefixtures("quick")
     def test_the_effect_of_a_change_stands_below_its_setting(self, dashboard: Dashboard, loop: Any) -> None:
         dashboard.complete()
         before = dashboard.store.run.result.result.scores

@@ -74,6 +74,7 @@ class TestPages:
         assert seen(dashboard) == [EXPLORE]
         assert opened(dashboard, FIGURES) is first
 
+    @pytest.mark.usefixtures("quick")
     def test_a_hidden_page_rests(self, dashboard: Dashboard, loop: Any) -> None:
         figures, equations = opened(dashboard, FIGURES), opened(dashboard, MODEL)
         assert not figures.visible and equations.visible
@@ -88,8 +89,8 @@ class TestPages:
 
 class TestFigures:
     @pytest.fixture
-    def figures(self, dashboard: Dashboard) -> Figures:
-        return opened(dashboard, FIGURES)
+    def figures(self, shared: Dashboard) -> Figures:
+        return opened(shared, FIGURES)
 
     def test_every_line_has_data(self, figures: Figures) -> None:
         plots = [plot for sheet in figures.sheets for plot in sheet.plots]
@@ -99,8 +100,8 @@ class TestFigures:
                 y = np.asarray(source.data["y"])
                 assert y.size > 50 and np.isfinite(y).mean() > 0.9 and len(source.data["x"]) == y.size
 
-    def test_values(self, figures: Figures, dashboard: Dashboard) -> None:
-        shown = dashboard.store.run.result
+    def test_values(self, figures: Figures, shared: Dashboard) -> None:
+        shown = shared.store.run.result
         turbulence = figures.sheets[2]
         tilt = np.asarray(turbulence.plots[1].sources["multirate"].data["y"])
         assert np.nanmax(tilt) == pytest.approx(1e3 * shown.values("multirate", "turbulence")[500:, 1].max(), rel=1e-6)
@@ -113,7 +114,7 @@ class TestFigures:
         n = len(psd["x"])
         assert np.allclose(psd["y"], 1e6 * shown.spectra["gpr-online", "vibration"].signal[1 : n + 1, 0])
 
-    def test_colours_and_captions(self, figures: Figures, dashboard: Dashboard) -> None:
+    def test_colours_and_captions(self, figures: Figures, shared: Dashboard) -> None:
         for sheet in figures.sheets:
             for plot in sheet.plots:
                 assert {n: line.renderer.glyph.line_color for n, line in plot.lines.items()} == {
@@ -124,18 +125,21 @@ class TestFigures:
         captions = [words(sheet.caption.html) for sheet in figures.sheets]
         assert "RMS error of tilt [nm]: LGS KF" in captions[2]
         assert re.search(r"LGS KF [\d.]+ \(paper 16\.6\)", captions[3]), "beside the one of the run, in its unit"
-        dashboard.display.param.update(unit="mas", dark=True)
+        shared.display.param.update(unit="mas", dark=True)
         # an rms coefficient of 16.6 nm is a slope of four times that over 8 m, 8.3 nrad
         assert f"(paper {8.3e-9 * np.degrees(1.0) * 3.6e6:.2f})" in words(figures.sheets[3].caption.html)
         assert figures.sheets[0].plots[0].figure.yaxis.axis_label == "tip [mas]"
         assert figures.sheets[0].plots[0].lines[TRUTH].renderer.glyph.line_color == look(TRUTH).dark
 
-    def test_without_a_vibration(self, figures: Figures, dashboard: Dashboard, loop: Any) -> None:
+    @pytest.mark.usefixtures("quick")
+    def test_without_a_vibration(self, dashboard: Dashboard, loop: Any) -> None:
+        opened(dashboard, FIGURES)
         dashboard.store.change("vibration.source", "none")
         loop.finish(dashboard.store)
         assert dashboard.store.run.state == "done"
 
-    def test_of_one_mode(self, figures: Figures, dashboard: Dashboard) -> None:
+    def test_of_one_mode(self, dashboard: Dashboard) -> None:
+        figures = opened(dashboard, FIGURES)
         record = dashboard.store.run.result.result.record
         tip = Record(y_lgs=record.y_lgs[:, :1], u=record.u[:, :1], dt=record.dt)
         result = RunResults(observe(tip, dashboard.store.scenario, observers=["kf-lgs"]))
@@ -145,9 +149,9 @@ class TestFigures:
 
 
 class TestModel:
-    def test_the_numbers_are_there(self, dashboard: Dashboard) -> None:
-        page = opened(dashboard, MODEL)
-        told = describe(dashboard.store.scenario, 0)
+    def test_the_numbers_are_there(self, shared: Dashboard) -> None:
+        page = opened(shared, MODEL)
+        told = describe(shared.store.scenario, 0)
         text = words(page.pane.html)
         for number in (told.turbulence.a1, -told.turbulence.a2):
             assert short(number, 7) in text
@@ -158,6 +162,7 @@ class TestModel:
         for facts in told.sensors.values():
             assert short(facts.noise) in text and short(facts.aliasing) in text
 
+    @pytest.mark.usefixtures("quick")
     def test_it_follows_settings_and_mode(self, dashboard: Dashboard) -> None:
         page = opened(dashboard, MODEL)
         dashboard.store.change("turbulence.wind_speed", 30)
@@ -203,6 +208,7 @@ class TestModel:
         assert short(x) == text
 
 
+@pytest.mark.usefixtures("quick")
 def test_the_first_page_rests_while_another_shows(dashboard: Dashboard, loop: Any) -> None:
     line = dashboard.explore.traces.traces["turbulence"].source
     spectrum = dashboard.explore.spectra.spectra["turbulence"].sources["kf-lgs"]

@@ -108,11 +108,11 @@ class TestPin:
         assert ">A [nm]<" not in pinned.explore.table.pane.html and not pinned.explore.pinning.note.visible
         assert pinned.explore.traces.traces["turbulence"].faint.source.data["xs"] == []
 
-    def test_nothing_is_drawn_before(self, dashboard: Dashboard) -> None:
-        assert all(dashboard.explore.traces.traces[target].faint.source is None for target in TARGETS)
+    def test_nothing_is_drawn_before(self, shared: Dashboard) -> None:
+        assert all(shared.explore.traces.traces[target].faint.source is None for target in TARGETS)
 
-    def test_all_samples_of_a_short_record_are_kept(self, dashboard: Dashboard) -> None:
-        shown = dashboard.store.run.result
+    def test_all_samples_of_a_short_record_are_kept(self, shared: Dashboard) -> None:
+        shown = shared.store.run.result
         kept = thin_lines(shown)
         values = shown.values("kf-lgs", "vibration")
         assert np.allclose(kept.signals["kf-lgs", "vibration"], values, atol=1e-6)
@@ -160,43 +160,41 @@ class TestWords:
 
 
 class TestTable:
-    def test_best_first(self, dashboard: Dashboard) -> None:
-        rms_of = {
-            s.observer: s.rms for s in dashboard.store.run.result.result.scores if (s.target, s.mode) == ("vibration", "tip")
-        }
+    def test_best_first(self, shared: Dashboard) -> None:
+        rms_of = {s.observer: s.rms for s in shared.store.run.result.result.scores if (s.target, s.mode) == ("vibration", "tip")}
         groups = group_by_knowledge(sorted(rms_of, key=lambda name: rms_of[name]))
-        assert order(dashboard, "vibration") == [name for of in groups.values() for name in of]
-        html = dashboard.explore.table.pane.html.partition(">Vibration, tip")[2]
+        assert order(shared, "vibration") == [name for of in groups.values() for name in of]
+        html = shared.explore.table.pane.html.partition(">Vibration, tip")[2]
         places = [html.index(f">{title}<") for title in groups]
         assert places == sorted(places) and "Prior knowledge: none" in groups
 
-    def test_marks(self, dashboard: Dashboard) -> None:
-        html = dashboard.explore.table.pane.html
+    def test_marks(self, shared: Dashboard) -> None:
+        html = shared.explore.table.pane.html
         assert html.count(">smallest<") == 3, "one causal observer per target and for both together, of one record"
         assert ">best<" not in html
         worse = [
             s
-            for s in dashboard.store.run.result.result.scores
+            for s in shared.store.run.result.result.scores
             if s.mode == "tip" and s.normalised_rms is not None and s.normalised_rms > 1
         ]
         assert html.count(">worse than zero<") == len(worse) > 0
 
-    def test_real_time_factor(self, dashboard: Dashboard) -> None:
-        score = next(s for s in dashboard.store.run.result.result.scores if s.observer == "gpr-online" and s.mode == "tip")
+    def test_real_time_factor(self, shared: Dashboard) -> None:
+        score = next(s for s in shared.store.run.result.result.scores if s.observer == "gpr-online" and s.mode == "tip")
         shown = f"<td>{hundredths(1e6 * score.seconds_per_step)}</td><td>{hundredths(1e3 * score.seconds_per_step)}</td>"
-        assert shown in dashboard.explore.table.pane.html
+        assert shown in shared.explore.table.pane.html
 
 
-def test_cumulative_rms(dashboard: Dashboard) -> None:
+def test_cumulative_rms(shared: Dashboard) -> None:
     """At the lowest frequency it is the rms of what is shown, the mean aside."""
-    dashboard.display.param.update(spectrum="cumulative", show="signal")
-    shown, view = dashboard.store.run.result, dashboard.explore.spectra.spectra["vibration"]
+    shared.display.param.update(spectrum="cumulative", show="signal")
+    shown, view = shared.store.run.result, shared.explore.spectra.spectra["vibration"]
     y = np.asarray(view.sources["kf-lgs"].data["y"])
     assert np.all(np.diff(y) <= 0)
     signal = shown.values("kf-lgs", "vibration")[500:, 0]
     assert y[0] == pytest.approx(1e3 * rms(signal), rel=0.15)
     assert view.figure.yaxis.axis_label == "cumulative rms, tip [nm]"
-    dashboard.display.show = "error"
+    shared.display.show = "error"
     error = signal - shown.values(TRUTH, "vibration")[500:, 0]
     assert np.asarray(view.sources["kf-lgs"].data["y"])[0] == pytest.approx(1e3 * rms(error), rel=0.15)
     assert view.figure.yaxis.axis_label == "cumulative rms of error, tip [nm]"

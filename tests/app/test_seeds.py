@@ -118,6 +118,7 @@ def test_every_seed_is_that_of_the_library_and_the_views_say_so(store: Store, lo
     assert high > low
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_change_of_settings_cancels_them_and_one_seed_is_none(store: Store, loop: Any) -> None:
     seeds = SeedRuns(store)
     store.start()
@@ -132,6 +133,7 @@ def test_a_change_of_settings_cancels_them_and_one_seed_is_none(store: Store, lo
     assert seeds.evidence is not None
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_loaded_record_has_no_other_seeds(store: Store, loop: Any) -> None:
     from wfsobs.app.sources import LoadedRecord
     from wfsobs.simulation.loop import simulate

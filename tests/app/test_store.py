@@ -6,6 +6,7 @@ import threading
 from typing import Any
 
 import numpy as np
+import pytest
 
 from wfsobs import pipeline
 from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING, Tell
@@ -65,6 +66,7 @@ def test_a_run_gives_what_the_core_gives(make_store: Any, loop: Any, short: Scen
     assert got == {(s.observer, s.target, s.mode): s.rms for s in expected.scores}
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_change_runs_again(make_store: Any, loop: Any, short: Scenario) -> None:
     store = make_store()
     store.start()
@@ -183,6 +185,7 @@ def test_what_was_posted_before_a_run_was_superseded_does_not_land_after(make_st
     assert store.run.result.scenario.turbulence.wind_speed == 20.0
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_run_is_done_once_its_result_has_landed(make_store: Any, loop: Any) -> None:
     """So that figures are drawn before what follows a whole run; a change in between supersedes it as any other."""
     store, seen = make_store(), []
@@ -192,6 +195,7 @@ def test_a_run_is_done_once_its_result_has_landed(make_store: Any, loop: Any) ->
     assert seen[-1] == {"state": "done"} and "result" in seen[-2] and "state" not in seen[-2]
 
 
+@pytest.mark.usefixtures("quick")
 def test_many_changes_in_a_row_show_only_the_last(make_store: Any, loop: Any) -> None:
     store = make_store()
     speeds: list[float] = []

@@ -31,16 +31,16 @@ def test_a_band_holds_the_line_that_lies_in_it() -> None:
 
 
 class TestStretch:
-    def test_nothing_where_nothing_is_zoomed(self, dashboard: Dashboard) -> None:
-        assert dashboard.explore.stretches["vibration"].pane.html == "", "two seconds are the whole record"
+    def test_nothing_where_nothing_is_zoomed(self, shared: Dashboard) -> None:
+        assert shared.explore.stretches["vibration"].pane.html == "", "two seconds are the whole record"
 
-    def test_the_rms_over_the_time_in_view(self, dashboard: Dashboard) -> None:
-        dashboard.explore.traces.x_range.update(start=1.0, end=1.5)
-        results = dashboard.store.run.result
-        (line,) = lines(dashboard)
+    def test_the_rms_over_the_time_in_view(self, shared: Dashboard) -> None:
+        shared.explore.traces.x_range.update(start=1.0, end=1.5)
+        results = shared.store.run.result
+        (line,) = lines(shared)
         assert line.startswith("RMS error, 1.00 – 1.50 s:")
         shown = [
-            n for n in ("kf-lgs", "gpr-online", "kf-multi", "kf-adaptive") if n not in dashboard.display.hidden_lines["vibration"]
+            n for n in ("kf-lgs", "gpr-online", "kf-multi", "kf-adaptive") if n not in shared.display.hidden_lines["vibration"]
         ]
         errors = {n: (results.values(n, "vibration") - results.values(TRUTH, "vibration"))[1000:1501, 0] for n in shown}
         common = np.isfinite(np.column_stack([*errors.values()])).all(axis=1)
@@ -50,10 +50,10 @@ class TestStretch:
         found = [float(text) for text in re.findall(r"([\d.]+) nm", line)]
         assert found == sorted(found), "the best first"
 
-    def test_the_rms_in_the_band_in_view(self, dashboard: Dashboard) -> None:
-        dashboard.explore.spectra.x_range.update(start=20.0, end=60.0)
-        (line,) = lines(dashboard, "turbulence")
-        spectrum = dashboard.store.run.result.spectra["kf-lgs", "turbulence"]
+    def test_the_rms_in_the_band_in_view(self, shared: Dashboard) -> None:
+        shared.explore.spectra.x_range.update(start=20.0, end=60.0)
+        (line,) = lines(shared, "turbulence")
+        spectrum = shared.store.run.result.spectra["kf-lgs", "turbulence"]
         inside = (spectrum.frequency >= 20.0) & (spectrum.frequency <= 60.0)
         expected = np.sqrt(np.trapezoid(spectrum.error[inside, 0], spectrum.frequency[inside]))
         assert line.startswith("RMS error, 20 – 60 Hz:")
@@ -61,23 +61,23 @@ class TestStretch:
         # the trapezoidal rule leaves out half of the first and of the last bin, of 61
         assert value is not None and float(value[1]) == pytest.approx(1e3 * expected, rel=0.05)
 
-    def test_hidden_lines_are_left_out(self, dashboard: Dashboard) -> None:
-        dashboard.explore.traces.x_range.update(start=1.0, end=1.5)
-        dashboard.explore.strips["vibration"].cards.hidden_lines = ["kf-lgs"]
-        assert "LGS KF" not in lines(dashboard)[0] and "Offline GPR" in lines(dashboard)[0]
+    def test_hidden_lines_are_left_out(self, shared: Dashboard) -> None:
+        shared.explore.traces.x_range.update(start=1.0, end=1.5)
+        shared.explore.strips["vibration"].cards.hidden_lines = ["kf-lgs"]
+        assert "LGS KF" not in lines(shared)[0] and "Offline GPR" in lines(shared)[0]
 
 
-def test_the_spectra_of_the_time_in_view(dashboard: Dashboard) -> None:
-    dashboard.explore.traces.x_range.update(start=1.0, end=1.6)
-    source = dashboard.explore.spectra.spectra["vibration"].sources["kf-lgs"]
+def test_the_spectra_of_the_time_in_view(shared: Dashboard) -> None:
+    shared.explore.traces.x_range.update(start=1.0, end=1.6)
+    source = shared.explore.spectra.spectra["vibration"].sources["kf-lgs"]
     whole = np.asarray(source.data["y"])
-    dashboard.display.window_spectra = True
-    results = dashboard.store.run.result
+    shared.display.window_spectra = True
+    results = shared.store.run.result
     error = (results.values("kf-lgs", "vibration") - results.values(TRUTH, "vibration"))[1000:1601, :1]
     frequency, density = psd(error, 1e-3)
     np.testing.assert_allclose(source.data["x"], frequency[1:], rtol=1e-12)
     np.testing.assert_allclose(source.data["y"], 1e6 * density[1:, 0], rtol=1e-9)
-    dashboard.explore.traces.x_range.update(start=1.2, end=1.6)
+    shared.explore.traces.x_range.update(start=1.2, end=1.6)
     assert len(source.data["x"]) < len(frequency) - 1, "it follows"
-    dashboard.display.window_spectra = False
+    shared.display.window_spectra = False
     np.testing.assert_array_equal(source.data["y"], whole)

@@ -6,7 +6,9 @@ import re
 from dataclasses import replace
 from typing import Any
 
-from tests.app.conftest import OneSeed
+import pytest
+
+from tests.app.conftest import OneSeed, compute_once
 from wfsobs.app.display import Display
 from wfsobs.app.idle_work import Budgets
 from wfsobs.app.jobs import DONE
@@ -19,8 +21,9 @@ from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.simulation.loop import simulate
 
 
+@pytest.mark.usefixtures("quick")
 def test_lines_are_true_for_the_simulation_of_the_settings_and_given_for_a_loaded_record(make_store: Any, loop: Any) -> None:
-    store: Store = make_store()
+    store: Store = make_store(compute_once)
     table = Table(Display(), OneSeed(store))
     store.start()
     loop.until(lambda: store.run.state == DONE)
@@ -31,7 +34,7 @@ def test_lines_are_true_for_the_simulation_of_the_settings_and_given_for_a_loade
 
 
 def test_what_has_no_error_says_its_own_reason(make_store: Any, loop: Any) -> None:
-    store: Store = make_store()
+    store: Store = make_store(compute_once)
     seeds = OneSeed(store)
     table = Table(display := Display(), seeds)
     lines = MainLines(display, seeds)
@@ -55,7 +58,7 @@ def test_what_has_no_error_says_its_own_reason(make_store: Any, loop: Any) -> No
 
 
 def test_before_a_run_there_is_a_row_for_what_will_run(make_store: Any, loop: Any) -> None:
-    store: Store = make_store()
+    store: Store = make_store(compute_once)
     table = Table(Display(), OneSeed(store))
 
     def rows() -> list[str]:
@@ -68,7 +71,7 @@ def test_before_a_run_there_is_a_row_for_what_will_run(make_store: Any, loop: An
 
 
 def test_every_dash_has_a_reason_and_no_number_an_exponent(make_store: Any, loop: Any) -> None:
-    store: Store = make_store()
+    store: Store = make_store(compute_once)
     table = Table(Display(), OneSeed(store))
     assert table.html().count("–") == len(re.findall('<span title="[^"]+">–</span>', table.html())) > 20
     store.start()

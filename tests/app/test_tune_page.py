@@ -54,6 +54,7 @@ def row(table: str, section: str, name: str) -> list[str]:
     return re.findall("<td[^>]*>(.*?)</td>", found)
 
 
+@pytest.mark.usefixtures("quick")
 def test_it_shows_what_the_core_finds(page: TunePage, dashboard: Dashboard, loop: Any) -> None:
     expected = tune(dashboard.store.scenario, "kf-lgs", evaluations=8, target="vibration")
     found = tuned(page, loop)
@@ -105,6 +106,7 @@ def test_a_gpr_and_its_likelihood(page: TunePage, dashboard: Dashboard, loop: An
     assert unit_for(found, dashboard.display) == unit_for(None, dashboard.display) == "mas"
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_loaded_record_is_cut(page: TunePage, dashboard: Dashboard, loop: Any, short: Scenario) -> None:
     record = replace(simulate(short.replace({"run.duration": 9.0, "run.seed": 4})), turbulence=None, vibration=None)
     dashboard.store.run_on(LoadedRecord(record, "night.npz", "key"), dashboard.store.scenario.replace({"run.duration": 9.0}))

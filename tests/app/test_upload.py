@@ -44,6 +44,7 @@ def previewed(dashboard: Dashboard, loop: Any, content: bytes, name: str = "nigh
     loop.until(lambda: not dashboard.upload.picker.message.startswith(("Reading", "Waiting")))
 
 
+@pytest.mark.usefixtures("quick")
 def test_what_was_refused_before_is_not_said_once_a_record_is_used(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
     dashboard.upload.handle({"action": "scenario", "name": "broken.toml", "text": "[run"})
     loop.until(lambda: dashboard.actions.toolbar.notes)
@@ -112,6 +113,7 @@ def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: 
     assert not any(len(source.data["xs"]) for source in faint), "and none beside errors"
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_preset_beside_a_record_keeps_its_rate_and_length(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
     """And what the simulation had comes back, of the preset, and of a record that the history gave back."""
     previewed(dashboard, loop, file_of(short))
@@ -131,6 +133,7 @@ def test_a_preset_beside_a_record_keeps_its_rate_and_length(dashboard: Dashboard
     assert dashboard.store.scenario.run.duration == 3.0 and dashboard.store.scenario.sensors.lgs_rate == 1000.0
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_record_of_one_mode_offers_no_other(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
     dashboard.display.mode = "tilt"
     record = simulate(short.replace({"run.seed": 9}))
@@ -147,6 +150,7 @@ def test_a_record_of_one_mode_offers_no_other(dashboard: Dashboard, loop: Any, s
     assert dashboard.display.mode == "tilt" == dashboard.modes.buttons.value
 
 
+@pytest.mark.usefixtures("quick")
 def test_settings_change_what_runs_on_the_record(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
     previewed(dashboard, loop, file_of(short))
     dashboard.upload.confirm()
@@ -159,6 +163,7 @@ def test_settings_change_what_runs_on_the_record(dashboard: Dashboard, loop: Any
     assert first.scores[0].rms != second.scores[0].rms
 
 
+@pytest.mark.usefixtures("quick")
 def test_what_is_said_of_it(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
     content = file_of(short).replace(b"_um", b"").replace(b"# unit: um\n", b"").replace(b"# command_sign: 1\n", b"")
     content = content.replace(b"# delay: 2\n", b"")
@@ -188,26 +193,27 @@ def test_what_is_said_of_it(dashboard: Dashboard, loop: Any, short: Scenario) ->
     assert not dashboard.upload.use.disabled and dashboard.upload.fields.unit.value != SILENT
 
 
-def test_what_is_said_of_the_mirror(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
+def test_what_is_said_of_the_mirror(shared: Dashboard, shared_loop: Any, short: Scenario) -> None:
     """A measurement alone is a record in open loop; of commands, parts of a step, a gain and a rail can be said."""
     content = file_of(short).replace(b"# delay: 2\n", b"")
-    previewed(dashboard, loop, content)
-    fields = dashboard.upload.fields
+    previewed(shared, shared_loop, content)
+    fields = shared.upload.fields
     for widget, value in ((fields.delay, "1.5"), (fields.gain, "1.2"), (fields.rail, "0.1"), (fields.trust, True)):
         widget.value = value
-        loop.until(lambda: not dashboard.upload.picker.message.startswith(("Reading", "Waiting")))
-    found = dashboard.upload._preview
+        shared_loop.until(lambda: not shared.upload.picker.message.startswith(("Reading", "Waiting")))
+    found = shared.upload._preview
     assert re.fullmatch(r"\d+ commands beyond the rail of 0\.1, delay 1\.5, command gain 1\.2", found.record.origin)
     assert np.abs(found.record.u).max() == pytest.approx(0.12)
-    assert "a command is seen 1.5 steps later" in dashboard.upload.content.text.html
+    assert "a command is seen 1.5 steps later" in shared.upload.content.text.html
     fields.open_loop.value = True
-    loop.until(lambda: not dashboard.upload.picker.message.startswith(("Reading", "Waiting")))
-    assert not dashboard.upload._preview.record.u.any() and not dashboard.upload.use.disabled
-    previewed(dashboard, loop, content)
-    assert "a command is seen 2 steps later" in dashboard.upload.content.text.html, "what was said of the file before is gone"
-    assert not fields.trust.value and dashboard.upload._preview.record.u.any()
+    shared_loop.until(lambda: not shared.upload.picker.message.startswith(("Reading", "Waiting")))
+    assert not shared.upload._preview.record.u.any() and not shared.upload.use.disabled
+    previewed(shared, shared_loop, content)
+    assert "a command is seen 2 steps later" in shared.upload.content.text.html, "what was said of the file before is gone"
+    assert not fields.trust.value and shared.upload._preview.record.u.any()
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_vibration_spectrum(dashboard: Dashboard, loop: Any) -> None:
     """10 um^2/Hz over 1 Hz about 30 Hz on tip, nothing on tilt; without a unit it is asked for."""
     rows = "29.4,0,0\n29.5,10,0\n30.5,10,0\n30.6,0,0\n"
@@ -242,6 +248,7 @@ def renamed(content: bytes) -> bytes:
     return content
 
 
+@pytest.mark.usefixtures("quick")
 def test_columns_of_other_names(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
     """Names that say enough are read at once; a choice moves a role; the copy names the columns."""
     content = renamed(file_of(short, training=None))
@@ -271,7 +278,7 @@ def test_columns_of_other_names(dashboard: Dashboard, loop: Any, short: Scenario
     assert not form.view.visible and dashboard.upload._preview is not None, "the next file has names of its own"
 
 
-def test_the_data_propose_sign_and_delay(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
+def test_the_data_propose_sign_and_delay(shared: Dashboard, shared_loop: Any, short: Scenario) -> None:
     """A loop of sign -1 and delay 3, written out, in a file that says nothing of either."""
     rng = np.random.default_rng(4)
     k = np.arange(6000)[:, None]
@@ -282,45 +289,45 @@ def test_the_data_propose_sign_and_delay(dashboard: Dashboard, loop: Any, short:
         u[i] = 0.99 * u[i - 1] + 0.3 * y[i]
     file = io.BytesIO()
     np.savez(file, y_lgs=y, u=u, dt=np.array(1e-3))
-    previewed(dashboard, loop, file.getvalue(), "night.npz")
-    text = dashboard.upload.content.text.html
+    previewed(shared, shared_loop, file.getvalue(), "night.npz")
+    text = shared.upload.content.text.html
     assert "sign −1: commands move with the measurement" in text and "delay 3: commands 3 steps earlier explain" in text
     assert "unit proposed: the numbers are plausible as um (" in text, "on 8 m an arcsec would be 10 um"
-    assert dashboard.upload.take.visible and dashboard.upload._preview.record.delay == 2
-    dashboard.upload.take_proposals()
-    loop.until(lambda: dashboard.upload._preview is not None and not dashboard.upload.take.visible)
-    found = dashboard.upload._preview
+    assert shared.upload.take.visible and shared.upload._preview.record.delay == 2
+    shared.upload.take_proposals()
+    shared_loop.until(lambda: shared.upload._preview is not None and not shared.upload.take.visible)
+    found = shared.upload._preview
     assert found.record.delay == 3 and found.record.origin == "command sign -1"
     # the disturbance and the noise of one sample are all that is left of z
     assert found.rms["z"][0] == pytest.approx(np.sqrt(0.5 + 0.04), rel=0.02)
-    assert "sign −1: commands move with the measurement" in dashboard.upload.content.text.html, "of the file, however it is read"
+    assert "sign −1: commands move with the measurement" in shared.upload.content.text.html, "of the file, however it is read"
 
 
-def test_a_record_whose_unit_nobody_knows_waits_for_it(dashboard: Dashboard, loop: Any) -> None:
+def test_a_record_whose_unit_nobody_knows_waits_for_it(shared: Dashboard, shared_loop: Any) -> None:
     """Of 200 nm rms in um on 8 m as well as in urad, and the same in nm, which nobody would take for um."""
-    rng, upload = np.random.default_rng(5), dashboard.upload
+    rng, upload = np.random.default_rng(5), shared.upload
     for scale, right, plausible in ((0.2, "um", True), (200.0, "nm", False)):
         file = io.BytesIO()
         np.savez(file, y_lgs=scale * rng.standard_normal((3000, 2)), u=np.zeros((3000, 2)), dt=np.array(1e-3))
-        previewed(dashboard, loop, file.getvalue(), "night.npz")
+        previewed(shared, shared_loop, file.getvalue(), "night.npz")
         assert upload.use.disabled and "Choose the unit first" in upload.missing.html
         assert ("plausible as um or" in upload.missing.html) == plausible and right in upload.missing.html
         upload.confirm()
-        assert dashboard.store.source is None
+        assert shared.store.source is None
         upload.fields.unit.value = right
-        loop.until(lambda: not upload.use.disabled)
+        shared_loop.until(lambda: not upload.use.disabled)
         assert upload.missing.html == "" and upload._preview is not None
         assert upload._preview.rms["z"][0] == pytest.approx(0.2, rel=0.05)  # 1 / sqrt(2 N) = 1.3 %
         upload.fields.unit.value = SILENT
         upload.discard()
 
 
-def test_template_and_sample(dashboard: Dashboard, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_template_and_sample(shared: Dashboard, shared_loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     sent: list[dict[str, Any]] = []
-    monkeypatch.setattr(dashboard.actions.toolbar, "_send_msg", sent.append)
+    monkeypatch.setattr(shared.actions.toolbar, "_send_msg", sent.append)
     for count, what in enumerate(("template", "sample"), 1):
-        dashboard.upload.handle({"action": what})
-        loop.until(lambda count=count: len(sent) == count)
+        shared.upload.handle({"action": what})
+        shared_loop.until(lambda count=count: len(sent) == count)
     files = {it["name"]: it["content"] for it in sent}
     template = read_record(io.BytesIO(files["wfsobs-template.csv"]), "t.csv")
     assert (template.n_steps, template.ratio, template.delay, template.missing) == (6, 5, 2, 1)
@@ -330,30 +337,31 @@ def test_template_and_sample(dashboard: Dashboard, loop: Any, monkeypatch: pytes
     assert record.turbulence is not None and len(files["wfsobs-sample.csv"]) < LARGEST
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_scenario_that_is_dropped(dashboard: Dashboard, loop: Any) -> None:
     dashboard.upload.handle({"action": "scenario", "name": "a.toml", "text": "run.seed = 77\nrun.duration = 2.0"})
     loop.until(lambda: dashboard.store.scenario.run.seed == 77)
 
 
-def test_what_is_no_record(dashboard: Dashboard, loop: Any) -> None:
-    before = dashboard.store.run.result
+def test_what_is_no_record(shared: Dashboard, shared_loop: Any) -> None:
+    before = shared.store.run.result
     for content, name, line in (
         (b"hello", "a.npz", "a.npz: not an .npz file"),
         (b"", "a.csv", "a.csv: is empty"),
         (b"# nothing", "a.csv", "a.csv: holds no table"),
         (b"x", "<b>.exe", "_b_.exe: its name ends in none of"),
     ):
-        previewed(dashboard, loop, content, name)
-        assert dashboard.upload.picker.message.startswith(line)
-        assert "<b>.exe" not in dashboard.upload.content.text.html
-        dashboard.upload.confirm()
-        assert dashboard.store.source is None and dashboard.store.run.result is before
+        previewed(shared, shared_loop, content, name)
+        assert shared.upload.picker.message.startswith(line)
+        assert "<b>.exe" not in shared.upload.content.text.html
+        shared.upload.confirm()
+        assert shared.store.source is None and shared.store.run.result is before
 
 
 def test_nothing_of_the_file_before_stays_after_a_refusal(
-    dashboard: Dashboard, loop: Any, short: Scenario, subtests: pytest.Subtests
+    shared: Dashboard, shared_loop: Any, short: Scenario, subtests: pytest.Subtests
 ) -> None:
-    upload, file = dashboard.upload, file_of(short)
+    upload, file = shared.upload, file_of(short)
     refusals: list[dict[str, Any]] = [
         {"action": "large", "name": "a.npz"},
         {"action": "part", "name": "a.npz", "index": 0, "count": 1, "data": "%%%"},
@@ -362,27 +370,27 @@ def test_nothing_of_the_file_before_stays_after_a_refusal(
     ]
     for refused in refusals:
         with subtests.test(str(refused)):
-            previewed(dashboard, loop, file)
+            previewed(shared, shared_loop, file)
             assert upload.room.visible and not upload.use.disabled
             upload.handle(refused)
-            loop.until(lambda: not upload.picker.message.startswith(("Reading", "Waiting")))
+            shared_loop.until(lambda: not upload.picker.message.startswith(("Reading", "Waiting")))
             assert upload.picker.message.startswith("a.npz") or "choose the file again" in upload.picker.message
             assert not upload.room.visible or ("night.csv" not in upload.content.text.html and upload.use.disabled)
             upload.confirm()
-            assert dashboard.store.source is None
+            assert shared.store.source is None
 
 
-def test_a_record_that_is_too_short_cannot_be_used(dashboard: Dashboard, loop: Any) -> None:
+def test_a_record_that_is_too_short_cannot_be_used(shared: Dashboard, shared_loop: Any) -> None:
     """The template as it is: six steps."""
-    previewed(dashboard, loop, TEMPLATE.encode(), "template.csv")
-    upload = dashboard.upload
+    previewed(shared, shared_loop, TEMPLATE.encode(), "template.csv")
+    upload = shared.upload
     assert upload.use.disabled and "Duration = 0.006: takes a number from 0.1" in upload.missing.html
     upload.confirm()
-    assert dashboard.store.source is None
+    assert shared.store.source is None
 
 
-def test_parts_that_make_no_sense(dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch) -> None:
-    upload = dashboard.upload
+def test_parts_that_make_no_sense(shared: Dashboard, monkeypatch: pytest.MonkeyPatch) -> None:
+    upload = shared.upload
     for msg in (
         {"index": 0, "count": 0, "data": bytes(3)},
         {"index": 0, "count": "x", "data": b""},
@@ -395,7 +403,7 @@ def test_parts_that_make_no_sense(dashboard: Dashboard, monkeypatch: pytest.Monk
     upload.handle({"action": "large", "name": "../x.csv"})
     assert upload.picker.message == f"x.csv: larger than {LARGEST // 1_000_000} MB"
     monkeypatch.setattr(module, "LARGEST", 1000)
-    sent(dashboard, bytes(3000), part=400)
+    sent(shared, bytes(3000), part=400)
     assert upload._content == b"" and upload.picker.message == "night.csv: larger than 0 MB"
 
 
@@ -407,6 +415,7 @@ def test_reading_is_bounded_on_a_server_with_limits(dashboard: Dashboard, loop: 
         assert line in dashboard.upload.picker.message and dashboard.upload.use.disabled
 
 
+@pytest.mark.usefixtures("quick")
 def test_on_a_server_with_limits(loop: Any, short: Scenario) -> None:
     """The line of runs and the limits hold for records as well, and nobody gets the results of another's."""
     service = Service(Limits(duration=2.0), 1, 100_000_000)

@@ -36,7 +36,7 @@ class TestViewState:
         assert dashboard.explore.strips["vibration"].cards.hidden_lines == ["truth", "kf-lgs"]
         assert dashboard.seeds.count == 3
 
-    def test_what_makes_no_sense_is_named(self, dashboard: Dashboard, subtests: pytest.Subtests) -> None:
+    def test_what_makes_no_sense_is_named(self, shared: Dashboard, subtests: pytest.Subtests) -> None:
         for field, reason in [
             ("view.page=moon", "view.page = moon: takes one of explore, identify"),
             ("view.window=3,1", "view.window = 3,1: takes two times [s], the first one smaller"),
@@ -47,11 +47,11 @@ class TestViewState:
             ("view.colour=red", "view.colour: there is no such part of a view"),
         ]:
             with subtests.test(field):
-                dashboard.display.mode, dashboard.actions.toolbar.notes = "tip", []
-                dashboard.actions.handle({"action": "view", "query": f"?{field}&view.mode=tilt"})
-                (note,) = dashboard.actions.toolbar.notes
+                shared.display.mode, shared.actions.toolbar.notes = "tip", []
+                shared.actions.handle({"action": "view", "query": f"?{field}&view.mode=tilt"})
+                (note,) = shared.actions.toolbar.notes
                 assert note.startswith("Not used from the link: ") and reason in note
-                assert dashboard.display.mode == "tilt", "the rest is used"
+                assert shared.display.mode == "tilt", "the rest is used"
 
     def test_a_theme_that_was_chosen(self, dashboard: Dashboard) -> None:
         dashboard.view_state.choose_theme(True)

@@ -59,23 +59,23 @@ class TestEnvelope:
 
 
 class TestTraces:
-    def test_signal(self, dashboard: Dashboard) -> None:
-        dashboard.display.show = "signal"
-        shown = dashboard.store.run.result
-        data = trace(dashboard, "turbulence")
+    def test_signal(self, shared: Dashboard) -> None:
+        shared.display.show = "signal"
+        shown = shared.store.run.result
+        data = trace(shared, "turbulence")
         assert set(data) == {"x", TRUTH, *(o.id for o in OBSERVERS.values() if "turbulence" in o.targets)} - {"zero"}
         expected = 1e3 * envelope(shown.values("kf-lgs", "turbulence")[:, 0], BINS)
         assert np.allclose(data["kf-lgs"], expected, rtol=1e-6)
         assert data["x"][0] >= 0 and data["x"][-1] <= 2.0 and data["x"].size == data[TRUTH].size
 
-    def test_error(self, dashboard: Dashboard) -> None:
-        assert dashboard.display.show == "error", "at first"
-        shown = dashboard.store.run.result
+    def test_error(self, shared: Dashboard) -> None:
+        assert shared.display.show == "error", "at first"
+        shown = shared.store.run.result
         error = shown.values("kf-lgs", "vibration") - shown.values(TRUTH, "vibration")
-        data = trace(dashboard, "vibration")
+        data = trace(shared, "vibration")
         assert np.allclose(data["kf-lgs"], 1e3 * envelope(error[:, 0], BINS), rtol=1e-5)
         assert np.isnan(data[TRUTH]).all()
-        assert "error of tip [nm]" in dashboard.explore.traces.traces["vibration"].figure.yaxis.axis_label
+        assert "error of tip [nm]" in shared.explore.traces.traces["vibration"].figure.yaxis.axis_label
 
     def test_a_line_alone_has_its_band(self, dashboard: Dashboard) -> None:
         """Of 95 %, 1.96 standard deviations around the estimate, or around no error; none with more lines, nor of no model."""
@@ -99,35 +99,36 @@ class TestTraces:
         dashboard.display.hidden_lines = {"turbulence": [name for name in drawn.lines if name not in (TRUTH, "persistence")]}
         assert not drawn.band.renderer.visible
 
-    def test_mode_and_unit(self, dashboard: Dashboard) -> None:
-        dashboard.display.param.update(mode="tilt", unit="mas", show="signal")
-        truth = dashboard.store.run.result.values(TRUTH, "vibration")[:, 1]
-        assert np.allclose(trace(dashboard, "vibration")[TRUTH], 103.132403 * envelope(truth, BINS), rtol=1e-6)
-        assert dashboard.explore.traces.traces["vibration"].figure.yaxis.axis_label == "tilt [mas]"
+    def test_mode_and_unit(self, shared: Dashboard) -> None:
+        shared.display.param.update(mode="tilt", unit="mas", show="signal")
+        truth = shared.store.run.result.values(TRUTH, "vibration")[:, 1]
+        assert np.allclose(trace(shared, "vibration")[TRUTH], 103.132403 * envelope(truth, BINS), rtol=1e-6)
+        assert shared.explore.traces.traces["vibration"].figure.yaxis.axis_label == "tilt [mas]"
 
-    def test_figures_share_their_time_axis(self, dashboard: Dashboard) -> None:
-        ranges = {id(t.figure.x_range) for t in dashboard.explore.traces.traces.values()}
+    def test_figures_share_their_time_axis(self, shared: Dashboard) -> None:
+        ranges = {id(t.figure.x_range) for t in shared.explore.traces.traces.values()}
         assert len(ranges) == 1
-        assert (dashboard.explore.traces.x_range.start, dashboard.explore.traces.x_range.end) == (0.0, 2.0)
+        assert (shared.explore.traces.x_range.start, shared.explore.traces.x_range.end) == (0.0, 2.0)
 
-    def test_figures_share_their_crosshair(self, dashboard: Dashboard) -> None:
+    def test_figures_share_their_crosshair(self, shared: Dashboard) -> None:
         spans = [
             {id(tool.overlay) for tool in t.figure.tools if isinstance(tool, CrosshairTool)}
-            for t in dashboard.explore.traces.traces.values()
+            for t in shared.explore.traces.traces.values()
         ]
         assert len(spans) == 2 and spans[0] == spans[1] and len(spans[0]) == 1
 
-    def test_a_zoom_sends_the_samples_of_its_window(self, dashboard: Dashboard) -> None:
-        dashboard.display.show = "signal"
-        dashboard.explore.traces.x_range.update(start=1.0, end=1.1)
-        data = trace(dashboard, "vibration")
+    def test_a_zoom_sends_the_samples_of_its_window(self, shared: Dashboard) -> None:
+        shared.display.show = "signal"
+        shared.explore.traces.x_range.update(start=1.0, end=1.1)
+        data = trace(shared, "vibration")
         step = np.diff(data["x"])
         assert np.allclose(step, 1e-3), "every sample of it"
         assert data["x"][0] == pytest.approx(0.975, abs=2e-3) and data["x"][-1] == pytest.approx(1.125, abs=3e-3)
         first = round(data["x"][0] / 1e-3)
-        truth = dashboard.store.run.result.values(TRUTH, "vibration")[first : first + data["x"].size, 0]
+        truth = shared.store.run.result.values(TRUTH, "vibration")[first : first + data["x"].size, 0]
         assert np.allclose(data[TRUTH], 1e3 * truth, rtol=1e-6)
 
+    @pytest.mark.usefixtures("quick")
     def test_the_window_stays_through_a_change(self, dashboard: Dashboard, loop: Any) -> None:
         dashboard.explore.traces.zoom(0.2)
         window = (dashboard.explore.traces.x_range.start, dashboard.explore.traces.x_range.end)
@@ -143,29 +144,29 @@ class TestTraces:
         assert (dashboard.explore.traces.x_range.start, dashboard.explore.traces.x_range.end) == (0.0, 3.0)
         assert dashboard.explore.traces.x_range.reset_end == 3.0
 
-    def test_hidden_lines(self, dashboard: Dashboard) -> None:
-        dashboard.explore.strips["vibration"].cards.hidden_lines = ["kf-lgs"]
-        assert not dashboard.explore.traces.traces["vibration"].lines["kf-lgs"].visible
-        assert not dashboard.explore.spectra.spectra["vibration"].lines["kf-lgs"].visible
-        assert dashboard.explore.traces.traces["turbulence"].lines["kf-lgs"].visible
-        dashboard.explore.strips["vibration"].cards.hidden_lines = []
-        assert dashboard.explore.traces.traces["vibration"].lines["kf-lgs"].visible
+    def test_hidden_lines(self, shared: Dashboard) -> None:
+        shared.explore.strips["vibration"].cards.hidden_lines = ["kf-lgs"]
+        assert not shared.explore.traces.traces["vibration"].lines["kf-lgs"].visible
+        assert not shared.explore.spectra.spectra["vibration"].lines["kf-lgs"].visible
+        assert shared.explore.traces.traces["turbulence"].lines["kf-lgs"].visible
+        shared.explore.strips["vibration"].cards.hidden_lines = []
+        assert shared.explore.traces.traces["vibration"].lines["kf-lgs"].visible
 
-    def test_the_axis_leaves_out_the_warm_up(self, dashboard: Dashboard) -> None:
-        figure = dashboard.explore.traces.traces["turbulence"].figure
-        data = trace(dashboard, "turbulence")
+    def test_the_axis_leaves_out_the_warm_up(self, shared: Dashboard) -> None:
+        figure = shared.explore.traces.traces["turbulence"].figure
+        data = trace(shared, "turbulence")
         counted = np.concatenate([np.asarray(v)[data["x"] >= 0.5] for k, v in data.items() if k != "x"])
         assert figure.y_range.start < np.nanmin(counted) < np.nanmax(counted) < figure.y_range.end
 
 
 class TestSpectra:
-    def test_signal_and_error(self, dashboard: Dashboard) -> None:
-        shown, view = dashboard.store.run.result, dashboard.explore.spectra.spectra["vibration"]
+    def test_signal_and_error(self, shared: Dashboard) -> None:
+        shown, view = shared.store.run.result, shared.explore.spectra.spectra["vibration"]
         spectrum = shown.spectra["gpr-online", "vibration"]
-        dashboard.display.show = "signal"
+        shared.display.show = "signal"
         assert np.allclose(view.sources["gpr-online"].data["y"], 1e6 * spectrum.signal[1:, 0])
         truth = np.asarray(view.sources[TRUTH].data["y"])
-        dashboard.display.show = "error"
+        shared.display.show = "error"
         assert np.allclose(view.sources["gpr-online"].data["y"], 1e6 * spectrum.error[1:, 0])
         assert np.array_equal(view.sources[TRUTH].data["y"], truth), "the error of answering zero"
 
@@ -178,12 +179,13 @@ class TestSpectra:
         assert np.allclose(view.sources["gpr-offline"].data["y"], 1e6 * spectrum.error[1:, 0])
         assert np.isfinite(trace(dashboard, "vibration")["gpr-offline"]).any()
 
-    def test_unit(self, dashboard: Dashboard) -> None:
-        dashboard.display.unit = "um"
-        view = dashboard.explore.spectra.spectra["vibration"]
-        assert np.allclose(view.sources[TRUTH].data["y"], dashboard.store.run.result.spectra[TRUTH, "vibration"].signal[1:, 0])
+    def test_unit(self, shared: Dashboard) -> None:
+        shared.display.unit = "um"
+        view = shared.explore.spectra.spectra["vibration"]
+        assert np.allclose(view.sources[TRUTH].data["y"], shared.store.run.result.spectra[TRUTH, "vibration"].signal[1:, 0])
         assert "µm²/Hz" in view.figure.yaxis.axis_label
 
+    @pytest.mark.usefixtures("quick")
     def test_peaks_are_marked(self, dashboard: Dashboard, loop: Any) -> None:
         view = dashboard.explore.spectra.spectra["vibration"]
         peaks = [p.frequency for p in dashboard.store.scenario.vibration.peaks]
@@ -199,17 +201,17 @@ class TestSpectra:
         assert view.marks["peaks"].data_source.data["x"] == []
         assert ">peaks<" not in legend.html
 
-    def test_axes(self, dashboard: Dashboard) -> None:
-        assert dashboard.explore.spectra.x_range.start == pytest.approx(0.667, abs=0.01)
-        assert dashboard.explore.spectra.x_range.end == 500.0
-        for view in dashboard.explore.spectra.spectra.values():
+    def test_axes(self, shared: Dashboard) -> None:
+        assert shared.explore.spectra.x_range.start == pytest.approx(0.667, abs=0.01)
+        assert shared.explore.spectra.x_range.end == 500.0
+        for view in shared.explore.spectra.spectra.values():
             assert 0 < view.figure.y_range.start < view.figure.y_range.end
 
 
 class TestNumbers:
-    def test_the_table_shows_the_scores(self, dashboard: Dashboard) -> None:
-        html = dashboard.explore.table.pane.html
-        for score in dashboard.store.run.result.result.scores:
+    def test_the_table_shows_the_scores(self, shared: Dashboard) -> None:
+        html = shared.explore.table.pane.html
+        for score in shared.store.run.result.result.scores:
             if score.mode == "tip":
                 assert number(1e3 * score.rms) in html
         targets = [len(OBSERVERS[name].targets) for name in ON_PAPER]
@@ -217,12 +219,13 @@ class TestNumbers:
         assert html.count("<tr data-observer") == 6 + sum(targets) + both, "two bounds of each target and of both together"
         assert "RMS error [nm]" in html and "Turbulence, tip" in html
 
-    def test_the_table_follows_mode_and_unit(self, dashboard: Dashboard) -> None:
-        dashboard.display.param.update(mode="tilt", unit="mas")
-        score = next(s for s in dashboard.store.run.result.result.scores if s.mode == "tilt")
-        assert number(score.rms * per_micrometre("mas", 8.0)) in dashboard.explore.table.pane.html
-        assert "RMS error [mas]" in dashboard.explore.table.pane.html
+    def test_the_table_follows_mode_and_unit(self, shared: Dashboard) -> None:
+        shared.display.param.update(mode="tilt", unit="mas")
+        score = next(s for s in shared.store.run.result.result.scores if s.mode == "tilt")
+        assert number(score.rms * per_micrometre("mas", 8.0)) in shared.explore.table.pane.html
+        assert "RMS error [mas]" in shared.explore.table.pane.html
 
+    @pytest.mark.usefixtures("quick")
     def test_a_failure_is_named(self, dashboard: Dashboard, loop: Any) -> None:
         dashboard.store.change("multirate.measurement_noise", "manual")
         dashboard.store.change("multirate.ngs_noise", 0.5)
@@ -231,21 +234,21 @@ class TestNumbers:
         for failure in failures:
             assert failure.observer in dashboard.explore.table.pane.html
 
-    def test_cards(self, dashboard: Dashboard) -> None:
-        cards = {c["name"]: c for c in dashboard.explore.strips["vibration"].cards.items}
+    def test_cards(self, shared: Dashboard) -> None:
+        cards = {c["name"]: c for c in shared.explore.strips["vibration"].cards.items}
         score = next(
             s
-            for s in dashboard.store.run.result.result.scores
+            for s in shared.store.run.result.result.scores
             if (s.observer, s.target, s.mode) == ("gpr-online", "vibration", "tip")
         )
         assert cards["gpr-online"]["value"] == number(1e3 * score.rms)
         low, high = score.interval or (0.0, 0.0)
         assert float(cards["gpr-online"]["half"].removeprefix("± ")) == pytest.approx(500.0 * (high - low), abs=0.051)
-        assert dashboard.explore.strips["vibration"].cards.heads["value"] == "RMS error [nm]"
+        assert shared.explore.strips["vibration"].cards.heads["value"] == "RMS error [nm]"
         assert cards["gpr-online"]["colour"] == look("gpr-online").light
         assert cards[TRUTH]["value"] == number(1e3 * score.truth_rms)
         assert "zero" not in cards
-        html = dashboard.explore.strips["vibration"].cards.html
+        html = shared.explore.strips["vibration"].cards.html
         assert re.findall('class="card.*? data-name="([^"]+)"', html) == [*cards]
         folded = re.findall('class="card folded".*? data-name="([^"]+)"', html)
         assert folded == [name for name, card in cards.items() if not card["main"]]
@@ -286,11 +289,11 @@ class TestLooks:
         seen = [(look(name).light, look(name).dash) for name in together]
         assert len(seen) == len(set(seen))
 
-    def test_dark_mode(self, dashboard: Dashboard) -> None:
-        dashboard.display.dark = True
-        line = dashboard.explore.traces.traces["vibration"].lines["gpr-online"]
+    def test_dark_mode(self, shared: Dashboard) -> None:
+        shared.display.dark = True
+        line = shared.explore.traces.traces["vibration"].lines["gpr-online"]
         assert line.renderer.glyph.line_color == look("gpr-online").dark
-        assert look("gpr-online").dark in dashboard.explore.table.pane.html
+        assert look("gpr-online").dark in shared.explore.table.pane.html
 
 
 def test_tilt_on_sky() -> None:
@@ -299,6 +302,7 @@ def test_tilt_on_sky() -> None:
 
 
 class TestHigherModes:
+    @pytest.mark.usefixtures("quick")
     def test_the_switch_offers_what_the_run_has(self, dashboard: Dashboard, loop: Any) -> None:
         switch, display, store = dashboard.modes, dashboard.display, dashboard.store
         assert switch.buttons.visible and not switch.list.visible
@@ -328,12 +332,13 @@ class TestHigherModes:
         switch.list.value = "oblique trefoil"  # the pinned run has no such mode
         assert display.compared_runs and display.runs_drawn == [] and "oblique trefoil" in dashboard.explore.table.pane.html
 
-    def test_buttons_and_display_agree(self, dashboard: Dashboard) -> None:
-        dashboard.modes.buttons.value = "tilt"
-        assert dashboard.display.mode == "tilt" == dashboard.modes.list.value
-        dashboard.display.mode = "tip"
-        assert dashboard.modes.buttons.value == "tip"
+    def test_buttons_and_display_agree(self, shared: Dashboard) -> None:
+        shared.modes.buttons.value = "tilt"
+        assert shared.display.mode == "tilt" == shared.modes.list.value
+        shared.display.mode = "tip"
+        assert shared.modes.buttons.value == "tip"
 
+    @pytest.mark.usefixtures("quick")
     def test_csv_names_every_mode(self, dashboard: Dashboard, loop: Any) -> None:
         dashboard.store.change("telescope.radial_order", 2)
         loop.finish(dashboard.store)
@@ -360,6 +365,7 @@ def test_the_verdict_stays_dimmed_until_the_next_one(dashboard: Dashboard, loop:
     assert ">Vibration, tilt</h2>" in line.pane.html and "Without prior knowledge: " in line.pane.html
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_record_without_truth_leaves_no_choice_but_its_signals(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
     switch = dashboard.explore.show_switch
     dashboard.display.show = RUNNING_RMS

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.app.conftest import SHORT
 from tests.records import ON_PAPER
 from wfsobs.app import work
 from wfsobs.app.work import TRUTH, RunResults, compute
@@ -16,6 +17,7 @@ from wfsobs.dependence import Memo
 from wfsobs.evaluation.exact_errors import scored_samples
 from wfsobs.progress import QUIET, Cancelled, Watch
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.spectrum import psd
 
 
@@ -23,13 +25,15 @@ def keys(shown: RunResults) -> set[tuple[str, str]]:
     return {(e.observer, e.target) for e in shown.result.estimates}
 
 
-@pytest.fixture
-def reports(monkeypatch: pytest.MonkeyPatch, short: Scenario) -> list[tuple[float, RunResults | None]]:
+@pytest.fixture(scope="module")
+def reports() -> list[tuple[float, RunResults | None]]:
     """Everything that a run reports when nothing is held back, the final result last."""
-    monkeypatch.setattr(work, "INTERVAL", 0.0)
-    monkeypatch.setattr(work, "DELIVERY_INTERVAL", 0.0)
     out: list[tuple[float, RunResults | None]] = []
-    final = compute(short, Watch(lambda fraction: out.append((fraction, None))), lambda result: out.append((out[-1][0], result)))
+    watch, scenario = Watch(lambda fraction: out.append((fraction, None))), PRESETS["paper"]().replace(SHORT)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(work, "INTERVAL", 0.0)
+        patch.setattr(work, "DELIVERY_INTERVAL", 0.0)
+        final = compute(scenario, watch, lambda result: out.append((out[-1][0], result)))
     return [*out, (1.0, final)]
 
 
@@ -84,6 +88,7 @@ def test_only_what_depends_runs(short: Scenario) -> None:
     assert compute(unused, QUIET, lambda **_: None, None, memo).ran == ()
 
 
+@pytest.mark.usefixtures("quick")
 def test_another_warm_up_scores_the_same_estimates(short: Scenario) -> None:
     memo = Memo()
     first = compute(short, QUIET, lambda **_: None, None, memo)
