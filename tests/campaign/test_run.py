@@ -94,8 +94,8 @@ def test_what_is_done_is_not_done_again(plan, undisturbed):
 
 
 def test_shares_make_up_the_whole(plan, undisturbed, tmp_path):
-    for k in (1, 2, 3):
-        campaign("run", plan, "--out", tmp_path, "--shard", f"{k}/3", "--workers", 1)
+    for k in (1, 2):
+        campaign("run", plan, "--out", tmp_path, "--shard", f"{k}/2", "--workers", 1)
     assert campaign("table", tmp_path, "--csv").stdout == campaign("table", undisturbed, "--csv").stdout
 
 

@@ -312,7 +312,9 @@ def test_no_controller_of_the_lgs_beats_the_bound(delay: float, noise: float) ->
     ],
 )
 def test_an_unstable_loop_is_said_to_be_one(changes: dict[str, Any]) -> None:
-    result = run(QUICK | {"control.integrator": "manual"} | changes)
+    integrators = [name for name in CONTROLLERS if name.startswith("integrator")]
+    result = run(QUICK | {"control.integrator": "manual"} | changes, ("none", *integrators, "lqg-kf-lgs"))
+    assert len(result.outcomes) == len(integrators) + 2 > 4
     for one in result.outcomes:
         if one.controller.startswith("integrator"):
             assert one.stable == (False, False) and one.residual is None and one.u is None

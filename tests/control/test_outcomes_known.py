@@ -16,7 +16,7 @@ from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
 from wfsobs.testing import QUICK
 
-BASE = PRESETS["paper"]().replace({**QUICK, "run.duration": 0.8})
+BASE = PRESETS["paper"]().replace({**QUICK, "run.duration": 0.5})
 GPR = {"integrator+gpr-offline", "integrator+gpr-online"}
 OF_LINES = {"lqg-kf-multi", "lqg-multirate-multi"}
 ADAPTIVE = {"lqg-kf-adaptive", "lqg-multirate-adaptive"}
@@ -31,10 +31,10 @@ CASES: dict[str, tuple[dict[str, Any], set[str]]] = {
     "stroke": ({"control.stroke": 0.3}, set(CONTROLLERS)),
     "supervision": ({"control.supervised": True}, set(CONTROLLERS) - {"none", "integrator"}),
     "windows of a filter": ({"adaptive.window": 0.3}, ADAPTIVE),
-    "an observer's own": ({"gp.background_rms": 0.1}, set()),
-    "what only the Strehl ratio is of": ({"control.wavelength": 1.6}, set()),
-    "windows, which are of z in the loop": ({"gpr_online.inputs": "z"}, set()),
-    "a width below that of every line": ({"multipeak.line_width": 0.011}, set()),
+    "an observer's own, what the Strehl ratio is of, windows of z in the loop, and a width below that of every line": (
+        {"gp.background_rms": 0.1, "control.wavelength": 1.6, "gpr_online.inputs": "z", "multipeak.line_width": 0.011},
+        set(),
+    ),
 }
 
 

@@ -156,7 +156,7 @@ def test_the_promise_takes_a_mirror_with_dynamics_into_account(monkeypatch: pyte
     """A probe shows it; the controller on the mirror as it is keeps the promise."""
     monkeypatch.setattr("wfsobs.closed_loop.promise.DRAWS", FEWER)
     mirror = TruePlant(1.1 * np.eye(2), 1.4, 0.0, 2.0 * np.pi * 0.2, 0.5)
-    record, rng = wfsobs.simulate(SCENARIO.replace({"run.duration": 20.0})), np.random.default_rng(6)
+    record, rng = wfsobs.simulate(SCENARIO), np.random.default_rng(6)
     acting, probe = ActingPlant(mirror), 0.01 * rng.standard_normal(record.z.shape)
     y, u, own, seen = np.zeros_like(record.z), np.zeros_like(record.z), np.zeros(2), np.zeros(2)
     for k, z in enumerate(record.z):
@@ -167,7 +167,7 @@ def test_the_promise_takes_a_mirror_with_dynamics_into_account(monkeypatch: pyte
     found = make_promise(Record(y, u, record.dt), SCENARIO, controllers=["lqg-kf-multi"])
     assert found.plant[0].has_dynamics and found.matrix == pytest.approx(mirror.matrix, abs=0.05)
     (one,) = [one for one in found.residuals if one.controller == "lqg-kf-multi"]
-    next_one = wfsobs.simulate(SCENARIO.replace({"run.duration": 20.0, "run.seed": 41}))
+    next_one = wfsobs.simulate(SCENARIO.replace({"run.seed": 41}))
     plant = replace(mirror, matrix=mirror.matrix @ np.linalg.inv(found.matrix))
     _, correction = drive(wfsobs.design("lqg-kf-multi", found.scenario), next_one.measurements(), plant, rng)
     left = np.sqrt(np.square(noise_of(next_one)[0] + correction)[1000:].mean(axis=0))

@@ -339,22 +339,25 @@ def test_with_the_plant_of_the_controllers_theory_is_that_without_errors(preset:
 @pytest.mark.parametrize(
     "errors",
     [
-        {"delay_error": 0.4, "gain_error": [0.2, -0.1]},
-        {"rotation": 15.0, "coupling": 0.1, "resonance": 250.0, "damping": 0.3},
+        {"delay_error": 0.4, "gain_error": [0.5, -0.2]},
+        {"rotation": 25.0, "coupling": 0.1, "resonance": 250.0, "damping": 0.3},
     ],
 )
 def test_theory_is_what_simulations_leave(errors: dict[str, Any]) -> None:
+    """The line is wide: of one of 0.03 the mean square scatters 2.6 times as much, and takes 7 times as many steps. Errors are so
+    large that one of 4 % in the gain of the theory is seen."""
     names = ["integrator", "lqg-kf-lgs", "lqg-multirate-multi"]
     s = MATCHED.replace({f"plant.{name}": value for name, value in errors.items()})
-    s = s.replace({"run.duration": 40.0, "sensors.lgs_low_frequency_rms": 0.02})
+    wide = {"vibration.peaks.0.damping": 0.2, "kalman.damping": 0.2}
+    s = s.replace({"run.duration": 20.0, "sensors.lgs_low_frequency_rms": 0.02, **wide})
     plan, squares = design(s, names), {name: [] for name in names}
-    for seed in range(14):
+    for seed in range(12):
         one = s.replace({"run.seed": seed + 1})
         for outcome in closed_loop(simulate(one), replace(plan, scenario=one)).outcomes:
             assert outcome.residual is not None
-            squares[outcome.controller].append((outcome.residual[1000:] ** 2).mean(axis=0))
+            squares[outcome.controller].append((outcome.residual[500:] ** 2).mean(axis=0))
     for name, found in squares.items():
-        mean, error = np.mean(found, axis=0), np.std(found, axis=0, ddof=1) / np.sqrt(14.0)
+        mean, error = np.mean(found, axis=0), np.std(found, axis=0, ddof=1) / np.sqrt(12.0)
         for mode, one in enumerate(plan.laws[name]):
             assert one.predicted_rms is not None
             assert error[mode] < 0.02 * mean[mode], "of the mean square: 1 % of the rms"

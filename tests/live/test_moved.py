@@ -15,7 +15,7 @@ PART = 20_000
 """Frames of which peaks are identified."""
 
 
-@pytest.mark.parametrize(("seed", "at"), [(1, 20.2), (2, 20.5), (3, 23.0), (4, 30.0), (5, 37.0), (6, 39.5)])
+@pytest.mark.parametrize(("seed", "at"), [(1, 20.2), (3, 23.0), (4, 30.0), (6, 39.5)])
 def test_a_line_that_jumps_in_the_midst_is_told_as_moved(seed, at):
     scenario = PRESETS["peak-jump"]().replace({"run.duration": 60.0, "run.seed": seed, "events.0.start": at})
     record, said = simulate(scenario), []

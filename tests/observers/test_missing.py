@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -92,23 +93,25 @@ def inputs(measurements: Measurements, mode: int, both: bool) -> Array:
     return np.stack([measurements.z[:, mode], measurements.z_ngs[:, mode]][: 1 + both], axis=1)
 
 
-def dropout(**more: object) -> tuple[Record, Scenario]:
-    """The preset with shorter stretches: both lasers out from 5 to 5.5 s, frames of either sensor lost from 7 s on."""
+@cache
+def dropout() -> tuple[Record, Scenario]:
+    """The preset with shorter stretches: both lasers out from 4 to 4.5 s, frames of either sensor lost from 5.2 s on.
+
+    Narrow lines are known to 1 % of their deviation after 4 s, not after 3 s."""
     scenario = PRESETS["laser-dropout"]().replace(
         {
-            "run.duration": 8.0,
+            "run.duration": 5.8,
             "events": [
-                {"kind": "laser", "start": 5.0, "duration": 0.5, "lasers": 2},
-                {"kind": "frames", "start": 7.0, "duration": 1.0, "sensor": "lgs", "share": 0.3},
-                {"kind": "frames", "start": 7.0, "duration": 1.0, "sensor": "ngs", "share": 0.3},
+                {"kind": "laser", "start": 4.0, "duration": 0.5, "lasers": 2},
+                {"kind": "frames", "start": 5.2, "duration": 0.6, "sensor": "lgs", "share": 0.3},
+                {"kind": "frames", "start": 5.2, "duration": 0.6, "sensor": "ngs", "share": 0.3},
             ],
-            **more,
         }
     )
     return wfsobs.simulate(scenario), scenario.before_events
 
 
-STRETCHES = {"gap": slice(5000, 5500), "after": slice(5500, 5700), "later": slice(5700, 7000), "lost frames": slice(7000, 8000)}
+STRETCHES = {"gap": slice(4000, 4500), "after": slice(4500, 4700), "later": slice(4700, 5200), "lost frames": slice(5200, 5800)}
 
 
 @pytest.mark.slow
@@ -152,21 +155,23 @@ GAPS = [slice(start, start + 60) for start in range(1000, 3000, 200)]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["kf-lgs", "kf-ngs", "multirate", "gp-both"])
+@pytest.mark.parametrize("name", ["kf-lgs", "kf-ngs", "multirate"])
 def test_bands_hold_what_they_say_in_a_gap(name: str) -> None:
     """200 records of the observer's own model with ten gaps each, in and after them: within 2 percentage points.
 
-    Of those whose deviations are not compared with the exact filter's above, and of one filter of either kind that are. In the
+    Of those whose deviations are not compared with the exact filter's above, and of one filter that is. In the
     gaps of the NGS filter nine frames are missing."""
     prior, settings = told(name, "hold")
     measurements, truth = own_record(name, prior, np.random.default_rng(11))
+    assert measurements.y_ngs is not None
     y, y_ngs = measurements.y_lgs.copy(), measurements.y_ngs.copy()
     for gap in GAPS:
         y[gap] = np.nan
         if name == "kf-ngs":
             y_ngs[gap] = np.nan
     found = OBSERVERS[name].estimate(replace(measurements, y_lgs=y, y_ngs=y_ngs), prior, settings)
-    whole = OBSERVERS[name].estimate(measurements, prior, settings)
+    one = replace(measurements, y_lgs=measurements.y_lgs[:, :1], u=measurements.u[:, :1], y_ngs=measurements.y_ngs[:, :1])
+    whole = OBSERVERS[name].estimate(one, told(name, "hold", 1)[0], settings)
     errors = {target: found[target] - truth[target] for target in OBSERVERS[name].targets}
     if len(errors) == 2:
         errors["total"] = errors["turbulence"] + errors["vibration"]
@@ -187,8 +192,9 @@ def test_bands_hold_what_they_say_in_a_gap(name: str) -> None:
 @pytest.mark.parametrize("name", [*WITH_MODEL, "kf-adaptive", "multirate-adaptive"])
 def test_stated_frame_by_frame_as_over_a_record(name: str) -> None:
     """And a state saved within a gap goes on."""
-    record, scenario = dropout(**{"adaptive.window": 0.2, "adaptive.interval": 0.05})
-    cut = slice(4800, 5600)
+    record, scenario = dropout()
+    scenario = scenario.replace({"adaptive.window": 0.2, "adaptive.interval": 0.05})
+    cut = slice(3800, 4600)
     y_ngs = record.y_ngs[cut].copy()
     y_ngs[[600, 605]] = np.nan
     record = replace(

@@ -160,13 +160,14 @@ def test_filters_that_learn_are_about_as_sure_as_they_may_be(preset: str) -> Non
     for seed in (11, 12):
         s = PRESETS[preset]().replace({"run.seed": seed, "run.duration": 12.0, "vibration.synthesis": "gaussian"})
         record = simulate(s)
+        estimates = {name: run_observer(name, record, s) for name in ("kf-adaptive", "multirate-adaptive")}
         for name, target in (
             ("kf-adaptive", "vibration"),
             ("multirate-adaptive", "vibration"),
             ("multirate-adaptive", "turbulence"),
             ("multirate-adaptive", TOTAL),
         ):
-            found = run_observer(name, record, s)
+            found = estimates[name]
             of = TARGETS if target == TOTAL else (target,)
             error = sum(found[one] - record.truth(one) for one in of)[5000:]
             for mode in range(2):

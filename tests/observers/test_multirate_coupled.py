@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from wfsobs.testing import check_observer, step_difference
 
 OBSERVER = OBSERVERS["multirate-coupled"]
 LONG = SHAKEN.replace({"telescope.radial_order": 1, "run.duration": 160.0})
+simulated = cache(simulate)
 
 
 def model_of(scenario: Scenario) -> AsterismModel:
@@ -85,7 +87,7 @@ def test_a_gain_of_the_lgs_for_the_vibration_is_known() -> None:
     """That of a combination of stars, above one: the error of the next measurement is as stated, within 5 % of its rms."""
     stars = {"sensors.lgs_count": 3, "sensors.lgs_radius": 60.0, "sensors.lgs_combination": "minimum-variance"}
     scenario = SHAKEN.replace({**stars, "telescope.radial_order": 1, "run.duration": 60.0, "sensors.ngs_noise": 0.05})
-    record = simulate(scenario)
+    record = simulated(scenario)
     given = arguments(OBSERVER, record, scenario)
     assert given[1].asterism is not None and (given[1].asterism.line_gain > 1.2).all()
     found = OBSERVER.estimate(*given)
@@ -110,20 +112,20 @@ def test_with_two_lgs_of_four_errors_are_as_stated(name: str) -> None:
     """From a second after they went out; steps are the run."""
     out = [{"kind": "laser", "start": 20.0, "duration": 140.0, "lasers": 2}]
     scenario = LONG.replace({"sensors.lgs_count": 4, "events": out})
-    record, at = simulate(scenario), slice(round(21.0 / scenario.dt), -1)
+    record, at = simulated(scenario), slice(round(21.0 / scenario.dt), -1)
     given = arguments(OBSERVERS[name], record, scenario)
     found = OBSERVERS[name].estimate(*given)
     for target in TARGETS:
         error = np.mean((found[target] - record.truth(target))[at] ** 2, axis=0)
         np.testing.assert_allclose(error, np.mean(found.sd[target][at] ** 2, axis=0), rtol=0.1)
     short = scenario.replace({"run.duration": 2.0, "events": [out[0] | {"start": 1.0, "duration": 0.5}]})
-    assert step_difference(OBSERVERS[name], *arguments(OBSERVERS[name], simulate(short), short)) <= 1e-12
+    assert step_difference(OBSERVERS[name], *arguments(OBSERVERS[name], simulated(short), short)) <= 1e-12
 
 
 @pytest.mark.slow
 def test_its_bands_hold_what_they_say() -> None:
     """160 s of tip and tilt at 250 Hz: 68 and 95 % within 2 percentage points, in every phase of the frames."""
-    record, ratio = simulate(LONG), LONG.sensors.exposure_ratio
+    record, ratio = simulated(LONG), LONG.sensors.exposure_ratio
     found = OBSERVER.estimate(*arguments(OBSERVER, record, LONG))
     errors = {target: found[target] - record.truth(target) for target in OBSERVER.targets}
     errors["total"] = errors["turbulence"] + errors["vibration"]
@@ -144,7 +146,7 @@ def test_it_keeps_the_rules_of_observers() -> None:
 @pytest.mark.slow
 def test_without_the_lgs_it_goes_on_with_the_ngs() -> None:
     """For 0.4 s of every second: from 0.2 s on errors are as stated; steps are the run, with NGS frames lost as well."""
-    record = simulate(LONG)
+    record = simulated(LONG)
     at = np.arange(record.n_steps)
     gone, late = at % 250 < 100, (at % 250 >= 50) & (at % 250 < 100)
     lossy = replace(record, y_lgs=np.where(gone[:, None], np.nan, record.y_lgs))
@@ -155,7 +157,7 @@ def test_without_the_lgs_it_goes_on_with_the_ngs() -> None:
         # of 150 gaps, in which errors are some two independent ones
         np.testing.assert_allclose(np.sqrt(np.mean(error**2, axis=0)), np.sqrt(np.mean(sd**2, axis=0)), rtol=0.1)
     short = LONG.replace({"run.duration": 4.0})
-    record = simulate(short)
+    record = simulated(short)
     frames = record.y_ngs.copy()
     frames[[5, 300, 305, 620]] = np.nan
     lossy = replace(record, y_lgs=np.where(gone[:1000, None], np.nan, record.y_lgs), y_ngs=frames)
@@ -166,7 +168,7 @@ def test_without_the_lgs_it_goes_on_with_the_ngs() -> None:
 def test_with_ngs_frames_lost_it_is_as_sure_as_it_says() -> None:
     """Half of them at random, then ten in a row: errors are as stated to 10 %, whatever the number that are lost in a row up to
     four; ten in a row leave no more than a tenth above what the LGS alone do."""
-    record, ratio = simulate(LONG), LONG.sensors.exposure_ratio
+    record, ratio = simulated(LONG), LONG.sensors.exposure_ratio
     due = np.arange(ratio, record.n_steps, ratio)
     at, rng = np.arange(due.size), np.random.default_rng(5)
     lost = np.where(at < due.size // 2, rng.random(due.size) < 0.5, at % 40 >= 30)
@@ -189,7 +191,7 @@ def test_with_ngs_frames_lost_it_is_as_sure_as_it_says() -> None:
 
 def test_where_modes_are_independent_it_refuses_and_runs_only_if_named() -> None:
     scenario = wfsobs.PRESETS["paper"]().replace({"run.duration": 1.0, "run.warm_up": 0.1})
-    (line,) = observe(simulate(scenario), scenario, observers=[OBSERVER.id]).failures
+    (line,) = observe(simulated(scenario), scenario, observers=[OBSERVER.id]).failures
     assert line.reason == f"multirate-coupled left out: {INDEPENDENT_ON_BOTH}"
     assert OBSERVER.id not in usual_observers(scenario) and OBSERVER.id in usual_observers(FLOW)
     with pytest.raises(ValueError, match="the bound of each is its own"):

@@ -36,8 +36,9 @@ def scenario() -> Scenario:
     """Short, with a Kalman model set by hand, so that no line is in it but those of the multi-peak one."""
     return PRESETS["paper"]().replace(
         {
-            "run.duration": 6.0,
+            "run.duration": 2.5,
             "run.warm_up": 0.2,
+            "adaptive.window": 1.5,
             "kalman.process_noise": "manual",
             "gpr_offline.training_size": 60,
             "gpr_offline.depth": 25,

@@ -31,7 +31,7 @@ RECORDS, STEPS, SETTLED, RATIO = 200, 3000, 1000, 5
 WITH_MODEL = ["kf-lgs", "kf-multi", "kf-ngs", "multirate", "multirate-optimal", "multirate-multi", "gp-lgs", "gp-both"]
 
 
-def told(name: str, between: str) -> tuple[Prior, object]:
+def told(name: str, between: str, records: int = RECORDS) -> tuple[Prior, object]:
     """The prior of one mode of the paper's preset, as often as there are records, and the settings."""
     scenario = wfsobs.PRESETS["paper"]().replace({"kalman.ngs_between_frames": between})
     observer = OBSERVERS[name]
@@ -39,12 +39,12 @@ def told(name: str, between: str) -> tuple[Prior, object]:
     slow = Ar2(2 * pi * 2.0, 0.9, 0.03, scenario.dt)  # of 2 Hz, so that a record of seconds holds many of its times
     prior = replace(
         one,
-        model=one.model[:1] * RECORDS,
-        noise=one.noise[:1] * RECORDS,
-        lgs_error=(LgsError(slow),) * RECORDS if one.lgs_error else (),
-        stars=one.stars[:1] * RECORDS,
-        lines=one.lines[:1] * RECORDS,
-        beams=tuple(replace(beams, lgs=(slow,)) for beams in one.beams[:1]) * RECORDS,
+        model=one.model[:1] * records,
+        noise=one.noise[:1] * records,
+        lgs_error=(LgsError(slow),) * records if one.lgs_error else (),
+        stars=one.stars[:1] * records,
+        lines=one.lines[:1] * records,
+        beams=tuple(replace(beams, lgs=(slow,)) for beams in one.beams[:1]) * records,
     )
     return prior, observer_settings(observer, scenario)
 

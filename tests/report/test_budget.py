@@ -115,6 +115,8 @@ def test_export_runs_as_many_seeds_as_asked_for(seeds: int, short: Scenario, tmp
 
     path = tmp_path / "r.html"
     seen: list[int] = []
-    export(path, short, seeds=seeds, on_result=lambda result: seen.append(result.scenario.run.seed))
+    export(
+        path, short, observers=["kf-lgs", "kf-multi"], seeds=seeds, on_result=lambda result: seen.append(result.scenario.run.seed)
+    )
     it = parse(path.read_text(encoding="utf-8"))
     assert seen == [short.run.seed] and ("from 3 seeds" in it.text) == (seeds == 3)

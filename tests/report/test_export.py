@@ -153,6 +153,6 @@ def test_what_nobody_wants_any_more_is_stopped(result: Any, monkeypatch: pytest.
 def test_a_failure_of_an_observer_is_in_the_report(short: Scenario, tmp_path: Path, parse: Any) -> None:
     weights = ("measurement_noise=manual", "lgs_noise=0.04", "ngs_noise=0.001")
     words = [word for w in weights for word in ("--set", f"multirate.{w}")]
-    done = call("export", str(tmp_path / "r.html"), *QUICK, *words)
+    done = call("export", str(tmp_path / "r.html"), *QUICK, *FEW, "--observer", "multirate", *words)
     assert done.exit_code == 0 and "multirate left out" in done.stderr
     assert "the cycle of 5 steps is unstable" in parse((tmp_path / "r.html").read_text(encoding="utf-8")).text

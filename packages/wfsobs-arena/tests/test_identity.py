@@ -16,7 +16,16 @@ import wfsobs
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 
-ASK = "from mine.entry import ME; from wfsobs_arena.identity import code_version; print(code_version(ME))"
+ASK = """
+import sys
+from importlib import import_module
+from wfsobs_arena.identity import code_version
+
+for sys.path[0] in sys.argv[1:]:
+    for name in [name for name in sys.modules if name.partition(".")[0] == "mine"]:
+        del sys.modules[name]
+    print(code_version(import_module("mine.entry").ME))
+"""
 FILES = {
     "__init__.py": "",
     "entry.py": """
@@ -40,30 +49,18 @@ ME = Observer("me", "Me", ("vibration",), partial(run, 3))
 }
 
 
-@pytest.fixture
-def package(tmp_path: Path) -> Path:
-    (tmp_path / "mine").mkdir()
-    for name, text in FILES.items():
-        (tmp_path / "mine" / name).write_text(text, encoding="utf-8")
-    return tmp_path / "mine"
-
-
-def version_of(package: Path) -> str:
-    """Return it as a fresh process sees the files."""
-    return subprocess.run([sys.executable, "-c", ASK], cwd=package.parent, check=True, capture_output=True, text=True).stdout
-
-
 @pytest.mark.slow
-def test_a_change_of_what_it_imports_is_another_version_and_one_of_the_rest_is_not(package: Path) -> None:
-    versions = [version_of(package)]
+def test_a_change_of_what_it_imports_is_another_version_and_one_of_the_rest_is_not(tmp_path: Path) -> None:
+    folders = [tmp_path / changed for changed in ("nothing", "other.py", "entry.py", "deeper.py", "late.py", "weights.npz")]
+    for folder in folders:
+        (folder / "mine").mkdir(parents=True)
+        for name, text in FILES.items():
+            whole = text + "\n# changed\n" * (name == folder.name)
+            (folder / "mine" / name).write_text(whole, encoding="utf-8")
+    asked = subprocess.run([sys.executable, "-c", ASK, *folders], check=True, capture_output=True, text=True)
+    versions = asked.stdout.splitlines()
     assert versions[0].startswith(f"wfsobs {wfsobs.__version__} mine 0 ")
-    (package / "other.py").write_text("changed = 1", encoding="utf-8")
-    assert version_of(package) == versions[0]
-    for name in ("entry.py", "deeper.py", "late.py", "weights.npz"):
-        with (package / name).open("a", encoding="utf-8") as file:
-            file.write("\n# changed\n")
-        versions.append(version_of(package))
-    assert len(set(versions)) == 5
+    assert versions[0] == versions[1] and len(versions) == 6 and len(set(versions)) == 5
 
 
 def test_code_of_wfsobs_that_an_observer_uses_counts(monkeypatch: pytest.MonkeyPatch) -> None:
