@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -310,7 +310,7 @@ def split_source(text: str) -> tuple[str, str]:
     (('night.fits', 'RECON'), ('matrix.npy', ''))
     """
     path, colon, name = text.rpartition(":")
-    is_whole = Path(text).is_file() or path.lower() in TRANSLATED
+    is_whole = os.path.isfile(text) or path.lower() in TRANSLATED
     return (path, name) if colon and not is_whole else (text, "")
 
 
