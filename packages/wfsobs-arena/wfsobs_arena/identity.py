@@ -95,6 +95,7 @@ def _digest(path: Path) -> bytes:
     return hashlib.sha256(path.read_bytes()).digest()
 
 
+@cache
 def _package_version(package: str) -> str:
     """Return the version of the distribution that has a package; "0" for a script."""
     names = packages_distributions().get(package, [])
