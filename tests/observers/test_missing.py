@@ -17,7 +17,8 @@ from wfsobs.evaluation.scores import half_width
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.gp import kernels_of, measured_late, sampled_model
-from wfsobs.observers.kalman.filters import every_peak_model, multirate_noise, optimal_model
+from wfsobs.observers.kalman.filters import every_peak_model, multirate_noise, optimal_model, steady_mode
+from wfsobs.observers.kalman.step import FrameErrors
 from wfsobs.priors_from.scenario import arguments, observer_settings, prior_of
 from wfsobs.record import Measurements, Record
 from wfsobs.scenario import Scenario
@@ -186,6 +187,18 @@ def test_bands_hold_what_they_say_in_a_gap(name: str) -> None:
         last = [gap.stop - 1 for gap in GAPS]
         assert (sd[last] > 1.01 * whole.sd[target][last]).all()
     assert STEPS >= GAPS[-1].stop
+
+
+def test_errors_of_frames_are_steady_where_their_gain_is() -> None:
+    """From whatever covariance, frames with the steady gain lead to the steady one."""
+    (model,), dt = told("kf-ngs", "hold", 1)[0].model, PRESETS["paper"]().dt
+    slow = steady_mode(model.at(RATIO * dt).disturbance(), model.ngs_noise).gains.steps[0]
+    errors = FrameErrors(model.disturbance(), slow, RATIO, model.ngs_noise)
+    update = np.hstack([(np.eye(len(slow.L)) - slow.L @ slow.C) @ slow.A, slow.L])
+    S = np.zeros_like(errors.steady)
+    for _ in range(3000):
+        S = errors.after(S, update)
+    np.testing.assert_allclose(S, errors.steady, rtol=1e-8, atol=1e-10 * np.abs(errors.steady).max())
 
 
 @pytest.mark.slow
