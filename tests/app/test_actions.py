@@ -6,12 +6,14 @@ import io
 import tomllib
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from tests.app.conftest import WAIT
 from wfsobs.app import actions as module
 from wfsobs.app import downloads
 from wfsobs.app.actions import LARGEST, Actions
@@ -149,11 +151,20 @@ def test_a_report_is_made_aside_of_what_is_shown_one_at_a_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked: list[tuple[Any, str]] = []
-    monkeypatch.setattr(module, "make", lambda shown, preset, *_, **__: asked.append((shown, preset)) or b"<!doctype html>")
+    begun, may_end = Event(), Event()
+
+    def make(shown: Any, preset: str, *_: Any, **__: Any) -> bytes:
+        asked.append((shown, preset))
+        begun.set()
+        assert may_end.wait(WAIT)
+        return b"<!doctype html>"
+
+    monkeypatch.setattr(module, "make", make)
     shown = shared_actions.store.run.result
     shared_actions.handle({"action": "report"})
-    assert shared_actions.toolbar.reporting
+    assert shared_actions.toolbar.reporting and begun.wait(WAIT)
     shared_actions.handle({"action": "report"})
+    may_end.set()
     shared_loop.until(lambda: not shared_actions.toolbar.reporting)
     (file,) = shared_actions.sent  # type: ignore[attr-defined]
     assert file["name"] == "wfsobs-report.html" and file["content"] == b"<!doctype html>"

@@ -57,6 +57,12 @@ class Run(param.Parameterized):
         return self
 
 
+def test_another_mode_has_its_own_lines(shared: Dashboard, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wfsobs.app.views.errors.main_observers", lambda _scores, _target, mode, *_: [{"tilt": "kf-multi"}[mode]])
+    shared.display.mode = "tilt"
+    assert shared.display.named_lines == {target: ["kf-multi"] for target in TARGETS}
+
+
 class TestRule:
     @pytest.mark.parametrize("target", TARGETS)
     def test_the_references_and_the_best_by_prior_knowledge_that_are_causal(self, scores: tuple[Score, ...], target: str) -> None:

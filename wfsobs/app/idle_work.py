@@ -119,7 +119,6 @@ class SeedRuns(param.Parameterized):
         shown = self.run.result if self.run.state == DONE and not self.store.stale else None
         if shown is self._of:
             return
-        self.task.close()
         self._of, self._scores = shown, [shown.result.scores] if shown is not None else []
         self._go_on()
 
