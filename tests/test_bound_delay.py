@@ -34,6 +34,7 @@ def residual_of_taps(spectra: TrueSpectra, delay: float, taps: int, jitter: floa
     return float(np.sqrt(s[0] - shared @ np.linalg.solve(measured, shared)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [1.0, 1.3, 2.0, 2.2, 2.7, 2.95])
 def test_no_filter_of_many_taps_leaves_less_and_some_leave_hardly_more(delay: float) -> None:
     """Of 1500 taps, which miss 1e-5; what the fraction costs is 2 and 5 % for delays of 2.7 and 2.95."""

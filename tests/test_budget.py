@@ -200,12 +200,14 @@ BOTH_RIGHT = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SOON)
 def test_a_missing_measurement_is_none_to_the_filter_of_the_right_model(name: str) -> None:
     for it in budgets(BOTH_RIGHT[name].replace({"run.duration": 1.5}), "kf-multi"):
         assert abs(it.terms["mismatch"]) < 1e-6 * it.total, it
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BOTH_RIGHT)
 def test_a_filter_of_both_sensors_whose_model_is_right_has_no_mismatch(name: str) -> None:
     """With the slow error of the LGS, which both sensors together tell from the turbulence."""

@@ -38,6 +38,7 @@ def disturbance(n: int, rng: np.random.Generator) -> Array:
     return rng.standard_normal(n) + sum(p.sample(n, rng) for p in processes)
 
 
+@pytest.mark.slow
 def test_a_stationary_record_has_no_changes() -> None:
     """In no more records than the level says: at most as many as binomial chance allows once in 10^4."""
     rng, count = np.random.default_rng(5), 300
@@ -56,6 +57,7 @@ def test_a_vibration_that_comes_for_a_while_is_found_where_it_is(section: int) -
     assert ratio == pytest.approx(1.0 + 12.5 / 0.256, rel=0.15)  # 128 bins: 9 % and their mean
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gone", [slice(4000, 4300), slice(3000, 6000), slice(0, 500)])
 def test_missing_frames_are_no_change(gone: slice) -> None:
     """Sections in which many are missing are not compared; of 100 records one has a change by chance."""
@@ -123,6 +125,7 @@ def verdicts(found: dict[str, Any]) -> dict[str, str]:
     return {f["subject"]: f["verdict"] for f in found["findings"]}
 
 
+@pytest.mark.slow
 def test_a_right_record_can_be_relied_on(tmp_path: Path, record: Record) -> None:
     found = checked(tmp_path, record)
     assert found["reliable"]
@@ -143,6 +146,7 @@ def test_a_rate_of_no_loop_and_a_mode_without_noise_are_excluded(tmp_path: Path,
         assert verdicts(checked(tmp_path, none))["identification"] == "excluded"
 
 
+@pytest.mark.slow
 def test_a_wrong_sign_is_excluded_and_put_right_by_the_next_command(tmp_path: Path, record: Record) -> None:
     file, data = tmp_path / "r.npz", {"y_lgs": record.y_lgs, "u": -record.u, "dt": np.array(record.dt), "unit": np.array("um")}
     np.savez(file, allow_pickle=False, **data)
@@ -219,6 +223,7 @@ def test_halves_are_compared_by_what_their_modes_have_in_common(monkeypatch: pyt
     assert group.delay == none and group.common_delay == PlantNumber() and group.common_gain == whole.common_gain
 
 
+@pytest.mark.slow
 def test_an_offset_and_a_few_outliers_are_no_fault(tmp_path: Path, record: Record) -> None:
     """One frame in 200 off by 40 times the noise in one part of the record, two of the first ones, which pass a gate, far off;
     and commands about another place than zero.
@@ -230,6 +235,7 @@ def test_an_offset_and_a_few_outliers_are_no_fault(tmp_path: Path, record: Recor
     assert found["reliable"] and verdicts(found)["stationarity"] == "ok"
 
 
+@pytest.mark.slow
 def test_faults_are_named(tmp_path: Path, record: Record) -> None:
     """Lost frames, a level of outliers and noise that grows."""
     rng = np.random.default_rng(3)
@@ -245,6 +251,7 @@ def test_faults_are_named(tmp_path: Path, record: Record) -> None:
     assert (seen["frames"], seen["stationarity"], seen["outlying samples"]) == ("note", "note", "note")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
 def test_a_size_that_no_telescope_has_is_named(tmp_path: Path, record: Record, scale: float) -> None:
     """As of nanometres read as micrometres, or the reverse."""

@@ -254,6 +254,7 @@ def test_a_function_counts_with_what_is_bound_to_it_and_one_that_may_hold_more_h
 
 
 class TestReuse:
+    @pytest.mark.slow
     @pytest.mark.parametrize("path", CASES)
     def test_only_what_depends_runs(self, path: str, before: tuple[Memo, Record, list[Any]]) -> None:
         memo, record, kept = before

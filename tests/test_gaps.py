@@ -154,6 +154,7 @@ def test_every_observer_runs_on_a_record_with_gaps_nearly_as_well() -> None:
         assert 0.8 * a.rms <= b.rms <= 1.5 * a.rms + 1e-12, a.observer
 
 
+@pytest.mark.slow
 def test_no_deviation_is_stated_where_a_measurement_was_filled() -> None:
     """Over a record and frame by frame; in other steps it is."""
     s, observer = scenario().replace({"turbulence.source": "frozen-flow"}), OBSERVERS["kf-coupled"]

@@ -40,6 +40,7 @@ def noise_with_outliers(seed: int, n: int = 1000, share: float = 0.03) -> Array:
     return z
 
 
+@pytest.mark.slow
 @settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.sampled_from((REJECT, CLIP, GateSettings(2.5))))
 def test_all_samples_at_once_are_as_one_by_one(seed: int, what: GateSettings) -> None:
@@ -75,6 +76,7 @@ def test_the_prediction_is_that_of_least_squares() -> None:
     np.testing.assert_allclose(gate.save()["weights"][0], solution, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", [2.5, 2.7, 3.0, 3.5])
 def test_of_gaussian_noise_as_many_are_rejected_as_lie_beyond_the_level(level: float) -> None:
     """Within 15 %: the deviation is a median of 128 samples, smoothed over some eight blocks, and the fit has 64 weights.
@@ -129,6 +131,7 @@ def paper() -> Sequence[Record]:
     return [wfsobs.simulate(settings.replace({"run.seed": seed})) for seed in range(6)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("start", "stop"), [(0, 300), (20, 200), (60, 300), (100, 330), (128, 300), (180, 256)])
 def test_a_clean_record_with_an_early_gap_loses_nothing(paper: Sequence[Record], start: int, stop: int) -> None:
     """Samples that are missing count for no fit; outliers of 40 sigma after it are found all the same."""
@@ -156,6 +159,7 @@ def clean(request: pytest.FixtureRequest) -> tuple[Array, dict[int, dict[str, Ar
     return z, states
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [RUN, ORDER, 300, 1000, 3000])
 def test_a_clean_record_with_a_gap_loses_nothing_after_it(clean: tuple[Array, dict[int, dict[str, Array]]], length: int) -> None:
     """The prediction over it decays to the first sample, the disturbance does not: that is no step of what comes."""
@@ -337,6 +341,7 @@ def test_the_gate_of_training_data_is_run_once(ut4: Record, monkeypatch: pytest.
     assert sorted(length for length in lengths if length <= n) == [n - record.delay] * 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["kf-multi", "multirate-multi", "gp-both", "persistence", "kf-ngs"])
 def test_an_observer_with_a_gate_is_the_same_step_by_step(ut4: Record, name: str) -> None:
     broken = replace(with_ngs_outliers(with_outliers(first_steps(ut4, 2000), 30.0)[0], 30.0)[0], gate=REJECT)

@@ -48,6 +48,7 @@ def integrator(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(tmp_path_factory.mktemp("integrator"), "integrator", "c99")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("start", "stop"), [(0, 150), (0, 300), (20, 200), (130, 2000)])
 def test_the_gate_in_c99_is_that_of_python_after_an_early_gap(integrator: Path, start: int, stop: int) -> None:
     whole = (integrator / "gate.f64").read_bytes()

@@ -130,6 +130,7 @@ def test_same_seed_same_result_and_a_subset_is_part_of_it() -> None:
     assert other is not None and mine is not None and not np.array_equal(other.values, mine.values)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("missing", "words", "left_out"),
     [

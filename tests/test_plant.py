@@ -55,6 +55,7 @@ def right(n: PlantNumber, value: float, sds: float = 4.0) -> bool:
     return n.value is not None and n.sd is not None and abs(n.value - value) < sds * n.sd
 
 
+@pytest.mark.slow
 def test_errors_are_those_of_the_cramer_rao_bound() -> None:
     """White commands s in white noise w, half a frame; any response of four lags, each coefficient with the sd w / (s sqrt(2 n)).
 
@@ -213,6 +214,7 @@ def test_commands_too_small_for_their_squares_tell_nothing() -> None:
     assert not contradiction(Record(y, 1e-200 * u, DT))
 
 
+@pytest.mark.slow
 def test_bad_samples_and_other_units_do_not_matter() -> None:
     record = closed_loop(10_000, 2.4, np.eye(2))
     y, rng = record.y_lgs.copy(), np.random.default_rng(3)

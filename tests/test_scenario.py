@@ -68,6 +68,7 @@ def test_modes_up_to_an_order(order: int, count: int) -> None:
     assert [mode.name for mode in modes[:2]] == ["tip", "tilt"] and modes[-1].radial_order == order
 
 
+@pytest.mark.slow
 def test_a_pickled_scenario_is_whole_where_no_observer_is_known_yet() -> None:
     path = "multipeak.line_width"
     content = pickle.dumps(Scenario().replace({path: 0.123}))

@@ -110,6 +110,7 @@ def test_missing_samples_of_training_data_are_held(night: Record, other: Record)
     np.testing.assert_array_equal(training.y_lgs[103:], other.y_lgs[103:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LEARN)
 def test_a_design_is_trained_without_gaps_by_either_kind_of_data(name: str, night: Record, other: Record) -> None:
     """Oracle: a record as training data, whose gaps are held."""
@@ -150,6 +151,7 @@ def test_training_data_that_do_not_fit_are_one_line_whoever_brings_them(
         training_of(replace(night, training=raw))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [True, False], ids=["first seconds", "another record"])
 def test_a_mode_that_the_record_never_measures_needs_no_training_data(first: bool, night: Record, other: Record) -> None:
     """The other mode is estimated as without it; one that is lost in the training data alone is refused."""

@@ -41,6 +41,7 @@ def predictions(name: str, record: Record) -> Array:
     return np.array(out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_it_is_an_integrator_and_then_minus_the_prediction_of_its_observer(name: str, record: Record) -> None:
     (outcome,) = closed_loop(record, design(SHORT, [name])).outcomes
@@ -56,6 +57,7 @@ def test_it_is_an_integrator_and_then_minus_the_prediction_of_its_observer(name:
     assert steps[FIRST - 110 : FIRST - 90].max() < 2.0 * np.delete(steps, slice(FIRST - 110, FIRST - 90)).max(), "no bump"
 
 
+@pytest.mark.slow
 def test_they_are_told_nothing_and_follow_a_line_that_jumps() -> None:
     """The fixed model has the line at its old place: in the end the adaptive one leaves less, and before it not much more."""
     assert {controller_needs(name, SHORT) for name in NAMES} == {"none"}
@@ -68,6 +70,7 @@ def test_they_are_told_nothing_and_follow_a_line_that_jumps() -> None:
     assert rms(adaptive.residual[after]) < 0.8 * rms(fixed.residual[after])
 
 
+@pytest.mark.slow
 def test_they_run_supervised(record: Record) -> None:
     wrong = SHORT.replace({"control.supervised": True, "plant.delay_error": 2.0, "plant.gain_error": [0.5, 0.5]})
     for outcome in closed_loop(record, design(wrong, NAMES)).outcomes:

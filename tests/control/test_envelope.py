@@ -41,6 +41,7 @@ def test_spectra_of_each_plant() -> None:
         assert np.allclose(together, alone, rtol=1e-9, atol=0) and np.ptp(together, axis=0).min() > 1e-4
 
 
+@pytest.mark.slow
 def test_every_point_is_the_loop_of_its_plant(result: PlantEnvelope) -> None:
     """On fewer frequencies: to 1 % where the loop is stable, and stable where eigenvalues have it."""
     assert set(result.errors) == {"delay", "gain", "rotation", "resonance"}
@@ -131,6 +132,7 @@ def test_curves_are_means_and_maxima_of_their_parts() -> None:
     assert mean[1] == pytest.approx(rms[11:20].mean()) and most[1] == rms[11] and most[-1] == 1.0
 
 
+@pytest.mark.slow
 def test_the_command_prints_table_and_rows(tmp_path) -> None:
     file = tmp_path / "s.toml"
     file.write_text("[sensors]\nlgs_rate = 500.0\n")
@@ -154,6 +156,7 @@ def test_it_draws_residuals_against_the_delay(result: PlantEnvelope) -> None:
         result.plot.residuals(over="wind")
 
 
+@pytest.mark.slow
 def test_controllers_that_are_not_linear_are_simulated() -> None:
     """Each plant is the loop of it; what comes before the end is what there is by then."""
     s = MATCHED.replace({"run.duration": 3.0, "run.warm_up": 0.5, "gpr_online.training_size": 40, "gpr_online.depth": 20})

@@ -21,6 +21,7 @@ def test_an_ar1_without_noise_is_predicted_by_its_law(a: float) -> None:
     assert laws.taps_of(Spectra(S, S, S), Mirror(2.0), 1.0) == pytest.approx(a**2 * np.eye(laws.TAPS)[0], abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["paper", "ut4", "galacsi-nfm"])
 def test_limits_hold_between_the_frequencies_where_they_are_set(preset: str) -> None:
     """Multipliers meet them to some 2 % after the rounds that they have; more than four points per tap leave no room between."""
@@ -41,6 +42,7 @@ def test_uncertainty_is_that_of_the_plant() -> None:
     assert laws.uncertainty(Mirror(3.0), omega) == pytest.approx(expected, rel=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["paper", "strong-turbulence", "ut4", "galacsi-nfm"])
 def test_every_plant_is_borne_at_little_loss(preset: str) -> None:
     """A tenth is the most that robustness may cost against the LQG of every peak; the integrator is worse at worst."""

@@ -50,6 +50,7 @@ def test_it_commands_by_the_exact_filter(name: str) -> None:
                 assert np.sqrt(np.mean(left[at] ** 2)) == pytest.approx(rms, rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LQG)
 def test_a_design_that_takes_over_in_a_gap_knows_of_it(name: str) -> None:
     """The same design goes on as if there had been no change, to rounding; so does a saved state."""

@@ -104,6 +104,7 @@ def test_mirrors_are_drawn_from_their_deviations() -> None:
         draw_plants([swings, group()], 2, np.random.default_rng(1))
 
 
+@pytest.mark.slow
 def test_spectra_are_drawn_from_their_deviations() -> None:
     rng = np.random.default_rng(5)
     y = 0.02 * rng.standard_normal((20_000, 1))

@@ -66,6 +66,7 @@ def test_with_a_fraction_of_a_frame_of_delay_and_with_limits(name: str, changes:
     assert difference(name, record, scenario.replace(changes)) <= (GPR if "gpr" in name else ROUNDING)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_a_saved_state_and_a_reset(name: str) -> None:
     record, scenario = with_gaps("paper")

@@ -45,6 +45,7 @@ def test_on_the_right_plant_it_is_the_controller_from_frame_1000_on(record: Reco
         assert steps[895:905].max() <= 3.0 * np.delete(steps, slice(895, 905)).max(), "no bump"
 
 
+@pytest.mark.slow
 def test_where_it_would_diverge_the_integrator_takes_over(record: Record, wrong: ClosedLoop) -> None:
     alone = closed_loop(record, design(RIGHT.replace({**WRONG, "control.supervised": False}), NAMES[1:]))
     assert all(one.residual is None and one.stable == (False, False) for one in alone.outcomes)

@@ -46,6 +46,7 @@ def close(
     return residual, u
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STEPWISE)
 def test_while_all_is_well_it_is_the_controller(name: str, record: wfsobs.Record) -> None:
     alone, supervised = wfsobs.design(name, SCENARIO), SupervisedController(wfsobs.design(name, SCENARIO), PLAN)
@@ -109,6 +110,7 @@ def test_a_loop_that_grows_slowly_is_no_more_usual_the_second_time() -> None:
     assert not any(free.exceeds(1.003**k * rng.standard_normal(1)) for k in range(3 * grown)), "without the cap it would be usual"
 
 
+@pytest.mark.slow
 def test_a_disturbance_that_stays_larger_becomes_usual() -> None:
     """Three times as much from 3 s on is no fault of the controller, which has the loop again for good."""
     calm = wfsobs.simulate(SCENARIO.replace({"run.duration": 20.0}))

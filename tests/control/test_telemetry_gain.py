@@ -100,6 +100,7 @@ def test_records_that_have_no_gain(z: Array, line: str) -> None:
         gain_from_telemetry(z, Mirror())
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path: Path) -> None:
     scenario = wfsobs.PRESETS["paper"]().replace({"run.duration": 6.0})
     record = wfsobs.simulate(scenario)

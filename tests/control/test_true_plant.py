@@ -105,6 +105,7 @@ def test_no_errors_are_no_plant_of_its_own() -> None:
         Scenario().replace({"plant.delay_error": -0.9, "plant.delay_jitter": 0.2}).validate()
 
 
+@pytest.mark.slow
 def test_frame_by_frame_it_is_the_loop_of_the_record() -> None:
     """Of an error too small to matter, every controller that is not trained leaves what it does without."""
     names = ["none", "integrator", "lqg-kf-multi", "lqg-multirate-multi", "integrator+gpr-online"]
@@ -299,6 +300,7 @@ def test_lost_commands_are_judged_by_the_mean_square(lost: float) -> None:
     assert radius([law], Mirror(2.0), TruePlant(ONE, 2.0, loss=lost)) == pytest.approx(known, rel=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["integrator", "lqg-kf-lgs", "lqg-multirate"])
 @settings(max_examples=3, deadline=None, derandomize=True)
 @given(st.floats(2.0, 3.2), st.floats(0.0, 0.5), st.floats(0.0, 0.3), st.floats(0.7, 1.3), st.sampled_from([0.0, 0.4]))
@@ -322,6 +324,7 @@ def test_the_growth_in_the_mean_square_is_that_of_the_kronecker_product(
 # ---------------------------------------------------------------------- residual
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["paper", "ut4"])
 def test_with_the_plant_of_the_controllers_theory_is_that_without_errors(preset: str) -> None:
     names = ["integrator", "lqg-kf-multi"]

@@ -160,6 +160,7 @@ def test_columns_that_nobody_names_keep_their_names(ending: str) -> None:
     is_as_clean(read_record(file, f"a{ending}", declaration=stated), f"unit nm{unused}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["frame", "FrameCounter", "frame_no", "wfs frame counter"])
 @pytest.mark.parametrize("bits", [8, 16, 32])
 @pytest.mark.parametrize("every", [1, 4])
@@ -317,6 +318,7 @@ def in_hdf5(names: tuple[str, str], unit: str = "nm", clock: str = "s", factor: 
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("unit", "factor"), [("milliseconds", 1e3), ("MSEC", 1e3), ("usec", 1e6), ("seconds since 2026-01-01", 1.0), ("", 1.0)]
 )
@@ -324,6 +326,7 @@ def test_units_of_a_clock_in_other_words(unit: str, factor: float) -> None:
     assert read_record(in_hdf5(("y_lgs", "u"), "nm", unit, factor), "a.h5").dt == pytest.approx(0.002, rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("names", [("y_lgs", "u"), ("slopes", "cmds")])
 def test_what_is_no_unit_is_refused_unless_one_is_stated(names: tuple[str, str]) -> None:
     roles = {} if names[0] == "y_lgs" else dict(zip(("y_lgs", "u"), names, strict=True))

@@ -203,6 +203,7 @@ def test_a_unit_that_is_none_is_not_taken_for_micrometres(tmp_path: Path) -> Non
     assert isinstance(shown, Preview) and shown.reading.missing.startswith("Choose the unit first")
 
 
+@pytest.mark.slow
 def test_what_does_not_decide_is_not_excluded() -> None:
     """Commands that follow nothing, or do nothing, too few steps, a mirror at rest, a loop so slow that its commands are lost in
     the noise; numbers without noise."""

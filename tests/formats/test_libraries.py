@@ -348,6 +348,7 @@ CELLS = np.empty(2, dtype=object)
 CELLS[:] = [Y, U]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "content", "line"),
     [
@@ -439,6 +440,7 @@ NO_PLACE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", [fmt.endings[0] for fmt in FORMATS if fmt.write])
 def test_what_is_converted_is_what_it_was(tmp_path: Path, ending: str) -> None:
     """Or what has no place is named; no temporary file is left."""

@@ -106,6 +106,7 @@ def test_slopes_without_a_matrix_are_told_of_it(file: Path) -> None:
         wfsobs.load(file, columns=COLUMNS)
 
 
+@pytest.mark.slow
 def test_the_command_line_reads_them_and_repeats_how(file: Path) -> None:
     words = ["--column", "y_lgs=slopes", "--column", "u=volts", "--reconstructor", f"{file}:R", "--command-modes", f"{file}:M"]
     result = CliRunner().invoke(main, ["check", str(file), *words])

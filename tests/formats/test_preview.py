@@ -39,6 +39,7 @@ def content(ending: str, record=RECORD) -> bytes:
 CONTENT = {ending: content(ending) for ending in ENDINGS}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_the_numbers_of_a_record(ending: str) -> None:
     found = preview(CONTENT[ending], f"night{ending}")
@@ -90,6 +91,7 @@ def refused(data: bytes, name: str) -> str:
     return line
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_cut_anywhere(ending: str) -> None:
     whole = CONTENT[ending]
@@ -99,6 +101,7 @@ def test_cut_anywhere(ending: str) -> None:
         assert refused(whole[:length], f"cut{ending}").startswith(f"cut{ending}: ")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_the_wrong_kind(ending: str) -> None:
     for other, data in (*CONTENT.items(), ("", b"\x89PNG\r\n\x1a\n" + bytes(range(256)))):

@@ -93,6 +93,7 @@ def written(record: Record, ending: str) -> io.BytesIO:
     return file
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "ending", [pytest.param(e, marks=pytest.mark.slow) if e == ".h5" else e for e in ENDINGS if e != AOT]
 )  # a process for every file of HDF5
@@ -133,6 +134,7 @@ def test_npz_of_either_byte_order(record: Record, order: str, single: bool) -> N
     assert again.y_lgs.dtype.isnative and again.dt == record.dt
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_packed_by_gzip(ending: str, tmp_path: Path) -> None:
     record = simulate(paper().replace({"run.duration": 0.5, "run.warm_up": 0.1}))
@@ -264,6 +266,7 @@ def slopes_of_a_loop(rng: np.random.Generator, unit: str, to_modes: np.ndarray |
     return aotpy.AOSystem(ao_mode="SCAO", main_telescope=telescope, sources=[star], **parts)
 
 
+@pytest.mark.slow
 def test_matrices_of_an_aot_file_as_reconstructors(tmp_path: Path) -> None:
     """Its control matrix, through its commands where these have modes, and the mean slopes of its subapertures."""
     import aotpy

@@ -430,6 +430,7 @@ print(0, turn())
 """
 
 
+@pytest.mark.slow
 def test_a_process_goes_first_where_the_system_lets_it():
     """What it says of its turn is what the system says."""
     lines = subprocess.run([sys.executable, "-c", TURNS], capture_output=True, text=True, check=True).stdout.splitlines()

@@ -108,6 +108,7 @@ def test_nothing_after_a_step_changes_its_estimate(name: str, record: Record, su
                     assert np.array_equal(other[target][: k + 1], values[: k + 1], equal_nan=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [n for n in CAUSAL if n != "zero"])
 def test_the_change_is_seen_afterwards(name: str, record: Record) -> None:
     """So that the test above can fail: some 60 steps later every estimate has moved."""

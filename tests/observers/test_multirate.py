@@ -69,6 +69,7 @@ VARIANTS: list[dict[str, Any]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changes", VARIANTS)
 def test_every_step_is_the_textbook_recursion(changes: dict[str, Any]) -> None:
     s = scenario(changes)
@@ -174,6 +175,7 @@ def time_varying(record: Record, s: Scenario, mode: int, lgs: float, ngs: float,
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_error", [True, False])
 @pytest.mark.parametrize("ratio", [1, 2, 5])
 def test_the_optimal_filter_is_the_time_varying_one_once_that_has_settled(ratio: int, with_error: bool) -> None:

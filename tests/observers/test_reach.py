@@ -65,6 +65,7 @@ def _record() -> Record:
     return together(simulate(scenario()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inputs_filter", ["raw", "standardised"])
 @pytest.mark.parametrize("name", ON_PAPER)
 def test_nothing_that_an_observer_reaches_is_truth(

@@ -278,6 +278,7 @@ def refusal(*arguments: Any, **named: Any) -> str:
     return ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*(n for n in STEPS if has_prior(OBSERVERS[n], PRESETS["paper"]())), *CONTROLLERS])
 def test_a_prior_that_lacks_something_is_one_line(name: str) -> None:
     scenario = PRESETS["paper"]().replace({"run.duration": 2.0})

@@ -342,6 +342,7 @@ def test_a_sweep_is_drawn_with_its_own_numbers(sweep: SweepResults, field: Sweep
     assert {text.split("\n")[0] for text in names.dimension_values("best")} == {look(it.name).label for it in best if it}
 
 
+@pytest.mark.slow
 def test_a_sweep_over_words_has_them_as_ticks() -> None:
     """One after the other, by both backends."""
     lines = sweep_over("turbulence.source=ar2,ar3,none").plot.errors()
@@ -399,6 +400,7 @@ def test_a_paper_figure_is_written_as_every_kind_of_file(name: str, suffix: str,
         assert b"/MediaBox [ 0 0 249.44" in content and b"/FontFile2" in content
 
 
+@pytest.mark.slow
 def test_the_command_draws_from_a_record_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert CliRunner().invoke(main, ["run", *ARGUMENTS, "--observer", "zero", "--save", "own.npz"]).exit_code == 0
@@ -415,6 +417,7 @@ def test_the_command_draws_from_a_record_of_ones_own(tmp_path: Path, monkeypatch
         assert refused.exit_code == 2 and why in refused.output and "Traceback" not in refused.output
 
 
+@pytest.mark.slow
 def test_what_is_composed_keeps_its_units_and_a_title_its_place(result: wfsobs.Result) -> None:
     """The title stands with the legend of a column, not under it."""
     both = result.record.plot.traces() * result.record.plot.traces(mode="tilt")
@@ -425,6 +428,7 @@ def test_what_is_composed_keeps_its_units_and_a_title_its_place(result: wfsobs.R
     assert legend is not None and (legend.get_title().get_text(), axes.get_title()) == ("Night", "")
 
 
+@pytest.mark.slow
 def test_what_is_composed_begins_a_row_where_it_does_not_fit(result: wfsobs.Result) -> None:
     """At 40 mm each, bars with their names at 80 mm; nothing is cut off."""
     traces, bars = result.plot.traces() + result.plot.spectra(), result.plot.errors() + result.plot.budget()
@@ -462,6 +466,7 @@ def test_two_columns_have_legends_beside(result: wfsobs.Result) -> None:
     assert all(axes.get_legend() for axes in paper.axes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [88.0, 180.0])
 def test_a_legend_of_all_observers_has_room(width: float, result: wfsobs.Result) -> None:
     truth = result.record.vibration
@@ -474,6 +479,7 @@ def test_a_legend_of_all_observers_has_room(width: float, result: wfsobs.Result)
     assert paper.axes[0].get_position().height * own.height / paper.dpi > 0.8  # inches: the plot keeps its height
 
 
+@pytest.mark.slow
 def test_legends_of_all_observers_do_not_cover_each_other_in_a_notebook(result: wfsobs.Result) -> None:
     truths = {"turbulence": result.record.turbulence, "vibration": result.record.vibration}
     estimates = tuple(Estimate(o.id, of, x, 0.0) for o in OBSERVERS.values() for of, x in truths.items() if x is not None)
@@ -508,6 +514,7 @@ def test_what_cannot_be_drawn_is_one_line(
             draw()
 
 
+@pytest.mark.slow
 def test_without_holoviews_the_extra_is_named() -> None:
     code = (
         "import sys; sys.modules['holoviews'] = None\nimport wfsobs\n"

@@ -122,6 +122,7 @@ def test_the_numbers_of_the_run_over_the_record_through_the_command() -> None:
     assert summary["missing"] == len(lost) and summary["fallbacks"] == 0
 
 
+@pytest.mark.slow
 def test_a_publisher_that_dies_and_comes_back(tmp_path: Path) -> None:
     """Its subscriber finds it by itself: the output is zero meanwhile, and the observer starts anew at its counter."""
     said: list[str] = []

@@ -37,6 +37,7 @@ def tuned() -> TuningResult:
     return tune(FAST, "lqg-kf-lgs", evaluations=16, envelope=EnvelopeGoal())
 
 
+@pytest.mark.slow
 def test_it_leaves_less_at_the_worst_plant_and_little_more_at_the_nominal_one(tuned: TuningResult) -> None:
     """Of a model that is the truth, none leaves less at the nominal plant: what is won at the worst is paid for there."""
     assert tuned.before.spreads and tuned.after.spreads
@@ -57,12 +58,14 @@ def test_plants_of_the_search_are_the_first_of_the_envelope(tuned: TuningResult)
     assert whole.corners == pytest.approx(seen.corners, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_loss_of_nothing_keeps_the_best_nominal_design() -> None:
     kept = tune(FAST, "lqg-kf-lgs", evaluations=8, envelope=EnvelopeGoal(loss=0.0))
     assert kept.scenario == FAST
     assert any("at the nominal plant, above" in e.reason for e in kept.history)
 
 
+@pytest.mark.slow
 def test_a_gain_by_hand_starts_from_the_optimal_one_less_its_caution() -> None:
     s = FAST.replace({"control.caution": 2.0})
     gains = [one.law.gain for one in design(s, ["integrator"]).laws["integrator"] if one.law and one.law.gain]
@@ -114,6 +117,7 @@ def test_what_cannot_be_tuned_is_refused() -> None:
         tune(FAST, "integrator", envelope=goal, watch=Watch(is_cancelled=lambda: True))
 
 
+@pytest.mark.slow
 def test_the_envelope_of_tuned_controllers_is_that_of_each(tuned: TuningResult) -> None:
     all_of_them = tuned_envelope(FAST, controllers=["integrator", "lqg-kf-lgs", "integrator+gpr-online"], points=16)
     assert [spread.controller for spread in all_of_them.spreads] == ["integrator", "lqg-kf-lgs"]
@@ -121,6 +125,7 @@ def test_the_envelope_of_tuned_controllers_is_that_of_each(tuned: TuningResult) 
     assert all_of_them.spreads[1].caution == pytest.approx(tuned.scenario.control.caution, rel=0.3), "a flat minimum"
 
 
+@pytest.mark.slow
 def test_report_and_command(tuned: TuningResult, tmp_path) -> None:
     said = json.loads(json.dumps(tuning_dict(tuned), allow_nan=False))
     assert said["controller"] == "lqg-kf-lgs" and "observer" not in said
