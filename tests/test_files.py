@@ -98,6 +98,7 @@ def test_a_file_that_cannot_be_written_is_named_before_anything_is_computed(tmp_
         "identify none.npz --command-modes night.npz --out night.npz",
         "tune --observer kf-lgs --record night.npz --out night.npz",
         "live --headless --replay night.npz --record night.npz",
+        "live --headless --record night.npz --log night.npz",
         "run --vibration-psd night.npz --save night.npz",
         "identify none.npz --config own.toml --out own.toml",
         f"identify none.npz --set butterworth.frequencies={[*range(11, 99)]} --config own.toml --out own.toml".replace(", ", ","),

@@ -26,7 +26,7 @@ def write_whole(path: str | Path, write: Callable[[IO[bytes]], object]) -> None:
         The file cannot be written; it names `path`. A file that was there before is unchanged.
     """
     try:
-        if _is_device(path):
+        if is_device(path):
             with open(path, "wb") as file:
                 write(file)
         else:
@@ -40,7 +40,7 @@ def write_text(path: str | Path, text: str) -> None:
     write_whole(path, lambda file: file.write(text.encode()))
 
 
-def _is_device(path: str | Path) -> bool:
+def is_device(path: str | Path) -> bool:
     """Return whether a path is that of a device or a pipe."""
     return os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path)
 
@@ -62,7 +62,7 @@ def check_writable(path: str | Path, endings: tuple[str, ...] = ()) -> None:
 
     endings : those that its name takes; any where there are none
     """
-    if _is_device(path):
+    if is_device(path):
         return
     named = str(path)
     path = Path(os.path.realpath(path) if os.path.islink(path) else path)

@@ -426,3 +426,18 @@ def test_the_button_saves_what_is_shown(open_page: Any, server: Any, tmp_path: P
     want = [number(1e3 * row["rms_um"]) for row in rows if (row["target"], row["mode"]) == ("vibration", "tip")]
     assert sorted(shown, key=float) == sorted(want, key=float)
     assert "--set turbulence.wind_speed=22.0" in text
+
+
+EVENT = ("events.0.kind=wind", "events.0.duration=0.5", "run.duration=6", "run.warm_up=0.5")
+
+
+def test_traces_begin_where_the_event_of_a_state_is(browser: Browser, tmp_path: Path) -> None:
+    path = tmp_path / "events.html"
+    changes = [word for change in EVENT for word in ("--set", change)]
+    arguments = ["export", str(path), *changes, "--vary", "events.0.start=2,4", "--observer", "kf-lgs"]
+    assert CliRunner().invoke(main, arguments).exit_code == 0
+    with opening(browser, path) as open_it:
+        page = open_it()
+        for place, start in (("0", 1.0), ("1", 3.0), ("0", 1.0)):  # two seconds with the event in the middle
+            page.locator("#vary-0").fill(place)
+            until(page, f"() => Bokeh.documents[0].get_model_by_name('trace-vibration').x_range.start === {start}")

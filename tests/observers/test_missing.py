@@ -190,7 +190,7 @@ def test_bands_hold_what_they_say_in_a_gap(name: str) -> None:
 
 
 def test_errors_of_frames_are_steady_where_their_gain_is() -> None:
-    """From whatever covariance, frames with the steady gain lead to the steady one."""
+    """From no error at all, 3,000 frames with the steady gain lead to the steady covariance, but for rounding."""
     (model,), dt = told("kf-ngs", "hold", 1)[0].model, PRESETS["paper"]().dt
     slow = steady_mode(model.at(RATIO * dt).disturbance(), model.ngs_noise).gains.steps[0]
     errors = FrameErrors(model.disturbance(), slow, RATIO, model.ngs_noise)

@@ -150,8 +150,8 @@ function drawTable() {
   document.getElementById("table").replaceChildren(copy)
 }
 
-// What the axes are set by.
-const framed = (it) => [it?.length, it?.dt, it?.events.start[0]].join()
+// What the ranges of the axes depend on.
+const rangesOf = (it) => [it?.length, it?.dt, it?.events.start[0]].join()
 
 function drawAxes() {
   const [target] = data.targets, {length} = state, f = axis("frequency")
@@ -182,7 +182,7 @@ function draw() {
   }
   for (const it of all("[data-verdict]")) it.hidden = it.dataset.verdict !== `${shown.state}` || it.dataset.mode !== shown.mode
   drawTable()
-  if (framed(before) !== framed(state)) drawAxes()
+  if (rangesOf(before) !== rangesOf(state)) drawAxes()
 }
 
 try {

@@ -17,7 +17,7 @@ from click.core import ParameterSource
 
 from wfsobs.cli.show import print_note
 from wfsobs.closed_loop.envelope import Uncertainty
-from wfsobs.files import check_writable
+from wfsobs.files import check_writable, is_device
 from wfsobs.priors_from.telemetry import told_by, training_part
 from wfsobs.record import DELAY, Record, RecordError
 from wfsobs.scenario import Scenario, configfile
@@ -47,14 +47,17 @@ POSITIVE = FiniteRange(0, min_open=True)
 
 
 def check_output(path: str, endings: tuple[str, ...] = ()) -> None:
-    """Raise OSError where the file cannot be written, or where another parameter of the command names it, too."""
+    """Raise OSError where an output file cannot be written, or is also given for another parameter of the command.
+
+    endings : as of `check_writable`
+    """
     check_writable(path, endings)
+    if is_device(path):
+        return
     given = click.get_current_context().params.values()
     texts = [text for value in given for text in (value if isinstance(value, tuple) else (value,)) if isinstance(text, str)]
     names = [name for text in texts for name in {text, split_source(text)[0]}]
-    if [os.path.realpath(name) for name in names].count(os.path.realpath(path)) > 1 and (
-        os.path.isfile(path) or not os.path.exists(path)
-    ):
+    if [os.path.realpath(name) for name in names].count(os.path.realpath(path)) > 1:
         raise OSError(errno.EEXIST, "is also named as another file of this command; write to another", path)
 
 
