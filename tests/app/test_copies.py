@@ -44,13 +44,13 @@ FILE = "the night's record.npz"
 
 
 def file_of(short: Scenario) -> bytes:
-    """A record in nm whose commands are taken off, which does not say so, nor its rate and delay; it has its truth."""
+    """A record in nm whose commands are taken off after 3 steps, which does not say so, nor its rate; it has its truth."""
     record = simulate(short.replace({"run.seed": 9}))
     arrays = record_arrays(record)
     for name in ("unit", "command_sign", "delay", "dt"):
         del arrays[name]
     arrays |= {name: 1e3 * values for name, values in arrays.items() if values.ndim == 2}
-    arrays |= {name: -arrays[name] for name in ("u", "training_u")}
+    arrays |= {name: -np.roll(arrays[name], -1, axis=0) for name in ("u", "training_u")}
     file = io.BytesIO()
     format_of(".npz").write(file, arrays)
     return file.getvalue()
@@ -78,7 +78,7 @@ def board(request: Any, loop: Any, short: Scenario, tmp_path: Path, monkeypatch:
         for widget, value in (
             (upload.fields.unit, "nm"),
             (upload.fields.sign, -1),
-            (upload.fields.delay, "2"),
+            (upload.fields.delay, "3"),
             (upload.fields.rate, "1000"),
         ):
             widget.value = value

@@ -147,6 +147,16 @@ def test_together_has_a_row_per_name(folder):
     assert table(folder, "--together", "--parquet", folder / "all.parquet").exit_code != 0
 
 
+@pytest.mark.parametrize(("command", "option"), [("table", "--parquet"), ("report", "--out")])
+def test_files_of_a_campaign_are_no_output(folder, command, option):
+    """Those that are there, by another name as well, and a name that would be taken for one."""
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    for out in (folder / "plan.json", next(folder.glob("rows/*")), folder / "rows/../rows/all.parquet"):
+        found = CliRunner().invoke(main, ["campaign", command, str(folder), option, str(out)])
+        assert found.exit_code != 0 and "belongs to the campaign" in found.stderr
+    assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
 def test_observers_without_errors_are_listed_with_the_reason_before_and_after(tmp_path):
     """In the plan for its first run, in the table for the runs that are shown."""
     text = PLAN.replace('"persistence"', '"persistence", "kf-adaptive"')

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -149,6 +150,13 @@ def write_batch(folder: Path, rows: Sequence[Mapping[str, Any]], provenance: Map
         os.fsync(file.fileno())
 
     write_whole(path, write)
+
+
+def check_apart(path: Path, folder: Path) -> None:
+    """Raise OSError where a file to write would stand among those that a campaign keeps."""
+    real = path.resolve()
+    if real == (folder / PLAN).resolve() or real.parent == (folder / ROWS).resolve():
+        raise OSError(errno.EEXIST, "belongs to the campaign; write to another", str(path))
 
 
 def batch_files(folder: Path) -> list[Path]:

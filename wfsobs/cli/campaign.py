@@ -26,7 +26,16 @@ from wfsobs.campaign.follow import CampaignFolder, TogetherRow, standings
 from wfsobs.campaign.plan import Campaign, cells_where, load_plan
 from wfsobs.campaign.pools import DaskCluster, Processes, usable_processors
 from wfsobs.campaign.run import BATCH, run_campaign, run_cost, run_rows
-from wfsobs.campaign.store import RESULTS, add_settings, finished_runs, folder_plan, need_pyarrow, present_rows, read_results
+from wfsobs.campaign.store import (
+    RESULTS,
+    add_settings,
+    check_apart,
+    finished_runs,
+    folder_plan,
+    need_pyarrow,
+    present_rows,
+    read_results,
+)
 from wfsobs.campaign.sweep import MOST_SEEDS, SweepResults, parse_axis, plan_sweep, run_sweep
 from wfsobs.cli.options import check_output, json_option, observer_option, scenario_options
 from wfsobs.cli.show import new_table, print_json, print_note, progress_bar, show_table
@@ -364,6 +373,9 @@ def print_table(
 
     if together and parquet:
         raise SettingError("--parquet: takes all rows, not --together")
+    if parquet:
+        check_output(parquet)
+        check_apart(Path(parquet), Path(folder))
     plan = folder_plan(Path(folder))
     if together:
         print_together(Path(folder), only, target, mode, as_csv)
@@ -394,6 +406,8 @@ def report(folder: str, out: str | None) -> None:
     from wfsobs.campaign.report import write_report
 
     path = Path(out) if out else Path(folder) / "report.html"
+    check_output(str(path))
+    check_apart(path, Path(folder))
     write_report(Path(folder), path)
     print_note(f"{path}: written")
 
