@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -282,6 +283,10 @@ def test_the_command_prints_a_table_and_adds_to_the_rows() -> None:
     for row in chain(r for r in rows if r["observer"] == "kf-lgs"):
         assert sum(row["budget"]["terms_um2"].values()) == pytest.approx(row["rms_um"] ** 2, rel=1e-6)
     assert {r["budget"]["reason"] for r in rows if r["observer"] == "butterworth-ol"} == {"looks ahead"}
+    out = call("run", *SHORT, "--set", "vibration.source=none", "--observer", "multirate-multi", "--budget")
+    assert out.exit_code == 0 and re.search(r"vibration  . tip  [^\n]* 0\.00 . +0\.0 . +0\.0 +0 % ", out.stdout), (
+        "an error of zero"
+    )
     out = call("run", *SHORT, "--observer", "zero", "--budget-of", "kf-lgs")
     assert out.exit_code == 0 and "wfsobs: --budget-of kf-lgs: it did not run" in out.stderr
 

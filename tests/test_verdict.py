@@ -145,6 +145,17 @@ def test_a_filter_of_one_line_does_harm_at_the_others_and_not_where_there_are_no
     assert not by_name["one line"].harms and by_name["one line"].ties
 
 
+def test_who_knows_bands_has_no_model_of_peaks() -> None:
+    result = run(SCENARIOS["paper"].replace({"sensors.lgs_noise": 0.2}), observers=("gpr-online", "kf-lgs", "zero"))
+    given = (result.scenario, result.record, result.estimates, result.scores, "vibration", "tilt")
+    found = verdict(*given, simulation=result.scenario)
+    assert found is not None and found.harms[0].observer == "gpr-online"
+    said = next(line for line in found.sentences() if line.startswith("Online GPR"))
+    assert (
+        "knows the frequency bands; " in said and "model" not in said and re.search("error lies (at|away from) the peaks", said)
+    )
+
+
 NAMES = {
     "noise": "sensor noise",
     "lag": "lag",

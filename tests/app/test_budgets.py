@@ -125,6 +125,8 @@ def test_a_negative_term_has_no_piece_and_is_told(page: Page, loop: Any) -> None
         (0.0, "−7"),
         (2.0 / 9.0, "27"),
     ]
+    page.budgets.by_observer = {"kf-lgs": [Budget("kf-lgs", "vibration", "tip", 0.0, dict.fromkeys(TERMS, 0.0))]}
+    assert {share for _, share, *_ in page.row("kf-lgs")["parts"]} == {0.0}, "without vibration there is no error of it"
 
 
 def test_the_legend_has_the_causes_of_every_row_and_the_scale_holds_the_limit(page: Page, loop: Any) -> None:

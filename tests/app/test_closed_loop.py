@@ -55,7 +55,7 @@ def page(dashboard: Dashboard, loop: Any) -> ClosedLoopPage:
 def test_it_says_what_the_command_says(page: ClosedLoopPage, dashboard: Dashboard) -> None:
     of = dashboard.store.run.result
     assert of is not None and page.results is not None
-    expected = rows(closed_loop(of.result.record, design(of.scenario)), None)
+    expected = rows(closed_loop(of.result.record, design(of.scenario)), of.scenario.run.seed)
     assert list(page.results.rows) == expected
     cards = {card["name"]: card for card in page.cards.items}
     assert list(cards) == list(CONTROLLERS)

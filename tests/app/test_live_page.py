@@ -112,18 +112,20 @@ def test_a_loop_from_start_to_the_end_of_the_session(page: LivePage, dashboard: 
 
 
 def check_controllers(page: LivePage, live: LiveLoop) -> None:
-    """In the table: rms of the last seconds in nm and mas, Strehl of both modes; and a detector beside that of the star."""
+    """In the table: rms of the last seconds in the unit, Strehl of both modes; and a detector beside that of the star."""
     assert page.picture is not None
     wait(lambda: (left := live.control_view(1.0)) is not None and left.first + len(left.residual("integrator")) == live.newest)
-    page.draw()
     rms = seen(page, live, "integrator")
     page.controls.whose.value = "none"
     assert page.controls.names_to_design == ["none"]
-    cells = re.findall(r'data-controller="integrator".*?</tr>', page.picture.control_table.html, re.S)[0]
     mas = 4e-6 / 8.0 * np.degrees(1.0) * 3.6e6  # per micrometre of a Noll tip on 8 m
     lost = (2 * np.pi / 2.2) ** 2 * np.sum(rms**2)
-    for value in (number(1e3 * rms[0]), number(mas * rms[0]), f"{np.exp(-lost):.4f}"):
-        assert f"<td>{value}</td>" in cells
+    for unit, scale in (("mas", mas), ("nm", 1e3)):
+        page.display.unit = unit
+        page.draw()
+        assert f"Residual [{unit}]" in page.picture.control_table.html
+        cells = re.findall(r'data-controller="integrator".*?</tr>', page.picture.control_table.html, re.S)[0]
+        assert all(f"<td>{value}</td>" in cells for value in (number(scale * rms[0]), f"{np.exp(-lost):.4f}"))
     assert len(page.picture.stars.row) == 2 and set(live.controllers) == {"none", "integrator"}
     page.controls.controllers.value = ["integrator"]
     assert live.controllers == {"integrator"} and page.controls.names_to_design is None, "who runs no more is not designed anew"

@@ -213,6 +213,18 @@ def test_what_is_said_of_the_mirror(shared: Dashboard, shared_loop: Any, short: 
     assert not fields.trust.value and shared.upload._preview.record.u.any()
 
 
+def test_a_statement_that_is_refused_leaves_the_preview(shared: Dashboard, shared_loop: Any, short: Scenario) -> None:
+    """The refusal names the field that would take it, not the option of a command."""
+    previewed(shared, shared_loop, file_of(short))
+    shown = shared.upload.content.text.html
+    shared.upload.fields.delay.value = "3"
+    shared_loop.until(lambda: "3 is stated" in shared.upload.picker.message)
+    assert shared.upload.picker.message.endswith("delay is 2, but 3 is stated; “Trust sign and delay as stated” takes that")
+    assert shared.upload.content.text.html == shown and shared.upload.content.figure.visible and shared.upload.use.disabled
+    previewed(shared, shared_loop, b"seeing,airmass\n1,2\n", "log.csv")
+    assert "seen" not in shared.upload.content.text.html and not shared.upload.content.figure.visible
+
+
 @pytest.mark.usefixtures("quick")
 def test_a_vibration_spectrum(dashboard: Dashboard, loop: Any) -> None:
     """10 um^2/Hz over 1 Hz about 30 Hz on tip, nothing on tilt; without a unit it is asked for."""

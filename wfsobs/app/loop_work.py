@@ -70,8 +70,8 @@ def compute(of: RunResults, watch: Watch, tell: Tell, memo: Memo | None = None) 
             spectra[outcome.controller] = psd(outcome.residual[start:], record.dt)
         if outcome.controller not in quick[:-1]:
             result = ClosedLoop(plan, record, tuple(outcomes))
-            source = of.result.prior_source
-            table = tuple(rows(result, None, source=source))
+            source, simulation = of.result.prior_source, of.simulation
+            table = tuple(rows(result, simulation.run.seed if simulation else None, source=source))
             shown = LoopResults(result, table, dict(spectra), linear, outcome.controller == names[-1], source)
             if not shown.complete:
                 tell(result=shown)

@@ -127,6 +127,7 @@ class UploadFields:
         said = "Trust sign and delay as stated", "Open loop: the mirror was at rest"
         self.trust, self.open_loop = (pmui.Checkbox(label=label, size="small", margin=(4, 0)) for label in said)
         self.widgets: Final = (self.unit, self.sign, self.delay, self.rate, self.gain, self.rail, self.trust, self.open_loop)
+        self._options: Final = {"--trust": self.trust, "--open-loop": self.open_loop, "--rail": self.rail}
         self._first: Final = [widget.value for widget in self.widgets]
         for widget in self.widgets:
             widget.param.watch(lambda _event: on_change(), "value")
@@ -135,6 +136,12 @@ class UploadFields:
         """Leave every question to the file."""
         for widget, value in zip(self.widgets, self._first, strict=True):
             widget.value = value
+
+    def name_fields(self, text: str) -> str:
+        """Name the fields in place of the options of commands."""
+        for option, widget in self._options.items():
+            text = text.replace(option, f"“{widget.label}”")
+        return signs(text)
 
     def read(self, roles: dict[str, str]) -> DeclaredFormat:
         """Read the fields; roles : of columns that have been chosen. Raises SettingError where a field holds no number."""
@@ -179,7 +186,9 @@ NOTHING = np.empty(0)
 class PreviewView:
     """The text and the figure of a preview."""
 
-    def __init__(self) -> None:
+    def __init__(self, in_words: Callable[[str], str]) -> None:
+        """Make them. in_words : writes a line of evidence as the page has it."""
+        self.in_words: Final = in_words
         self.text: Final = html(margin=(4, 0), styles=TEXT)
         self.figure: Final = new_spectrum(None, None)
         self.figure.name = "Spectrum of the record"
@@ -187,18 +196,19 @@ class PreviewView:
         for source, colour, mode in zip(self.sources, COLOURS, TIP_TILT, strict=True):
             self.figure.line("x", "y", source=source, color=colour, line_width=1.4, legend_label=mode.name)
 
-    def show(self, name: str, preview: Preview | SpectrumPreview | RecordError) -> None:
+    def show(self, name: str, preview: Preview | SpectrumPreview | None) -> None:
         """Show what was read of the file of this name; why it could not be stands above."""
-        known = None if isinstance(preview, RecordError) else preview
         self.figure.yaxis.axis_label = "PSD [µm²/Hz]" if isinstance(preview, SpectrumPreview) else "PSD of z [µm²/Hz]"
-        words = f"<p><b>{escape(name)}</b></p>{_list(known.lines() if known else [])}"
+        words = f"<p><b>{escape(name)}</b></p>{_list(preview.lines() if preview else [])}"
         if isinstance(preview, Preview):
-            words += f'<p>Evidence in the data:</p><div class="evidence">{_list(map(signs, preview.reading.lines()))}</div>'
+            words += (
+                f'<p>Evidence in the data:</p><div class="evidence">{_list(map(self.in_words, preview.reading.lines()))}</div>'
+            )
         self.text.html = words
-        self.figure.visible = known is not None
+        self.figure.visible = preview is not None
         for mode, source in enumerate(self.sources):
-            there = known is not None and mode < known.spectrum.shape[1]
-            x, y = (known.frequency, known.spectrum[:, mode]) if known and there else (NOTHING, NOTHING)
+            there = preview is not None and mode < preview.spectrum.shape[1]
+            x, y = (preview.frequency, preview.spectrum[:, mode]) if preview and there else (NOTHING, NOTHING)
             send(source, {"x": x[x > 0], "y": y[x > 0]})
 
 
@@ -282,17 +292,18 @@ class Upload:
         self.use: Final = make_button("Use this record", self.confirm, color="primary", margin=4)
         self.drop: Final = make_button("Discard", self.discard, variant="outlined", margin=4)
         self.missing: Final = html(margin=(8, 4))
-        self.content: Final = PreviewView()
+        self.fields: Final = UploadFields(self.look)
+        self.content: Final = PreviewView(self.fields.name_fields)
         self.form: ColumnForm | None = None
         proposals = {"variant": "outlined", "margin": 4, "visible": False}
         self.take: Final = make_button("Take the proposed sign and delay", self.take_proposals, **proposals)
         self.room: Final = pn.Column(visible=False, **WIDE)
         self._parcel = PartialFile()
         self._name, self._content, self._digest = "", b"", ""
+        self._digest_shown = ""  # SHA-256 of the file whose preview is shown
         self._preview: AnyPreview | None = None
         self.reading: Final = BackgroundTask(store.session)
         self.reading.param.watch(self._read, ["state", "place", "message"])
-        self.fields: Final = UploadFields(self.look)
         store.param.watch(self._follow, "scenario")
         store.param.watch(self._entitle, ["source", "wanted_record"])
 
@@ -396,11 +407,13 @@ class Upload:
             return
         self._preview = None if isinstance(preview, RecordError) else preview
         self.use.label = "Use this spectrum" if isinstance(preview, SpectrumPreview) else "Use this record"
-        self.picker.message = "" if self._preview else str(preview)
+        self.picker.message = "" if self._preview else self.fields.name_fields(str(preview))
         missing = self._obstacle(preview) if isinstance(preview, Preview) else ""
         self.missing.html = missing and f'<span role="status">{missing}</span>'
         self.use.disabled = self._preview is None or bool(missing)
-        self.content.show(self._name, preview)
+        if self._preview is not None or self._digest_shown != self._digest:  # else what was read before stays
+            self.content.show(self._name, self._preview)
+            self._digest_shown = self._digest
         self.take.visible = isinstance(preview, Preview) and differs_from_proposals(preview)
         self._lay_out()
 
@@ -410,7 +423,7 @@ class Upload:
             fit_to_record(preview.record, self.store.scenario)
         except SettingError as error:
             return name_settings(str(error))
-        return signs(preview.reading.missing)
+        return self.fields.name_fields(preview.reading.missing)
 
     def _ask(self, preview: ColumnsPreview) -> None:
         """Ask which column is what; read the file at once if its names tell enough."""

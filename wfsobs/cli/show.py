@@ -257,7 +257,7 @@ def budget_table(budgets: Sequence[Budget]) -> Table:
         if last != (it.target, it.mode):
             out.add_section()
         last = (it.target, it.mode)
-        parts = [(round(it.terms[name] * 1e6, 1) + 0.0, it.terms[name] / it.total) for name in TERMS]  # zero without a sign
+        parts = [(round(it.terms[name] * 1e6, 1) + 0.0, it.shares[name]) for name in TERMS]  # zero without a sign
         cells = (f"{part:.1f} {round(100.0 * share):4d} %" for part, share in parts)
         bound = "-" if it.bound is None else f"{it.bound * 1e6:.1f}"
         out.add_row(*last, row_label(it.observer), f"{sqrt(it.total) * 1e3:.2f}", f"{it.total * 1e6:.1f}", *cells, bound)

@@ -50,7 +50,7 @@ LIMITED = "theory and margins are not applicable: a limit of the mirror acts, an
 SUPERVISED = "no theory and no margins under supervision: an integrator may take over"
 """Why the others have none."""
 
-LEARNT = "an integrator closes its loop until its first window is full, at {:.2f} s; residuals count from {:.2f} s: not ranked"
+LEARNT = "an integrator closes its loop until its first window is full, at {:.5g} s; residuals count from {:.5g} s: not ranked"
 """What the residual of a controller that learns is of."""
 
 NOT_APPLICABLE = "n/a"

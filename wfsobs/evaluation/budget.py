@@ -112,6 +112,11 @@ class Budget:
     method: str = LINEAR
     reason: str = ""
 
+    @property
+    def shares(self) -> dict[str, float]:
+        """Term -> its share of the total; zero where there is no error."""
+        return {name: part / self.total if self.total else 0.0 for name, part in self.terms.items()}
+
 
 @dataclass(frozen=True)
 class Source:

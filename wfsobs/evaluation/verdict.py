@@ -247,11 +247,10 @@ class Verdict:
             percent = round(100.0 * share)
             reason = f"; {f'{percent} %' if percent < 100 else 'all'} of {their} error comes from {CAUSES[first.cause]}"
         elif self.lines:
-            shares = {
-                f"at peaks that are not in {their} {models}": others,
-                f"at peaks in {their} {models}": known,
-                "away from the peaks": 1.0 - known - others,
-            }
+            shares = {"at the peaks": known + others}
+            if first.place.knowledge in (PEAKS, ONE_PEAK):
+                shares = {f"at peaks that are not in {their} {models}": others, f"at peaks in {their} {models}": known}
+            shares["away from the peaks"] = 1.0 - known - others
             where, share = max(shares.items(), key=lambda item: item[1])
             reason = f"; {100.0 * share:.0f} % of {their} error lies {where}"
         knowledge = first.place.knowledge_clause(self.lines, several)
@@ -297,9 +296,9 @@ def verdict(
         assert truth is not None and start is not None and stop is not None
         error = (values[name] - truth[:, column])[round(start / record.dt) : round(stop / record.dt)]
         shares = _shares(error, record.dt, lines, given_lines(scenario, name, column))
-        terms, total = (explained[name].terms, explained[name].total) if name in explained else ({"": 0.0}, 1.0)
-        cause = max(terms, key=terms.__getitem__)
-        harms.append(Harm(places[name], worse, *shares, cause, terms[cause] / total))
+        parts = explained[name].shares if name in explained else {"": 0.0}
+        cause = max(parts, key=parts.__getitem__)
+        harms.append(Harm(places[name], worse, *shares, cause, parts[cause]))
     return Verdict(target, mode, tuple(places.values()), len(lines), tuple(harms), found.n_seeds, source)
 
 

@@ -14,7 +14,7 @@ import panel as pn
 import panel_material_ui as pmui
 
 from wfsobs.app.compared import name_of_difference
-from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.display import Display
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs import FAILED, RUNNING
 from wfsobs.app.live_work import live_job, record_saves
@@ -92,14 +92,12 @@ def live_html(loop: LiveLoop, view: LiveView, target: str, display: Display, sca
     )
 
 
-def control_html(loop: LiveLoop, seconds: float, display: Display) -> str:
+def control_html(loop: LiveLoop, seconds: float, display: Display, scale: float) -> str:
     """Write what every controller leaves, least first; nothing before one runs."""
     left = loop.control_view(seconds)
     if left is None or not loop.controllers:
         return ""
-    scenario, column = loop.scenario, display.column
-    wavelength = scenario.control.wavelength
-    mas = per_micrometre("mas", scenario.telescope.diameter) if scenario.modes[column].radial_order == 1 else float("nan")
+    wavelength = loop.scenario.control.wavelength
     found = [(name, left.rms(name), left.rms_since_start(name)) for name in loop.controllers]
 
     def strehl_text(rms: Array) -> str:
@@ -108,10 +106,10 @@ def control_html(loop: LiveLoop, seconds: float, display: Display) -> str:
     return render_part(
         "live_controllers",
         display,
-        found=sorted(found, key=lambda one: inf if isnan(one[1][column]) else one[1][column]),
+        found=sorted(found, key=lambda one: inf if isnan(one[1][display.column]) else one[1][display.column]),
         has_truth=loop.source.has_truth,
-        mas=mas,
         seconds=seconds,
+        scale=scale,
         strehl=strehl_text,
         wavelength=wavelength,
     )
@@ -299,7 +297,7 @@ class LiveRoom:
         self._bounds = loop.workshop.bounds(loop.scenario)
         self.legend.html = self._legend(loop, target)
         self.table.html = live_html(loop, view, target, self.display, scale, self._bounds)
-        self.control_table.html = control_html(loop, self.controls.window.value, self.display)
+        self.control_table.html = control_html(loop, self.controls.window.value, self.display, scale)
         self.news.html = events_html(loop.events, loop.sampling.dt)
         self.peaks.html = peaks_html(loop.workshop.change, scale, self.display.unit_label)
 

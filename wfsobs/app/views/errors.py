@@ -606,8 +606,8 @@ class Strip:
         it = self.budgets.budget(score.observer, self.target, self.display.mode)
         if it is None or not it.terms:
             return {}
-        whole, scale = sum(max(part, 0.0) for part in it.terms.values()), self.display.scale(results.scenario)
-        percent = {name: f"{round(100.0 * part / it.total)} %".replace("-", "−") for name, part in it.terms.items()}
+        whole, scale = sum(max(part, 0.0) for part in it.terms.values()) or 1.0, self.display.scale(results.scenario)
+        percent = {name: f"{round(100.0 * share)} %".replace("-", "−") for name, share in it.shares.items()}
         return {
             "parts": [
                 [TERM_COLOURS[name], max(part, 0.0) / whole, f"{BUDGET_TERMS[name]} {percent[name]}", name]
