@@ -15,7 +15,7 @@ from tests.test_plant import closed_loop as loop_of_plant
 from tests.test_plant import rotation
 from wfsobs.cli import main
 from wfsobs.cli.options import DeclaredFile, load_declared
-from wfsobs.identification.plant import contradiction
+from wfsobs.identification.plant import Contradiction, contradiction
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -89,8 +89,8 @@ def test_undecided_where_the_record_does_not_say() -> None:
     slow = command_response(Record(y, u, 1e-3))
     assert slow is not None and slow.sign == 1 and slow.delay is None and slow.margin < DECIDED
     assert "delay undecided" in slow.lines()[1] and slow.lines()[1].endswith("3 are needed")
-    told = Reading(response=slow, contradiction="command delay 2 is excluded by the data")
-    assert told.lines() == slow.lines()[:1], "the likelihood decides it"
+    told = Reading(response=slow, contradiction=Contradiction("command delay 2 is excluded by the data"))
+    assert told.lines() == [told.contradiction.text], "the likelihood decides it"
     assert command_response(Record(y[:300], u[:300], 1e-3)) is None
     assert command_response(Record(y, np.zeros_like(u), 1e-3)) is None
 
@@ -163,11 +163,14 @@ def test_what_the_data_exclude(disturbance: Array, delay: int, steps: int) -> No
     noise = NOISE * np.random.default_rng(3).standard_normal(disturbance.shape)
     record = closed_loop(disturbance, noise, 1, delay)
     record = replace(record, y_lgs=record.y_lgs[:steps], u=record.u[:steps] + 30.0, delay=delay)
-    assert contradiction(record) == ""
+    assert contradiction(record) is None
     reverse = contradiction(replace(record, u=-record.u), -1)
-    assert reverse.startswith("command sign -1 is excluded by the data") and reverse.endswith(" with +1")
+    assert reverse is not None and reverse.proposal == {"command_sign": 1}
+    assert reverse.text.startswith("command sign -1 is excluded by the data") and reverse.text.endswith(" with +1")
     if delay < 3:
-        assert contradiction(replace(record, delay=5)).startswith("command delay 5 is excluded by the data, which")
+        late = contradiction(replace(record, delay=5))
+        assert late is not None and late.text.startswith("command delay 5 is excluded by the data, which")
+        assert late.proposal["command_delay"] == pytest.approx(delay, abs=0.1)
 
 
 @pytest.mark.slow
@@ -176,7 +179,11 @@ def test_what_the_data_exclude(disturbance: Array, delay: int, steps: int) -> No
     [
         (1.5, np.eye(2), r"command delay 2 is excluded by the data, .* with (1\.\d+) \+- .*"),
         (2.0, 1.25 * np.eye(2), r"command gain 1 of (?:tip|tilt) is excluded by the data, .* with (1\.\d+) \+- .*"),
-        (2.0, rotation(np.radians(96.0)), r"command rotation 0 is excluded by the data, .* with \+(9\d\.\d) degrees, y = R u"),
+        (
+            2.0,
+            rotation(np.radians(96.0)),
+            r"command rotation 0 is excluded by the data, .* with \+(9\d\.\d) degrees, y = R u; .*",
+        ),
         (2.0, np.diag([1.0, -1.0]), r"command sign (\+1) of tilt is excluded by the data, .* with -1, .*"),
         (2.0, np.diag([-1.0, 1.0]), r"command sign (\+1) of tip is excluded by the data, .* with -1, .*"),
         (2.0, np.eye(2), ""),
@@ -184,8 +191,10 @@ def test_what_the_data_exclude(disturbance: Array, delay: int, steps: int) -> No
 )
 def test_what_else_the_data_exclude(delay: float, matrix: Array, line: str) -> None:
     """Read as of two frames, gain 1, no rotation; numbers within five of the deviations that are usual in 20 s."""
-    found = re.fullmatch(line, contradiction(replace(loop_of_plant(20_000, delay, matrix, gain=0.4), delay=2)))
+    why = contradiction(replace(loop_of_plant(20_000, delay, matrix, gain=0.4), delay=2))
+    found = re.fullmatch(line, why.text if why else "")
     assert found, line
+    assert why is None or set(why.proposal) == ({"command_delay"} if "delay" in line else set()), "what a page has a field for"
     right = {1.5: 1.5}.get(delay, float(matrix[0, 0]) if line.startswith("command gain") else 96.0)
     if "+-" in line or "degrees" in line:
         assert float(found[1]) == pytest.approx(right, abs=5.0 * (0.3 if "degrees" in line else 0.03))
@@ -213,7 +222,7 @@ def test_what_does_not_decide_is_not_excluded() -> None:
     last = [(noise, half), (half, slow), (ramp, ramp), (noise, np.sign(ramp - 2500.5))]
     for y, commands in ((noise, u), (noise[:300], u[:300]), (noise, 0.0 * u), (noise, -slow), (u, u), *last):
         for sign in (1, -1):
-            assert contradiction(Record(y, sign * commands, 1e-3)) == ""
+            assert contradiction(Record(y, sign * commands, 1e-3)) is None
     assert command_response(Record(np.ones_like(noise), u, 1e-3)) is None
 
 
@@ -223,15 +232,15 @@ def test_missing_frames_exclude_no_delay(disturbance: Array, rows: slice) -> Non
     """Of a sensor that is slower than the commands, one row in two or three."""
     record = closed_loop(disturbance, NOISE * np.random.default_rng(1).standard_normal(disturbance.shape), 1, 2)
     record.y_lgs[rows] = np.nan
-    assert contradiction(record) == ""
+    assert contradiction(record) is None
 
 
 @pytest.mark.slow
 def test_every_way_in_refuses_a_wrong_sign_unless_it_is_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each asks for what the data exclude; of the same record that is found out once."""
-    known: dict[tuple[object, ...], str] = {}
+    known: dict[tuple[object, ...], Contradiction | None] = {}
 
-    def once(record: Record, *stated: Any) -> str:
+    def once(record: Record, *stated: Any) -> Contradiction | None:
         key = record.y_lgs.tobytes(), record.u.tobytes(), record.delay, stated
         known[key] = known[key] if key in known else contradiction(record, *stated)
         return known[key]
@@ -256,4 +265,5 @@ def test_every_way_in_refuses_a_wrong_sign_unless_it_is_trusted(tmp_path: Path, 
         load(wrong)
     assert load(wrong, trust=True).n_steps == record.n_steps
     found = preview(wrong.read_bytes(), "wrong.npz")
-    assert isinstance(found, Preview) and "trust what is stated: command sign +1 is excluded" in found.reading.missing
+    assert isinstance(found, Preview) and "trust what is stated" in found.reading.missing
+    assert found.reading.proposal == {"command_sign": -1} and found.reading.is_stated

@@ -39,7 +39,7 @@ from wfsobs.settings.values import SettingError
 from wfsobs.telemetry.columns import ROLES
 from wfsobs.telemetry.formats import FORMATS
 from wfsobs.telemetry.intake import DeclaredFormat
-from wfsobs.telemetry.preview import ColumnsPreview, Preview, SpectrumPreview, preview_any, safe_name
+from wfsobs.telemetry.preview import ColumnsPreview, Preview, Reading, SpectrumPreview, preview_any, safe_name
 from wfsobs.telemetry.records import TEMPLATE, sample_csv
 from wfsobs.units import UNITS
 
@@ -151,17 +151,12 @@ class UploadFields:
         mirror = {"command_gain": None if gain is None else (gain,), "rail": rail, "open_loop": self.open_loop.value}
         return DeclaredFormat(unit, self.sign.value or None, delay, rate, roles, self.trust.value, **mirror)
 
-    def take_proposals(self, preview: Preview) -> None:
+    def take_proposals(self, reading: Reading) -> None:
         """Fill in the sign and the delay that the data propose."""
-        if (found := preview.reading.response) is not None:
-            self.sign.value = found.sign or self.sign.value
-            self.delay.value = str(found.delay) if found.delay else self.delay.value
-
-
-def differs_from_proposals(preview: Preview) -> bool:
-    """Return whether the data propose another sign or delay than those with which the record was read."""
-    found, sign, delay = preview.reading.response, preview.reading.sign, preview.record.delay
-    return found is not None and (found.sign not in (None, sign) or found.delay not in (None, delay))
+        found = reading.proposal
+        self.trust.value = self.trust.value or reading.is_stated
+        self.sign.value = found.get("command_sign", self.sign.value)
+        self.delay.value = f"{found['command_delay']:g}" if "command_delay" in found else self.delay.value
 
 
 def _number(field: Any, least: float) -> Any:
@@ -370,7 +365,7 @@ class Upload:
     def take_proposals(self) -> None:
         """Fill in the sign and the delay that the data propose."""
         if isinstance(self._preview, Preview):
-            self.fields.take_proposals(self._preview)
+            self.fields.take_proposals(self._preview.reading)
 
     def look(self) -> None:
         """Read the file, beside the page, as what the fields say."""
@@ -414,7 +409,7 @@ class Upload:
         if self._preview is not None or self._digest_shown != self._digest:  # else what was read before stays
             self.content.show(self._name, self._preview)
             self._digest_shown = self._digest
-        self.take.visible = isinstance(preview, Preview) and differs_from_proposals(preview)
+        self.take.visible = isinstance(preview, Preview) and bool(preview.reading.proposal)
         self._lay_out()
 
     def _obstacle(self, preview: Preview) -> str:

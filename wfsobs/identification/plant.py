@@ -456,8 +456,26 @@ OFF_DELAY, OFF_GAIN, TURNED = 0.2, 0.1, 10.0
 """Distance of a delay [frames], a gain and an angle [degrees] from what is stated below which a record is not refused."""
 
 
-def contradiction(record: Record, sign: int = 1, delay: float | None = None, gain: Sequence[float] = (1.0,)) -> str:
-    """Return in a line why the data exclude the plant with which a record was read; empty where they do not.
+@dataclass(frozen=True)
+class Contradiction:
+    """Why the data exclude how a record was read.
+
+    Attributes
+    ----------
+    text : str
+        In a line.
+    proposal : dict of str to float
+        What to state in place of the sign or the delay, by the names of `DeclaredFormat`; empty where it is something else.
+    """
+
+    text: str
+    proposal: dict[str, float] = field(default_factory=dict)
+
+
+def contradiction(
+    record: Record, sign: int = 1, delay: float | None = None, gain: Sequence[float] = (1.0,)
+) -> Contradiction | None:
+    """Return why the data exclude the plant with which a record was read; None where they do not.
 
     The likeliest plant near the stated one, of tip and tilt over CHECKED frames, is compared with the stated one, each with the
     spectra that are likeliest for it. A loop that reduces an error tells sign and rotation besides, where what is new in its
@@ -473,14 +491,16 @@ def contradiction(record: Record, sign: int = 1, delay: float | None = None, gai
     y, u = (x[:, : len(TIP_TILT)] for x in known_signals(record, CHECKED))
     moving = np.flatnonzero(np.ptp(u, axis=0) > 0)
     if len(y) < SHORTEST or not moving.size or record.delay > LONGEST or np.isnan(y).mean(axis=0).max() > MOST_MISSING:
-        return ""
+        return None
     y, u = (x[:, moving] / np.nanstd(y) for x in (y, u))
     with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):  # numbers without noise decide nothing
         return _contradiction_of(PlantLikelihood(y, u, record.dt), record.delay, (sign, delay or record.delay, gain), moving)
-    return ""
+    return None
 
 
-def _contradiction_of(data: PlantLikelihood, delay: int, statement: tuple[int, float, Sequence[float]], moving: Array) -> str:
+def _contradiction_of(
+    data: PlantLikelihood, delay: int, statement: tuple[int, float, Sequence[float]], moving: Array
+) -> Contradiction | None:
     k, (guess, excited, _) = moving.size, guess_plant(data)
     names, ways = [TIP_TILT[i].name for i in moving], (*statement[:2], np.resize(statement[2], k))
     stated = np.concatenate([np.full(k, float(delay)), np.ones(k), np.zeros(k - 1)])
@@ -492,7 +512,7 @@ def _contradiction_of(data: PlantLikelihood, delay: int, statement: tuple[int, f
     if not is_turned and _is_far(new):  # from a delay that is frames off there is no way to the right one
         new = _nearest(data, np.concatenate([np.full(k, np.mean(guess[:k])), guess[k:]]), ties)
     if (_is_far(new) and not is_turned) or not _what_is_off(new, stated, names, ways):
-        return ""
+        return None
     new = data.fit(data.with_spectra(new.theta, new.spectra, MOST_PEAKS, plain=False), ties)
     # where nothing excites the loop, a plant is known as well as the form of the background
     rests_on_form = any(s.background for s in new.spectra) and excited < EXCITED and not is_turned
@@ -502,8 +522,10 @@ def _contradiction_of(data: PlantLikelihood, delay: int, statement: tuple[int, f
     old = _likeliest(*(data.fit(one, ties[:, :0]) for one in again))
     worth, better = old.criterion - new.criterion, _what_is_off(new, stated, names, ways)
     if not worth > CLEAR * (FORM if rests_on_form else 1.0) or not better:
-        return ""
-    return f"command {better[0]} is excluded by the data, which are likelier by {worth:.0f} (log-likelihood) with {better[1]}"
+        return None
+    what, there, proposal = better
+    text = f"command {what} is excluded by the data, which are likelier by {worth:.0f} (log-likelihood) with {there}"
+    return Contradiction(text, proposal)
 
 
 def _nearest(data: PlantLikelihood, theta: Array, ties: Array) -> PlantFit:
@@ -521,8 +543,10 @@ def _is_far(fit: PlantFit) -> bool:
     return bool(np.any((gains < NEAR[0]) | (gains > NEAR[1])))
 
 
-def _what_is_off(fit: PlantFit, theta: Array, names: Sequence[str], ways: tuple[int, float, Array]) -> tuple[str, str] | None:
-    """Return what of a stated plant is off the fitted one, and what it is there; None where nothing is.
+def _what_is_off(
+    fit: PlantFit, theta: Array, names: Sequence[str], ways: tuple[int, float, Array]
+) -> tuple[str, str, dict[str, float]] | None:
+    """Return what of a stated plant is off the fitted one, what it is there, and what to state; None where nothing is.
 
     ways : sign, delay and gains as they were stated
     """
@@ -531,15 +555,18 @@ def _what_is_off(fit: PlantFit, theta: Array, names: Sequence[str], ways: tuple[
     least = np.array([OFF_DELAY] * k + [OFF_GAIN] * k + [np.radians(TURNED)] * (k - 1))
     is_off: Array = np.abs(off) > np.maximum(SURE * sd, np.where(sd > 0.0, least, np.inf))
     turn, is_flipped = float(np.degrees(off[-1])) if k == 2 else 0.0, fit.theta[k : 2 * k] < 0
+    late = delay + float(off[0])
+    proposed = round(late) if abs(late - round(late)) < 3.0 * sd[0] else float(f"{late:.3g}")
+    delays: dict[str, float] = {"command_delay": proposed} if is_off[0] else {}
     if is_flipped.any() and not is_flipped.all():
-        return f"sign {sign:+d} of {names[int(abs(turn) < 90.0)]}", f"{-sign:+d}, and that of the other mode as it is"
+        return f"sign {sign:+d} of {names[int(abs(turn) < 90.0)]}", f"{-sign:+d}, and that of the other mode as it is", {}
     if is_flipped.any() or abs(turn) > 135.0:
-        return f"sign {sign:+d}", f"{-sign:+d}"
+        return f"sign {sign:+d}", f"{-sign:+d}", {"command_sign": -sign, **delays}
     if is_off[0]:
-        return f"delay {delay:g}", PlantNumber(delay + float(off[0]), float(sd[0])).text()
+        return f"delay {delay:g}", PlantNumber(late, float(sd[0])).text(), delays
     if is_off[2 * k :].any():
-        return "rotation 0", f"{turn:+.1f} degrees, y = R u"
+        return "rotation 0", f"{turn:+.1f} degrees, y = R u; R^-1 as --command-modes of wfsobs convert turns them", {}
     for i in np.flatnonzero(is_off[k : 2 * k]).tolist():
         of = f" of {names[i]}" * (k == 2)
-        return f"gain {gains[i]:g}{of}", PlantNumber(*(float(gains[i] * x) for x in (fit.theta[k + i], sd[k + i]))).text()
+        return f"gain {gains[i]:g}{of}", PlantNumber(*(float(gains[i] * x) for x in (fit.theta[k + i], sd[k + i]))).text(), {}
     return None

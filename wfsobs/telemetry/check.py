@@ -172,7 +172,7 @@ def _unit(record: Record, reading: Reading) -> Iterator[Remark]:
 
 def _plant(record: Record, reading: Reading) -> tuple[tuple[GroupPlant, ...], list[Remark]]:
     """Return the plant, as far as it can be looked for, and the findings on the commands."""
-    found = [Remark("commands", "excluded", reading.contradiction)] if reading.contradiction else []
+    found = [Remark("commands", "excluded", reading.contradiction.text)] if reading.contradiction else []
     found += [Remark("mirror", "note", line) for line in reading.limits]
     if not record.u.any():
         what = "not used, as stated" if "u not used" in record.origin else "none"

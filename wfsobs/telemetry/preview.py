@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from wfsobs.identification.plant import Contradiction
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import DELAY, Record, RecordError, hold_last
 from wfsobs.scenario import Scenario
@@ -50,27 +51,42 @@ class Reading:
         Units under which the size of z is plausible -> its rms [um]; empty where the file or the user states the unit.
     limits : list of str
         What the data say of commands at the limit of the mirror, a line per mode.
-    contradiction : str
+    contradiction : Contradiction or None
         Why the data exclude its commands or its unit, unless that is trusted.
     delay : float
         Delay of the commands as the file or the user states it, with its fraction [steps].
     gain : tuple of float or None
         What the mirror does of a command as the user states it, one number or one per mode.
+    is_stated : bool
+        Whether the file states the sign or the delay.
     """
 
     sign: int = 1
     response: CommandResponse | None = None
     units: dict[str, float] = field(default_factory=dict)
     limits: list[str] = field(default_factory=list)
-    contradiction: str = ""
+    contradiction: Contradiction | None = None
     delay: float = DELAY
     gain: tuple[float, ...] | None = None
+    is_stated: bool = False
+
+    @property
+    def proposal(self) -> dict[str, float]:
+        """What the data propose in place of the sign and the delay as they were read, by the names of `DeclaredFormat`."""
+        if self.contradiction is not None:  # of whole frames and of no rotation, the response is less
+            return self.contradiction.proposal
+        if self.response is None or self.delay % 1:
+            return {}
+        found = (("command_sign", self.response.sign, self.sign), ("command_delay", self.response.delay, self.delay))
+        return {name: value for name, value, read in found if value not in (None, read)}
 
     def lines(self) -> list[str]:
         """Return the evidence, a line each."""
         lines = self.response.lines() if self.response else ["sign and delay: too few steps, or commands that do not move"]
-        if self.contradiction.startswith("command delay"):
-            lines = [line for line in lines if "delay undecided" not in line]
+        if self.contradiction is not None and self.contradiction.text.startswith("command"):
+            lines = [self.contradiction.text]
+        elif self.delay % 1:  # the response is of whole frames
+            lines = lines[:1]
         lines += self.limits
         if self.units:
             ways = " or ".join(f"{unit} ({float(f'{1e3 * rms:.3g}'):g} nm rms of z)" for unit, rms in self.units.items())
@@ -81,7 +97,7 @@ class Reading:
     def missing(self) -> str:
         """What to say before the record can be used, in a line; empty where nothing is."""
         if set(self.units) <= {"um"}:
-            return self.contradiction and f"State what the data say, or trust what is stated: {self.contradiction}."
+            return "State what the data say, or trust what is stated." if self.contradiction else ""
         return f"Choose the unit first: the file does not say it, and the numbers are plausible as {' or '.join(self.units)}."
 
 
@@ -269,7 +285,8 @@ def read_off(record: Record, contents: Contents, declaration: DeclaredFormat, sc
     response = command_response(replace(record, u=sign * record.u))
     excluded = contradiction_of(record, contents, declaration, scenario)
     stated = stated_delay(contents, declaration), declaration.command_gain
-    return Reading(sign, response, units, saturation_lines(record, declaration.rail), excluded, *stated)
+    is_stated = not contents.arrays.keys().isdisjoint({"command_sign", "delay"})
+    return Reading(sign, response, units, saturation_lines(record, declaration.rail), excluded, *stated, is_stated)
 
 
 def safe_name(name: str) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from wfsobs.files import write_whole
-from wfsobs.identification.plant import contradiction
+from wfsobs.identification.plant import Contradiction, contradiction
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
@@ -257,19 +257,20 @@ def read_with_delay(
         contents = read_contents(file, name, stated.columns, most)
         record = to_record(contents, scenario := scenario or Scenario(), stated)
         if why := contradiction_of(record, contents, stated, scenario):
-            raise RecordError(f"{why}; --trust goes on")
+            raise RecordError(f"{why.text}; --trust goes on")
         return record, stated_delay(contents, stated)
     except RecordError as error:
         raise RecordError(f"{name.removesuffix('/.npz')}: {error}") from None
 
 
-def contradiction_of(record: Record, contents: Contents, declaration: DeclaredFormat, scenario: Scenario) -> str:
-    """Return why the data exclude the plant or the unit with which a record was read; empty where they do not, or are not to."""
+def contradiction_of(record: Record, contents: Contents, declaration: DeclaredFormat, scenario: Scenario) -> Contradiction | None:
+    """Return why the data exclude the plant or the unit with which a record was read; None where they do not, or are not to."""
     if declaration.trust:
-        return ""
+        return None
     units = plausible_units(record, contents, declaration, scenario)
     if units and not PLAUSIBLE[0] / FAR < z_rms(record) < PLAUSIBLE[1] * FAR:
-        return f"no unit is stated, and um is excluded by the size of z, plausible as {' or '.join(units)}: state the unit"
+        plausible = " or ".join(units)
+        return Contradiction(f"no unit is stated, and um is excluded by the size of z, plausible as {plausible}: state the unit")
     stated = stated_sign(contents, declaration), stated_delay(contents, declaration), declaration.command_gain or (1.0,)
     return contradiction(record, *stated)
 
