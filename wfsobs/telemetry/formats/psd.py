@@ -31,7 +31,7 @@ FEWEST_BINS = 8
 UNEVEN = 0.01
 """Maximum relative difference of the spaces between bins, which short numbers round."""
 
-SQUARED = re.compile(r"(?P<unit>[A-Za-zµμ]+)\s*(?:\^|\*\*)?2\s*(?:/\s*|\s)Hz(?:\^?-1)?")
+SQUARED = re.compile(r"(?P<unit>[A-Za-zµμ]+)\s*(?:(?:\^|\*\*)?2|²)\s*(?:/\s*|\s)Hz(?:\^?-1|⁻¹)?")
 Table = tuple[dict[str, Array], dict[str, str]]
 """Columns, and their units in the file."""
 
