@@ -228,6 +228,25 @@ def test_every_file_gives_the_record_and_says_what_is_guessed(name: str, content
     assert (record.dt, record.delay, record.missing, record.origin) == (0.001, 2, 0, origin)
 
 
+@pytest.mark.parametrize("kind", [pa.list_(pa.float64()), pa.list_(pa.float64(), 2), pa.list_(pa.int32(), 2)])
+@pytest.mark.parametrize("lost", [[7], [0, 1, 5], [N - 2, N - 1], [*range(0, N, 2)]])
+@pytest.mark.parametrize("names", [("y_lgs", "u"), ("slopes", "cmd")])
+def test_null_lists_are_missing_samples(kind: pa.DataType, lost: list[int], names: tuple[str, str]) -> None:
+    """Also half of them, which are as many numbers as lists of one number would be, and those at the end."""
+    rows = np.round(Y).tolist()
+    for row in lost:
+        rows[row] = None
+    rows[20] = [None, 3.0]
+    content = parquet(**dict(zip(names, (pa.array(rows, kind), pa.array(U.tolist())), strict=True)))
+    stated = DeclaredFormat(
+        columns=dict(zip(("y_lgs", "u"), names, strict=True)) if names[0] != "y_lgs" else {}, **KHZ, trust=True
+    )
+    expected = np.round(Y)
+    expected[lost], expected[20] = np.nan, (np.nan, 3.0)
+    record = read_record(io.BytesIO(content), "a.parquet", declaration=stated)
+    np.testing.assert_allclose(record.y_lgs, 1e-3 * expected, rtol=1e-12)
+
+
 def test_a_folder_of_arrays_on_the_command_line(tmp_path: Path) -> None:
     """Which column is what by --column, or by a table of a settings file."""
     (tmp_path / "night").mkdir()
@@ -366,6 +385,13 @@ CELLS[:] = [Y, U]
         ("a.sav", b"no", "damaged, or not a save file of IDL"),
         ("a.parquet", b"PAR1", "damaged, or not a Parquet file"),
         ("a.parquet", parquet(y_lgs=[{"a": 1}]), "y_lgs holds struct<a: int64>, not numbers"),
+        (
+            "a.parquet",
+            parquet(y_lgs=[[1.0], None, [2.0, 3.0, 4.0]]),
+            "y_lgs holds lists of 1 to 3 numbers; it takes lists of one",
+        ),
+        ("a.parquet", parquet(y_lgs=[["a"]]), "y_lgs holds list<element: string>, not numbers"),
+        ("a.parquet", parquet(y_ngs=pa.array([None, None], pa.list_(pa.float64()))), "y_ngs is empty"),
         ("a.npy", saved(lambda file: np.save(file, CELLS, allow_pickle=True)), "damaged, or holds more than plain arrays"),
     ],
 )

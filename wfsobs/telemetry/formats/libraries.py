@@ -14,7 +14,7 @@ import sys
 import tempfile
 import warnings
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from math import prod
 from typing import IO, Any
 
@@ -23,6 +23,7 @@ import numpy as np
 from wfsobs.record import RecordError
 from wfsobs.telemetry.formats.contents import (
     DEEPEST,
+    FAST,
     NUMBERS,
     STAMP,
     TEXTS,
@@ -325,7 +326,8 @@ def read_parquet(file: IO[bytes], most: int) -> FileColumns:
                 out.add(name, float(value) if name in NUMBERS else value)
         for field in source.schema_arrow:
             of = field.type.value_type if types.is_list(field.type) or types.is_fixed_size_list(field.type) else field.type
-            if not (types.is_integer(of) or types.is_floating(of) or types.is_timestamp(of) or types.is_string(of)):
+            alone = of is field.type and (types.is_timestamp(of) or types.is_string(of))
+            if not (types.is_integer(of) or types.is_floating(of) or alone):
                 out.leave(field.name, f"{field.name} holds {str(field.type)[:40]}, not numbers")
                 continue
             column = source.read([field.name]).column(0)
@@ -334,21 +336,24 @@ def read_parquet(file: IO[bytes], most: int) -> FileColumns:
 
 
 def _add_column(out: FileColumns, name: str, column: Any, is_list: bool) -> None:
-    """Add a column of Arrow, without the nulls that end it; those before are missing samples."""
-    valid = np.flatnonzero(column.is_valid())
-    column = column.slice(0, valid[-1] + 1 if valid.size else 0)
-    n = len(column)
+    """Add a column of Arrow, whose nulls are missing samples; without those that end what may be shorter than the record."""
+    valid = np.asarray(column.is_valid())
+    if name.lower() not in FAST:
+        valid = valid[: np.flatnonzero(valid).max(initial=-1) + 1]
+        column = column.slice(0, len(valid))
     if is_list:
-        column = column.flatten()
-    if n and column.type == "string":
-        texts: Iterable[str] = (str(x.as_py()) for x in column)
-        if not STAMP.fullmatch(next(iter(texts)).strip()):
-            out.leave(name, f"{name} holds text, not numbers")
-            return
-        out.add(name, np.array([parse_cell(str(x.as_py() or "")) for x in column]), "s")
-    elif n and len(column) % n == 0:
+        lengths = np.unique(column.value_lengths().drop_null())
+        if lengths.size > 1:
+            return out.leave(name, f"{name} holds lists of {lengths[0]} to {lengths[-1]} numbers; it takes lists of one length")
+        values = np.full((len(valid), *lengths), np.nan)
+        values[valid] = column.flatten().to_numpy(zero_copy_only=False).reshape(-1, *lengths)
+    elif column.type == "string":
+        if valid.any() and not STAMP.fullmatch(column.drop_null()[0].as_py().strip()):
+            return out.leave(name, f"{name} holds text, not numbers")
+        return out.add(name, np.array([parse_cell(x or "") for x in column.to_pylist()]), "s")
+    else:
         values = column.to_numpy(zero_copy_only=False)
-        out.add(name, values.reshape(n, -1) if is_list else values)
+    out.add(name, values)
 
 
 def write_parquet(file: IO[bytes], arrays: Mapping[str, Array]) -> None:
