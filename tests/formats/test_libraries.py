@@ -134,6 +134,25 @@ def of_matlab_73(f: h5py.File) -> None:
     f["y_lgs"], f["u"], f["dt"] = Y.T, U.T, np.array([[1e-3]])
 
 
+def as_matlab_73(name: str, values: np.ndarray, **attributes: Any) -> Callable[[h5py.File], None]:
+    """Return what adds an array, and a loop in a structure, as MATLAB does: axes the other way round, texts as numbers."""
+
+    def fill(f: h5py.File) -> None:
+        numbers = {"loop/wfs/slopes": Y.T, "loop/dm/cmd": U.T, "loop/fs": np.array([[1000.0]]), name: values}
+        for path, array in numbers.items():
+            f[path] = array
+            f[path].attrs["MATLAB_class"] = np.bytes_("double")
+        f[name].attrs.update(attributes)
+        f["loop/wfs/unit"] = np.array([[ord(letter)] for letter in "nm"], np.uint16)
+        f["loop/wfs/unit"].attrs["MATLAB_class"] = np.bytes_("char")
+
+    return fill
+
+
+NOTHING = {"MATLAB_empty": np.uint8(1)}
+SIZES = np.array([0, 0], np.uint64)
+
+
 def array(kind: str) -> bytes:
     rows = np.c_[Y, U] if kind == "plain" else np.rec.fromarrays([*Y.T, *U.T], names="a,b,c,d")
     return saved(lambda file: np.save(file, rows))
@@ -157,6 +176,15 @@ CASES: list[tuple[str, bytes, dict[str, Any], str]] = [
         matlab(d={"s": Y, "c": U, "fs": 1000, "unit": "nm"}),
         {"columns": {"y_lgs": "d.s", "u": "d.c"}},
         "unit nm, 1000 Hz by d.fs",
+    ),
+    *(
+        (
+            "a.mat",
+            hdf5(as_matlab_73("info", SIZES, **NOTHING), 512),
+            {"columns": {"y_lgs": f"loop{sign}wfs{sign}slopes", "u": f"loop{sign}dm{sign}cmd"}},
+            "unit nm, 1000 Hz by loop.fs, column info not used",
+        )
+        for sign in "./"
     ),
     ("a.mat", hdf5(of_matlab_73, 512), NM, "unit nm, y_lgs and u with a row per mode"),
     (
@@ -372,6 +400,13 @@ CELLS[:] = [Y, U]
     ("name", "content", "line"),
     [
         ("a.mat", matlab(y_lgs=CELLS, u=U), "y_lgs is a MATLAB cell, which is not read"),
+        ("a.mat", hdf5(as_matlab_73("y_ngs", SIZES, **NOTHING), 512), "y_ngs is empty"),
+        (
+            "a.mat",
+            hdf5(as_matlab_73("flux", Y.T), 512),
+            "has no y_lgs; a record needs y_lgs, u and dt; as its names suggest: --column "
+            "'u=loop.dm.cmd' --column 'y_lgs=loop.wfs.slopes'",
+        ),
         ("a.mat", matlab(y_lgs=np.rec.fromarrays([[1, 2]], names="a"), u=U), "y_lgs is a MATLAB struct, which is not read"),
         ("a.mat", b"MATLAB 5.0 MAT-file" + bytes(9), "damaged, or not a MATLAB file"),
         ("a.h5", hdf5(referring), "y_lgs holds objects or references, not numbers"),

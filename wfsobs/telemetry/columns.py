@@ -76,7 +76,7 @@ def to_contents(file: FileColumns, roles: Mapping[str, str]) -> Contents:
     if unknown := [role for role in roles if role not in ROLES | SIGNALS]:
         columns, arrays = ", ".join(ROLES), ", ".join(SIGNALS)
         raise RecordError(f"{unknown[0][:80]!r} is no part of a record; a column is one of {columns}, an array one of {arrays}")
-    roles = dict(pair for role, name in roles.items() for pair in _each_mode(file, role, name))
+    roles = dict(pair for role, name in roles.items() for pair in _each_mode(file, role, file.own_name(name)))
     for role, name in roles.items():
         if name in file.texts:
             raise RecordError(file.texts[name])
@@ -334,7 +334,7 @@ def matrix_of(file: FileColumns, source: str, name: str = "") -> LoopMatrix:
         found.setdefault(key.partition("[")[0], []).append(values)
     if not name and (len(found) > 1 and all(len(columns) == 1 for columns in found.values())):  # a table without names
         found = {"": [column for columns in found.values() for column in columns]}
-    name = name or (next(iter(found)) if len(found) == 1 else "")
+    name = file.own_name(name) or (next(iter(found)) if len(found) == 1 else "")
     if name not in found:
         what = f"has no matrix {name!r}; it" if name else "which of its arrays is the matrix? It"
         raise RecordError(f"{source}: {what} has {', '.join(sorted(found)[:20])}: give FILE:NAME")

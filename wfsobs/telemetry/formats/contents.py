@@ -178,6 +178,11 @@ class FileColumns(Contents):
         else:
             self.leave(name, f"{name} holds text, not numbers")
 
+    def own_name(self, name: str) -> str:
+        """Return a name as the file has it: `s/field`, as MATLAB stores it in version 7.3, is `s.field`."""
+        known = (*self.columns, *self.texts)
+        return next((x for x in (name, name.replace("/", ".")) if any(key.startswith(x) for key in known)), name)
+
     def leave(self, name: str, why: str) -> None:
         """Leave out what holds no numbers. Raises RecordError with that reason where it has the name of a part of a record."""
         if name.lower() in (*SIGNALS, *CLOCKS, STARS, APART, *NUMBERS) or parse_heading(name):

@@ -70,7 +70,7 @@ def read_matlab(file: IO[bytes], most: int) -> FileColumns:
     """
     head = file.read(USERBLOCK + len(HDF5))
     if head.endswith(HDF5) or head.startswith(HDF5):
-        return read_hdf5(file, most)
+        return read_hdf5(file, most, ".")
     out, content = FileColumns(most=most), read_at_most(file, most)
     with refuse_damage("damaged, or not a MATLAB file"):
         if (order := {b"IM": "<", b"MI": ">"}.get(content[126:128])) is None:
@@ -157,9 +157,10 @@ def write_matlab(file: IO[bytes], arrays: Mapping[str, Array]) -> None:
 DAMAGED = "damaged, or not an HDF5 file"
 
 
-def read_hdf5(file: IO[bytes], most: int) -> FileColumns:
+def read_hdf5(file: IO[bytes], most: int, separator: str = "/") -> FileColumns:
     """Read the arrays of an HDF5 file under their paths, of MATLAB with the axes as it shows them. Raises RecordError.
 
+    separator : what stands between the names of a path
     This is done in a process of its own, since the HDF5 library may end it at a damaged file.
     """
     out, content = FileColumns(), read_at_most(file, most)
@@ -172,7 +173,8 @@ def read_hdf5(file: IO[bytes], most: int) -> FileColumns:
             arrays = {key: found[key] for key in found}
     if said["error"]:
         raise TooLargeError(most) if said["error"] == "large" else RecordError(said["error"])
-    for i, (name, text) in enumerate(said["parts"]):
+    for i, (path, text) in enumerate(said["parts"]):
+        name = path.replace("/", separator)
         if (key := f"part {i}") in arrays:
             out.add(name, arrays[key], text)
         else:
@@ -238,6 +240,8 @@ def _dataset(name: str, item: Any, is_plain: bool) -> Part:
     if item.shape is None or not is_plain:
         return name, None, f"{name} holds objects or references, not numbers"
     values, of_matlab = item[()], _text(item.attrs.get("MATLAB_class", ""))
+    if item.attrs.get("MATLAB_empty"):  # the numbers are its sizes
+        values = values[:0]
     if item.dtype.hasobject:
         values = _text(np.ravel(values)[0])
     if of_matlab == "char":
