@@ -7,6 +7,7 @@ import struct
 import zlib
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -273,6 +274,122 @@ def test_null_lists_are_missing_samples(kind: pa.DataType, lost: list[int], name
     expected[lost], expected[20] = np.nan, (np.nan, 3.0)
     record = read_record(io.BytesIO(content), "a.parquet", declaration=stated)
     np.testing.assert_allclose(record.y_lgs, 1e-3 * expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("ratio", [2, 5])
+def test_null_lists_between_the_frames_of_a_slow_sensor(ratio: int) -> None:
+    """Up to the last row, whether a frame comes in it or not; or one row per frame, and nulls to the end."""
+    frames = {k: float(k) for k in range(ratio, N, ratio)}
+    in_rows = [[frames[k]] * 2 if k in frames else None for k in range(N)]
+    by_frame = [*([x] * 2 for x in frames.values()), *[None] * (N - len(frames))]
+    for rows in (in_rows, by_frame):
+        table = pa.table({"y_lgs": Y.tolist(), "u": U.tolist(), "y_ngs": rows}).replace_schema_metadata({"ratio": str(ratio)})
+        content = saved(lambda file, table=table: pq.write_table(table, file))
+        record = read_record(io.BytesIO(content), "a.parquet", declaration=DeclaredFormat(**KHZ))
+        assert record.y_ngs is not None and {k: 1e3 * x for k, x in enumerate(record.y_ngs[:, 1]) if x == x} == pytest.approx(
+            frames
+        )
+
+
+# ---------------------------------------------------------------------- what belongs to what
+
+PARTS = {"y_lgs": "wfs{0}slopes", "u": "dm{0}cmd"}
+CASES_OF_UNITS: list[tuple[dict[str, Any], str]] = [
+    ({"wfs.unit": "um", "dm.unit": "nm"}, "unit nm"),
+    ({"wfs.unit": "um", "unit": "nm"}, "unit nm"),
+    ({"wfs.unit": "um", "dm.unit": "nm", "unit": "mas"}, "unit nm"),
+    ({"wfs.unit": "um", "dm.unit": "V"}, "u is in 'V', which is no unit of a wavefront: state one of um, nm"),
+    ({"wfs.unit": "um", "cfg.unit": "nm"}, "u is in 'nm or um', which is no unit of a wavefront: state one of um, nm"),
+    ({"cfg.unit": "um", "log.unit": "nm"}, "y_lgs is in 'nm or um', which is no unit of a wavefront: state one of um, nm"),
+    ({"wfs.unit": "um", "dm.unit": "nm", "wfs.time": 1e-3 * STEPS}, "unit nm"),
+    ({"wfs.unit": "um", "dm.unit": "nm", "clock.time": STEPS, "clock.unit": "ms"}, "unit nm"),
+]
+
+
+def parts_in(kind: str, parts: dict[str, Any]) -> bytes:
+    """Return a file with parts {path: values}; texts as arrays, or as attributes of their group or root."""
+
+    def fill(f: h5py.File) -> None:
+        for path, values in parts.items():
+            group, _, key = path.replace(".", "/").rpartition("/")
+            if isinstance(values, np.ndarray) or kind == "a.h5":
+                f[path.replace(".", "/")] = values
+            else:
+                f.require_group(f"/{group}").attrs[key] = values
+
+    tree: dict[str, Any] = {}
+    for path, values in parts.items():
+        group, _, key = path.rpartition(".")
+        (tree.setdefault(group, {}) if group else tree)[key] = values
+    return matlab(**tree) if kind == "a.mat" else hdf5(fill)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("more", "said"), CASES_OF_UNITS)
+@pytest.mark.parametrize("kind", ["a.mat", "a.h5", "attributes.h5"])
+def test_a_unit_is_that_of_what_it_stands_beside(kind: str, more: dict[str, Any], said: str) -> None:
+    parts = {"wfs.slopes": 1e-3 * Y, "dm.cmd": U} | more
+    separator = "." if kind == "a.mat" else "/"
+    columns = {role: name.format(separator) for role, name in PARTS.items()}
+    columns.update(("time", name.replace(".", separator)) for name in more if name.endswith("time"))
+    stated = DeclaredFormat(columns=columns, rate=1000.0, trust=True)
+    if said.startswith("unit"):
+        record = read_record(io.BytesIO(parts_in(kind, parts)), kind, declaration=stated)
+        np.testing.assert_allclose(record.y_lgs, 1e-3 * Y, rtol=1e-12)
+        np.testing.assert_allclose(record.u, 1e-3 * U, rtol=1e-12)
+        assert record.origin == said
+    else:
+        with pytest.raises(RecordError, match=f"^{kind}: {said}"):
+            read_record(io.BytesIO(parts_in(kind, parts)), kind, declaration=stated)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fields", [True, False])
+def test_the_unit_of_a_table_is_not_that_of_its_clock(fields: bool) -> None:
+    rows = np.c_[1e-3 * STEPS, Y, U]
+    names = [f"loop.{x}" for x in "tabcd"] if fields else [f"loop[{i}]" for i in range(5)]
+
+    def fill(f: h5py.File) -> None:
+        f["loop"] = np.rec.fromarrays([*rows.T], names="t,a,b,c,d") if fields else rows
+        f["loop"].attrs["unit"] = "nm"
+
+    stated = DeclaredFormat(columns=dict(zip(("time", *COLUMNS), names, strict=True)))
+    record = read_record(io.BytesIO(hdf5(fill)), "a.h5", declaration=stated)
+    np.testing.assert_allclose(record.u, 1e-3 * U, rtol=1e-12)
+    assert (record.dt, record.origin) == (0.001, "unit nm")
+
+
+def rates_in(kind: str, stated: dict[str, dict[str, float]]) -> bytes:
+    """Return a file whose root, LGS and NGS state a rate each, as attributes or keywords."""
+    arrays = {"lgs": (Y, "Y_LGS"), "dm": (U, "U"), "ngs": (Y[::5], "SLOPES")}
+    if kind == "a.h5":
+
+        def fill(f: h5py.File) -> None:
+            for group, (values, name) in arrays.items():
+                f[f"{group}/{name.lower()}"] = values
+            for group, numbers in stated.items():
+                f[f"/{group}"].attrs.update(numbers)
+
+        return hdf5(fill)
+    hdus = {"": fits.PrimaryHDU()} | {group: fits.ImageHDU(values, name=name) for group, (values, name) in arrays.items()}
+    for group, numbers in stated.items():
+        hdus[group].header.update(numbers)
+    return saved(fits.HDUList([*hdus.values()]).writeto)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("key", ["DT", "RATE"])
+@pytest.mark.parametrize("kind", ["a.h5", "a.fits"])
+def test_the_rate_of_the_root_comes_first_and_others_must_agree(kind: str, key: str) -> None:
+    fast, slow = ({key: x if key == "DT" else 1.0 / x} for x in (1e-3, 5e-3))
+    way = DeclaredFormat(unit="nm", columns={"y_lgs": "lgs/y_lgs", "u": "dm/u"} if kind == "a.h5" else {})
+    for stated in ({"": fast, "ngs": slow}, {"": fast, "lgs": slow, "ngs": slow}, {"lgs": fast}, {"lgs": fast, "ngs": fast}):
+        assert read_record(io.BytesIO(rates_in(kind, stated)), kind, declaration=way).dt == 0.001
+    for stated in ({"lgs": fast, "ngs": slow}, {"ngs": slow, "lgs": fast}):
+        content = rates_in(kind, stated)
+        with pytest.raises(RecordError, match=r"1000 Hz by .* and 200 Hz by .*: state one \(--rate, rate=\)"):
+            read_record(io.BytesIO(content), kind, declaration=way)
+        assert read_record(io.BytesIO(content), kind, declaration=replace(way, rate=1000.0)).dt == 0.001
 
 
 def test_a_folder_of_arrays_on_the_command_line(tmp_path: Path) -> None:

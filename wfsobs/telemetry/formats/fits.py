@@ -79,11 +79,14 @@ def tables_and_images(hdus: HDUList, most: float) -> FileColumns:
     fits = astropy_fits()
     out = FileColumns(most=most)
     for number, hdu in enumerate(hdus):
+        part = f"{hdu.name or 'HDU'} {number}." if number else ""
         for key, keyword in KEYWORDS.items():
-            if keyword in hdu.header and not (key == "unit" and hdu.is_image and hdu.data is not None):  # of one image alone
-                out.arrays[key] = np.array(hdu.header[keyword])
-        if EXACT in hdu.header:
-            out.arrays["dt"] = np.array(float(hdu.header[EXACT]))
+            if keyword not in hdu.header or (part and keyword in hdus[0].header):
+                continue
+            if key != "unit":
+                out.add(key, float(hdu.header.get(EXACT, hdu.header[keyword])) if key == "dt" else hdu.header[keyword])
+            elif not hdu.is_image or hdu.data is None:  # of one image alone
+                out.add(f"{part}{key}", hdu.header[keyword])
         data: Any = hdu.data
         if isinstance(hdu, fits.BinTableHDU):
             for column in hdu.columns:
@@ -97,7 +100,7 @@ def tables_and_images(hdus: HDUList, most: float) -> FileColumns:
         elif data is not None:
             out.add(hdu.name or f"image {number}", image_numbers(hdu), str(hdu.header.get("BUNIT", "")))
         for key in filter(is_rate, hdu.header):
-            out.add(key, hdu.header[key])
+            out.add(f"{part}{key}", hdu.header[key])
     return out
 
 

@@ -27,6 +27,7 @@ from wfsobs.telemetry.formats.contents import (
     NUMBERS,
     STAMP,
     TEXTS,
+    UNIT,
     FileColumns,
     TooLargeError,
     import_library,
@@ -211,7 +212,7 @@ def _read_parts(file: IO[bytes], most: int) -> Iterator[Part]:
             if count > MOST_PARTS:  # also where a group is within itself
                 raise RecordError(f"has more than {MOST_PARTS} groups and arrays")
             item = source[path]
-            yield from _attributes(item)
+            yield from _attributes(item, isinstance(item, h5py.Group))
             if isinstance(item, h5py.Dataset):
                 room -= max(item.size or 0, prod(item.chunks or ())) * max(item.dtype.itemsize, 8)
                 if room < 0:
@@ -226,12 +227,15 @@ def _read_parts(file: IO[bytes], most: int) -> Iterator[Part]:
                         yield name, None, f"{name} is a link, which is not followed"
 
 
-def _attributes(item: Any) -> Iterator[Part]:
-    """Yield the numbers and texts of a record, or its rate, among the attributes of a group or of an array."""
+def _attributes(item: Any, is_group: bool) -> Iterator[Part]:
+    """Yield the numbers and texts of a record, or its rate, that the root states, and those that only other parts do."""
+    where = f"{item.name}/".lstrip("/")
     for key in item.attrs:
-        is_text = key.lower() in TEXTS and item.name == "/"
-        if (is_text or key.lower() in NUMBERS or is_rate(key)) and item.attrs.get_id(key).shape in ((), (1,)):
-            yield key, item.attrs[key], ""
+        is_text = (key.lower() in TEXTS and not where) or (UNIT.fullmatch(key) is not None and is_group)
+        if (where and key in item.file.attrs and not is_text) or item.attrs.get_id(key).shape not in ((), (1,)):
+            continue
+        if is_text or key.lower() in NUMBERS or is_rate(key):
+            yield key if key.lower() in NUMBERS else f"{where}{key}", item.attrs[key], ""
 
 
 def _dataset(name: str, item: Any, is_plain: bool) -> Part:
@@ -340,17 +344,20 @@ def read_parquet(file: IO[bytes], most: int) -> FileColumns:
 
 
 def _add_column(out: FileColumns, name: str, column: Any, is_list: bool) -> None:
-    """Add a column of Arrow, whose nulls are missing samples; without those that end what may be shorter than the record."""
+    """Add a column of Arrow, whose nulls are missing samples; without those that end what may be shorter than the record.
+
+    That begins with a sample, as frames in rows of their own do, and frames in the rows of fast steps do not.
+    """
     valid = np.asarray(column.is_valid())
-    if name.lower() not in FAST:
+    if name.lower() not in FAST and valid[:1].all():
         valid = valid[: np.flatnonzero(valid).max(initial=-1) + 1]
         column = column.slice(0, len(valid))
     if is_list:
         lengths = np.unique(column.value_lengths().drop_null())
         if lengths.size > 1:
             return out.leave(name, f"{name} holds lists of {lengths[0]} to {lengths[-1]} numbers; it takes lists of one length")
-        values = np.full((len(valid), *lengths), np.nan)
-        values[valid] = column.flatten().to_numpy(zero_copy_only=False).reshape(-1, *lengths)
+        values = np.full((len(valid), lengths.max(initial=0)), np.nan)
+        values[valid] = column.flatten().to_numpy(zero_copy_only=False).reshape(valid.sum(), -1)
     elif column.type == "string":
         if valid.any() and not STAMP.fullmatch(column.drop_null()[0].as_py().strip()):
             return out.leave(name, f"{name} holds text, not numbers")
