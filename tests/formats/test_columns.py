@@ -280,6 +280,15 @@ def test_columns_of_text() -> None:
         read_record(io.BytesIO(table(OWN, TIME, *Y.T, U.T[0], late)), "a.csv")
 
 
+@pytest.mark.parametrize("row", ["{},{},{},{},{},{}", "[{}],[{}],[{}],[{}],[{}],[{}]", '({}),"{}",{},{},{},{}'])
+@pytest.mark.parametrize("counted", ["-", "", "none", "counts"])
+def test_a_row_of_units_below_the_heading(row: str, counted: str) -> None:
+    names = ["frame", *(name.rpartition("_")[0] for name in OWN)]
+    heading, *rows = table(names, np.arange(N), 1e3 * TIME, *Y.T, *U.T).decode().split("\n")
+    content = "\n".join([heading, row.format(counted, "ms", "nm", "nm", "nm", "nm"), *rows])
+    is_as_clean(read_record(io.BytesIO(content.encode()), "a.csv"), "unit nm, frames counted by frame")
+
+
 @pytest.mark.parametrize("word", ["NA", "-", "null", ""])
 def test_words_for_a_missing_sample(word: str) -> None:
     tip = np.array([word, *map(repr, Y[1:, 0].tolist())])

@@ -7,6 +7,7 @@ import struct
 import zlib
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -134,6 +135,25 @@ def of_matlab_73(f: h5py.File) -> None:
     f["y_lgs"], f["u"], f["dt"] = Y.T, U.T, np.array([[1e-3]])
 
 
+def as_matlab_73(name: str, values: np.ndarray, **attributes: Any) -> Callable[[h5py.File], None]:
+    """Return what adds an array, and a loop in a structure, as MATLAB does: axes the other way round, texts as numbers."""
+
+    def fill(f: h5py.File) -> None:
+        numbers = {"loop/wfs/slopes": Y.T, "loop/dm/cmd": U.T, "loop/fs": np.array([[1000.0]]), name: values}
+        for path, array in numbers.items():
+            f[path] = array
+            f[path].attrs["MATLAB_class"] = np.bytes_("double")
+        f[name].attrs.update(attributes)
+        f["loop/wfs/unit"] = np.array([[ord(letter)] for letter in "nm"], np.uint16)
+        f["loop/wfs/unit"].attrs["MATLAB_class"] = np.bytes_("char")
+
+    return fill
+
+
+NOTHING = {"MATLAB_empty": np.uint8(1)}
+SIZES = np.array([0, 0], np.uint64)
+
+
 def array(kind: str) -> bytes:
     rows = np.c_[Y, U] if kind == "plain" else np.rec.fromarrays([*Y.T, *U.T], names="a,b,c,d")
     return saved(lambda file: np.save(file, rows))
@@ -157,6 +177,15 @@ CASES: list[tuple[str, bytes, dict[str, Any], str]] = [
         matlab(d={"s": Y, "c": U, "fs": 1000, "unit": "nm"}),
         {"columns": {"y_lgs": "d.s", "u": "d.c"}},
         "unit nm, 1000 Hz by d.fs",
+    ),
+    *(
+        (
+            "a.mat",
+            hdf5(as_matlab_73("info", SIZES, **NOTHING), 512),
+            {"columns": {"y_lgs": f"loop{sign}wfs{sign}slopes", "u": f"loop{sign}dm{sign}cmd"}},
+            "unit nm, 1000 Hz by loop.fs, column info not used",
+        )
+        for sign in "./"
     ),
     ("a.mat", hdf5(of_matlab_73, 512), NM, "unit nm, y_lgs and u with a row per mode"),
     (
@@ -226,6 +255,141 @@ def test_every_file_gives_the_record_and_says_what_is_guessed(name: str, content
     np.testing.assert_allclose(record.y_lgs, 1e-3 * Y, rtol=1e-12)
     np.testing.assert_allclose(record.u, 1e-3 * U, rtol=1e-12)
     assert (record.dt, record.delay, record.missing, record.origin) == (0.001, 2, 0, origin)
+
+
+@pytest.mark.parametrize("kind", [pa.list_(pa.float64()), pa.list_(pa.float64(), 2), pa.list_(pa.int32(), 2)])
+@pytest.mark.parametrize("lost", [[7], [0, 1, 5], [N - 2, N - 1], [*range(0, N, 2)]])
+@pytest.mark.parametrize("names", [("y_lgs", "u"), ("slopes", "cmd")])
+def test_null_lists_are_missing_samples(kind: pa.DataType, lost: list[int], names: tuple[str, str]) -> None:
+    """Also half of them, which are as many numbers as lists of one number would be, and those at the end."""
+    rows = np.round(Y).tolist()
+    for row in lost:
+        rows[row] = None
+    rows[20] = [None, 3.0]
+    content = parquet(**dict(zip(names, (pa.array(rows, kind), pa.array(U.tolist())), strict=True)))
+    stated = DeclaredFormat(
+        columns=dict(zip(("y_lgs", "u"), names, strict=True)) if names[0] != "y_lgs" else {}, **KHZ, trust=True
+    )
+    expected = np.round(Y)
+    expected[lost], expected[20] = np.nan, (np.nan, 3.0)
+    record = read_record(io.BytesIO(content), "a.parquet", declaration=stated)
+    np.testing.assert_allclose(record.y_lgs, 1e-3 * expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("ratio", [2, 5])
+def test_null_lists_between_the_frames_of_a_slow_sensor(ratio: int) -> None:
+    """Up to the last row, whether a frame comes in it or not; or one row per frame, and nulls to the end."""
+    frames = {k: float(k) for k in range(ratio, N, ratio)}
+    in_rows = [[frames[k]] * 2 if k in frames else None for k in range(N)]
+    by_frame = [*([x] * 2 for x in frames.values()), *[None] * (N - len(frames))]
+    for rows in (in_rows, by_frame):
+        table = pa.table({"y_lgs": Y.tolist(), "u": U.tolist(), "y_ngs": rows}).replace_schema_metadata({"ratio": str(ratio)})
+        content = saved(lambda file, table=table: pq.write_table(table, file))
+        record = read_record(io.BytesIO(content), "a.parquet", declaration=DeclaredFormat(**KHZ))
+        assert record.y_ngs is not None and {k: 1e3 * x for k, x in enumerate(record.y_ngs[:, 1]) if x == x} == pytest.approx(
+            frames
+        )
+
+
+# ---------------------------------------------------------------------- what belongs to what
+
+PARTS = {"y_lgs": "wfs{0}slopes", "u": "dm{0}cmd"}
+CASES_OF_UNITS: list[tuple[dict[str, Any], str]] = [
+    ({"wfs.unit": "um", "dm.unit": "nm"}, "unit nm"),
+    ({"wfs.unit": "um", "unit": "nm"}, "unit nm"),
+    ({"wfs.unit": "um", "dm.unit": "nm", "unit": "mas"}, "unit nm"),
+    ({"wfs.unit": "um", "dm.unit": "V"}, "u is in 'V', which is no unit of a wavefront: state one of um, nm"),
+    ({"wfs.unit": "um", "cfg.unit": "nm"}, "u is in 'nm or um', which is no unit of a wavefront: state one of um, nm"),
+    ({"cfg.unit": "um", "log.unit": "nm"}, "y_lgs is in 'nm or um', which is no unit of a wavefront: state one of um, nm"),
+    ({"wfs.unit": "um", "dm.unit": "nm", "wfs.time": 1e-3 * STEPS}, "unit nm"),
+    ({"wfs.unit": "um", "dm.unit": "nm", "clock.time": STEPS, "clock.unit": "ms"}, "unit nm"),
+]
+
+
+def parts_in(kind: str, parts: dict[str, Any]) -> bytes:
+    """Return a file with parts {path: values}; texts as arrays, or as attributes of their group or root."""
+
+    def fill(f: h5py.File) -> None:
+        for path, values in parts.items():
+            group, _, key = path.replace(".", "/").rpartition("/")
+            if isinstance(values, np.ndarray) or kind == "a.h5":
+                f[path.replace(".", "/")] = values
+            else:
+                f.require_group(f"/{group}").attrs[key] = values
+
+    tree: dict[str, Any] = {}
+    for path, values in parts.items():
+        group, _, key = path.rpartition(".")
+        (tree.setdefault(group, {}) if group else tree)[key] = values
+    return matlab(**tree) if kind == "a.mat" else hdf5(fill)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("more", "said"), CASES_OF_UNITS)
+@pytest.mark.parametrize("kind", ["a.mat", "a.h5", "attributes.h5"])
+def test_a_unit_is_that_of_what_it_stands_beside(kind: str, more: dict[str, Any], said: str) -> None:
+    parts = {"wfs.slopes": 1e-3 * Y, "dm.cmd": U} | more
+    separator = "." if kind == "a.mat" else "/"
+    columns = {role: name.format(separator) for role, name in PARTS.items()}
+    columns.update(("time", name.replace(".", separator)) for name in more if name.endswith("time"))
+    stated = DeclaredFormat(columns=columns, rate=1000.0, trust=True)
+    if said.startswith("unit"):
+        record = read_record(io.BytesIO(parts_in(kind, parts)), kind, declaration=stated)
+        np.testing.assert_allclose(record.y_lgs, 1e-3 * Y, rtol=1e-12)
+        np.testing.assert_allclose(record.u, 1e-3 * U, rtol=1e-12)
+        assert record.origin == said
+    else:
+        with pytest.raises(RecordError, match=f"^{kind}: {said}"):
+            read_record(io.BytesIO(parts_in(kind, parts)), kind, declaration=stated)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fields", [True, False])
+def test_the_unit_of_a_table_is_not_that_of_its_clock(fields: bool) -> None:
+    rows = np.c_[1e-3 * STEPS, Y, U]
+    names = [f"loop.{x}" for x in "tabcd"] if fields else [f"loop[{i}]" for i in range(5)]
+
+    def fill(f: h5py.File) -> None:
+        f["loop"] = np.rec.fromarrays([*rows.T], names="t,a,b,c,d") if fields else rows
+        f["loop"].attrs["unit"] = "nm"
+
+    stated = DeclaredFormat(columns=dict(zip(("time", *COLUMNS), names, strict=True)))
+    record = read_record(io.BytesIO(hdf5(fill)), "a.h5", declaration=stated)
+    np.testing.assert_allclose(record.u, 1e-3 * U, rtol=1e-12)
+    assert (record.dt, record.origin) == (0.001, "unit nm")
+
+
+def rates_in(kind: str, stated: dict[str, dict[str, float]]) -> bytes:
+    """Return a file whose root, LGS and NGS state a rate each, as attributes or keywords."""
+    arrays = {"lgs": (Y, "Y_LGS"), "dm": (U, "U"), "ngs": (Y[::5], "SLOPES")}
+    if kind == "a.h5":
+
+        def fill(f: h5py.File) -> None:
+            for group, (values, name) in arrays.items():
+                f[f"{group}/{name.lower()}"] = values
+            for group, numbers in stated.items():
+                f[f"/{group}"].attrs.update(numbers)
+
+        return hdf5(fill)
+    hdus = {"": fits.PrimaryHDU()} | {group: fits.ImageHDU(values, name=name) for group, (values, name) in arrays.items()}
+    for group, numbers in stated.items():
+        hdus[group].header.update(numbers)
+    return saved(fits.HDUList([*hdus.values()]).writeto)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("key", ["DT", "RATE"])
+@pytest.mark.parametrize("kind", ["a.h5", "a.fits"])
+def test_the_rate_of_the_root_comes_first_and_others_must_agree(kind: str, key: str) -> None:
+    fast, slow = ({key: x if key == "DT" else 1.0 / x} for x in (1e-3, 5e-3))
+    way = DeclaredFormat(unit="nm", columns={"y_lgs": "lgs/y_lgs", "u": "dm/u"} if kind == "a.h5" else {})
+    for stated in ({"": fast, "ngs": slow}, {"": fast, "lgs": slow, "ngs": slow}, {"lgs": fast}, {"lgs": fast, "ngs": fast}):
+        assert read_record(io.BytesIO(rates_in(kind, stated)), kind, declaration=way).dt == 0.001
+    for stated in ({"lgs": fast, "ngs": slow}, {"ngs": slow, "lgs": fast}):
+        content = rates_in(kind, stated)
+        with pytest.raises(RecordError, match=r"1000 Hz by .* and 200 Hz by .*: state one \(--rate, rate=\)"):
+            read_record(io.BytesIO(content), kind, declaration=way)
+        assert read_record(io.BytesIO(content), kind, declaration=replace(way, rate=1000.0)).dt == 0.001
 
 
 def test_a_folder_of_arrays_on_the_command_line(tmp_path: Path) -> None:
@@ -353,6 +517,13 @@ CELLS[:] = [Y, U]
     ("name", "content", "line"),
     [
         ("a.mat", matlab(y_lgs=CELLS, u=U), "y_lgs is a MATLAB cell, which is not read"),
+        ("a.mat", hdf5(as_matlab_73("y_ngs", SIZES, **NOTHING), 512), "y_ngs is empty"),
+        (
+            "a.mat",
+            hdf5(as_matlab_73("flux", Y.T), 512),
+            "has no y_lgs; a record needs y_lgs, u and dt; as its names suggest: --column "
+            "'u=loop.dm.cmd' --column 'y_lgs=loop.wfs.slopes'",
+        ),
         ("a.mat", matlab(y_lgs=np.rec.fromarrays([[1, 2]], names="a"), u=U), "y_lgs is a MATLAB struct, which is not read"),
         ("a.mat", b"MATLAB 5.0 MAT-file" + bytes(9), "damaged, or not a MATLAB file"),
         ("a.h5", hdf5(referring), "y_lgs holds objects or references, not numbers"),
@@ -366,6 +537,13 @@ CELLS[:] = [Y, U]
         ("a.sav", b"no", "damaged, or not a save file of IDL"),
         ("a.parquet", b"PAR1", "damaged, or not a Parquet file"),
         ("a.parquet", parquet(y_lgs=[{"a": 1}]), "y_lgs holds struct<a: int64>, not numbers"),
+        (
+            "a.parquet",
+            parquet(y_lgs=[[1.0], None, [2.0, 3.0, 4.0]]),
+            "y_lgs holds lists of 1 to 3 numbers; it takes lists of one",
+        ),
+        ("a.parquet", parquet(y_lgs=[["a"]]), "y_lgs holds list<element: string>, not numbers"),
+        ("a.parquet", parquet(y_ngs=pa.array([None, None], pa.list_(pa.float64()))), "y_ngs is empty"),
         ("a.npy", saved(lambda file: np.save(file, CELLS, allow_pickle=True)), "damaged, or holds more than plain arrays"),
     ],
 )

@@ -68,6 +68,13 @@ def test_a_unit_is_never_guessed(name: str) -> None:
         read_psd(io.BytesIO(MAKE[name]("nm/Hz")), name)
 
 
+@pytest.mark.parametrize("unit", ["nm²/Hz", "nm2/Hz", "nm**2 / Hz", "nm² Hz⁻¹", "nm^2 Hz^-1"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_squares_however_they_are_written(unit: str, encoding: str) -> None:
+    text = f"frequency [Hz],tip [{unit}],tilt [{unit}]\n1,2,3\n2,4,5\n"
+    assert read_psd(io.BytesIO(text.encode(encoding)), "a.csv")["tip"] == pytest.approx([2e-6, 4e-6])
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

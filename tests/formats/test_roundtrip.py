@@ -23,6 +23,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.formats import FORMATS, format_of
+from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.records import load_record, name_differences, read_record, record_arrays, save_record
 from wfsobs.units import micrometres_per
 
@@ -179,6 +180,20 @@ def test_scaled_integers_and_blanks() -> None:
     record = read_record(file, "r.fits")
     np.testing.assert_array_equal(record.y_lgs, physical)
     np.testing.assert_array_equal(record.u, [[1, 2], [np.nan, 3], [4, 5]])
+
+
+@pytest.mark.parametrize("zero", [0, 32768])
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+@pytest.mark.parametrize("blank", [-32768, 0])
+def test_blanks_of_unsigned_and_of_scaled_images(zero: int, scale: float, blank: int) -> None:
+    """The keyword BLANK is of the integers as they are stored."""
+    stored = np.array([[1, 2], [blank, blank], [4, -5], [7, 8]], dtype=np.int16)
+    images = [fits.ImageHDU(stored, name=name) for name in ("Y_LGS", "U")]
+    images[0].header.update(QLANK=blank, QZERO=zero, QSCALE=scale, DT=0.001)  # astropy changes its own
+    fits.HDUList([fits.PrimaryHDU(), *images]).writeto(file := io.BytesIO())
+    content = re.sub(rb"Q(LANK |ZERO |SCALE)  =", rb"B\1  =", file.getvalue())
+    record = read_record(io.BytesIO(content), "r.fits", declaration=DeclaredFormat(unit="um", trust=True))
+    np.testing.assert_array_equal(record.y_lgs, np.where(stored == blank, np.nan, scale * stored + zero))
 
 
 def test_what_the_dashboard_saves_as_csv_is_read() -> None:

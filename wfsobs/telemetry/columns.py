@@ -24,10 +24,11 @@ from wfsobs.telemetry.formats.contents import (
     from_columns,
     is_rate,
     mean_slopes,
+    names_around,
     parse_heading,
 )
 from wfsobs.typing import Array
-from wfsobs.units import SECONDS, split_unit, stated_unit
+from wfsobs.units import SECONDS, parse_unit, split_unit, stated_unit
 
 SIGNALS = {
     "y_lgs": "measurement",
@@ -76,7 +77,7 @@ def to_contents(file: FileColumns, roles: Mapping[str, str]) -> Contents:
     if unknown := [role for role in roles if role not in ROLES | SIGNALS]:
         columns, arrays = ", ".join(ROLES), ", ".join(SIGNALS)
         raise RecordError(f"{unknown[0][:80]!r} is no part of a record; a column is one of {columns}, an array one of {arrays}")
-    roles = dict(pair for role, name in roles.items() for pair in _each_mode(file, role, name))
+    roles = dict(pair for role, name in roles.items() for pair in _each_mode(file, role, file.own_name(name)))
     for role, name in roles.items():
         if name in file.texts:
             raise RecordError(file.texts[name])
@@ -85,7 +86,8 @@ def to_contents(file: FileColumns, roles: Mapping[str, str]) -> Contents:
                 f"it has {', '.join([*file.columns][:20])}" if file.columns else "columns of its format have names of their own"
             )
             raise RecordError(f"has no column {name[:80]!r}; {there}")
-        found[role] = file.columns[name], "" if role == FRAME else stated_unit(name, file.column_units.get(name, ""))
+        unit = stated_unit(name, file.column_units.get(name, "")) or file.unit_around(name, role in CLOCKS)
+        found[role] = file.columns[name], "" if role == FRAME else unit
     unused = []
     for name, values in file.columns.items():
         role, unit = parse_heading(name, file.column_units.get(name, "")) or ("", "")
@@ -96,11 +98,12 @@ def to_contents(file: FileColumns, roles: Mapping[str, str]) -> Contents:
         elif role in found:
             raise RecordError(f"two columns are named {role}")
         else:
-            found[role] = values, unit
+            found[role] = values, unit or file.unit_around(name, role in CLOCKS)
     contents = from_columns(found)
     contents.units |= {name: unit for name, unit in file.units.items() if name not in contents.arrays}
     contents.arrays = file.arrays | contents.arrays
     contents.guesses = [*file.guesses, *contents.guesses]
+    _take_loose_units(file, contents)
     n_rows = len(contents.arrays["y_lgs"]) if np.ndim(contents.arrays.get("y_lgs", 0)) else 0
     counters = [name for name in unused if _has_counter_name(name) and is_counter(file.columns[name], n_rows)]
     if FRAME not in found and len(counters) == 1:
@@ -113,11 +116,7 @@ def to_contents(file: FileColumns, roles: Mapping[str, str]) -> Contents:
         if unit := _guess_unit(contents.arrays[name]) or by_step:
             contents.arrays[name] = contents.arrays[name] * SECONDS[unit]
             contents.guesses.append(f"{name} in {unit}")
-    rates = {name: rate for name, rate in file.numbers.items() if is_rate(name) and rate > 0}
-    if not contents.arrays.keys() & {"dt", TIME} and len(set(rates.values())) == 1:
-        name, rate = rates.popitem()
-        contents.arrays["dt"] = np.array(1.0 / rate)
-        contents.guesses.append(f"{rate:g} Hz by {name}")
+    unsettled = _take_rate(file, contents)
     contents.leftovers = [*unused, *(f"{name} (text)" if why.endswith("number") else name for name, why in file.texts.items())]
     many = _many_in_one(unused)
     suggested = {role: name for role, name in (suggest_roles(unused) | many).items() if role not in roles}
@@ -128,7 +127,37 @@ def to_contents(file: FileColumns, roles: Mapping[str, str]) -> Contents:
     if unused and "y_lgs" not in {role.partition("/")[0] for role in (*suggested, *contents.arrays)}:
         there = dict.fromkeys(re.sub(r"\[\d+\]$", "", name) for name in unused if name not in suggested.values())
         contents.hint += f"; which of its columns is what? It has {', '.join([*there][:20])}"
+    contents.hint += unsettled
     return contents
+
+
+def _take_loose_units(file: FileColumns, contents: Contents) -> None:
+    """Take a unit that stands beside no column for that of signals without one; several are together a unit that is none."""
+    within = {outer for name in (*file.columns, *file.texts) for outer in (name, *names_around(name))}
+    loose = {unit: name for name, text in file.column_units.items() if name not in within and (unit := parse_unit(text))}
+    silent = [name for name in SIGNALS if name in contents.arrays and name not in contents.units]
+    if loose and silent and "unit" not in contents.arrays:
+        unit = " or ".join(sorted(loose.keys() | set(contents.units.values())))
+        contents.units |= dict.fromkeys(silent, unit)
+        contents.guesses.append(f"unit of {' and '.join(loose.values())}")
+
+
+def _take_rate(file: FileColumns, contents: Contents) -> str:
+    """Take the rate that the root of a file states, or else all parts that state one; return what to do where these differ."""
+    rates = {name: rate for name, rate in file.numbers.items() if is_rate(name) and rate > 0}
+    rates = {name: rate for name, rate in rates.items() if not [*names_around(name)]} or rates
+    if np.ndim(contents.arrays.get("dt", 0)):
+        rates |= {f"dt = {step:g} s": 1.0 / step for step in contents.arrays.pop("dt") if step}
+    different = {f"{rate:.6g} Hz": name for name, rate in rates.items()}
+    if contents.arrays.keys() & {"dt", TIME} or not rates:
+        return ""
+    if len(different) > 1:
+        stated = " and ".join(f"{rate} by {name}" for rate, name in different.items())
+        return f"; it states {stated}: state one (--rate, rate=), or which --column is the time"
+    name, rate = rates.popitem()
+    contents.arrays["dt"] = np.array(1.0 / rate)
+    contents.guesses.append(f"{rate:g} Hz by {name}")
+    return ""
 
 
 def _guess_unit(time: Array) -> str:
@@ -334,7 +363,7 @@ def matrix_of(file: FileColumns, source: str, name: str = "") -> LoopMatrix:
         found.setdefault(key.partition("[")[0], []).append(values)
     if not name and (len(found) > 1 and all(len(columns) == 1 for columns in found.values())):  # a table without names
         found = {"": [column for columns in found.values() for column in columns]}
-    name = name or (next(iter(found)) if len(found) == 1 else "")
+    name = file.own_name(name) or (next(iter(found)) if len(found) == 1 else "")
     if name not in found:
         what = f"has no matrix {name!r}; it" if name else "which of its arrays is the matrix? It"
         raise RecordError(f"{source}: {what} has {', '.join(sorted(found)[:20])}: give FILE:NAME")

@@ -97,7 +97,7 @@ class FileColumns(Contents):
     columns : dict of str to Array
         Name in the file -> values, (n,).
     column_units : dict of str to str
-        Name in the file -> unit beside it, as written.
+        Name in the file, also of an array, a table, a structure or a group of columns -> its unit, as written.
     texts : dict of str to str
         Name in the file -> why it holds no numbers.
     numbers : dict of str to float
@@ -124,8 +124,9 @@ class FileColumns(Contents):
         """
         values, known = np.asarray(data), name.lower()
         if values.dtype.names and name.count(".") < DEEPEST:
+            self.column_units[name] = unit
             for key in values.dtype.names:
-                self.add(f"{name}.{key}", values[key], unit)
+                self.add(f"{name}.{key}", values[key])
         elif values.dtype.kind == "O" and isinstance(values.item() if values.size == 1 else None, HOLDS):
             self.add(name, values.item(), unit)
         elif values.dtype.kind == "M":
@@ -139,7 +140,7 @@ class FileColumns(Contents):
         elif known in (*NUMBERS, *TEXTS):
             if values.size > 1 and not (values == values.flat[0]).all():
                 raise RecordError(f"{known} holds {values.size} numbers that differ; it takes one")
-            self.arrays[known] = values.flat[0].reshape(())
+            self.arrays[known] = np.unique(np.append(self.arrays.get(known, ()), values.flat[0])).squeeze()  # of several parts
         elif values.size == 1 and known not in NAMES and not parse_heading(name):
             self.numbers[name] = float(values.item())
         else:
@@ -164,25 +165,48 @@ class FileColumns(Contents):
             self.state_unit(known, unit)
         elif known in (STARS, APART):
             self.arrays[known] = rows.ravel() if known == STARS else values
+        self.column_units[name] = unit
         for i, column in enumerate(rows.T[:MOST_COLUMNS]):
-            key = f"{name}[{i}]" if rows.shape[1] > 1 else name
-            self.columns[key], self.column_units[key] = column.astype(np.float64), unit
+            self.columns[f"{name}[{i}]" if rows.shape[1] > 1 else name] = column.astype(np.float64)
 
     def _add_texts(self, name: str, texts: list[str]) -> None:
         if name.lower() in TEXTS and len(texts) == 1:
             self.arrays[name.lower()] = np.array(texts[0])
-        elif UNIT.fullmatch(name) and len(texts) == 1 and "unit" not in self.arrays and parse_unit(texts[0]):
+        elif len(texts) == 1 and (match := UNIT.fullmatch(name)) and match["of"]:
+            self.column_units[match["of"]] = texts[0].strip()
+        elif len(texts) == 1 and match and "unit" not in self.arrays and parse_unit(texts[0]):
             self.arrays["unit"] = np.array(texts[0])
         elif len(texts) > 1 and STAMP.fullmatch(texts[0].strip()):
             self.add(name, np.array([parse_cell(text) for text in texts]), "s")
         else:
             self.leave(name, f"{name} holds text, not numbers")
 
+    def unit_around(self, name: str, is_clock: bool) -> str:
+        """Return the unit of the nearest that a column is in; a clock takes one of time, a signal none of these."""
+        units = (self.column_units.get(outer, "") for outer in names_around(name))
+        return next((unit for unit in units if unit and (unit.lower() in SECONDS) == is_clock), "")
+
+    def own_name(self, name: str) -> str:
+        """Return a name as the file has it: `s/field`, as MATLAB stores it in version 7.3, is `s.field`."""
+        known = (*self.columns, *self.texts)
+        return next((x for x in (name, name.replace("/", ".")) if any(key.startswith(x) for key in known)), name)
+
     def leave(self, name: str, why: str) -> None:
         """Leave out what holds no numbers. Raises RecordError with that reason where it has the name of a part of a record."""
         if name.lower() in (*SIGNALS, *CLOCKS, STARS, APART, *NUMBERS) or parse_heading(name):
             raise RecordError(why)
         self.texts[name] = why
+
+
+def names_around(name: str) -> Iterator[str]:
+    """Yield the names of the array, the structures and the groups that a column is in.
+
+    >>> [*names_around("loop/wfs.slopes[0]")]
+    ['loop/wfs.slopes', 'loop/wfs', 'loop']
+    """
+    while match := re.fullmatch(r"(.+)[/.\[].*", name):
+        name = match[1]
+        yield name
 
 
 RATE = re.compile(
@@ -200,7 +224,7 @@ def is_rate(name: str) -> bool:
     return RATE.fullmatch(name) is not None
 
 
-UNIT = re.compile(r"(?:.*[/.])?units?", re.I)
+UNIT = re.compile(r"(?:(?P<of>.*)[/.])?units?", re.I)
 """Name of the unit of a structure or a group."""
 
 KINDS = {"O": "objects", "b": "yes or no", "c": "complex numbers", "V": "structures too deep"}

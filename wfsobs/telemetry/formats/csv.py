@@ -19,6 +19,7 @@ import numpy as np
 
 from wfsobs.record import RecordError
 from wfsobs.telemetry.formats.contents import (
+    ABSENT,
     NUMBERS,
     STAMP,
     TEXTS,
@@ -67,8 +68,9 @@ def read(file: IO[bytes], most: int) -> FileColumns:
     width, commas = len(heading), False
     cells_of, ends = {i: array("d") for i in range(width)}, [0] * width
     first = next(rows, None)
-    if first and any(cell.strip() for cell in first[1]) and all(x.strip() in ("", *SECONDS) or parse_unit(x) for x in first[1]):
-        out.column_units = {name: cell.strip() for name, cell in zip(heading, first[1], strict=False)}
+    units = [cell.strip(" []()-") for cell in first[1]] if first else []
+    if any(x in SECONDS or parse_unit(x) for x in units) and all(x.lower() in ABSENT or not _is_number(x) for x in units):
+        out.column_units = dict(zip(heading, units, strict=False))
     elif first:
         rows = chain([first], rows)
     for step, (line, cells) in enumerate(rows):

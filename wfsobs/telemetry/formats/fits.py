@@ -58,7 +58,8 @@ def open_fits(file: IO[bytes], most: int) -> Iterator[HDUList]:
         raise RecordError("not a FITS file, or a compressed one")
     with refuse_damage(DAMAGED, fits.VerifyError), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of headers that are not quite to the standard
-        with fits.open(io.BytesIO(content), memmap=False, lazy_load_hdus=False, disable_image_compression=True) as hdus:
+        how = {"memmap": False, "lazy_load_hdus": False, "disable_image_compression": True}
+        with fits.open(io.BytesIO(content), **how, do_not_scale_image_data=True) as hdus:  # astropy forgets some blanks in that
             _check_sizes(hdus, len(content), most)
             yield hdus
 
@@ -78,11 +79,14 @@ def tables_and_images(hdus: HDUList, most: float) -> FileColumns:
     fits = astropy_fits()
     out = FileColumns(most=most)
     for number, hdu in enumerate(hdus):
+        part = f"{hdu.name or 'HDU'} {number}." if number else ""
         for key, keyword in KEYWORDS.items():
-            if keyword in hdu.header and not (key == "unit" and hdu.is_image and hdu.data is not None):  # of one image alone
-                out.arrays[key] = np.array(hdu.header[keyword])
-        if EXACT in hdu.header:
-            out.arrays["dt"] = np.array(float(hdu.header[EXACT]))
+            if keyword not in hdu.header or (part and keyword in hdus[0].header):
+                continue
+            if key != "unit":
+                out.add(key, float(hdu.header.get(EXACT, hdu.header[keyword])) if key == "dt" else hdu.header[keyword])
+            elif not hdu.is_image or hdu.data is None:  # of one image alone
+                out.add(f"{part}{key}", hdu.header[keyword])
         data: Any = hdu.data
         if isinstance(hdu, fits.BinTableHDU):
             for column in hdu.columns:
@@ -94,15 +98,20 @@ def tables_and_images(hdus: HDUList, most: float) -> FileColumns:
                     raw = data.view(np.ndarray)[column.name]
                     out.add(name, _native(data[column.name], raw, column.null), column.unit or "")
         elif data is not None:
-            unit = str(hdu.header.get("BUNIT", ""))
-            out.add(hdu.name or f"image {number}", _native(data, data, hdu.header.get("BLANK")), unit)
+            out.add(hdu.name or f"image {number}", image_numbers(hdu), str(hdu.header.get("BUNIT", "")))
         for key in filter(is_rate, hdu.header):
-            out.add(key, hdu.header[key])
+            out.add(f"{part}{key}", hdu.header[key])
     return out
 
 
+def image_numbers(hdu: Any) -> Array:
+    """Return the numbers of an image, scaled as its header says."""
+    header = hdu.header
+    return _native(hdu.data, hdu.data, header.get("BLANK")) * header.get("BSCALE", 1.0) + header.get("BZERO", 0.0)
+
+
 def _native(data: Any, raw: Any, blank: int | None) -> Array:
-    """Return numbers in native byte order, scaled as the header says, NaN where the stored integer is `blank`."""
+    """Return numbers in native byte order, NaN where the stored integer is `blank`."""
     if np.asarray(data).dtype.kind not in "fiu":
         return np.asarray(data)
     out = np.array(data, dtype=np.float64)

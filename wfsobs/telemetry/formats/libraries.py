@@ -14,7 +14,7 @@ import sys
 import tempfile
 import warnings
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from math import prod
 from typing import IO, Any
 
@@ -23,9 +23,11 @@ import numpy as np
 from wfsobs.record import RecordError
 from wfsobs.telemetry.formats.contents import (
     DEEPEST,
+    FAST,
     NUMBERS,
     STAMP,
     TEXTS,
+    UNIT,
     FileColumns,
     TooLargeError,
     import_library,
@@ -69,7 +71,7 @@ def read_matlab(file: IO[bytes], most: int) -> FileColumns:
     """
     head = file.read(USERBLOCK + len(HDF5))
     if head.endswith(HDF5) or head.startswith(HDF5):
-        return read_hdf5(file, most)
+        return read_hdf5(file, most, ".")
     out, content = FileColumns(most=most), read_at_most(file, most)
     with refuse_damage("damaged, or not a MATLAB file"):
         if (order := {b"IM": "<", b"MI": ">"}.get(content[126:128])) is None:
@@ -156,9 +158,10 @@ def write_matlab(file: IO[bytes], arrays: Mapping[str, Array]) -> None:
 DAMAGED = "damaged, or not an HDF5 file"
 
 
-def read_hdf5(file: IO[bytes], most: int) -> FileColumns:
+def read_hdf5(file: IO[bytes], most: int, separator: str = "/") -> FileColumns:
     """Read the arrays of an HDF5 file under their paths, of MATLAB with the axes as it shows them. Raises RecordError.
 
+    separator : what stands between the names of a path
     This is done in a process of its own, since the HDF5 library may end it at a damaged file.
     """
     out, content = FileColumns(), read_at_most(file, most)
@@ -171,7 +174,8 @@ def read_hdf5(file: IO[bytes], most: int) -> FileColumns:
             arrays = {key: found[key] for key in found}
     if said["error"]:
         raise TooLargeError(most) if said["error"] == "large" else RecordError(said["error"])
-    for i, (name, text) in enumerate(said["parts"]):
+    for i, (path, text) in enumerate(said["parts"]):
+        name = path.replace("/", separator)
         if (key := f"part {i}") in arrays:
             out.add(name, arrays[key], text)
         else:
@@ -208,7 +212,7 @@ def _read_parts(file: IO[bytes], most: int) -> Iterator[Part]:
             if count > MOST_PARTS:  # also where a group is within itself
                 raise RecordError(f"has more than {MOST_PARTS} groups and arrays")
             item = source[path]
-            yield from _attributes(item)
+            yield from _attributes(item, isinstance(item, h5py.Group))
             if isinstance(item, h5py.Dataset):
                 room -= max(item.size or 0, prod(item.chunks or ())) * max(item.dtype.itemsize, 8)
                 if room < 0:
@@ -223,12 +227,15 @@ def _read_parts(file: IO[bytes], most: int) -> Iterator[Part]:
                         yield name, None, f"{name} is a link, which is not followed"
 
 
-def _attributes(item: Any) -> Iterator[Part]:
-    """Yield the numbers and texts of a record, or its rate, among the attributes of a group or of an array."""
+def _attributes(item: Any, is_group: bool) -> Iterator[Part]:
+    """Yield the numbers and texts of a record, or its rate, that the root states, and those that only other parts do."""
+    where = f"{item.name}/".lstrip("/")
     for key in item.attrs:
-        is_text = key.lower() in TEXTS and item.name == "/"
-        if (is_text or key.lower() in NUMBERS or is_rate(key)) and item.attrs.get_id(key).shape in ((), (1,)):
-            yield key, item.attrs[key], ""
+        is_text = (key.lower() in TEXTS and not where) or (UNIT.fullmatch(key) is not None and is_group)
+        if (where and key in item.file.attrs and not is_text) or item.attrs.get_id(key).shape not in ((), (1,)):
+            continue
+        if is_text or key.lower() in NUMBERS or is_rate(key):
+            yield key if key.lower() in NUMBERS else f"{where}{key}", item.attrs[key], ""
 
 
 def _dataset(name: str, item: Any, is_plain: bool) -> Part:
@@ -237,6 +244,8 @@ def _dataset(name: str, item: Any, is_plain: bool) -> Part:
     if item.shape is None or not is_plain:
         return name, None, f"{name} holds objects or references, not numbers"
     values, of_matlab = item[()], _text(item.attrs.get("MATLAB_class", ""))
+    if item.attrs.get("MATLAB_empty"):  # the numbers are its sizes
+        values = values[:0]
     if item.dtype.hasobject:
         values = _text(np.ravel(values)[0])
     if of_matlab == "char":
@@ -325,7 +334,8 @@ def read_parquet(file: IO[bytes], most: int) -> FileColumns:
                 out.add(name, float(value) if name in NUMBERS else value)
         for field in source.schema_arrow:
             of = field.type.value_type if types.is_list(field.type) or types.is_fixed_size_list(field.type) else field.type
-            if not (types.is_integer(of) or types.is_floating(of) or types.is_timestamp(of) or types.is_string(of)):
+            alone = of is field.type and (types.is_timestamp(of) or types.is_string(of))
+            if not (types.is_integer(of) or types.is_floating(of) or alone):
                 out.leave(field.name, f"{field.name} holds {str(field.type)[:40]}, not numbers")
                 continue
             column = source.read([field.name]).column(0)
@@ -334,21 +344,27 @@ def read_parquet(file: IO[bytes], most: int) -> FileColumns:
 
 
 def _add_column(out: FileColumns, name: str, column: Any, is_list: bool) -> None:
-    """Add a column of Arrow, without the nulls that end it; those before are missing samples."""
-    valid = np.flatnonzero(column.is_valid())
-    column = column.slice(0, valid[-1] + 1 if valid.size else 0)
-    n = len(column)
+    """Add a column of Arrow, whose nulls are missing samples; without those that end what may be shorter than the record.
+
+    That begins with a sample, as frames in rows of their own do, and frames in the rows of fast steps do not.
+    """
+    valid = np.asarray(column.is_valid())
+    if name.lower() not in FAST and valid[:1].all():
+        valid = valid[: np.flatnonzero(valid).max(initial=-1) + 1]
+        column = column.slice(0, len(valid))
     if is_list:
-        column = column.flatten()
-    if n and column.type == "string":
-        texts: Iterable[str] = (str(x.as_py()) for x in column)
-        if not STAMP.fullmatch(next(iter(texts)).strip()):
-            out.leave(name, f"{name} holds text, not numbers")
-            return
-        out.add(name, np.array([parse_cell(str(x.as_py() or "")) for x in column]), "s")
-    elif n and len(column) % n == 0:
+        lengths = np.unique(column.value_lengths().drop_null())
+        if lengths.size > 1:
+            return out.leave(name, f"{name} holds lists of {lengths[0]} to {lengths[-1]} numbers; it takes lists of one length")
+        values = np.full((len(valid), lengths.max(initial=0)), np.nan)
+        values[valid] = column.flatten().to_numpy(zero_copy_only=False).reshape(valid.sum(), -1)
+    elif column.type == "string":
+        if valid.any() and not STAMP.fullmatch(column.drop_null()[0].as_py().strip()):
+            return out.leave(name, f"{name} holds text, not numbers")
+        return out.add(name, np.array([parse_cell(x or "") for x in column.to_pylist()]), "s")
+    else:
         values = column.to_numpy(zero_copy_only=False)
-        out.add(name, values.reshape(n, -1) if is_list else values)
+    out.add(name, values)
 
 
 def write_parquet(file: IO[bytes], arrays: Mapping[str, Array]) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 
 from wfsobs.record import RecordError
 from wfsobs.telemetry.formats import csv
-from wfsobs.telemetry.formats.fits import open_fits
+from wfsobs.telemetry.formats.fits import image_numbers, open_fits
 from wfsobs.typing import Array
 from wfsobs.units import UNITS, micrometres_per, parse_unit
 
@@ -31,7 +31,7 @@ FEWEST_BINS = 8
 UNEVEN = 0.01
 """Maximum relative difference of the spaces between bins, which short numbers round."""
 
-SQUARED = re.compile(r"(?P<unit>[A-Za-zµμ]+)\s*(?:\^|\*\*)?2\s*(?:/\s*|\s)Hz(?:\^?-1)?")
+SQUARED = re.compile(r"(?P<unit>[A-Za-zµμ]+)\s*(?:(?:\^|\*\*)?2|²)\s*(?:/\s*|\s)Hz(?:\^?-1|⁻¹)?")
 Table = tuple[dict[str, Array], dict[str, str]]
 """Columns, and their units in the file."""
 
@@ -102,8 +102,7 @@ def _from_fits(file: IO[bytes]) -> Table:
                 return columns, {name: names[name].unit or "" for name in COLUMNS}
             if hdu.is_image and hdu.data is not None and hdu.data.ndim == 2 and hdu.data.shape[0] == len(COLUMNS):
                 density = str(hdu.header.get("BUNIT", ""))
-                rows = np.array(hdu.data, dtype=np.float64)
-                return dict(zip(COLUMNS, rows, strict=True)), {"frequency": "Hz", "tip": density, "tilt": density}
+                return dict(zip(COLUMNS, image_numbers(hdu), strict=True)), {"frequency": "Hz", "tip": density, "tilt": density}
     raise NoSpectrumError("has neither a table of frequency, tip and tilt nor an image of three rows")
 
 
