@@ -3,13 +3,14 @@
 Where a frame was lost, telemetry often has the last value once more, a line between neighbours or a prediction. An observer that
 takes these for measurements trusts them, and starts wrong after the gap. A frame is taken for missing where
 
-- the measurement, or the pseudo-open-loop of it, is the same in all modes for the third time, or
+- the measurement, or the pseudo-open-loop of it, is the same in all modes for the third time, or as much later as it is by chance
+  where the numbers of the measurement have steps, or
 - the last WINDOW frames follow a polynomial as no measured ones do: the squares left over are below SHARE of their median so far.
   DEGREE is such that a line of 50 Hz at 1 kHz, which a prediction goes on with, leaves 1e-5 of its power.
 
-No later frame decides, and nothing is found before USUAL / 10 frames with noise. Windows overlap, so that one in 10^9 of white
-noise of usual strength would be below SHARE, and that of one real frame at the end is not where the gap was long. What lasts
-longer than LONGEST is no gap but what the sensor measures.
+No later frame decides, but for the steps of the numbers, which are those of the whole record, and nothing is found before
+USUAL / 10 frames with noise. Windows overlap, so that one in 10^9 of white noise of usual strength would be below SHARE, and that
+of one real frame at the end is not where the gap was long. What lasts longer than LONGEST is no gap but what the sensor measures.
 """
 
 from __future__ import annotations
@@ -39,6 +40,9 @@ LONGEST = 10.0
 
 ROUNDING = 1e-12
 """Of a number, that is no noise."""
+
+RARE = 0.1
+"""Runs as long that a record has by chance, at most, where frames are taken for missing."""
 
 AT_ONCE = 100_000
 """Windows that are fitted at once, for the memory."""
@@ -75,13 +79,17 @@ def find_bridged(y: Array, z: Array, dt: float) -> Array:
     """
     with np.errstate(over="ignore", invalid="ignore"):  # of values beyond all measure, which are found elsewhere
         rounding = ROUNDING * (np.abs(y) + np.abs(z))
-        again = _is_again(y, 0.0 * rounding) | _is_again(z, rounding)
-        again[1:] &= again[:-1]
-        return _lacking(again, _squares_left_over(z), rounding, LONGEST / dt)
+        run, chance = np.maximum(_repeats(y, 0.0 * rounding), _repeats(z, rounding)), _chance_of_repeat(y)
+        again = (run >= 2) & (len(y) * chance**run <= RARE)
+        share = SHARE * float(len(y) * chance**WINDOW <= RARE)  # else whole windows of one value are measured
+        return _lacking(again, _squares_left_over(z), rounding, LONGEST / dt, share)
 
 
-def _lacking(again: Array, left_over: Array, rounding: Array, longest: float) -> Array:
-    """Return which frames repeat, or lack the noise that those before them have, (n,); none before there is some noise."""
+def _lacking(again: Array, left_over: Array, rounding: Array, longest: float, share: float) -> Array:
+    """Return which frames repeat, or lack the noise that those before them have, (n,); none before there is some noise.
+
+    share : of the usual squares left over, below which they do
+    """
     rows, every = np.arange(len(again)), USUAL // 10
     apart = rows - np.maximum.accumulate(np.where(again, rows, -1))  # a window with frames that repeat says nothing of the others
     usual, seen, lasting, k = np.zeros(left_over.shape[1]), 0, 0, WINDOW
@@ -91,7 +99,7 @@ def _lacking(again: Array, left_over: Array, rounding: Array, longest: float) ->
         part = slice(k, k + every - seen % every)
         squares, count = left_over[part], np.arange(1, len(out[part]) + 1)
         has_noise = (seen >= every) & (np.isfinite(usual) & (usual > rounding[part] ** 2)).all(axis=1)
-        lacks = has_noise & (again[part] | (apart[part] >= WINDOW) & (squares <= SHARE * usual).all(axis=1))
+        lacks = has_noise & (again[part] | (apart[part] >= WINDOW) & (squares < share * usual).all(axis=1))
         run = count - np.maximum.accumulate(np.where(lacks, -lasting, count))
         is_over = bool((run > longest).any())
         n = int(np.argmax(run > longest)) + 1 if is_over else len(count)
@@ -105,11 +113,22 @@ def _lacking(again: Array, left_over: Array, rounding: Array, longest: float) ->
     return out
 
 
-def _is_again(x: Array, rounding: Array) -> Array:
-    """Return where x (n, n_modes) is in all modes what it was one frame before, but for rounding, (n,)."""
-    out = np.zeros(len(x), dtype=bool)
-    out[1:] = (np.abs(np.diff(x, axis=0)) <= rounding[1:]).all(axis=1)
-    return out
+def _repeats(x: Array, rounding: Array) -> Array:
+    """Return for how many frames x (n, n_modes) has been in all modes what it was before, but for rounding, (n,)."""
+    rows, same = np.arange(len(x)), (np.abs(np.diff(x, axis=0, prepend=np.nan)) <= rounding).all(axis=1)
+    return rows - np.maximum.accumulate(np.where(same, 0, rows))
+
+
+def _chance_of_repeat(y: Array) -> float:
+    """Return the probability, at most, that the next frame of y (n, n_modes) is the same in all modes.
+
+    In every mode it is taken for the share of the changes that are as small as any, those by one step of its numbers: nearly none
+    where they are fine, and all where a step is more than the noise.
+    """
+    change = np.abs(np.diff(y, axis=0))
+    change[change == 0.0] = np.inf
+    least, changes = (change <= 1.5 * change.min(axis=0, initial=np.inf)).sum(axis=0), np.isfinite(change).sum(axis=0)
+    return float(np.prod(np.minimum(least / np.maximum(changes, 1), 1.0)))
 
 
 def _squares_left_over(z: Array) -> Array:
