@@ -22,6 +22,7 @@ arbitrary response over four lags, or that of a second-order mirror.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from math import sqrt
 
@@ -31,7 +32,7 @@ from scipy.fft import irfft, rfft
 from scipy.stats import chi2
 
 from wfsobs.control.margins import residual_density
-from wfsobs.record import Record, hold_last
+from wfsobs.record import Record, delay_signal, hold_last
 from wfsobs.scenario import Scenario
 from wfsobs.signal.wiener import circle_mean
 from wfsobs.simulation.true_spectra import true_spectra
@@ -160,6 +161,13 @@ class PlantLikelihood:
         self.missing = [MissingSamples(np.isnan(x), dt) for x in self.y.T]
         self.U = np.array([self._transform(x) for x in self.u])
         self.Y = self._transform(self.filled_y)
+
+    def without(self, own: Array) -> PlantLikelihood:
+        """Return the same measurements with commands that lack a part (n, k)."""
+        out = copy(self)
+        out.u = self.u - np.array([delay_signal(own, lag) for lag in range(len(self.u))])
+        out.U = np.array([self._transform(x) for x in out.u])
+        return out
 
     @property
     def filled_y(self) -> Array:
