@@ -6,6 +6,7 @@ import csv
 import re
 import subprocess
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from click.testing import CliRunner
 
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.jobs import DONE
-from wfsobs.app.pages.campaign import CampaignPage
+from wfsobs.app.pages.campaign import CampaignPage, standings_html
 from wfsobs.app.pages.pages import CAMPAIGN, EXPLORE
 from wfsobs.app.render import number
 from wfsobs.app.service import Session
@@ -87,7 +88,12 @@ def test_a_campaign_is_followed_and_opened(dashboard: Dashboard, loop: Any, plan
     page.tick()
     loop.until(lambda: "8 of 8 runs" in page.status.text)
     assert page.status.text.endswith(", finished")
-    assert "Persistence" in page.table.html
+    assert "Persistence" in page.table.html and "interval of 95 %" in page.table.html
+    assert page.state is not None
+    view = page.view_of(page.state)
+    assert view is not None
+    looked_at = replace(view, errors=replace(view.errors, level=0.99))
+    assert "interval of 99 %" in standings_html(looked_at, page.display), "the level that is tested at"
     page.target.value = "vibration"
     grid = page.map.grid
     assert (grid["columns"], grid["rows"]) == (["5", "20"], ["10", "5"]), "the smallest value is at the bottom"

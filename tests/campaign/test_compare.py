@@ -6,12 +6,16 @@ import tracemalloc
 import numpy as np
 import pyarrow as pa
 import pytest
+from click.testing import CliRunner
 from scipy.stats import binom, ttest_rel
 
 from wfsobs.campaign.compare import LEVEL, Comparison, compare, mean_interval
+from wfsobs.campaign.follow import CampaignFolder
 from wfsobs.campaign.plan import Stop, looks, parse_plan
+from wfsobs.campaign.report import write_report
 from wfsobs.campaign.run import wanted_seeds
-from wfsobs.campaign.store import ROWS, BatchIndex, schema, write_batch
+from wfsobs.campaign.store import ROWS, BatchIndex, open_folder, schema, write_batch
+from wfsobs.cli import main
 from wfsobs.evaluation.result import can_be_best
 from wfsobs.observers import OBSERVERS
 
@@ -104,6 +108,28 @@ def test_intervals_where_it_is_stopped_cover_at_least_94_per_cent():
         used.append(count)
     assert hits / 4000 >= 0.94
     assert np.mean(used) < 80  # some are stopped before the last look
+
+
+def test_all_that_is_shown_of_looks_is_at_the_level_of_one(tmp_path):
+    """Three looks share the 5 %: a difference of p = 0.033 is none, by scipy's paired t-test of single looks at 98.33 %."""
+    better, worse = np.full(8, 10.0), 10.0 + np.array([1.9, -1.2, 2.4, 0.3, 1.1, -0.2, 2.0, 0.9]) + 0.25
+    test, level = ttest_rel(worse, better), 1.0 - 0.05 / 3.0
+    assert 0.05 / 3.0 < test.pvalue < 0.05
+    low, high = test.confidence_interval(level)
+    plan = parse_plan('seeds = 8\nobservers = ["kf-lgs", "kf-multi"]\n[stop]\nfirst = 2\n', tmp_path)
+    assert plan.level == pytest.approx(level, rel=1e-12)
+    open_folder(plan, tmp_path)
+    both = [*rows(better, "kf-lgs"), *rows(worse, "kf-multi")]
+    found = [{**r, "seed": r["seed"] + 1, "key": f"{r['seed']} {r['name']}"} for r in both]
+    write_batch(tmp_path, found, {"host": "h", "process": 1, "written": 0.0})
+    place = CampaignFolder(tmp_path).read().errors["vibration", "tip"].standings([0])[1]
+    assert place.is_tie and 10.0 * place.low == pytest.approx(low, rel=1e-9)  # another order of sums
+    said = CliRunner().invoke(main, ["campaign", "table", str(tmp_path)]).stdout
+    assert f"~{(low + high) / 2:.2f} +- {(high - low) / 2:.2f}" in said and "interval of 98.3 %" in said
+    assert "interval of 98.3 %" in CliRunner().invoke(main, ["campaign", "table", str(tmp_path), "--together"]).stdout
+    write_report(tmp_path, tmp_path / "report.html")
+    report = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert f"± {(high - low) / 2:.2f} <span" in report and "98.3 % (paired t)" in report
 
 
 def test_a_look_takes_the_first_seeds_whatever_has_arrived(tmp_path):

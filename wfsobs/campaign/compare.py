@@ -129,11 +129,14 @@ class CampaignErrors:
         rms [nm], (n_cells, n_seeds, n_names), NaN without a result.
     eligible : Array
         Whether a name ran in a scenario and can be the best there, bool (n_cells, n_names).
+    level : float
+        Level of the tests and of the intervals of differences.
     """
 
     names: tuple[str, ...]
     values: Array
     eligible: Array
+    level: float = LEVEL
 
     @cached_property
     def count(self) -> Array:
@@ -179,7 +182,7 @@ class CampaignErrors:
             with np.errstate(divide="ignore"):
                 samples = np.where(rms > 0, np.log(rms), np.nan)
             mean, eligible = np.exp(mean_interval(samples)[0]), np.all(self.eligible[cells] | np.isnan(rms), axis=0)
-        best, difference, half, tie, untested = compare_columns(samples, mean, eligible)
+        best, difference, half, tie, untested = compare_columns(samples, mean, eligible, self.level)
         parts = difference, difference - half, difference + half
         above, low, high = (part / mean[best] if len(cells) == 1 else np.expm1(part) for part in parts)
         numbers = [column.tolist() for column in (mean, above, low, high, np.arange(len(mean)) == best, tie, untested)]
@@ -282,17 +285,19 @@ def coded_rows(table: pyarrow.Table, codes: dict[str, int]) -> Array:
     return rows
 
 
-def gather_errors(rows: Array, codes: Mapping[str, int], shape: tuple[int, int]) -> dict[tuple[str, str], CampaignErrors]:
+def gather_errors(
+    rows: Array, codes: Mapping[str, int], shape: tuple[int, int], level: float = LEVEL
+) -> dict[tuple[str, str], CampaignErrors]:
     """Return (target, mode) -> errors of rows, whose cells and seeds are places in an array of this shape."""
     texts, out = list(codes), {}
     for target, mode in np.unique(rows[["target", "mode"]]).tolist():
         if texts[target]:
             part = rows[(rows["target"] == target) & (rows["mode"] == mode)]
-            out[texts[target], texts[mode]] = _errors_of(part, texts, texts[target], shape)
+            out[texts[target], texts[mode]] = _errors_of(part, texts, texts[target], shape, level)
     return out
 
 
-def _errors_of(rows: Array, texts: list[str], target: str, shape: tuple[int, int]) -> CampaignErrors:
+def _errors_of(rows: Array, texts: list[str], target: str, shape: tuple[int, int], level: float) -> CampaignErrors:
     """Return the errors of the rows of one target and mode."""
     codes, place = np.unique(rows["name"], return_inverse=True)
     known, order = np.unique([texts[code] for code in codes], return_inverse=True)
@@ -301,7 +306,7 @@ def _errors_of(rows: Array, texts: list[str], target: str, shape: tuple[int, int
     values[rows["cell"], rows["seed"], column] = rows["rms_nm"]
     eligible[rows["cell"], column] = np.array([can_win(name, target) for name in names])[column]
     eligible[rows["cell"][rows["apart"]], column[rows["apart"]]] = False
-    return CampaignErrors(tuple(names), values, eligible)
+    return CampaignErrors(tuple(names), values, eligible, level)
 
 
 def compare(table: pyarrow.Table, level: float = LEVEL) -> list[Comparison]:

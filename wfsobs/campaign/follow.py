@@ -225,7 +225,7 @@ class CampaignFolder:
         self._parts = [rows.copy()]
         rows["seed"] -= plan.seeds.start
         shape = len(plan.cells), len(plan.seeds)
-        errors = gather_errors(rows, codes, shape)
+        errors = gather_errors(rows, codes, shape, plan.level)
         done = np.ones(shape, dtype=bool)
         failures = {}
         for name in (*plan.observers, *plan.controllers):

@@ -165,6 +165,11 @@ class Campaign:
         return len(self.cells) * len(self.seeds)
 
     @property
+    def level(self) -> float:
+        """Level of tests and intervals of differences: that of one look where there are several."""
+        return self.stop.level if self.stop else LEVEL
+
+    @property
     def axes(self) -> tuple[str, ...]:
         """Dotted paths of the settings that the cells differ in."""
         return tuple(dict.fromkeys(path for cell in self.cells for path in cell.changes))

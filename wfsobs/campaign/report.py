@@ -187,7 +187,7 @@ def write_report(folder: Path, path: Path) -> None:
 
     plan = folder_plan(folder)
     table = present_rows(plan, read_results(folder))
-    comparisons = compare(table)
+    comparisons = compare(table, plan.level)
     groups = comparison_groups(comparisons)
     stable = first_places(table, np.random.default_rng(0))
     environment = Environment(

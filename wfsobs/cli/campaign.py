@@ -100,7 +100,7 @@ def print_csv(plan: Campaign, table: pyarrow.Table) -> None:
 def summary_table(plan: Campaign, rows: object, title: str) -> Table:
     """Return a table with one row per scenario, target, mode and observer."""
     texts, numbers = ("Scenario", "Settings", "Target", "Mode", "Name"), ("rms, nm", SPREAD, "above the best, nm", "seeds")
-    caption = "+-: interval of 95 % of the paired difference from the best; ~: not significant"
+    caption = f"+-: interval of {100 * plan.level:.3g} % of the paired difference from the best; ~: not significant"
     out = new_table(texts, numbers, no_wrap=False, title=title, caption=caption)
     targets, modes = (*SCORED, "residual"), [m.name for m in plan.cells[0].scenario().modes]
 
@@ -109,7 +109,7 @@ def summary_table(plan: Campaign, rows: object, title: str) -> Table:
         return one.cell, targets.index(one.target), modes.index(one.mode) if one.mode in modes else len(modes), one.mode
 
     before = None
-    for one in sorted(compare(rows), key=place):
+    for one in sorted(compare(rows, plan.level), key=place):
         key = (one.cell, one.target, one.mode)
         settings = ", ".join(f"{path.split('.')[-1]} = {value}" for path, value in plan.cells[one.cell].changes.items())
         new = key != before
@@ -164,7 +164,9 @@ def print_together(folder: Path, only: Sequence[str], target: str | None, mode: 
         out.writerows([["" if value != value else value for value in astuple(row)] for row in rows])  # NaN is not known
         return
     title = f"{state.plan.name}: {state.n_done} of {state.plan.n_runs} runs, {len(cells)} of {len(state.plan.cells)} scenarios"
-    caption = "wins: scenarios with the smallest error, and how many of them are significant"
+    caption = (
+        f"above the best: interval of {100 * state.plan.level:.3g} %; wins: with the smallest error, and how many are significant"
+    )
     out = new_table(("Target", "Mode", "Name"), NUMBERS, no_wrap=False, title=title, caption=caption)
     before = None
     for row in rows:

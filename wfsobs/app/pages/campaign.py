@@ -74,6 +74,7 @@ def standings_html(view: CampaignView, display: Display) -> str:
         lost=[name_label(name) for name in sorted(lost)],
         scale=view.scale(display),
         paired_over="scenarios" if len(view.errors.known_cells(view.cells)) > 1 else "seeds",
+        level=view.errors.level,
         untested=UNTESTED,
         isfinite=np.isfinite,
         label=name_label,
