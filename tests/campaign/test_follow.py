@@ -8,6 +8,7 @@ import pytest
 from wfsobs.campaign.compare import CampaignErrors, compare
 from wfsobs.campaign.follow import CampaignFolder
 from wfsobs.campaign.plan import MOST_VALUES, parse_plan, plan_axes
+from wfsobs.campaign.report import write_report
 from wfsobs.campaign.run import run_rows
 from wfsobs.campaign.store import batch_files, open_folder, read_batch, read_results, write_batch
 from wfsobs.settings.values import SettingError
@@ -120,6 +121,27 @@ def test_nothing_is_tied_without_a_test():
         assert [(s.is_tie, s.is_untested) for s in sorted(found.standings([0, 1]))] == [(False, False), (False, True)]
         assert found.verdict([0, 1]).ties == () and not found.verdict([0, 1]).is_decided
         assert not found.winners[1].is_decided, "there is nothing beside it"
+
+
+@pytest.mark.parametrize(("rms", "margin"), [(12.0, 2.0 / 500.0**0.5), (9.0, 0.0)])
+def test_the_margin_is_over_the_seeds_that_both_have(tmp_path, rms, margin):
+    """The best has 10 nm twice and 30 nm, where the next failed, twice, so an rms of sqrt(500)."""
+    values = np.array([[[10.0, rms], [10.0, rms], [30.0, np.nan], [30.0, np.nan]]])
+    found = CampaignErrors(("kf-lgs", "kf-multi"), values, np.ones((1, 2), dtype=bool)).winners[0]
+    assert found.best.name == "kf-lgs" and found.margin == pytest.approx(margin, rel=1e-12)
+    names = '["kf-lgs", "kf-multi"]'
+    plan = parse_plan(f"seeds = 4\nobservers = {names}\n[grid]\nturbulence.wind_speed = [5, 20]", tmp_path)
+    open_folder(plan, tmp_path)
+    row = {"scenario": "paper", "target": "total", "mode": "tip", "apart": False}
+    rows = [
+        {**row, "key": f"{cell} {i} {name}", "cell": cell, "seed": i + 1, "name": name, "rms_nm": None if np.isnan(it) else it}
+        for cell in (0, 1)
+        for i, of in enumerate(values[0].tolist())
+        for name, it in zip(("kf-lgs", "kf-multi"), of, strict=True)
+    ]
+    write_batch(tmp_path, rows, {"host": "", "process": 1, "written": 1.0})
+    write_report(tmp_path, tmp_path / "report.html")
+    assert f"22.4 nm, {margin:.0%} before the next" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow

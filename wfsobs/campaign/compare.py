@@ -107,7 +107,7 @@ class CampaignPlace(NamedTuple):
 class CampaignWinner(NamedTuple):
     """The best over some scenarios.
 
-    margin : how much worse the next is, NaN without one;  ties : what does not differ by a test
+    margin : how much worse the next is where both have a result, NaN without one;  ties : what does not differ by a test
     is_decided : whether it differs significantly from all others
     """
 
@@ -197,8 +197,9 @@ class CampaignErrors:
             return None
         rivals = [s for s in standings if s.is_rival]
         decided = bool(rivals) and not any(s.is_tie or s.is_untested for s in rivals)
-        margin = min((s.rms for s in rivals), default=np.nan) / best.rms - 1.0 if best.rms > 0 else np.nan
-        return CampaignWinner(best, float(margin), tuple(s.name for s in standings if s.is_tie), decided)
+        above = [s.above for s in rivals if not np.isnan(s.above)]
+        margin = max(min(above), 0.0) if above else np.nan  # what failed may be better where it did not
+        return CampaignWinner(best, margin, tuple(s.name for s in standings if s.is_tie), decided)
 
     @cached_property
     def winners(self) -> dict[int, CampaignWinner]:

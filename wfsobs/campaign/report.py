@@ -8,7 +8,6 @@ seeds of one scenario are no independent evidence about others.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
@@ -252,8 +251,8 @@ def _map(
         best = next((r for r in rows if r.is_best), None)
         if best is None:
             continue
-        second = min((r.rms for r in rows if r.difference is not None), default=math.inf)
-        margin = second / best.rms - 1.0 if best.rms > 0 and math.isfinite(second) else FULL_MARGIN
+        above = [r.difference for r in rows if r.difference is not None]
+        margin = max(min(above), 0.0) / best.rms if above and best.rms > 0 else FULL_MARGIN  # as `CampaignErrors.verdict` has it
         tie = any(r.is_tie for r in rows)
         values = [changes[cell][path] for path in paths]
         x, y, *_ = [*values, None]
