@@ -130,6 +130,7 @@ def test_all_that_is_shown_of_looks_is_at_the_level_of_one(tmp_path):
     write_report(tmp_path, tmp_path / "report.html")
     report = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert f"± {(high - low) / 2:.2f} <span" in report and "98.3 % (paired t)" in report
+    assert all("a best of the same data" in " ".join(text.split()) for text in (said, report)), "of more rows fewer hold"
 
 
 def test_a_look_takes_the_first_seeds_whatever_has_arrived(tmp_path):

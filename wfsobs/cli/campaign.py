@@ -100,7 +100,9 @@ def print_csv(plan: Campaign, table: pyarrow.Table) -> None:
 def summary_table(plan: Campaign, rows: object, title: str) -> Table:
     """Return a table with one row per scenario, target, mode and observer."""
     texts, numbers = ("Scenario", "Settings", "Target", "Mode", "Name"), ("rms, nm", SPREAD, "above the best, nm", "seeds")
-    caption = f"+-: interval of {100 * plan.level:.3g} % of the paired difference from the best; ~: not significant"
+    caption = (
+        f"+-: interval of {100 * plan.level:.3g} % of one paired difference from a best of the same data; ~: not significant"
+    )
     out = new_table(texts, numbers, no_wrap=False, title=title, caption=caption)
     targets, modes = (*SCORED, "residual"), [m.name for m in plan.cells[0].scenario().modes]
 
@@ -164,9 +166,8 @@ def print_together(folder: Path, only: Sequence[str], target: str | None, mode: 
         out.writerows([["" if value != value else value for value in astuple(row)] for row in rows])  # NaN is not known
         return
     title = f"{state.plan.name}: {state.n_done} of {state.plan.n_runs} runs, {len(cells)} of {len(state.plan.cells)} scenarios"
-    caption = (
-        f"above the best: interval of {100 * state.plan.level:.3g} %; wins: with the smallest error, and how many are significant"
-    )
+    level = f"interval of {100 * state.plan.level:.3g} % of one difference from a best of the same data"
+    caption = f"above the best: {level}; wins: scenarios with the smallest error, and how many of them are significant"
     out = new_table(("Target", "Mode", "Name"), NUMBERS, no_wrap=False, title=title, caption=caption)
     before = None
     for row in rows:
