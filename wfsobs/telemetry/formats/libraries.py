@@ -357,7 +357,7 @@ def _add_column(out: FileColumns, name: str, column: Any, is_list: bool) -> None
         if lengths.size > 1:
             return out.leave(name, f"{name} holds lists of {lengths[0]} to {lengths[-1]} numbers; it takes lists of one length")
         values = np.full((len(valid), lengths.max(initial=0)), np.nan)
-        values[valid] = column.flatten().to_numpy(zero_copy_only=False).reshape(valid.sum(), -1)
+        values[valid] = column.flatten().to_numpy(zero_copy_only=False).reshape(valid.sum(), values.shape[1])
     elif column.type == "string":
         if valid.any() and not STAMP.fullmatch(column.drop_null()[0].as_py().strip()):
             return out.leave(name, f"{name} holds text, not numbers")
