@@ -188,6 +188,7 @@ CASES: list[tuple[str, bytes, dict[str, Any], str]] = [
         for sign in "./"
     ),
     ("a.mat", hdf5(of_matlab_73, 512), NM, "unit nm, y_lgs and u with a row per mode"),
+    ("a.mat", matlab(y_lgs={"tip": Y[:, :1], "tilt": Y[:, 1:]}, u={"tip": U[:, :1], "tilt": U[:, 1:]}, dt=1e-3), NM, "unit nm"),
     (
         "a.h5",
         hdf5(mapped),

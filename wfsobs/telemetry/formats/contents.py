@@ -50,8 +50,10 @@ NUMBERS = ("dt", "ratio", "delay", "command_sign")
 TEXTS = ("unit", "origin", "scenario")
 NAMES = (*SIGNALS, *CLOCKS, STARS, APART, *NUMBERS, *TEXTS)
 
-COLUMN = re.compile(r"(?:truth/)?(?P<array>[a-z_]+)/(?P<mode>[A-Za-z0-9 -]+?)(?:(?:_| ?[\[(])(?P<unit>[A-Za-zµμ]+)[\])]?)?$")
-"""Name of a column of one mode, such as y_lgs/tip_um."""
+COLUMN = re.compile(
+    r"(?:truth/)?(?P<array>[a-z_]+)(?:/|\.(?=tip|tilt))(?P<mode>[A-Za-z0-9 -]+?)(?:(?:_| ?[\[(])(?P<unit>[A-Za-zµμ]+)[\])]?)?$"
+)
+"""Name of a column of one mode, such as y_lgs/tip_um, or y_lgs.tip of a structure."""
 
 MOST_COLUMNS = 20_000
 """Maximum columns of one array that a file offers under names of its own."""
