@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from math import pi
@@ -22,7 +23,7 @@ from wfsobs.identification import identify
 from wfsobs.identification.plant import GroupPlant, PlantNumber, identify_plant
 from wfsobs.identification.result import Identification
 from wfsobs.progress import Watch
-from wfsobs.record import Record, RecordError
+from wfsobs.record import Record, RecordError, frame_mean
 from wfsobs.signal.autoregressive import Ar2
 from wfsobs.telemetry import check
 from wfsobs.telemetry.check import LEVEL, find_changes
@@ -275,3 +276,24 @@ def test_too_little_is_said(tmp_path: Path, record: Record) -> None:
     assert CliRunner().invoke(main, ["check", str(tmp_path / "r.npz")]).stdout.endswith("\nIt cannot be identified.\n")
     done = CliRunner().invoke(main, ["check", str(tmp_path / "no.npz")])
     assert (done.exit_code, done.output.count("\n")) == (2, 1)
+
+
+def test_what_the_frames_of_the_ngs_lack_is_said(tmp_path: Path) -> None:
+    """Those that are missing, by `observe` as well, and noise of their own where they are means of the LGS."""
+    rng = np.random.default_rng(1)
+    y, u = 0.05 * rng.standard_normal((2, 1500, 2))
+    y[:, 1], frames = np.where(np.arange(1500) == 5, 0.1, np.nan), np.full((1500, 2), np.nan)
+    frames[5::50] = rng.standard_normal((30, 2))
+    record = Record(y, u, DT, y_ngs=frames, ratio=5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = checked(tmp_path, record)
+    texts = [(f["subject"], f["text"]) for f in found["findings"] if "frames" in f["subject"]]
+    assert texts == [("frames", "1500 at 1000 Hz, 1.5 s; 1499 missing (99.9 %)"), ("NGS frames", "299; 269 missing (90 %)")]
+    told = CliRunner().invoke(main, ["observe", str(tmp_path / "r.npz"), "--observer", "zero"]).stderr
+    assert "269 of 299 NGS frames are missing" in told.replace("\n", " ")
+    y = rng.standard_normal((1500, 2)).cumsum(axis=0)
+    for ratio in (1, 5):
+        frames = np.roll(frame_mean(y, ratio), -1, axis=0)
+        with pytest.raises(RecordError, match="y_ngs has no noise of its own beside y_lgs"):
+            identify(Record(y, u, DT, y_ngs=frames, ratio=ratio))

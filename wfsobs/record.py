@@ -130,6 +130,12 @@ class Signals:
         return int(np.isnan(self.y_lgs).any(axis=1).sum())
 
     @property
+    def ngs_gaps(self) -> Array:
+        """Which NGS frames a mode has no measurement of, bool (frames,)."""
+        frames = self.y_lgs[:0] if self.y_ngs is None or self.ratio is None else self.y_ngs[self.ratio :: self.ratio]
+        return np.asarray(np.isnan(frames).any(axis=1))
+
+    @property
     def z(self) -> Array:
         """Pseudo-open-loop LGS measurement, z[k] = y_lgs[k] - u[k-delay] = phi_dist[k-1] + noise [um]; NaN where either is."""
         return pseudo_open_loop(self.y_lgs, self.u, self.delay)

@@ -320,6 +320,8 @@ def load_with_delay(record_file: str, scenario: Scenario, declaration: DeclaredF
         print_note(f"{record_file}: y_lgs of {' and '.join(still)} is one value all the time; a measurement has noise")
     if record.missing:
         print_note(f"{record_file}: {record.missing} of {record.n_steps} frames are missing")
+    if (gone := record.ngs_gaps).any():
+        print_note(f"{record_file}: {gone.sum()} of {gone.size} NGS frames are missing")
     expected = erfc(record.gate.level / sqrt(2.0)) * record.n_steps * record.n_modes if record.gate else 0.0
     if record.gate and record.outliers > expected + 3.0 * sqrt(expected):
         what = "missing" if record.gate.action == "reject" else "clipped"

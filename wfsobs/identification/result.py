@@ -206,6 +206,8 @@ def autocorrelation_test(e: Array, numbers: int) -> float:
 
 FEWEST, SHARE = 200, 0.5
 """Minimum NGS frames, and minimum share of them that is measured."""
+NO_NOISE = 1e-4
+"""Of the rms of z: a difference that is never larger is of numbers that were rounded."""
 LEAST = 0.1
 """Minimum share of the NGS in the noise of the difference."""
 LEFT = 0.01
@@ -237,7 +239,7 @@ class SensorDifference:
 def sensor_differences(record: Record) -> Array | None:
     """Return the mean of z over each NGS frame minus the frame, (frames, n_modes) [um]; None without enough frames.
 
-    NaN where a sample is missing.
+    NaN where a sample is missing. Raises RecordError where the frames are means of the LGS.
     """
     if record.y_ngs is None or record.ratio is None:
         return None
@@ -250,7 +252,11 @@ def sensor_differences(record: Record) -> Array | None:
         return None
     start = first - ratio + 1
     out = z[start : start + whole * ratio].reshape(whole, ratio, -1).mean(axis=1) - frames[:whole]
-    return out if (np.isfinite(out).mean(axis=0) >= SHARE).all() else None
+    if not (np.isfinite(out).mean(axis=0) >= SHARE).all():
+        return None
+    if (np.nanmax(np.abs(out), axis=0) <= NO_NOISE * np.nanstd(z, axis=0)).any():
+        raise RecordError("y_ngs has no noise of its own beside y_lgs")
+    return out
 
 
 def read_difference(difference: Array, dt: float, ratio: int, lgs_noise: Number) -> SensorDifference:

@@ -145,15 +145,18 @@ def check_record(record: Record, reading: Reading, raw: Record, watch: Watch = Q
 def _frames(record: Record) -> Iterator[Remark]:
     n = record.n_steps
     share = record.missing / n
-    text = f"{n} at {1.0 / record.dt:.6g} Hz, {n * record.dt:.4g} s; {record.missing} missing ({100.0 * share:.2g} %)"
+    text = f"{n} at {1.0 / record.dt:.6g} Hz, {n * record.dt:.4g} s; {record.missing} missing ({100.0 * share:.3g} %)"
     yield Remark("frames", "note" if share > OUTLYING else "ok", text)
+    if (gone := record.ngs_gaps).size:
+        text = f"{gone.size}; {gone.sum()} missing ({100.0 * gone.mean():.3g} %)"
+        yield Remark("NGS frames", "note" if gone.mean() > OUTLYING else "ok", text)
     low, high = Sensors.settings()["lgs_rate"].bounds
     if not low <= 1.0 / record.dt <= high:
         yield Remark("rate", "excluded", f"that of a loop is {low:g} to {high:g} Hz: check dt, or the unit of the time")
     for name, y in (("y_lgs", record.y_lgs), ("y_ngs", record.y_ngs)):
         for mode, values in zip(MODE_NAMES, () if y is None else y.T, strict=False):
             known = values[~np.isnan(values)]
-            if known.size and np.ptp(known) == 0.0:
+            if known.size > 1 and np.ptp(known) == 0.0:
                 yield Remark("frames", "excluded", f"{name}/{mode} is {known[0]:g} all the time; a measurement has noise")
     if record.origin:
         yield Remark("read as", "ok", record.origin)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import sqrt
 
 import numpy as np
 
@@ -231,7 +232,7 @@ def _misfits(h: Array, g: Array) -> Array:
 
 def _in_errors(differences: Array) -> float:
     """Return the mean over blocks in standard errors."""
-    return float(differences.mean() / max(differences.std(ddof=1) / np.sqrt(differences.size), 1e-300))
+    return float(differences.mean()) / max(float(differences.std(ddof=1)) / sqrt(differences.size), 1e-300)
 
 
 def _correlation(h: Array, g: Array) -> float:

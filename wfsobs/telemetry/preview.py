@@ -141,8 +141,7 @@ class Preview:
         r = self.record
         ngs = "none"
         if r.y_ngs is not None and r.ratio is not None:
-            lost = int(np.isnan(r.y_ngs[r.ratio :: r.ratio]).any(axis=1).sum())
-            ngs = f"{self.rate / r.ratio:.6g} Hz, {lost} frames missing"
+            ngs = f"{self.rate / r.ratio:.6g} Hz, {r.ngs_gaps.sum()} frames missing"
         truth = [name for name in ("turbulence", "vibration") if getattr(r, name) is not None]
         return [
             f"{r.n_steps} steps at {self.rate:.6g} Hz, {self.duration:.4g} s, {r.missing} missing"
