@@ -48,17 +48,17 @@ def test_it_is_the_gain_whose_loop_leaves_least(delay: float, leak: float) -> No
     found = gain_from_telemetry(z, mirror, leak)
     assert found.limit == highest_stable_gain(mirror, leak)
     tried = found.gain * np.array([0.9, 1.0, 1.1])
-    start = n - n * 19 // 20 // 16 * 16
-    left = [np.square(close(phi, noise, g, mirror, leak)[0][start:]).mean() for g in tried]
+    left = [np.square(close(phi, noise, g, mirror, leak)[0][100:]).mean() for g in tried]
     assert left[1] == min(left), "no neighbour leaves less"
-    # a parabola through gains a hundredth of the limit apart: its third derivative is all that is left out
-    assert found.measured_rms == pytest.approx(np.sqrt(left[1]), rel=1e-4)
+    # 100 of 6,000 steps, in which the loops settle, are left out: their mean square is known to a fifth
+    assert found.measured_rms == pytest.approx(np.sqrt(left[1]), rel=0.2 / 60.0 / 2.0)
 
 
 @pytest.mark.slow
-def test_it_is_that_of_the_true_spectra_within_its_deviation() -> None:
-    """Over 60 records: no bias beyond three standard errors, and deviations of the right size."""
-    mirror, n, grid = Mirror(2.0), 10_000, 2**16 + 1
+@pytest.mark.parametrize(("delay", "gone"), [(2.0, 0.0), (2.0, 0.19), (1.0, 0.1)])
+def test_it_is_that_of_the_true_spectra_within_its_deviation(delay: float, gone: float) -> None:
+    """Over 60 records: no bias beyond three standard errors, deviations of the right size, and what they hold."""
+    mirror, n, grid = Mirror(delay), 10_000, 2**16 + 1
     f = np.linspace(0.0, 0.5 / DT, grid)
     own = (SLOW.psd(f) + LINE.psd(f)) / (2.0 * DT)
     omega = 2.0 * np.pi * f * DT
@@ -66,11 +66,15 @@ def test_it_is_that_of_the_true_spectra_within_its_deviation() -> None:
     found = []
     for seed in range(60):
         rng = np.random.default_rng(seed)
-        found.append(gain_from_telemetry(disturbance(rng, n) + NOISE * rng.standard_normal(n), mirror))
+        z = disturbance(rng, n) + NOISE * rng.standard_normal(n)
+        z[rng.random(n) < gone] = np.nan
+        found.append(gain_from_telemetry(z, mirror))
     gains, deviations = np.array([(one.gain, one.deviation) for one in found]).T
     assert abs(gains.mean() - best) < 3.0 * gains.std() / np.sqrt(gains.size)
     # 60 records tell a standard deviation to 9 %, 16 blocks each of its estimates to 18 %
-    assert 0.7 < np.sqrt(np.square(deviations).mean()) / gains.std() < 1.3
+    assert 0.7 < np.sqrt(np.square(deviations).mean()) / gains.std() < 1.4
+    # 93 % by Student's t of 15 degrees of freedom: less than 50 of 60 are one in 200
+    assert np.sum(np.abs(gains - best) < 1.96 * deviations) >= 50
 
 
 @pytest.mark.parametrize("gone", [0.01, 0.1, 0.19, "a burst", "the end"])

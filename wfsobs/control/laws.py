@@ -5,8 +5,9 @@ without a model of spectra or noise. The pseudo-open-loop z of a record is what 
 given: it would have left the measurement y = E(g) z. With white noise and at least one step of delay, E(g) = 1 + terms of the
 past, so that the noise of y is uncorrelated with the residual that it measures and mean y^2 is the mean square of the residual
 plus the variance of the noise, whatever g is: the gain that is best for y is best for the residual. This is the integral over the
-measured spectrum times |E(g)|^2 by which observatories optimise modal gains (Gendron and Lena 1994, A&A 291, 337), taken over the
-samples themselves.
+measured spectrum times |E(g)|^2 by which observatories optimise modal gains (Gendron and Lena 1994, A&A 291, 337). It is
+taken over correlations of the steps z[k] - leak z[k-1], which the rest of E(g) filters to y. Each correlation is a mean over the
+pairs that are known, so that missing samples do not bias it.
 
 LQG commands against the disturbance what a Kalman filter predicts of it. The mirror follows a command at once and without cost,
 so the best command is minus the prediction of what the disturbance will be while it acts (certainty equivalence): u[k] =
@@ -40,7 +41,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import toeplitz
 from scipy.optimize import minimize_scalar
-from scipy.signal import lfilter
+from scipy.signal import correlate, lfilter
 
 from wfsobs.control.margins import residual_density
 from wfsobs.control.mirror import Law, Mirror, Plant
@@ -144,11 +145,11 @@ TRIED = 80
 BLOCKS = 16
 """Of the record, for the jackknife."""
 
-START = 0.05
-"""Share of the record that is left out for the integrators to settle."""
+LAGS = 1000
+"""Of the correlations: an integrator of the smallest gain tried remembers less."""
 
 SHORTEST, LEAST = 1000, 0.8
-"""Minimum of measured samples, and of their share: with more lines over missing ones the gain is off by some 5 %."""
+"""Minimum of measured samples, and of their share: where more are missing, few pairs of steps are known."""
 
 
 @dataclass(frozen=True)
@@ -177,8 +178,7 @@ def gain_from_telemetry(z: Array, mirror: Mirror, leak: float = 1.0) -> Telemetr
     Parameters
     ----------
     z : Array
-        Pseudo-open-loop measurement, (n_steps,) [um]. Integrators see a straight line over missing samples (NaN), which do not
-        count in what they leave.
+        Pseudo-open-loop measurement, (n_steps,) [um]; NaN is a missing sample.
     mirror : Mirror
         Its delay; limits are not regarded.
     leak : float
@@ -194,24 +194,36 @@ def gain_from_telemetry(z: Array, mirror: Mirror, leak: float = 1.0) -> Telemetr
         raise RecordError(f"{measured.size} of {z.size} samples are measured, a gain needs {SHORTEST}, and {LEAST:.0%}")
     if not np.ptp(z[measured]) > 0.0:
         raise RecordError("the measurements do not move: every gain is as good as another")
-    z = np.interp(np.arange(z.size), measured, z[measured])
+    steps = z[1:] - leak * z[:-1]
+    steps = steps[steps.size % BLOCKS :]
+    known = ~np.isnan(steps)
+    total, count = _lag_sums(np.where(known, steps, 0.0), BLOCKS), _lag_sums(known.astype(float), BLOCKS)
     limit = highest_stable_gain(mirror, leak)
     gains = limit * np.arange(1, TRIED + 1) / (TRIED + 1)
-    used = measured[int(START * measured.size) :]
-    used = used[used.size % BLOCKS :]
-    power = np.stack([np.square(_left(z, gain, mirror, leak)[used]).reshape(BLOCKS, -1).mean(axis=1) for gain in gains])
-    gain, variance = _least(gains, power.mean(axis=1))
-    others = np.array([_least(gains, np.delete(power, block, axis=1).mean(axis=1))[0] for block in range(BLOCKS)])
+    weights = np.stack([_weights(gain, mirror, leak) for gain in gains])
+
+    def least(blocks: Array | slice) -> tuple[float, float]:
+        return _least(gains, weights @ (total[blocks].sum(axis=0) / np.maximum(count[blocks].sum(axis=0), 1.0)))
+
+    gain, variance = least(slice(None))
+    others = np.array([least(kept)[0] for kept in ~np.eye(BLOCKS, dtype=bool)])
     deviation = float(np.sqrt((BLOCKS - 1) * others.var()))
     return TelemetryGain(gain, deviation, float(np.sqrt(variance)), limit)
 
 
-def _left(z: Array, gain: float, mirror: Mirror, leak: float) -> Array:
-    """Return the measurement (n_steps,) that the integrator would have left of z, from rest."""
-    free = np.array([1.0, -leak])
+def _lag_sums(x: Array, blocks: int) -> Array:
+    """Return the sums of x[k] x[k + lag] over each of so many blocks of x (n,), (blocks, LAGS)."""
+    size, ahead = x.size // blocks, np.pad(x, (0, LAGS - 1))
+    return np.array([correlate(ahead[i : i + size + LAGS - 1], x[i : i + size], "valid") for i in range(0, x.size, size)])
+
+
+def _weights(gain: float, mirror: Mirror, leak: float) -> Array:
+    """Return the weights (LAGS,) of the correlations of the steps in the mean square that the integrator leaves."""
     loop = gain * mirror.taps
-    loop[:2] += free
-    return lfilter(free, loop, z)
+    loop[:2] += 1.0, -leak
+    weights = _lag_sums(lfilter([1.0], loop, np.eye(1, LAGS)[0]), 1)[0]
+    weights[1:] *= 2.0
+    return weights
 
 
 def _least(gains: Array, variance: Array) -> tuple[float, float]:
