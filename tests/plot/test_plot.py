@@ -330,6 +330,20 @@ def test_the_model_is_drawn_over_what_was_measured(found: Identification, result
     np.testing.assert_array_equal(lines["Measured"].dimension_values(1), 1e6 * psd(z, result.record.dt)[1][1:, 1])
 
 
+@pytest.mark.parametrize("lost", [0.1, 0.3])
+def test_what_was_measured_is_drawn_without_gaps_and_outliers(found: Identification, record: wfsobs.Record, lost: float) -> None:
+    rng, y = np.random.default_rng(4), record.y_lgs.copy()
+    y[rng.random(y.shape) < lost] = np.nan
+    y[rng.integers(10, len(y), 5 if lost < 0.2 else 0)] += 3.0  # with more lost, 3 s are too few to tell outliers
+    drawn = curves(found.plot.spectra(replace(record, y_lgs=y)))["Measured"]
+    frequency, density = drawn.dimension_values(0), drawn.dimension_values(1)
+    whole = 1e6 * psd(record.z[record.delay :, 0], record.dt)[1][1:]
+    for low, high in ((1.0, 10.0), (80.0, 150.0), (150.0, 300.0), (400.0, 500.0)):
+        band = (low < frequency) & (frequency < high)
+        # The mean over 70 Hz and 3 s scatters by 7 %, and what is drawn of it is that of another record: three times that.
+        assert density[band].mean() == pytest.approx(whole[band].mean(), rel=0.2)
+
+
 def test_a_sweep_is_drawn_with_its_own_numbers(sweep: SweepResults, field: SweepResults) -> None:
     """From the least value to the highest, in whatever order they are given."""
     figure = sweep.plot.errors(target="turbulence")

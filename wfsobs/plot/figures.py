@@ -41,6 +41,7 @@ from wfsobs.record import Record, hold_last
 from wfsobs.scenario.configfile import Variation
 from wfsobs.sensors.zernike import MODE_NAMES
 from wfsobs.signal.spectrum import psd
+from wfsobs.spectral.whittle import complete
 from wfsobs.typing import Array
 from wfsobs.units import unit_text
 
@@ -229,13 +230,13 @@ class IdentificationPlots:
     identification: Identification
 
     def spectra(self, record: Record | None = None, *, mode: str | None = None) -> hv.Overlay:
-        """Draw the spectrum of the model and its peaks, over that of z where the record is given."""
+        """Draw the spectrum of the model and its peaks, over that of z, completed, where the record is given."""
         it = self.identification
         name, column = _mode_of(len(it.modes), mode)
         found = it.modes[column]
         y, lines = quantity(f"PSD of z {name}", "nm²/Hz", f"PSD of z, {name}"), []
         if record is not None:
-            frequency, density = psd(hold_last(record.z[record.delay :]), record.dt)
+            frequency, density = psd(complete(record.z[record.delay :], record.dt), record.dt)
             lines.append(draw_line(frequency[1:], NM**2 * density[1:, column], (FREQUENCY, y), "measured"))
         peaks = np.array([p.frequency.value for p in found.peaks])
         f = np.unique(np.concatenate([np.geomspace(1.0 / it.duration, 0.5 / it.dt, 4000), peaks]))

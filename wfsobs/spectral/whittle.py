@@ -24,6 +24,7 @@ from scipy.signal.windows import tukey
 from scipy.sparse.linalg import LinearOperator, cg
 from scipy.special import logit
 
+from wfsobs.record import hold_last
 from wfsobs.signal import whittle
 from wfsobs.signal.autoregressive import Ar2
 from wfsobs.spectral.model import Spectrum
@@ -254,6 +255,8 @@ CLOSE, MOST = 1e-4, 300
 """Approximate error of a filled sample, over the noise, at which conjugate gradients stop; maximum number of steps."""
 LEAST = 1e-3
 """Minimum measured share of a bin."""
+ROUNDS = 5
+"""Of `complete`: each leaves about the share that is missing of the error of the spectrum."""
 HALF = 8
 """Samples to either side from which a sample is predicted."""
 FAR = 5.0
@@ -333,6 +336,24 @@ class MissingSamples:
     def _at_all_frequencies(self, S: Array) -> Array:
         """Return a density at all frequencies of rfft, zero included."""
         return np.concatenate([S[:1], S, S[-1:]])[: self.n // 2 + 1]
+
+
+def complete(z: Array, dt: float) -> Array:
+    """Return z (n, n_modes) without gaps (NaN) and outlying samples, to see its spectrum.
+
+    There is what is likely given all others: a random draw that has the smoothed spectrum of z.
+    """
+    out = hold_last(z).copy()
+    for mode in np.flatnonzero(np.ptp(out, axis=0) > 0.0):
+        seen = np.where(find_outlying(z[:, mode]), np.nan, z[:, mode])
+        missing, mean = MissingSamples(np.isnan(seen), dt, np.random.default_rng(0)), np.nanmean(seen)
+        if missing.any:
+            x = missing.interpolate(seen - mean)
+            for _ in range(ROUNDS):
+                S = _smooth(periodogram(x, dt))
+                x = missing.fill(seen - mean, S) + missing.draw_errors(S)[0]
+            out[:, mode] = x + mean
+    return out
 
 
 def _smooth(V: Array) -> Array:

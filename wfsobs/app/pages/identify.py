@@ -52,14 +52,12 @@ from wfsobs.identification.identification import (
 )
 from wfsobs.identification.process import Number
 from wfsobs.identification.result import IdentifiedMode
-from wfsobs.observers.missing import fill_missing
 from wfsobs.pipeline import as_stated
-from wfsobs.prior import Model
-from wfsobs.priors_from.scenario import prior_of
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.spectral.search import LOWEST
+from wfsobs.spectral.whittle import complete
 from wfsobs.typing import Array
 
 PER_SAMPLE = 40e-6
@@ -78,8 +76,7 @@ class RecordSpectrum(NamedTuple):
 def estimate_record_spectrum(of: RunResults, _watch: Watch, _tell: Tell) -> RecordSpectrum:
     """Estimate the spectrum of the record shown, with the taper that the identification uses. Raises RecordError."""
     record = of.result.record
-    z = fill_missing(record, prior_of(of.result.scenario.before_events, record, (Model,))).z[record.delay :]
-    return RecordSpectrum(record, *bin_periodogram(z, record.dt))
+    return RecordSpectrum(record, *bin_periodogram(complete(record.z[record.delay :], record.dt), record.dt))
 
 
 def seconds(record: Record) -> float:
