@@ -442,6 +442,33 @@ def test_neighbours_that_look_like_one_are_told_apart() -> None:
         assert abs(p.frequency.value - true.omega / (2 * pi)) < 4.0 * p.frequency.std
 
 
+@pytest.mark.parametrize(("bins", "rms"), [(3.0, 0.006), (5.0, 0.0012), (8.0, 0.006), (10.0, 0.0012)])
+def test_two_undamped_lines_a_few_bins_apart_are_told_apart(bins: float, rms: float) -> None:
+    """What is stated of either is that of a line alone: one to six Cramer-Rao bounds of its frequency (two to four were seen)."""
+    n, rng = 20_000, np.random.default_rng(12)
+    lines = [Sinusoid(f, sqrt(2.0) * rms * np.exp(2j * pi * rng.random())) for f in (30.0, 30.0 + bins / (n * DT))]
+    z = 0.014 * rng.standard_normal(n) + TURBULENCE.sample(n, rng) + sum(line.signal(n, DT) for line in lines)
+    (mode,) = identify(Record(z[:, None], np.zeros((n, 1)), DT)).modes
+    bound = sqrt(12.0 / n**3) * 0.014 / (2 * pi * rms * DT)
+    assert len(mode.peaks) == 2 and mode.whiteness.white
+    for p, true in zip(mode.peaks, lines, strict=True):
+        assert p.pure and abs(p.frequency.value - true.frequency) < 3.5 * p.frequency.std
+        assert bound < p.frequency.std < 6.0 * bound
+        assert abs(p.rms.value - rms) < 3.5 * p.rms.std  # a probability of 5e-4 each, as above
+        assert 1.0 < p.rms.std * sqrt(n) / 0.014 < 2.0  # bounds of a line in the noise: turbulence is beside it, and its width
+
+
+def test_a_narrow_resonance_is_not_told_apart_into_lines() -> None:
+    """Of half widths of 0.4, 0.7 and 2 bins, which look most like two lines: twice three in a record, far from each other."""
+    n, f = 20_000, (18.0, 24.0, 32.0, 41.0, 51.0, 60.0)
+    for seed in (13, 14):
+        rng = np.random.default_rng(seed)
+        true = [Ar2(2 * pi * f0, half / (n * DT * f0), 0.003, DT) for f0, half in zip(f, 2 * (0.4, 0.7, 2.0), strict=True)]
+        z = 0.014 * rng.standard_normal(n) + sum(p.sample(n, rng) for p in (TURBULENCE, *true))
+        (mode,) = identify(Record(z[:, None], np.zeros((n, 1)), DT)).modes
+        assert [p.frequency.value for p in mode.peaks] == pytest.approx(f, abs=0.3)
+
+
 def test_peaks_that_agree_are_one() -> None:
     def peak(f: float, xi: float = 0.01, rms: float = 0.01) -> IdentifiedProcess:
         return IdentifiedProcess(Number(f, 0.01), Number(xi, 0.001 if xi else 0.0), Number(rms, 0.001))
