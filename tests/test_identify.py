@@ -458,6 +458,18 @@ def test_two_undamped_lines_a_few_bins_apart_are_told_apart(bins: float, rms: fl
         assert 1.0 < p.rms.std * sqrt(n) / 0.014 < 2.0  # bounds of a line in the noise: turbulence is beside it, and its width
 
 
+@pytest.mark.parametrize("seed", [1, 3])
+def test_a_line_beside_a_stronger_one_is_not_told_apart_into_two(seed: int) -> None:
+    """Found while the stronger one was a resonance, and not yet at its place: what it leaves is no other line."""
+    n, rng = 20_000, np.random.default_rng(seed)
+    start = TURBULENCE.sample(n, rng) + 0.014 * rng.standard_normal(n)
+    lines = [Sinusoid(f, sqrt(2.0) * rms * np.exp(2j * pi * rng.random())) for f, rms in ((30.0, 0.03), (30.4, 0.006))]
+    (mode,) = identify(Record((start + sum(x.signal(n, DT) for x in lines))[:, None], np.zeros((n, 1)), DT)).modes
+    assert len(mode.peaks) == 2
+    for p, true in zip(mode.peaks, lines, strict=True):
+        assert abs(p.frequency.value - true.frequency) < 3.5 * p.frequency.std
+
+
 def test_a_narrow_resonance_is_not_told_apart_into_lines() -> None:
     """Of half widths of 0.4, 0.7 and 2 bins, which look most like two lines: twice three in a record, far from each other."""
     n, f = 20_000, (18.0, 24.0, 32.0, 41.0, 51.0, 60.0)

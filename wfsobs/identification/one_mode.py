@@ -426,11 +426,11 @@ class OneMode:
         weight = (np.abs(self.f - p.frequency) < (2.0 * NEIGHBOURS + half) * self.f[0]) / rest.psd(self.f)
         misfits = [misfit_of(self.spectrum, self.f[keep], self.I[keep])]
         for _ in range(2):
-            at = self.f[np.argmax(weight * self.I)]
+            free = np.all([np.abs(self.f - line.frequency) > NEARER * self.f[0] for line in self.lines], axis=0)
+            at = self.f[np.argmax(weight * free * self.I)]
             self.lines = [*self.lines, nearest_line(self.left, self.dt, at, 0.75 * self.f[0])]
             self._subtract_lines()
             misfits.append(misfit_of(rest, self.f[keep], self.I[keep]))
-            weight[np.abs(self.f - self.lines[-1].frequency) < NEARER * self.f[0]] = 0.0
         for _ in range(2):
             self._polish_lines(len(lines))
         is_worth = min(misfits[:2]) - misfit_of(rest, self.f[keep], self.I[keep]) > LINES_SPLIT
