@@ -55,6 +55,7 @@ class Explorer:
         """End with the program: Python waits for the server's thread."""
         threading.main_thread().join()
         self._thread.stop()
+        self._thread.join(5.0)  # nobody answers there any more
 
     def __repr__(self) -> str:
         return f"<dashboard at {self.url}>"
@@ -76,6 +77,7 @@ class Explorer:
     def close(self) -> None:
         """Stop serving; runs end."""
         self._thread.stop()
+        self._thread.join(5.0)  # nobody answers there any more
         self._service.close(1.5)
 
 

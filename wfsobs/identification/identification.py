@@ -18,6 +18,7 @@ from wfsobs.identification.one_mode import OneMode
 from wfsobs.identification.process import IdentifiedProcess, Number
 from wfsobs.identification.process import format_number as format_number
 from wfsobs.identification.result import (
+    NO_NOISE,
     WHITE_LEVEL,
     Identification,
     IdentifiedMode,
@@ -169,6 +170,8 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
     y_lgs = record.y_lgs.copy()
     y_lgs[record.delay :][: len(z)][outlying] = np.nan
     if (differences := sensor_differences(replace(record, y_lgs=y_lgs))) is not None and record.ratio is not None:
+        if (np.nanmax(np.abs(differences), axis=0) <= NO_NOISE * np.nanstd(z, axis=0)).any():
+            raise RecordError("y_ngs has no noise of its own beside y_lgs")
         found = tuple(
             replace(mode, difference=read_difference(column, record.dt, record.ratio, mode.noise))
             for mode, column in zip(found, differences.T, strict=True)
