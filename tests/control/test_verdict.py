@@ -46,7 +46,10 @@ def test_the_verdict_is_the_least_residual_of_each_kind_of_prior_knowledge_and_t
 def test_a_controller_that_learns_is_ranked_where_its_own_laws_close_the_loop() -> None:
     scenario = PRESETS["paper"]().replace({"run.duration": 2.0, "run.warm_up": 0.5, "adaptive.window": 1.0})
     names = ["integrator", "lqg-kf-adaptive"]
-    for warm_up, ranked, said in ((0.5, {"integrator"}, "until its first window is full, at 1.002 s; residuals count from 0.5 s"), (1.2, set(names), "")):
+    for warm_up, ranked, said in (
+        (0.5, {"integrator"}, "until its first window is full, at 1.002 s; residuals count from 0.5 s"),
+        (1.2, set(names), ""),
+    ):
         result = close_loop(scenario.replace({"run.warm_up": warm_up}), controllers=names)
         found = loop_verdict(result, "tip")
         assert found is not None and {place.observer for place in found.places} == ranked
