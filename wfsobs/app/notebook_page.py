@@ -34,7 +34,7 @@ class Explorer:
         self._first, self._height, self._service = scenario, height, make_service(NONE)
         self._dashboard: Dashboard | None = None
         self.url: str = f"http://localhost:{port}/"
-        self._thread = pn.serve(
+        self._thread: Any = pn.serve(  # a thread, as `threaded` is given
             {"/": self._page}, port=port, address="127.0.0.1", websocket_origin=f"localhost:{port}", show=False, threaded=True,
             verbose=False,
         )  # fmt: skip
@@ -55,7 +55,6 @@ class Explorer:
         """End with the program: Python waits for the server's thread."""
         threading.main_thread().join()
         self._thread.stop()
-        self._thread.join(5.0)  # nobody answers there any more
 
     def __repr__(self) -> str:
         return f"<dashboard at {self.url}>"
