@@ -564,8 +564,9 @@ def _what_is_off(
     is_off: Array = np.abs(off) > np.maximum(SURE * sd, np.where(sd > 0.0, least, np.inf))
     turn, is_flipped = float(np.degrees(off[-1])) if k == 2 else 0.0, fit.theta[k : 2 * k] < 0
     late = delay + float(off[0])
-    proposed = round(late) if abs(late - round(late)) < 3.0 * sd[0] else float(f"{late:.3g}")
-    delays: dict[str, float] = {"command_delay": proposed} if is_off[0] else {}
+    delays: dict[str, float] = {}
+    if is_off[0]:  # no number is off that is none
+        delays["command_delay"] = round(late) if abs(late - round(late)) < 3.0 * sd[0] else float(f"{late:.3g}")
     if is_flipped.any() and not is_flipped.all():
         return f"sign {sign:+d} of {names[int(abs(turn) < 90.0)]}", f"{-sign:+d}, and that of the other mode as it is", {}
     if is_flipped.any() or abs(turn) > 135.0:
