@@ -306,6 +306,11 @@ def test_the_data_propose_sign_and_delay(shared: Dashboard, shared_loop: Any, sh
     assert "command sign +1 is excluded by the data" in text and "explain" not in text, "the response has whole frames alone"
     assert "unit proposed: the numbers are plausible as um (" in text, "on 8 m an arcsec would be 10 um"
     assert shared.upload.take.visible and shared.upload._preview.record.delay == 2
+    shared.upload.fields.trust.value = True
+    shared_loop.until(lambda: shared.upload._preview is not None and not shared.upload.take.visible)
+    assert not shared.upload.use.disabled, "what is trusted is not proposed to be otherwise"
+    shared.upload.fields.trust.value = False
+    shared_loop.until(lambda: shared.upload.take.visible)
     shared.upload.take_proposals()
     shared_loop.until(lambda: shared.upload._preview is not None and not shared.upload.take.visible)
     found = shared.upload._preview

@@ -409,7 +409,7 @@ class Upload:
         if self._preview is not None or self._digest_shown != self._digest:  # else what was read before stays
             self.content.show(self._name, self._preview)
             self._digest_shown = self._digest
-        self.take.visible = isinstance(preview, Preview) and bool(preview.reading.proposal)
+        self.take.visible = isinstance(preview, Preview) and not self.fields.trust.value and bool(preview.reading.proposal)
         self._lay_out()
 
     def _obstacle(self, preview: Preview) -> str:
