@@ -183,7 +183,7 @@ def test_what_the_data_exclude(disturbance: Array, delay: int, steps: int) -> No
         (
             2.0,
             rotation(np.radians(96.0)),
-            r"command rotation 0 is excluded by the data, .* with \+(9\d\.\d) degrees, y = R u; .*",
+            r"command rotation 0 is excluded by the data, .* with \+(9\d\.\d) degrees, y = R u: state .*",
         ),
         (2.0, np.diag([1.0, -1.0]), r"command sign (\+1) of tilt is excluded by the data, .* with -1, .*"),
         (2.0, np.diag([-1.0, 1.0]), r"command sign (\+1) of tip is excluded by the data, .* with -1, .*"),

@@ -574,7 +574,7 @@ def _what_is_off(
     if is_off[0]:
         return f"delay {delay:g}", PlantNumber(late, float(sd[0])).text(), delays
     if is_off[2 * k :].any():
-        return "rotation 0", f"{turn:+.1f} degrees, y = R u; R^-1 as --command-modes of wfsobs convert turns them", {}
+        return "rotation 0", f"{turn:+.1f} degrees, y = R u: state the inverse of R as --command-modes of wfsobs convert", {}
     for i in np.flatnonzero(is_off[k : 2 * k]).tolist():
         of = f" of {names[i]}" * (k == 2)
         return f"gain {gains[i]:g}{of}", PlantNumber(*(float(gains[i] * x) for x in (fit.theta[k + i], sd[k + i]))).text(), {}
