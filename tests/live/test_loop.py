@@ -9,7 +9,7 @@ import threading
 import time
 import weakref
 from contextlib import suppress
-from multiprocessing import Pipe
+from multiprocessing import Pipe, get_context
 from multiprocessing.shared_memory import SharedMemory
 from types import SimpleNamespace
 
@@ -21,10 +21,10 @@ from wfsobs.live import simulated
 from wfsobs.live.board import Board, Delivery, read_view, trace_width
 from wfsobs.live.crew import Site
 from wfsobs.live.loop import TICK, LiveLoop, _keep
-from wfsobs.live.processes import POLL, REST, Pause, made_crew
+from wfsobs.live.processes import made_crew
 from wfsobs.live.ring import LiveFrame, Ring, Rows, merged_rows
 from wfsobs.live.simulated import FADE, GLANCE, SimulatedFrames, SimulatedLoop
-from wfsobs.live.source import Pace
+from wfsobs.live.source import Desk, Pace
 from wfsobs.scenario.presets import paper
 from wfsobs.settings.group import SettingError
 
@@ -363,22 +363,14 @@ def test_a_frame_is_taken_once_all_crews_have_it_and_late_by_the_last():
             part.release()
 
 
-def test_the_next_look_at_the_ring_is_when_a_frame_is_due(monkeypatch):
-    now, slept = 100.0, []
-    monkeypatch.setattr("wfsobs.live.processes.monotonic", lambda: now)
-    monkeypatch.setattr("wfsobs.live.processes.sleep", slept.append)
-    pause = Pause()
-    pause.note(99.9990)
-    pause.note(99.9998)
-    pause.rest()
-    now = 100.0007
-    pause.rest()
-    now = 100.1001
-    pause.note(100.1)  # frames are far apart: looked at often enough
-    pause.rest()
-    now = 200.0
-    pause.rest()
-    assert slept == pytest.approx([0.0006 + POLL, POLL, 0.0019 + POLL, REST], abs=1e-9)
+def test_who_waits_is_woken_once_however_many_frames_have_come():
+    wakes = [get_context("spawn").BoundedSemaphore() for _ in range(2)]
+    desk = Desk("", 2, queue.Queue(), 1.0, None, wakes)
+    for _ in range(3):
+        desk.wake()
+        desk.wake()
+        assert all(one.acquire(timeout=60) for one in wakes)
+    assert not any(one.acquire(timeout=0) for one in wakes)
 
 
 @pytest.mark.slow

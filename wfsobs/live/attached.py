@@ -19,7 +19,7 @@ from wfsobs.record import Sampling
 from wfsobs.signal.gate import GateSettings, OutlierGate, frame_mean_of
 from wfsobs.streams.follower import LONGEST_GAP
 from wfsobs.streams.network import Subscription, is_address
-from wfsobs.streams.shared_image import SharedImage, StreamError
+from wfsobs.streams.shared_image import POLL, SharedImage, StreamError
 from wfsobs.streams.wiring import STUCK, NgsStream, NgsWiring, check_elements
 from wfsobs.typing import Array
 
@@ -98,6 +98,8 @@ TICK = 0.05
 """Longest wait for a frame before a look at the commands [s]."""
 SPELL = 10.0
 """Time after which something that had ceased is told anew [s]."""
+FREQUENT = 0.1
+"""Pause between two looks at a stream, in frames: more looks would take time from what follows."""
 RETRY = 0.5
 """Pause before a stream that cannot be read is looked for again [s]."""
 
@@ -235,6 +237,7 @@ class StreamFrames:
         n = self._desk.n_modes
         self._row[0], self._row[1 : 1 + n], self._row[1 + n : 1 + 2 * n] = self._alive, z, ngs
         self._ring.write(self._row)
+        self._desk.wake()
 
     def _pass(self, z: Array, ngs: Array) -> tuple[Array, Array]:
         """Return the measurements of a frame without outliers."""
@@ -286,7 +289,7 @@ class StreamFrames:
     def _open(self, path: str, elements: Sequence[int]) -> SharedImage | Subscription:
         """Open a stream that has these elements. Raises StreamError."""
         if not is_address(path):
-            stream = SharedImage(path)
+            stream = SharedImage(path, max(POLL, FREQUENT * self._source.dt))
             check_elements(stream, elements)
             return stream
         stream = Subscription(path, lambda line: self._desk.say(self._ring.count, line), patience=RETRY)

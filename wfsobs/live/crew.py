@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import gc
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.queues import Queue
+from multiprocessing.synchronize import BoundedSemaphore
 from time import monotonic, sleep
 from typing import Any, Generic, TypeVar
 
@@ -44,6 +45,7 @@ class Site:
     sampling : modes, step and NGS ratio of the source
     ring_name, board_name : shared memory
     news     : events
+    wakes    : of the crews of observers, each released with every frame
     """
 
     settings: Mapping[str, Any]
@@ -51,6 +53,7 @@ class Site:
     ring_name: str
     board_name: str
     news: Queue[LiveEvent]
+    wakes: Sequence[BoundedSemaphore] = ()
 
 
 def warm_up_of(site: Site) -> int:

@@ -13,7 +13,7 @@ from multiprocessing.process import BaseProcess
 from queue import Empty
 from signal import Signals
 from threading import Event, Lock, RLock
-from time import monotonic, sleep
+from time import monotonic
 from typing import Any
 
 from wfsobs.live.board import CREWS, SLOTS, Board, Delivery, LiveView, crew_of, last_frames, read_view, trace_width
@@ -35,14 +35,10 @@ from wfsobs.live.source import (
 from wfsobs.scenario import Scenario
 from wfsobs.stepping import design
 
-POLL = 1e-4
-"""Pause between two looks at a ring whose next frame is due [s]."""
-REST = 2e-3
-"""Pause between two looks at a ring that stands still, and the longest one [s]."""
 HOPELESS = 1.0
 """Frames that a process may be behind [s] before it gives way to others: it cannot keep up."""
 LOOK = 0.01
-"""Pause between two looks at the commands [s]."""
+"""Pause between two looks at the commands, and the longest wait for a frame [s]."""
 
 
 def observe_frames(
@@ -81,7 +77,7 @@ def observe_frames(
     traces.skip_to(number)
     board.progress[place] = number
     board.is_ready[place] = 1
-    pause, look = Pause(), 0.0
+    look = 0.0
     while True:
         if (now := monotonic()) >= look:
             look = now + LOOK
@@ -91,7 +87,7 @@ def observe_frames(
             while inbox.poll():
                 crew.follow(receive(inbox), number)
         if ring.count <= number:
-            pause.rest()
+            site.wakes[place].acquire(timeout=LOOK)
             continue
         if (frame := ring.read(number)) is None:
             newest = ring.count // crew.ratio * crew.ratio
@@ -101,7 +97,6 @@ def observe_frames(
             continue
         traces.write(crew.take(frame, number))
         crew.settle()
-        pause.note(float(frame.due))
         number += 1
 
 
@@ -112,26 +107,6 @@ def made_crew(site: Site, board: Board, place: int, observers: tuple[str, ...]) 
     for name in observers:
         crew.start(name, design(name, scenario, sampling=site.sampling), 0)
     return crew
-
-
-class Pause:
-    """How long to wait for the next frame: until it is due, if they come by the clock."""
-
-    def __init__(self) -> None:
-        self._due, self._next = 0.0, 0.0
-
-    def note(self, due: float) -> None:
-        """Note when a frame was due, on the monotonic clock [s].
-
-        The next one is due as long after it as it after the last, and there when the source has written it.
-        """
-        self._next = due + min(due - self._due, REST) + POLL
-        self._due = due
-
-    def rest(self) -> None:
-        """Wait: at most REST, short where a frame is awaited."""
-        wait = self._next - monotonic()
-        sleep(REST if wait < -10 * REST else max(wait, POLL))
 
 
 class CrewProcess(Worker):
@@ -205,9 +180,10 @@ class LiveProcesses:
     def __init__(self, source: LiveSource, scenario: Scenario, observers: tuple[str, ...], speed: float, n_frames: int | None):
         self._context, self._tracker, self.is_over, self._lock = get_context("spawn"), Tracker(), Event(), RLock()
         news = self._context.Queue()
-        self.feed = SourceProcess(source, self._context, news, speed, n_frames)
+        wakes = tuple(self._context.BoundedSemaphore() for _ in CREWS)
+        self.feed = SourceProcess(source, self._context, news, wakes, speed, n_frames)
         self.board = Board(source.sampling.n_modes)
-        self._site = Site(scenario.to_dict(), source.sampling, self.feed.ring.name, self.board.name, news)
+        self._site = Site(scenario.to_dict(), source.sampling, self.feed.ring.name, self.board.name, news, wakes)
         self.crews: dict[int, CrewProcess] = {}
         self._late: set[int] = set()
         self.controllers: CrewProcess | None = None

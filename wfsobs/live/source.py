@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import signal
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import parent_process
@@ -13,6 +13,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext
 from multiprocessing.process import BaseProcess
 from multiprocessing.queues import Queue
+from multiprocessing.synchronize import BoundedSemaphore
 from threading import Thread
 from time import monotonic, sleep
 from typing import Any, NamedTuple, Protocol
@@ -89,6 +90,7 @@ class Desk:
     news  : events
     speed : at the start, 1 is real time
     n_frames : after which it ends; None for no end
+    wakes : of those that wait for frames, each for one
     """
 
     ring_name: str
@@ -96,10 +98,17 @@ class Desk:
     news: Queue[LiveEvent]
     speed: float
     n_frames: int | None
+    wakes: Sequence[BoundedSemaphore] = ()
 
     def say(self, number: int, what: str, origin: str = "") -> None:
         """Tell what happens from a frame on."""
         self.news.put(LiveEvent(number, what, origin=origin))
+
+    def wake(self) -> None:
+        """Have those go on who wait for the frame that has been written."""
+        for one in self.wakes:
+            with suppress(ValueError):  # it has been woken before, and does not wait
+                one.release()
 
 
 class Worker:
@@ -225,6 +234,7 @@ def send_frames(
         if (wait := due - monotonic()) > 0:
             sleep(wait)
         ring.send(row)
+        desk.wake()
         number += 1
         pace.advance()
         rest = next_row(number)
@@ -327,6 +337,8 @@ class SourceProcess:
         By which its processes are made.
     news : queue
         Receives events.
+    wakes : sequence of BoundedSemaphore
+        Released with every frame.
     speed : float
         1 is real time.
     n_frames : int or None
@@ -342,11 +354,19 @@ class SourceProcess:
 
     ring: Ring
 
-    def __init__(self, source: LiveSource, context: SpawnContext, news: Queue[LiveEvent], speed: float, n_frames: int | None):
+    def __init__(
+        self,
+        source: LiveSource,
+        context: SpawnContext,
+        news: Queue[LiveEvent],
+        wakes: Sequence[BoundedSemaphore],
+        speed: float,
+        n_frames: int | None,
+    ):
         os.environ["OPENBLAS_NUM_THREADS"] = "1"  # read by the processes
         n_modes = source.sampling.n_modes
         self.ring = Ring(n_modes)
-        self.workers: list[Worker] = source.staff(context, Desk(self.ring.name, n_modes, news, speed, n_frames))
+        self.workers: list[Worker] = source.staff(context, Desk(self.ring.name, n_modes, news, speed, n_frames, wakes))
 
     def tell(self, command: Command) -> None:
         """Give a command to the process that sends; new settings to the others as well."""

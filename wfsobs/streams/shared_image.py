@@ -252,7 +252,7 @@ WRITING = 2e-3
 YIELD = 1e-6
 """Pause while a frame is being written [s]: its writer may need this processor, which who goes first keeps otherwise."""
 POLL = 5e-5
-"""Pause between two looks at the counter where there is no semaphore [s]."""
+"""Shortest pause between two looks at the counter where there is no semaphore [s]."""
 
 
 def stream_path(name: str) -> Path:
@@ -271,6 +271,8 @@ class SharedImage:
     ----------
     path : str or Path
         File, as `stream_path` gives it.
+    poll : float, optional
+        Pause between two looks at the counter where there is no semaphore [s].
 
     Raises
     ------
@@ -287,8 +289,9 @@ class SharedImage:
         The counter when it was opened.
     """
 
-    def __init__(self, path: str | Path):
+    def __init__(self, path: str | Path, poll: float = POLL):
         self.path: str = str(path)
+        self._poll = poll
         try:
             with open(path, "r+b") as file:
                 self._map = mmap.mmap(file.fileno(), 0)
@@ -425,7 +428,7 @@ class SharedImage:
             if (left := until - time.monotonic()) <= 0:
                 return False
             if semaphore is None:
-                time.sleep(min(POLL, left))
+                time.sleep(min(self._poll, left))
             else:
                 semaphore.wait(left)
         return True
