@@ -153,7 +153,8 @@ def test_gain_of_the_integrator(page: Page, name: str) -> None:
     expect(gain).to_be_visible()
     expect(page.get_by_text("Only the integrator has a preview").first).to_be_visible()
     margin = page.locator(".numbers span[data-name=gain-margin] b").first
-    before = margin.inner_text()
+    before, stood = margin.inner_text(), gain.get_attribute("aria-valuenow")
+    assert stood is not None
     x, y = middle(gain)
     page.mouse.move(x, y)
     page.mouse.down()
@@ -164,11 +165,11 @@ def test_gain_of_the_integrator(page: Page, name: str) -> None:
     until(page, CHANGED)
     page.get_by_role("button", name="Undo").click()
     expect(margin).to_have_text(before)
-    stood = gain.get_attribute("aria-valuenow")
+    expect(gain).to_have_attribute("aria-valuenow", stood)  # the figure follows its numbers
     gain.focus()
     page.keyboard.press("Shift+ArrowLeft")
     expect(margin).not_to_have_text(before)  # and no result that comes in takes it back
-    assert float(gain.get_attribute("aria-valuenow") or "nan") < float(stood or "nan"), "to the left"
+    assert float(gain.get_attribute("aria-valuenow") or "nan") < float(stood), "to the left"
     page.keyboard.press("Escape")
     expect(margin).to_have_text(before)
 

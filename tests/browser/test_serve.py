@@ -18,10 +18,11 @@ from tests.browser.conftest import PATIENCE, leave
 
 pytestmark = pytest.mark.slow
 
-FLAGS = ["--public", "--runs", "1", "--max-duration", "100", "--lifetime", "5"]
+FLAGS = ["--public", "--runs", "1", "--max-duration", "100", "--max-seconds", "3600", "--lifetime", "5"]
 """Runs of a page that is gone stop with its session, and only then the next one begins."""
 
-LONG = "?run.duration=90&gpr_online.training_size=1000&run.seed="
+LONG = "?run.duration=100&adaptive.interval=0.05&gpr_online.training_size=1000&run.seed="
+"""A run that no test waits for the end of, however long its other steps take."""
 
 
 @pytest.fixture(scope="module")

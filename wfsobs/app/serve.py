@@ -359,8 +359,8 @@ def options(*, public: bool | None = None, runs: int | None = None, **values: An
 
     public : whether there are limits; None for where more than this machine reaches the page
 
-    >>> options(origins=("ao.example.org",), max_duration=30.0, max_depth=None).limits.duration
-    30.0
+    >>> options(origins=("ao.example.org",), max_duration=300.0, max_steps=300_000, max_depth=None).limits.steps
+    300000
     """
     own = {key.removeprefix("max_").replace("memory", "megabytes"): values.pop(key) for key in list(values) if key[:4] == "max_"}
     if public is None:

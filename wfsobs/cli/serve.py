@@ -54,6 +54,7 @@ def _check(pattern: re.Pattern[str], takes: str) -> Callable[[click.Context, cli
     help="Switch the limits on or off; they are on unless only this machine reaches the page.",
 )
 @click.option("--max-duration", type=POSITIVE, metavar="S", help="Maximum length of a record.")
+@click.option("--max-steps", type=click.IntRange(1), metavar="N", help="Maximum number of steps of a record.")
 @click.option("--max-training-size", type=click.IntRange(2), metavar="M", help="Maximum training size of a GPR.")
 @click.option("--max-depth", type=click.IntRange(1), metavar="D", help="Maximum window length of a GPR.")
 @click.option("--max-seconds", type=POSITIVE, metavar="S", help="Maximum estimated time of a run.")
