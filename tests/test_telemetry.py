@@ -85,7 +85,7 @@ WRONG = [
     (lambda a: changed(a, "u", 4, np.inf), "u is inf at step 4, mode 0"),
     (lambda a: a | {"training_y": a["u"]}, "training_y and training_u must come together"),
     (lambda a: a | {"training_y": a["u"], "training_u": a["u"][:-1]}, r"training_u has shape \(39, 2\); expected \(40, 2\)"),
-    (lambda a: {k: v for k, v in a.items() if k != "ratio"}, "y_ngs needs ratio"),
+    (lambda a: {k: v for k, v in a.items() if k != "ratio"} | {"y_ngs": a["y_lgs"]}, "y_ngs needs ratio"),
 ]
 
 

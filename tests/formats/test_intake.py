@@ -234,6 +234,37 @@ def test_a_frame_that_lacks_a_mode_is_lost() -> None:
     assert np.isnan(taken(y_ngs=ngs, ratio=5).y_ngs[[10, 15]]).all()
 
 
+@pytest.mark.parametrize("is_held", [False, True])
+@pytest.mark.parametrize("first", range(1, 7))
+def test_rows_of_ngs_frames_tell_their_distance(first: int, is_held: bool) -> None:
+    """Between frames a log has nothing, or the last one: both are read as frames at stated steps."""
+    frames, rows = RNG.standard_normal((N, 2)), np.arange(first, N, 5)
+    rows = np.delete(rows, 3)  # one is lost
+    logged = np.full((N, 2), np.nan)
+    logged[rows] = frames[rows]
+    due, cut = logged.copy(), first % 5
+    if is_held:
+        ends = [*rows[1:], N]
+        for row, end in zip(rows, ends, strict=True):
+            logged[row:end] = frames[row]
+    record = taken(y_ngs=logged)
+    known = taken(y_ngs=due[cut:], ratio=5, y_lgs=Y[cut:], u=U[cut:])
+    assert record.ratio == 5
+    np.testing.assert_array_equal(record.y_ngs, known.y_ngs)
+    np.testing.assert_array_equal(record.y_lgs, known.y_lgs)
+    assert record.origin == f"an NGS frame in 5 rows, the first in row {first}"
+
+
+def test_blank_cells_after_the_last_ngs_frame() -> None:
+    """A column that is blank to its end is short, also where rows are lost."""
+    steps = np.delete(np.arange(N), [7, 23])
+    ngs = np.where(np.isin(steps, [5, 10, 15, 20])[:, None], Y[steps], np.nan)[:20]
+    arrays = {"y_lgs": Y[steps], "u": U[steps], "dt": NONE, "time": steps * 1e-3, "y_ngs": ngs}
+    for record in (taken(**arrays), taken(**arrays, ratio=5)):
+        np.testing.assert_array_equal(np.flatnonzero(np.isfinite(record.y_ngs[:, 0])), [5, 10, 15, 20])
+        np.testing.assert_array_equal(record.y_ngs[5:21:5], Y[5:21:5])
+
+
 # ---------------------------------------------------------------------- one line
 
 

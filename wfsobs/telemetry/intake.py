@@ -230,42 +230,69 @@ def _apply_timestamps(
         time = _past_midnight(_clock(TIME, arrays[TIME], n))
         steps, dt, said = steps_of(time, dt, steps)
         start = float(time[0])
-    if steps is not None:
-        for name, values in signals.items():
-            if name not in TRAINING and values.shape[0] == n:
-                signals[name] = np.full((steps[-1] + 1, values.shape[1]), np.nan)
-                signals[name][steps] = values
+    at = np.arange(n) if steps is None else steps
+    for name, values in signals.items():
+        is_short = name == NGS and "time_ngs" not in arrays and values.shape[0] < n  # the blank rows at the end are not there
+        if is_short or (steps is not None and name not in TRAINING and values.shape[0] == n):
+            placed = np.full((at[-1] + 1, values.shape[1]), np.nan)
+            placed[at[: values.shape[0]]] = values
+            if not is_short or frame_distance(placed):
+                signals[name] = placed
     if dt is None:
         there = f": which column is the time? It has {', '.join(contents.leftovers[:20])}" if contents.leftovers else ""
         there = contents.hint if "--column" in contents.hint else there
         raise RecordError(f"has no dt and no time; a record needs y_lgs, u and dt, or a stated rate{there}")
     if NGS not in signals:
         return dt, None, said
+    ratio, rows = _apply_frames(signals, arrays, start, dt)
+    return dt, ratio, ", ".join(filter(None, (said, rows)))
+
+
+def _apply_frames(signals: dict[str, Array], arrays: Mapping[str, Array], start: float, dt: float) -> tuple[int, str]:
+    """Place NGS frames by their stamps, by the rows they are in or by the ratio; return the ratio, and what was guessed."""
+    frames, n, said = signals[NGS], signals["y_lgs"].shape[0], ""
     if "time_ngs" in arrays:
-        ratio = _stamped_frames(signals, arrays, start, dt)
+        steps = frames_at(_past_midnight(_clock("time_ngs", arrays["time_ngs"], frames.shape[0])), start, dt)
+        ratio = _ratio(arrays, int(np.median(np.diff(steps))) if steps.size > 1 else None)
+        late = np.flatnonzero((steps - steps[0]) % ratio)
+        if late.size:
+            raise RecordError(f"time_ngs: the frame in row {late[0]} is not a whole number of {ratio} steps after the first")
+        _place_frames(signals, steps, frames, ratio)
+    elif "ratio" not in arrays and frames.shape[0] == n:
+        ratio, steps = _ratio(arrays, frame_distance(frames)), rows_of_frames(frames)
+        _place_frames(signals, steps, frames[steps], ratio)
+        said = f"an NGS frame in {ratio} rows, the first in row {steps[0]}"
     else:
         ratio = _ratio(arrays)
-        signals[NGS] = place_frames(signals[NGS], signals["y_lgs"].shape[0], ratio)
+        signals[NGS] = place_frames(frames, n, ratio)
     signals[NGS] = drop_partial_frames(signals[NGS], ratio)
-    return dt, ratio, said
+    return ratio, said
 
 
-def _stamped_frames(signals: dict[str, Array], arrays: Mapping[str, Array], start: float, dt: float) -> int:
-    """Place the frames by their stamps, start the record `ratio` steps before a frame, and return the ratio."""
-    frames, n = signals[NGS], signals["y_lgs"].shape[0]
-    steps = frames_at(_past_midnight(_clock("time_ngs", arrays["time_ngs"], frames.shape[0])), start, dt)
-    between = int(np.median(np.diff(steps))) if steps.size > 1 else None
-    ratio = _ratio(arrays, between)
-    late = np.flatnonzero((steps - steps[0]) % ratio)
-    if late.size:
-        raise RecordError(f"time_ngs: the frame in row {late[0]} is not a whole number of {ratio} steps after the first")
+def rows_of_frames(y_ngs: Array) -> Array:
+    """Return the rows that have a frame, (n,), of most rows those where another one begins to be held; not the first row."""
+    rows = np.flatnonzero(np.isfinite(y_ngs).any(axis=1))
+    if rows.size > 0.5 * y_ngs.shape[0]:
+        rows = rows[np.concatenate([[True], (y_ngs[rows[1:]] != y_ngs[rows[:-1]]).any(axis=1)])]
+    return rows[rows > 0]
+
+
+def frame_distance(y_ngs: Array) -> int | None:
+    """Return the rows from a frame to the next; None where frames follow each other, or are less than three."""
+    steps = rows_of_frames(y_ngs)
+    distance = int(np.gcd.reduce(np.diff(steps))) if steps.size > 2 else 1
+    return distance if distance > 1 else None
+
+
+def _place_frames(signals: dict[str, Array], steps: Array, frames: Array, ratio: int) -> None:
+    """Put the frames of these steps in their rows, and start the record `ratio` steps before a frame."""
+    n = signals["y_lgs"].shape[0]
     inside = (steps >= 0) & (steps < n)
     signals[NGS] = np.full((n, frames.shape[1]), np.nan)
     signals[NGS][steps[inside]] = frames[inside]
     for name in (*FAST, NGS, STARS, APART):
         if name in signals:
             signals[name] = signals[name][steps[0] % ratio :]
-    return ratio
 
 
 def _training(signals: Mapping[str, Array]) -> Training | None:
@@ -304,7 +331,7 @@ def _number_of(
     if name not in arrays or (trust and declaration is not None):
         found = default if declaration is None else declaration
         if found is None:
-            raise RecordError("y_ngs needs ratio, the number of fast steps per NGS frame")
+            raise RecordError("y_ngs needs ratio, the number of fast steps per NGS frame, or time_ngs, their stamps, in the file")
         return found
     value = float(raw) if (raw := arrays[name]).ndim == 0 and raw.dtype.kind in "fiu" else np.nan
     if not np.isfinite(value):
