@@ -247,12 +247,14 @@ def test_rows_of_ngs_frames_tell_their_distance(first: int, is_held: bool) -> No
         ends = [*rows[1:], N]
         for row, end in zip(rows, ends, strict=True):
             logged[row:end] = frames[row]
-    record = taken(y_ngs=logged)
     known = taken(y_ngs=due[cut:], ratio=5, y_lgs=Y[cut:], u=U[cut:])
-    assert record.ratio == 5
-    np.testing.assert_array_equal(record.y_ngs, known.y_ngs)
-    np.testing.assert_array_equal(record.y_lgs, known.y_lgs)
-    assert record.origin == f"an NGS frame in 5 rows, the first in row {first}"
+    for stated in ({}, {"ratio": 5}):
+        record = taken(y_ngs=logged, **stated)
+        assert record.ratio == 5
+        np.testing.assert_array_equal(record.y_ngs, known.y_ngs)
+        np.testing.assert_array_equal(record.y_lgs, known.y_lgs)
+        is_said = not stated or is_held or cut > 0
+        assert record.origin == f"an NGS frame in 5 rows, the first in row {first}" * is_said
 
 
 def test_blank_cells_after_the_last_ngs_frame() -> None:

@@ -258,10 +258,12 @@ def _apply_frames(signals: dict[str, Array], arrays: Mapping[str, Array], start:
         if late.size:
             raise RecordError(f"time_ngs: the frame in row {late[0]} is not a whole number of {ratio} steps after the first")
         _place_frames(signals, steps, frames, ratio)
-    elif "ratio" not in arrays and frames.shape[0] == n:
-        ratio, steps = _ratio(arrays, frame_distance(frames)), rows_of_frames(frames)
+    elif frames.shape[0] == n and (distance := frame_distance(frames)) and distance % _ratio(arrays, distance) == 0:
+        ratio, steps = _ratio(arrays, distance), rows_of_frames(frames)
+        is_held = np.isfinite(frames).any(axis=1).sum() > steps.size + 1  # one in the first row is none
+        if "ratio" not in arrays or steps[0] % ratio or is_held:
+            said = f"an NGS frame in {ratio} rows, the first in row {steps[0]}"
         _place_frames(signals, steps, frames[steps], ratio)
-        said = f"an NGS frame in {ratio} rows, the first in row {steps[0]}"
     else:
         ratio = _ratio(arrays)
         signals[NGS] = place_frames(frames, n, ratio)
@@ -272,7 +274,7 @@ def _apply_frames(signals: dict[str, Array], arrays: Mapping[str, Array], start:
 def rows_of_frames(y_ngs: Array) -> Array:
     """Return the rows that have a frame, (n,), of most rows those where another one begins to be held; not the first row."""
     rows = np.flatnonzero(np.isfinite(y_ngs).any(axis=1))
-    if rows.size > 0.5 * y_ngs.shape[0]:
+    if rows.size > 0.5 * (y_ngs.shape[0] + 1):
         rows = rows[np.concatenate([[True], (y_ngs[rows[1:]] != y_ngs[rows[:-1]]).any(axis=1)])]
     return rows[rows > 0]
 
