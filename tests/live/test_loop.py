@@ -363,7 +363,7 @@ def test_a_frame_is_taken_once_all_crews_have_it_and_late_by_the_last():
             part.release()
 
 
-def test_who_waits_is_woken_once_however_many_frames_have_come():
+def test_a_crew_is_woken_once_however_many_frames_have_come():
     wakes = [get_context("spawn").BoundedSemaphore() for _ in range(2)]
     desk = Desk("", 2, queue.Queue(), 1.0, None, wakes)
     for _ in range(3):

@@ -4,6 +4,8 @@ import itertools
 import json
 import queue
 import threading
+from multiprocessing import get_context
+from multiprocessing.synchronize import BoundedSemaphore
 from time import monotonic
 
 import numpy as np
@@ -47,16 +49,24 @@ def test_frames_of_a_record_are_those_of_the_record():
     np.testing.assert_array_equal(again.z_ngs[1:], record.z_ngs[1:])
 
 
+def spent_semaphore() -> BoundedSemaphore:
+    """Return a semaphore of a crew that waits for a frame."""
+    semaphore = get_context("spawn").BoundedSemaphore()
+    semaphore.acquire()
+    return semaphore
+
+
 @pytest.mark.parametrize(("n_frames", "count", "last"), [(None, 7, [(7, "the record has ended")]), (3, 3, [])])
 def test_a_record_is_sent_until_its_end_or_what_was_asked_for(monkeypatch, n_frames, count, last):
     ring, inbox, news, opened = Ring(2), Inbox(), queue.Queue(), []
     monkeypatch.setattr(live_source, "enter_process", lambda **_: None)
     monkeypatch.setattr(live_source, "Ring", lambda *of: opened.append(Ring(*of)) or opened[-1])
-    rows = np.arange(70.0).reshape(7, 10)
+    rows, wake = np.arange(70.0).reshape(7, 10), spent_semaphore()
     inbox.waiting.append({"play": True, "line": "a setting"})
     try:
-        live_source._send(rows, 1e-4, Desk(ring.name, 2, news, 1.0, n_frames), inbox)
+        live_source._send(rows, 1e-4, Desk(ring.name, 2, news, 1.0, n_frames, (wake,)), inbox)
         assert ring.is_closed and ring.count == count
+        assert wake.acquire(timeout=0)
         np.testing.assert_array_equal(np.hstack(ring.read_frames(0, count)[1:]), rows[:count])
     finally:
         for one in (*opened, ring):
@@ -282,14 +292,16 @@ def test_two_streams_are_the_rows_of_the_record(tmp_path, lag, jitter):
 def test_a_gap_ends_with_the_last_frame_that_was_asked_for(tmp_path):
     """Else more would have been delivered than that, and fewer than none lost."""
     stream = SharedImage.create(tmp_path / "lgs.im.shm", (2,), dtype="float64")
-    ring, inbox = Ring(2), Inbox()
-    frames = StreamFrames(StreamSource(stream.path, (0, 1), 1.0, 1e-3), Desk(ring.name, 2, queue.Queue(), 1.0, 5), inbox)
+    ring, inbox, wake = Ring(2), Inbox(), spent_semaphore()
+    desk = Desk(ring.name, 2, queue.Queue(), 1.0, 5, (wake,))
+    frames = StreamFrames(StreamSource(stream.path, (0, 1), 1.0, 1e-3), desk, inbox)
     frames._look()
     inbox.waiting.append({"play": True})
     frames._follow_commands()
     for number in range(3):
         stream.write(np.full(2, number))
         frames.take()
+        assert wake.acquire(timeout=0)
     for number in range(3, 10):  # nobody looks
         stream.write(np.full(2, number))
     frames.run()

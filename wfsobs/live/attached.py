@@ -98,7 +98,7 @@ TICK = 0.05
 """Longest wait for a frame before a look at the commands [s]."""
 SPELL = 10.0
 """Time after which something that had ceased is told anew [s]."""
-FREQUENT = 0.1
+BETWEEN_LOOKS = 0.1
 """Pause between two looks at a stream, in frames: more looks would take time from what follows."""
 RETRY = 0.5
 """Pause before a stream that cannot be read is looked for again [s]."""
@@ -289,7 +289,7 @@ class StreamFrames:
     def _open(self, path: str, elements: Sequence[int]) -> SharedImage | Subscription:
         """Open a stream that has these elements. Raises StreamError."""
         if not is_address(path):
-            stream = SharedImage(path, max(POLL, FREQUENT * self._source.dt))
+            stream = SharedImage(path, max(POLL, BETWEEN_LOOKS * self._source.dt))
             check_elements(stream, elements)
             return stream
         stream = Subscription(path, lambda line: self._desk.say(self._ring.count, line), patience=RETRY)

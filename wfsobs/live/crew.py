@@ -45,7 +45,7 @@ class Site:
     sampling : modes, step and NGS ratio of the source
     ring_name, board_name : shared memory
     news     : events
-    wakes    : of the crews of observers, each released with every frame
+    wakes    : semaphores of the crews of observers, released with every frame
     """
 
     settings: Mapping[str, Any]

@@ -90,7 +90,7 @@ class Desk:
     news  : events
     speed : at the start, 1 is real time
     n_frames : after which it ends; None for no end
-    wakes : of those that wait for frames, each for one
+    wakes : semaphores of the crews of observers, released with every frame
     """
 
     ring_name: str
@@ -105,9 +105,9 @@ class Desk:
         self.news.put(LiveEvent(number, what, origin=origin))
 
     def wake(self) -> None:
-        """Have those go on who wait for the frame that has been written."""
+        """Wake the crews that wait for the frame that has been written."""
         for one in self.wakes:
-            with suppress(ValueError):  # it has been woken before, and does not wait
+            with suppress(ValueError):  # at its maximum: this crew is not waiting
                 one.release()
 
 

@@ -236,7 +236,7 @@ def _apply_timestamps(
         if is_short or (steps is not None and name not in TRAINING and values.shape[0] == n):
             placed = np.full((at[-1] + 1, values.shape[1]), np.nan)
             placed[at[: values.shape[0]]] = values
-            if not is_short or frame_distance(placed):
+            if not is_short or frame_distance(rows_of_frames(placed)):
                 signals[name] = placed
     if dt is None:
         there = f": which column is the time? It has {', '.join(contents.leftovers[:20])}" if contents.leftovers else ""
@@ -257,13 +257,15 @@ def _apply_frames(signals: dict[str, Array], arrays: Mapping[str, Array], start:
         late = np.flatnonzero((steps - steps[0]) % ratio)
         if late.size:
             raise RecordError(f"time_ngs: the frame in row {late[0]} is not a whole number of {ratio} steps after the first")
-        _place_frames(signals, steps, frames, ratio)
-    elif frames.shape[0] == n and (distance := frame_distance(frames)) and distance % _ratio(arrays, distance) == 0:
+        _align_frames(signals, steps, frames, ratio)
+    elif (
+        frames.shape[0] == n and (distance := frame_distance(rows_of_frames(frames))) and not distance % _ratio(arrays, distance)
+    ):
         ratio, steps = _ratio(arrays, distance), rows_of_frames(frames)
         is_held = np.isfinite(frames).any(axis=1).sum() > steps.size + 1  # one in the first row is none
         if "ratio" not in arrays or steps[0] % ratio or is_held:
             said = f"an NGS frame in {ratio} rows, the first in row {steps[0]}"
-        _place_frames(signals, steps, frames[steps], ratio)
+        _align_frames(signals, steps, frames[steps], ratio)
     else:
         ratio = _ratio(arrays)
         signals[NGS] = place_frames(frames, n, ratio)
@@ -272,22 +274,27 @@ def _apply_frames(signals: dict[str, Array], arrays: Mapping[str, Array], start:
 
 
 def rows_of_frames(y_ngs: Array) -> Array:
-    """Return the rows that have a frame, (n,), of most rows those where another one begins to be held; not the first row."""
+    """Return the rows with a frame, (n,); where most rows have numbers, those in which they change. The first row has none.
+
+    y_ngs : (n_steps, n_modes) [um], NaN or the last frame between two
+    """
     rows = np.flatnonzero(np.isfinite(y_ngs).any(axis=1))
     if rows.size > 0.5 * (y_ngs.shape[0] + 1):
         rows = rows[np.concatenate([[True], (y_ngs[rows[1:]] != y_ngs[rows[:-1]]).any(axis=1)])]
     return rows[rows > 0]
 
 
-def frame_distance(y_ngs: Array) -> int | None:
-    """Return the rows from a frame to the next; None where frames follow each other, or are less than three."""
-    steps = rows_of_frames(y_ngs)
+def frame_distance(steps: Array) -> int | None:
+    """Return the greatest common divisor of the distances of frames [steps]; None where it is 1, or of fewer than three frames.
+
+    steps : of the frames, (n,)
+    """
     distance = int(np.gcd.reduce(np.diff(steps))) if steps.size > 2 else 1
     return distance if distance > 1 else None
 
 
-def _place_frames(signals: dict[str, Array], steps: Array, frames: Array, ratio: int) -> None:
-    """Put the frames of these steps in their rows, and start the record `ratio` steps before a frame."""
+def _align_frames(signals: dict[str, Array], steps: Array, frames: Array, ratio: int) -> None:
+    """Put the frames of these steps, (n,), in their rows, and start the record a multiple of `ratio` steps before the first."""
     n = signals["y_lgs"].shape[0]
     inside = (steps >= 0) & (steps < n)
     signals[NGS] = np.full((n, frames.shape[1]), np.nan)
@@ -333,7 +340,9 @@ def _number_of(
     if name not in arrays or (trust and declaration is not None):
         found = default if declaration is None else declaration
         if found is None:
-            raise RecordError("y_ngs needs ratio, the number of fast steps per NGS frame, or time_ngs, their stamps, in the file")
+            raise RecordError(
+                "y_ngs needs ratio, the number of fast steps per NGS frame, or time_ngs, the time stamps of the frames"
+            )
         return found
     value = float(raw) if (raw := arrays[name]).ndim == 0 and raw.dtype.kind in "fiu" else np.nan
     if not np.isfinite(value):
