@@ -251,6 +251,8 @@ def _apply_timestamps(
 def _apply_frames(signals: dict[str, Array], arrays: Mapping[str, Array], start: float, dt: float) -> tuple[int, str]:
     """Place NGS frames by their stamps, by the rows they are in or by the ratio; return the ratio, and what was guessed."""
     frames, n, said = signals[NGS], signals["y_lgs"].shape[0], ""
+    steps = rows_of_frames(frames)
+    distance = frame_distance(steps) if frames.shape[0] == n else None
     if "time_ngs" in arrays:
         steps = frames_at(_past_midnight(_clock("time_ngs", arrays["time_ngs"], frames.shape[0])), start, dt)
         ratio = _ratio(arrays, int(np.median(np.diff(steps))) if steps.size > 1 else None)
@@ -258,10 +260,7 @@ def _apply_frames(signals: dict[str, Array], arrays: Mapping[str, Array], start:
         if late.size:
             raise RecordError(f"time_ngs: the frame in row {late[0]} is not a whole number of {ratio} steps after the first")
         _align_frames(signals, steps, frames, ratio)
-    elif (
-        frames.shape[0] == n and (distance := frame_distance(rows_of_frames(frames))) and not distance % _ratio(arrays, distance)
-    ):
-        ratio, steps = _ratio(arrays, distance), rows_of_frames(frames)
+    elif distance and distance % (ratio := _ratio(arrays, distance)) == 0:
         is_held = np.isfinite(frames).any(axis=1).sum() > steps.size + 1  # one in the first row is none
         if "ratio" not in arrays or steps[0] % ratio or is_held:
             said = f"an NGS frame in {ratio} rows, the first in row {steps[0]}"
