@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import BrowserContext, Page, expect
+from playwright.sync_api import BrowserContext, Page, Route, expect
 
 from tests.browser.conftest import PATIENCE, QUICK, answered, finished, leave, until, with_seeds
 
@@ -188,7 +188,8 @@ def speed(page: Page, text: str) -> None:
     box.press("Enter")
 
 
-CONNECTING = "() => Bokeh.index.roots[0].model.document.wfsobs.connection?.socket?.readyState === WebSocket.CONNECTING"
+LINK = "Bokeh.index.roots[0].model.document.wfsobs"
+CONNECTING = f"() => {LINK}.connection?.socket?.readyState === WebSocket.CONNECTING"
 """Whether the browser has a socket that waits for its answer: it cannot be sent by yet."""
 
 
@@ -216,6 +217,33 @@ def test_offline_for_a_while(page: Page) -> None:
     done(page)
 
 
+def test_an_answer_that_comes_late(page: Page, cable: Cable) -> None:
+    page.evaluate(f"() => {{ window.way = {LINK}.socket }}")
+    cable.quick.clear()
+    expect(banner(page, "The server does not answer")).to_be_visible()
+    held: list[Route] = []
+    page.route("**/static/**", lambda route: held.append(route))
+    with page.expect_request(lambda request: request.method == "HEAD"):  # whether the server is there at all
+        pass
+    cable.quick.set()
+    expect(banner(page, "The server does not answer")).to_be_hidden()
+    for it in held:
+        it.continue_()
+    page.unroute("**/static/**")
+    asked = page.evaluate(f"() => {LINK}.asked")
+    until(page, f"asked => {LINK}.model?.last_arrival > asked + 1", arg=asked)  # seconds later
+    assert page.evaluate(f"() => {LINK}.socket === window.way")
+
+
+def test_a_way_by_which_nothing_arrives(page: Page) -> None:
+    page.evaluate(f"() => {{ {LINK}.socket.send = () => {{}} }}")
+    expect(banner(page, "The server does not answer")).to_be_visible()
+    speed(page, "23")
+    connected_again(page)
+    until(page, "() => location.search.includes('turbulence.wind_speed=23')")
+    done(page)
+
+
 def test_a_cut_line_comes_back_to_the_same_session(page: Page, cable: Cable) -> None:
     page.get_by_role("button", name="Pin this run to compare others with it").click()
     expect(page.get_by_text("Compared with, faint in the figures")).to_be_visible()
@@ -232,7 +260,7 @@ def test_a_cut_line_comes_back_to_the_same_session(page: Page, cable: Cable) -> 
     until(page, "() => location.search.includes('vibration.peaks=6.5,')")
     expect(page.locator('[data-cell$=".frequency"]')).to_have_count(peaks + 1)
     expect(page.get_by_role("status").filter(has_text="Compared with")).to_contain_text(
-        "Wind speed V₀ 22 → 24 m/s"
+        "Wind speed V₀ 23 → 24 m/s"
     )  # the same session: its pinned run is there
     done(page)
 

@@ -3,7 +3,7 @@
 
 const TICK = 250 // [ms]; only those count in which this page gets to work
 const PATIENCE = 16 // with a question: another visitor's page takes the server two seconds [ticks]
-const GIVEN_UP = 40 // after which another way to the server is tried [ticks]
+const GIVEN_UP = 40 // after which another way to the server is looked for [ticks]
 const PERIOD = 12 // between questions where nothing is changed [ticks]
 const TIMEOUT = 3_000 // of a question beside the connection [ms]
 const LONGEST = 3_000 // between two attempts to connect [ms]
@@ -68,6 +68,7 @@ class Link {
   refused = 0
   wait = 0
   ticks = 0
+  isThere = false
 
   constructor(doc) {
     this.doc = doc
@@ -122,7 +123,9 @@ class Link {
     const waiting = this.asked > this.model.last_arrival
     if (!waiting && (this.unsent.length || this.ticks >= PERIOD)) this.ask()
     if (waiting && this.ticks === PATIENCE) this.fail("silent")
-    if (waiting && this.ticks % GIVEN_UP === 0) this.another()
+    if (!waiting || this.ticks < GIVEN_UP) return
+    if (this.ticks % GIVEN_UP === 0) reachable().then((it) => { this.isThere = it })
+    if (this.ticks % GIVEN_UP === PATIENCE && this.isThere) this.another()
   }
 
   answered(number) {
@@ -132,16 +135,12 @@ class Link {
     if (["offline", "silent"].includes(this.state)) this.turn("connected")
   }
 
-  // Where the server is there but this way to it is not. One that was busy answers by the socket first.
-  async another() {
+  // Where the server is there but this way to it is not, nor has it answered since: a page at work is late to read what came.
+  another() {
     const {socket} = this
-    if (!await reachable()) return
-    const {ticks} = this
-    setTimeout(() => {
-      if (this.ticks < ticks || socket !== this.socket || !socket) return
-      socket.send = () => {} // until it is closed: what is changed is kept
-      socket.close()
-    }, TIMEOUT)
+    if (!socket) return
+    socket.send = () => {} // until it is closed: what is changed is kept
+    socket.close()
   }
 
   // A lost connection is not used again: its reader may be in the middle of a message.
