@@ -189,6 +189,7 @@ def speed(page: Page, text: str) -> None:
 
 
 LINK = "Bokeh.index.roots[0].model.document.wfsobs"
+"""What watches the connection."""
 CONNECTING = f"() => {LINK}.connection?.socket?.readyState === WebSocket.CONNECTING"
 """Whether the browser has a socket that waits for its answer: it cannot be sent by yet."""
 
@@ -218,7 +219,7 @@ def test_offline_for_a_while(page: Page) -> None:
 
 
 def test_an_answer_that_comes_late(page: Page, cable: Cable) -> None:
-    page.evaluate(f"() => {{ window.way = {LINK}.socket }}")
+    page.evaluate(f"() => {{ window.before = {LINK}.socket }}")
     cable.quick.clear()
     expect(banner(page, "The server does not answer")).to_be_visible()
     held: list[Route] = []
@@ -231,11 +232,11 @@ def test_an_answer_that_comes_late(page: Page, cable: Cable) -> None:
         it.continue_()
     page.unroute("**/static/**")
     asked = page.evaluate(f"() => {LINK}.asked")
-    until(page, f"asked => {LINK}.model?.last_arrival > asked + 1", arg=asked)  # seconds later
-    assert page.evaluate(f"() => {LINK}.socket === window.way")
+    until(page, f"asked => {LINK}.model?.last_arrival > asked + 1", arg=asked)  # longer than it takes to close a socket
+    assert page.evaluate(f"() => {LINK}.socket === window.before")
 
 
-def test_a_way_by_which_nothing_arrives(page: Page) -> None:
+def test_a_socket_that_carries_nothing(page: Page) -> None:
     page.evaluate(f"() => {{ {LINK}.socket.send = () => {{}} }}")
     expect(banner(page, "The server does not answer")).to_be_visible()
     speed(page, "23")

@@ -3,7 +3,7 @@
 
 const TICK = 250 // [ms]; only those count in which this page gets to work
 const PATIENCE = 16 // with a question: another visitor's page takes the server two seconds [ticks]
-const GIVEN_UP = 40 // after which another way to the server is looked for [ticks]
+const GIVEN_UP = 40 // after which a request beside the socket tells whether the server is there [ticks]
 const PERIOD = 12 // between questions where nothing is changed [ticks]
 const TIMEOUT = 3_000 // of a question beside the connection [ms]
 const LONGEST = 3_000 // between two attempts to connect [ms]
@@ -135,7 +135,7 @@ class Link {
     if (["offline", "silent"].includes(this.state)) this.turn("connected")
   }
 
-  // Where the server is there but this way to it is not, nor has it answered since: a page at work is late to read what came.
+  // The server is there, but does not answer by this socket. Counted in ticks, as a busy page reads late what has arrived.
   another() {
     const {socket} = this
     if (!socket) return
