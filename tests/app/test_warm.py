@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 
 import pytest
 from bokeh.document import Document
-from panel.io.document import _cleanup_doc
 from panel.io.state import set_curdoc
 
 from wfsobs.app.dashboard import Dashboard
@@ -50,4 +49,3 @@ def test_the_first_picture_comes_with_the_page_and_is_made_of_little(service: Se
         assert len([m for m in doc.models if m.__class__.__name__ == "GlyphRenderer" and m.name == "kf-lgs"]) == 4
         assert dashboard.controls.preset.label in [getattr(m, "label", "") for m in doc.models]
     dashboard.store.session.leave()
-    _cleanup_doc(doc)
