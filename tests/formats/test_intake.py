@@ -278,6 +278,9 @@ def test_blank_cells_after_the_last_ngs_frame() -> None:
         ({"command_sign": 0}, "command_sign takes 1 or -1, not 0"),
         ({"delay": 0}, "delay takes a number of steps from 1 to 100, not 0"),
         ({"delay": "two"}, "delay takes a number, not 'two'"),
+        ({"delay": [1.0, 3.0]}, "delay differs between parts of the file: 1.0, 3.0; --trust takes what is stated"),
+        ({"command_sign": [-1, 1]}, "command_sign differs between parts of the file: -1, 1; --trust"),
+        ({"y_ngs": np.zeros((N, 2)), "ratio": [4, 5]}, "ratio differs between parts of the file: 4, 5$"),
         ({"dt": NONE}, "has no dt and no time"),
         ({"y_ngs": np.zeros((N, 2))}, "y_ngs needs ratio"),
         ({"y_ngs": np.zeros((N, 1)), "ratio": 1}, r"y_ngs has shape \(40, 1\); expected \(40, 2\)"),
@@ -288,6 +291,10 @@ def test_wrong_contents(arrays: dict, message: str) -> None:
     with pytest.raises(RecordError, match=message) as caught:
         taken(**arrays)
     assert "\n" not in str(caught.value)
+
+
+def test_what_is_trusted_stands_for_parts_that_differ() -> None:
+    assert taken(DeclaredFormat(command_delay=3.0, trust=True), delay=[1.0, 3.0]).delay == 3
 
 
 CSV = [

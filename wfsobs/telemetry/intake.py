@@ -19,10 +19,21 @@ from wfsobs.record import DELAY, Record, RecordError, Training, star_counts
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.zernike import order_of
 from wfsobs.telemetry.bridged import without_bridged
+from wfsobs.telemetry.clocks import (
+    AGREE,
+    counted_steps,
+    drop_partial_frames,
+    frame_distance,
+    frames_at,
+    past_midnight,
+    place_frames,
+    rows_of_frames,
+    steps_of,
+)
 from wfsobs.telemetry.columns import LoopMatrix, apply_matrices
 from wfsobs.telemetry.formats.contents import APART, FAST, FRAME, LARGEST, NGS, SIGNALS, STARS, TIME, TRAINING, Contents
 from wfsobs.typing import Array
-from wfsobs.units import ANGLES, SECONDS, UNITS, micrometres_per, parse_unit
+from wfsobs.units import ANGLES, UNITS, micrometres_per, parse_unit
 
 MOST_NAMED = 5
 """Maximum columns that are named as not used."""
@@ -227,7 +238,7 @@ def _apply_timestamps(
     start = 0.0
     steps = counted_steps(_clock(FRAME, arrays[FRAME], n)) if FRAME in arrays else None
     if TIME in arrays:
-        time = _past_midnight(_clock(TIME, arrays[TIME], n))
+        time = past_midnight(_clock(TIME, arrays[TIME], n))
         steps, dt, said = steps_of(time, dt, steps)
         start = float(time[0])
     at = np.arange(n) if steps is None else steps
@@ -254,7 +265,7 @@ def _apply_frames(signals: dict[str, Array], arrays: Mapping[str, Array], start:
     steps = rows_of_frames(frames)
     distance = frame_distance(steps) if frames.shape[0] == n else None
     if "time_ngs" in arrays:
-        steps = frames_at(_past_midnight(_clock("time_ngs", arrays["time_ngs"], frames.shape[0])), start, dt)
+        steps = frames_at(past_midnight(_clock("time_ngs", arrays["time_ngs"], frames.shape[0])), start, dt)
         ratio = _ratio(arrays, int(np.median(np.diff(steps))) if steps.size > 1 else None)
         late = np.flatnonzero((steps - steps[0]) % ratio)
         if late.size:
@@ -270,26 +281,6 @@ def _apply_frames(signals: dict[str, Array], arrays: Mapping[str, Array], start:
         signals[NGS] = place_frames(frames, n, ratio)
     signals[NGS] = drop_partial_frames(signals[NGS], ratio)
     return ratio, said
-
-
-def rows_of_frames(y_ngs: Array) -> Array:
-    """Return the rows with a frame, (n,); where most rows have numbers, those in which they change. The first row has none.
-
-    y_ngs : (n_steps, n_modes) [um], NaN or the last frame between two
-    """
-    rows = np.flatnonzero(np.isfinite(y_ngs).any(axis=1))
-    if rows.size > 0.5 * (y_ngs.shape[0] + 1):
-        rows = rows[np.concatenate([[True], (y_ngs[rows[1:]] != y_ngs[rows[:-1]]).any(axis=1)])]
-    return rows[rows > 0]
-
-
-def frame_distance(steps: Array) -> int | None:
-    """Return the greatest common divisor of the distances of frames [steps]; None where it is 1, or of fewer than three frames.
-
-    steps : of the frames, (n,)
-    """
-    distance = int(np.gcd.reduce(np.diff(steps))) if steps.size > 2 else 1
-    return distance if distance > 1 else None
 
 
 def _align_frames(signals: dict[str, Array], steps: Array, frames: Array, ratio: int) -> None:
@@ -316,16 +307,6 @@ def _clock(name: str, raw: Array, n: int) -> Array:
     return raw.astype(np.float64)
 
 
-def _past_midnight(time: Array) -> Array:
-    """Return the times of a day [s] with those after midnight going on; others as they are."""
-    midnight = np.diff(time, prepend=time[:1]) < -0.5 * DAY
-    return time + DAY * np.cumsum(midnight) if midnight.any() and 0 <= time.min() and time.max() < DAY else time
-
-
-DAY = SECONDS["d"]
-"""Length of a day [s]."""
-
-
 def _number(name: str, raw: Array) -> float:
     if raw.ndim != 0 or raw.dtype.kind not in "fiu" or not np.isfinite(raw) or raw <= 0:
         raise RecordError(f"{name} takes one number above 0, not {np.array2string(raw, threshold=4)}")
@@ -343,7 +324,12 @@ def _number_of(
                 "y_ngs needs ratio, the number of fast steps per NGS frame, or time_ngs, the time stamps of the frames"
             )
         return found
-    value = float(raw) if (raw := arrays[name]).ndim == 0 and raw.dtype.kind in "fiu" else np.nan
+    raw = arrays[name]
+    if raw.ndim:
+        found = ", ".join(map(str, raw.tolist()))
+        more = "; --trust takes what is stated" * (name != "ratio")
+        raise RecordError(f"{name} differs between parts of the file: {found}{more}")
+    value = float(raw) if raw.dtype.kind in "fiu" else np.nan
     if not np.isfinite(value):
         raise RecordError(f"{name} takes a number, not {np.array2string(raw, threshold=4)[:40]}")
     if declaration is not None and value != declaration:
@@ -410,192 +396,3 @@ def _apply_mirror(signals: dict[str, Array], delay: float, declaration: Declared
         signals["u"][:] = 0.0
     said = [f"delay {delay:g}"] if part >= WHOLE else []
     return said + ([f"command gain {', '.join(f'{g:g}' for g in gain)}"] if declaration.command_gain else [])
-
-
-JITTER = 0.3
-"""Maximum distance of a stamp from its step, in steps."""
-
-AGREE = 1e-3
-"""Maximum relative difference of the step of the stamps and a declared one."""
-
-BLOCK = 64
-"""Rows whose median tells a lost frame from the jitter of stamps."""
-
-COUNTERS = (8, 16, 32, 64)
-"""Bits of a frame counter."""
-
-
-def steps_of(time: Array, dt: float | None = None, frames: Array | None = None) -> tuple[Array, float, str]:
-    """Return the step of every row, and the time step, of time stamps.
-
-    A difference of several steps is a gap. Stamps that scatter are accepted where the frames are counted, or where the rate is
-    declared and no frame, or none that could not be told, is missing.
-
-    Parameters
-    ----------
-    time : Array
-        Time stamps, (n,) [s].
-    dt : float, optional
-        Declared time step [s].
-    frames : Array, optional
-        Step of every row where a frame counter tells it, (n,); the stamps then give the time step alone.
-
-    Returns
-    -------
-    steps : Array
-        Integers from 0, (n,).
-    dt : float
-        Time step [s].
-    said : str
-        That stamps scatter, in a few words.
-
-    Raises
-    ------
-    RecordError
-        Time goes backwards, the rate is not constant or not the declared one, or most frames are missing.
-    """
-    bad = np.flatnonzero(~np.isfinite(time))
-    if bad.size:
-        raise RecordError(f"time is {time[bad[0]]} in row {bad[0]}")
-    if time.size < 2:
-        raise RecordError("time needs two rows at least")
-    if frames is not None:
-        return frames, *_step_of_frames(time, dt, frames)
-    try:
-        return *_regular_steps(time, dt), ""
-    except RecordError:
-        steps = None if dt is None else _scattered_steps(time, dt)
-        if dt is None or steps is None:
-            raise
-    _check_lost(steps)
-    return steps, dt, f"stamps {np.std(time / dt - steps):.2g} steps rms off the stated rate"
-
-
-def _regular_steps(time: Array, dt: float | None) -> tuple[Array, float]:
-    """Return the steps and the time step of stamps that are at most JITTER from their steps."""
-    hint = "stamps that scatter need a stated rate" if dt is None else "it is not known which frames are missing"
-    difference = np.diff(time)
-    back = np.flatnonzero(difference <= 0)
-    if back.size:
-        row = back[0] + 1
-        raise RecordError(
-            f"time {'stands still' if difference[row - 1] == 0 else 'goes backwards'} at row {row}, "
-            f"from {time[row - 1]:.9g} to {time[row]:.9g} s; {hint}"
-        )
-    jump = np.rint(difference / np.median(difference))
-    steps = np.concatenate([[0.0], np.cumsum(np.maximum(jump, 1.0))])
-    step = _round_step((time[-1] - time[0]) / steps[-1], time)
-    off = np.abs(time - time[0] - steps * step) / step
-    uneven = np.abs(difference / step - np.diff(steps))
-    if max(off.max(), uneven.max()) > JITTER:
-        row = int(np.argmax(uneven)) + 1
-        raise RecordError(
-            f"the rate is not constant: {difference[row - 1]:.6g} s before row {row}, {step:.6g} s on average; {hint}"
-        )
-    _check_lost(steps)
-    if dt is not None and abs(step / dt - 1.0) > AGREE:
-        raise RecordError(f"time has a step of {step:.6g} s, but {dt:.6g} s are stated")
-    return steps.astype(int), step if dt is None else dt
-
-
-def counted_steps(frame: Array) -> Array:
-    """Return the step of every row of a frame counter (n,), from 0; one that starts anew at a power of two goes on.
-
-    >>> counted_steps(np.array([65534.0, 65535.0, 0.0, 3.0]))
-    array([0, 1, 2, 5])
-    """
-    if not (np.isfinite(frame) & (frame == np.round(frame))).all():
-        raise RecordError("frame takes whole numbers")
-    difference = np.diff(frame)
-    turn = next(2.0**bits for bits in COUNTERS if np.ptp(frame) < 2.0**bits)  # also of one with a sign
-    around = difference + turn * (difference < 0)
-    each = np.median(around)
-    wrong = np.flatnonzero((around <= 0) | (around % max(each, 1) != 0) | ((difference < 0) & (around > frame.size * each)))
-    if wrong.size:
-        row = wrong[0] + 1
-        raise RecordError(f"frame does not count at row {row}: from {frame[row - 1]:.0f} to {frame[row]:.0f}")
-    steps = np.concatenate([[0.0], np.cumsum(around / each)])
-    _check_lost(steps)
-    return steps.astype(int)
-
-
-def _check_lost(steps: Array) -> None:
-    lost = steps[-1] + 1 - steps.size
-    if lost > steps.size:
-        raise RecordError(f"{lost:.0f} frames are missing, more than the {steps.size} measured: cut the record at its gaps")
-
-
-def _step_of_frames(time: Array, dt: float | None, steps: Array) -> tuple[float, str]:
-    """Return the time step of rows whose steps are known, and how far the stamps are off. Raises where a pause lies between."""
-    step = _round_step((time[-1] - time[0]) / steps[-1], time)
-    if dt is not None and abs(step / dt - 1.0) > AGREE:
-        raise RecordError(f"time has a step of {step:.6g} s per frame, but {dt:.6g} s are stated")
-    off = (time - time[0]) / step - steps
-    if np.ptp(_medians(off)) > 1.0:
-        raise RecordError("time and frame do not agree: the frames counted do not come at one rate")
-    rms = np.std(off)
-    return step if dt is None else dt, f"stamps {rms:.2g} steps rms off the frames counted" if rms > JITTER / 3 else ""
-
-
-def _scattered_steps(time: Array, dt: float) -> Array | None:
-    """Return the steps of stamps that scatter about a known rate; None where they do not tell which frames are missing."""
-    exact = (time - time[0]) / dt
-    exact -= np.median(exact - np.rint(exact))
-    near = np.rint(exact)
-    jump = np.diff(near)
-    if np.median(jump) == 1 and jump.min() == 1 and np.abs(exact - near).max() < 0.5 - JITTER / 3:
-        return (near - near[0]).astype(int)
-    middle = _medians(exact - np.arange(time.size))
-    if middle.size < 3 or np.abs(middle[2:] - middle[:-2]).max() > 0.5:
-        return None
-    return np.arange(time.size)
-
-
-def _medians(x: Array) -> Array:
-    """Return the medians of successive blocks; of all where there are few."""
-    n = max(x.size // BLOCK, 1)
-    return np.array([np.median(part) for part in np.array_split(x, n)])
-
-
-def place_frames(frames: Array, n: int, ratio: int) -> Array:
-    """Return frames with a row per fast step, from one row per step or per frame."""
-    if frames.shape[0] == n:
-        return frames
-    out = np.full((n, frames.shape[1]), np.nan)
-    due = out[ratio::ratio]
-    if not 0 <= frames.shape[0] - len(due) <= 1:
-        raise RecordError(f"y_ngs has {frames.shape[0]} rows; it takes {n}, or one per frame, {len(due)}")
-    due[:] = frames[: len(due)]
-    return out
-
-
-def drop_partial_frames(y_ngs: Array, ratio: int) -> Array:
-    """Check that frames are at k = n, 2n, ...; drop a frame at k = 0, which saw nothing, and frames without all modes."""
-    steps = np.arange(y_ngs.shape[0])
-    due = (steps % ratio == 0) & (steps >= ratio)
-    wrong = ~due & ~np.isnan(y_ngs).all(axis=1) & (steps > 0)
-    if wrong.any():
-        raise RecordError(
-            f"y_ngs has a frame at step {int(np.argmax(wrong))}; with ratio = {ratio} "
-            f"frames are at steps {ratio}, {2 * ratio}, ... and NaN elsewhere"
-        )
-    return np.where((due & ~np.isnan(y_ngs).any(axis=1))[:, None], y_ngs, np.nan)
-
-
-def frames_at(time: Array, start: float, dt: float) -> Array:
-    """Return the fast steps (n,) of frames stamped `time` [s], where step 0 is at `start`. Raises RecordError between steps."""
-    exact = (time - start) / dt
-    steps = np.rint(exact)
-    wrong = np.flatnonzero(~(np.abs(exact - steps) <= JITTER))
-    if wrong.size:
-        raise RecordError(f"time_ngs is {time[wrong[0]]:.9g} s in row {wrong[0]}, which is no step of the fast clock")
-    back = np.flatnonzero(np.diff(steps) <= 0)
-    if back.size:
-        raise RecordError(f"time_ngs goes backwards or stands still at row {back[0] + 1}")
-    return steps.astype(int)
-
-
-def _round_step(step: float, time: Array) -> float:
-    """Return the shortest number within the rounding errors of the stamps that a step was computed from."""
-    error = 4.0 * np.spacing(np.abs(time).max()) / time.size
-    return next((x for x in (float(f"{step:.{digits}g}") for digits in range(1, 17)) if abs(x - step) <= error), step)
