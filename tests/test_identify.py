@@ -31,7 +31,7 @@ from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.signal.autoregressive import Ar2
+from wfsobs.signal.autoregressive import Ar2, Ar3
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import true_spectra
 from wfsobs.spectral.model import Spectrum
@@ -117,6 +117,16 @@ def test_cells_are_as_wide_as_they_may_be(sizes: tuple[int, int]) -> None:
 @pytest.mark.parametrize("n", [2000, 59_998, 60_013])
 def test_fast_length(n: int) -> None:
     assert 0.98 * n < fast_length(n) <= n
+
+
+@pytest.mark.parametrize("corner", [2.2, 3.0, 40.0, 900.0])
+def test_slopes_of_third_order_are_derivatives_of_the_density(corner: float) -> None:
+    """From a corner near that of the pair to one far beyond it; a step of 1e-4 leaves out 1e-8 of it."""
+    model = Spectrum(0.014, DT, Ar3(2.0, 0.9, corner, 0.3, DT))
+    f, x = np.geomspace(0.02, 499.0, 200), model.vector
+    for i, slope in enumerate(model.slopes(f, range(1, 5)), 1):
+        up, down = (model.with_vector(x + sign * 1e-4 * np.eye(len(x))[i]).psd(f) for sign in (1, -1))
+        np.testing.assert_allclose(slope, (up - down) / 2e-4, rtol=0, atol=1e-6 * np.abs(slope).max())
 
 
 def test_slopes_and_information_are_derivatives_of_the_likelihood() -> None:

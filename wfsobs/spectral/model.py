@@ -73,9 +73,6 @@ def densities(numbers: Array, dt: float, f: Array) -> tuple[Array, Array]:
     return S, slopes
 
 
-STEP = 1e-4
-"""Step of the central differences, in the logarithm of a parameter."""
-
 SLOW, FAST, LEAST = 1e-3, 1.5, 0.02
 """Bounds of omega of third-order turbulence, over the rate, and of its damping: beyond them it loses digits."""
 RMS = 2
@@ -120,8 +117,8 @@ class Spectrum:
 
     def psd(self, f: Array) -> Array:
         """Return the one-sided power spectral density [um^2/Hz] at f [Hz]."""
-        at = _Frequencies(f, self.dt)
-        return 2.0 * self.dt * self.noise**2 + sum((at.density(p) for p in self.processes), np.zeros_like(f))
+        sine, cosine = np.sin(np.pi * f * self.dt), np.cos(np.pi * f * self.dt)
+        return 2.0 * self.dt * self.noise**2 + sum((_density(p, sine, cosine) for p in self.processes), np.zeros_like(f))
 
     def without(self, resonance: Ar2) -> Spectrum:
         """Return the spectrum without one of its resonances."""
@@ -171,31 +168,21 @@ class Spectrum:
 
 def _slopes_of_third_order(p: Ar3, f: Array) -> Array:
     """Return the derivatives of the density by the parameters of a process, (4, len(f)) [um^2/Hz]."""
-    at, rows, frequencies = _vector(p), [], _Frequencies(f, p.dt)
-    for i in range(len(at)):
-        move = STEP * (p.damping if i == 0 else 1.0) * np.eye(len(at))[i]
-        up, down = (frequencies.density(_process(at + sign * move, p.dt)) for sign in (1.0, -1.0))
-        rows.append((up - down) / (2.0 * move[i]))
-    return np.array(rows)
+    by_omega, by_damping, by_corner, by_rms = p.psd(f) * p.log_slopes(f)
+    return np.array([by_omega + by_corner, by_damping, by_rms, (1.0 - p.omega / p.corner) * by_corner])
 
 
-class _Frequencies:
-    """Frequencies for the densities of many processes: they share sine and cosine, most of the work of `Ar2.psd`."""
-
-    def __init__(self, f: Array, dt: float):
-        self.sine, self.cosine = np.sin(np.pi * f * dt), np.cos(np.pi * f * dt)
-
-    def density(self, p: Ar2 | Ar3) -> Array:
-        """Return the one-sided power spectral density [um^2/Hz] of a process."""
-        damped, half = p.damping * p.omega * p.dt, 0.5 * p.omega * np.sqrt(1.0 - p.damping**2) * p.dt
-        # |1 - exp(-damped + 2i x)|^2 = (1 - exp(-damped))^2 + 4 exp(-damped) sin^2 x at both x = pi f dt -+ half
-        a, b = self.sine * np.cos(half), self.cosine * np.sin(half)
-        flat, turning = np.expm1(-damped) ** 2, 4.0 * np.exp(-damped)
-        out = 2.0 * p.dt * p.drive_variance / ((flat + turning * (a - b) ** 2) * (flat + turning * (a + b) ** 2))
-        if isinstance(p, Ar3):
-            decay = p.corner * p.dt
-            out /= np.expm1(-decay) ** 2 + 4.0 * np.exp(-decay) * self.sine**2
-        return out
+def _density(p: Ar2 | Ar3, sine: Array, cosine: Array) -> Array:
+    """Return the one-sided power spectral density [um^2/Hz] of a process; most of the work of `Ar2.psd` is sine and cosine."""
+    damped, angle = p.damping * p.omega * p.dt, 0.5 * p.omega * np.sqrt(1.0 - p.damping**2) * p.dt
+    # |1 - exp(-damped + 2i x)|^2 = (1 - exp(-damped))^2 + 4 exp(-damped) sin^2 x at both x = pi f dt -+ angle
+    a, b = sine * np.cos(angle), cosine * np.sin(angle)
+    flat, turning = np.expm1(-damped) ** 2, 4.0 * np.exp(-damped)
+    out = 2.0 * p.dt * p.drive_variance / ((flat + turning * (a - b) ** 2) * (flat + turning * (a + b) ** 2))
+    if isinstance(p, Ar3):
+        decay = p.corner * p.dt
+        out /= np.expm1(-decay) ** 2 + 4.0 * np.exp(-decay) * sine**2
+    return out
 
 
 def _vector(p: Ar2 | Ar3) -> Array:
