@@ -15,6 +15,7 @@ import numpy as np
 import panel as pn
 import pytest
 
+from tests.patience import ENOUGH
 from wfsobs.app.cache import freeze
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.idle_work import SeedRuns
@@ -31,9 +32,6 @@ from wfsobs.priors_from import scenario as priors
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-
-WAIT = 200.0
-"""How long a page is waited for [s]: a busy machine takes ten times as long as a quiet one."""
 
 SHORT = {
     "run.duration": 2.0,
@@ -54,11 +52,11 @@ class Loop:
         self.queue: queue.Queue[Callable[[], None]] = queue.Queue()
         self.closing: list[Any] = []
 
-    def land(self, timeout: float = WAIT) -> None:
+    def land(self, timeout: float = ENOUGH) -> None:
         """Do the next thing that was posted."""
         self.queue.get(timeout=timeout)()
 
-    def until(self, condition: Callable[[], bool], timeout: float = WAIT) -> None:
+    def until(self, condition: Callable[[], bool], timeout: float = ENOUGH) -> None:
         """Do what is posted until a condition holds."""
         end = monotonic() + timeout
         while not condition():

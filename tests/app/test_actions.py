@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from tests.app.conftest import WAIT
+from tests.patience import ENOUGH
 from wfsobs.app import actions as module
 from wfsobs.app import downloads
 from wfsobs.app.actions import LARGEST, Actions
@@ -156,13 +156,13 @@ def test_a_report_is_made_aside_of_what_is_shown_one_at_a_time(
     def make(shown: Any, preset: str, *_: Any, **__: Any) -> bytes:
         asked.append((shown, preset))
         begun.set()
-        assert may_end.wait(WAIT)
+        assert may_end.wait(ENOUGH)
         return b"<!doctype html>"
 
     monkeypatch.setattr(module, "make", make)
     shown = shared_actions.store.run.result
     shared_actions.handle({"action": "report"})
-    assert shared_actions.toolbar.reporting and begun.wait(WAIT)
+    assert shared_actions.toolbar.reporting and begun.wait(ENOUGH)
     shared_actions.handle({"action": "report"})
     may_end.set()
     shared_loop.until(lambda: not shared_actions.toolbar.reporting)

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.patience import ENOUGH
 from wfsobs.app.cache import Cache, arrays_in, key_of, size_of
 from wfsobs.app.jobs import CANCELLED, FAILED, RUNNING, Tell
 from wfsobs.app.limits import NONE
@@ -23,8 +24,6 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.settings.values import SettingError
-
-WAIT = 60.0
 
 
 def answer(scenario: Scenario) -> RunResults:
@@ -42,7 +41,7 @@ class Gated:
     def __call__(self, scenario: Scenario, watch: Watch, tell: Tell, _loaded: object) -> RunResults:
         self.calls.append((scenario, watch, tell))
         self.entered.release()
-        assert self.gate.wait(WAIT)
+        assert self.gate.wait(ENOUGH)
         watch.check()
         return answer(scenario)
 
@@ -62,7 +61,7 @@ class Asked:
 
     def end(self) -> dict[str, Any]:
         """The last that they hear."""
-        assert self.over.wait(WAIT)
+        assert self.over.wait(ENOUGH)
         return self.heard[-1]
 
 
@@ -76,7 +75,7 @@ def make_service() -> Iterator[Callable[..., Service]]:
 
     yield make
     for service in made:
-        assert service.close(WAIT), "a thread did not stop"
+        assert service.close(ENOUGH), "a thread did not stop"
 
 
 # ---------------------------------------------------------------------- what is kept
@@ -173,7 +172,7 @@ def test_the_same_settings_are_computed_once_at_the_same_time(make_service: Any,
     work = Gated()
     service = make_service(work)
     asked = [Asked(service, short.copy()) for _ in range(8)]
-    assert work.entered.acquire(timeout=WAIT)
+    assert work.entered.acquire(timeout=ENOUGH)
     work.gate.set()
     results = [one.end()["result"] for one in asked]
     assert len(work.calls) == 1 and len({id(shown) for shown in results}) == 1
@@ -192,7 +191,7 @@ def test_who_joins_hears_of_progress_those_who_come_late_too(make_service: Any, 
     work = Gated()
     service = make_service(work)
     first = Asked(service, short)
-    assert work.entered.acquire(timeout=WAIT)
+    assert work.entered.acquire(timeout=ENOUGH)
     part = answer(short)
     _, watch, tell = work.calls[0]
     watch.progress(0.3)
@@ -211,7 +210,7 @@ def test_one_who_leaves_does_not_stop_it_for_others(make_service: Any, short: Sc
     work = Gated()
     service = make_service(work)
     leader = Asked(service, short)
-    assert work.entered.acquire(timeout=WAIT)
+    assert work.entered.acquire(timeout=ENOUGH)
     follower = Asked(service, short)
     leader.leave()
     assert not work.calls[0][1].is_cancelled()
@@ -224,7 +223,7 @@ def test_what_nobody_wants_stops_at_once_and_starts_anew_for_the_next(make_servi
     work = Gated()
     service = make_service(work)
     leader = Asked(service, short)
-    assert work.entered.acquire(timeout=WAIT)
+    assert work.entered.acquire(timeout=ENOUGH)
     leader.leave()
     assert work.calls[0][1].is_cancelled()
     after = Asked(service, short)
@@ -238,14 +237,14 @@ def test_a_failure_reaches_all_and_is_not_kept(make_service: Any, short: Scenari
 
     def fails(scenario: Scenario, *_: object) -> RunResults:
         entered.set()
-        assert gate.wait(WAIT)
+        assert gate.wait(ENOUGH)
         if errors:
             raise errors.pop()
         return answer(scenario)
 
     service = make_service(fails)
     first = Asked(service, short)
-    assert entered.wait(WAIT)
+    assert entered.wait(ENOUGH)
     second = Asked(service, short)
     gate.set()
     for one in (first, second):
@@ -265,6 +264,6 @@ def test_closing_the_service_ends_every_wait(make_service: Any, short: Scenario)
 
     service = make_service(works, workers=1)
     asked = [Asked(service, short.replace({"run.seed": seed})) for seed in range(3)]
-    assert entered.wait(WAIT) and service.queue.length == 2
-    assert service.close(WAIT)
+    assert entered.wait(ENOUGH) and service.queue.length == 2
+    assert service.close(ENOUGH)
     assert [one.end() for one in (*asked, Asked(service, short))] == 4 * [{"state": CANCELLED}]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import threading
-import time
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +14,7 @@ from bokeh.document import Document
 from bokeh.models import ColumnDataSource
 from bokeh.plotting import figure
 
+from tests.patience import ENOUGH, is_running, wait
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.jobs import FAILED, RUNNING, Job
 from wfsobs.app.limits import NONE
@@ -51,21 +51,6 @@ def page(dashboard: Dashboard) -> LivePage:
     page.controls.running.value = ["kf-multi", "gp-both"]
     page.controls.controllers.value = ["none", "integrator"]
     return page
-
-
-def is_running(pid: int) -> bool:
-    try:
-        with open(f"/proc/{pid}/stat") as file:
-            return file.read().rpartition(")")[2].split()[0] != "Z"
-    except (FileNotFoundError, ProcessLookupError):  # it may end between opening and reading
-        return False
-
-
-def wait(condition: Any, seconds: float = 200.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 def begin(page: LivePage, loop: Any) -> LiveLoop:
@@ -210,12 +195,12 @@ def test_one_place_is_kept_for_jobs_that_end() -> None:
 
     done = threading.Event()
     leave = [service.queue.submit(Job("live", work, endless=True), owner, lambda _: None) for owner in (1, 2)]
-    assert running.acquire(timeout=20)
+    assert running.acquire(timeout=ENOUGH)
     service.queue.submit(Job("run", lambda *_: done.set()), 3, lambda _: None)
-    assert done.wait(20), "a run is done beside"
+    assert done.wait(ENOUGH), "a run is done beside"
     assert service.queue.running == 1 and service.queue.length == 1
     leave[0]()
-    assert running.acquire(timeout=20), "the second loop takes the place of the first"
+    assert running.acquire(timeout=ENOUGH), "the second loop takes the place of the first"
     leave[1]()
     assert service.close(20)
 

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.patience import ENOUGH
 from wfsobs.app import jobs as module
 from wfsobs.app.cache import Cache
 from wfsobs.app.controls.panel import status_of
@@ -20,7 +21,6 @@ from wfsobs.app.limits import NONE
 from wfsobs.app.service import BackgroundTask, Service
 from wfsobs.progress import Watch
 
-WAIT = 60.0
 KINDS = ("run", "loop", "identify", "tune", "upload", "report")
 
 
@@ -35,7 +35,7 @@ class Log:
 
     def until(self, condition: Any) -> None:
         with self.changed:
-            assert self.changed.wait_for(condition, WAIT)
+            assert self.changed.wait_for(condition, ENOUGH)
 
 
 class Asked:
@@ -85,7 +85,7 @@ def make_queue() -> Iterator[Callable[[int], JobQueue]]:
 
     yield make
     for queue in made:
-        assert queue.close(WAIT)
+        assert queue.close(ENOUGH)
 
 
 def test_first_come_first_served_and_told_the_place(make_queue: Any) -> None:
@@ -113,7 +113,7 @@ def test_thirty_sessions_with_six_kinds_of_work_and_one_worker(make_queue: Any) 
     assert sorted(one.places[-1] for one in asked) == list(range(1, 181)), "everyone is told a place of their own"
     gate.set()
     for one in (first, *asked):
-        assert one.over.wait(WAIT) and one.known["state"] == DONE
+        assert one.over.wait(ENOUGH) and one.known["state"] == DONE
     assert log.most_at_once == 1
     rounds = [log.started[1:][30 * i : 30 * i + 30] for i in range(6)]
     for kind, names in zip(KINDS, rounds, strict=True):
@@ -157,7 +157,7 @@ def test_what_takes_too_long_is_stopped_counted_from_its_turn(make_queue: Any) -
     limited = Asked(log, "b", time_limit=0.05).into(queue)
     time.sleep(0.1)  # it waits for longer than it may take, which does not count
     first.gate.set()
-    assert limited.over.wait(WAIT) and log.started == ["a", "b"]
+    assert limited.over.wait(ENOUGH) and log.started == ["a", "b"]
     assert limited.known == {"place": 0, "state": FAILED, "message": "It took more than 0.05 s, which is what this server allows"}
 
 
@@ -180,10 +180,10 @@ def test_everything_is_done_never_too_much_at_once(workers: int, jobs: list[tupl
         log.until(lambda: log.running.total() == min(workers, len(jobs)))
         gate.set()
         for one in asked:
-            assert one.over.wait(WAIT) and one.known["result"] == one.name
+            assert one.over.wait(ENOUGH) and one.known["result"] == one.name
         assert log.most_at_once <= workers and sorted(log.started) == sorted(one.name for one in asked)
     finally:
-        assert queue.close(WAIT)
+        assert queue.close(ENOUGH)
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError("of a package"), SystemExit("of a package")])
@@ -206,7 +206,7 @@ def test_a_closed_queue_starts_nothing(make_queue: Any) -> None:
     busy = Asked(log, "a").into(queue)
     log.until(lambda: log.started == ["a"])
     waiting = Asked(log, "b").into(queue)
-    assert queue.close(WAIT) and log.started == ["a"]
+    assert queue.close(ENOUGH) and log.started == ["a"]
     assert busy.known["state"] == waiting.known["state"] == CANCELLED
 
 
@@ -217,7 +217,7 @@ def test_a_closed_queue_starts_nothing(make_queue: Any) -> None:
 def service() -> Iterator[Service]:
     service = Service(NONE, 1, 0)
     yield service
-    assert service.close(WAIT)
+    assert service.close(ENOUGH)
 
 
 def test_the_page_shows_the_place(service: Service, make_store: Any, loop: Any) -> None:
@@ -261,7 +261,7 @@ def test_a_task_shows_one_job_at_a_time(service: Service, loop: Any, caplog: Any
     def slow(watch: Watch, tell: Any) -> str:
         watch.step(0.5)
         tell(latest="half")
-        assert gate.wait(WAIT)
+        assert gate.wait(ENOUGH)
         return "late"
 
     task.start(Job("tune", slow))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.patience import wait
 from wfsobs.app.cache import Cache
 from wfsobs.app.display import Display
 from wfsobs.app.idle_work import Budgets, SeedRuns
@@ -26,13 +27,6 @@ def queue() -> Iterator[JobQueue]:
     queue = JobQueue(1, Cache(1_000_000), rest=0.0)
     yield queue
     queue.close(5.0)
-
-
-def wait(condition: Any) -> None:
-    end = monotonic() + 200.0
-    while not condition():
-        assert monotonic() < end
-        sleep(0.005)
 
 
 def test_a_job_for_idle_time_gives_way_to_a_click_and_begins_again(queue: JobQueue) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.patience import ENOUGH
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.idle_work import SeedScores
 from wfsobs.app.jobs import CANCELLED, DONE, FAILED, RUNNING, Job
@@ -32,7 +33,6 @@ from wfsobs.scenario.presets import PRESETS
 from wfsobs.scenario.scenario import idle_settings, why_idle_at
 from wfsobs.settings.values import SettingError
 
-WAIT = 60.0
 """As long as one run is waited for elsewhere [s]."""
 
 WIND, RATIO = "turbulence.wind_speed", "sensors.exposure_ratio"
@@ -54,7 +54,7 @@ def page(dashboard: Dashboard) -> SweepPage:
 
 def finish(page: SweepPage, loop: Any) -> None:
     page.starter.start.param.trigger("clicks")
-    loop.until(lambda: page.work.state != RUNNING, 4 * WAIT)  # several runs
+    loop.until(lambda: page.work.state != RUNNING, 4 * ENOUGH)  # several runs
     assert page.work.state == DONE, page.work.message
 
 

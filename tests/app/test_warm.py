@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 
 import pytest
 from bokeh.document import Document
 from panel.io.state import set_curdoc
 
+from tests.patience import wait
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.limits import NONE
 from wfsobs.app.service import Service
@@ -30,9 +30,7 @@ def test_the_first_picture_comes_with_the_page_and_is_made_of_little(service: Se
     """Results that are known are drawn before anybody is told of the page; the settings and what is further down come later."""
     done: list[str] = []
     service.queue.submit(service.run(short), "before", lambda news: done.append(news.get("state", "")))
-    end = time.monotonic() + 60
-    while "done" not in done and time.monotonic() < end:
-        time.sleep(0.05)
+    wait(lambda: "done" in done)
     doc = Document()
     with set_curdoc(doc):
         posted: list[Callable[[], None]] = []

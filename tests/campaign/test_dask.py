@@ -10,6 +10,7 @@ import pytest
 from distributed import Client
 
 from tests.campaign.test_run import BATCHES, ENVIRONMENT, RUNS, SEEDS, SHORT_BATCHES, TINY, campaign
+from tests.patience import ENOUGH
 
 pytestmark = pytest.mark.slow
 
@@ -78,14 +79,14 @@ def alone(tmp_path_factory):
 def test_a_worker_that_dies_changes_nothing(cluster, tmp_path, alone):
     cluster.start_scheduler()
     nannies = [cluster.start_worker() for _ in range(2)]
-    with Client(cluster.address, timeout=60) as client:
-        client.wait_for_workers(2, timeout=60)
+    with Client(cluster.address, timeout=ENOUGH) as client:
+        client.wait_for_workers(2, timeout=ENOUGH)
     running, out = start_campaign(cluster, tmp_path)
     wait_for_batch(running, out)
     worker = max(psutil.Process(nannies[0].pid).children(recursive=True), key=lambda p: p.memory_info().rss)  # not its tracker
     worker.kill()
     assert running.poll() is None and len(list(out.glob("rows/*.parquet"))) < BATCHES
-    _, said = running.communicate(timeout=200)
+    _, said = running.communicate(timeout=ENOUGH)
     assert running.returncode == 0, said
     assert f"{RUNS} of {RUNS} runs are done".encode() in said
     assert campaign("table", out, "--csv").stdout == alone, "byte for byte"
@@ -102,7 +103,7 @@ def test_a_scheduler_that_is_started_again_changes_nothing(cluster, tmp_path, al
         assert told
     cluster.start_scheduler()
     cluster.start_worker()  # the first one ended with its scheduler
-    _, said = running.communicate(timeout=200)
+    _, said = running.communicate(timeout=ENOUGH)
     assert running.returncode == 0, said
     assert f"{RUNS} of {RUNS} runs are done, {RUNS} of them now; workers or their scheduler were lost".encode() in said
     assert b"Traceback" not in said and b"ERROR" not in said
@@ -115,12 +116,12 @@ def test_a_scheduler_without_workers_is_told_and_waited_for(cluster, tmp_path):
     line = f"wfsobs: no worker at {cluster.address}: waiting; start one with: dask worker {cluster.address} --nthreads 1\n"
     assert running.stderr.readline().decode() == line
     running.terminate()  # it does not wait for ever
-    _, said = running.communicate(timeout=60)
+    _, said = running.communicate(timeout=ENOUGH)
     assert running.returncode == 143 and b"0 of 4 runs are done" in said
     running, out = start_campaign(cluster, tmp_path, seeds=2)
     assert running.stderr.readline().decode() == line
     cluster.start_worker()
-    _, said = running.communicate(timeout=200)
+    _, said = running.communicate(timeout=ENOUGH)
     assert running.returncode == 0 and said.count(b"\n") == 2
     assert b"going on" in said and b"4 of 4 runs are done" in said
     assert not list(out.glob("rows/.*"))

@@ -14,6 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 import wfsobs
+from tests.patience import ENOUGH
 from wfsobs.campaign.store import ROWS, batch_files, read_batches, read_results, row_key, scenario_digest, schema, write_batch
 from wfsobs.cli import main
 
@@ -116,7 +117,7 @@ def test_killed_workers_and_a_killed_campaign_change_nothing(plan, undisturbed, 
     process, workers = start_short(plan, tmp_path)
     process.kill()
     process.communicate()
-    _, alive = psutil.wait_procs(workers, timeout=60)
+    _, alive = psutil.wait_procs(workers, timeout=ENOUGH)
     assert not alive, "workers do not outlive the campaign"
     assert 0 < len(list(tmp_path.glob("rows/*.parquet"))) < BATCHES
     for victim in (0, 1):
@@ -125,7 +126,7 @@ def test_killed_workers_and_a_killed_campaign_change_nothing(plan, undisturbed, 
         if victim == 0:
             time.sleep(0.2)
             process.kill()
-        _, said = process.communicate(timeout=200)
+        _, said = process.communicate(timeout=ENOUGH)
     assert (
         process.returncode == 0
         and f"{RUNS} of {RUNS} runs are done".encode() in said
@@ -143,7 +144,7 @@ def test_a_stopped_campaign_finishes_its_batches_and_resumes(plan, undisturbed, 
     while not (tmp_path / "rows").exists():
         time.sleep(0.05)
     process.send_signal(signal.SIGTERM)
-    _, said = process.communicate(timeout=200)
+    _, said = process.communicate(timeout=ENOUGH)
     assert process.returncode == 143 and b"the same command resumes" in said
     campaign("run", plan, "--out", tmp_path, "--workers", 1)
     assert campaign("table", tmp_path, "--csv").stdout == campaign("table", undisturbed, "--csv").stdout
@@ -162,7 +163,7 @@ def test_a_second_interrupt_ends_a_campaign_whose_workers_do_not_answer(plan, tm
             process.wait(20)
             ended = True
     assert b"Aborted!" in process.communicate()[1]
-    assert psutil.wait_procs(workers, timeout=60)[1] == []
+    assert psutil.wait_procs(workers, timeout=ENOUGH)[1] == []
 
 
 def test_scenarios_of_the_same_settings_are_all_told(tmp_path):

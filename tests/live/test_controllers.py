@@ -2,12 +2,12 @@
 
 import pickle
 import queue
-import time
 
 import numpy as np
 import pytest
 
 import wfsobs
+from tests.patience import wait
 from wfsobs.closed_loop.design import design as design_laws
 from wfsobs.closed_loop.run import closed_loop, residual_rms
 from wfsobs.live.checks import make_design
@@ -154,13 +154,6 @@ def test_controllers_beside_a_loop_that_runs():
 
 def known(loop, name):
     return (~np.isnan(loop.control_view(5.0).residual(name)[:, 0])).sum()
-
-
-def wait(condition, seconds=60.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 WRONG = {"plant.delay_error": 2.0, "plant.gain_error": [0.5, 0.5]}

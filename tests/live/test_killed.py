@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from concurrent.futures import wait as wait_for
 from multiprocessing import Pipe, get_context
 
@@ -15,6 +14,7 @@ import psutil
 import pytest
 
 import wfsobs
+from tests.patience import ENOUGH, wait
 from wfsobs.live.board import Board
 from wfsobs.live.follow import _row
 from wfsobs.live.loop import LiveLoop
@@ -72,18 +72,18 @@ def test_a_process_that_is_killed_ends_the_command_in_one_line_that_names_it(opt
         parent = psutil.Process(process.pid)
         # All but the tracker and the simulation read the memory of the loop; earlier each would begin a tracker of its own.
         readers = len(names) - 1 - (source == "simulation")
-        wait(lambda: sum(map(has_memory_of_the_loop, parent.children())) == readers)
+        wait(lambda: sum(map(has_memory_of_the_loop, parent.children())) == readers, 0.1)  # which takes a while of its own
         children = sorted(parent.children(), key=lambda child: child.pid)
         child = children[names.index(name)]
         child.kill()
-        out, errors = process.communicate(timeout=60)
+        out, errors = process.communicate(timeout=ENOUGH)
     finally:
         process.kill()
         process.communicate()
     line = name if name == TRACKER else f"the process of {name} ({child.pid}) was ended by signal 9 (SIGKILL)"
     told = [line for line in errors.splitlines() if "modes.im.shm" not in line]  # of a stream, what happens to it
     assert (process.returncode, out, told) == (2, "", [f"wfsobs: live: {line}"])
-    assert psutil.wait_procs(children, timeout=60)[1] == []
+    assert psutil.wait_procs(children, timeout=ENOUGH)[1] == []
 
 
 def has_memory_of_the_loop(process):
@@ -91,13 +91,6 @@ def has_memory_of_the_loop(process):
         return any("psm_" in region.path for region in process.memory_maps())
     except psutil.Error:  # it is being started
         return False
-
-
-def wait(condition, seconds=120.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.1)  # to look through the memory of a process takes a while of its own
 
 
 def test_every_process_that_is_killed_is_named():
@@ -108,9 +101,9 @@ def test_every_process_that_is_killed_is_named():
         loop.control("none", True)
         wait(lambda: loop.is_ready and len(loop._processes.processes) == 7)
         workshop, pids = loop._processes.workshop, [p.pid for p in loop._processes.processes]
-        assert workshop.submit(abs, -3).result(60) == 3
+        assert workshop.submit(abs, -3).result(ENOUGH) == 3
         with pytest.raises(ZeroDivisionError):
-            workshop.submit(divmod, 1, 0).result(60)
+            workshop.submit(divmod, 1, 0).result(ENOUGH)
         assert loop.failure() == ""
         of_crews = ("the observers (learning)", "the observers (long)")
         first, *others = ["the controllers", "the designs", *PROCESSES["simulation"][1:], *of_crews]

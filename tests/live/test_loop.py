@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import wfsobs
+from tests.patience import ENOUGH, is_running, wait
 from wfsobs.live import simulated
 from wfsobs.live.board import Board, Delivery, read_view, trace_width
 from wfsobs.live.crew import Site
@@ -95,17 +96,17 @@ def test_first_block_of_new_settings_is_whole(monkeypatch):
 
     maker = threading.Thread(target=make)
     maker.start()
-    assert ready.was_full.wait(60.0)
+    assert ready.was_full.wait(ENOUGH)
     for speed in (11.0, 12.0, 13.0):
         outbox.send({"settings": scenario.replace({"turbulence.wind_speed": speed}).to_dict()})
-    taken = [ready.get(timeout=60.0)]
+    taken = [ready.get(timeout=ENOUGH)]
     while taken[-1][0] < 3:
-        taken.append(ready.get(timeout=60.0))
+        taken.append(ready.get(timeout=ENOUGH))
     outbox.send({"settings": scenario.to_dict()})
     while taken[-1][0] < 4:
-        taken.append(ready.get(timeout=60.0))
+        taken.append(ready.get(timeout=ENOUGH))
     ready.closed = True
-    maker.join(60.0)
+    maker.join(ENOUGH)
     assert not maker.is_alive()
     order = [generation for generation, _ in taken]
     lengths = {g: sum(len(rows) for generation, rows in taken if generation == g) for g in set(order)}
@@ -369,7 +370,7 @@ def test_a_crew_is_woken_once_however_many_frames_have_come():
     for _ in range(3):
         desk.wake()
         desk.wake()
-        assert all(one.acquire(timeout=60) for one in wakes)
+        assert all(one.acquire(timeout=ENOUGH) for one in wakes)
     assert not any(one.acquire(timeout=0) for one in wakes)
 
 
@@ -389,24 +390,9 @@ def test_nothing_is_left_of_a_loop_whose_owner_is_killed():
     owner = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     *pids, ring, traces, board = owner.stdout.readline().split()
     owner.send_signal(signal.SIGKILL)
-    owner.communicate(timeout=60)
+    owner.communicate(timeout=ENOUGH)
     wait(lambda: not any(is_running(int(pid)) for pid in pids))
     wait(lambda: not any(os.path.exists(f"/dev/shm/{name}") for name in (ring, traces, board)))
-
-
-def wait(condition, seconds=60.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.02)
-
-
-def is_running(pid):
-    try:
-        with open(f"/proc/{pid}/stat") as file:
-            return file.read().rpartition(")")[2].split()[0] != "Z"
-    except (FileNotFoundError, ProcessLookupError):  # it may end between opening and reading
-        return False
 
 
 TURNS = """

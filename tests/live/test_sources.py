@@ -13,6 +13,7 @@ import pytest
 import zmq
 
 import wfsobs
+from tests.patience import ENOUGH
 from wfsobs.live import source as live_source
 from wfsobs.live.attached import SPELL, StreamFrames, StreamSource
 from wfsobs.live.board import LONG_STEPS
@@ -218,7 +219,7 @@ def test_two_streams_by_network_are_the_rows_of_the_record(is_late_to_look):
     record, context = wfsobs.simulate(paper().replace({"run.duration": 0.4, "run.warm_up": 0.1})), zmq.Context()
     lgs, ngs = Publisher(context), Publisher(context)
     ring, inbox, news = Ring(2), Inbox(), queue.Queue()
-    source = StreamSource(lgs.address, (0, 1), 1.0, 1e-3, ngs.address, NgsWiring((0, 1), 1.0, 5, 0, stuck=60.0))
+    source = StreamSource(lgs.address, (0, 1), 1.0, 1e-3, ngs.address, NgsWiring((0, 1), 1.0, 5, 0, stuck=ENOUGH))
     frames = StreamFrames(source, Desk(ring.name, 2, news, 1.0, None), inbox)
     while frames._stream is None:
         frames._look()
@@ -260,7 +261,7 @@ def test_two_streams_are_the_rows_of_the_record(tmp_path, lag, jitter):
     record, rng = wfsobs.simulate(paper().replace({"run.duration": 1.5})), np.random.default_rng(3)
     lgs, ngs = (SharedImage.create(tmp_path / name, (2,), dtype="float64") for name in ("lgs.im.shm", "ngs.im.shm"))
     ring, inbox, news = Ring(2), Inbox(), queue.Queue()
-    source = StreamSource(lgs.path, (0, 1), 1.0, 1e-3, ngs.path, NgsWiring((0, 1), 1.0, 5, lag))
+    source = StreamSource(lgs.path, (0, 1), 1.0, 1e-3, ngs.path, NgsWiring((0, 1), 1.0, 5, lag, stuck=ENOUGH))
     assert source.sampling.ratio == 5 and "multirate-multi" in observers_on(source, paper())
     frames = StreamFrames(source, Desk(ring.name, 2, news, 1.0, None), inbox)
     frames._look()

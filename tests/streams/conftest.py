@@ -1,15 +1,20 @@
 """The C program on the other side of a stream."""
 
 import subprocess
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
 
-ENOUGH = 60.0
-"""Longest wait for another process or thread [s]; nothing is expected to take so long."""
+from tests.patience import wait
+
+LONGEST = "60"
+"""What --stuck takes at most [s]."""
+
+wait_until = partial(wait, pause=1e-3)
+"""A file of another program and a line of another thread do not announce themselves."""
 
 
 @pytest.fixture(scope="session")
@@ -30,11 +35,3 @@ def started(*command: object) -> Iterator[subprocess.Popen[str]]:
     finally:
         process.kill()
         process.communicate()
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    """Look every millisecond: a file of another program and a line of another thread do not announce themselves."""
-    until = time.monotonic() + ENOUGH
-    while not condition():
-        assert time.monotonic() < until
-        time.sleep(0.001)

@@ -19,7 +19,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import wfsobs
-from tests.streams.conftest import ENOUGH, started, wait_until
+from tests.patience import ENOUGH
+from tests.streams.conftest import LONGEST, started, wait_until
 from wfsobs.cli import main
 from wfsobs.observers.step import StepObserver
 from wfsobs.signal.gate import RUN, GateSettings
@@ -61,7 +62,7 @@ def test_a_modal_filter_in_c_gets_the_numbers_of_the_run_over_the_record(tmp_pat
     with started(*command) as loop:
         wait_until(given.exists)
         options = ["--preset", "paper", "--set", "run.warm_up=0.5", "--observer", "kf-lgs", "--modes", "3,1", "--unit", "nm"]
-        more = ["--delay", "2", "--stuck", str(ENOUGH), "--semaphore", "9", "--json"]
+        more = ["--delay", "2", "--stuck", LONGEST, "--semaphore", "9", "--json"]
         attach = [sys.executable, "-m", "wfsobs", "attach", "--in", str(given), "--out", str(taken), *options, *more]
         with started(*attach) as ours:
             told, _ = loop.communicate(timeout=2 * ENOUGH)
@@ -82,7 +83,7 @@ def test_a_modal_filter_in_c_gets_the_numbers_of_the_run_over_the_record(tmp_pat
 @contextmanager
 def attached(given: Path, taken: Path) -> Iterator[Popen[str]]:
     options = ["--preset", "paper", "--set", "run.warm_up=0.5", "--observer", "kf-lgs", "--modes", "3,1", "--json"]
-    streams = ["--in", str(given), "--out", str(taken), "--stuck", str(ENOUGH), "--semaphore", "9"]
+    streams = ["--in", str(given), "--out", str(taken), "--stuck", LONGEST, "--semaphore", "9"]
     with started(sys.executable, "-m", "wfsobs", "attach", *streams, *options) as ours:
         yield ours
 

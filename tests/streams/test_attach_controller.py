@@ -12,7 +12,8 @@ from click.testing import CliRunner
 from numpy.typing import ArrayLike
 
 import wfsobs
-from tests.streams.conftest import ENOUGH, started, wait_until
+from tests.patience import ENOUGH
+from tests.streams.conftest import LONGEST, started, wait_until
 from wfsobs.cli import main
 from wfsobs.control.supervisor import SupervisedController, Supervision
 from wfsobs.control.true_plant import ActingPlant, TruePlant, drive
@@ -237,7 +238,7 @@ def test_a_loop_in_shared_memory_is_closed_from_the_command_line(tmp_path: Path)
     source = SharedImage.create(tmp_path / "y.im.shm", (2,), dtype="float64")
     sink = SharedImage.create(tmp_path / "u.im.shm", (2,), dtype="float64")
     sink.write(start)
-    told = ["--controller", "lqg-kf-lgs", "--unit", "nm", "--command-delay", "2", "--stuck", str(ENOUGH)]
+    told = ["--controller", "lqg-kf-lgs", "--unit", "nm", "--command-delay", "2", "--stuck", LONGEST]
     acting = ActingPlant(TruePlant(np.eye(2), 2.0))
     for _ in range(5):
         correction = acting.take(start * 1e-3)

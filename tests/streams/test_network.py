@@ -19,7 +19,8 @@ import zmq
 from click.testing import CliRunner
 
 import wfsobs
-from tests.streams.conftest import ENOUGH, started, wait_until
+from tests.patience import ENOUGH
+from tests.streams.conftest import LONGEST, started, wait_until
 from tests.streams.test_attach import measurements, stepped
 from wfsobs.cli import main
 from wfsobs.stepping import design
@@ -87,7 +88,7 @@ def test_the_numbers_of_the_run_over_the_record_through_the_command() -> None:
     with closing(Loop()) as loop:
         options = ["--preset", "paper", "--set", "run.warm_up=0.5", "--observer", "kf-lgs", "--modes", "3,1", "--unit", "nm"]
         attach = [sys.executable, "-m", "wfsobs", "attach", "--in", loop.address, "--out", ANYWHERE, *options]
-        with started(*attach, "--stuck", ENOUGH, "--json") as ours:
+        with started(*attach, "--stuck", LONGEST, "--json") as ours:
             loop.wait_for_reader()
             loop.send(0, np.zeros(5))
             assert ours.stderr is not None

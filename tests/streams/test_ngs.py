@@ -13,7 +13,8 @@ import pytest
 from click.testing import CliRunner
 
 import wfsobs
-from tests.streams.conftest import ENOUGH, started
+from tests.patience import ENOUGH
+from tests.streams.conftest import LONGEST, started
 from wfsobs.cli import main
 from wfsobs.stepping import design
 from wfsobs.streams.attach import Attachment
@@ -257,7 +258,7 @@ def test_the_command_gives_the_run_over_the_record(tmp_path: Path, record: wfsob
     more = ["--preset", "paper", "--set", "run.warm_up=0.001", "--observer", "multirate-multi", "--unit", "nm", "--json"]
     streams = ["--in", lgs.path, "--ngs", ngs.path, "--ngs-modes", "2,0", "--out", sink.path]
     got = []
-    with started(sys.executable, "-m", "wfsobs", "attach", *streams, *more, "--stuck", ENOUGH) as ours:
+    with started(sys.executable, "-m", "wfsobs", "attach", *streams, *more, "--stuck", LONGEST) as ours:
         assert ours.stderr is not None
         assert ours.stderr.readline(), "its first report: it waits for frames"
         for row in range(FIRST, 800):

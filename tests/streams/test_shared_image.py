@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.streams.conftest import ENOUGH, started, wait_until
+from tests.patience import ENOUGH
+from tests.streams.conftest import started, wait_until
 from wfsobs.streams.shared_image import CURRENT, OLDER, Semaphore, SharedImage, StreamError, stream_path
 
 OLD_FORMAT = "32s 80s B3x 3I Q B7x Q 2Q 2Q 2Q 2Q B b B5x Q B1x H4x Q Q Q B1x H 64s4x"
