@@ -36,6 +36,7 @@ name = "Tiny"
 seeds = 2
 first_seed = 7
 observers = ["kf-lgs", "persistence"]
+controllers = ["integrator"]
 [settings]
 run.duration = 0.3
 run.warm_up = 0.1
@@ -47,7 +48,7 @@ PLACE = {"host": "here", "process": 1, "written": 1.0}
 
 
 def add_batch(plan: Campaign, folder: Path, seed: int) -> None:
-    write_batch(folder, [row for cell in plan.cells for row in run_rows(cell, seed, plan.observers, ())], PLACE)
+    write_batch(folder, [row for cell in plan.cells for row in run_rows(cell, seed, plan.observers, plan.controllers)], PLACE)
 
 
 @pytest.fixture
@@ -104,6 +105,9 @@ def test_a_campaign_is_followed_and_opened(dashboard: Dashboard, loop: Any, plan
     y = page.slice.lines.sources["kf-lgs"].data["y"]
     rms = {c.cell: c.rms for c in compare(read_results(tmp_path)) if (c.target, c.mode, c.name) == ("vibration", "tip", "kf-lgs")}
     assert y == pytest.approx([(rms[0] * rms[1]) ** 0.5, (rms[2] * rms[3]) ** 0.5]), "geometric mean over the other condition"
+    page.target.value = "residual"
+    assert "integrator" in page.slice.lines.sources, "the best of every error are shown first"
+    page.target.value = "vibration"
     page.filters["sensors.exposure_ratio"].value = "5"
     assert page.slice.lines.sources["kf-lgs"].data["y"] == pytest.approx([rms[0], rms[2]])
     of_states = [[(s["state"], s["title"].rpartition(": ")[2]) for s in row] for row in page.map.grid["cells"]]
@@ -121,7 +125,7 @@ def test_a_campaign_that_was_stopped_is_said_to_be(
     dashboard: Dashboard, loop: Any, plan: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def add(cell: int, written: float) -> None:
-        write_batch(tmp_path, run_rows(plan.cells[cell], 8, plan.observers, ()), {**PLACE, "written": written})
+        write_batch(tmp_path, run_rows(plan.cells[cell], 8, plan.observers, plan.controllers), {**PLACE, "written": written})
 
     def look_at(now: float) -> None:
         monkeypatch.setattr("wfsobs.campaign.follow.time", lambda: now)
@@ -136,7 +140,7 @@ def test_a_campaign_that_was_stopped_is_said_to_be(
     add(1, started + 14.0)
     monkeypatch.setattr("wfsobs.campaign.follow.time", lambda: started + 14.0)
     page = open_campaign(dashboard, loop)
-    usual = "Tiny: 2 of 8 runs, 4 scenarios, 40 rows"
+    usual = "Tiny: 2 of 8 runs, 4 scenarios, 52 rows"
     assert page.status.text == f"{usual}, about 48 s left", "six runs of 8 s"
     look_at(started + 37.0)
     assert page.status.text == f"{usual}, about 48 s left", "23 s are less than three times 8 s"
@@ -152,7 +156,7 @@ def test_a_campaign_that_was_stopped_is_said_to_be(
     add(2, started + 354.0)
     add(3, started + 360.0)
     look_at(started + 361.0)
-    assert page.status.text == "Tiny: 4 of 8 runs, 4 scenarios, 80 rows, about 24 s left", "four runs of 6 s"
+    assert page.status.text == "Tiny: 4 of 8 runs, 4 scenarios, 104 rows, about 24 s left", "four runs of 6 s"
 
 
 def cells_of(page: CampaignPage, name: str) -> dict[str, str]:

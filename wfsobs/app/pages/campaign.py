@@ -153,7 +153,7 @@ PERIOD = 5.0
 """Time between two looks at a campaign that is not finished [s]."""
 NONE = ALL = ""
 FIRST_LINES = 5
-"""Observers whose lines are shown first: the best ones."""
+"""Observers, and controllers, whose lines are shown first: the best ones of every error."""
 SHADES = (
     "A full colour: the next is at least 30 % worse. Striped: another does not differ significantly, by a paired t-test over the "
     "seeds of a scenario, or over the scenarios where a square has several, or there are too few results to test. "
@@ -268,9 +268,9 @@ class CampaignPage(Page):
             path: make_select(f"Only {name}", {"all": ALL} | {of: of for of in value_names(self.axes[path])}, ALL, 300)
             for name, path in names.items()
         }
-        ranked = [s.name for s in next(iter(state.errors.values())).standings(range(len(state.plan.cells)))]
         known = [*state.plan.observers, *state.plan.controllers]
-        best = [name for name in ranked if name in known][:FIRST_LINES]
+        ranked = ([s.name for s in errors.standings(range(len(state.plan.cells)))] for errors in state.errors.values())
+        best = dict.fromkeys(name for of in ranked for name in [name for name in of if name in known][:FIRST_LINES])
         bounds = [name for name in BOUNDS if any(name in errors.names for errors in state.errors.values())]
         self.lines = pmui.MultiChoice(
             label="Lines", options={name_label(name): name for name in (*known, *bounds)}, value=[*best, *bounds], **WIDE
