@@ -114,7 +114,7 @@ def test_a_state_has_the_lines_of_the_result(result: Result) -> None:
 def test_an_unfinished_observer_is_named(result: Result) -> None:
     done = {name: tuple(it for it in getattr(result, name) if it.observer != "gpr-online") for name in ("estimates", "scores")}
     part = replace(result, **done)
-    assert state_of(part).reasons == ("gpr-online left out: not finished when the report was made",)
+    assert state_of(part).reasons == ("Online GPR left out: not finished when the report was made",)
 
 
 def test_that_there_is_no_bound_is_said(result: Result) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wfsobs.app.style import observers_of
-from wfsobs.app.views.errors import main_observers
+from wfsobs.app.views.errors import lines_of_failures, main_observers
 from wfsobs.app.work import TRUTH
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.run import closed_loop
@@ -21,7 +21,7 @@ from wfsobs.evaluation.bound import NO_BOUND
 from wfsobs.evaluation.budget import Budget, budget_row, error_budget
 from wfsobs.evaluation.evidence import Evidence
 from wfsobs.evaluation.exact_errors import cumulative_rms, spectra
-from wfsobs.evaluation.result import Result, Row, score_rows
+from wfsobs.evaluation.result import Result, Row, row_label, score_rows
 from wfsobs.evaluation.scores import RESIDUAL, SCORED
 from wfsobs.evaluation.verdict import verdict
 from wfsobs.observers.base import TARGETS
@@ -255,8 +255,8 @@ def loop_rows(result: Result) -> list[Row]:
 def _reasons(result: Result, observers: Sequence[str]) -> list[str]:
     """Why an observer gave nothing."""
     done = {item.observer for item in (*result.estimates, *result.failures)}
-    waiting = [f"{name} left out: not finished when the report was made" for name in observers if name not in done]
-    return [f.reason for f in result.failures] + waiting
+    waiting = [f"{row_label(name)} left out: not finished when the report was made" for name in observers if name not in done]
+    return lines_of_failures(result) + waiting
 
 
 def _frequencies(frequency: Array) -> dict[str, Floats]:
