@@ -214,6 +214,8 @@ def test_a_loaded_record_stays(page: IdentifyPage, dashboard: Dashboard, loop: A
     shown = dashboard.store.run.result
     assert shown is not None and shown.is_recorded and shown.result.record is loaded
     assert shown.scenario.kalman.process_noise == "matched" and not page.stale.visible
+    it = dashboard.pages.suggestion
+    assert IDENTIFIED in it.words.html and not it.button.visible, "nor is it suggested again"
 
 
 @pytest.mark.usefixtures("quick")

@@ -332,12 +332,16 @@ class Suggestion:
         store.param.watch(self._refresh, ["source", "scenario"])
         store.run.param.watch(self._refresh, "state")
 
+    def follow(self, page: IdentifyPage) -> IdentifyPage:
+        """Say from now on how far the page is; return it."""
+        self.page = page
+        page.work.param.watch(self._refresh, ["state", "progress", "message"])
+        return page
+
     def _identify(self) -> None:
-        if self.page is None:
-            self.page = self._make_page()
-            self.page.work.param.watch(self._refresh, ["state", "progress", "message"])
-        self.page.starter.begin()
-        self._waits = self.page.work.state == RUNNING
+        page = self._make_page()
+        page.starter.begin()
+        self._waits = page.work.state == RUNNING
         self._refresh()
 
     def _refresh(self, *_: object) -> None:

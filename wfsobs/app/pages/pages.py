@@ -75,8 +75,9 @@ class Pages(param.Parameterized):
         self.store = store
         self.display = display
         explored = partial(setattr, self, "current", EXPLORE)
+        self.suggestion: Final = Suggestion(store, self._identify_page)
         self._makers: dict[str, Callable[[Store, Display], Page]] = {
-            IDENTIFY: IdentifyPage,
+            IDENTIFY: lambda *of: self.suggestion.follow(IdentifyPage(*of)),
             TUNE: TunePage,
             SWEEP: partial(SweepPage, explore=explored),
             LOOP: ClosedLoopPage,
@@ -86,7 +87,6 @@ class Pages(param.Parameterized):
         }
         if store.session.service.campaign is not None:
             self._makers[CAMPAIGN] = partial(CampaignPage, explore=explored)
-        self.suggestion: Final = Suggestion(store, self._identify_page)
         known = {title: name for title, name in TITLES.items() if name == EXPLORE or name in self._makers}
         self.param["current"].objects = known
         self.by_name: dict[str, Page] = {EXPLORE: explore}
