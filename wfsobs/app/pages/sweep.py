@@ -285,9 +285,9 @@ class SweepPage(Page):
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""
-        row = line(*(field for axis in self.axes for field in (axis.select, axis.values)))
+        rows = [line(axis.select, axis.values) for axis in self.axes]
         more = line(self.seeds, self.observers, *self.starter.view())
-        sweep = box("Sweep", text(INTRO), row, more, self.estimate, self.starter.status, self.stale)
+        sweep = box("Sweep", text(INTRO), *rows, more, self.estimate, self.starter.status, self.stale)
         return boxes(sweep, example("sweep", self.boxes[0]), *self.boxes, self.shades)
 
     def plan(self) -> Sweep:
