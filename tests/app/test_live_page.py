@@ -70,7 +70,7 @@ def test_a_loop_from_start_to_the_end_of_the_session(page: LivePage, dashboard: 
     assert set(live.board.active()) == {"kf-multi", "gp-both"}
     page.buttons["Pause"].param.trigger("clicks")
     wait(lambda: not live.is_playing and live.count == live.newest)
-    assert page.buttons["Pause"].label == "Play"
+    assert (page.buttons["Pause"].label, page.buttons["Pause"].icon) == ("Play", "play_arrow")
     page.draw()
     view = live.view(page.controls.window.value)
     best, rms = ranking(view, live.board.active(), "turbulence", 0)[0]

@@ -440,7 +440,8 @@ class LivePage(Page):
         view = loop.readings.look(loop.view, self.controls.window.value, anew=not loop.is_playing)
         with pn.io.hold():
             self.status.html = f'<p class="text" role="status">{escape(status_line(loop, view))}</p>'
-            self.buttons["Pause"].label = "Pause" if loop.is_playing else "Play"
+            label, icon = ("Pause", "pause") if loop.is_playing else ("Play", "play_arrow")
+            self.buttons["Pause"].param.update(label=label, icon=icon)
             if view.n > 1:
                 self._draw_room(loop, view)
         return True
