@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.browser.conftest import answered, carded, eventually, until
+from tests.browser.conftest import QUICK, Server, answered, carded, eventually, until
 from wfsobs.app.style import look
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario.presets import PRESETS
@@ -109,6 +109,11 @@ def test_phone(phone: Page, tmp_path: Path) -> None:
     shot(page, tmp_path, "phone")
     page.get_by_role("button", name="Open drawer").click()
     expect(wind(page)).to_be_visible()
+
+
+def test_a_phone_shows_which_page_a_link_has_opened(open_page: Any, server: Server) -> None:
+    page = open_page(390, 844, f"{server.url}{QUICK}&view.page=model")
+    expect(page.get_by_role("button", name="Model", exact=True)).to_be_in_viewport()
 
 
 def test_first_paint(wide: Page, tmp_path: Path) -> None:

@@ -54,6 +54,7 @@ TABS = {
         "borderRadius": "4px !important",
         "color": "#fff",
         "&:hover:not(.Mui-selected)": {"backgroundColor": "#ffffff30", "color": "#fff"},
+        "&.Mui-selected": {"scrollInitialTarget": "nearest"},
         "&.Mui-selected, &.Mui-selected:hover": {"backgroundColor": "#fff !important", "color": f"{PRIMARY} !important"},
         "&.Mui-focusVisible": {"outline": "2px solid #fff", "outlineOffset": "-2px"},
     }
