@@ -110,11 +110,16 @@ class Contender:
         return self.label or row_label(self.observer)
 
     def with_error(self, scale: float, unit: str) -> str:
-        """Write the name and the error with its interval; scale : from micrometres to the unit."""
-        text = _format_number(self.rms * scale)
+        """Write the name and the error with its interval; scale : from micrometres to the unit.
+
+        >>> Contender("kf-lgs", 0.0217, (0.002, 0.5), False, PEAKS, 1).with_error(1e3, "nm")
+        'LGS KF 21.7 nm (interval unknown)'
+        """
+        text, ends = _format_number(self.rms * scale), ""
         if self.interval:
-            text += " " + uncertainty_text(self.rms, self.interval, lambda x: f"{x * scale:.{len(text.partition('.')[2])}f}")
-        return f"{self.name} {text} {unit}"
+            ends = uncertainty_text(self.rms, self.interval, lambda x: f"{x * scale:.{len(text.partition('.')[2])}f}")
+        after = (unit, ends) if "unknown" in ends else (ends, unit)
+        return " ".join(filter(None, (self.name, text, *after)))
 
     def knowledge_clause(self, lines: int, several: bool = False) -> str:
         """Write what it knows before it measures; lines : of the vibration, 0 where that is not known."""
