@@ -14,11 +14,13 @@ import pytest
 from tests.records import ON_PAPER
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import VIBRATION, Observer
+from wfsobs.observers.step import HeldEstimate
 from wfsobs.prior import Prior
 from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import Measurements, Record
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.testing import QUICK, CheckError, arrays_of, changed_after, check_observer, steps_to_check
+from wfsobs.typing import Array
 
 CALLS: list[int] = []
 SHORTER = PRESETS["paper"]().replace({**QUICK, "run.duration": 0.8})
@@ -127,6 +129,20 @@ def test_ours_are_the_same_in_a_fresh_process(name: str) -> None:
 def test_what_breaks_a_rule_is_refused_with_the_reason(run: Any, reason: str) -> None:
     with pytest.raises(CheckError, match=f"^mine: .*{reason}"):
         check_observer(observer(run))
+
+
+class Silent(HeldEstimate):
+    def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None: ...
+    def predict(self, frames: float, target: str) -> Any: ...
+
+
+@pytest.mark.parametrize(
+    ("made", "reason"),
+    [(None, "step returns no Estimator, but NoneType$"), (Silent(2, None), "predict returns no tuple of mean and standard dev")],
+)
+def test_a_step_that_returns_nothing_is_refused_with_the_reason(made: Any, reason: str) -> None:
+    with pytest.raises(CheckError, match=f"^mine: .*{reason}"):
+        check_observer(observer(None, step=lambda *_: made), alone=False)
 
 
 @pytest.mark.parametrize("every", [2, 3, 5, 7])

@@ -26,6 +26,7 @@ from wfsobs.live.processes import made_crew
 from wfsobs.live.ring import LiveFrame, Ring, Rows, merged_rows
 from wfsobs.live.simulated import FADE, GLANCE, SimulatedFrames, SimulatedLoop
 from wfsobs.live.source import Desk, Pace
+from wfsobs.observers.step import StepError
 from wfsobs.scenario.presets import paper
 from wfsobs.settings.group import SettingError
 
@@ -227,6 +228,14 @@ def errors_by_a_frame(record, total, k):
     """Return z less its prediction in the steps of the NGS frame at k, with their mean from the NGS, (5, 2)."""
     error = record.z[k - 4 : k + 1] - total[k - 5 : k]
     return error - error.mean(axis=0) + record.z_ngs[k] - total[k - 5 : k].mean(axis=0)
+
+
+@pytest.mark.parametrize("call", ["advance", "predict", "settle"])
+def test_the_observer_that_ends_in_an_error_is_named(stage, monkeypatch, call):
+    live = stage(("kf-lgs", "kf-multi"))
+    monkeypatch.setattr(live.crew._active["kf-multi"].estimator, call, lambda *_: {}["spam"])
+    with pytest.raises(StepError, match=r"^kf-multi: KeyError: 'spam'$"):
+        live.run(1)
 
 
 @pytest.mark.slow

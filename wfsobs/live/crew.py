@@ -22,7 +22,7 @@ from wfsobs.live.board import NEXT, SCORED, SLOTS, Board, rms_of_known, slot_wid
 from wfsobs.live.ring import CAPACITY, LiveFrame, Ring, Rows
 from wfsobs.live.source import ALARM, Command, LiveEvent, enter_process, receive
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.step import StepError, StepObserver
+from wfsobs.observers.step import StepError, StepObserver, step_error
 from wfsobs.record import Sampling, fuse_frames
 from wfsobs.streams.follower import EDGES
 from wfsobs.typing import Array
@@ -148,7 +148,10 @@ class ObserverCrew(Crew[StepObserver]):
         self._past, self._past_z = np.full((self.ratio, n, m), np.nan), np.full((self.ratio - 1, m), np.nan)
 
     def take(self, frame: LiveFrame, number: int) -> Array:
-        """Have every observer take a frame; return the row of their estimates. `settle` follows once that is written."""
+        """Have every observer take a frame; return the row of their estimates. `settle` follows once that is written.
+
+        Raises StepError, as `settle` does, where an observer ends in an error.
+        """
         if self._waits == COUNTED:
             self.count()
         self._start_waiting(number)
@@ -157,9 +160,12 @@ class ObserverCrew(Crew[StepObserver]):
         for slot, observer, outs in self._followers:
             # u goes to those alone that need it, and no NGS measurement to a first frame
             u = frame.u if observer.estimator.needs_command else None
-            observer.update(frame.z, ngs if observer.frame else None, u)
-            for target, out in outs:
-                out[:] = observer.predict(0, target)[0]
+            try:
+                observer.update(frame.z, ngs if observer.frame else None, u)
+                for target, out in outs:
+                    out[:] = observer.predict(0, target)[0]
+            except Exception as error:
+                raise step_error(observer.id, error) from error
             now = monotonic()
             self._times[slot], before = now - before, now
         self._row[:2] = number, before - float(frame.due)
@@ -171,7 +177,10 @@ class ObserverCrew(Crew[StepObserver]):
     def settle(self) -> None:
         """Have those learn that learn from every frame."""
         for observer in self._active.values():
-            observer.settle()
+            try:
+                observer.settle()
+            except Exception as error:
+                raise step_error(observer.id, error) from error
 
     def count(self) -> None:
         """Count latencies and squared errors of the frames that wait for it; what is NaN is not known.

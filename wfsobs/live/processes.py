@@ -32,6 +32,7 @@ from wfsobs.live.source import (
     may_go_first,
     receive,
 )
+from wfsobs.observers.step import StepError, step_error
 from wfsobs.scenario import Scenario
 from wfsobs.stepping import design
 
@@ -62,14 +63,20 @@ def observe_frames(
         Commands.
     """
     enter_process()
+    try:
+        _follow_ring(site, traces_name, place, observers, joins_late, inbox)
+    except StepError as error:
+        site.news.put(LiveEvent(0, str(error), kind=FAILURE))
+
+
+def _follow_ring(
+    site: Site, traces_name: str, place: int, observers: tuple[str, ...], joins_late: bool, inbox: Connection
+) -> None:
+    """Follow a ring. Raises StepError where an observer has no design, or ends in an error."""
     sampling = site.sampling
     ring, board = Ring(sampling.n_modes, site.ring_name), Board(sampling.n_modes, site.board_name)
     traces = Rows(trace_width(sampling.n_modes), ROOM, traces_name)
-    try:
-        crew = made_crew(site, board, place, observers)
-    except ValueError as error:
-        site.news.put(LiveEvent(0, str(error), kind=FAILURE))
-        return
+    crew = made_crew(site, board, place, observers)
     gc.collect()
     gc.freeze()
     go_first(SOURCE - 1 - place)  # after the designs, which must not delay the crews that run
@@ -101,11 +108,14 @@ def observe_frames(
 
 
 def made_crew(site: Site, board: Board, place: int, observers: tuple[str, ...]) -> ObserverCrew:
-    """Return a crew with the observers that run from the start. Raises ValueError where one has no design."""
+    """Return a crew with the observers that run from the start. Raises StepError where one has no design."""
     scenario = Scenario.from_dict(dict(site.settings))
     crew = ObserverCrew(site.sampling, warm_up_of(site), board, place, site.news.put)
     for name in observers:
-        crew.start(name, design(name, scenario, sampling=site.sampling), 0)
+        try:
+            crew.start(name, design(name, scenario, sampling=site.sampling), 0)
+        except Exception as error:
+            raise step_error(name, error) from error
     return crew
 
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
-from wfsobs.observers.step import MakeEstimator, StepError, StepObserver, run_frames
+from wfsobs.observers.step import Estimator, MakeEstimator, StepError, StepObserver, run_frames
 from wfsobs.prior import PARTS, TRUE, Part, Prior, PriorSource, ask_nothing, words_for
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import SENSORS, Estimates, Measurements, Record, Sampling, hold_last
@@ -270,16 +270,23 @@ class Observer:
         ValueError
             There is none; one line with the reason.
         """
-        if self.step is None:
-            why = "has no step interface" if self.causal else "looks ahead: it cannot run frame by frame"
-            raise StepError(f"{self.id}: {why}")
         needs_ngs = "y_ngs" in self.needs
         if needs_ngs and sampling.ratio is None:
             raise StepError(f"{self.id}: needs NGS frames: a sampling with their ratio")
         width = getattr(settings, "line_width", LINE_WIDTH)
         beside = None if self.takes_missing else bridges(prior, sampling.n_modes, sampling.dt, sampling.ratio, width)
-        estimator = self.step(prior, settings, sampling, horizon)
+        estimator = self.estimator(prior, settings, sampling, horizon)
         return StepObserver(self.id, self.targets, estimator, sampling, needs_ngs, beside, gate)
+
+    def estimator(self, prior: Prior, settings: Any, sampling: Sampling, horizon: float) -> Estimator:
+        """Return its estimator, as `step` makes it. Raises StepError where there is none."""
+        if self.step is None:
+            why = "has no step interface" if self.causal else "looks ahead: it cannot run frame by frame"
+            raise StepError(f"{self.id}: {why}")
+        made = self.step(prior, settings, sampling, horizon)
+        if not isinstance(made, Estimator):
+            raise StepError(f"{self.id}: step returns no Estimator, but {type(made).__name__}")
+        return made
 
     @property
     def group(self) -> str | None:
@@ -325,9 +332,7 @@ def check_estimates(estimates: object, targets: tuple[str, ...], shape: tuple[in
 
 def run_design(observer: Observer, measurements: Measurements, prior: Prior, settings: Any, watch: Watch) -> Estimates:
     """Run the estimator of an observer over a record: all steps at once where it can, else frame by frame."""
-    if observer.step is None:
-        raise StepError(f"{observer.id}: has neither a run nor a step")
-    estimator = observer.step(prior, settings, measurements.sampling, 0.0)
+    estimator = observer.estimator(prior, settings, measurements.sampling, 0.0)
     run = getattr(estimator, "run", None)
     found = run(measurements, watch) if run else run_frames(estimator, observer.targets, measurements, watch)
     if observer.targets == TARGETS:

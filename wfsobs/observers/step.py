@@ -22,12 +22,18 @@ from wfsobs.observers.stepping import StateArrays, Stateful, load_parts, save_pa
 from wfsobs.prior import Prior
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Estimates, Measurements, Sampling, by_name
+from wfsobs.settings.values import error_line
 from wfsobs.signal.gate import GateSettings, OutlierGate, frame_mean_of
 from wfsobs.typing import Array
 
 
 class StepError(ValueError):
     """Error: a step that cannot be taken, or an observer that has none; one line with the reason."""
+
+
+def step_error(id: str, error: Exception) -> StepError:
+    """Return what an observer, of another package perhaps, has raised, in one line that names it."""
+    return error if isinstance(error, StepError) else StepError(f"{id}: {error_line(error)}")
 
 
 def take_state(new: StateArrays, old: StateArrays) -> None:
@@ -144,7 +150,10 @@ def run_frames(estimator: Any, targets: Sequence[str], measurements: Measurement
         if frame.each is not None and see_each is not None:
             see_each(frame.each)
         estimator.advance(frame.z, frame.ngs, frame.u)
-        now, spread = estimate() if estimate else np.array([estimator.predict(0.0, one) for one in targets]).swapaxes(0, 1)
+        pairs = [] if estimate else [estimator.predict(0.0, one) for one in targets]
+        if any(not isinstance(pair, tuple) for pair in pairs):
+            raise StepError("predict returns no tuple of mean and standard deviation")
+        now, spread = estimate() if estimate else np.array(pairs).swapaxes(0, 1)
         values.append(now)
         sd.append(spread)
     if estimate:
