@@ -115,6 +115,11 @@ def test_equal_errors_are_close_as_well(leaders: tuple[str, ...], marks: dict[st
     assert marks_of(errors, leaders) == marks
 
 
+def test_one_alone_leads_by_two_samples_too() -> None:
+    two = gather_evidence([run(PRESETS["paper"]().replace({"run.duration": 1.002}), observers=["kf-lgs"]).scores])
+    assert two.leaders("turbulence", "tip") == ("kf-lgs",)
+
+
 def test_rows_that_are_missing_or_apart_in_a_seed_say_nothing() -> None:
     found = gather_evidence(
         [[score("kf-lgs", 1.0), score("ridge", 2.0)], [score("kf-lgs", 1.0), score("ridge", 2.0, apart=True)]]

@@ -103,9 +103,10 @@ class Evidence:
         if self.n_seeds == 1:
             pieces = [np.array(self.record[key].pieces).reshape(-1, 2).T for key in keys]
             columns = [*(error for error, _ in pieces), pieces[0][1]]
-            if min(of.size for of in columns) < 3:
-                return np.zeros((len(columns), len(columns)), dtype=bool)
-        return means_differ(np.column_stack(columns[: len(keys) + with_truth]), self.n_seeds == 1)
+        columns = columns[: len(keys) + with_truth]
+        if self.n_seeds == 1 and min(of.size for of in columns) < 3:
+            return np.zeros((len(columns), len(columns)), dtype=bool)
+        return means_differ(np.column_stack(columns), self.n_seeds == 1)
 
 
 def means_differ(values: Array, in_order: bool = False) -> NDArray[np.bool_]:
