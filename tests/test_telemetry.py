@@ -81,6 +81,7 @@ WRONG = [
     (lambda a: changed(a, "u", 3, 1e300), r"u is 1e\+300 at step 3, mode 0; it takes finite numbers up to 1e\+12, NaN"),
     (lambda a: changed(a, "y_lgs", 3, -np.inf), "y_lgs is -inf at step 3, mode 0; it takes finite numbers"),
     (lambda a: changed(a, "y_lgs", slice(None), np.nan), "y_lgs holds no measurement of one of its modes"),
+    (lambda a: changed(a, "u", slice(None), np.nan), "u holds no command of one of its modes"),
     (lambda a: a | {"training_y": changed(a, "u", 2, np.nan)["u"], "training_u": a["u"]}, "training_y is nan at step 2, mode 0"),
     (lambda a: changed(a, "u", 4, np.inf), "u is inf at step 4, mode 0"),
     (lambda a: a | {"training_y": a["u"]}, "training_y and training_u must come together"),

@@ -146,8 +146,9 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
     mirror += _apply_mirror(signals, delay, declaration)
     mirror += [f"{' and '.join(swapped)} with a row per mode"] if swapped else []
     origin = ", ".join(filter(None, (origin, *mirror, *contents.guesses, timing, _name_unused(contents.leftovers))))
-    if np.isnan(signals["y_lgs"]).all(axis=0).any():
-        raise RecordError("y_lgs holds no measurement of one of its modes")
+    for name, what in (("y_lgs", "measurement"), ("u", "command")):
+        if np.isnan(signals[name]).all(axis=0).any():
+            raise RecordError(f"{name} holds no {what} of one of its modes")
     fields = {name: signals[name] for name in (*FAST, NGS) if name in signals}
     if STARS in signals:
         fields[STARS] = np.nan_to_num(signals[STARS][:, 0]).astype(int)
