@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.step import StepError
+from wfsobs.observers.step import Naming, StepError
 from wfsobs.prior import LgsStars, Part, Prior, Spectra, Training
 from wfsobs.priors_from.controllers import own_settings, plant_of
 from wfsobs.priors_from.scenario import SHARED, as_sampled, observer_settings, prior_of
@@ -96,13 +96,15 @@ def design(
         observer = OBSERVERS[name]
         own = observer_settings(observer, settings)
         given = prior_in(name, told, observer.parts(own), settings, sampling, train)
-        return observer.design(given, own, sampling, horizon, gate)
+        with Naming(name):
+            return observer.design(given, own, sampling, horizon, gate)
     if horizon:
         raise StepError(f"{name}: a controller has the horizon of its mirror, control.delay; leave horizon out")
     controller = CONTROLLERS[name]
     groups = own_settings(controller, settings)
     given = prior_in(name, told, controller.parts(groups), settings, sampling, train)
-    return controller.design(given, plant_of(settings), groups, sampling, gate)
+    with Naming(name):
+        return controller.design(given, plant_of(settings), groups, sampling, gate)
 
 
 def prior_in(

@@ -236,6 +236,9 @@ def test_the_observer_that_ends_in_an_error_is_named(stage, monkeypatch, call):
     monkeypatch.setattr(live.crew._active["kf-multi"].estimator, call, lambda *_: {}["spam"])
     with pytest.raises(StepError, match=r"^kf-multi: KeyError: 'spam'$"):
         live.run(1)
+    monkeypatch.setattr(live.crew._active["kf-lgs"].estimator, "predict", lambda *_: (np.zeros(3), np.zeros(3)))
+    with pytest.raises(StepError, match=r"^kf-lgs: predict takes the shape \(2,\), one number per mode, not \(3,\)$"):
+        live.run(1)
 
 
 @pytest.mark.slow

@@ -95,10 +95,11 @@ class Commands(click.Group):
         try:
             return super().invoke(ctx)
         except ValueError as error:
+            from wfsobs.observers.step import StepError
             from wfsobs.record import RecordError
             from wfsobs.settings.values import SettingError
 
-            if not isinstance(error, (SettingError, RecordError)):
+            if not isinstance(error, (SettingError, RecordError, StepError)):
                 raise
             click.echo(f"wfsobs: {error}", err=True)
         except OSError as error:

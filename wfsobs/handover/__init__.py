@@ -37,7 +37,7 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.control.step import Integrators, KalmanLaws, LinearLaws, StepController
 from wfsobs.files import check_writable, write_text, write_whole
-from wfsobs.observers.step import StepError
+from wfsobs.observers.step import Naming, StepError
 from wfsobs.observers.stepping import Gain, GainCycle
 from wfsobs.prior import Prior
 from wfsobs.priors_from.controllers import own_settings, plant_of
@@ -523,7 +523,8 @@ def write_design(name: str, scenario: Scenario, form: str, path: str | Path) -> 
     controller, sampling, plant = CONTROLLERS[name], sampling_of(scenario), plant_of(scenario)
     groups = own_settings(controller, scenario)
     prior = prior_in(name, scenario, controller.parts(groups), scenario, sampling, None)
-    linear = linear_design(controller.design(prior, plant, groups, sampling))
+    with Naming(name):
+        linear = linear_design(controller.design(prior, plant, groups, sampling))
     if form == "c99":
         gate = GateSettings(scenario.sensors.gate_level)
         write_c99(path, linear, make_vectors(controller, prior, plant, groups, sampling, gate), gate)

@@ -22,7 +22,7 @@ from wfsobs.live.board import NEXT, SCORED, SLOTS, Board, rms_of_known, slot_wid
 from wfsobs.live.ring import CAPACITY, LiveFrame, Ring, Rows
 from wfsobs.live.source import ALARM, Command, LiveEvent, enter_process, receive
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.step import StepError, StepObserver, step_error
+from wfsobs.observers.step import StepError, StepObserver
 from wfsobs.record import Sampling, fuse_frames
 from wfsobs.streams.follower import EDGES
 from wfsobs.typing import Array
@@ -160,12 +160,9 @@ class ObserverCrew(Crew[StepObserver]):
         for slot, observer, outs in self._followers:
             # u goes to those alone that need it, and no NGS measurement to a first frame
             u = frame.u if observer.estimator.needs_command else None
-            try:
-                observer.update(frame.z, ngs if observer.frame else None, u)
-                for target, out in outs:
-                    out[:] = observer.predict(0, target)[0]
-            except Exception as error:
-                raise step_error(observer.id, error) from error
+            observer.update(frame.z, ngs if observer.frame else None, u)
+            for target, out in outs:
+                out[:] = observer.predict(0, target)[0]
             now = monotonic()
             self._times[slot], before = now - before, now
         self._row[:2] = number, before - float(frame.due)
@@ -177,10 +174,7 @@ class ObserverCrew(Crew[StepObserver]):
     def settle(self) -> None:
         """Have those learn that learn from every frame."""
         for observer in self._active.values():
-            try:
-                observer.settle()
-            except Exception as error:
-                raise step_error(observer.id, error) from error
+            observer.settle()
 
     def count(self) -> None:
         """Count latencies and squared errors of the frames that wait for it; what is NaN is not known.

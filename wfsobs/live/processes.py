@@ -32,7 +32,7 @@ from wfsobs.live.source import (
     may_go_first,
     receive,
 )
-from wfsobs.observers.step import StepError, step_error
+from wfsobs.observers.step import Naming, StepError
 from wfsobs.scenario import Scenario
 from wfsobs.stepping import design
 
@@ -112,10 +112,8 @@ def made_crew(site: Site, board: Board, place: int, observers: tuple[str, ...]) 
     scenario = Scenario.from_dict(dict(site.settings))
     crew = ObserverCrew(site.sampling, warm_up_of(site), board, place, site.news.put)
     for name in observers:
-        try:
+        with Naming(name):
             crew.start(name, design(name, scenario, sampling=site.sampling), 0)
-        except Exception as error:
-            raise step_error(name, error) from error
     return crew
 
 

@@ -31,9 +31,19 @@ class StepError(ValueError):
     """Error: a step that cannot be taken, or an observer that has none; one line with the reason."""
 
 
-def step_error(id: str, error: Exception) -> StepError:
-    """Return what an observer, of another package perhaps, has raised, in one line that names it."""
-    return error if isinstance(error, StepError) else StepError(f"{id}: {error_line(error)}")
+class Naming:
+    """A context in which what an observer or a controller raises, of another package perhaps, is a StepError that names it."""
+
+    def __init__(self, id: str):
+        self._id = id
+
+    def __enter__(self) -> None:
+        """Do nothing."""
+
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        """Raise StepError."""
+        if isinstance(error, Exception) and not isinstance(error, StepError):
+            raise StepError(f"{self._id}: {error_line(error)}") from error
 
 
 def take_state(new: StateArrays, old: StateArrays) -> None:
@@ -322,6 +332,7 @@ class StepObserver(StepBase):
         super().__init__(id, sampling, needs_ngs, bridges, gate, self._each_shape)
         self._parts[id] = estimator
         self._allowed_requests: set[tuple[float, str]] = set()
+        self._naming = Naming(id)
         self._nothing = np.full(sampling.n_modes, np.nan)
         self._see_stars: Callable[[int | None], None] | None = getattr(estimator, "see_stars", None)
         self._see_each: Callable[[Array], None] | None = getattr(estimator, "see_each", None)
@@ -370,7 +381,8 @@ class StepObserver(StepBase):
         slow = None if slow is None else self._complete_ngs(slow)
         if self._see_stars is not None:
             self._see_stars(stars)
-        self.estimator.advance(z, slow, u)
+        with self._naming:
+            self.estimator.advance(z, slow, u)
         self.frame += 1
 
     def predict(
@@ -405,7 +417,10 @@ class StepObserver(StepBase):
         if (frames, target) not in self._allowed_requests:
             self._check_request(frames, target)
             self._allowed_requests.add((frames, target))
-        mean, sd = self.estimator.predict(frames, target) if self.frame else (self._nothing, self._nothing)
+        with self._naming:
+            mean, sd = self.estimator.predict(frames, target) if self.frame else (self._nothing, self._nothing)
+            if mean.shape != self._nothing.shape:
+                raise ValueError(f"predict takes the shape {self._nothing.shape}, one number per mode, not {mean.shape}")
         if self._lgs is not None and self._lgs.is_missing.any():
             sd = np.where(self._lgs.is_missing, np.nan, sd)
         if out is None:
@@ -439,7 +454,8 @@ class StepObserver(StepBase):
 
         An observer that learns from every frame learns here: call it once the command has been sent.
         """
-        self.estimator.settle()
+        with self._naming:
+            self.estimator.settle()
 
     def take_over(self, old: StepObserver) -> None:
         """Go on where another design of the same observer is: the estimates continue without a start of their own.
