@@ -157,16 +157,18 @@ def test_files_of_a_campaign_are_no_output(folder, command, option):
     assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_observers_without_errors_are_listed_with_the_reason_before_and_after(tmp_path):
+def test_what_has_no_errors_is_listed_with_the_reason_before_and_after(tmp_path):
     """In the plan for its first run, in the table for the runs that are shown."""
-    text = PLAN.replace('"persistence"', '"persistence", "kf-adaptive"')
+    text = PLAN.replace('"persistence"]', '"persistence", "kf-adaptive"]\ncontrollers = ["lqg-kf-adaptive"]')
     (tmp_path / "plan.toml").write_text(text, encoding="utf-8")
     plan = parse_plan(text, tmp_path)
     open_folder(plan, tmp_path)
-    rows = [row for cell in plan.cells for row in run_rows(cell, 1, plan.observers, ())]
+    rows = [row for cell in plan.cells for row in run_rows(cell, 1, plan.observers, plan.controllers)]
     write_batch(tmp_path, rows, {"host": "here", "process": 1, "written": 1.0})
-    why = next(row["note"] for row in rows if row["name"] == "kf-adaptive").removeprefix("kf-adaptive ")
+    notes = {row["name"]: row["note"].removeprefix("kf-adaptive ") for row in rows if row["rms_nm"] is None}
+    line, of_loop = (f"without errors: {name}, {{}}: {notes[name]}\n" for name in ("kf-adaptive", "lqg-kf-adaptive"))
     said = CliRunner().invoke(main, ["campaign", "plan", str(tmp_path / "plan.toml")]).stdout
-    assert said.endswith(f"without errors: kf-adaptive, 1 run: {why}\n") and "300 steps" in why
-    for only, n in (((), 4), (("--only", "turbulence.wind_speed=20", "--target", "vibration"), 2)):
-        assert table(tmp_path, *only).stderr == f"wfsobs: without errors: kf-adaptive, {n} runs: {why}\n"
+    assert said.endswith(line.format("1 run") + of_loop.format("1 run")) and "300 steps" in line and "300 steps" in of_loop
+    assert table(tmp_path).stderr == "".join(f"wfsobs: {it.format('4 runs')}" for it in (line, of_loop))
+    only = "--only", "turbulence.wind_speed=20", "--target", "vibration"
+    assert table(tmp_path, *only).stderr == f"wfsobs: {line.format('2 runs')}"

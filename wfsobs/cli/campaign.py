@@ -132,7 +132,7 @@ def summary_table(plan: Campaign, rows: object, title: str) -> Table:
 
 
 def failure_lines(failures: Mapping[tuple[str, str], int]) -> list[str]:
-    """Write a line for each observer without errors in some runs; failures : (name, reason) -> in how many runs.
+    """Write a line for each observer or controller without errors in some runs; failures : (name, reason) -> in how many runs.
 
     Of several reasons, which may have numbers of their run in them, the most frequent.
 
@@ -261,7 +261,7 @@ def _try_first_run(plan: Campaign) -> tuple[float, str, Counter[tuple[str, str]]
         first, again = times[1] - times[0], times[2] - times[1]
         mean = mean * again / costs[0] + max(first - again, 0.0) / len(plan.seeds)  # designs and bounds, once for all seeds
         how = f" (the first run took {again:.2g} s here)"
-    return mean * plan.n_runs / 3600, how, Counter((row["name"], row["note"]) for row in rows if not row["target"])
+    return mean * plan.n_runs / 3600, how, Counter({(row["name"], row["note"]) for row in rows if row["rms_nm"] is None})
 
 
 def rows_of_a_run(plan: Campaign) -> int:
@@ -396,8 +396,8 @@ def print_table(
         return
     done = int(finished_runs(plan, Path(folder)).sum())
     show_table(summary_table(plan, rows, f"{plan.name}: {done} of {plan.n_runs} runs"))
-    failed = rows.filter(pc.field("target") == "").group_by(["name", "note"]).aggregate([([], "count_all")]).to_pylist()
-    for line in failure_lines({(it["name"], it["note"]): it["count_all"] for it in failed}):
+    failed = rows.filter(pc.field("rms_nm").is_null()).group_by(["name", "note"]).aggregate([("key", "count_distinct")])
+    for line in failure_lines({(it["name"], it["note"]): it["key_count_distinct"] for it in failed.to_pylist()}):
         print_note(f"without errors: {line}")
 
 
