@@ -118,6 +118,19 @@ def test_it_is_the_filter_of_the_stars_that_are_there(name: str) -> None:
                 assert np.abs(found.sd[target][at, mode] / sd[at, i] - 1.0).max() < 0.005
 
 
+def test_the_next_measurement_is_stated_by_the_stars_that_are_there() -> None:
+    """Where the model is true its errors are white: 4 % is 3.6 deviations of the rms of 4000. The noise of all four stars is half
+    of that of one, and a frame in ten is lost."""
+    changes = {"run.duration": 3.0, "vibration.source": "ar2", "sensors.lgs_count": STARS, "sensors.lgs_low_frequency_rms": 0.0}
+    events = [{"kind": "laser", "start": 1.0, "duration": 2.0, "lasers": 3}]
+    events += [{"kind": "frames", "start": 1.0, "duration": 2.0, "sensor": "lgs", "share": 0.1}]
+    scenario = PRESETS["paper"]().replace(changes | {"events": events})
+    record = wfsobs.simulate(scenario)
+    found = OBSERVERS["kf-multi"].estimate(*arguments(OBSERVERS["kf-multi"], record, scenario.before_events))
+    error = (record.z[1:] - (found["turbulence"] + found["vibration"])[:-1]) / found.sd["next z"][:-1]
+    assert np.sqrt(np.nanmean(error[1000:] ** 2)) == pytest.approx(1.0, abs=0.04)
+
+
 @pytest.mark.parametrize("name", BOTH)
 def test_not_told_it_is_another(name: str) -> None:
     """With three of four out, more than 5 % of its standard deviation from the exact one, which is nearer to the truth."""

@@ -333,8 +333,8 @@ class GapStep:
         Gives x_hat[k] from (x_hat[k-1], v[k]), (n, n + m).
     is_last : bool
         Whether the filter is steady after it.
-    sd : Array or None
-        What its owner states of the errors after it, once asked for; kept with it.
+    sd : dict of int to Array
+        What its owner states of the errors after it, by the sensors of the next measurement; kept with it.
     """
 
     is_last: bool
@@ -345,7 +345,7 @@ class GapStep:
 
     def __init__(self, posterior: Array, update: Array, is_last: bool):
         self.posterior, self.update, self.is_last = posterior, update, is_last
-        self.sd: Array | None = None
+        self.sd: dict[int, Array] = {}
         self.following: dict[Pattern, GapStep] = {}
 
 

@@ -96,26 +96,35 @@ class StatedErrors:
 
     def __init__(self, mode: ModeFilter):
         A, _, Q, _ = mode.cycle[-1]
-        targets, S, repeat = mode.rows(TARGETS), lyapunov(A, Q), len(mode.cycle)  # S : but for a running NGS frame
-        total = targets.sum(axis=0)
-        self._rows, self._least = [], []
-        for j, (A, _, Q, R) in enumerate(mode.cycle):
-            c = mode.cycle[(j + 1) % repeat][1][0]
-            ahead = c @ A
-            other = ahead - total
-            if np.abs(other).max() <= 1e-9 * np.abs(total).max():
-                other = np.zeros_like(other)
-            rows = np.vstack([targets, total, ahead, other])
-            self._rows.append(rows)
-            self._least.append(np.array([0.0, 0.0, 0.0, other @ S @ other + c @ Q @ c + R[0, 0]]))
+        self._mode, self._targets = mode, mode.rows(TARGETS)
+        self._S = lyapunov(block_diag(A, mode.mean.A), block_diag(Q, mode.mean.Q))  # but for a running NGS frame
+        self._terms: dict[tuple[int, int], tuple[Array, Array]] = {}
 
-    def sd(self, P: Array, j: int) -> Array:
-        """Return them after step j of the cycle, (4,); P : covariance after the measurement, (n, n) or of more states."""
-        rows = self._rows[j]
-        P = P[: rows.shape[1], : rows.shape[1]]
-        variances = np.einsum("ij,ij->i", rows @ P, rows)
+    def sd(self, P: Array, j: int, stars: int = 0) -> Array:
+        """Return them after step j of the cycle, (4,); P : covariance after the measurement, (n, n) or of more states.
+
+        stars : LGS that the next z is the mean over, 0 for all
+        """
+        if (j, stars) not in self._terms:
+            self._terms[j, stars] = self._rows(j, stars)
+        rows, least = self._terms[j, stars]
+        n = len(P)
+        variances = np.einsum("ij,ij->i", rows[:, :n] @ P, rows[:, :n])
         variances[3] -= variances[4]
-        return np.sqrt(np.maximum(variances[:4] + self._least[j], 0.0))
+        return np.sqrt(np.maximum(variances[:4] + least, 0.0))
+
+    def _rows(self, j: int, stars: int) -> tuple[Array, Array]:
+        """Return rows of the state, (5, n), and what is added to the variances of the first four."""
+        cycle, mean = self._mode.cycle, self._mode.mean
+        (A, _, Q, R), C = cycle[j], cycle[(j + 1) % len(cycle)][1]
+        c = np.append(C[0], mean.C[stars - 1])
+        ahead, targets = c @ block_diag(A, mean.A), np.pad(self._targets, ((0, 0), (0, len(mean.A))))
+        total = targets.sum(axis=0)
+        other = ahead - total
+        if np.abs(other).max() <= 1e-9 * np.abs(total).max():
+            other = np.zeros_like(other)
+        noise = c @ block_diag(Q, mean.Q) @ c + R[0, 0] * mean.noise[stars - 1] ** 2
+        return np.vstack([targets, total, ahead, other]), np.array([0.0, 0.0, 0.0, other @ self._S @ other + noise])
 
 
 STEADY, OPEN, CLOSED = range(3)
@@ -338,9 +347,10 @@ class KalmanEstimator(LinearEstimator):
         sd = steady[j].copy() if self.bank.last or not self.bank.has_first else np.full(steady[j].shape, np.nan)
         for mode, near in enumerate(self.bank.near):
             if near is not None:
-                if near.sd is None:
-                    near.sd = stated[mode].sd(near.posterior, j)
-                sd[:, mode] = near.sd
+                stars = min(self.bank.stars or 0, len(self.modes[mode].mean.noise))  # of the next z, as of the last
+                if stars not in near.sd:
+                    near.sd[stars] = stated[mode].sd(near.posterior, j, stars)
+                sd[:, mode] = near.sd[stars]
         return (rows @ self._states)[:, :, 0].T, sd
 
     def run(self, measurements: Measurements, watch: Watch) -> Estimates:
