@@ -20,7 +20,8 @@ from wfsobs import PRESETS
 from wfsobs import simulate as disturbance_of
 from wfsobs.control.true_plant import ActingPlant, TruePlant
 from wfsobs.identification.plant import identify_plant
-from wfsobs.identification.plant_likelihood import PlantFit, PlantLikelihood, design_probe, rotation_matrix
+from wfsobs.identification.plant_likelihood import PlantFit, PlantLikelihood, rotation_matrix
+from wfsobs.identification.probe import design_probe
 from wfsobs.record import Record
 from wfsobs.signal.autoregressive import Ar2
 from wfsobs.spectral.model import Spectrum

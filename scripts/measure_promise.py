@@ -17,7 +17,7 @@ import numpy as np
 import wfsobs
 from wfsobs.closed_loop.promise import make_promise
 from wfsobs.control.true_plant import FAR, ActingPlant, TruePlant, drive
-from wfsobs.identification.plant_likelihood import design_probe
+from wfsobs.identification.probe import design_probe
 from wfsobs.priors_from.controllers import full_plant_of
 from wfsobs.record import Record, RecordError
 

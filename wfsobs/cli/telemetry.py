@@ -45,7 +45,7 @@ from wfsobs.identification.identification import (
     whiteness_lines,
 )
 from wfsobs.identification.plant import identify_plant, plant_dict, plant_lines
-from wfsobs.identification.plant_likelihood import design_probe
+from wfsobs.identification.probe import design_probe
 from wfsobs.identification.process import Number
 from wfsobs.identification.result import Identification
 from wfsobs.pipeline import as_stated

@@ -22,6 +22,7 @@ from wfsobs.identification.plant_likelihood import (
     LONGEST,
     MOST_PEAKS,
     SHAPES,
+    Fill,
     PlantFit,
     PlantLikelihood,
     Response,
@@ -42,8 +43,9 @@ from wfsobs.typing import Array
 SHORTEST, MOST_STEPS = 1000, 100_000
 """Minimum frames of a record; frames that are looked at, its first."""
 
-MOST_MISSING = 0.2
-"""Share of missing frames beyond which no plant is identified or excluded: of a third a shorter delay seems likelier."""
+MOST_MISSING, MOST_UNTOLD = 0.2, 0.03
+"""Share of missing frames beyond which no plant is identified or excluded: of a third a shorter delay seems likelier; and that
+where the loop had them and there is no probe: then 5 % are enough for it."""
 
 FROZEN = 100
 """Frames in a row with the same measurement that are taken for one that was not renewed."""
@@ -122,6 +124,9 @@ class GroupPlant:
     chance, rigid : float
         Probability that what the measurements hold of a probe beside this plant, and beside one of a delay and a gain alone, is
         chance; where the first is below `OTHERWISE` nothing is identifiable. 1 where a probe is small.
+    untold : float
+        Share of frames that are missing though the loop had them; where it is above `MOST_UNTOLD` and a probe is small nothing is
+        identifiable.
     """
 
     modes: tuple[str, ...]
@@ -137,6 +142,7 @@ class GroupPlant:
     covariance: Array = field(repr=False, compare=False)
     chance: float = 1.0
     rigid: float = 1.0
+    untold: float = 0.0
     swinging: PlantFit | None = field(default=None, repr=False, compare=False)
 
     @property
@@ -268,8 +274,15 @@ def plant_lines(groups: Sequence[GroupPlant]) -> list[str]:
         )
         if chance < OTHERWISE
     ]
+    untold = [
+        f"{' and '.join(g.modes)}: {100.0 * g.untold:.2g} % of the frames are missing, which the loop had: "
+        f"without a probe no plant is identifiable where more than {100.0 * MOST_UNTOLD:g} % are"
+        for g in groups
+        if g.untold > MOST_UNTOLD and g.own_share <= PROBED
+    ]
     return [
         *otherwise,
+        *untold,
         "gain: of mirror and sensor (optical gain) together, which cannot be told apart; negative of a flipped axis",
         "delay: group delay at low frequencies, that of the mirror included",
         f"disturbance: {form}; {basis}",
@@ -320,6 +333,7 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
     both = np.column_stack([pooled[:, 0], np.eye(len(pooled))[:, 1:]])
     each, ties = (_over_delays(data, each, gains), gains) if one_delay else (_over_delays(data, apart, both), both)
     chance, rigid, mirror, swinging = 1.0, 1.0, each, None
+    untold = 0.0 if data.is_blind else max(float(missing.is_missing.mean()) for missing in data.missing)
     if excited > PROBED:
         rigid, (mirror, swinging) = data.response_left(each, own), _with_dynamics(data, each, ties)
         chance = data.response_left(mirror, own)
@@ -340,7 +354,8 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
         value, sd = float(fit.theta[i]), float(np.sqrt(max(fit.covariance[i, i], 0.0)))
         widest = WIDEST_DELAY if i < k else WIDEST_GAIN * abs(value) if i < 2 * k else WIDEST_ANGLE
         near = all(abs(rival[i]) <= APART * sd for rival in rivals)
-        return PlantNumber(value, sd) if near and 0.0 < sd < widest and chance >= OTHERWISE else PlantNumber()
+        is_known = near and 0.0 < sd < widest and chance >= OTHERWISE and (untold <= MOST_UNTOLD or excited > PROBED)
+        return PlantNumber(value, sd) if is_known else PlantNumber()
 
     delay, gain = tuple(number(each, i) for i in range(k)), tuple(number(each, k + i) for i in range(k))
     rotation = number(each, 2 * k) if k == 2 else None
@@ -354,8 +369,8 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
     uncertainty = data.uncertainty(each, mirror if rigid < OTHERWISE else each) if is_known else np.inf
     peaks, coloured = tuple(len(s.resonances) for s in each.spectra), any(s.background for s in each.spectra)
     numbers = delay, gain, rotation, common_delay, common_gain
-    swinging = swinging if rigid < OTHERWISE <= chance else None
-    return GroupPlant(names, *numbers, uncertainty, peaks, coloured, excited, each.covariance, chance, rigid, swinging)
+    swinging = replace(swinging, fill=None) if swinging and rigid < OTHERWISE <= chance else None
+    return GroupPlant(names, *numbers, uncertainty, peaks, coloured, excited, each.covariance, chance, rigid, untold, swinging)
 
 
 def _likeliest(*fits: PlantFit) -> PlantFit:
@@ -369,10 +384,10 @@ def _with_dynamics(data: PlantLikelihood, fit: PlantFit, ties: Array) -> tuple[P
     Returns the response over few lags, or the second-order one where its log-likelihood is larger by SWINGS; and the second-order
     one, None where its log-likelihood is smaller by RIVAL.
     """
-    ties = block_diag(ties, np.eye(2))
+    ties, fill = block_diag(ties, np.eye(2)), Fill(data, fit.spectra, fit.theta)
 
     def of(mirror: Response, shape: Sequence[float]) -> PlantFit:
-        return data.fit(replace(fit, theta=np.append(fit.theta, shape), mirror=mirror), ties)
+        return data.newton_fit(replace(fit, theta=np.append(fit.theta, shape), mirror=mirror, fill=fill), ties)
 
     few = of(partial(few_lags, int(fit.theta[: data.k].mean())), (0.0, 0.0))
     swinging = min((of(second_order, shape) for shape in SHAPES), key=lambda one: one.value)
@@ -394,7 +409,7 @@ def _over_delays(data: PlantLikelihood, fit: PlantFit, ties: Array) -> PlantFit:
             continue
         theta = fit.theta.copy()
         theta[:k] = lower + frame + (place or theta[:k] - lower)
-        top = data.fit(replace(fit, theta=theta), ties, stays=True)
+        top = data.newton_fit(replace(fit, theta=theta), ties, stays=True)
         tops.append(top)
         if top.value - min(one.value for one in tops) < NEGLIGIBLE:
             points += _along(data, top, ties[:, 1:], lower + frame)
@@ -419,7 +434,7 @@ def _along(data: PlantLikelihood, top: PlantFit, rest: Array, lower: Array) -> l
     def at(near: PlantFit, shift: float) -> PlantFit:
         theta = near.theta.copy()
         theta[:k] = np.clip(theta[:k] + shift, lower, lower + 1.0)
-        return data.fit(replace(near, theta=theta), rest)
+        return data.newton_fit(replace(near, theta=theta), rest)
 
     found = {0: at(top, 0.0)}
     for way in (-1, 1):
@@ -491,7 +506,7 @@ def contradiction(
         Sign, delay and gain of the commands as they were stated, for the line alone.
     """
     y, u = (x[:, : len(TIP_TILT)] for x in known_signals(record, CHECKED))
-    moving = np.flatnonzero(np.ptp(u, axis=0) > 0)
+    moving = np.flatnonzero(np.fmax.reduce(u) > np.fmin.reduce(u))
     if len(y) < SHORTEST or not moving.size or record.delay > LONGEST or np.isnan(y).mean(axis=0).max() > MOST_MISSING:
         return None
     y, u = (x[:, moving] / np.nanstd(y) for x in (y, u))

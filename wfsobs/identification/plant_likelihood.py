@@ -15,27 +15,20 @@ well. A probe in the commands makes that small.
 
 A mirror with dynamics has an impulse response of unit gain, with a group delay at low frequency and two shape parameters: an
 arbitrary response over four lags, or that of a second-order mirror.
-
-`design_probe` makes that which tells the plant to a wanted accuracy at the least cost.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
-from math import sqrt
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.fft import irfft, rfft
+from scipy.fft import rfft
 from scipy.stats import chi2
 
-from wfsobs.control.margins import residual_density
 from wfsobs.record import Record, delay_signal, hold_last
-from wfsobs.scenario import Scenario
-from wfsobs.signal.wiener import circle_mean
-from wfsobs.simulation.true_spectra import true_spectra
 from wfsobs.spectral.model import Spectrum
 from wfsobs.spectral.quick import quick_spectrum
 from wfsobs.spectral.whittle import (
@@ -111,6 +104,9 @@ NARROW, BAND, LOOSE = 10.0, 0.1, 0.1
 each number of a spectrum beside that of the data, which keeps those that the data say nothing of.
 """
 
+REFILLS = 2
+"""Times that missing samples are filled anew: each leaves about the share that is missing of the error of the spectra."""
+
 SMALL = 1e-4
 """Step of the finite differences of a response."""
 
@@ -119,9 +115,9 @@ FAR = 0.05
 
 
 def known_signals(record: Record, most: int) -> tuple[Array, Array]:
-    """Return the first measurements of a record, NaN where a command that they may see is lost, and commands."""
-    y, u = record.y_lgs[:most].copy(), hold_last(record.u[:most])
-    lost = np.isnan(record.u[:most]).sum(axis=1) > 0
+    """Return the first measurements of a record, NaN where a command that they may see is lost, and commands, NaN where lost."""
+    y, u = record.y_lgs[:most].copy(), record.u[:most]
+    lost = np.isnan(u).sum(axis=1) > 0
     for lag in range(1, LONGEST + 2):
         y[lag:][lost[:-lag]] = np.nan
     return y, u
@@ -140,6 +136,7 @@ class PlantFit:
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
     bins: int = 0
     mirror: Response | None = None
+    fill: Fill | None = field(default=None, repr=False, compare=False)
 
     @property
     def criterion(self) -> float:
@@ -154,19 +151,21 @@ class PlantLikelihood:
         skip = LONGEST + 1
         self.n, self.dt, self.k = fast_length(len(y) - skip), dt, y.shape[1]
         self.f = periodogram_frequencies(self.n, dt)
+        lost, u = np.isnan(u).sum(axis=1) > 0, hold_last(u)
         u = u - u.mean(axis=0)
         self.u = np.array([u[skip - j : skip - j + self.n] for j in range(LONGEST + 2)])
         self.y = (y - np.nanmean(y, axis=0))[skip : skip + self.n]
         self.y = np.column_stack([np.where(np.isnan(x) | find_outlying(x), np.nan, x) for x in self.y.T])
-        self.missing = [MissingSamples(np.isnan(x), dt) for x in self.y.T]
-        self.U = np.array([self._transform(x) for x in self.u])
-        self.Y = self._transform(self.filled_y)
+        self.missing = [MissingSamples(np.isnan(x), dt, np.random.default_rng(0)) for x in self.y.T]
+        self.U = np.array([self.transform(x) for x in self.u])
+        known, is_told = np.isnan(self.y).sum(axis=1) == 0, ~lost[skip : skip + self.n]
+        self.is_blind: bool = any(m.any for m in self.missing) and lacks_missing(self.filled_y, self.u[0], known, is_told)
 
     def without(self, own: Array) -> PlantLikelihood:
         """Return the same measurements with commands that lack a part (n, k)."""
         out = copy(self)
         out.u = self.u - np.array([delay_signal(own, lag) for lag in range(len(self.u))])
-        out.U = np.array([self._transform(x) for x in out.u])
+        out.U = np.array([self.transform(x) for x in out.u])
         return out
 
     @property
@@ -174,7 +173,7 @@ class PlantLikelihood:
         """Measurements with straight lines through gaps."""
         return np.column_stack([m.interpolate(x) for m, x in zip(self.missing, self.y.T, strict=True)])
 
-    def _transform(self, x: Array) -> Array:
+    def transform(self, x: Array) -> Array:
         """Return the Fourier transform of the columns (k, bins), such that its square is the periodogram."""
         return np.sqrt(2.0 * self.dt / self.n) * rfft(taper(self.n)[:, None] * x, axis=0)[1 : (self.n + 1) // 2].T
 
@@ -183,17 +182,12 @@ class PlantLikelihood:
 
         plain : without a background, which the commands of a wrong plant look like
         """
-        seen = self._mirror_signal(theta)
-        z = self.y - seen
-        for i, missing in enumerate(self.missing):
-            z[:, i] = missing.interpolate(z[:, i]) if not spectra else missing.fill(z[:, i], spectra[i].psd(self.f))
-        if any(missing.any for missing in self.missing):
-            self.Y = self._transform(z + seen)
-        some = zip(z.T, spectra or [None] * self.k, strict=True)
+        fill = Fill(self, spectra, None if self.is_blind else theta)
+        some = zip(fill.z(theta).T, spectra or [None] * self.k, strict=True)
         found = [quick_spectrum(x, self.dt, most, LOWEST, s, complete=not plain) for x, s in some]
-        return PlantFit(theta, [replace(s, background=None) if plain else s for s in found])
+        return PlantFit(theta, [replace(s, background=None) if plain else s for s in found], fill=fill)
 
-    def _mirror_signal(self, theta: Array) -> Array:
+    def mirror_signal(self, theta: Array) -> Array:
         """Return the commands as the measurements see them, (n, k)."""
         whole = np.minimum(theta[: self.k].astype(int), LONGEST)
         part = theta[: self.k] - whole
@@ -209,49 +203,58 @@ class PlantLikelihood:
         angle = theta[2 * self.k] if self.k == 2 else 0.0
         return rotation_matrix(angle + turn)[: self.k, : self.k] * theta[self.k : 2 * self.k]
 
-    def _mirror_transform(self, theta: Array, lower: Array | None, mirror: Response | None) -> tuple[Array, Array]:
-        """Return the commands as they are measured (k, bins), and their derivatives by delay and shape (k, 1 or 3, bins)."""
+    def _mirror_transform(self, theta: Array, lower: Array | None, mirror: Response | None, fill: Fill) -> tuple[Array, Array]:
+        """Return the commands as each mode measures them (k, k, bins), and slopes by delay and shape (k, k, 1 or 3, bins)."""
         if mirror is None:
             lower = np.minimum(theta[: self.k].astype(int), LONGEST) if lower is None else lower
-            before, change = (np.array([x[d, j] for j, d in enumerate(lower)]) for x in (self.U, self.U[1:] - self.U[:-1]))
-            return before + (theta[: self.k] - lower)[:, None] * change, change[:, None]
+            before, after = (np.stack([fill.commands(d)[:, j] for j, d in enumerate(lower + i)], axis=1) for i in (0, 1))
+            change = after - before
+            return before + (theta[: self.k] - lower)[:, None] * change, change[:, :, None]
         steps = SMALL * np.eye(3)
         of_modes = [np.append(delay, theta[self.size :]) for delay in theta[: self.k]]
         taps = [[mirror(x), *((mirror(x + e) - mirror(x - e)) / (2.0 * SMALL) for e in steps)] for x in of_modes]
         out = rfft(taps, self.n)[..., 1 : (self.n + 1) // 2] * self.U[1][:, None]
-        return out[:, 0], out[:, 1:]
+        return out[None, :, 0], out[None, :, 1:]
 
-    def z(self, theta: Array, lower: Array | None = None, mirror: Response | None = None) -> tuple[Array, Array]:
+    def z(self, theta: Array, fill: Fill, lower: Array | None = None, mirror: Response | None = None) -> tuple[Array, Array]:
         """Return the transform of z (k, bins) and its derivatives by theta (p, k, bins); lower : whole part of the delays."""
-        m, slopes = self._mirror_transform(theta, lower, mirror)
-        matrix = self._matrix(theta)
-        by_delay = [-matrix[:, j, None] * slopes[j, 0] for j in range(self.k)]
-        by_gain = [-matrix[:, j, None] / theta[self.k + j] * m[j] for j in range(self.k)]
-        by_angle = [-self._matrix(theta, np.pi / 2.0) @ m] if self.k == 2 else []
-        by_shape = [-matrix @ slopes[:, i] for i in range(1, slopes.shape[1])]
-        return self.Y - matrix @ m, np.array(by_delay + by_gain + by_angle + by_shape)
+        m, slopes = self._mirror_transform(theta, lower, mirror, fill)
+        matrix = self._matrix(theta)[:, :, None]
+        by_delay = [-matrix[:, j] * slopes[:, j, 0] for j in range(self.k)]
+        by_gain = [-matrix[:, j] / theta[self.k + j] * m[:, j] for j in range(self.k)]
+        by_angle = [-(self._matrix(theta, np.pi / 2.0)[:, :, None] * m).sum(axis=1)] if self.k == 2 else []
+        by_shape = [-(matrix * slopes[:, :, i]).sum(axis=1) for i in range(1, slopes.shape[2])]
+        return fill.Y - (matrix * m).sum(axis=1), np.array(by_delay + by_gain + by_angle + by_shape)
 
-    def fit(self, start: PlantFit, ties: Array, *, stays: bool = False) -> PlantFit:
+    def fit(self, start: PlantFit, ties: Array) -> PlantFit:
+        """Return `newton_fit`, and again with missing samples that are filled by what it finds, so that likelihoods compare."""
+        found = self.newton_fit(start, ties)
+        for _ in range(REFILLS * self.is_blind):
+            found = self.newton_fit(replace(found, fill=Fill(self, found.spectra, None)), ties)
+        return found
+
+    def newton_fit(self, start: PlantFit, ties: Array, *, stays: bool = False) -> PlantFit:
         """Take damped Newton steps with the expected second derivatives.
 
         ties : theta by its free numbers (p, q);  stays : delays do not go beyond the whole numbers on either side
         """
         theta, spectra, mirror = start.theta, list(start.spectra), start.mirror
+        fill = start.fill or Fill(self, spectra, theta)
         cells = [Cells(self.f, np.zeros_like(self.f), np.ones_like(self.f), [p.frequency for p in s.resonances]) for s in spectra]
         lower, held = np.minimum(theta[: self.k].astype(int), LONGEST), 1e-3
         best, F, q = np.inf, np.zeros((0, 0)), ties.shape[1]
         theta_there, spectra_there, lower_there = theta, spectra, lower
         gradient = np.zeros(0)
         for _ in range(STEPS):
-            Z, dZ = self.z(theta_there, lower_there, mirror)
-            for cell, z in zip(cells, Z, strict=True):
-                cell.mean = np.add.reduceat(np.abs(z) ** 2, _edges(cell)) / cell.count
+            Z, dZ = self.z(theta_there, fill, lower_there, mirror)
+            for cell, power in zip(cells, np.abs(Z) ** 2 + fill.power, strict=True):
+                cell.mean = np.add.reduceat(power, _edges(cell)) / cell.count
             there = sum(cell.misfit(s) for s, cell in zip(spectra_there, cells, strict=True))
             gain = best - there
             crossed = (lower_there != lower).any()
             if gain >= 0:
                 theta, spectra, lower, best, held = theta_there, spectra_there, lower_there, there, 0.2 * held
-                F, gradient = self._second_derivatives(dZ, Z, spectra, cells, ties)
+                F, gradient = self._second_derivatives(dZ, Z, spectra, cells, ties, fill.spectra_share)
                 if gain < ENOUGH and not crossed:
                     break
             else:
@@ -271,8 +274,8 @@ class PlantLikelihood:
                 at += len(free)
                 spectra_there.append(s.with_vector(vector))
         covariance = np.linalg.inv(F)[:q, :q] * inflation(self.n)
-        covariance /= 1.0 - max(missing.is_missing.mean() for missing in self.missing)  # filled ones tell nothing
-        return PlantFit(theta, spectra, float(best), ties @ covariance @ ties.T, self.f.size, mirror)
+        covariance /= fill.plant_share
+        return PlantFit(theta, spectra, float(best), ties @ covariance @ ties.T, self.f.size, mirror, fill)
 
     def _within(self, theta: Array, lower: Array, stays: bool) -> tuple[Array, Array]:
         """Stop delays at the next whole number, where the derivative changes; from there they go on in the next step, or stay."""
@@ -285,9 +288,12 @@ class PlantLikelihood:
         return theta, out
 
     def _second_derivatives(
-        self, dZ: Array, Z: Array, spectra: Sequence[Spectrum], cells: Sequence[Cells], ties: Array
+        self, dZ: Array, Z: Array, spectra: Sequence[Spectrum], cells: Sequence[Cells], ties: Array, shares: Sequence[float]
     ) -> tuple[Array, Array]:
-        """Return the expected second derivatives and the gradient of - log L by the free numbers of plant and spectra."""
+        """Return the expected second derivatives and the gradient of - log L by the free numbers of plant and spectra.
+
+        shares : of the samples of each mode that tell of its spectrum
+        """
         dZ = np.tensordot(ties.T, dZ, 1)
         q = len(dZ)
         size = q + sum(len(s.free_parameters) for s in spectra)
@@ -303,7 +309,7 @@ class PlantLikelihood:
             smooth = np.array([np.interp(cell.frequency, *self._band_means(x / cell.count, cell)) for x in by_cell])
             smooth = smooth.reshape(q, len(cell.count))
             F[:q, own] = -(smooth * cell.count) @ slopes.T
-            F[own, own] = (slopes * cell.count) @ slopes.T + LOOSE * np.eye(len(free))
+            F[own, own] = shares[i] * (slopes * cell.count) @ slopes.T + LOOSE * np.eye(len(free))
             at += len(free)
         F[q:, :q] = F[:q, q:].T
         return F, gradient
@@ -321,8 +327,9 @@ class PlantLikelihood:
 
         Score test of a further response, as many numbers as lags for each mode, with the spectra of the fit.
         """
-        Z = self.z(fit.theta, mirror=fit.mirror)[0]
-        seen = self._matrix(fit.theta) @ self._transform(own)
+        assert fit.fill is not None
+        Z = self.z(fit.theta, fit.fill, mirror=fit.mirror)[0]
+        seen = (self._matrix(fit.theta)[:, :, None] * fit.fill.transform(own)).sum(axis=1)
         turn = np.exp(-2j * np.pi * self.f * self.dt * np.arange(1, LONGEST + 3)[:, None])
         total = 0.0
         for z, one, s in zip(Z, seen, fit.spectra, strict=True):
@@ -336,7 +343,8 @@ class PlantLikelihood:
 
         dynamic : the fit with the response of the mirror; what z lacks of that one counts as an error
         """
-        (Z, dZ), right = self.z(fit.theta), self.z(dynamic.theta, mirror=dynamic.mirror)[0]
+        assert fit.fill is not None and dynamic.fill is not None
+        (Z, dZ), right = self.z(fit.theta, fit.fill), self.z(dynamic.theta, dynamic.fill, mirror=dynamic.mirror)[0]
         values, vectors = np.linalg.eigh(fit.covariance)
         dZ = np.tensordot((vectors * np.sqrt(np.maximum(values, 0.0))).T, dZ, 1)
         low, worst = 1.0, 0.0
@@ -353,6 +361,76 @@ class PlantLikelihood:
         return float(np.sqrt(worst))
 
 
+class Fill:
+    """Transforms of measurements and commands with samples in the place of those that are missing.
+
+    By spectra of z these are their expectation given all others, else straight lines. Where the loop lacked the measurements,
+    these and the commands are filled alike: the z of any plant is linear in them, and so filled as well. Where it had them, its
+    commands tell of what is missing, but not what: the measurements alone are filled, by one plant.
+
+    Attributes
+    ----------
+    Y : Array
+        Transform of the measurements, (k, bins).
+    power : Array
+        What the spectra of z lack where the samples are filled, (k, bins).
+    spectra_share : sequence of float
+        Share of the samples of each mode that tell of its spectrum, where the plant is told of no more than it is.
+    plant_share : float
+        Share of the samples that tell of the plant, where others count as well.
+
+    Parameters
+    ----------
+    data : PlantLikelihood
+        Measurements and commands.
+    spectra : sequence of Spectrum
+        Of z by mode; none for straight lines.
+    theta : Array or None
+        The plant by which the measurements alone are filled.
+    """
+
+    def __init__(self, data: PlantLikelihood, spectra: Sequence[Spectrum], theta: Array | None):
+        self._data, self._S = data, [s.psd(data.f) for s in spectra]
+        has_gaps = any(missing.any for missing in data.missing)
+        self._is_alike = theta is None and has_gaps
+        self._commands: dict[int, Array] = {}
+        shares = [1.0 - float(missing.is_missing.mean()) for missing in data.missing]
+        self.spectra_share: Sequence[float] = shares if self._is_alike else [1.0] * data.k
+        self.plant_share: float = 1.0 if self._is_alike else min(shares)
+        self.power: Array = np.zeros((data.k, data.f.size))
+        for i, missing in enumerate(data.missing):
+            if self._S and missing.any and data.is_blind:
+                S = self._S[i]
+                self.power[i] = (1.0 - missing.measured_share(S, missing.draw_errors(S))) * S
+        seen = np.zeros_like(data.y) if theta is None else data.mirror_signal(theta)
+        self.Y: Array = data.transform(self._fill(data.y - seen) + seen)
+
+    def z(self, theta: Array) -> Array:
+        """Return the z of a plant, (n, k)."""
+        return self._fill(self._data.y - self._data.mirror_signal(theta))
+
+    def commands(self, lag: int) -> Array:
+        """Return the transform of the commands so many frames before as each mode measures them, (k, k, bins)."""
+        if lag not in self._commands:
+            self._commands[lag] = self.transform(self._data.u[lag]) if self._is_alike else self._data.U[lag][None]
+        return self._commands[lag]
+
+    def transform(self, x: Array) -> Array:
+        """Return the transform of the columns of x (n, k) as each mode measures them, (k or 1, k, bins)."""
+        if not self._is_alike:
+            return self._data.transform(x)[None]
+        columns = range(self._data.k)
+        return np.array([self._data.transform(np.column_stack([self._fill_one(i, x[:, j]) for j in columns])) for i in columns])
+
+    def _fill(self, x: Array) -> Array:
+        return np.column_stack([self._fill_one(i, column) for i, column in enumerate(x.T)])
+
+    def _fill_one(self, mode: int, x: Array) -> Array:
+        """Return a signal of a mode with its missing samples filled, (n,)."""
+        missing = self._data.missing[mode]
+        return missing.fill(x, self._S[mode]) if self._S and missing.any else missing.interpolate(x)
+
+
 def rotation_matrix(angle: float) -> Array:
     """Return the matrix (2, 2) of a rotation by an angle [rad]."""
     c, s = np.cos(angle), np.sin(angle)
@@ -363,18 +441,53 @@ def _edges(cells: Cells) -> Array:
     return np.concatenate([[0], np.cumsum(cells.count)[:-1]]).astype(int)
 
 
+def past_of(y: Array, u: Array) -> Array:
+    """Return the last ORDER measurements and commands before each sample from the ORDER th on, (n - ORDER, 2 k ORDER)."""
+    return np.column_stack([x[ORDER - i : len(x) - i] for x in (y, u) for i in range(1, ORDER + 1)])
+
+
 def prediction_errors(y: Array, u: Array, rows: Array | None = None) -> tuple[Array, Array]:
     """Return what is new in measurements and commands, (n, ...) each, from their ORDER th sample on: not told by their past.
 
     rows : which of these samples it is told of, bool (n - ORDER,), all by default; zero at the others
     """
-    n = len(y) - ORDER
-    past = np.column_stack([x[ORDER - i : ORDER - i + n] for x in (y, u) for i in range(1, ORDER + 1)])
-    rows = np.arange(n) if rows is None else np.flatnonzero(rows)
+    past, rows = past_of(y, u), np.arange(len(y) - ORDER) if rows is None else np.flatnonzero(rows)
     new_y, new_u = np.zeros_like(y[ORDER:]), np.zeros_like(u[ORDER:])
     for x, new in ((y, new_y), (u, new_u)):
         new[rows] = x[ORDER:][rows] - past[rows] @ np.linalg.lstsq(past[rows], x[ORDER:][rows], rcond=1e-10)[0]
     return new_y, new_u
+
+
+TOLD = 5
+"""Least number of frames per coefficient by which it is decided whether the loop had what is missing."""
+
+
+def lacks_missing(y: Array, u: Array, is_known: Array, is_told: Array) -> bool:
+    """Return whether a loop itself lacked the measurements that are not known.
+
+    Then its commands there are what its law makes of a measurement of zero, or of the expected one. If it had them, what is new
+    in the commands is as large as elsewhere. False where too few frames tell.
+
+    Parameters
+    ----------
+    y, u : Array
+        Measurements, with any numbers where they are missing, and commands, (n, k).
+    is_known, is_told : Array
+        Which measurements and which commands are known, bool (n,).
+    """
+    since = np.asarray(sliding_window_view(is_known, ORDER).all(axis=1))[:-1]
+    past, k = past_of(y, u), u.shape[1]
+    now, lost = since & is_known[ORDER:], since & ~is_known[ORDER:] & is_told[ORDER:]
+    if np.count_nonzero(now) < TOLD * past.shape[1] or np.count_nonzero(lost) < TOLD * 2 * k:
+        return False
+    both = np.column_stack([past[now], y[ORDER:][now]])
+    law, expected = (np.linalg.lstsq(x, u[ORDER:][now], rcond=1e-10)[0] for x in (both, past[now]))
+    sizes = [np.sum((u[ORDER:][now] - x @ c) ** 2) / k for x, c in ((both, law), (past[now], expected))]
+    n, p = past[now].shape
+    own, new = np.array(sizes) * (n + p) / (n * (n - p))  # at other frames
+    hints = np.column_stack([past[lost] @ law[:-k], past[lost] @ expected])
+    left = u[ORDER:][lost] - hints @ np.linalg.lstsq(hints, u[ORDER:][lost], rcond=1e-10)[0]
+    return bool(np.sum(left**2) / (k * (len(left) - 2 * k)) < 0.5 * (own + new))
 
 
 def smooth_basis() -> Array:
@@ -425,83 +538,3 @@ def guess_plant(data: PlantLikelihood) -> tuple[Array, float, Array]:
     gain = best[1] if explained and not FAR < best[1] < 1.0 / FAR else 1.0
     own = np.vstack([np.zeros((ORDER, k)), own])
     return np.concatenate([np.zeros(k), gain * np.diag(flip), [angle] * (k == 2)]), excited, own
-
-
-LOW = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)
-"""Lowest frequencies of a probe that are tried, over the rate."""
-
-
-@dataclass(frozen=True)
-class Probe:
-    """White commands above a frequency, beside those of the loop of a scenario, which is its integrator at a delay of two.
-
-    Attributes
-    ----------
-    low : float
-        Minimum frequency, the maximum is half the rate [Hz].
-    rms : float
-        Of the commands of each mode [um].
-    bound : dict of str to float
-        Cramer-Rao bounds of the probe alone, whatever the plant's own motion tells, if the lag of the mirror is unknown (any
-        response of four lags): `delay_frames`, one of both modes, `gain`, that of the worse mode, and `rotation_deg`.
-    cost : float
-        What it adds to the rms of the residual of a mode while it lasts, over that; the largest of the modes.
-    """
-
-    low: float
-    rms: float
-    bound: dict[str, float]
-    cost: float
-
-    def commands(self, n: int, n_modes: int, dt: float, rng: np.random.Generator) -> Array:
-        """Return its commands (n, n_modes) [um], to be added to those of the loop."""
-        x = rfft(rng.standard_normal((n, n_modes)), axis=0)
-        x[np.arange(len(x)) / (n * dt) < self.low] = 0.0
-        x = irfft(x, n, axis=0)
-        return self.rms * x / x.std(axis=0)
-
-
-def design_probe(scenario: Scenario, seconds: float, accuracy: Mapping[str, float]) -> Probe:
-    """Design the probe that adds least to the residual of a scenario's loop, for standard deviations of the plant.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        Disturbance, noise, integrator.
-    seconds : float
-        How long it lasts [s].
-    accuracy : mapping of str to float
-        Standard deviations by name, as `Probe.bound`.
-
-    Returns
-    -------
-    Probe
-        The one whose lowest frequency, of LOW over the rate, costs least.
-    """
-    spectra, probes = [true_spectra(scenario, mode) for mode in range(2)], []
-    for share in LOW:
-        information, rotation, excess, density = np.zeros((5, 5)), 0.0, [], []
-        for s in spectra:
-            omega = np.pi * np.arange(s.measurement.size) / (s.measurement.size - 1)
-            forgets = 1.0 - scenario.loop.leak * np.exp(-1j * omega)
-            acts = scenario.loop.gain * scenario.loop.closed * np.exp(-2j * omega)
-            sensitivity = np.divide(forgets, forgets + acts, out=np.ones_like(forgets), where=acts != 0.0)
-            own = residual_density(1.0 - sensitivity, s.total[0], s.total[1], s.measurement)
-            power = np.abs(sensitivity) ** 2 * np.where(omega >= 2.0 * np.pi * share, 0.5 / (0.5 - share), 0.0)
-            excess.append(circle_mean(power) / circle_mean(own))
-            density.append((omega, power))
-        n = seconds / scenario.dt
-        for mode, s in enumerate(spectra):
-            (omega, power), other = density[mode], density[1 - mode][1]
-            back = np.exp(-1j * omega)
-            # by delay, two numbers of the mirror's shape, and gain, but for two frames
-            slopes = np.array([back - 1.0, (1.0 - back) ** 2 / back, (1.0 - back) ** 2, np.ones_like(omega)])
-            products = np.real(slopes[:, None] * slopes.conj()) * power / s.measurement
-            information[np.ix_(*[[0, 1, 2, 3 + mode]] * 2)] += n * np.array([[circle_mean(x) for x in row] for row in products])
-            rotation += n * circle_mean(other / s.measurement) if other.size == omega.size else 0.0
-        sd = np.sqrt(np.diag(np.linalg.inv(information)))
-        unit = {"delay_frames": sd[0], "gain": sd[3:].max(), "rotation_deg": np.degrees(1.0 / sqrt(rotation))}
-        rms = max(unit[name] / accuracy[name] for name in unit)
-        cost = sqrt(1.0 + rms**2 * max(excess)) - 1.0
-        probes.append(Probe(share / scenario.dt, float(rms), {name: float(x / rms) for name, x in unit.items()}, cost))
-    return min(probes, key=lambda probe: probe.cost)
