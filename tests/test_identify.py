@@ -427,7 +427,7 @@ def test_result_as_a_file_of_settings(record: Record, found: Identification, tmp
     out = tmp_path / "f.toml"
     done = CliRunner().invoke(main, ["identify", str(tmp_path / "r.npz"), "--out", str(out)])
     assert done.exit_code == 0, done.output
-    assert "resonance" in done.stdout and "residual is white at 1%" in done.stdout
+    assert "resonance" in done.stdout and "residual is white at 1 %" in done.stdout
     saved = configfile.load_scenario(out)
     saved.validate()
     assert saved == found.scenario(PRESETS["paper"]())
@@ -510,7 +510,7 @@ NOISE = 0.01 * np.random.default_rng(9).standard_normal((6000, 1))
         (np.sin(2 * pi * 20.3 * T) + np.where((T > 2) & (T < 3), 0.0, NOISE), "not stationary"),  # held samples
         (np.round(NOISE / 0.02) * 0.02, "is white"),  # counts
         (NOISE + 3.0 * T, "NOT white"),  # drift
-        (NOISE + 5.0 * (np.arange(6000)[:, None] % 997 == 500), "is white at 1% ("),  # outliers
+        (NOISE + 5.0 * (np.arange(6000)[:, None] % 997 == 500), "is white at 1 % ("),  # outliers
         (NOISE * (1.0 + (T > 3)), "not stationary"),
     ],
 )

@@ -151,7 +151,7 @@ def test_a_gap_of_many_periods_moves_no_line(seed: int) -> None:
 
 
 def test_what_lacks_too_much_is_refused() -> None:
-    with pytest.raises(RecordError, match=r"tip: \d+ of \d+ samples are measured, identification needs 1000, and 50%"):
+    with pytest.raises(RecordError, match=r"tip: \d+ of \d+ samples are measured, identification needs 1000, and 50 %"):
         identify(record(0.6, np.random.default_rng(1), 6000))
 
 

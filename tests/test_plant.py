@@ -248,7 +248,7 @@ def test_signals_that_tell_nothing_of_a_plant_are_named() -> None:
         (y, 0.0 * u, "the commands of tip and tilt do not move"),
         (y, u * tip, "the commands of tilt do not move"),
         (0.0 * y + 0.1, u, "the measurements of tip and tilt do not move"),
-        (gone, u, "tip: 100% of the frames are missing, or follow a lost command; at most 20%"),
+        (gone, u, "tip: 100 % of the frames are missing, or follow a lost command; at most 20 %"),
         (y * tip, u, "the measurements of tilt do not move"),
         (y @ same, u, "the measurements of tip and tilt are the same"),
         (frozen, u, "of tip and tilt stay the same for 500 frames from frame 1500 on: leave out what is not measured"),

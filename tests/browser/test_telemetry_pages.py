@@ -21,7 +21,7 @@ def test_identify_and_use_it(page: Page) -> None:
     page.get_by_role("button", name="Identify", exact=True).click()
     expect(page.get_by_role("button", name="Filters only")).to_be_disabled()
     page.get_by_role("button", name="Identify the record").click()
-    expect(page.get_by_text(re.compile("tip: residual is (NOT )?white at 1%"))).to_be_visible()
+    expect(page.get_by_text(re.compile("tip: residual is (NOT )?white at 1 %"))).to_be_visible()
     row = page.get_by_role("region", name="Identified in tip").locator("tr", has_text="turbulence")
     expect(row.locator("td").first).to_have_text(re.compile(r"^\s*\d"))
     corner = float(row.locator("td").first.inner_text().split()[0])

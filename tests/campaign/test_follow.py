@@ -141,7 +141,7 @@ def test_the_margin_is_over_the_seeds_that_both_have(tmp_path, rms, margin):
     ]
     write_batch(tmp_path, rows, {"host": "", "process": 1, "written": 1.0})
     write_report(tmp_path, tmp_path / "report.html")
-    assert f"22.4 nm, {margin:.0%} before the next" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert f"22.4 nm, {100.0 * margin:.0f} % before the next" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow

@@ -94,8 +94,8 @@ def test_missing_samples_hardly_matter(gone: float | str) -> None:
 @pytest.mark.parametrize(
     ("z", "line"),
     [
-        (np.sin(np.arange(999.0)), "999 of 999 samples are measured, a gain needs 1000, and 80%"),
-        (np.where(np.arange(3_000) % 3, np.nan, 1.0), "1000 of 3000 samples are measured, a gain needs 1000, and 80%"),
+        (np.sin(np.arange(999.0)), "999 of 999 samples are measured, a gain needs 1000, and 80 %"),
+        (np.where(np.arange(3_000) % 3, np.nan, 1.0), "1000 of 3000 samples are measured, a gain needs 1000, and 80 %"),
         (np.full(2_000, 3.0), "the measurements do not move: every gain is as good as another"),
     ],
 )

@@ -46,8 +46,8 @@ def records(draw) -> Record:
     def maybe(make):
         return make() if draw(st.booleans()) else None
 
-    y = signal()
-    y[0] = draw(st.floats(-1.0, 1.0))  # of every mode one measurement at least
+    y, u = signal(), signal()
+    y[0], u[0] = draw(st.floats(-1.0, 1.0)), draw(st.floats(-1.0, 1.0))  # of every mode one measurement and command at least
     ratio = draw(st.integers(1, 5))
     y_ngs = maybe(signal)
     if y_ngs is not None:
@@ -57,7 +57,7 @@ def records(draw) -> Record:
     training = maybe(lambda: Training(signal(FINITE, rows), signal(FINITE, rows), maybe(lambda: signal(FINITE, rows))))
     return Record(
         y,
-        signal(),
+        u,
         draw(st.floats(1e-5, 1.0)),
         y_ngs,
         None if y_ngs is None else ratio,

@@ -52,7 +52,7 @@ def test_an_alarm_is_told_once_and_when_it_is_over():
         "ALARM noise up",
         "over: noise",
         "ALARM error of kf-multi up",
-        "ALARM 10.0% of LGS frames missing",
+        "ALARM 10.0 % of LGS frames missing",
         "over: error of kf-multi",
         "over: LGS frames missing",
     ]
@@ -68,7 +68,7 @@ def test_ngs_frames_that_were_due_are_missing():
         frames.ngs[3 : 3 + 10 * lost : 10] = np.nan
         alarms.look_at(frames, 7, 10)
         alarms.look_at(frames, 7, None)  # no NGS: none is due
-    assert said == ["ALARM 2.0% of NGS frames missing", "over: NGS frames missing"]
+    assert said == ["ALARM 2.0 % of NGS frames missing", "over: NGS frames missing"]
     first = LiveFrame(np.zeros(10), np.zeros((10, 2)), np.full((10, 2), np.nan), *[np.zeros((10, 2))] * 3)
     alarms.look_at(first, 0, 10)  # none is due with the first frame of all
     assert len(said) == 2

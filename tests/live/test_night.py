@@ -65,10 +65,10 @@ def test_what_is_told_of_a_night(night):
         "0 of 2 lasers",
         "2 of 2 lasers",
         "wind 15 m/s",
-        "10% of LGS frames lost",
+        "10 % of LGS frames lost",
         "all LGS frames",
         "peak from 47.50 to 50.50 Hz, 30.0 nm",
-        "50% of NGS frames lost",
+        "50 % of NGS frames lost",
         "all NGS frames",
         "peak at 47.50 Hz, 30.0 nm",
     ]

@@ -74,9 +74,9 @@ def test_lasers_and_frames_fail_and_are_back():
         (2.0, 2, 1.0, 0.0, "0 of 2 lasers"),  # nothing is measured: no noise to simulate
         (3.0, 1, 0.0, 0.0, "1 of 2 lasers"),
         (5.0, 2, 0.0, 0.0, "2 of 2 lasers"),
-        (8.0, 2, 0.5, 0.0, "50% of LGS frames lost"),
-        (9.0, 2, 0.75, 0.25, "75% of LGS frames lost, 25% of NGS frames lost"),
-        (10.0, 2, 0.5, 0.0, "50% of LGS frames lost, all NGS frames"),
+        (8.0, 2, 0.5, 0.0, "50 % of LGS frames lost"),
+        (9.0, 2, 0.75, 0.25, "75 % of LGS frames lost, 25 % of NGS frames lost"),
+        (10.0, 2, 0.5, 0.0, "50 % of LGS frames lost, all NGS frames"),
         (12.0, 2, 0.0, 0.0, "all LGS frames"),
     ]
     assert programme.present == scenario.before_events
@@ -92,7 +92,7 @@ def test_what_is_changed_by_hand_stays_beside_the_events():
     programme.become(scenario.replace({"turbulence.wind_speed": 30.0}), "by hand")
     programme.play(5.0)
     assert [c["losses"]["ngs"] for c in said] == pytest.approx([0.2, 1 - 0.8 * 0.5, 1 - 0.8 * 0.5, 0.2])
-    assert [c["line"] for c in said] == ["20% of frames lost", "50% of NGS frames lost", "by hand", "all NGS frames"]
+    assert [c["line"] for c in said] == ["20 % of frames lost", "50 % of NGS frames lost", "by hand", "all NGS frames"]
     assert programme.present == scenario.replace({"turbulence.wind_speed": 30.0}).before_events
     with pytest.raises(SettingError, match="at 9 s"):
         programme.become(scenario_of({"kind": "wind", "start": 9.0, "wind_factor": 10.0}), "too much")

@@ -257,7 +257,7 @@ def _map(
         values = [changes[cell][path] for path in paths]
         x, y, *_ = [*values, None]
         winners[best.name] = name_label(best.name)
-        text = f"{winners[best.name]}, {best.rms:.1f} nm, {margin:.0%} before the next"
+        text = f"{winners[best.name]}, {best.rms:.1f} nm, {100.0 * margin:.0f} % before the next"
         text += ", another is not significantly worse" if tie else ""
         text += f"; {', '.join(f'{label} = {_short(v)}' for label, v in zip(labels, values, strict=False))}; {of}"
         squares.append(

@@ -225,7 +225,7 @@ def _run_headless(order: LiveOrder, seconds: float, as_json: bool) -> None:
         print_json(result)
         return
     error = ("rms" if source.has_truth else "next") + ", nm"
-    title = f"{result['frames']} frames, {result['lost']} lost, {result['late_share']:.2%} more than 1 ms late"
+    title = f"{result['frames']} frames, {result['lost']} lost, {100.0 * result['late_share']:.2f} % more than 1 ms late"
     table = new_table(("Observer",), (error, "step p50, us", "p99.9, us", "longer than a frame"), no_wrap=False, title=title)
     for name, row in result["observers"].items():
         rms = row["rms_nm"] if source.has_truth else _rms(row["next_nm"].values())

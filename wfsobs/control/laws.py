@@ -191,7 +191,7 @@ def gain_from_telemetry(z: Array, mirror: Mirror, leak: float = 1.0) -> Telemetr
     """
     measured = np.flatnonzero(~np.isnan(z))
     if measured.size < max(SHORTEST, LEAST * z.size):
-        raise RecordError(f"{measured.size} of {z.size} samples are measured, a gain needs {SHORTEST}, and {LEAST:.0%}")
+        raise RecordError(f"{measured.size} of {z.size} samples are measured, a gain needs {SHORTEST}, and {100.0 * LEAST:.0f} %")
     if not np.ptp(z[measured]) > 0.0:
         raise RecordError("the measurements do not move: every gain is as good as another")
     steps = z[1:] - leak * z[:-1]

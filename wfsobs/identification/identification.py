@@ -152,7 +152,7 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
     for name, column in zip(MODE_NAMES, z.T, strict=False):
         if (count := np.count_nonzero(np.isfinite(column))) < max(SHORTEST, LEAST * len(z)):
             raise RecordError(
-                f"{name}: {count} of {len(z)} samples are measured, identification needs {SHORTEST}, and {LEAST:.0%}"
+                f"{name}: {count} of {len(z)} samples are measured, identification needs {SHORTEST}, and {100.0 * LEAST:.0f} %"
             )
         if not np.nanstd(column) > RESTING * np.nanmax(np.abs(column)):
             raise RecordError(f"{name}: z is constant, there is nothing to identify")
@@ -317,7 +317,8 @@ def whiteness_lines(result: Identification) -> list[str]:
         outlying = {"samples": m.outlying, "NGS frames": m.difference.outlying if m.difference else 0}
         rest += "".join(f"; outlying {what} taken for missing: {count}" for what, count in outlying.items() if count)
         why = "".join(f"; {remark}" for remark in w.remarks)
-        out.append(f"{m.name}: residual is {'white' if w.white else 'NOT white'} at {WHITE_LEVEL:.0%} ({tests}{rest}){why}")
+        form = "white" if w.white else "NOT white"
+        out.append(f"{m.name}: residual is {form} at {100.0 * WHITE_LEVEL:.0f} % ({tests}{rest}){why}")
     return out
 
 

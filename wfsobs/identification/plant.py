@@ -197,7 +197,7 @@ def identify_plant(record: Record, watch: Watch = QUIET) -> tuple[GroupPlant, ..
     for name, gone in zip(MODE_NAMES, np.isnan(y).mean(axis=0).tolist(), strict=False):
         if gone > MOST_MISSING:
             what = "of the frames are missing, or follow a lost command"
-            raise RecordError(f"{name}: {gone:.0%} {what}; at most {MOST_MISSING:.0%}")
+            raise RecordError(f"{name}: {100.0 * gone:.0f} % {what}; at most {100.0 * MOST_MISSING:.0f} %")
     out = []
     groups = list(_groups(record.n_modes))
     for i, columns in enumerate(groups):

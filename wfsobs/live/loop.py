@@ -186,7 +186,7 @@ class Alarms:
         """Judge what has come of the measurements that were due, (n, n_modes)."""
         if len(due):
             missing = float(np.isnan(due).any(axis=1).mean())
-            self._set(f"{sensor} frames missing", missing > MISSING, f"{missing:.1%} of {sensor} frames missing")
+            self._set(f"{sensor} frames missing", missing > MISSING, f"{100.0 * missing:.1f} % of {sensor} frames missing")
 
     def _judge(self, what: str, value: float, about: str = "") -> None:
         """Judge a number, of an observer if `about` it, by what it has been so far; while it is raised it does not count."""

@@ -187,9 +187,8 @@ def _act(scenario: Scenario, t: float) -> Act:
     if any(event.kind == LASER for event in scenario.events):
         changes["sensors.lgs_count"], words["lasers"] = left or count, f"{left} of {count} lasers"
     for sensor in sorted({event.sensor for event in scenario.events if event.kind == FRAMES}):
-        words[sensor] = (
-            f"{shares[sensor]:.0%} of {sensor.upper()} frames lost" if shares[sensor] else f"all {sensor.upper()} frames"
-        )
+        frames = f"{sensor.upper()} frames"
+        words[sensor] = f"{100.0 * shares[sensor]:.0f} % of {frames} lost" if shares[sensor] else f"all {frames}"
     try:
         present = before.replace(changes) if changes else before
         present.validate()
@@ -224,9 +223,9 @@ def loss_line(lgs: bool, ngs: bool, loss: float) -> str:
     """Say what of the frames does not arrive.
 
     >>> loss_line(False, True, 0.1), loss_line(True, True, 0.0)
-    ('lasers out, 10% of frames lost', 'all frames arrive')
+    ('lasers out, 10 % of frames lost', 'all frames arrive')
     """
-    parts = [(not lgs, "lasers out"), (not ngs, "no NGS frames"), (loss > 0, f"{loss:.0%} of frames lost")]
+    parts = [(not lgs, "lasers out"), (not ngs, "no NGS frames"), (loss > 0, f"{100.0 * loss:.0f} % of frames lost")]
     return ", ".join(line for holds, line in parts if holds) or "all frames arrive"
 
 
