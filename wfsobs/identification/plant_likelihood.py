@@ -147,6 +147,16 @@ class PlantFit:
 class PlantLikelihood:
     """Measurements, and commands of up to LONGEST + 1 frames before, of the modes of a group, with their Fourier transforms."""
 
+    n: int
+    dt: float
+    k: int
+    f: Array
+    u: Array
+    y: Array
+    U: Array
+    missing: list[MissingSamples]
+    is_blind: bool
+
     def __init__(self, y: Array, u: Array, dt: float):
         skip = LONGEST + 1
         self.n, self.dt, self.k = fast_length(len(y) - skip), dt, y.shape[1]
@@ -159,7 +169,7 @@ class PlantLikelihood:
         self.missing = [MissingSamples(np.isnan(x), dt, np.random.default_rng(0)) for x in self.y.T]
         self.U = np.array([self.transform(x) for x in self.u])
         known, is_told = np.isnan(self.y).sum(axis=1) == 0, ~lost[skip : skip + self.n]
-        self.is_blind: bool = any(m.any for m in self.missing) and lacks_missing(self.filled_y, self.u[0], known, is_told)
+        self.is_blind = any(m.any for m in self.missing) and lacks_missing(self.filled_y, self.u[0], known, is_told)
 
     def without(self, own: Array) -> PlantLikelihood:
         """Return the same measurements with commands that lack a part (n, k)."""
