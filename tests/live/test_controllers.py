@@ -190,6 +190,19 @@ def test_what_diverges_is_switched_off_and_a_supervised_one_is_not():
     assert np.isnan(ControlView(0, record.dt, rows[-1:]).residual("lqg-kf-lgs")).all()
 
 
+def test_what_ends_in_an_error_is_switched_off_and_the_others_go_on(monkeypatch):
+    said = queue.Queue()
+    crew, record = crew_of(paper().replace(SMALL), ("integrator", "lqg-kf-lgs"), said)
+    law, frames = crew._waiting["lqg-kf-lgs"].controller.law, iter(range(300))
+    monkeypatch.setattr(law, "command", lambda *_: {k: np.zeros(2) for k in range(299)}[next(frames)])
+    rows = rows_of(crew, record)
+    view = ControlView(0, record.dt, rows)
+    assert np.isfinite(view.residual("integrator")).all()
+    assert np.isnan(view.residual("lqg-kf-lgs")[299:]).all() and np.isfinite(view.residual("lqg-kf-lgs")[:299]).all()
+    words = [event.line for event in said.queue][2:]
+    assert words == ["lqg-kf-lgs off", "ALARM lqg-kf-lgs: KeyError: 299"]
+
+
 def test_a_new_design_goes_on_with_the_mirror_where_it_is():
     scenario = paper().replace(
         {**SMALL, "run.duration": 2.5, "control.supervised": True, "plant.resonance": 400.0, "plant.hysteresis": 0.1}

@@ -304,7 +304,8 @@ class StepController(StepBase):
         Raises
         ------
         StepError
-            A wrong shape, an infinite number, an NGS frame that is not due. The frame is then not taken, and no command is given.
+            A wrong shape, an infinite number, an NGS frame that is not due: the frame is then not taken, and no command is given.
+            Or an error of the law or the prediction.
         """
         return self._take(y, ngs, stars, "y", is_open=False)
 
@@ -353,14 +354,14 @@ class StepController(StepBase):
             push_row(self._mirror, seen)
         if slow is not None:
             slow = self._complete_ngs(slow if is_open else slow - self._mirror.mean(axis=0))
-        forward = self._none
-        if self.ahead is not None:
-            z, forward = self.ahead.split(z)
-        u = self._none.copy()
-        if self.law is not None:
-            self.law.see_stars(stars)
-            u = self.plant.mirror.clip_commands(self.law.command(z, slow, forward), self._commands[0])
-            self.law.tell(u, forward)
+        forward, u = self._none, self._none.copy()
+        with self._naming:
+            if self.ahead is not None:
+                z, forward = self.ahead.split(z)
+            if self.law is not None:
+                self.law.see_stars(stars)
+                u = self.plant.mirror.clip_commands(self.law.command(z, slow, forward), self._commands[0])
+                self.law.tell(u, forward)
         push_row(self._commands, u)
         self.frame += 1
         return u
@@ -368,7 +369,8 @@ class StepController(StepBase):
     def settle(self) -> None:
         """Do what does not need to be done before the command is out; the next `update` does it otherwise."""
         if self.ahead is not None:
-            self.ahead.estimator.settle()
+            with self._naming:
+                self.ahead.estimator.settle()
 
     def take_over(self, old: StepController) -> None:
         """Go on where another design of the same controller is, without a bump.

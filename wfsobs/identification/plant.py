@@ -44,8 +44,8 @@ SHORTEST, MOST_STEPS = 1000, 100_000
 """Minimum frames of a record; frames that are looked at, its first."""
 
 MOST_MISSING, MOST_UNTOLD = 0.2, 0.03
-"""Share of missing frames beyond which no plant is identified or excluded: of a third a shorter delay seems likelier; and that
-where the loop had them and there is no probe: then 5 % are enough for it."""
+"""Share of missing frames beyond which no plant is identified or excluded: with a third of them a shorter delay is likelier. The
+second one holds where the controller received them and there is no probe: 5 % are then enough for that."""
 
 FROZEN = 100
 """Frames in a row with the same measurement that are taken for one that was not renewed."""
@@ -125,8 +125,8 @@ class GroupPlant:
         Probability that what the measurements hold of a probe beside this plant, and beside one of a delay and a gain alone, is
         chance; where the first is below `OTHERWISE` nothing is identifiable. 1 where a probe is small.
     untold : float
-        Share of frames that are missing though the loop had them; where it is above `MOST_UNTOLD` and a probe is small nothing is
-        identifiable.
+        Share of frames that are missing although the controller received them, where without a probe it is above `MOST_UNTOLD`:
+        nothing is identifiable then. Otherwise 0.
     """
 
     modes: tuple[str, ...]
@@ -275,10 +275,10 @@ def plant_lines(groups: Sequence[GroupPlant]) -> list[str]:
         if chance < OTHERWISE
     ]
     untold = [
-        f"{' and '.join(g.modes)}: {100.0 * g.untold:.2g} % of the frames are missing, which the loop had: "
-        f"without a probe no plant is identifiable where more than {100.0 * MOST_UNTOLD:g} % are"
+        f"{' and '.join(g.modes)}: {100.0 * g.untold:.2g} % of the frames that the controller received are missing: "
+        f"without a probe no plant is identifiable beyond {100.0 * MOST_UNTOLD:g} %"
         for g in groups
-        if g.untold > MOST_UNTOLD and g.own_share <= PROBED
+        if g.untold
     ]
     return [
         *otherwise,
@@ -333,7 +333,8 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
     both = np.column_stack([pooled[:, 0], np.eye(len(pooled))[:, 1:]])
     each, ties = (_over_delays(data, each, gains), gains) if one_delay else (_over_delays(data, apart, both), both)
     chance, rigid, mirror, swinging = 1.0, 1.0, each, None
-    untold = 0.0 if data.is_blind else max(float(missing.is_missing.mean()) for missing in data.missing)
+    gone = 0.0 if data.is_blind else max(float(missing.is_missing.mean()) for missing in data.missing)
+    untold = gone if gone > MOST_UNTOLD and excited <= PROBED else 0.0
     if excited > PROBED:
         rigid, (mirror, swinging) = data.response_left(each, own), _with_dynamics(data, each, ties)
         chance = data.response_left(mirror, own)
@@ -354,8 +355,7 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
         value, sd = float(fit.theta[i]), float(np.sqrt(max(fit.covariance[i, i], 0.0)))
         widest = WIDEST_DELAY if i < k else WIDEST_GAIN * abs(value) if i < 2 * k else WIDEST_ANGLE
         near = all(abs(rival[i]) <= APART * sd for rival in rivals)
-        is_known = near and 0.0 < sd < widest and chance >= OTHERWISE and (untold <= MOST_UNTOLD or excited > PROBED)
-        return PlantNumber(value, sd) if is_known else PlantNumber()
+        return PlantNumber(value, sd) if near and 0.0 < sd < widest and chance >= OTHERWISE and not untold else PlantNumber()
 
     delay, gain = tuple(number(each, i) for i in range(k)), tuple(number(each, k + i) for i in range(k))
     rotation = number(each, 2 * k) if k == 2 else None

@@ -90,8 +90,8 @@ ORDER, SPAN, DEGREE = 16, 12, 4
 """Of the first guess: frames of the past that predict a measurement, and frames after it over which the response of a disturbance
 is a polynomial of this degree, which follows lines up to about a tenth of the rate."""
 
-ENOUGH = 4
-"""Predictions per coefficient."""
+PER_COEFFICIENT = 4
+"""Minimum number of frames per coefficient of a regression."""
 
 PEAKS, MOST_PEAKS, LOWEST = 10, 40, 5.0
 """Maximum number of resonances per mode, while a maximum is looked for and then; their minimum frequency [Hz]."""
@@ -145,7 +145,32 @@ class PlantFit:
 
 
 class PlantLikelihood:
-    """Measurements, and commands of up to LONGEST + 1 frames before, of the modes of a group, with their Fourier transforms."""
+    """Measurements, and commands of up to LONGEST + 1 frames before, of the modes of a group, with their Fourier transforms.
+
+    Attributes
+    ----------
+    n, k : int
+        Number of frames and of modes.
+    dt : float
+        Time step [s].
+    f : Array
+        Frequencies [Hz], (bins,).
+    y, u : Array
+        Measurements (n, k), NaN where one is missing or outlying, and commands of 0, 1, ... frames before, (lags, n, k) [um].
+    U : Array
+        Transform of the commands, (lags, k, bins).
+    missing : list of MissingSamples
+        The missing samples of every mode.
+    is_blind : bool
+        Whether the controller did not receive the missing measurements either (`missed_by_controller`).
+
+    Parameters
+    ----------
+    y, u : Array
+        As `known_signals` returns them, (n, k) [um].
+    dt : float
+        Time step [s].
+    """
 
     n: int
     dt: float
@@ -161,15 +186,16 @@ class PlantLikelihood:
         skip = LONGEST + 1
         self.n, self.dt, self.k = fast_length(len(y) - skip), dt, y.shape[1]
         self.f = periodogram_frequencies(self.n, dt)
-        lost, u = np.isnan(u).sum(axis=1) > 0, hold_last(u)
+        has_command, u = np.isnan(u).sum(axis=1) == 0, hold_last(u)
         u = u - u.mean(axis=0)
         self.u = np.array([u[skip - j : skip - j + self.n] for j in range(LONGEST + 2)])
-        self.y = (y - np.nanmean(y, axis=0))[skip : skip + self.n]
-        self.y = np.column_stack([np.where(np.isnan(x) | find_outlying(x), np.nan, x) for x in self.y.T])
+        y = (y - np.nanmean(y, axis=0))[skip : skip + self.n]
+        self.y = np.column_stack([np.where(np.isnan(x) | find_outlying(x), np.nan, x) for x in y.T])
+        self.y -= np.nanmean(self.y, axis=0)  # regressions have no constant
         self.missing = [MissingSamples(np.isnan(x), dt, np.random.default_rng(0)) for x in self.y.T]
         self.U = np.array([self.transform(x) for x in self.u])
-        known, is_told = np.isnan(self.y).sum(axis=1) == 0, ~lost[skip : skip + self.n]
-        self.is_blind = any(m.any for m in self.missing) and lacks_missing(self.filled_y, self.u[0], known, is_told)
+        masks = np.isnan(y).sum(axis=1) > 0, np.isnan(self.y).sum(axis=1) == 0, has_command[skip : skip + self.n]
+        self.is_blind = any(m.any for m in self.missing) and missed_by_controller(self.filled_y, self.u[0], *masks)
 
     def without(self, own: Array) -> PlantLikelihood:
         """Return the same measurements with commands that lack a part (n, k)."""
@@ -192,10 +218,14 @@ class PlantLikelihood:
 
         plain : without a background, which the commands of a wrong plant look like
         """
-        fill = Fill(self, spectra, None if self.is_blind else theta)
+        fill = self.fill(theta, spectra)
         some = zip(fill.z(theta).T, spectra or [None] * self.k, strict=True)
         found = [quick_spectrum(x, self.dt, most, LOWEST, s, complete=not plain) for x, s in some]
         return PlantFit(theta, [replace(s, background=None) if plain else s for s in found], fill=fill)
+
+    def fill(self, theta: Array, spectra: Sequence[Spectrum]) -> Fill:
+        """Return the measurements filled by spectra, and by the plant where the controller received what is missing."""
+        return Fill(self, spectra, None if self.is_blind else theta)
 
     def mirror_signal(self, theta: Array) -> Array:
         """Return the commands as the measurements see them, (n, k)."""
@@ -237,10 +267,13 @@ class PlantLikelihood:
         return fill.Y - (matrix * m).sum(axis=1), np.array(by_delay + by_gain + by_angle + by_shape)
 
     def fit(self, start: PlantFit, ties: Array) -> PlantFit:
-        """Return `newton_fit`, and again with missing samples that are filled by what it finds, so that likelihoods compare."""
+        """Return `newton_fit`, repeated with samples filled by its spectra where the controller missed them.
+
+        The likelihoods of several fits can then be compared, each with its own fill. Parameters as of `newton_fit`.
+        """
         found = self.newton_fit(start, ties)
         for _ in range(REFILLS * self.is_blind):
-            found = self.newton_fit(replace(found, fill=Fill(self, found.spectra, None)), ties)
+            found = self.newton_fit(replace(found, fill=self.fill(found.theta, found.spectra)), ties)
         return found
 
     def newton_fit(self, start: PlantFit, ties: Array, *, stays: bool = False) -> PlantFit:
@@ -249,7 +282,7 @@ class PlantLikelihood:
         ties : theta by its free numbers (p, q);  stays : delays do not go beyond the whole numbers on either side
         """
         theta, spectra, mirror = start.theta, list(start.spectra), start.mirror
-        fill = start.fill or Fill(self, spectra, theta)
+        fill = start.fill or self.fill(theta, spectra)
         cells = [Cells(self.f, np.zeros_like(self.f), np.ones_like(self.f), [p.frequency for p in s.resonances]) for s in spectra]
         lower, held = np.minimum(theta[: self.k].astype(int), LONGEST), 1e-3
         best, F, q = np.inf, np.zeros((0, 0)), ties.shape[1]
@@ -302,7 +335,7 @@ class PlantLikelihood:
     ) -> tuple[Array, Array]:
         """Return the expected second derivatives and the gradient of - log L by the free numbers of plant and spectra.
 
-        shares : of the samples of each mode that tell of its spectrum
+        shares : of the samples of each mode that carry information on its spectrum
         """
         dZ = np.tensordot(ties.T, dZ, 1)
         q = len(dZ)
@@ -372,22 +405,23 @@ class PlantLikelihood:
 
 
 class Fill:
-    """Transforms of measurements and commands with samples in the place of those that are missing.
+    """Transforms of measurements and commands without gaps.
 
-    By spectra of z these are their expectation given all others, else straight lines. Where the loop lacked the measurements,
-    these and the commands are filled alike: the z of any plant is linear in them, and so filled as well. Where it had them, its
-    commands tell of what is missing, but not what: the measurements alone are filled, by one plant.
+    Missing samples are replaced by their expectation given all others, for the spectra of z, or by straight lines. Where the
+    controller missed them, measurements and commands are filled alike: z is linear in them, so that the z of any plant is filled
+    as well. Where the controller received them, the commands depend on them, by a law that is not known: the measurements alone
+    are filled, with the z of one plant.
 
     Attributes
     ----------
     Y : Array
         Transform of the measurements, (k, bins).
     power : Array
-        What the spectra of z lack where the samples are filled, (k, bins).
+        Power that the periodogram of z lacks because samples are filled, (k, bins).
     spectra_share : sequence of float
-        Share of the samples of each mode that tell of its spectrum, where the plant is told of no more than it is.
+        Share of the samples of each mode that count in the information on its spectrum.
     plant_share : float
-        Share of the samples that tell of the plant, where others count as well.
+        Factor of the information on the plant: filled samples count in it unless measurements and commands are filled alike.
 
     Parameters
     ----------
@@ -396,7 +430,7 @@ class Fill:
     spectra : sequence of Spectrum
         Of z by mode; none for straight lines.
     theta : Array or None
-        The plant by which the measurements alone are filled.
+        The plant by which the measurements alone are filled; None to fill the commands as well.
     """
 
     def __init__(self, data: PlantLikelihood, spectra: Sequence[Spectrum], theta: Array | None):
@@ -468,36 +502,41 @@ def prediction_errors(y: Array, u: Array, rows: Array | None = None) -> tuple[Ar
     return new_y, new_u
 
 
-TOLD = 5
-"""Least number of frames per coefficient by which it is decided whether the loop had what is missing."""
+def missed_by_controller(y: Array, u: Array, is_missing: Array, is_known: Array, has_command: Array) -> bool:
+    """Test whether the controller did not receive the measurements that are missing.
 
-
-def lacks_missing(y: Array, u: Array, is_known: Array, is_told: Array) -> bool:
-    """Return whether a loop itself lacked the measurements that are not known.
-
-    Then its commands there are what its law makes of a measurement of zero, or of the expected one. If it had them, what is new
-    in the commands is as large as elsewhere. False where too few frames tell.
+    Its command is then what its law gives for a measurement of zero, or for the expected one, and a regression on both leaves as
+    little of it as the law leaves where the measurement is known. A command that follows from a measurement leaves as much as a
+    prediction from the past alone.
 
     Parameters
     ----------
     y, u : Array
-        Measurements, with any numbers where they are missing, and commands, (n, k).
-    is_known, is_told : Array
-        Which measurements and which commands are known, bool (n,).
+        Measurements, any numbers where one is missing, and commands, (n, k).
+    is_missing, is_known : Array
+        Which measurements are missing, and which are neither missing nor outlying, bool (n,).
+    has_command : Array
+        Which commands are in the record, bool (n,).
+
+    Returns
+    -------
+    bool
+        False also where there are fewer than PER_COEFFICIENT frames per coefficient.
     """
-    since = np.asarray(sliding_window_view(is_known, ORDER).all(axis=1))[:-1]
-    past, k = past_of(y, u), u.shape[1]
-    now, lost = since & is_known[ORDER:], since & ~is_known[ORDER:] & is_told[ORDER:]
-    if np.count_nonzero(now) < TOLD * past.shape[1] or np.count_nonzero(lost) < TOLD * 2 * k:
+    windows = ((is_known, ORDER), (has_command, ORDER + 1))
+    known, sent = (np.asarray(sliding_window_view(x, n).all(axis=1)) for x, n in windows)
+    since = known[:-1] & sent
+    past, k, now, gone = past_of(y, u), u.shape[1], since & is_known[ORDER:], since & is_missing[ORDER:]
+    if np.count_nonzero(now) < PER_COEFFICIENT * past.shape[1] or np.count_nonzero(gone) < PER_COEFFICIENT * 2 * k:
         return False
-    both = np.column_stack([past[now], y[ORDER:][now]])
-    law, expected = (np.linalg.lstsq(x, u[ORDER:][now], rcond=1e-10)[0] for x in (both, past[now]))
-    sizes = [np.sum((u[ORDER:][now] - x @ c) ** 2) / k for x, c in ((both, law), (past[now], expected))]
-    n, p = past[now].shape
-    own, new = np.array(sizes) * (n + p) / (n * (n - p))  # at other frames
-    hints = np.column_stack([past[lost] @ law[:-k], past[lost] @ expected])
-    left = u[ORDER:][lost] - hints @ np.linalg.lstsq(hints, u[ORDER:][lost], rcond=1e-10)[0]
-    return bool(np.sum(left**2) / (k * (len(left) - 2 * k)) < 0.5 * (own + new))
+    y, u, past, now_past = y[ORDER:], u[ORDER:], past[gone], past[now]
+    both = np.column_stack([now_past, y[now]])
+    law, expected = (np.linalg.lstsq(x, u[now], rcond=1e-10)[0] for x in (both, now_past))
+    n, p = now_past.shape
+    own, new = (np.sum((u[now] - x @ c) ** 2) * (n + p) / (n * (n - p)) for x, c in ((both, law), (now_past, expected)))
+    hints = np.column_stack([past @ law[:-k], past @ expected])
+    left = u[gone] - hints @ np.linalg.lstsq(hints, u[gone], rcond=1e-10)[0]
+    return bool(np.sum(left**2) / (len(left) - 2 * k) < 0.5 * (own + new))
 
 
 def smooth_basis() -> Array:
@@ -517,7 +556,7 @@ def guess_plant(data: PlantLikelihood) -> tuple[Array, float, Array]:
     """
     y, u, k, n = data.filled_y, data.u[0], data.k, data.n - ORDER
     known = np.asarray(sliding_window_view(~np.isnan(data.y).any(axis=1), ORDER + 1).all(axis=1))
-    is_enough = np.count_nonzero(known) >= ENOUGH * 2 * k * ORDER
+    is_enough = np.count_nonzero(known) >= PER_COEFFICIENT * 2 * k * ORDER
     w, v = prediction_errors(y, u, known if is_enough else None)
     turn = -np.linalg.lstsq(w, v, rcond=None)[0]
     own = v + w @ turn

@@ -363,7 +363,10 @@ class ControlCrew(Crew[Beside]):
         return not (self._active or self._waiting)
 
     def take(self, frame: LiveFrame, number: int) -> Array:
-        """Have every controller take a frame; return the row of what they leave."""
+        """Have every controller take a frame; return the row of what they leave.
+
+        A controller that diverges or ends in an error is switched off.
+        """
         self._start_waiting(number)
         ngs = None if np.isnan(frame.ngs[0]) else frame.ngs
         disturbance = frame.turbulence + frame.vibration
@@ -371,11 +374,15 @@ class ControlCrew(Crew[Beside]):
         for name, member in list(self._active.items()):
             seat, controller = SEATS.index(name), member.controller
             measured = frame.z + member.loop.correction
-            member.take(frame.z, ngs)
-            self._tell_reason(name, member, number)
-            if member.loop.has_diverged:
+            try:
+                member.take(frame.z, ngs)
+                self._tell_reason(name, member, number)
+                end = LiveEvent(number, "{} diverges", name, kind=ALARM) if member.loop.has_diverged else None
+            except StepError as error:
+                end = LiveEvent(number, str(error), kind=ALARM)
+            if end:
                 self.follow({"id": name, "design": None}, number)
-                self._say(LiveEvent(number, "{} diverges", name, kind=ALARM))
+                self._say(end)
                 continue
             left = disturbance + member.loop.correction
             # without truth, what its sensor would have seen

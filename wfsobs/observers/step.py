@@ -32,7 +32,7 @@ class StepError(ValueError):
 
 
 class Naming:
-    """A context in which what an observer or a controller raises, of another package perhaps, is a StepError that names it."""
+    """Context that turns what an observer or a controller, perhaps of another package, raises into a StepError with its id."""
 
     def __init__(self, id: str):
         self._id = id
@@ -205,6 +205,7 @@ class StepBase:
         each_shape: tuple[int, int] | None = None,
     ):
         self.id, self.sampling, self.uses_ngs, self.bridges, self.frame = id, sampling, uses_ngs, bridges, 0
+        self._naming: Naming = Naming(id)
         self._ratio = sampling.ratio or 0
         self._lgs, self._ngs = bridges or (None, None)
         if not uses_ngs:
@@ -332,7 +333,6 @@ class StepObserver(StepBase):
         super().__init__(id, sampling, needs_ngs, bridges, gate, self._each_shape)
         self._parts[id] = estimator
         self._allowed_requests: set[tuple[float, str]] = set()
-        self._naming = Naming(id)
         self._nothing = np.full(sampling.n_modes, np.nan)
         self._see_stars: Callable[[int | None], None] | None = getattr(estimator, "see_stars", None)
         self._see_each: Callable[[Array], None] | None = getattr(estimator, "see_each", None)
