@@ -136,16 +136,11 @@ def test_killed_workers_and_a_killed_campaign_change_nothing(plan, undisturbed, 
 
 
 def test_a_stopped_campaign_finishes_its_batches_and_resumes(plan, undisturbed, tmp_path):
-    process = subprocess.Popen(
-        [*COMMAND, "campaign", "run", str(plan), "--out", str(tmp_path), "--workers", "1"],
-        env=ENVIRONMENT,
-        stderr=subprocess.PIPE,
-    )
-    while not (tmp_path / "rows").exists():
-        time.sleep(0.05)
+    process, _ = start_short(plan, tmp_path)
     process.send_signal(signal.SIGTERM)
     _, said = process.communicate(timeout=ENOUGH)
     assert process.returncode == 143 and b"the same command resumes" in said
+    assert f"{RUNS} of {RUNS} runs are done".encode() not in said
     campaign("run", plan, "--out", tmp_path, "--workers", 1)
     assert campaign("table", tmp_path, "--csv").stdout == campaign("table", undisturbed, "--csv").stdout
 
@@ -274,3 +269,25 @@ def test_the_plan_says_how_much_it_is(plan):
     assert f"Tiny: 2 scenarios x {SEEDS} seeds = {RUNS} runs" in said and "turbulence.wind_speed: 5, 10" in said
     # in each run 2 modes; turbulence, vibration and both of kf-lgs and two bounds, turbulence alone of persistence
     assert f"{RUNS * 2 * (3 * 3 + 1)} rows" in said
+
+
+STOPPED_LATE = """
+import signal
+from wfsobs.campaign import run
+from wfsobs.cli import main
+
+class Batches(run._Batches):
+    def learn(self, *of):
+        super().learn(*of)
+        signal.raise_signal(signal.SIGTERM)
+
+run._Batches = Batches
+if __name__ == "__main__":
+    main()
+"""
+
+
+def test_a_campaign_that_is_stopped_in_its_last_batch_is_done(plan, tmp_path):
+    command = [sys.executable, "-c", STOPPED_LATE, "campaign", "run", str(plan), "--out", str(tmp_path), "--workers", "1"]
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, timeout=ENOUGH)
+    assert done.returncode == 0 and f"{RUNS} of {RUNS} runs are done".encode() in done.stderr and b"resumes" not in done.stderr

@@ -162,7 +162,7 @@ def test_an_envelope_is_drawn_with_its_own_numbers(envelope: PlantEnvelope) -> N
 
 
 def test_long_traces_keep_their_extremes(result: wfsobs.Result) -> None:
-    lines = curves(result.plot.traces(target="turbulence", observers=["kf-lgs"]))
+    lines = curves(result.plot.traces(target="turbulence", observers="kf-lgs"))
     assert lines.keys() == {"LGS KF", "Truth"}
     truth = result.record.turbulence
     assert truth is not None
@@ -509,7 +509,7 @@ def test_what_cannot_be_drawn_is_one_line(
     for draw, why in (
         (lambda: result.plot.traces(mode="focus"), "mode 'focus': there are tip, tilt"),
         (lambda: result.plot.spectra(target="noise"), "target 'noise': there are turbulence, vibration"),
-        (lambda: result.plot.traces(observers=["kf"]), "observer 'kf': there are kf-lgs, "),
+        (lambda: result.plot.traces(observers="kf"), "observer 'kf': there are kf-lgs, "),
         (lambda: result.plot.traces(observers=["gpr-online"], target="turbulence", of_error=True), "no estimate of turbulence"),
         (lambda: result.plot.errors(target="noise"), "there is no error of noise"),
         (lambda: result.plot.traces(start=2.0, stop=2.0), "from 2 s to 2 s: the record has 3 s"),

@@ -297,9 +297,12 @@ def newest(source: Subscription, is_wanted: Callable[[np.ndarray], bool]) -> tup
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        (["--in", "tcp://nowhere", "--shadow"], "tcp://nowhere: Invalid argument"),
-        (["--in", "SHM", "--shadow", "--ngs", "tcp://nowhere", "--observer", "gp-both"], "tcp://nowhere: Invalid argument"),
-        (["--in", "SHM", "--out", "tcp://nowhere"], "tcp://nowhere: Invalid argument"),
+        (["--in", "tcp://nowhere", "--shadow"], "tcp://nowhere: takes a port up to 65535, as in tcp://localhost:5555"),
+        (
+            ["--in", "SHM", "--shadow", "--ngs", "tcp://nowhere", "--observer", "gp-both"],
+            "tcp://nowhere: takes a port up to 65535",
+        ),
+        (["--in", "SHM", "--out", "tcp://nowhere"], "tcp://nowhere: takes a port up to 65535"),
         (["--in", "tcp://localhost:65536", "--shadow"], "tcp://localhost:65536: takes a port up to 65535"),
         (["--in", "SHM", "--out", "tcp://*:70000"], "tcp://*:70000: takes a port up to 65535"),
     ],

@@ -312,7 +312,7 @@ def run(plan_file: str, out: str, workers: int | None, scheduler: str | None, sh
     else:
         lost = f"; workers or their scheduler were lost {state.breaks} times, and their batches ran again" if state.breaks else ""
         print_note(f"{out}: {state.n_done} of {state.total} runs are done, {state.runs} of them now{lost}")
-    if stop():
+    if stop() and state.n_done < state.total:
         print_note("stopped; the same command resumes")
         sys.exit(STOPPED)
 

@@ -38,6 +38,7 @@ from wfsobs.plot.elements import (
 )
 from wfsobs.plot.looks import TERM_COLOURS, look
 from wfsobs.record import Record, hold_last
+from wfsobs.registry import name_list
 from wfsobs.scenario.configfile import Variation
 from wfsobs.sensors.zernike import MODE_NAMES
 from wfsobs.signal.spectrum import psd
@@ -59,8 +60,8 @@ SIGNALS = {
 }
 """What is drawn of a record."""
 
-Selection = Sequence[str] | None
-"""Ids of what is drawn; None for all that there is."""
+Selection = Sequence[str] | str | None
+"""Ids of what is drawn, or one of them; None for all that there is."""
 
 
 @dataclass(frozen=True)
@@ -144,10 +145,10 @@ class ResultPlots:
     def errors(self, *, observers: Selection = None, target: str | None = None, mode: str | None = None) -> hv.Layout:
         """Draw the errors of the table as bars, the least on top, each with its 95 % interval; limits among them."""
         (name, _), figures = _mode_of(self.result.record.n_modes, mode), []
-        self._check(observers)
+        chosen = self._choose(observers)
         for of in dict.fromkeys(s.target for s in self.result.scores):
-            rows = [s for s in self.result.scores if (s.target, s.mode) == (of, name)]
-            rows = sorted((s for s in rows if observers is None or s.observer in observers), key=lambda s: s.rms)
+            rows = [s for s in self.result.scores if (s.target, s.mode) == (of, name) and s.observer in chosen]
+            rows.sort(key=lambda s: s.rms)
             if rows and target in (None, of):
                 x = quantity(f"rms {of} {name}", "nm", f"rms error, {of}, {name}")
                 of_rows = [(row_label(s.observer), [NM * s.rms], [look(s.observer).light]) for s in rows]
@@ -164,7 +165,7 @@ class ResultPlots:
         Those that are not linear have one only where they are named in `observers`. Raises ValueError where there is none.
         """
         (name, _), figures = _mode_of(self.result.record.n_modes, mode), []
-        self._check(observers)
+        self._choose(observers)
         found = [it for it in error_budget(self.result, observers=observers, mode=name) if it.terms]
         for of in dict.fromkeys(it.target for it in found):
             rows = sorted((it for it in found if it.target == of), key=lambda it: it.total)
@@ -180,11 +181,11 @@ class ResultPlots:
     def _signals(self, observers: Selection, target: str | None, of_error: bool) -> dict[str, dict[str, Array]]:
         """Return target -> what is drawn of it -> (n_steps, n_modes) [um]: the truth, last and so on top, where there is one."""
         out: dict[str, dict[str, Array]] = {}
-        self._check(observers)
+        chosen = self._choose(observers)
         for of in TARGETS if target is None else (_one_of(TARGETS, target, "target"),):
             truth = self.result.record.truth(of)
-            own = {e.observer: e.values for e in self.result.estimates if e.target == of and e.observer != NO_ESTIMATE}
-            own = {key: x for key, x in own.items() if observers is None or key in observers}
+            some = [e for e in self.result.estimates if e.target == of and e.observer in chosen and e.observer != NO_ESTIMATE]
+            own = {e.observer: e.values for e in some}
             if of_error and truth is None:
                 raise ValueError(f"the record has no true {of}, so no error of an estimate: of_error=False draws estimates")
             if of_error:
@@ -195,9 +196,9 @@ class ResultPlots:
             raise ValueError(f"nothing to draw: there is no estimate of {target or 'any target'}")
         return {of: signals for of, signals in out.items() if signals}
 
-    def _check(self, observers: Selection) -> None:
-        """Raise ValueError for an observer that has neither an estimate nor a score."""
-        _check(observers, list(dict.fromkeys(it.observer for it in (*self.result.estimates, *self.result.scores))), "observer")
+    def _choose(self, observers: Selection) -> list[str]:
+        """Return the ids that are chosen. Raises ValueError for an observer that has neither an estimate nor a score."""
+        return _choose(observers, [it.observer for it in (*self.result.estimates, *self.result.scores)], "observer")
 
     def _of_frequency(
         self,
@@ -257,13 +258,13 @@ class SweepPlots:
         known = self.results.known_keys()
         name = _one_of(list(dict.fromkeys(key[2] for key in known)), mode, "mode")
         _one_of(list(dict.fromkeys(key[1] for key in known)), target, "target")
-        _check(observers, list(dict.fromkeys(key[0] for key in known)), "observer")
+        chosen = _choose(observers, [key[0] for key in known], "observer")
         y = quantity(f"mean rms {target} {name}", "nm", f"mean rms error\n{target}, {name}")
         if len(self.results.sweep.axes) == 2:
             return self._map(target, name, y)
         (axis,) = self.results.sweep.axes
         (x, places, ticks), parts = self._place("x", axis), []
-        for key in [k for k in known if k[1:] == (target, name) and (observers is None or k[0] in observers)]:
+        for key in [k for k in known if k[1:] == (target, name) and k[0] in chosen]:
             cells = [(at, self.results.error(i, key)) for i, at in enumerate(places)]
             points = np.array([(value, *(NM * e for e in error)) for value, error in cells if error is not None])
             if key[0] != NO_ESTIMATE and len(points):
@@ -305,20 +306,20 @@ class LoopPlots:
 
     def residuals(self, *, controllers: Selection = None, mode: str | None = None) -> hv.Overlay:
         """Draw power spectral densities of what every controller left."""
-        (name, column), dt = self._mode(controllers, mode), self.loop.record.dt
+        (chosen, name, column), dt = self._choose(controllers, mode), self.loop.record.dt
         y, lines = quantity(f"PSD of residual {name}", "nm²/Hz", f"PSD of residual\n{name}"), []
         for it in self.loop.outcomes:
-            if it.residual is not None and (controllers is None or it.controller in controllers):
+            if it.residual is not None and it.controller in chosen:
                 frequency, density = psd(it.residual[round(self.loop.design.start / dt) :], dt)
                 lines.append(draw_line(frequency[1:], NM**2 * density[1:, column], (FREQUENCY, y), it.controller))
         return overlay(_some(lines, "residual"), log="xy")
 
     def errors(self, *, controllers: Selection = None, mode: str | None = None) -> hv.Overlay:
         """Draw the rms of what every controller left as bars, the least on top."""
-        name, column = self._mode(controllers, mode)
+        chosen, name, column = self._choose(controllers, mode)
         left = {it.controller: residual_rms(it, self.loop.record, self.loop.design.start) for it in self.loop.outcomes}
         known = {key: NM * rms[column] for key, rms in left.items() if rms is not None}
-        known = {key: known[key] for key in sorted(known, key=known.__getitem__) if controllers is None or key in controllers}
+        known = {key: known[key] for key in sorted(known, key=known.__getitem__) if key in chosen}
         x = quantity(f"rms of residual {name}", "nm", f"rms of residual, {name}")
         _some(list(known), "residual")
         return overlay([draw_bars([(look(k).label, [v], [look(k).light]) for k, v in known.items()], x)], rows=len(known))
@@ -342,13 +343,13 @@ class LoopPlots:
         style(point, color="black", bokeh={"marker": "star", "size": 9}, matplotlib={"marker": "*", "s": 30})
         return overlay([*parts, point], xlim=(-3.0, 1.5), ylim=(-2.0, 2.0))
 
-    def _mode(self, controllers: Selection, mode: str | None) -> tuple[str, int]:
-        _check(controllers, [it.controller for it in self.loop.outcomes], "controller")
-        return _mode_of(len(self.loop.scenario.modes), mode)
+    def _choose(self, controllers: Selection, mode: str | None) -> tuple[list[str], str, int]:
+        chosen = _choose(controllers, [it.controller for it in self.loop.outcomes], "controller")
+        return chosen, *_mode_of(len(self.loop.scenario.modes), mode)
 
     def _curves(self, controllers: Selection, mode: str | None) -> dict[str, Curves]:
-        (_, column), plan = self._mode(controllers, mode), self.loop.design
-        laws = {key: of[column] for key, of in plan.laws.items() if controllers is None or key in controllers}
+        (chosen, _, column), plan = self._choose(controllers, mode), self.loop.design
+        laws = {key: of[column] for key, of in plan.laws.items() if key in chosen}
         known = {key: it.law.poles for key, it in laws.items() if it.law and it.margins}
         return {key: curves(plan.loop(key, column), poles, self.loop.record.dt) for key, poles in known.items()}
 
@@ -368,13 +369,11 @@ class EnvelopePlots:
         over, unit = _one_of(list(of.errors), over, "error"), {"delay": "frames", "rotation": "deg"}.get(over, "")
         x, y = quantity(f"error of {over}", unit), quantity(f"rms {mode}", "nm", f"residual, {mode}")
         lines, found = list[Any](), of.curves(over, column)
-        _check(controllers, list(found), "controller")
-        for name, (at, mean, most) in found.items():
-            if controllers is None or name in controllers:
-                it, known = look(name), np.isfinite(mean)
-                lines.append(draw_line(at[known], NM * mean[known], (x, y), it))
-                worst = Look(f"{it.label}, worst", it.light, it.dark, (2, 2))
-                lines.append(draw_line(at[known], NM * most[known], (x, y), worst))
+        for name in _choose(controllers, list(found), "controller"):
+            (at, mean, most), it = found[name], look(name)
+            known, worst = np.isfinite(mean), Look(f"{it.label}, worst", it.light, it.dark, (2, 2))
+            lines.append(draw_line(at[known], NM * mean[known], (x, y), it))
+            lines.append(draw_line(at[known], NM * most[known], (x, y), worst))
         return overlay(_some(lines, "stable plant"), log="y")
 
 
@@ -416,10 +415,12 @@ def _some(parts: list[Any], what: str) -> list[Any]:
     return parts
 
 
-def _check(selection: Selection, names: Sequence[str], what: str) -> None:
-    """Raise ValueError for a name that is not there."""
-    for name in selection or ():
+def _choose(selection: Selection, names: Sequence[str], what: str) -> list[str]:
+    """Return which of some names are chosen, in their order. Raises ValueError for one that is not there."""
+    names, chosen = list(dict.fromkeys(names)), name_list(selection)
+    for name in chosen or ():
         _one_of(names, name, what)
+    return [name for name in names if chosen is None or name in chosen]
 
 
 def _samples(record: Record, start: float, stop: float | None) -> slice:

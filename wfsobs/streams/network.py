@@ -256,9 +256,9 @@ class Publication:
 def _open_socket(path: str, kind: str) -> zmq.Socket[bytes]:
     """Return a socket in a context of its own: SUB connected, PUB bound."""
     zmq = _zmq(path)
-    port = path.rpartition(":")[2]
-    if port.isdecimal() and int(port) > LARGEST_PORT:  # ZeroMQ would take another one
-        raise StreamError(f"{path}: takes a port up to {LARGEST_PORT}")
+    port = path.removeprefix(SCHEME).rpartition(":")[2]
+    if port != "*" and not (port.isdecimal() and int(port) <= LARGEST_PORT):  # ZeroMQ would take another one
+        raise StreamError(f"{path}: takes a port up to {LARGEST_PORT}, as in {SCHEME}localhost:5555")
     socket = zmq.Context().socket(getattr(zmq, kind))
     try:
         if kind == "PUB":
