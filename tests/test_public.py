@@ -142,6 +142,8 @@ def test_representations_are_one_line(result: wfsobs.Result) -> None:
         assert "\n" not in repr(made) and len(repr(made)) < 200
     assert "length 2 s, rate 1000 Hz, modes 2" in repr(result.record)
     assert repr(result).startswith("Result(2 observers, 24 scores, Record(")
+    assert repr(wfsobs.design("kf-lgs", result.scenario)) == "StepObserver(kf-lgs, frames 0, modes 2)"
+    assert "pieces" not in repr(result.scores[0])  # numbers by the dozen
 
 
 def test_a_notebook_shows_tables(result: wfsobs.Result) -> None:

@@ -8,7 +8,7 @@ The error against time shows the effect of an event, and how long each observer 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from hashlib import blake2b
 from math import pi, sqrt
@@ -306,7 +306,7 @@ class Score:
     interval: tuple[float, float] | None = None
     phases: tuple[float, ...] | None = None
     calibration: Calibration | None = None
-    pieces: tuple[tuple[float, float], ...] = ()
+    pieces: tuple[tuple[float, float], ...] = field(default=(), repr=False)
 
 
 Derive = Callable[[Estimate, str, Callable[[], Score]], Score]

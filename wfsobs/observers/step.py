@@ -218,6 +218,9 @@ class StepBase:
         self._parts: dict[str, Stateful] = {name: part for name, part in known.items() if part is not None}
         self._arrays: dict[str, Array] = {"lgs_history": self._lgs_history} if self._lgs_history.size else {}
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.id}, frames {self.frame}, modes {self.sampling.n_modes})"
+
     def reset(self) -> None:
         """Go back to before the first frame, a mirror at rest."""
         self.frame = 0
