@@ -3,7 +3,8 @@
 Plant and disturbance are identified (`wfsobs.identification`), the controllers are designed from what was found, and theory tells
 what each leaves with plants and on spectra that are drawn from their uncertainty: a design fits the spectra that it was made for
 better than any other. The mean square of the next record differs from that of the process by what a record of this length tells
-of it, which the scatter over simulations of what was identified shows; it is distributed as gamma.
+of it, which the scatter over simulations of what was identified shows; it is distributed as gamma. Where the loop lost frames, so
+does the next one, and simulations with and without these losses tell how much more is left.
 """
 
 from __future__ import annotations
@@ -53,6 +54,9 @@ DRAWS, RECORDS = 64, 8
 
 HIGHEST, NEAR_LINE = 0.49, 4
 """Largest frequency of a drawn resonance, over the rate; bins on either side of an undamped line that do not count."""
+
+LEFT = 0.05
+"""Part of the difference between two plants that may be lacking where samples are missing."""
 
 CRITICAL = 0.999
 """Largest damping ratio of a mirror that `TruePlant` takes."""
@@ -194,12 +198,14 @@ def make_promise(
     plan = design(told, None if names is None else [INTEGRATOR, *names])
     length = min(record.n_steps, MOST_STEPS // SECTIONS)
     model = simulate(told.replace({"run.duration": (SECTIONS * length + START) * record.dt, "run.seed": seed}))
+    models = [model, *with_losses(model, record, any(group.loss for group in groups))]
     inverse = np.linalg.inv(likeliest.matrix)
     plants = [replace(one, matrix=one.matrix @ inverse) for one in others]
     outlying = np.column_stack([find_outlying(column) for column in corrected.z.T])
     clean = replace(record, y_lgs=np.where(outlying, np.nan, record.y_lgs))
+    shares = measured_shares(found, as_seen(clean, likeliest).z)
     seen = (as_seen(clean, one).z for one in others)
-    drawn = [of(draw_spectra(found, z, rng)) for z in seen]
+    drawn = [of(draw_spectra(found, z, shares, rng)) for z in seen]
     spectra = [[true_spectra(one, mode) for mode in range(record.n_modes)] for one in drawn]
     left, out = dict[str, Array](), list[ResidualPromise]()
     common = rng.uniform(size=(DRAWS, RECORDS, 1))
@@ -215,13 +221,33 @@ def make_promise(
             out.append(ResidualPromise(name, note=next(iter(notes), "not stable")))
             continue
         squares = residuals(laws, plan.mirror, plants, spectra, watch) ** 2
-        (outcome,) = each_outcome(model, plan, watch, [name])
-        assert outcome.residual is not None
-        shape = record.n_steps / length / _scatter(outcome.residual[START:]) ** 2
+        runs = [outcome.residual for one in models for outcome in each_outcome(one, plan, watch, [name])]
+        if any(run is None for run in runs):
+            out.append(ResidualPromise(name, note="not stable where frames are lost"))
+            continue
+        whole, *_, lossy = (run[START:] for run in (*runs, *runs) if run is not None)
+        squares *= np.mean(lossy**2, axis=0) / np.mean(whole**2, axis=0)
+        shape = record.n_steps / length / _scatter(lossy) ** 2
         left[name] = (squares[:, None] * gamma.ppf(common, shape) / shape).reshape(-1, record.n_modes)
         out.append(_interval_of(name, left[name], left[INTEGRATOR]))
         watch.step((i + 1) / len(plan.laws))
     return Promise(told, groups, likeliest.matrix, tuple(mode.noise.value for mode in found.modes), tuple(out))
+
+
+def with_losses(model: Record, record: Record, lgs: bool) -> list[Record]:
+    """Return a model record that has lost what a record has, again and again; none where nothing is lost.
+
+    lgs : whether the loop of the record lost the LGS frames that are missing; of NGS frames it is taken to have
+    """
+    gone, ngs, y_ngs = np.isnan(record.y_lgs).any(axis=1) & lgs, record.ngs_gaps, model.y_ngs
+    if not (gone.any() or ngs.any()):
+        return []
+    y_lgs = np.where(np.resize(gone, model.n_steps)[:, None], np.nan, model.y_lgs)
+    if ngs.any() and y_ngs is not None and model.ratio is not None:
+        y_ngs = y_ngs.copy()
+        frames = y_ngs[model.ratio :: model.ratio]
+        frames[np.resize(ngs, len(frames))] = np.nan
+    return [replace(model, y_lgs=y_lgs, y_ngs=y_ngs)]
 
 
 def _interval_of(name: str, squares: Array, integrator: Array) -> ResidualPromise:
@@ -276,29 +302,45 @@ def draw_plants(groups: Sequence[GroupPlant], n_modes: int, rng: np.random.Gener
     return [TruePlant(one, late, 0.0, *mirror) for one, late, *mirror in each]
 
 
-def draw_spectra(identification: Identification, z: Array, rng: np.random.Generator) -> Identification:
-    """Return a model of the disturbance from the uncertainty of that which fits z, (n_steps, n_modes), best; undamped lines stay.
-
-    It is fitted from what was identified, which the z of another plant is near to.
-    """
-    modes, dt = [], identification.dt
-    z = z[LONGEST + 1 :]
-    z = z[: fast_length(len(z))]
+def measured_shares(identification: Identification, z: Array) -> list[Array]:
+    """Return the measured share of every bin of the spectra of z, (n_steps, n_modes), an array (bins,) for each mode."""
+    shares, dt, z = list[Array](), identification.dt, _cut(z)
     f = periodogram_frequencies(len(z), dt)
     for mode, column in zip(identification.modes, z.T, strict=True):
+        missing, S = MissingSamples(np.isnan(column), dt, np.random.default_rng(0)), mode.spectrum.psd(f)
+        shares.append(missing.measured_share(S, missing.draw_errors(S)) if missing.any else np.ones_like(f))
+    return shares
+
+
+def draw_spectra(identification: Identification, z: Array, shares: Sequence[Array], rng: np.random.Generator) -> Identification:
+    """Return a model of the disturbance from the uncertainty of that which fits z, (n_steps, n_modes), best; undamped lines stay.
+
+    It is fitted from what was identified, which the z of another plant is near to. shares : of `measured_shares`
+    """
+    modes, dt, z = [], identification.dt, _cut(z)
+    f = periodogram_frequencies(len(z), dt)
+    for mode, column, share in zip(identification.modes, z.T, shares, strict=True):
         missing, pure = MissingSamples(np.isnan(column), dt), [line for line in mode.prior.lines if not line.damping]
         keep = np.ones_like(f)
         for line in pure:
             keep[np.abs(f - line.frequency) < NEAR_LINE * f[0]] = 0.0
-        resonances = [p.omega / (2.0 * pi) for p in mode.spectrum.resonances]
-        cells = Cells(f, periodogram(missing.fill(column, mode.spectrum.psd(f)), dt), keep, resonances)
-        s = fit_spectrum(mode.spectrum, cells)
+        resonances, s = [p.omega / (2.0 * pi) for p in mode.spectrum.resonances], mode.spectrum
+        for _ in range(missing.rounds(LEFT)):
+            S = s.psd(f)
+            cells = Cells(f, periodogram(missing.fill(column, S), dt) + (1.0 - share) * S, keep, resonances, share)
+            s = fit_spectrum(s, cells)
         information = spectrum_information(s, cells) / inflation(len(z))
         spread = np.linalg.cholesky(np.linalg.inv(information + np.eye(len(information))))  # none by more than e
         s = s.with_vector(s.vector + spread @ rng.standard_normal(len(spread)))
         lines = tuple(Line(min(p.omega / (2.0 * pi), HIGHEST / dt), p.damping, p.rms) for p in s.resonances)
         modes.append(replace(mode, prior=Lines(s.noise, dt, s.continuum, (*lines, *pure))))
     return replace(identification, modes=tuple(modes))
+
+
+def _cut(z: Array) -> Array:
+    """Return the rows of z that every plant has commands for, of a length whose transform is fast."""
+    z = z[LONGEST + 1 :]
+    return z[: fast_length(len(z))]
 
 
 def as_seen(record: Record, plant: TruePlant) -> Record:

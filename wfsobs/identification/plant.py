@@ -127,6 +127,8 @@ class GroupPlant:
     untold : float
         Share of frames that are missing although the controller received them, where without a probe it is above `MOST_UNTOLD`:
         nothing is identifiable then. Otherwise 0.
+    loss : float
+        Share of frames that are missing because the controller did not receive them either.
     """
 
     modes: tuple[str, ...]
@@ -143,6 +145,7 @@ class GroupPlant:
     chance: float = 1.0
     rigid: float = 1.0
     untold: float = 0.0
+    loss: float = 0.0
     swinging: PlantFit | None = field(default=None, repr=False, compare=False)
 
     @property
@@ -280,9 +283,12 @@ def plant_lines(groups: Sequence[GroupPlant]) -> list[str]:
         for g in groups
         if g.untold
     ]
+    loss = max(group.loss for group in groups)
+    missed = f"{100.0 * loss:.2g} % of the frames are missing: the controller did not receive them either, as its commands tell"
     return [
         *otherwise,
         *untold,
+        *[missed] * (loss > 0.0),
         "gain: of mirror and sensor (optical gain) together, which cannot be told apart; negative of a flipped axis",
         "delay: group delay at low frequencies, that of the mirror included",
         f"disturbance: {form}; {basis}",
@@ -333,8 +339,8 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
     both = np.column_stack([pooled[:, 0], np.eye(len(pooled))[:, 1:]])
     each, ties = (_over_delays(data, each, gains), gains) if one_delay else (_over_delays(data, apart, both), both)
     chance, rigid, mirror, swinging = 1.0, 1.0, each, None
-    gone = 0.0 if data.is_blind else max(float(missing.is_missing.mean()) for missing in data.missing)
-    untold = gone if gone > MOST_UNTOLD and excited <= PROBED else 0.0
+    gone = max(float(missing.is_missing.mean()) for missing in data.missing)
+    untold, loss = gone * (not data.is_blind and gone > MOST_UNTOLD and excited <= PROBED), gone * data.is_blind
     if excited > PROBED:
         rigid, (mirror, swinging) = data.response_left(each, own), _with_dynamics(data, each, ties)
         chance = data.response_left(mirror, own)
@@ -370,7 +376,9 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
     peaks, coloured = tuple(len(s.resonances) for s in each.spectra), any(s.background for s in each.spectra)
     numbers = delay, gain, rotation, common_delay, common_gain
     swinging = replace(swinging, fill=None) if swinging and rigid < OTHERWISE <= chance else None
-    return GroupPlant(names, *numbers, uncertainty, peaks, coloured, excited, each.covariance, chance, rigid, untold, swinging)
+    return GroupPlant(
+        names, *numbers, uncertainty, peaks, coloured, excited, each.covariance, chance, rigid, untold, loss, swinging
+    )
 
 
 def _likeliest(*fits: PlantFit) -> PlantFit:
