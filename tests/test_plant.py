@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 from math import pi, sqrt
 from pathlib import Path
 
@@ -16,7 +17,14 @@ from wfsobs import PRESETS, simulate
 from wfsobs.cli import main
 from wfsobs.control.true_plant import ActingPlant, TruePlant
 from wfsobs.identification.plant import GroupPlant, PlantNumber, contradiction, identify_plant, plant_lines
-from wfsobs.identification.plant_likelihood import PlantLikelihood, few_lags, guess_plant, known_signals, second_order
+from wfsobs.identification.plant_likelihood import (
+    PlantLikelihood,
+    Response,
+    few_lags,
+    guess_plant,
+    known_signals,
+    second_order,
+)
 from wfsobs.identification.probe import design_probe
 from wfsobs.record import Record, RecordError
 from wfsobs.signal.autoregressive import Ar2
@@ -162,6 +170,37 @@ def test_whether_the_controller_missed_what_is_missing(share: float, probe: floa
         assert PlantLikelihood(*known_signals(record, 10_000), DT).is_blind is is_blind
     had.u[rows] = np.nan
     assert not PlantLikelihood(*known_signals(had, 10_000), DT).is_blind
+
+
+@pytest.mark.parametrize(
+    ("mirror", "shape"), [(None, ()), (partial(few_lags, 2), (0.1, -0.05)), (second_order, (np.log(0.2), np.log(0.5)))]
+)
+def test_z_of_any_plant_is_filled_alike(mirror: Response | None, shape: tuple[float, ...]) -> None:
+    """Where the controller missed frames, its transform is that of z with the missing samples filled; so are its derivatives."""
+    data = PlantLikelihood(*known_signals(closed_loop(4000, 1.7, np.eye(2), lost=0.1), 4000), DT)
+    theta = np.array([1.7, 1.9, 1.1, -0.9, 0.2, *shape])
+    spectra = data.with_spectra(theta).spectra
+    fill = data.fill(theta, spectra)
+    assert data.is_blind and fill.is_alike
+
+    def z(at: Array) -> Array:
+        m = data.mirror_signal(at)
+        if mirror is not None:
+            taps = np.fft.rfft([mirror(np.append(late, at[5:])) for late in at[:2]], data.n)
+            moved = np.fft.irfft(taps * np.fft.rfft(data.u[1].T), data.n)
+            m = ((rotation(at[4]) * at[2:4]) @ moved).T
+        each = zip(data.missing, (data.y - m).T, spectra, strict=True)
+        return data.transform(np.column_stack([missing.fill(one, s.psd(data.f)) for missing, one, s in each]))
+
+    Z, dZ = data.z(theta, fill, mirror=mirror)
+    scale = np.sqrt(np.mean(np.abs(Z) ** 2))
+    # samples are filled to 1e-3 of the noise
+    np.testing.assert_allclose(Z, z(theta), rtol=0, atol=0.01 * scale)
+    for i, slope in enumerate(dZ):
+        e = np.zeros(len(theta))
+        e[i] = 0.05
+        of_two = (z(theta + e) - z(theta - e)) / 0.1
+        assert np.sqrt(np.mean(np.abs(slope - of_two) ** 2)) < 0.05 * np.sqrt(np.mean(np.abs(of_two) ** 2)), i
 
 
 def test_no_probe_is_seen_in_too_few_frames() -> None:

@@ -22,7 +22,6 @@ from wfsobs.identification.plant_likelihood import (
     LONGEST,
     MOST_PEAKS,
     SHAPES,
-    Fill,
     PlantFit,
     PlantLikelihood,
     Response,
@@ -392,7 +391,7 @@ def _with_dynamics(data: PlantLikelihood, fit: PlantFit, ties: Array) -> tuple[P
     Returns the response over few lags, or the second-order one where its log-likelihood is larger by SWINGS; and the second-order
     one, None where its log-likelihood is smaller by RIVAL.
     """
-    ties, fill = block_diag(ties, np.eye(2)), Fill(data, fit.spectra, fit.theta)
+    ties, fill = block_diag(ties, np.eye(2)), data.fill(fit.theta, fit.spectra)
 
     def of(mirror: Response, shape: Sequence[float]) -> PlantFit:
         return data.newton_fit(replace(fit, theta=np.append(fit.theta, shape), mirror=mirror, fill=fill), ties)

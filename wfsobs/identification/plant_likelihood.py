@@ -25,7 +25,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.fft import rfft
+from scipy.fft import irfft, rfft
 from scipy.stats import chi2
 
 from wfsobs.record import Record, delay_signal, hold_last
@@ -253,8 +253,13 @@ class PlantLikelihood:
         steps = SMALL * np.eye(3)
         of_modes = [np.append(delay, theta[self.size :]) for delay in theta[: self.k]]
         taps = [[mirror(x), *((mirror(x + e) - mirror(x - e)) / (2.0 * SMALL) for e in steps)] for x in of_modes]
-        out = rfft(taps, self.n)[..., 1 : (self.n + 1) // 2] * self.U[1][:, None]
-        return out[None, :, 0], out[None, :, 1:]
+        response = rfft(taps, self.n)
+        if fill.is_alike:
+            moved = irfft(response * rfft(self.u[1].T)[:, None], self.n)
+            out = np.stack([fill.transform(x.T) for x in moved.swapaxes(0, 1)], axis=2)
+        else:
+            out = (response[..., 1 : (self.n + 1) // 2] * self.U[1][:, None])[None]
+        return out[:, :, 0], out[:, :, 1:]
 
     def z(self, theta: Array, fill: Fill, lower: Array | None = None, mirror: Response | None = None) -> tuple[Array, Array]:
         """Return the transform of z (k, bins) and its derivatives by theta (p, k, bins); lower : whole part of the delays."""
@@ -414,6 +419,8 @@ class Fill:
 
     Attributes
     ----------
+    is_alike : bool
+        Whether measurements and commands are filled alike.
     Y : Array
         Transform of the measurements, (k, bins).
     power : Array
@@ -436,11 +443,11 @@ class Fill:
     def __init__(self, data: PlantLikelihood, spectra: Sequence[Spectrum], theta: Array | None):
         self._data, self._S = data, [s.psd(data.f) for s in spectra]
         has_gaps = any(missing.any for missing in data.missing)
-        self._is_alike = theta is None and has_gaps
+        self.is_alike: bool = theta is None and has_gaps
         self._commands: dict[int, Array] = {}
         shares = [1.0 - float(missing.is_missing.mean()) for missing in data.missing]
-        self.spectra_share: Sequence[float] = shares if self._is_alike else [1.0] * data.k
-        self.plant_share: float = 1.0 if self._is_alike else min(shares)
+        self.spectra_share: Sequence[float] = shares if self.is_alike else [1.0] * data.k
+        self.plant_share: float = 1.0 if self.is_alike else min(shares)
         self.power: Array = np.zeros((data.k, data.f.size))
         for i, missing in enumerate(data.missing):
             if self._S and missing.any and data.is_blind:
@@ -456,12 +463,12 @@ class Fill:
     def commands(self, lag: int) -> Array:
         """Return the transform of the commands so many frames before as each mode measures them, (k, k, bins)."""
         if lag not in self._commands:
-            self._commands[lag] = self.transform(self._data.u[lag]) if self._is_alike else self._data.U[lag][None]
+            self._commands[lag] = self.transform(self._data.u[lag]) if self.is_alike else self._data.U[lag][None]
         return self._commands[lag]
 
     def transform(self, x: Array) -> Array:
         """Return the transform of the columns of x (n, k) as each mode measures them, (k or 1, k, bins)."""
-        if not self._is_alike:
+        if not self.is_alike:
             return self._data.transform(x)[None]
         columns = range(self._data.k)
         return np.array([self._data.transform(np.column_stack([self._fill_one(i, x[:, j]) for j in columns])) for i in columns])
