@@ -3,8 +3,8 @@
 Plant and disturbance are identified (`wfsobs.identification`), the controllers are designed from what was found, and theory tells
 what each leaves with plants and on spectra that are drawn from their uncertainty: a design fits the spectra that it was made for
 better than any other. The mean square of the next record differs from that of the process by what a record of this length tells
-of it, which the scatter over simulations of what was identified shows; it is distributed as gamma. Where the loop lost frames, so
-does the next one, and simulations with and without these losses tell how much more is left.
+of it, which the scatter over simulations of what was identified shows; it is distributed as gamma. If the controller missed
+frames, the next one misses as many: mean squares are multiplied by the ratio of those of simulations with and without losses.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.stats import gamma
 
-from wfsobs.closed_loop.design import design
+from wfsobs.closed_loop.design import Design, design
 from wfsobs.closed_loop.envelope import residuals
 from wfsobs.closed_loop.run import each_outcome
 from wfsobs.control.controllers import CONTROLLERS
@@ -34,6 +34,7 @@ from wfsobs.record import Record, RecordError, hold_last
 from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.zernike import HIGHEST_ORDER, modes_up_to
+from wfsobs.settings.values import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import true_spectra
 from wfsobs.spectral.whittle import (
@@ -56,7 +57,7 @@ HIGHEST, NEAR_LINE = 0.49, 4
 """Largest frequency of a drawn resonance, over the rate; bins on either side of an undamped line that do not count."""
 
 LEFT = 0.05
-"""Part of the difference between two plants that may be lacking where samples are missing."""
+"""Share of the change of the spectra from one plant to another that filled samples may lack."""
 
 CRITICAL = 0.999
 """Largest damping ratio of a mirror that `TruePlant` takes."""
@@ -173,7 +174,7 @@ def make_promise(
     RecordError
         The data do not decide delay, gain and rotation: a probe is needed (`wfsobs probe`). Or a mode is lacking.
     SettingError
-        A controller is unknown.
+        A controller is unknown, or the integrator is not stable.
     """
     if record.n_modes < (most := len(base_scenario(record.n_modes, record.dt, scenario).modes)):
         raise RecordError(f"the record has {record.n_modes} of {most} modes; a promise takes all of a radial order")
@@ -198,7 +199,7 @@ def make_promise(
     plan = design(told, None if names is None else [INTEGRATOR, *names])
     length = min(record.n_steps, MOST_STEPS // SECTIONS)
     model = simulate(told.replace({"run.duration": (SECTIONS * length + START) * record.dt, "run.seed": seed}))
-    models = [model, *with_losses(model, record, any(group.loss for group in groups))]
+    lossy = with_losses(model, record, has_lost_lgs=any(group.loop_loss for group in groups))
     inverse = np.linalg.inv(likeliest.matrix)
     plants = [replace(one, matrix=one.matrix @ inverse) for one in others]
     outlying = np.column_stack([find_outlying(column) for column in corrected.z.T])
@@ -219,35 +220,42 @@ def make_promise(
         if lacks_ngs or len(laws) < record.n_modes or not all(law.stable for law in laws):
             notes = ["the record has no NGS"] if lacks_ngs else [one.note for one in plan.laws[name] if one.note]
             out.append(ResidualPromise(name, note=next(iter(notes), "not stable")))
+            if name == INTEGRATOR:
+                raise SettingError(f"{name}: {out[-1].note}: the others cannot be compared with it")
             continue
         squares = residuals(laws, plan.mirror, plants, spectra, watch) ** 2
-        runs = [outcome.residual for one in models for outcome in each_outcome(one, plan, watch, [name])]
-        if any(run is None for run in runs):
-            out.append(ResidualPromise(name, note="not stable where frames are lost"))
-            continue
-        whole, *_, lossy = (run[START:] for run in (*runs, *runs) if run is not None)
-        squares *= np.mean(lossy**2, axis=0) / np.mean(whole**2, axis=0)
-        shape = record.n_steps / length / _scatter(lossy) ** 2
+        residual = _residual(model, plan, name, watch)
+        if lossy is not None:
+            whole, residual = residual, _residual(lossy, plan, name, watch)
+            squares *= np.mean(residual**2, axis=0) / np.mean(whole**2, axis=0)
+        shape = record.n_steps / length / _scatter(residual) ** 2
         left[name] = (squares[:, None] * gamma.ppf(common, shape) / shape).reshape(-1, record.n_modes)
         out.append(_interval_of(name, left[name], left[INTEGRATOR]))
         watch.step((i + 1) / len(plan.laws))
     return Promise(told, groups, likeliest.matrix, tuple(mode.noise.value for mode in found.modes), tuple(out))
 
 
-def with_losses(model: Record, record: Record, lgs: bool) -> list[Record]:
-    """Return a model record that has lost what a record has, again and again; none where nothing is lost.
+def with_losses(model: Record, record: Record, *, has_lost_lgs: bool) -> Record | None:
+    """Return the model record with the losses of a record, repeated to its length; None without losses.
 
-    lgs : whether the loop of the record lost the LGS frames that are missing; of NGS frames it is taken to have
+    has_lost_lgs : whether its controller missed the LGS measurements that are missing; NGS frames count as missed
     """
-    gone, ngs, y_ngs = np.isnan(record.y_lgs).any(axis=1) & lgs, record.ngs_gaps, model.y_ngs
-    if not (gone.any() or ngs.any()):
-        return []
-    y_lgs = np.where(np.resize(gone, model.n_steps)[:, None], np.nan, model.y_lgs)
+    lgs, ngs, y_lgs, y_ngs = np.isnan(record.y_lgs) & has_lost_lgs, record.ngs_gaps, model.y_lgs.copy(), model.y_ngs
+    if not (lgs.any() or ngs.any()):
+        return None
+    y_lgs[lgs[np.arange(model.n_steps) % record.n_steps]] = np.nan
     if ngs.any() and y_ngs is not None and model.ratio is not None:
         y_ngs = y_ngs.copy()
         frames = y_ngs[model.ratio :: model.ratio]
         frames[np.resize(ngs, len(frames))] = np.nan
-    return [replace(model, y_lgs=y_lgs, y_ngs=y_ngs)]
+    return replace(model, y_lgs=y_lgs, y_ngs=y_ngs)
+
+
+def _residual(model: Record, plan: Design, name: str, watch: Watch) -> Array:
+    """Return what a stable controller leaves of a model record after the start, (n_steps - START, n_modes) [um]."""
+    (outcome,) = each_outcome(model, plan, watch, [name])
+    assert outcome.residual is not None
+    return outcome.residual[START:]
 
 
 def _interval_of(name: str, squares: Array, integrator: Array) -> ResidualPromise:

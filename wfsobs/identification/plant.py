@@ -42,7 +42,7 @@ from wfsobs.typing import Array
 SHORTEST, MOST_STEPS = 1000, 100_000
 """Minimum frames of a record; frames that are looked at, its first."""
 
-MOST_MISSING, MOST_UNTOLD = 0.2, 0.03
+MOST_MISSING, MOST_RECORD_LOSS = 0.2, 0.03
 """Share of missing frames beyond which no plant is identified or excluded: with a third of them a shorter delay is likelier. The
 second one holds where the controller received them and there is no probe: 5 % are then enough for that."""
 
@@ -123,10 +123,10 @@ class GroupPlant:
     chance, rigid : float
         Probability that what the measurements hold of a probe beside this plant, and beside one of a delay and a gain alone, is
         chance; where the first is below `OTHERWISE` nothing is identifiable. 1 where a probe is small.
-    untold : float
-        Share of frames that are missing although the controller received them, where without a probe it is above `MOST_UNTOLD`:
-        nothing is identifiable then. Otherwise 0.
-    loss : float
+    record_loss : float
+        Share of frames that are missing although the controller received them, where without a probe it is above
+        `MOST_RECORD_LOSS`: nothing is identifiable then. Otherwise 0.
+    loop_loss : float
         Share of frames that are missing because the controller did not receive them either.
     """
 
@@ -143,8 +143,8 @@ class GroupPlant:
     covariance: Array = field(repr=False, compare=False)
     chance: float = 1.0
     rigid: float = 1.0
-    untold: float = 0.0
-    loss: float = 0.0
+    record_loss: float = 0.0
+    loop_loss: float = 0.0
     swinging: PlantFit | None = field(default=None, repr=False, compare=False)
 
     @property
@@ -276,17 +276,17 @@ def plant_lines(groups: Sequence[GroupPlant]) -> list[str]:
         )
         if chance < OTHERWISE
     ]
-    untold = [
-        f"{' and '.join(g.modes)}: {100.0 * g.untold:.2g} % of the frames that the controller received are missing: "
-        f"without a probe no plant is identifiable beyond {100.0 * MOST_UNTOLD:g} %"
+    unrecorded = [
+        f"{' and '.join(g.modes)}: {100.0 * g.record_loss:.2g} % of the frames that the controller received are missing: "
+        f"without a probe no plant is identifiable beyond {100.0 * MOST_RECORD_LOSS:g} %"
         for g in groups
-        if g.untold
+        if g.record_loss
     ]
-    loss = max(group.loss for group in groups)
-    missed = f"{100.0 * loss:.2g} % of the frames are missing: the controller did not receive them either, as its commands tell"
+    loss = max(group.loop_loss for group in groups)
+    missed = f"{100.0 * loss:.2g} % of the frames are missing: by its commands, the controller did not receive them either"
     return [
         *otherwise,
-        *untold,
+        *unrecorded,
         *[missed] * (loss > 0.0),
         "gain: of mirror and sensor (optical gain) together, which cannot be told apart; negative of a flipped axis",
         "delay: group delay at low frequencies, that of the mirror included",
@@ -339,7 +339,8 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
     each, ties = (_over_delays(data, each, gains), gains) if one_delay else (_over_delays(data, apart, both), both)
     chance, rigid, mirror, swinging = 1.0, 1.0, each, None
     gone = max(float(missing.is_missing.mean()) for missing in data.missing)
-    untold, loss = gone * (not data.is_blind and gone > MOST_UNTOLD and excited <= PROBED), gone * data.is_blind
+    record_loss = gone * (not data.is_blind and gone > MOST_RECORD_LOSS and excited <= PROBED)
+    loop_loss = float(np.isnan(y).any(axis=1).mean()) * data.is_blind
     if excited > PROBED:
         rigid, (mirror, swinging) = data.response_left(each, own), _with_dynamics(data, each, ties)
         chance = data.response_left(mirror, own)
@@ -360,7 +361,7 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
         value, sd = float(fit.theta[i]), float(np.sqrt(max(fit.covariance[i, i], 0.0)))
         widest = WIDEST_DELAY if i < k else WIDEST_GAIN * abs(value) if i < 2 * k else WIDEST_ANGLE
         near = all(abs(rival[i]) <= APART * sd for rival in rivals)
-        return PlantNumber(value, sd) if near and 0.0 < sd < widest and chance >= OTHERWISE and not untold else PlantNumber()
+        return PlantNumber(value, sd) if near and 0.0 < sd < widest and chance >= OTHERWISE and not record_loss else PlantNumber()
 
     delay, gain = tuple(number(each, i) for i in range(k)), tuple(number(each, k + i) for i in range(k))
     rotation = number(each, 2 * k) if k == 2 else None
@@ -376,7 +377,7 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
     numbers = delay, gain, rotation, common_delay, common_gain
     swinging = replace(swinging, fill=None) if swinging and rigid < OTHERWISE <= chance else None
     return GroupPlant(
-        names, *numbers, uncertainty, peaks, coloured, excited, each.covariance, chance, rigid, untold, loss, swinging
+        names, *numbers, uncertainty, peaks, coloured, excited, each.covariance, chance, rigid, record_loss, loop_loss, swinging
     )
 
 
