@@ -16,7 +16,8 @@ from wfsobs.bench import tasks, textbook
 from wfsobs.bench.measure import OURS, Row, max_error, measure_time, row, with_ratios
 from wfsobs.bench.tasks import Sizes
 from wfsobs.cli.bench import bench
-from wfsobs.observers.gpr.regression import predict_sliding, train
+from wfsobs.observers.gpr.offline import train
+from wfsobs.observers.gpr.online import predict_sliding
 from wfsobs.observers.gpr.windows import SquaredExponential
 
 pytestmark = pytest.mark.slow

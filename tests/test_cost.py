@@ -9,8 +9,8 @@ import pytest
 from wfsobs.cost import frozen_flow_seconds, part_seconds, run_seconds
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
-from wfsobs.observers.gpr import regression
-from wfsobs.observers.gpr.regression import OfflineGpr, OnlineGpr
+from wfsobs.observers.gpr.offline import OfflineGpr, offline_seconds
+from wfsobs.observers.gpr.online import OnlineGpr, online_seconds
 from wfsobs.scenario.presets import paper, ut4
 
 
@@ -27,12 +27,12 @@ from wfsobs.scenario.presets import paper, ut4
     ],
 )
 def test_online_gpr_near_what_was_measured(m: int, depth: int, measured: float) -> None:
-    assert 0.7 < regression.online_seconds(OnlineGpr(training_size=m, depth=depth), 10_000, 1, 1e-3) / measured < 1.5
+    assert 0.7 < online_seconds(OnlineGpr(training_size=m, depth=depth), 10_000, 1, 1e-3) / measured < 1.5
 
 
 @pytest.mark.parametrize(("m", "depth", "measured"), [(100, 407, 0.017), (1000, 407, 0.055), (2048, 407, 0.138)])
 def test_offline_gpr_near_what_was_measured(m: int, depth: int, measured: float) -> None:
-    assert 0.7 < regression.offline_seconds(OfflineGpr(training_size=m, depth=depth), 10_000, 1, 1e-3) / measured < 1.8
+    assert 0.7 < offline_seconds(OfflineGpr(training_size=m, depth=depth), 10_000, 1, 1e-3) / measured < 1.8
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from scipy.linalg import solve
 
 from wfsobs import PRESETS, observe, simulate
 from wfsobs.observers.gp import GaussianProcess, kernels_of
-from wfsobs.observers.gpr.regression import predict
+from wfsobs.observers.gpr.ridge import predict
 from wfsobs.prior import Lines
 from wfsobs.priors_from.scenario import prior_of
 

@@ -14,7 +14,8 @@ from wfsobs.app.idle_work import Budgets
 from wfsobs.app.jobs import DONE
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
-from wfsobs.app.views.errors import Cards, MainLines, Strip, Table
+from wfsobs.app.views.cards import Cards
+from wfsobs.app.views.errors import MainLines, Strip, Table
 from wfsobs.evaluation.bound import NO_BOUND
 from wfsobs.evaluation.result import Failure
 from wfsobs.evaluation.scores import BOUNDS

@@ -16,7 +16,8 @@ from wfsobs.execution import run_observer
 from wfsobs.live.board import SLOTS
 from wfsobs.live.checks import check_slot
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.kalman.joint import ALIKE, FRAME_MEANS, MEANS, AsterismEstimator, AsterismModel
+from wfsobs.observers.kalman.joint import AsterismEstimator
+from wfsobs.observers.kalman.joint_model import ALIKE, FRAME_MEANS, MEANS, AsterismModel
 from wfsobs.observers.step import StepError
 from wfsobs.prior import Asterism, Lines, Prior
 from wfsobs.priors_from.scenario import arguments, prior_of, usual_observers

@@ -19,7 +19,8 @@ from wfsobs.execution import run_observer
 from wfsobs.live.checks import observers_on
 from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.kalman.joint import INDEPENDENT, AsterismModel, JointEstimator, flow_model
+from wfsobs.observers.kalman.joint import JointEstimator
+from wfsobs.observers.kalman.joint_model import INDEPENDENT, AsterismModel, flow_model
 from wfsobs.pipeline import observe, run
 from wfsobs.prior import Flow, Lines
 from wfsobs.priors_from.scenario import arguments, has_prior, prior_of, usual_observers

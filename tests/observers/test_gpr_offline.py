@@ -13,7 +13,7 @@ from scipy.signal import butter, lfilter, sosfilt
 
 from wfsobs.evaluation.scores import lag
 from wfsobs.execution import run_observer
-from wfsobs.observers.gpr.regression import train, training_targets
+from wfsobs.observers.gpr.offline import train, training_targets
 from wfsobs.observers.gpr.windows import ConditionError, SquaredExponential
 from wfsobs.priors_from.scenario import bands_of
 from wfsobs.record import RecordError, Training

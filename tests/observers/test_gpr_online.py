@@ -14,7 +14,7 @@ from scipy.signal import butter, lfilter, sosfilt
 
 from wfsobs.evaluation.scores import lag
 from wfsobs.execution import run_observer
-from wfsobs.observers.gpr.regression import predict_sliding
+from wfsobs.observers.gpr.online import predict_sliding
 from wfsobs.observers.gpr.windows import ConditionError, SquaredExponential
 from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import RecordError

@@ -7,7 +7,7 @@ from scipy.signal import lfilter
 from wfsobs.execution import run_observer
 from wfsobs.observers.base import VIBRATION
 from wfsobs.observers.gpr import sliding_regression
-from wfsobs.observers.gpr.regression import GPR_ONLINE, gpr_online, predict_sliding
+from wfsobs.observers.gpr.online import GPR_ONLINE, gpr_online, predict_sliding
 from wfsobs.observers.gpr.sliding_regression import ENOUGH, SlidingRegression
 from wfsobs.observers.gpr.windows import ConditionError, SquaredExponential
 from wfsobs.observers.step import run_frames

@@ -11,7 +11,7 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from wfsobs.evaluation.bound import bound_rms
 from wfsobs.execution import run_observer
-from wfsobs.observers.gpr.regression import TAPS, fit, predict
+from wfsobs.observers.gpr.ridge import TAPS, fit, predict
 from wfsobs.observers.kalman.filters import steady_filter
 from wfsobs.priors_from.scenario import lines_of, measurement_noise, modelled_processes, modelled_turbulence
 from wfsobs.record import RecordError

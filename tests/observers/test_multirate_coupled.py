@@ -15,7 +15,7 @@ from wfsobs.evaluation.bound import bound
 from wfsobs.evaluation.scores import BOUND_BOTH, BOUND_BOTH_MODES, half_width
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.kalman.joint import INDEPENDENT_ON_BOTH, AsterismModel, coupled_model, flow_model
+from wfsobs.observers.kalman.joint_model import INDEPENDENT_ON_BOTH, AsterismModel, coupled_model, flow_model
 from wfsobs.pipeline import observe, run
 from wfsobs.prior import Flow, FlowOfBoth, LgsStars, Lines
 from wfsobs.priors_from.scenario import arguments, prior_of, usual_observers

@@ -16,7 +16,8 @@ import wfsobs
 from tests.records import ON_PAPER
 from wfsobs.evaluation.scores import calibration, crps, half_width
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.gpr.regression import HELD, predict_sliding, train
+from wfsobs.observers.gpr.offline import HELD, train
+from wfsobs.observers.gpr.online import predict_sliding
 from wfsobs.observers.gpr.windows import SquaredExponential
 from wfsobs.observers.kalman.filters import MultiPeak
 from wfsobs.prior import LgsError, Noise, Prior

@@ -18,7 +18,7 @@ from wfsobs.control.controllers import CONTROLLERS, gpr_offline_ahead, gpr_onlin
 from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
-from wfsobs.observers.gpr.regression import training_targets
+from wfsobs.observers.gpr.offline import training_targets
 from wfsobs.observers.kalman.step import matrix_power
 from wfsobs.observers.missing import fill_missing
 from wfsobs.observers.step import StepError

@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-from wfsobs.observers.gpr.regression import training_targets
+from wfsobs.observers.gpr.offline import training_targets
 from wfsobs.observers.gpr.windows import SquaredExponential
 from wfsobs.priors_from.scenario import bands_of
 from wfsobs.priors_from.telemetry import training_of

@@ -38,8 +38,9 @@ from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, VIBRATION
 from wfsobs.observers.baselines import online_reference
-from wfsobs.observers.gpr.regression import gpr_online, kernel_of, train, training_targets
-from wfsobs.observers.gpr.windows import SquaredExponential, window_signals
+from wfsobs.observers.gpr.offline import train, training_targets
+from wfsobs.observers.gpr.online import gpr_online
+from wfsobs.observers.gpr.windows import SquaredExponential, kernel_of, window_signals
 from wfsobs.observers.kalman.adaptive import adapt
 from wfsobs.observers.kalman.filters import multirate_filter, multirate_noise, steady_filter
 from wfsobs.pipeline import run

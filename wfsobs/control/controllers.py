@@ -15,7 +15,8 @@ from wfsobs.control.base import Controller
 from wfsobs.control.laws import best_gain, h2_fir, integrator_law, lqg, lqg_adaptive
 from wfsobs.control.mirror import Law, Plant
 from wfsobs.observers.base import VIBRATION, Look, Tunable
-from wfsobs.observers.gpr.regression import OfflineEstimator, OfflineGpr, OnlineEstimator, OnlineGpr, trained_estimator
+from wfsobs.observers.gpr.offline import OfflineEstimator, OfflineGpr, trained_estimator
+from wfsobs.observers.gpr.online import OnlineEstimator, OnlineGpr
 from wfsobs.observers.kalman.adaptive import KF_ADAPTIVE, MULTIRATE_ADAPTIVE, kf_adaptive, multirate_adaptive
 from wfsobs.observers.kalman.filters import (
     MODEL,

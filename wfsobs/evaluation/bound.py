@@ -54,7 +54,7 @@ from wfsobs.evaluation.scores import (
 )
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, TURBULENCE
-from wfsobs.observers.kalman.joint import AsterismModel, flow_model
+from wfsobs.observers.kalman.joint_model import AsterismModel, flow_model
 from wfsobs.prior import Asterism, Flow, FlowOfBoth, Lines
 from wfsobs.priors_from.scenario import has_prior, prior_of
 from wfsobs.record import TOTAL, Record

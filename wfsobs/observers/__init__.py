@@ -7,7 +7,9 @@ from wfsobs.observers.base import Observer
 from wfsobs.observers.baselines import BUTTERWORTH_CL, BUTTERWORTH_OL, PERSISTENCE, ZERO
 from wfsobs.observers.gp import GP_BOTH, GP_LGS
 from wfsobs.observers.gpr.adaptive import GPR_ADAPTIVE
-from wfsobs.observers.gpr.regression import GPR_OFFLINE, GPR_ONLINE, RIDGE, RIDGE_30
+from wfsobs.observers.gpr.offline import GPR_OFFLINE
+from wfsobs.observers.gpr.online import GPR_ONLINE
+from wfsobs.observers.gpr.ridge import RIDGE, RIDGE_30
 from wfsobs.observers.kalman.adaptive import KF_ADAPTIVE, MULTIRATE_ADAPTIVE
 from wfsobs.observers.kalman.filters import KF_LGS, KF_MULTI, KF_NGS, MULTIRATE, MULTIRATE_MULTI, MULTIRATE_OPTIMAL
 from wfsobs.observers.kalman.joint import KF_ASTERISM, KF_COUPLED, MULTIRATE_COUPLED

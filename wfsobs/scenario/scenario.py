@@ -31,7 +31,8 @@ from wfsobs.settings.values import Plain, SettingError, declared_settings
 from wfsobs.signal.gate import GateSettings
 
 if TYPE_CHECKING:
-    from wfsobs.observers.gpr.regression import OfflineGpr, OnlineGpr
+    from wfsobs.observers.gpr.offline import OfflineGpr
+    from wfsobs.observers.gpr.online import OnlineGpr
     from wfsobs.observers.kalman.adaptive import Adaptive
     from wfsobs.observers.kalman.filters import MultiPeak, MultiRate
 

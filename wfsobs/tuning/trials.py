@@ -28,8 +28,9 @@ from wfsobs.evaluation.scores import PREDICTION, supervised_scores, unsupervised
 from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, VIBRATION
-from wfsobs.observers.gpr.regression import eliminated_covariance, kernel_of, online_targets, training_targets
-from wfsobs.observers.gpr.windows import SquaredExponential, scale_of, window_signals
+from wfsobs.observers.gpr.offline import eliminated_covariance, training_targets
+from wfsobs.observers.gpr.online import online_targets
+from wfsobs.observers.gpr.windows import SquaredExponential, kernel_of, scale_of, window_signals
 from wfsobs.observers.missing import fill_missing
 from wfsobs.prior import Bands
 from wfsobs.priors_from.scenario import bands_of, prior_of

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wfsobs.observers.gpr.regression import PLAIN, TAPS, fit, predict
+from wfsobs.observers.gpr.ridge import PLAIN, TAPS, fit, predict
 from wfsobs.record import hold_last
 from wfsobs.typing import Array
 

@@ -40,7 +40,7 @@ from wfsobs.app.share import LOOP, CopiedTask
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.style import look
-from wfsobs.app.views.errors import Cards, card_of, error_fields
+from wfsobs.app.views.cards import Cards, card_of, error_fields
 from wfsobs.app.views.gain_editor import GainEditor, decibel, plane
 from wfsobs.app.views.plots import (
     FigureLines,

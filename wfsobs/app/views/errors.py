@@ -9,18 +9,18 @@ from math import inf, sqrt
 from typing import Any, Final
 
 import numpy as np
-import param
 from markupsafe import Markup
 from param.parameterized import batch_call_watchers
 
 from wfsobs.app.compared import ComparedRun, find_score
 from wfsobs.app.display import AT_LIMIT, IN_MOST, Display, over, score_columns
-from wfsobs.app.glossary import BOUND, RELATIVE, TERMS, explain_first, sentence_on, term
+from wfsobs.app.glossary import BOUND, RELATIVE, TERMS, explain_first, term
 from wfsobs.app.idle_work import Budgets, SeedRuns
 from wfsobs.app.jobs import DONE, RUNNING
-from wfsobs.app.render import NOTHING, Row, change, hundredths, macro, missing, number, render, table, with_decimals_of
+from wfsobs.app.render import Row, change, hundredths, macro, missing, number, table, with_decimals_of
 from wfsobs.app.service import IDLE
-from wfsobs.app.style import TERM_COLOURS, WIDE, HtmlComponent, follow_html, look, observers_of, script, sheets, swatch, watch
+from wfsobs.app.style import TERM_COLOURS, follow_html, look, observers_of, swatch, watch
+from wfsobs.app.views.cards import Cards, card_of, error_fields
 from wfsobs.app.views.switches import LineChoice
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.bound import NO_BOUND
@@ -43,7 +43,6 @@ from wfsobs.evaluation.result import (
     score_rows,
     scored_interval,
     target_title,
-    uncertainty_text,
 )
 from wfsobs.evaluation.result import Row as ScoreRow
 from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS, LOOP, OF_STAR, PREDICTION, RESIDUAL, SCORED, Score
@@ -383,99 +382,6 @@ LEAST = 0.01
 """Share of an error from which on the legend has a cause."""
 
 LIMIT = "limit"
-
-
-class Cards(HtmlComponent):
-    """A row per line; a click on one hides or shows its line, a double click, whose clicks undo each other, shows it alone."""
-
-    hidden_lines: param.List[list[Any]] = param.List([], doc="Names of the rows whose lines are hidden.")
-
-    _esm = script("page", "markup", "strip")
-    _stylesheets = sheets("base", "style", "strip", "bare")
-
-    def __init__(self, kind: str = "observers"):
-        """Make the table. kind : what the rows are of."""
-        self.kind = kind
-        self.on_main: Callable[[], None] = lambda: None
-        self.on_all: Callable[[], None] = lambda: None
-        self.is_open: bool = False
-        self._among: list[str] = []
-        """What is hidden again once a line is no longer alone."""
-        self._own_choice: list[str] = []
-        super().__init__(self._take, **WIDE)
-        self.show([])
-
-    def show(
-        self, items: list[dict[str, Any]], heads: Mapping[str, str] | None = None, legend: Sequence[tuple[str, str]] = ()
-    ) -> None:
-        """Show rows, as `Strip` makes them.
-
-        heads : headings of the columns value, note, change and bar; legend : (colour, label) of the pieces of bars
-        """
-        self.items, self.heads, self.legend = items, heads or {}, legend
-        self._fold()
-
-    @param.depends("hidden_lines", watch=True)
-    def _follow(self) -> None:
-        """Mark the rows; a click moves none of them."""
-        if self.hidden_lines == self._own_choice:
-            self._draw()
-        else:
-            self._fold()
-
-    def _fold(self) -> None:
-        """Fold away the rows that are not of the main lines and not shown."""
-        minor = [it for it in self.items if not it.get("main") and (it["name"] in self.hidden_lines or it["value"] == NOTHING)]
-        self._minor_rows = [] if self.is_open else [it["name"] for it in minor]
-        self._draw()
-
-    def _draw(self) -> None:
-        of = {name: getattr(self, name) for name in ("kind", "items", "heads", "legend", "is_open")}
-        longest = max((max(it["size"], it["limit"]) for it in self.items if it["name"] not in self._minor_rows), default=0.0)
-        values = {"hidden": self.hidden_lines, "folded": self._minor_rows, "longest": longest, "terms": TERMS, "truth": TRUTH}
-        self.html = render("strip.html", **of, **values)
-
-    def _take(self, data: dict[str, Any]) -> None:
-        """Take a click: on a row, or the wish for the main rows, all rows or all lines."""
-        name, names, hidden = str(data.get("name")), [str(it["name"]) for it in self.items], self.hidden_lines
-        match data.get("action"):
-            case "main" | "all" as rows:
-                self.is_open = rows == "all"
-                (self.on_all if self.is_open else self.on_main)()
-                self._fold()
-            case "lines":
-                self._hide([])
-            case "toggle" if name in names:
-                self._hide([it for it in hidden if it != name] if name in hidden else [*hidden, name])
-            case "solo" if name in names:
-                self._show_alone(name, names)
-
-    def _show_alone(self, name: str, names: list[str]) -> None:
-        """Hide all lines but one, or, where it is alone, those that were hidden before; one without a row stays hidden."""
-        shown = [it for it in names if it not in self.hidden_lines]
-        if shown == [name]:
-            return self._hide(self._among)
-        if len(shown) != 1:
-            self._among = self.hidden_lines
-        self._hide([*(it for it in self.hidden_lines if it not in names), *(it for it in names if it != name)])
-
-    def _hide(self, names: list[str]) -> None:
-        self._own_choice = self.hidden_lines = names
-
-
-def card_of(name: str, dark: bool, note: str, value: str = NOTHING, **fields: Any) -> dict[str, Any]:
-    """Describe the row of an observer or a controller that has no bar, nor anything it is compared with, but for other fields."""
-    it = look(name)
-    known = {"name": name, "label": it.label, "colour": it.colour(dark), "dash": it.dash, "about": sentence_on(name)}
-    empty = {"unit": "", "half": "", "change": "", "parts": (), "size": 0.0, "limit": 0.0, "compared": ()}
-    return {**known, "note": note, "value": value, **empty, **fields}
-
-
-def error_fields(rms: float, interval: Sequence[float] | None, scale: float, n_seeds: int = 1) -> dict[str, str]:
-    """Format an error [um] and its interval; scale : from micrometres to the unit shown;  n_seeds : that it is a mean over."""
-    value = number(rms * scale)
-    half = uncertainty_text(rms, interval, lambda x: with_decimals_of(value, x * scale)) if interval else ""
-    return {"value": value, "half": half, "meaning": over(n_seeds)}
 
 
 class Strip:

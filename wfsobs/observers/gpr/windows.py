@@ -289,6 +289,11 @@ class Gpr(Group):
     )
 
 
+def kernel_of(settings: Gpr) -> SquaredExponential:
+    """Return the kernel with the numbers of the settings."""
+    return SquaredExponential(settings.signal_std, settings.length_scale, settings.noise_std)
+
+
 ORDER = 2
 """Of the high-pass."""
 
