@@ -17,6 +17,7 @@ from packaging.requirements import Requirement
 from packaging.version import Version
 
 import wfsobs
+from tests.records import short
 from wfsobs.cli.group import COMMANDS, main
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.run import closed_loop
@@ -112,6 +113,32 @@ def test_help_and_presets_import_no_large_library(arguments: list[str]) -> None:
         "print('large:', sorted({'scipy', 'rich', 'panel', 'bokeh', 'astropy', 'pandas'} & set(sys.modules)))\n"
     )
     assert in_a_new_process(code).splitlines()[-1] == "large: []"
+
+
+def test_what_takes_long_to_import_waits_until_it_is_used() -> None:
+    code = (
+        "import sys, wfsobs\nimport wfsobs.live.crew\nwfsobs.run, wfsobs.design, wfsobs.load\n"
+        "print('large:', sorted({'scipy.signal', 'scipy.stats', 'scipy.interpolate', 'scipy.io'} & set(sys.modules)))\n"
+    )
+    assert in_a_new_process(code).splitlines()[-1] == "large: []"
+
+
+@pytest.mark.parametrize("name", ["kf-adaptive", "multirate-adaptive", "gpr-adaptive"])
+def test_nothing_is_imported_while_a_loop_runs(name: str, tmp_path: Path) -> None:
+    """It would wait for the disk; those that learn are through with their first window here."""
+    save_record(tmp_path / "record.npz", wfsobs.simulate(short("paper")[1].replace({"run.duration": 4.0})))
+    code = (
+        "import sys, wfsobs\nfrom wfsobs.observers.step import frames_of\n"
+        f"record = wfsobs.load({str(tmp_path / 'record.npz')!r})\n"
+        f"observer = wfsobs.design({name!r}, wfsobs.PRESETS['paper'](), sampling=record.sampling)\n"
+        "before = {*sys.modules}\n"
+        "for frame in frames_of(record.measurements()):\n"
+        "    observer.update(frame.z, frame.ngs, frame.u)\n"
+        "    observer.predict(0, observer.targets[-1])\n"
+        "    observer.settle()\n"
+        "print('imported:', {*sys.modules} - before)\n"
+    )
+    assert in_a_new_process(code).splitlines()[-1] == "imported: set()"
 
 
 def test_the_list_of_commands_says_what_each_says_of_itself() -> None:

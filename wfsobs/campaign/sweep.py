@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+import scipy
 
 from wfsobs.cost import run_seconds
 from wfsobs.evaluation.evidence import FEWEST, Evidence, Key, gather_evidence
@@ -133,12 +134,10 @@ def _limits(path: str, of: Any, log: bool) -> tuple[float, float]:
 
 def _unit_points(method: str, points: int, dimensions: int, seed: int) -> list[list[float]]:
     """Return points of the unit cube."""
-    from scipy.stats import qmc  # takes as long to import as all else
-
     if method == "sobol":  # the first points of a power of two, for which the sequence is balanced
         power = max(0, math.ceil(math.log2(points)))
-        return qmc.Sobol(dimensions, rng=seed).random_base2(power)[:points].tolist()
-    return qmc.LatinHypercube(dimensions, rng=seed).random(points).tolist()
+        return scipy.stats.qmc.Sobol(dimensions, rng=seed).random_base2(power)[:points].tolist()
+    return scipy.stats.qmc.LatinHypercube(dimensions, rng=seed).random(points).tolist()
 
 
 def conditions(table: Mapping[str, Any], folder: Path) -> list[Changes]:

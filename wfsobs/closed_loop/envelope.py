@@ -14,8 +14,7 @@ from math import ceil, inf, log2
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from scipy.stats import binomtest
-from scipy.stats.qmc import Sobol
+import scipy
 
 from wfsobs.closed_loop.design import design, loop_spectra, select_controllers
 from wfsobs.closed_loop.run import each_outcome
@@ -89,7 +88,7 @@ class Spread:
     @property
     def unstable_interval(self) -> tuple[float, float]:
         """95 % interval of their share, of as many independent points (Clopper and Pearson), whose scatter Sobol's is below."""
-        found = binomtest(self.unstable, len(self.points)).proportion_ci(0.95, "exact")
+        found = scipy.stats.binomtest(self.unstable, len(self.points)).proportion_ci(0.95, "exact")
         return float(found.low), float(found.high)
 
     @property
@@ -407,7 +406,8 @@ def error_samples(uncertainty: Uncertainty, base: TruePlant, points: int) -> tup
     if base.resonance:
         most["resonance"] = uncertainty.resonance
     power = ceil(log2(points))
-    cube = Sobol(len(most), scramble=False).random_base2(power)[:points] + 0.5 ** (power + 1)  # in the middle of the cells
+    first = scipy.stats.qmc.Sobol(len(most), scramble=False).random_base2(power)[:points]
+    cube = first + 0.5 ** (power + 1)  # in the middle of the cells
     corners = np.array(list(product((-1.0, 1.0), repeat=len(most))))
     by = list(enumerate(most.items()))
     return {k: x * (2.0 * cube[:, i] - 1.0) for i, (k, x) in by}, {k: x * corners[:, i] for i, (k, x) in by}

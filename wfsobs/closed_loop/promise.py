@@ -15,8 +15,8 @@ from math import pi
 from typing import Any
 
 import numpy as np
-from scipy.signal import lfilter
-from scipy.stats import gamma
+import scipy
+from scipy.special import gammaincinv
 
 from wfsobs.closed_loop.design import Design, design
 from wfsobs.closed_loop.envelope import residuals
@@ -229,7 +229,7 @@ def make_promise(
             whole, residual = residual, _residual(lossy, plan, name, watch)
             squares *= np.mean(residual**2, axis=0) / np.mean(whole**2, axis=0)
         shape = record.n_steps / length / _scatter(residual) ** 2
-        left[name] = (squares[:, None] * gamma.ppf(common, shape) / shape).reshape(-1, record.n_modes)
+        left[name] = (squares[:, None] * gammaincinv(shape, common) / shape).reshape(-1, record.n_modes)
         out.append(_interval_of(name, left[name], left[INTEGRATOR]))
         watch.step((i + 1) / len(plan.laws))
     return Promise(told, groups, likeliest.matrix, tuple(mode.noise.value for mode in found.modes), tuple(out))
@@ -358,7 +358,7 @@ def as_seen(record: Record, plant: TruePlant) -> Record:
     are missing.
     """
     u, response = hold_last(record.u), plant.frame_response(LAGS)
-    moved = lfilter(response, [1.0], u - u[0], axis=0) + u[0]
+    moved = scipy.signal.lfilter(response, [1.0], u - u[0], axis=0) + u[0]
     lost = np.convolve(np.isnan(record.u).any(axis=1), np.abs(response) > SEEN)[: len(u)] > 0
     return replace(record, u=np.where(lost[:, None], np.nan, moved @ plant.matrix.T), delay=1)
 

@@ -39,9 +39,9 @@ from math import pi
 from typing import Any
 
 import numpy as np
+import scipy
 from scipy.linalg import toeplitz
 from scipy.optimize import minimize_scalar
-from scipy.signal import correlate, lfilter
 
 from wfsobs.control.margins import residual_density
 from wfsobs.control.mirror import Law, Mirror, Plant
@@ -214,14 +214,15 @@ def gain_from_telemetry(z: Array, mirror: Mirror, leak: float = 1.0) -> Telemetr
 def _lag_sums(x: Array, blocks: int) -> Array:
     """Return the sums of x[k] x[k + lag] over each of so many blocks of x (n,), (blocks, LAGS)."""
     size, ahead = x.size // blocks, np.pad(x, (0, LAGS - 1))
-    return np.array([correlate(ahead[i : i + size + LAGS - 1], x[i : i + size], "valid") for i in range(0, x.size, size)])
+    sums = [scipy.signal.correlate(ahead[i : i + size + LAGS - 1], x[i : i + size], "valid") for i in range(0, x.size, size)]
+    return np.array(sums)
 
 
 def _weights(gain: float, mirror: Mirror, leak: float) -> Array:
     """Return the weights (LAGS,) of the correlations of the steps in the mean square that the integrator leaves."""
     loop = gain * mirror.taps
     loop[:2] += 1.0, -leak
-    weights = _lag_sums(lfilter([1.0], loop, np.eye(1, LAGS)[0]), 1)[0]
+    weights = _lag_sums(scipy.signal.lfilter([1.0], loop, np.eye(1, LAGS)[0]), 1)[0]
     weights[1:] *= 2.0
     return weights
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 from scipy.optimize import minimize_scalar
 
 from wfsobs.control.mirror import Law, Mirror
@@ -153,7 +153,7 @@ def residual_variance(law: Law, spectra: Spectra, mirror: Mirror) -> float:
     of frequencies of the spectra.
     """
     points = frequencies(law.poles)
-    T = CubicSpline(points, mirror.response(points) * law.response(points))
+    T = scipy.interpolate.CubicSpline(points, mirror.response(points) * law.response(points))
     n, total = spectra.measurement.size, 0.0
     for start in range(0, n, AT_A_TIME):
         part = slice(start, min(start + AT_A_TIME, n))

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from math import inf
 
 import numpy as np
-from scipy.signal import lfilter
+import scipy
 
 from wfsobs.observers.kalman.step import ModeFilter
 from wfsobs.observers.stepping import GainCycle
@@ -52,7 +52,7 @@ class Mirror:
 
     def correction(self, u: Array) -> Array:
         """phi_corr (n_steps, ...) [um] of commands u of that shape."""
-        return lfilter(self.taps[1:], [1.0], u, axis=0)
+        return scipy.signal.lfilter(self.taps[1:], [1.0], u, axis=0)
 
     def response(self, omega: Array) -> Complex:
         """P, from a command to the measurement, at omega [rad per step]; same shape."""

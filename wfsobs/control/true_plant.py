@@ -17,7 +17,7 @@ from math import inf, pi
 from typing import Any
 
 import numpy as np
-from scipy.signal import lfilter
+import scipy
 
 from wfsobs.control.step import StepController, push_row
 from wfsobs.control.supervisor import SupervisedController
@@ -132,7 +132,7 @@ class TruePlant:
         """Gain of the LGS measurements of n frames from `start` on, (n,)."""
         keeps = np.exp(-1.0 / self.gain_time)
         noise = rng.standard_normal(n) * np.append(1.0, np.full(n - 1, np.sqrt(1.0 - keeps**2)))
-        return 1.0 + self.gain_drift * np.arange(n) + self.gain_rms * lfilter([1.0], [1.0, -keeps], noise)
+        return 1.0 + self.gain_drift * np.arange(n) + self.gain_rms * scipy.signal.lfilter([1.0], [1.0, -keeps], noise)
 
 
 class ActingPlant:

@@ -37,8 +37,7 @@ from math import inf, log, pi
 
 import numpy as np
 from scipy import fft
-from scipy.special import diric
-from scipy.stats import chi2
+from scipy.special import diric, gammaincinv
 
 from wfsobs.evaluation.result import JOINT_BOUNDS
 from wfsobs.evaluation.scores import (
@@ -152,7 +151,7 @@ class PeriodicError:
         n = degrees_of_freedom(self.covariance, last - first) if least > 0 else inf
         if self.n_lines:
             n = mean**2 / (least**2 / n + learning**2 / (2 * self.n_lines * learning_freedom(last / max(first, 1))))
-        low, high = np.sqrt(mean * chi2.ppf([0.5 - 0.5 * SHARE, 0.5 + 0.5 * SHARE], n) / n)
+        low, high = np.sqrt(2.0 * mean * gammaincinv(0.5 * n, [0.5 - 0.5 * SHARE, 0.5 + 0.5 * SHARE]) / n)
         return float(low), float(high)
 
 

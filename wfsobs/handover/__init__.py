@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.io import savemat
+import scipy
 from scipy.linalg import block_diag
 
 from wfsobs.control.base import Controller, Settings
@@ -356,7 +356,7 @@ def write_mat(path: str | Path, design: LinearDesign) -> None:
     """Write the arrays to a MATLAB file. Raises OSError."""
     values = {name: str(x) if x.dtype.kind == "U" else x for name, x in arrays(design).items()}
     buffer: Any = BytesIO()
-    savemat(buffer, values)
+    scipy.io.savemat(buffer, values)
     write_whole(path, lambda file: file.write(buffer.getvalue()))
 
 

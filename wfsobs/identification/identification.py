@@ -12,7 +12,7 @@ from math import isnan, sqrt
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2, gamma
+from scipy.special import chdtrc, gammainccinv
 
 from wfsobs.identification.one_mode import OneMode
 from wfsobs.identification.process import IdentifiedProcess, Number
@@ -83,7 +83,7 @@ def in_time(e: Array, dt: float) -> list[str]:
     """Check innovations for changes of their variance, which no test of whiteness sees."""
     parts = np.array([np.var(part) for part in np.array_split(e, PARTS)])
     statistic = 0.5 * len(e) / PARTS * np.sum((parts / parts.mean() - 1.0) ** 2)
-    if chi2.sf(statistic, PARTS - 1) >= REMARK_LEVEL:
+    if chdtrc(PARTS - 1, statistic) >= REMARK_LEVEL:
         return []
     low, high = np.sqrt(np.array([parts.min(), parts.max()]) / parts.mean())
     return [f"it is not stationary: over tenths of the record the rms of the noise is {low:.2f} to {high:.2f} of its mean"]
@@ -234,7 +234,7 @@ def _has_part(fine: Array, T: float, frequency: float, width: int) -> bool:
         return bool(fine[max(round(frequency * PAD * T) - 1, 0)] > -np.log(JOINT))
     centre = round(frequency * T)
     bins = fine[PAD - 1 :: PAD][max(centre - width // 2 - 1, 0) : centre + width // 2]
-    return bool(bins.sum() > gamma.isf(JOINT, width))
+    return bool(bins.sum() > gammainccinv(width, JOINT))
 
 
 def count_unexplained(modes: Sequence[OneMode], level: float) -> list[int]:

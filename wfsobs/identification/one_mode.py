@@ -14,7 +14,7 @@ from math import pi
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import gamma
+from scipy.special import gammainccinv
 
 from wfsobs.signal.autoregressive import Ar2, Ar3
 from wfsobs.spectral.model import BACKGROUND_REACHES, BACKGROUND_WORTH, RMS, Spectrum, with_first_guess
@@ -219,7 +219,7 @@ def _sum_dips(worth: Array, about: float, level: float) -> tuple[Array, NDArray[
     centre = np.arange(n) + 0.5
     low, high = (centre / about).astype(int), np.minimum(np.ceil(centre * about).astype(int), n)
     count, found = high - low, worth[high] - worth[low]
-    return found, count, found > gamma.isf(level, count * MEAN**2 / VARIANCE, scale=VARIANCE / MEAN)
+    return found, count, found > VARIANCE / MEAN * gammainccinv(count * MEAN**2 / VARIANCE, level)
 
 
 WIDEST_LINE = 9

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from wfsobs.identification.plant_likelihood import (
     LONGEST,
@@ -333,7 +333,7 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
     apart = data.fit(each, np.eye(len(pooled)))
     together = np.append(np.full(k, apart.theta[:k].mean()), apart.theta[k:])
     each = _likeliest(each, data.fit(replace(apart, theta=together), gains))
-    one_delay = each.value - apart.value <= 0.5 * chi2.isf(DIFFERS, 1)
+    one_delay = each.value - apart.value <= 0.5 * chdtri(1, DIFFERS)
     rivals = [fit.theta - each.theta for fit in fits if fit.criterion - each.criterion < RIVAL]
     both = np.column_stack([pooled[:, 0], np.eye(len(pooled))[:, 1:]])
     each, ties = (_over_delays(data, each, gains), gains) if one_delay else (_over_delays(data, apart, both), both)
@@ -348,7 +348,7 @@ def _identify_group(names: tuple[str, ...], y: Array, u: Array, dt: float) -> Gr
     equal = np.zeros(len(pooled))
     equal[k : 2 * k] = np.sign(each.theta[k : 2 * k]) * ([1.0, -1.0] if k == 2 else 0.0)
     variance, off = equal @ each.covariance @ equal, equal @ each.theta
-    one_gain = off**2 <= chi2.isf(DIFFERS, 1) * variance
+    one_gain = off**2 <= chdtri(1, DIFFERS) * variance
     common = each
     if variance and one_delay and one_gain:  # given that the gains are one
         gain_of = each.covariance @ equal / variance

@@ -26,7 +26,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.fft import irfft, rfft
-from scipy.stats import chi2
+from scipy.special import chdtrc, chdtri
 
 from wfsobs.record import Record, delay_signal, hold_last
 from wfsobs.spectral.model import Spectrum
@@ -384,7 +384,7 @@ class PlantLikelihood:
             D = turn * one / np.sqrt(s.psd(self.f))
             score, F = (D.conj() @ (z / np.sqrt(s.psd(self.f)))).real, (D.conj() @ D.T).real
             total += 2.0 * float(score @ np.linalg.solve(F + 1e-9 * np.trace(F) * np.eye(len(F)), score))
-        return float(chi2.sf(total, len(turn) * self.k))
+        return float(chdtrc(len(turn) * self.k, total))
 
     def uncertainty(self, fit: PlantFit, dynamic: PlantFit) -> float:
         """Return the 95 % limit of the rms of the error of z over the rms of z, in the worst octave.
@@ -402,7 +402,7 @@ class PlantLikelihood:
                 part = dZ[:, i, octave]
                 sizes = np.maximum(np.linalg.eigvalsh(np.real(part @ part.conj().T)), 0.0)
                 freedom = sizes.sum() ** 2 / max((sizes**2).sum(), 1e-300)  # as of a multiple of chi squared
-                limit = sizes.sum() * chi2.ppf(0.95, freedom) / freedom if freedom > 0 else 0.0
+                limit = sizes.sum() * chdtri(freedom, 0.05) / freedom if freedom > 0 else 0.0
                 limit += float(np.sum(np.abs(Z[i, octave] - right[i, octave]) ** 2))
                 worst = max(worst, limit / max(float(np.sum(np.abs(right[i, octave]) ** 2)), 1e-300))
             low *= 2.0

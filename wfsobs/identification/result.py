@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.stats import chi2, kstwobign
+from scipy.special import chdtrc, kolmogorov
 
 from wfsobs.identification.one_mode import BROAD, SETTLED, OneMode, is_continuum
 from wfsobs.identification.process import (
@@ -176,7 +176,7 @@ def cumulated_test(ratio: Array, n: int) -> float:
     """Return the p-value of I / S, (bins,), of a record of n samples."""
     count = len(ratio)
     distance = np.cumsum(ratio) / ratio.sum() - np.arange(1, count + 1) / count
-    return float(kstwobign.sf(np.max(np.abs(distance)) * np.sqrt(count / inflation(n))))
+    return float(kolmogorov(np.max(np.abs(distance)) * np.sqrt(count / inflation(n))))
 
 
 def innovations(z: Array, spectrum: Spectrum) -> Array:
@@ -201,7 +201,7 @@ def autocorrelation_test(e: Array, numbers: int) -> float:
     r = irfft(power)[: lags + 1]
     rho = r[1:] / r[0]
     statistic = n * (n + 2) * np.sum(rho**2 / (n - np.arange(1, lags + 1)))
-    return float(chi2.sf(statistic, LAGS))
+    return float(chdtrc(LAGS, statistic))
 
 
 FEWEST, SHARE = 200, 0.5

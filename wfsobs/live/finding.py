@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import fdtri
 
 from wfsobs.evaluation.bound import INFORMATION, bound
 from wfsobs.identification import identify
@@ -301,7 +301,7 @@ def has_risen(peak: PeakFinding, before: Finding, now: Finding) -> bool:
     was, level_was, bins_were = before.spectrum.band(peak.frequency, half)
     power, level, bins = now.spectrum.band(peak.frequency, half)
     freedom = 2.0 * np.maximum(np.minimum(bins, bins_were), 1.0)
-    least = np.clip(stats.f.isf(CHANCE, freedom, freedom), CHANGE, MOST)
+    least = np.clip(fdtri(freedom, freedom, 1.0 - CHANCE), CHANGE, MOST)
     return bool(np.any(power * level_was > least * np.maximum(was, level_was) * np.maximum(level, level_was)))
 
 

@@ -23,7 +23,7 @@ from math import cos, exp, expm1, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter, lfiltic
+import scipy
 from scipy.special import expit, logit
 
 from wfsobs.signal.whittle import negative_log_likelihood, whittle_fit
@@ -158,7 +158,8 @@ class Ar2:
         return self._continue(last, np.zeros(n))
 
     def _continue(self, last: Array, drive: Array) -> Array:
-        return lfilter([1.0], self.denominator, drive, zi=lfiltic([1.0], self.denominator, last[::-1]))[0]
+        rest = scipy.signal.lfiltic([1.0], self.denominator, last[::-1])
+        return scipy.signal.lfilter([1.0], self.denominator, drive, zi=rest)[0]
 
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """Draw `n` steps of the process, stationary from the first, shape (n,)."""

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag
-from scipy.signal import butter, get_window, sosfilt, welch
 
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.typing import Array
@@ -42,14 +42,14 @@ def bandpass_bank(frequencies: Sequence[float], bandwidth: float, order: int, dt
 
 @lru_cache(maxsize=64)  # a run asks several times for the same ones
 def _bandpass(low: float, high: float, order: int, dt: float) -> Array:
-    return butter(order, [low, high], "bandpass", fs=1.0 / dt, output="sos")
+    return scipy.signal.butter(order, [low, high], "bandpass", fs=1.0 / dt, output="sos")
 
 
 def filter_causal(bank: Sequence[Array], x: Array) -> Array:
     """Return the sum of the band-passes of x (n, n_modes) along the steps, from rest; same shape."""
     out = np.zeros_like(x)
     for sos in bank:
-        out += sosfilt(sos, x, axis=0)
+        out += scipy.signal.sosfilt(sos, x, axis=0)
     return out
 
 
@@ -60,7 +60,8 @@ def filter_zero_phase(bank: Sequence[Array], x: Array) -> Array:
     """
     out = np.zeros_like(x)
     for sos in bank:
-        out += sosfilt(sos, sosfilt(sos, x, axis=0)[::-1], axis=0)[::-1]
+        forward = scipy.signal.sosfilt(sos, x, axis=0)
+        out += scipy.signal.sosfilt(sos, forward[::-1], axis=0)[::-1]
     return out
 
 
@@ -263,7 +264,7 @@ def psd(x: ArrayLike, dt: float, *, resolution: float = 0.5) -> tuple[Array, Arr
         raise ValueError(f"resolution = {resolution:g}: takes more than 0 Hz, and no more than 1 / dt = {1.0 / dt:g} Hz")
     x = np.asarray(x, dtype=float)
     window = min(round(1.0 / (resolution * dt)), len(x))
-    frequency, density = welch(x, fs=1.0 / dt, nperseg=window, axis=0, detrend="constant")
+    frequency, density = scipy.signal.welch(x, fs=1.0 / dt, nperseg=window, axis=0, detrend="constant")
     return frequency, density
 
 
@@ -292,7 +293,7 @@ def expected_psd(spectrum: Array, dt: float, n_steps: int, resolution: float = 0
         One-sided density [unit^2/Hz].
     """
     length, n = min(round(1.0 / (resolution * dt)), n_steps), 2 * (spectrum.size - 1)
-    window = get_window("hann", length)
+    window = scipy.signal.get_window("hann", length)
     power = np.abs(np.fft.rfft(window, 2 * length)) ** 2
     weight = np.fft.irfft(power)[:length] / np.sum(window**2)
     covariance = np.zeros(length)

@@ -25,9 +25,8 @@ from functools import lru_cache
 from math import ceil, hypot, pi
 
 import numpy as np
+import scipy
 from scipy.fft import next_fast_len
-from scipy.interpolate import CubicSpline
-from scipy.signal import hilbert
 
 from wfsobs.atmosphere import View, frozen_flow
 from wfsobs.progress import QUIET, Watch
@@ -220,7 +219,7 @@ def shift_peak(signal: Array, events: Sequence[Event], dt: float, before: int = 
         Signal with events, (n,).
     """
     t = (np.arange(signal.size) - before) * dt
-    return strength(events, t) * (hilbert(signal) * np.exp(2j * np.pi * phase_turns(events, t))).real
+    return strength(events, t) * (scipy.signal.hilbert(signal) * np.exp(2j * np.pi * phase_turns(events, t))).real
 
 
 def shift_process(process: Ar2, x: Array, events: Sequence[Event]) -> Array:
@@ -250,7 +249,7 @@ def turbulence_steps(at: Array | None, n_steps: int) -> int:
 
 def interpolate_steps(x: Array, at: Array | None) -> Array:
     """Interpolate x (n, ...) at the times `at` [steps] by a cubic spline; return x itself where `at` is None."""
-    return x if at is None else CubicSpline(np.arange(len(x)), x)(at)
+    return x if at is None else scipy.interpolate.CubicSpline(np.arange(len(x)), x)(at)
 
 
 def laser_count(scenario: Scenario, n_steps: int) -> Array:

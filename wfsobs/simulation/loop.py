@@ -7,7 +7,7 @@ from dataclasses import replace
 from math import isnan
 
 import numpy as np
-from scipy.signal import lfilter
+import scipy
 
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import DELAY, Measurements, Record, Training, delay_signal, frame_mean
@@ -46,7 +46,7 @@ def integrate_commands(open_loop_y: Array, gain: float, leak: float) -> Array:
     """
     if np.isnan(open_loop_y).any():
         return np.column_stack([_holding_integrator(y.tolist(), gain, leak) for y in open_loop_y.T])
-    return lfilter([-gain], [1.0, -leak, gain], open_loop_y, axis=0)
+    return scipy.signal.lfilter([-gain], [1.0, -leak, gain], open_loop_y, axis=0)
 
 
 def _holding_integrator(open_loop_y: Sequence[float], gain: float, leak: float) -> list[float]:

@@ -29,8 +29,7 @@ from math import log2, pi, sqrt
 import numpy as np
 from scipy.fft import fft, ifft
 from scipy.optimize import minimize_scalar
-from scipy.special import erfcx
-from scipy.stats import gamma
+from scipy.special import erfcx, gammainccinv
 
 from wfsobs.spectral.model import Spectrum
 from wfsobs.spectral.whittle import MOST_TAPERED, inflation, periodogram, periodogram_frequencies, taper
@@ -297,11 +296,11 @@ def _limits(count: int, T: float, width: int, modes: int, share: float, n: int, 
     shape = width * modes / (1.0 if width == 1 else inflation(n))
     if width == 1:  # PAD frequencies to a bin, and the factor above: by iteration
         probability = probability * PAD
-        limit = gamma.isf(probability, shape)
+        limit = gammainccinv(shape, probability)
         for _ in range(4):
-            limit = gamma.isf(probability / (1.0 + np.sqrt(np.pi * limit / 3.0)), shape)
+            limit = gammainccinv(shape, probability / (1.0 + np.sqrt(np.pi * limit / 3.0)))
     else:
-        limit = gamma.isf(probability, shape) * width * modes / shape
+        limit = gammainccinv(shape, probability) * width * modes / shape
     return np.interp(np.log(np.arange(1, count + 1)), np.log(j), limit)
 
 

@@ -20,7 +20,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.ndimage import binary_opening, median_filter
 from scipy.optimize import least_squares
-from scipy.signal.windows import tukey
 from scipy.sparse.linalg import LinearOperator, cg
 from scipy.special import logit
 
@@ -43,7 +42,8 @@ FINE, NEAR = 200, 8
 @lru_cache(maxsize=4)
 def taper(n: int) -> Array:
     """Return Tukey's taper for n samples, its mean square 1, (n,)."""
-    h = tukey(n, 2.0 * min(TAPERED / n, MOST_TAPERED))
+    k, edge = np.arange(n), min(TAPERED / n, MOST_TAPERED) * (n - 1)
+    h = 0.5 - 0.5 * np.cos(np.pi * np.minimum(np.minimum(k, k[::-1]) / edge, 1.0))
     h /= np.sqrt(np.mean(h**2))
     h.flags.writeable = False
     return h

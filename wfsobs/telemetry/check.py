@@ -12,9 +12,9 @@ from math import hypot
 from typing import Literal
 
 import numpy as np
+import scipy
 from scipy.fft import rfft
-from scipy.signal import detrend
-from scipy.stats import f as fisher
+from scipy.special import fdtr, fdtrc
 
 from wfsobs.identification.identification import identify
 from wfsobs.identification.plant import EXCITED, GroupPlant, PlantNumber, identify_plant
@@ -327,7 +327,7 @@ def find_changes(z: Array, dt: float) -> list[tuple[float, float, int, float]]:
     """
     length, compared = len(z) // SECTIONS, sections_compared(z)
     n = compared.size
-    parts = detrend(hold_last(z[:, None])[: SECTIONS * length].reshape(SECTIONS, length)[compared], axis=1)
+    parts = scipy.signal.detrend(hold_last(z[:, None])[: SECTIONS * length].reshape(SECTIONS, length)[compared], axis=1)
     power = np.abs(rfft(parts * np.hanning(length + 2)[1:-1], axis=1)) ** 2
     half = length // 2
     edges = [FEWEST_BINS << i for i in range(half.bit_length()) if FEWEST_BINS << i <= half - FEWEST_BINS] + [half]
@@ -341,8 +341,8 @@ def find_changes(z: Array, dt: float) -> list[tuple[float, float, int, float]]:
         if not others.min() > 0.0:  # numbers without noise
             continue
         ratio = total / others
-        law = fisher(2.0 * freedom, 2.0 * (n - 1) * freedom)
-        tails = 2.0 * np.minimum(law.sf(ratio), law.cdf(ratio))
+        law = 2.0 * freedom, 2.0 * (n - 1) * freedom
+        tails = 2.0 * np.minimum(fdtrc(*law, ratio), fdtr(*law, ratio))
         worst = int(np.argmin(tails))
         if tails[worst] < LEVEL / (n * (len(edges) - 1)):
             out.append((low / (length * dt), high / (length * dt), int(compared[worst]), float(ratio[worst])))

@@ -19,8 +19,8 @@ from math import inf, isfinite
 from typing import Any
 
 import numpy as np
+import scipy
 from scipy.optimize import minimize
-from scipy.stats import qmc
 
 from wfsobs.closed_loop.envelope import Spread
 from wfsobs.evaluation.result import Failure
@@ -85,7 +85,7 @@ def minimise(f: Callable[[Array], float], start: Array, evaluations: int, rng: n
     f gives infinity where it fails; it keeps what it was asked.
     """
     try:
-        points = [start, *qmc.LatinHypercube(len(start), seed=rng).random(evaluations // DESIGN)]
+        points = [start, *scipy.stats.qmc.LatinHypercube(len(start), seed=rng).random(evaluations // DESIGN)]
         values = [f(point) for point in points]
         for size in SIMPLEX:
             i = int(np.argmin(values))

@@ -32,10 +32,10 @@ from types import MappingProxyType
 from typing import ClassVar, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.lib.stride_tricks import as_strided, sliding_window_view
 from scipy.linalg.blas import dsymv
 from scipy.linalg.lapack import dpotrf, dpotrs
-from scipy.signal import butter, sosfilt, sosfilt_zi
 
 from wfsobs.observers.step import StepError
 from wfsobs.observers.stepping import SampleHistory, StateArrays
@@ -329,7 +329,7 @@ def high_pass(corner: float, dt: float) -> Array:
     """Second-order sections of the Butterworth high-pass with that corner [Hz]. Raises RecordError beyond half the rate."""
     if corner >= 0.5 / dt:
         raise RecordError(f"the high-pass of the inputs at {corner:g} Hz must lie below half the rate, {0.5 / dt:g} Hz")
-    return butter(ORDER, corner, "highpass", fs=1.0 / dt, output="sos")
+    return scipy.signal.butter(ORDER, corner, "highpass", fs=1.0 / dt, output="sos")
 
 
 def _channels(settings: Gpr, y: Array, u: Array, z: Array, mode: int) -> Array:
@@ -352,9 +352,10 @@ class StreamingInputs(StateArrays):
     def run(self, samples: Array) -> Array:
         """Return the inputs of the next samples, both (n, channels)."""
         if self._sos is not None and self._filter is not None:
-            start = self._filter if self._is_started else sosfilt_zi(self._sos)[:, :, None] * samples[0]  # no output at rest
-            out, self._filter[...] = sosfilt(self._sos, samples, axis=0, zi=start)
-            self._is_started = True
+            if not self._is_started:
+                self._filter[...] = scipy.signal.sosfilt_zi(self._sos)[:, :, None] * samples[0]  # no output at rest
+                self._is_started = True
+            out, self._filter[...] = scipy.signal.sosfilt(self._sos, samples, axis=0, zi=self._filter)
             return out
         return samples if self._scale is None else (samples - self._scale.mean) / self._scale.std
 
