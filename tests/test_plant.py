@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from math import pi, sqrt
@@ -18,6 +19,7 @@ from wfsobs.cli import main
 from wfsobs.control.true_plant import ActingPlant, TruePlant
 from wfsobs.identification.plant import GroupPlant, PlantNumber, contradiction, identify_plant, plant_lines
 from wfsobs.identification.plant_likelihood import (
+    LONGEST,
     PlantLikelihood,
     Response,
     few_lags,
@@ -158,6 +160,29 @@ def test_frames_that_the_loop_lacked() -> None:
         errors += [(n.value - value) / n.sd for n, value in numbers if n.value is not None and n.sd is not None]
     # six of 16 are enough: of six normal numbers one in 2000 has this rms
     assert len(errors) >= 6 and np.sqrt(np.mean(np.square(errors))) < 2.0
+
+
+@pytest.mark.parametrize("value", [-9.999, 40.0])
+@pytest.mark.parametrize("rows", [[0], [2000], [3000, 3003, 3999], range(1500, 1505)])
+def test_a_number_in_place_of_a_command_is_no_command(rows: Sequence[int], value: float) -> None:
+    """In the commands, or in all of the row: as where the commands are missing."""
+    right, lost = closed_loop(4000, 2.0, np.eye(2)), closed_loop(4000, 2.0, np.eye(2))
+    lost.u[rows] = np.nan
+    for signals in ((right.u,), (right.u, right.y_lgs)):
+        for x in signals:
+            x[rows] = value
+        for got, want, whole in zip(known_signals(right, 4000), known_signals(lost, 4000), (right.y_lgs, right.u), strict=True):
+            np.testing.assert_array_equal(np.where(whole == value, np.nan, got), np.where(whole == value, np.nan, want))
+    assert np.isnan(known_signals(right, 4000)[1]).all(axis=1).sum() == len(rows)
+
+
+@pytest.mark.parametrize("delay", range(1, LONGEST + 1))
+def test_a_command_that_the_mirror_received_stays_however_large(delay: int) -> None:
+    record = closed_loop(4000, float(delay), np.eye(2), gain=0.05)
+    kick = 10.0 * np.ptp(record.u)
+    record.u[[1000, 2000, 2001, 3000]] += kick
+    record.y_lgs[[1000 + delay, 2000 + delay, 2001 + delay, 3000 + delay]] += kick
+    assert not np.isnan(known_signals(record, 4000)[1]).any()
 
 
 @pytest.mark.parametrize("probe", [0.0, 0.003])

@@ -128,6 +128,8 @@ class GroupPlant:
         `MOST_RECORD_LOSS`: nothing is identifiable then. Otherwise 0.
     loop_loss : float
         Share of frames that are missing because the controller did not receive them either.
+    outlying_commands : int
+        Commands that the mirror cannot have received (`not_received`): taken as lost.
     """
 
     modes: tuple[str, ...]
@@ -146,6 +148,7 @@ class GroupPlant:
     record_loss: float = 0.0
     loop_loss: float = 0.0
     swinging: PlantFit | None = field(default=None, repr=False, compare=False)
+    outlying_commands: int = 0
 
     @property
     def has_dynamics(self) -> bool:
@@ -194,6 +197,7 @@ def identify_plant(record: Record, watch: Watch = QUIET) -> tuple[GroupPlant, ..
         `watch` asks to stop.
     """
     y, u = known_signals(record, MOST_STEPS)
+    outlying = int(np.isnan(u).any(axis=1).sum() - np.isnan(record.u[: len(u)]).any(axis=1).sum())
     if len(y) < SHORTEST:
         raise RecordError(f"the record has {len(y)} frames, the plant needs {SHORTEST}")
     for name, gone in zip(MODE_NAMES, np.isnan(y).mean(axis=0).tolist(), strict=False):
@@ -206,7 +210,7 @@ def identify_plant(record: Record, watch: Watch = QUIET) -> tuple[GroupPlant, ..
         watch.check()
         names = tuple(MODE_NAMES[c] for c in columns)
         _check_motion(names, y[:, columns], u[:, columns])
-        out.append(_identify_group(names, y[:, columns], u[:, columns], record.dt))
+        out.append(replace(_identify_group(names, y[:, columns], u[:, columns], record.dt), outlying_commands=outlying))
         watch.step((i + 1) / len(groups))
     return tuple(out)
 
@@ -282,12 +286,13 @@ def plant_lines(groups: Sequence[GroupPlant]) -> list[str]:
         for g in groups
         if g.record_loss
     ]
-    loss = max(group.loop_loss for group in groups)
+    loss, outlying = max(group.loop_loss for group in groups), groups[0].outlying_commands
     missed = f"{100.0 * loss:.2g} % of the frames are missing: by its commands, the controller did not receive them either"
     return [
         *otherwise,
         *unrecorded,
         *[missed] * (loss > 0.0),
+        *[f"commands taken as lost: {outlying}, far from those around them, and no measurement shows them"] * (outlying > 0),
         "gain: of mirror and sensor (optical gain) together, which cannot be told apart; negative of a flipped axis",
         "delay: group delay at low frequencies, that of the mirror included",
         f"disturbance: {form}; {basis}",

@@ -22,10 +22,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 from scipy.fft import irfft, rfft
+from scipy.ndimage import maximum_filter, median_filter, minimum_filter
 from scipy.special import chdtrc, chdtri
 
 from wfsobs.record import Record, delay_signal, hold_last
@@ -114,9 +117,36 @@ FAR = 0.05
 """Gain of the first guess below which, or over whose inverse, it is not taken for 1."""
 
 
+AROUND, JUMP, SEEN = 5, 5.0, 2.0
+"""Samples on either side whose median one is compared with; difference from it, over what the range of these usually is, of a
+command that is tested, and of a measurement that shows it: 6 deviations of white noise."""
+
+
+def not_received(y: Array, u: Array) -> NDArray[np.bool_]:
+    """Return which commands the mirror cannot have received, bool (n,): far from those around them, with no trace in y later on.
+
+    Files have numbers such as -9999 in place of what is missing, and errors of the link to the recorder.
+    """
+
+    def is_far(x: Array, times: float) -> Any:
+        middle, least, most = (one(x, (2 * AROUND + 1, 1)) for one in (median_filter, minimum_filter, maximum_filter))
+        usual = np.median(most - least, axis=0)
+        return np.any((np.abs(x - middle) > times * usual) & (usual > 0.0), axis=1)
+
+    out = is_far(hold_last(u), JUMP)
+    shows = is_far(hold_last(y), SEEN) & ~out  # a number in place of all that is missing stands in both
+    shows[:AROUND] = shows[-AROUND:] = False  # what is around these is not known
+    edges = np.flatnonzero(np.diff(np.pad(out, 1).astype(int)))
+    for start, stop in edges.reshape(-1, 2):
+        if stop - start > AROUND or shows[stop : stop + LONGEST + 1].any():
+            out[start:stop] = False
+    return out
+
+
 def known_signals(record: Record, most: int) -> tuple[Array, Array]:
     """Return the first measurements of a record, NaN where a command that they may see is lost, and commands, NaN where lost."""
-    y, u = record.y_lgs[:most].copy(), record.u[:most]
+    y, u = record.y_lgs[:most].copy(), record.u[:most].copy()
+    u[not_received(y, u)] = np.nan
     lost = np.isnan(u).sum(axis=1) > 0
     for lag in range(1, LONGEST + 2):
         y[lag:][lost[:-lag]] = np.nan
@@ -569,7 +599,7 @@ def guess_plant(data: PlantLikelihood) -> tuple[Array, float, Array]:
     own = v + w @ turn
     excited = float(np.sum(own**2) / max(np.sum(v**2), 1e-300)) if is_enough else 0.0
     source, basis = (w if excited < 0.5 else own)[: n - SPAN], smooth_basis()
-    inverse = np.linalg.inv(source.T @ source)
+    inverse = np.linalg.pinv(source.T @ source)
     h, g = (np.array([x[ORDER + i : ORDER + i + len(source)].T @ source @ inverse for i in range(SPAN + 1)]) for x in (y, u))
     if excited >= 0.5:  # commands of their own: what they do is seen directly
         turn = max(h[1:], key=np.linalg.norm)
