@@ -179,6 +179,37 @@ def test_stamps_that_scatter_too_much_to_say_what_is_missing() -> None:
         taken(DeclaredFormat(rate=1000.0), time=time, dt=NONE, y_lgs=y, u=y)
 
 
+MS, MJD = 1e-3, 86400e-8
+
+
+@pytest.mark.parametrize(
+    ("rate", "quantum", "start"),
+    [(450, MS, 0.0), (700, MS, 0.0), (800, MS, 1.7621456e9), (900, MS, 0.0), (1000, MJD, 60982.9 * 86400), (7000, 1e-4, 0.0)],
+)
+def test_rounded_stamps_are_no_missing_frames(rate: int, quantum: float, start: float) -> None:
+    """A lost frame among them is refused: it could be another rate."""
+    n = 2000
+    y = RNG.standard_normal((n, 2))
+    time = quantum * np.floor((start + np.arange(n) / rate) / quantum + 1e-3)
+    record = taken(time=time, dt=NONE, y_lgs=y, u=y)
+    assert (record.missing, record.n_steps) == (0, n) and record.dt == pytest.approx(1.0 / rate, rel=1e-9)
+    assert record.origin == f"stamps rounded to {quantum:.3g} s"
+    assert taken(DeclaredFormat(rate=float(rate)), time=time, dt=NONE, y_lgs=y, u=y).missing == 0
+    there = np.delete(np.arange(n), 900)
+    with pytest.raises(RecordError, match=r"rounded stamps and missing frames are not told apart; state the rate"):
+        taken(time=time[there], dt=NONE, y_lgs=y[there], u=y[there])
+
+
+@pytest.mark.parametrize("rate", [500, 700, 1000])
+@pytest.mark.parametrize("lost", [1, 20, 600])
+def test_losses_are_no_rounding(rate: float, lost: int) -> None:
+    rows = np.delete(np.arange(2000), np.random.default_rng(lost).choice(np.arange(1, 1999), lost, replace=False))
+    y = RNG.standard_normal((rows.size, 2))
+    record = taken(time=rows / rate, dt=NONE, y_lgs=y, u=y)
+    assert record.missing == lost and record.dt == pytest.approx(1.0 / rate, rel=1e-9) and record.origin == ""
+    np.testing.assert_array_equal(record.y_lgs[rows], y)
+
+
 def test_more_modes_than_the_settings_have() -> None:
     five = RNG.standard_normal((N, 5))
     with pytest.raises(RecordError, match=r"1 to 2 modes\): 5 modes need telescope.radial_order = 2"):
@@ -262,7 +293,7 @@ def test_blank_cells_after_the_last_ngs_frame() -> None:
     """A column that is blank to its end is short, also where rows are lost."""
     steps = np.delete(np.arange(N), [7, 23])
     ngs = np.where(np.isin(steps, [5, 10, 15, 20])[:, None], Y[steps], np.nan)[:20]
-    arrays = {"y_lgs": Y[steps], "u": U[steps], "dt": NONE, "time": steps * 1e-3, "y_ngs": ngs}
+    arrays = {"y_lgs": Y[steps], "u": U[steps], "dt": NONE, "time": steps * 1.1e-3, "y_ngs": ngs}
     for record in (taken(**arrays), taken(**arrays, ratio=5)):
         np.testing.assert_array_equal(np.flatnonzero(np.isfinite(record.y_ngs[:, 0])), [5, 10, 15, 20])
         np.testing.assert_array_equal(record.y_ngs[5:21:5], Y[5:21:5])

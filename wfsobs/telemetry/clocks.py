@@ -17,6 +17,15 @@ AGREE = 1e-3
 BLOCK = 64
 """Rows whose median tells a lost frame from the jitter of stamps."""
 
+ROUNDED = 1.3
+"""Maximum spread of rounded stamps about a line, in quanta."""
+
+TURNS = 8
+"""Uneven differences that tell rounding, which spaces them evenly, from losses."""
+
+BLOCKS = 100
+"""Maximum stretches of TURNS uneven differences that are looked at."""
+
 COUNTERS = (8, 16, 32, 64)
 """Bits of a frame counter."""
 
@@ -33,8 +42,8 @@ def past_midnight(time: Array) -> Array:
 def steps_of(time: Array, dt: float | None = None, frames: Array | None = None) -> tuple[Array, float, str]:
     """Return the step of every row, and the time step, of time stamps.
 
-    A difference of several steps is a gap. Stamps that scatter are accepted where the frames are counted, or where the rate is
-    declared and no frame, or none that could not be told, is missing.
+    A difference of several steps is a gap, unless rounding alone explains it. Stamps that scatter are accepted where the frames
+    are counted, or where the rate is declared and no frame, or none that could not be told, is missing.
 
     Parameters
     ----------
@@ -52,12 +61,13 @@ def steps_of(time: Array, dt: float | None = None, frames: Array | None = None) 
     dt : float
         Time step [s].
     said : str
-        That stamps scatter, in a few words.
+        That stamps are rounded or scatter, in a few words.
 
     Raises
     ------
     RecordError
-        Time goes backwards, the rate is not constant or not the declared one, or most frames are missing.
+        Time goes backwards, the rate is not constant or not the declared one, most frames are missing, or rounded stamps do not
+        tell which are.
     """
     bad = np.flatnonzero(~np.isfinite(time))
     if bad.size:
@@ -66,6 +76,8 @@ def steps_of(time: Array, dt: float | None = None, frames: Array | None = None) 
         raise RecordError("time needs two rows at least")
     if frames is not None:
         return frames, *_step_of_frames(time, dt, frames)
+    if dt is None and (rounded := _rounded_step(time)):
+        return np.arange(time.size), *rounded
     try:
         return *_regular_steps(time, dt), ""
     except RecordError:
@@ -74,6 +86,43 @@ def steps_of(time: Array, dt: float | None = None, frames: Array | None = None) 
             raise
     _check_lost(steps)
     return steps, dt, f"stamps {np.std(time / dt - steps):.2g} steps rms off the stated rate"
+
+
+def _rounded_step(time: Array) -> tuple[float, str] | None:
+    """Return the time step of stamps that are rounded to a third of it or more, and that they are; None of any others.
+
+    Stamps in whole quanta are rounded where they follow a line over the whole record. Raises RecordError where they follow it
+    over most stretches alone, or too few of their differences are uneven to say that no frame is missing there.
+    """
+    difference, error = np.diff(time), 4.0 * np.spacing(np.abs(time).max())
+    for unit in (1.0, DAY) if difference.min() > 0 else ():
+        quantum = unit * 10.0 ** np.floor(np.log10(1.01 * difference.min() / unit))
+        ticks = np.rint(difference / quantum)
+        if quantum < JITTER * difference.mean() or np.abs(difference - ticks * quantum).max() > error:
+            continue
+        uneven = np.flatnonzero(ticks != np.median(ticks))
+        count = np.concatenate([[0.0], np.cumsum(ticks)])
+        slope, spread = _line(count)
+        if spread <= ROUNDED and uneven.size >= TURNS:
+            rate = 1.0 / (slope * quantum)
+            written = (float(f"{rate:.{digits}g}") for digits in range(1, 17))
+            rate = next((x for x in written if abs(x / rate - 1.0) * count[-1] <= 1.0), rate)
+            return 1.0 / rate, f"stamps rounded to {quantum:.3g} s"
+        parts = np.split(count, uneven[TURNS::TURNS])[:-1]
+        spreads = [_line(part)[1] for part in parts[:: len(parts) // BLOCKS + 1]] or [spread]
+        if np.median(spreads) <= ROUNDED and uneven.size > AGREE * time.size:
+            raise RecordError(
+                f"time is in whole {quantum:.3g} s, so that rounded stamps and missing frames are not told apart; "
+                "state the rate (--rate, rate=)"
+            )
+    return None
+
+
+def _line(x: Array) -> tuple[float, float]:
+    """Return the slope of the least-squares line of x by its row, and the range of what it leaves."""
+    row = np.arange(x.size) - 0.5 * (x.size - 1)
+    slope = row @ x / max(row @ row, 1.0)
+    return float(slope), float(np.ptp(x - slope * row))
 
 
 def _regular_steps(time: Array, dt: float | None) -> tuple[Array, float]:
