@@ -305,7 +305,7 @@ def test_blank_cells_after_the_last_ngs_frame() -> None:
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"unit": "V"}, "unit is 'V', which is no unit"),
+        ({"unit": "V"}, "y_lgs is in 'V', which is no unit of a wavefront: state one of um, nm"),
         ({"command_sign": 0}, "command_sign takes 1 or -1, not 0"),
         ({"delay": 0}, "delay takes a number of steps from 1 to 100, not 0"),
         ({"delay": "two"}, "delay takes a number, not 'two'"),

@@ -24,6 +24,7 @@ from click.testing import CliRunner
 import wfsobs
 from wfsobs.cli import main
 from wfsobs.record import Record, RecordError, Training
+from wfsobs.telemetry.columns import LoopMatrix
 from wfsobs.telemetry.formats import FORMATS
 from wfsobs.telemetry.formats.contents import TooLargeError
 from wfsobs.telemetry.intake import DeclaredFormat
@@ -58,6 +59,10 @@ def saved(write: Callable[[io.BytesIO], Any]) -> bytes:
 
 def matlab(**arrays: Any) -> bytes:
     return saved(lambda file: scipy.io.savemat(file, arrays, do_compression=True))
+
+
+def npz(**arrays: Any) -> bytes:
+    return saved(lambda file: np.savez(file, **arrays))
 
 
 def with_object(content: bytes) -> bytes:
@@ -342,6 +347,85 @@ def test_a_unit_is_that_of_what_it_stands_beside(kind: str, more: dict[str, Any]
     else:
         with pytest.raises(RecordError, match=f"^{kind}: {said}"):
             read_record(io.BytesIO(parts_in(kind, parts)), kind, declaration=stated)
+
+
+def with_comment(line: str) -> bytes:
+    return table(f"{line}\ntime,{HEAD.replace('_nm', '')}", np.c_[1e-3 * STEPS, Y, U])
+
+
+def with_attribute(name: str, value: Any, at: tuple[str, ...] = ("y_lgs", "u")) -> bytes:
+    def fill(f: h5py.File) -> None:
+        f["y_lgs"], f["u"], f["dt"] = Y, U, 1e-3
+        for path in at:
+            f[path].attrs[name] = value
+
+    return hdf5(fill)
+
+
+def with_metadata(name: str, of_fields: bool) -> bytes:
+    columns = pa.table(dict(zip(COLUMNS, np.c_[Y, U].T, strict=True)))
+    if of_fields:
+        schema = pa.schema([field.with_metadata({name: "nm"}) for field in columns.schema], {"dt": "0.001"})
+        return saved(lambda file: pq.write_table(columns.cast(schema), file))
+    return saved(lambda file: pq.write_table(columns.replace_schema_metadata({name: "nm", "dt": "0.001"}), file))
+
+
+SPELLINGS = ["unit", "Unit", "UNITS", "unit "]
+ARRAYS = {"y_lgs": Y, "u": U, "dt": 1e-3}
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        *(("a.csv", with_comment(f"# {word}: nm")) for word in SPELLINGS),
+        *(("a.h5", with_attribute(word, "nm")) for word in SPELLINGS),
+        *(("a.h5", with_attribute("unit", value, at)) for value in (["nm"], ["nm", "nm"]) for at in (("y_lgs", "u"), ("/",))),
+        ("a.h5", with_attribute("Units", np.array([b"nm", b"nm"]), ("/",))),
+        *(("a.parquet", with_metadata(word, of_fields)) for word in SPELLINGS for of_fields in (True, False)),
+        *((f"a{end}", save(unit=["nm", "nm"], **ARRAYS)) for end, save in ((".npz", npz), (".mat", matlab))),
+    ],
+)
+def test_a_unit_in_any_spelling(name: str, content: bytes) -> None:
+    record = read_record(io.BytesIO(content), name)
+    np.testing.assert_allclose(record.y_lgs, 1e-3 * Y, rtol=1e-12)
+    np.testing.assert_allclose(record.u, 1e-3 * U, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "unit"),
+    [
+        ("a.csv", with_comment("# unit: nm\n# Units: um"), "nm and um"),
+        ("a.csv", with_comment("# Units: furlong"), "furlong"),
+        ("a.h5", with_attribute("units", ["nm", "um"]), "nm and um"),
+        ("a.npz", npz(unit=["nm", "um"], **ARRAYS), "nm and um"),
+        ("a.mat", matlab(units=["nm", "um"], **ARRAYS), "nm and um"),
+        ("a.npz", npz(units="pixel", **ARRAYS), "pixel"),
+    ],
+)
+def test_units_that_differ_or_are_none_are_refused_unless_one_is_stated(name: str, content: bytes, unit: str) -> None:
+    with pytest.raises(RecordError, match=f"(y_lgs|u) is in '{unit}', which is no unit of a wavefront: state one of um, nm"):
+        read_record(io.BytesIO(content), name)
+    record = read_record(io.BytesIO(content), name, declaration=DeclaredFormat(unit="nm"))
+    np.testing.assert_allclose(record.y_lgs, 1e-3 * Y, rtol=1e-12)
+
+
+def test_a_matrix_makes_modes_of_what_has_no_unit() -> None:
+    stated = DeclaredFormat(reconstructor=LoopMatrix("R", ((1e-3, 0.0), (0.0, 1e-3))), trust=True)
+    content = npz(unit="pixel", **ARRAYS)
+    record = read_record(io.BytesIO(content), "a.npz", declaration=replace(stated, open_loop=True))
+    np.testing.assert_allclose(record.y_lgs, 1e-3 * Y, rtol=1e-12)
+    with pytest.raises(RecordError, match="u is in 'pixel', which is no unit"):
+        read_record(io.BytesIO(content), "a.npz", declaration=stated)
+
+
+@pytest.mark.parametrize(
+    ("line", "delay", "sign"),
+    [("# Delay: 3", 3, 1), ("# delay : 3", 3, 1), ("# Command_Sign: -1", 2, -1), ("# DELAY: 1\n# command_sign : -1", 1, -1)],
+)
+def test_delay_and_sign_in_any_spelling(line: str, delay: int, sign: int) -> None:
+    record = read_record(io.BytesIO(with_comment(line)), "a.csv", declaration=DeclaredFormat(unit="nm", trust=True))
+    assert record.delay == delay
+    np.testing.assert_allclose(record.u, 1e-3 * sign * U, rtol=1e-12)
 
 
 @pytest.mark.slow

@@ -114,6 +114,8 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
     signals = {name: _signal(name, arrays[name]) for name in SIGNALS if name in arrays}
     swapped = [name for name, values in signals.items() if values.shape[0] < values.shape[1] > most]
     signals |= {name: np.ascontiguousarray(signals[name].T) for name in swapped}
+    if (unit := str(arrays.get("unit", "")).strip()) and parse_unit(unit) is None:
+        contents.units = dict.fromkeys(signals, unit) | contents.units
     modes = apply_matrices(signals, declaration.reconstructor, declaration.command_modes)
     if declaration.reconstructor and not declaration.reconstructor.keeps_unit:
         contents.units.pop("y_lgs", None)
@@ -185,9 +187,7 @@ def _stars_apart(raw: Array, n: int, n_modes: int) -> Array:
 def _into_micrometres(signals: dict[str, Array], contents: Contents, declaration: DeclaredFormat, diameter: float) -> str:
     """Scale every signal to um, commands with their sign; return unit, sign and aperture as one line."""
     arrays, own = contents.arrays, contents.units
-    if "unit" in arrays:
-        if (unit := parse_unit(str(arrays["unit"]))) is None:
-            raise RecordError(f"unit is {str(arrays['unit'])[:40]!r}, which is no unit of a wavefront")
+    if unit := parse_unit(str(arrays.get("unit", ""))):
         own = dict.fromkeys(signals, unit) | own
     own = {name: unit for name, unit in own.items() if parse_unit(unit) or declaration.unit is None}
     for name, unit in own.items():

@@ -134,7 +134,7 @@ class FileColumns(Contents):
         elif values.dtype.kind == "M":
             self.add(name, np.where(np.isnat(values), np.nan, values.astype("M8[ns]").astype(np.int64) * 1e-9), "s")
         elif values.dtype.kind in "SU":
-            self._add_texts(name, [x.decode("utf-8", "replace") if isinstance(x, bytes) else x for x in values.ravel().tolist()])
+            self._add_texts(name, texts_of(values))
         elif values.dtype.kind not in "fiu":
             self.leave(name, f"{name} holds {KINDS.get(values.dtype.kind, values.dtype)}, not numbers")
         elif not values.size:
@@ -172,12 +172,13 @@ class FileColumns(Contents):
             self.columns[f"{name}[{i}]" if rows.shape[1] > 1 else name] = column.astype(np.float64)
 
     def _add_texts(self, name: str, texts: list[str]) -> None:
-        if name.lower() in TEXTS and len(texts) == 1:
+        if (match := UNIT.fullmatch(name)) and any(texts):
+            if match["of"]:
+                self.column_units[match["of"]] = one_text(texts)
+            else:
+                self.arrays["unit"] = np.array(one_text([*np.atleast_1d(self.arrays.get("unit", [])).tolist(), *texts]))
+        elif name.lower() in TEXTS and len(texts) == 1:
             self.arrays[name.lower()] = np.array(texts[0])
-        elif len(texts) == 1 and (match := UNIT.fullmatch(name)) and match["of"]:
-            self.column_units[match["of"]] = texts[0].strip()
-        elif len(texts) == 1 and match and "unit" not in self.arrays and parse_unit(texts[0]):
-            self.arrays["unit"] = np.array(texts[0])
         elif len(texts) > 1 and STAMP.fullmatch(texts[0].strip()):
             self.add(name, np.array([parse_cell(text) for text in texts]), "s")
         else:
@@ -226,8 +227,33 @@ def is_rate(name: str) -> bool:
     return RATE.fullmatch(name) is not None
 
 
-UNIT = re.compile(r"(?:(?P<of>.*)[/.])?units?", re.I)
+UNIT = re.compile(r"(?:(?P<of>.*)[/.])?\s*units?\s*", re.I)
 """Name of the unit of a structure or a group."""
+
+
+def texts_of(values: object) -> list[str]:
+    """Return the texts among values, decoded."""
+    plain = (x.decode("utf-8", "replace") if isinstance(x, bytes) else x for x in np.ravel(np.asarray(values)).tolist())
+    return [x for x in plain if isinstance(x, str)]
+
+
+def one_text(texts: Iterable[str]) -> str:
+    """Return equal texts as one, and those that differ as what is no unit.
+
+    >>> one_text(["nm", "nm "]), one_text(["nm", "um"])
+    ('nm', 'nm and um')
+    """
+    return " and ".join(dict.fromkeys(filter(None, map(str.strip, texts))))
+
+
+def unit_among(attributes: Mapping[str, object]) -> str:
+    """Return the unit that is among attributes, empty where there is none.
+
+    >>> unit_among({"Units": ["nm", "nm"], "comment": "good seeing"})
+    'nm'
+    """
+    return one_text(text for name, value in attributes.items() if UNIT.fullmatch(name) for text in texts_of(value))
+
 
 KINDS = {"O": "objects", "b": "yes or no", "c": "complex numbers", "V": "structures too deep"}
 """Kinds of array that are not read, by numpy's letter."""

@@ -23,7 +23,7 @@ from wfsobs.telemetry.formats.contents import (
     NUMBERS,
     STAMP,
     TEXTS,
-    Contents,
+    UNIT,
     FileColumns,
     TooLargeError,
     numbers_and_texts,
@@ -120,7 +120,7 @@ def numbered_lines(file: IO[bytes]) -> Iterator[tuple[int, str]]:
             yield number, text
 
 
-def _head(file: IO[bytes], contents: Contents) -> tuple[list[str], str, Iterator[tuple[int, list[str]]], bool]:
+def _head(file: IO[bytes], contents: FileColumns) -> tuple[list[str], str, Iterator[tuple[int, list[str]]], bool]:
     """Return the heading, what separates cells, the rows as (line, cells), and whether a comment is taken for the heading.
 
     Numbers and texts of comments go to `contents`.
@@ -142,8 +142,9 @@ def _head(file: IO[bytes], contents: Contents) -> tuple[list[str], str, Iterator
             return [f"column {i + 1}" for i in range(len(heading))], SEPARATORS[sign], rows, False
         comment = text.lstrip("#%!/ ")
         name, colon, value = comment.partition(":")
-        if colon and name in TEXTS:
-            contents.arrays[name] = np.array(value.strip())
+        name = name.strip().lower()
+        if colon and (name in TEXTS or UNIT.fullmatch(name)):
+            contents.add(name, value.strip())
         elif colon and name in NUMBERS:
             try:
                 contents.arrays[name] = np.array(float(value))

@@ -36,7 +36,9 @@ from wfsobs.telemetry.formats.contents import (
     parse_cell,
     read_at_most,
     refuse_damage,
+    texts_of,
     to_columns,
+    unit_among,
 )
 from wfsobs.typing import Array
 
@@ -134,9 +136,9 @@ def _add_matrix(out: FileColumns, body: memoryview, order: str, name: str = "") 
     elif kind in NUMBERS_OR_TEXT and not flags & COMPLEX:
         stored, data = next(parts, (1, b""))
         if kind == TEXT:
-            out.add(
-                name, bytes(data).decode({16: "utf-8", 4: f"utf-16{'lb'[order == '>']}e", 17: "utf-16"}.get(stored, "latin-1"))
-            )
+            text = bytes(data).decode({16: "utf-8", 4: f"utf-16{'lb'[order == '>']}e", 17: "utf-16"}.get(stored, "latin-1"))
+            rows = [text[row :: shape[0]] for row in range(shape[0])] if len(shape) == 2 else [text]
+            out.add(name, np.array(rows, dtype=str))
             return
         out.add(name, np.frombuffer(data, order + STORED[stored]).reshape(shape, order="F"))
     else:
@@ -232,9 +234,11 @@ def _attributes(item: Any, is_group: bool) -> Iterator[Part]:
     where = f"{item.name}/".lstrip("/")
     for key in item.attrs:
         is_text = (key.lower() in TEXTS and not where) or (UNIT.fullmatch(key) is not None and is_group)
-        if (where and key in item.file.attrs and not is_text) or item.attrs.get_id(key).shape not in ((), (1,)):
+        if not is_text and ((where and key in item.file.attrs) or item.attrs.get_id(key).shape not in ((), (1,))):
             continue
-        if is_text or key.lower() in NUMBERS or is_rate(key):
+        if is_text:
+            yield f"{where}{key}", texts_of(item.attrs[key]), ""
+        elif key.lower() in NUMBERS or is_rate(key):
             yield key if key.lower() in NUMBERS else f"{where}{key}", item.attrs[key], ""
 
 
@@ -250,7 +254,8 @@ def _dataset(name: str, item: Any, is_plain: bool) -> Part:
         values = _text(np.ravel(values)[0])
     if of_matlab == "char":
         values = "".join(map(chr, np.transpose(values).ravel().tolist()))
-    return name, np.transpose(values) if of_matlab else values, _text(item.attrs.get("units", item.attrs.get("unit", "")))
+    unit = unit_among({key: item.attrs[key] for key in item.attrs if UNIT.fullmatch(key)})
+    return name, np.transpose(values) if of_matlab else values, unit
 
 
 def _text(value: object) -> str:
@@ -330,7 +335,8 @@ def read_parquet(file: IO[bytes], most: int) -> FileColumns:
         if 8 * sum(group.column(j).num_values for group in groups for j in range(group.num_columns)) > most:
             raise TooLargeError(most)
         for key, value in (source.schema_arrow.metadata or {}).items():
-            if (name := key.decode("utf-8", "replace")) in (*NUMBERS, *TEXTS):
+            name = key.decode("utf-8", "replace").strip().lower()
+            if name in (*NUMBERS, *TEXTS) or UNIT.fullmatch(name):
                 out.add(name, float(value) if name in NUMBERS else value)
         for field in source.schema_arrow:
             of = field.type.value_type if types.is_list(field.type) or types.is_fixed_size_list(field.type) else field.type
@@ -339,11 +345,12 @@ def read_parquet(file: IO[bytes], most: int) -> FileColumns:
                 out.leave(field.name, f"{field.name} holds {str(field.type)[:40]}, not numbers")
                 continue
             column = source.read([field.name]).column(0)
-            _add_column(out, field.name, column.combine_chunks(), of is not field.type)
+            unit = unit_among({key.decode("utf-8", "replace"): value for key, value in (field.metadata or {}).items()})
+            _add_column(out, field.name, column.combine_chunks(), of is not field.type, unit)
     return out
 
 
-def _add_column(out: FileColumns, name: str, column: Any, is_list: bool) -> None:
+def _add_column(out: FileColumns, name: str, column: Any, is_list: bool, unit: str) -> None:
     """Add a column of Arrow, whose nulls are missing samples; without those that end what may be shorter than the record.
 
     That begins with a sample, as frames in rows of their own do, and frames in the rows of fast steps do not.
@@ -364,7 +371,7 @@ def _add_column(out: FileColumns, name: str, column: Any, is_list: bool) -> None
         return out.add(name, np.array([parse_cell(x or "") for x in column.to_pylist()]), "s")
     else:
         values = column.to_numpy(zero_copy_only=False)
-    out.add(name, values)
+    out.add(name, values, unit)
 
 
 def write_parquet(file: IO[bytes], arrays: Mapping[str, Array]) -> None:
