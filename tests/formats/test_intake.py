@@ -232,6 +232,13 @@ def test_one_row_per_frame() -> None:
         taken(y_ngs=frames[:6], ratio=5)
 
 
+def test_frames_before_and_after_the_record_are_left_out() -> None:
+    """The one at its start has seen nothing of it."""
+    steps, frames = np.array([-5, 5, 15, 25, 45]), RNG.standard_normal((5, 2))
+    record = taken(time=0.001 * np.arange(N), time_ngs=0.001 * steps, y_ngs=frames)
+    np.testing.assert_array_equal(record.y_ngs[np.isfinite(record.y_ngs[:, 0])], frames[2:4])
+
+
 @pytest.mark.parametrize("phase", [0, 1, 3])
 def test_frames_with_a_clock_of_their_own(phase: int) -> None:
     """The record starts where its first frame began, and a frame that is not there is NaN."""
@@ -250,6 +257,11 @@ def test_frames_with_a_clock_of_their_own(phase: int) -> None:
         ([5, 10, 17, 20, 25], "frame in row 2 is not a whole number of 5 steps"),
         ([5, 10, 15.5, 20, 25], "time_ngs is 0.0155 s in row 2, which is no step"),
         ([5, 10, 10, 15, 20], "time_ngs goes backwards or stands still at row 2"),
+        (
+            [5e3, 1e4, 15e3, 2e4, 25e3],
+            "time_ngs: 5 of 5 frames are outside of the record's 0 to 0.039 s; it takes stamps in the unit",
+        ),
+        ([30, 35, 40, 45, 50], "time_ngs: 3 of 5 frames are outside"),
     ],
 )
 def test_frames_off_their_clock(steps: list[float], message: str) -> None:

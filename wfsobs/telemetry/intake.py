@@ -267,6 +267,13 @@ def _apply_frames(signals: dict[str, Array], arrays: Mapping[str, Array], start:
     distance = frame_distance(steps) if frames.shape[0] == n else None
     if "time_ngs" in arrays:
         steps = frames_at(past_midnight(_clock("time_ngs", arrays["time_ngs"], frames.shape[0])), start, dt)
+        outside = int(((steps < 0) | (steps >= n)).sum())
+        if outside > 0.5 * steps.size:
+            end = start + (n - 1) * dt
+            raise RecordError(
+                f"time_ngs: {outside} of {steps.size} frames are outside of the record's {start:.9g} to {end:.9g} s; "
+                "it takes stamps in the unit and on the clock of time"
+            )
         ratio = _ratio(arrays, int(np.median(np.diff(steps))) if steps.size > 1 else None)
         late = np.flatnonzero((steps - steps[0]) % ratio)
         if late.size:
