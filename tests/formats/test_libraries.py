@@ -409,6 +409,35 @@ def test_units_that_differ_or_are_none_are_refused_unless_one_is_stated(name: st
     np.testing.assert_allclose(record.y_lgs, 1e-3 * Y, rtol=1e-12)
 
 
+def with_rate(name: str, value: float, unit: str) -> bytes:
+    def fill(f: h5py.File) -> None:
+        f["y_lgs"], f["u"], f[name] = Y, U, value
+        f[name].attrs["unit"] = unit
+
+    return hdf5(fill)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "unit", "line"),
+    [
+        ("dt", 1, "ms", ""),
+        ("dt", 1000.0, "us", ""),
+        ("dt", 1e-3, "s", ""),
+        ("rate", 1, "kHz", ""),
+        ("frame_rate", 1000.0, "Hz", ""),
+        ("dt", 1.0, "nm", "dt is in 'nm', which is no unit of time; it takes s, ms"),
+        ("rate", 1.0, "ms", "rate is in 'ms', which is no unit of a rate; it takes Hz or kHz"),
+    ],
+)
+def test_the_unit_of_a_step_or_a_rate(name: str, value: float, unit: str, line: str) -> None:
+    content = io.BytesIO(with_rate(name, value, unit))
+    if line:
+        with pytest.raises(RecordError, match=line):
+            read_record(content, "a.h5", declaration=DeclaredFormat(**NM))
+    else:
+        assert read_record(content, "a.h5", declaration=DeclaredFormat(**NM)).dt == pytest.approx(1e-3, rel=1e-12)
+
+
 def test_a_matrix_makes_modes_of_what_has_no_unit() -> None:
     stated = DeclaredFormat(reconstructor=LoopMatrix("R", ((1e-3, 0.0), (0.0, 1e-3))), trust=True)
     content = npz(unit="pixel", **ARRAYS)

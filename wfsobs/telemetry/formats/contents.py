@@ -142,9 +142,10 @@ class FileColumns(Contents):
         elif known in (*NUMBERS, *TEXTS):
             if values.size > 1 and not (values == values.flat[0]).all():
                 raise RecordError(f"{known} holds {values.size} numbers that differ; it takes one")
-            self.arrays[known] = np.unique(np.append(self.arrays.get(known, ()), values.flat[0])).squeeze()  # of several parts
+            value = values.flat[0] * (seconds_per(known, unit) if known == "dt" else 1)
+            self.arrays[known] = np.unique(np.append(self.arrays.get(known, ()), value)).squeeze()  # of several parts
         elif values.size == 1 and known not in NAMES and not parse_heading(name):
-            self.numbers[name] = float(values.item())
+            self.numbers[name] = float(values.item()) * (hertz_per(name, unit) if is_rate(name) else 1.0)
         else:
             self._add_numbers(name, values, unit)
 
@@ -226,6 +227,21 @@ def is_rate(name: str) -> bool:
     """
     return RATE.fullmatch(name) is not None
 
+
+def hertz_per(name: str, unit: str) -> float:
+    """Return the hertz per unit of a rate, 1 where none is stated. Raises RecordError.
+
+    >>> hertz_per("rate", "kHz"), hertz_per("rate", "")
+    (1000.0, 1.0)
+    """
+    hertz = HERTZ.get(unit.strip().lower() or "hz")
+    if hertz is None:
+        raise RecordError(f"{name} is in {unit[:40]!r}, which is no unit of a rate; it takes Hz or kHz")
+    return hertz
+
+
+HERTZ = {"khz": 1e3, "kilohertz": 1e3, **dict.fromkeys("hz hertz 1/s s-1 s^-1 fps".split(), 1.0)}
+"""Hertz per unit of a rate."""
 
 UNIT = re.compile(r"(?:(?P<of>.*)[/.])?\s*units?\s*", re.I)
 """Name of the unit of a structure or a group."""
