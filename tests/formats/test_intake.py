@@ -344,6 +344,11 @@ CSV = [
     ("y_lgs/tip_um,u/tip_um\n1,2\n3,x\n", "line 3, u/tip_um: 'x' is not a number"),
     ("y_lgs/tip_um,u/tip_um\n1,2\n3\n", "line 3 has 1 cells, the heading 2"),
     ("y_lgs/tip_um;u/tip_um\n1,5;2\n3,x;2\n", "line 3, y_lgs/tip_um: '3,x' is not a number"),
+    (
+        "y_lgs/tip_um;u/tip_um\n0,001;2\n3;5.235\n",
+        "line 3, u/tip_um: '5.235' has a decimal point, where other cells have decimal",
+    ),
+    ('y_lgs/tip_um,u/tip_um\n5.235,2\n"0,001",5\n', "line 2, y_lgs/tip_um: '5.235' has a decimal point, where other cells"),
     ("y_lgs/tip_um;u/tip_um\n1;2\n1\n", "line 3 has 1 cells, the heading 2; cells are separated by semicolons"),
     ("frame,seeing\n1,2\n", "has no y_lgs; a record needs y_lgs, u and dt"),
     ("y_lgs/tip_um,y_lgs/tip_um,u/tip_um\n1,2,3\n", "two columns have the same heading, y_lgs/tip_um"),

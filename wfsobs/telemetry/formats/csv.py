@@ -66,6 +66,7 @@ def read(file: IO[bytes], most: int) -> FileColumns:
         heading[i] = f"{name} ({i + 1})" if name and name in seen else name
         seen.add(name)
     width, commas = len(heading), False
+    points = dict[int, str]()
     cells_of, ends = {i: array("d") for i in range(width)}, [0] * width
     first = next(rows, None)
     units = [cell.strip(" []()-") for cell in first[1]] if first else []
@@ -84,6 +85,8 @@ def read(file: IO[bytes], most: int) -> FileColumns:
                 ends[i] = step + 1
             try:
                 column.append(float(text or "nan"))
+                if "." in text and i not in points:
+                    points[i] = f"line {line}, {heading[i]}: {text[:40]!r}"
                 continue
             except ValueError:
                 pass
@@ -95,7 +98,10 @@ def read(file: IO[bytes], most: int) -> FileColumns:
                 continue
             if STAMP.fullmatch(text):
                 out.column_units[heading[i]] = "s"
-            commas |= "," in text and heading[i] not in out.column_units
+            else:
+                commas |= "," in text
+    if commas and (point := next((where for i, where in points.items() if i in cells_of), "")):
+        raise RecordError(f"{point} has a decimal point, where other cells have decimal commas")
     out.columns = {heading[i]: np.array(column[: ends[i]]) for i, column in cells_of.items() if heading[i] or ends[i]}
     out.guesses += ["heading of the comment above"] * named
     out.guesses += [f"cells separated by {separator}"] * (separator != "commas") + ["decimal commas"] * commas
