@@ -101,6 +101,14 @@ def test_observers_are_chosen_by_name_in_every_command_that_runs_them(tmp_path):
         assert (result.exit_code, result.stderr.count("\n")) == (2, 1) and "'nobody': no such observer" in result.stderr
 
 
+def test_parts_that_a_saved_record_lacks_are_named(tmp_path):
+    path = tmp_path / "r.aot.fits"
+    result = call("run", *QUICK, "--observer", "zero", "--save", str(path))
+    saved = wfsobs.load(path, trust=True)
+    assert (saved.turbulence, saved.vibration, saved.training) == (None, None, None)
+    assert f"wfsobs: {path}: has no place for " in result.stderr and "turbulence, vibration" in result.stderr
+
+
 @pytest.mark.slow
 def test_a_saved_record_gives_the_same_numbers(tmp_path):
     record, estimates = tmp_path / "r.npz", tmp_path / "e.npz"

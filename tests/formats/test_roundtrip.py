@@ -140,7 +140,7 @@ def test_npz_of_either_byte_order(record: Record, order: str, single: bool) -> N
 def test_packed_by_gzip(ending: str, tmp_path: Path) -> None:
     record = simulate(paper().replace({"run.duration": 0.5, "run.warm_up": 0.1}))
     plain, packed = tmp_path / f"r{ending}", tmp_path / f"r{ending}.gz"
-    wfsobs.save(plain, record)
+    save_record(plain, record)
     packed.write_bytes(gzip.compress(plain.read_bytes(), 1))
     assert not name_differences(wfsobs.load(plain), wfsobs.load(packed))
     with pytest.raises(RecordError, match=r"r2.*\.gz: its name ends in none of"):

@@ -220,7 +220,8 @@ def _run_headless(order: LiveOrder, seconds: float, as_json: bool) -> None:
             frames = LiveFrame(*(np.array(part) for part in zip(*kept, strict=True)))
             is_simulated = isinstance(source, SimulatedLoop)
             record = record_of(frames, scenario) if is_simulated else open_loop_record(frames, source.sampling)
-            save_record(order.record_file, record, configfile.to_toml(scenario.before_events))
+            if lost := save_record(order.record_file, record, configfile.to_toml(scenario.before_events)):
+                print_note(lost)
     if as_json:
         print_json(result)
         return

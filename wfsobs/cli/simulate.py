@@ -164,8 +164,8 @@ def run(
         for i in range(seeds):
             one = scenario.replace({"run.seed": scenario.run.seed + i})
             record = simulate(one)
-            if save:
-                save_record(save, record, configfile.to_toml(one))
+            if save and (lost := save_record(save, record, configfile.to_toml(one))):
+                print_note(lost)
             inner = watch.part(i / seeds, 1.0 / seeds)
             result = observe_record(record, one, observers=observers or None, watch=inner, is_simulated=True)
             warn(result)

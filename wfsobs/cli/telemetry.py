@@ -59,7 +59,15 @@ from wfsobs.spectral.search import LOWEST
 from wfsobs.telemetry.check import Check, check_record
 from wfsobs.telemetry.intake import DeclaredFormat, to_record
 from wfsobs.telemetry.preview import read_off
-from wfsobs.telemetry.records import load_record, name_differences, open_record, read_contents, save_arrays, save_record
+from wfsobs.telemetry.records import (
+    line_of_lost,
+    load_record,
+    name_differences,
+    open_record,
+    read_contents,
+    save_arrays,
+    save_record,
+)
 
 
 @click.command()
@@ -75,8 +83,8 @@ def convert(record_file: str, out: str, scenario: Scenario, declaration: Declare
     check_output(out)
     record = load_with_delay(record_file, scenario, declaration)[0]
     save_record(out, record)
-    if lost := name_differences(record, load_record(out, scenario, DeclaredFormat(trust=True))):
-        print_note(f"{out}: has no place for {', '.join(lost)}")
+    if lost := line_of_lost(out, name_differences(record, load_record(out, scenario, DeclaredFormat(trust=True)))):
+        print_note(lost)
 
 
 def identification_table(result: Identification) -> Table:

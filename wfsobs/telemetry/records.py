@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import re
+import warnings
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -36,13 +37,22 @@ MOST_BYTES = 4_000_000_000
 """Maximum bytes of numbers in a file."""
 
 
-def save_record(path: str | Path, record: Record, scenario_toml: str | None = None) -> None:
-    """Write a record in the format of the name's ending. Raises OSError, RecordError."""
+def save_record(path: str | Path, record: Record, scenario_toml: str | None = None) -> str:
+    """Write a record in the format of the name's ending; return a line if that has no place for parts of it.
+
+    Raises OSError, RecordError.
+    """
     try:
         write = writer_of(str(path))
         write_whole(path, lambda file: write(file, record_arrays(record, scenario_toml)))
     except RecordError as error:
         raise RecordError(f"{path}: {error}") from None
+    return line_of_lost(path, [name for name in format_of(str(path)).omits if getattr(record, name) is not None])
+
+
+def line_of_lost(path: str | Path, names: Sequence[str]) -> str:
+    """Return the line that a file has no place for these parts of a record; empty without any."""
+    return f"{path}: has no place for {', '.join(names)}" if names else ""
 
 
 def save(path: str | Path, record: Record) -> None:
@@ -53,7 +63,7 @@ def save(path: str | Path, record: Record) -> None:
     path : str or Path
         The file, whose ending gives the format; one that is there is replaced once the new one is whole.
     record : Record
-        Measurements and commands [um], and the truth where the format has a place for it.
+        Measurements and commands [um], and the truth where the format has a place for it; a warning names what it has none for.
 
     Raises
     ------
@@ -62,7 +72,8 @@ def save(path: str | Path, record: Record) -> None:
     RecordError
         There is no such format, or it is only read.
     """
-    save_record(path, record)
+    if lost := save_record(path, record):
+        warnings.warn(lost, stacklevel=2)
 
 
 def name_differences(record: Record, other: Record) -> list[str]:

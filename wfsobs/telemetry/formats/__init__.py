@@ -15,7 +15,7 @@ from typing import IO
 
 from wfsobs.record import RecordError
 from wfsobs.telemetry.formats import aot, csv, fits, libraries, npz
-from wfsobs.telemetry.formats.contents import FileColumns, read_at_most
+from wfsobs.telemetry.formats.contents import APART, STARS, FileColumns, read_at_most
 from wfsobs.typing import Array
 
 
@@ -31,21 +31,24 @@ class Format:
         (open file, maximum bytes of numbers) -> FileColumns, under the file's own names.
     write : callable or None
         (open file, arrays) -> None; None of a format that is only read.
+    omits : tuple of str
+        Parts of a record that have no place in what it writes.
     """
 
     endings: tuple[str, ...]
     read: Callable[[IO[bytes], int], FileColumns]
     write: Callable[[IO[bytes], Mapping[str, Array]], None] | None = None
+    omits: tuple[str, ...] = ()
 
 
 FORMATS = (
     Format((".npz",), npz.read, npz.write),
-    Format((".csv", ".txt", ".dat", ".tsv", ".asc"), csv.read, csv.write),
-    Format((".aot.fits",), aot.read, aot.write),
-    Format((".fits", ".fit", ".fts"), aot.read_fits, fits.write),
+    Format((".csv", ".txt", ".dat", ".tsv", ".asc"), csv.read, csv.write, (STARS, APART)),
+    Format((".aot.fits",), aot.read, aot.write, ("open_loop_y", STARS, APART, "turbulence", "vibration", "training")),
+    Format((".fits", ".fit", ".fts"), aot.read_fits, fits.write, (STARS, APART)),
     Format((".h5", ".hdf5", ".hdf", ".he5"), libraries.read_hdf5, libraries.write_hdf5),
     Format((".mat",), libraries.read_matlab, libraries.write_matlab),
-    Format((".parquet", ".pq"), libraries.read_parquet, libraries.write_parquet),
+    Format((".parquet", ".pq"), libraries.read_parquet, libraries.write_parquet, (STARS, APART)),
     Format((".npy",), npz.read_npy),
     Format((".sav", ".idl"), libraries.read_sav),
 )
