@@ -18,6 +18,8 @@ def test_round_trip_is_exact(name, tmp_path):
     configfile.save_scenario(scenario, tmp_path / "s.toml")
     assert configfile.load_scenario(tmp_path / "s.toml") == scenario
     assert [p.name for p in tmp_path.iterdir()] == ["s.toml"]
+    (tmp_path / "s.toml").write_text(configfile.to_toml(scenario), encoding="utf-8-sig")
+    assert configfile.load_scenario(tmp_path / "s.toml") == scenario
 
 
 def test_peaks_are_tables():

@@ -136,9 +136,9 @@ def load_columns(path: str | Path) -> dict[str, str]:
 
 
 def read_text(path: str | Path) -> str:
-    """Return the text of a file. Raises SettingError."""
+    """Return the text of a file, also of one that begins with a mark of UTF-8. Raises SettingError."""
     try:
-        return Path(path).read_text(encoding="utf-8")
+        return Path(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise SettingError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or 'not UTF-8 text'}") from None
 
