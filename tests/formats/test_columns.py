@@ -421,6 +421,8 @@ def test_on_the_command_line(tmp_path: Path) -> None:
         assert rms[mode] == pytest.approx(1e-3 * np.sqrt(np.mean(values**2)), rel=1e-2), "to the samples that are scored"
     done = CliRunner().invoke(main, ["observe", str(path), "--column", "time"])
     assert done.exit_code != 0 and "--column time: takes ROLE=NAME" in done.output
+    done = CliRunner().invoke(main, ["observe", str(path), *words, "--column", "u/tip=flux"])
+    assert (done.exit_code, done.stderr) == (2, "wfsobs: --column u/tip=flux: u/tip is stated twice\n")
 
 
 def test_what_always_rises_is_proposed_as_the_time() -> None:

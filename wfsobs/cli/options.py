@@ -194,12 +194,15 @@ def record_options(command: Callable) -> Callable:
     def with_declaration(**values: Any) -> Any:
         stated = {field.name: values.pop(field.name) for field in fields(DeclaredFile)}
         config = click.get_current_context().params.get("config")
-        roles = {} if config is None else configfile.load_columns(config)
+        roles = dict[str, str]()
         for text in stated["columns"]:
             role, equals, name = text.partition("=")
             if not equals:
                 raise SettingError(f"--column {text}: takes ROLE=NAME, such as y_lgs/tip=slope_x")
+            if role.strip() in roles:
+                raise SettingError(f"--column {text}: {role.strip()} is stated twice")
             roles[role.strip()] = name
+        roles = ({} if config is None else configfile.load_columns(config)) | roles
         sign, gain = stated["command_sign"], stated["command_gain"]
         try:
             gains = tuple(map(float, gain.split(","))) if gain else None
