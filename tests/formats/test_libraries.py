@@ -627,6 +627,10 @@ CELLS = np.empty(2, dtype=object)
 CELLS[:] = [Y, U]
 
 
+def packed_images(file: io.BytesIO) -> None:
+    fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(Y, name="Y_LGS"), fits.CompImageHDU(U, name="U")]).writeto(file)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "content", "line"),
@@ -659,6 +663,7 @@ CELLS[:] = [Y, U]
         ),
         ("a.parquet", parquet(y_lgs=[["a"]]), "y_lgs holds list<element: string>, not numbers"),
         ("a.parquet", parquet(y_ngs=pa.array([None, None], pa.list_(pa.float64()))), "y_ngs is empty"),
+        ("a.fits", saved(packed_images), "Y_LGS is a compressed image, which is not read: unpack it, as funpack does"),
         ("a.npy", saved(lambda file: np.save(file, CELLS, allow_pickle=True)), "damaged, or holds more than plain arrays"),
     ],
 )

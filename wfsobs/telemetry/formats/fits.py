@@ -87,6 +87,10 @@ def tables_and_images(hdus: HDUList, most: float) -> FileColumns:
                 out.add(key, float(hdu.header.get(EXACT, hdu.header[keyword])) if key == "dt" else hdu.header[keyword])
             elif not hdu.is_image or hdu.data is None:  # of one image alone
                 out.add(f"{part}{key}", hdu.header[keyword])
+        if hdu.header.get("ZIMAGE"):
+            name = hdu.name or f"image {number}"
+            out.leave(name, f"{name} is a compressed image, which is not read: unpack it, as funpack does")
+            continue
         data: Any = hdu.data
         if isinstance(hdu, fits.BinTableHDU):
             for column in hdu.columns:
