@@ -378,7 +378,7 @@ ARRAYS = {"y_lgs": Y, "u": U, "dt": 1e-3}
 @pytest.mark.parametrize(
     ("name", "content"),
     [
-        *(("a.csv", with_comment(f"# {word}: nm")) for word in SPELLINGS),
+        *(("a.csv", with_comment(f"# {word}{sign} nm")) for word in SPELLINGS for sign in ":="),
         *(("a.h5", with_attribute(word, "nm")) for word in SPELLINGS),
         *(("a.h5", with_attribute("unit", value, at)) for value in (["nm"], ["nm", "nm"]) for at in (("y_lgs", "u"), ("/",))),
         ("a.h5", with_attribute("Units", np.array([b"nm", b"nm"]), ("/",))),
@@ -450,7 +450,7 @@ def test_a_matrix_makes_modes_of_what_has_no_unit() -> None:
 
 @pytest.mark.parametrize(
     ("line", "delay", "sign"),
-    [("# Delay: 3", 3, 1), ("# delay : 3", 3, 1), ("# Command_Sign: -1", 2, -1), ("# DELAY: 1\n# command_sign : -1", 1, -1)],
+    [("# Delay: 3", 3, 1), ("# delay : 3", 3, 1), ("# Command_Sign: -1", 2, -1), ("# DELAY: 1\n# command sign : -1", 1, -1)],
 )
 def test_delay_and_sign_in_any_spelling(line: str, delay: int, sign: int) -> None:
     record = read_record(io.BytesIO(with_comment(line)), "a.csv", declaration=DeclaredFormat(unit="nm", trust=True))

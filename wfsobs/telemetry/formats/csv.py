@@ -147,8 +147,8 @@ def _head(file: IO[bytes], contents: FileColumns) -> tuple[list[str], str, Itera
                 return names, SEPARATORS[sign], rows, True
             return [f"column {i + 1}" for i in range(len(heading))], SEPARATORS[sign], rows, False
         comment = text.lstrip("#%!/ ")
-        name, colon, value = comment.partition(":")
-        name = name.strip().lower()
+        name, colon, value = comment.partition("=" if UNIT.fullmatch(comment.partition("=")[0]) else ":")
+        name = name.strip().lower().replace(" ", "_")
         if colon and (name in TEXTS or UNIT.fullmatch(name)):
             contents.add(name, value.strip())
         elif colon and name in NUMBERS:
