@@ -347,6 +347,10 @@ def test_a_record_of_numbers_of_any_kind(kind: Any) -> None:
         ({"lgs_stars": np.ones(8, int)}, r"lgs_stars takes 9 whole numbers from 0, not int64 of shape \(8,\)"),
         ({"lgs_stars": np.full(9, 1.5)}, r"lgs_stars takes 9 whole numbers from 0, not float64 of shape \(9,\)"),
         ({"lgs_stars": np.full(9, -1)}, r"lgs_stars takes 9 whole numbers from 0, not int64 of shape \(9,\)"),
+        (
+            {"lgs_stars": np.ma.masked_less(np.arange(9), 1)},
+            r"lgs_stars takes 9 whole numbers from 0, not float64 of shape \(9,\)",
+        ),
         ({"y_stars": np.zeros((9, 2))}, r"y_stars has shape \(9, 2\); expected \(9, n_lgs, 2\)"),
         ({"y_stars": np.zeros((9, 3, 1))}, r"y_stars has shape \(9, 3, 1\); expected \(9, n_lgs, 2\)"),
         ({"y_stars": np.full((9, 3, 2), np.inf)}, "y_stars holds infinite numbers; a missing sample is NaN"),
@@ -357,6 +361,18 @@ def test_what_is_no_record_is_one_line(change: dict[str, Any], line: str) -> Non
     assert Record(**good).dt == 1e-3
     with pytest.raises(RecordError, match=f"^{line}$"):
         Record(**(good | change))
+
+
+@pytest.mark.parametrize(
+    "kind", [np.ma.array, lambda x, mask: [np.ma.array(row, mask=gone) for row, gone in zip(x, mask, strict=True)]]
+)
+def test_what_is_masked_is_missing(kind: Any) -> None:
+    numbers = np.arange(18).reshape(9, 2)
+    mask = numbers % 5 == 0
+    for shape in (lambda x: x, lambda x: x.astype(float)):
+        record = Record(kind(shape(numbers), mask=mask), kind(shape(numbers), mask=~mask), 1e-3)
+        np.testing.assert_array_equal(record.y_lgs, np.where(mask, np.nan, numbers))
+        np.testing.assert_array_equal(record.u, np.where(mask, numbers, np.nan))
 
 
 def test_whole_numbers_of_any_kind_are_whole_numbers() -> None:

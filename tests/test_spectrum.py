@@ -141,6 +141,12 @@ def test_a_spectrum_needs_a_resolution_that_has_a_window(resolution: float) -> N
         psd(np.ones(100), 1e-3, resolution=resolution)
 
 
+def test_a_spectrum_does_not_take_masked_numbers_as_measured() -> None:
+    y = np.ma.array(np.arange(200.0).reshape(100, 2), mask=np.arange(200).reshape(100, 2) == 7)
+    is_known = ~np.isnan(psd(y, 1e-3)[1]).any(axis=0)
+    np.testing.assert_array_equal(is_known, [True, False])
+
+
 # ---------------------------------------------------------------------- tables
 
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from wfsobs.notebook import PlotAccessor, html_table, import_extra
 from wfsobs.settings.values import shorten
 from wfsobs.signal.gate import GateSettings, OutlierGate, frame_mean_of, let_through
-from wfsobs.typing import Array
+from wfsobs.typing import Array, fill_masked
 
 if TYPE_CHECKING:
     import xarray
@@ -317,7 +317,7 @@ class Record(Signals):
 def _numbers(name: str, values: ArrayLike) -> Array:
     """Return a signal as float64. Raises RecordError."""
     try:
-        out = np.asarray(values, dtype=np.float64)
+        out = fill_masked(values).astype(np.float64, copy=False)
     except (TypeError, ValueError):
         raise RecordError(f"{name} holds no numbers, or rows of unlike lengths") from None
     if np.isinf(out).any():
@@ -327,7 +327,7 @@ def _numbers(name: str, values: ArrayLike) -> Array:
 
 def star_counts(counts: ArrayLike, n_steps: int) -> NDArray[np.int_]:
     """Return the number of LGS in every step as integers. Raises RecordError."""
-    raw = np.asarray(counts)
+    raw = fill_masked(counts)
     is_count = raw.dtype.kind in "fiu" and raw.shape == (n_steps,) and np.isfinite(raw).all()
     if not is_count or not ((raw >= 0) & (raw % 1 == 0)).all():
         raise RecordError(f"lgs_stars takes {n_steps} whole numbers from 0, not {raw.dtype} of shape {raw.shape}")

@@ -152,6 +152,7 @@ def test_wrong_input_is_one_line_and_takes_no_frame() -> None:
         (0.1, r"lqg-kf-multi: amend: command takes the shape \(2,\), one number per mode, not \(\)"),
         ([np.inf, 0.0], "lqg-kf-multi: amend: command is infinite in frame 0; .*"),
         ([0.0, np.nan], "lqg-kf-multi: amend: command has NaN; takes what the mirror was sent, finite numbers"),
+        (np.ma.array([0.0, 0.1], mask=[0, 1]), "lqg-kf-multi: amend: command has NaN; .*"),
         ("ab", "lqg-kf-multi: amend: command takes real numbers, not text"),
     ],
 )

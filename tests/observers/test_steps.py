@@ -209,6 +209,15 @@ def refused(match: str):
     return pytest.raises(StepError, match=match)
 
 
+def test_what_is_masked_is_missing() -> None:
+    masked, missing = (wfsobs.design("multirate", PRESETS["paper"]()) for _ in range(2))
+    for _ in range(7):
+        z, ngs = [1.0, 2.0], [3.0, 4.0] if masked.frame == 5 else None
+        masked.update(np.ma.array(z, mask=[0, 1]), None if ngs is None else np.ma.array(ngs, mask=[1, 0]))
+        missing.update([z[0], np.nan], None if ngs is None else [np.nan, ngs[1]])
+        np.testing.assert_array_equal(masked.predict(1, "turbulence"), missing.predict(1, "turbulence"))
+
+
 def test_wrong_input_is_one_line_and_takes_no_frame() -> None:
     observer = wfsobs.design("multirate", PRESETS["paper"]())
     with refused(r"z takes the shape \(2,\)"):

@@ -24,7 +24,7 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Estimates, Measurements, Sampling, by_name
 from wfsobs.settings.values import error_line
 from wfsobs.signal.gate import GateSettings, OutlierGate, frame_mean_of
-from wfsobs.typing import Array
+from wfsobs.typing import Array, fill_masked
 
 
 class StepError(ValueError):
@@ -486,7 +486,7 @@ KNOWN = frozenset({"beside", "commands", "covariance", "frames", "held_value", "
 def as_numbers(id: str, x: ArrayLike, name: str) -> Array:
     """Return real numbers as float64. Raises StepError for anything else."""
     try:
-        raw = np.asarray(x)
+        raw = fill_masked(x)
         if raw.dtype.kind in "biufO":
             return raw.astype(float)
     except (TypeError, ValueError):

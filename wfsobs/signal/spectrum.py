@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag
 
 from wfsobs.signal.periodic import PeriodicFilter
-from wfsobs.typing import Array
+from wfsobs.typing import Array, fill_masked
 
 
 def bandpass_bank(frequencies: Sequence[float], bandwidth: float, order: int, dt: float) -> list[Array]:
@@ -262,7 +262,7 @@ def psd(x: ArrayLike, dt: float, *, resolution: float = 0.5) -> tuple[Array, Arr
         raise ValueError(f"dt = {dt:g}: takes a time step above 0 s")
     if not 0.0 < resolution <= 1.0 / dt:
         raise ValueError(f"resolution = {resolution:g}: takes more than 0 Hz, and no more than 1 / dt = {1.0 / dt:g} Hz")
-    x = np.asarray(x, dtype=float)
+    x = fill_masked(x).astype(float)
     window = min(round(1.0 / (resolution * dt)), len(x))
     frequency, density = scipy.signal.welch(x, fs=1.0 / dt, nperseg=window, axis=0, detrend="constant")
     return frequency, density
