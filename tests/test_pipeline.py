@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas
 import pytest
+from astropy.units import Unit
 
 from tests.records import ON_PAPER
 from wfsobs import PRESETS, Record, RecordError, Scenario, SettingError, observe, run, simulate
@@ -323,6 +324,9 @@ def test_a_record_of_numbers_of_any_kind(kind: Any) -> None:
     np.testing.assert_array_equal(one.estimates[0].values, two.estimates[0].values)
 
 
+NM = Unit("nm")
+
+
 @pytest.mark.parametrize(
     ("change", "line"),
     [
@@ -331,6 +335,8 @@ def test_a_record_of_numbers_of_any_kind(kind: Any) -> None:
         ({"turbulence": np.zeros((9, 1))}, r"turbulence has shape \(9, 1\); expected \(9, 2\), that of y_lgs"),
         ({"y_lgs": [["a", "b"]]}, "y_lgs holds no numbers, or rows of unlike lengths"),
         ({"y_lgs": [[1.0], [1.0, 2.0]]}, "y_lgs holds no numbers, or rows of unlike lengths"),
+        ({"u": np.ones((9, 2)) * NM}, "u has the unit nm; takes plain numbers in um, .*"),
+        ({"u": [np.ones(2) * NM] * 9}, "u has the unit nm; takes plain numbers in um, .*"),
         ({"u": np.full((9, 2), np.inf)}, "u holds infinite numbers; a missing sample is NaN"),
         ({"dt": 0}, "dt takes a time step above 0 s, not 0"),
         ({"dt": np.nan}, "dt takes a time step above 0 s, not nan"),

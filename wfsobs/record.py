@@ -14,6 +14,7 @@ from wfsobs.notebook import PlotAccessor, html_table, import_extra
 from wfsobs.settings.values import shorten
 from wfsobs.signal.gate import GateSettings, OutlierGate, frame_mean_of, let_through
 from wfsobs.typing import Array, fill_masked
+from wfsobs.units import unit_refusal
 
 if TYPE_CHECKING:
     import xarray
@@ -316,6 +317,8 @@ class Record(Signals):
 
 def _numbers(name: str, values: ArrayLike) -> Array:
     """Return a signal as float64. Raises RecordError."""
+    if why := unit_refusal(values):
+        raise RecordError(f"{name} {why}")
     try:
         out = fill_masked(values).astype(np.float64, copy=False)
     except (TypeError, ValueError):

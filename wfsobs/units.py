@@ -111,3 +111,11 @@ NO_UNITS = frozenset("x y tip tilt lgs ngs wfs dm ttm utc tai gps unix rel abs".
 
 def _parse_any(text: str) -> str:
     return parse_unit(text) or (text if text in SECONDS else "")
+
+
+def unit_refusal(values: object) -> str:
+    """Return why values, or arrays in a list, that bring a unit with them are refused; "" without one."""
+    for one in (values, *(values if isinstance(values, (list, tuple)) else ())):
+        if (unit := getattr(one, "unit", None)) is not None:
+            return f'has the unit {str(unit) or 1}; takes plain numbers in um, such as those of to_value("um")'
+    return ""

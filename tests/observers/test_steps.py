@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from astropy.units import Unit
 
 import wfsobs
 from tests.records import ON_PAPER, kalman_model, short, third_of_pairs
@@ -233,6 +234,8 @@ def test_wrong_input_is_one_line_and_takes_no_frame() -> None:
         observer.update([0.0, 0.0], "ab")
     with refused("^multirate: stars takes a whole number, 0 or more, not 'x'$"):
         observer.update([0.0, 0.0], stars="x")  # type: ignore[arg-type]
+    with refused("^multirate: z has the unit nm; takes plain numbers in um, .+$"):
+        observer.update([1.0, 2.0] * Unit("nm"))
     assert observer.frame == 0
     for z in ([0.0, np.nan], np.float32([1.0, 2.0]), [1, 2], [True, False], [None, 1.0], [1e300, -1e300]):
         observer.update(z)

@@ -25,6 +25,7 @@ from wfsobs.record import Estimates, Measurements, Sampling, by_name
 from wfsobs.settings.values import error_line
 from wfsobs.signal.gate import GateSettings, OutlierGate, frame_mean_of
 from wfsobs.typing import Array, fill_masked
+from wfsobs.units import unit_refusal
 
 
 class StepError(ValueError):
@@ -485,6 +486,8 @@ KNOWN = frozenset({"beside", "commands", "covariance", "frames", "held_value", "
 
 def as_numbers(id: str, x: ArrayLike, name: str) -> Array:
     """Return real numbers as float64. Raises StepError for anything else."""
+    if why := unit_refusal(x):
+        raise StepError(f"{id}: {name} {why}")
     try:
         raw = fill_masked(x)
         if raw.dtype.kind in "biufO":
