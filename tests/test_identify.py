@@ -524,7 +524,7 @@ def test_records_that_are_none_of_the_model_are_survived_and_told(z: np.ndarray,
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"y_lgs": np.where(np.arange(4000)[:, None] == 7, np.inf, np.ones((4000, 2))), "u": np.zeros((4000, 2))}, "infinite"),
+        ({"y_lgs": np.where(np.arange(4000)[:, None] == 7, np.inf, np.ones((4000, 2))), "u": np.zeros((4000, 2))}, "is inf at step 7"),
         ({"y_lgs": np.zeros((900, 2)), "u": np.zeros((900, 2))}, "900 samples, identification needs"),
         ({"y_lgs": np.zeros((4000, 2)), "u": np.zeros((4000, 2))}, "tip: z is constant"),
         ({"y_lgs": np.ones((4000, 2)), "u": np.zeros((4000, 2)), "dt": 0.1}, "lowest peak frequency = 5 Hz: .* 2.5 Hz"),

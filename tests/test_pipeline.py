@@ -333,11 +333,17 @@ NM = Unit("nm")
         ({"y_lgs": np.zeros(9)}, r"y_lgs has shape \(9,\); expected \(n_steps, n_modes\)"),
         ({"u": np.zeros((8, 2))}, r"u has shape \(8, 2\); expected \(9, 2\), that of y_lgs"),
         ({"turbulence": np.zeros((9, 1))}, r"turbulence has shape \(9, 1\); expected \(9, 2\), that of y_lgs"),
-        ({"y_lgs": [["a", "b"]]}, "y_lgs holds no numbers, or rows of unlike lengths"),
+        ({"y_lgs": [["a", "b"]]}, "y_lgs holds <U1, not numbers"),
+        ({"y_lgs": np.ones((9, 2)) * 1j}, "y_lgs holds complex128, not numbers"),
+        ({"u": np.ones((9, 2), bool)}, "u holds bool, not numbers"),
+        (
+            {"vibration": np.full((9, 2), -2e12)},
+            r"vibration is -2000000000000\.0 at step 0, mode 0; .* up to 1e\+12, .*",
+        ),
         ({"y_lgs": [[1.0], [1.0, 2.0]]}, "y_lgs holds no numbers, or rows of unlike lengths"),
         ({"u": np.ones((9, 2)) * NM}, "u has the unit nm; takes plain numbers in um, .*"),
         ({"u": [np.ones(2) * NM] * 9}, "u has the unit nm; takes plain numbers in um, .*"),
-        ({"u": np.full((9, 2), np.inf)}, "u holds infinite numbers; a missing sample is NaN"),
+        ({"u": np.full((9, 2), np.inf)}, "u is inf at step 0, mode 0; it takes finite numbers"),
         ({"dt": 0}, "dt takes a time step above 0 s, not 0"),
         ({"dt": np.nan}, "dt takes a time step above 0 s, not nan"),
         ({"dt": "1 ms"}, r"dt takes a time step \[s\], not '1 ms'"),
@@ -359,7 +365,7 @@ NM = Unit("nm")
         ),
         ({"y_stars": np.zeros((9, 2))}, r"y_stars has shape \(9, 2\); expected \(9, n_lgs, 2\)"),
         ({"y_stars": np.zeros((9, 3, 1))}, r"y_stars has shape \(9, 3, 1\); expected \(9, n_lgs, 2\)"),
-        ({"y_stars": np.full((9, 3, 2), np.inf)}, "y_stars holds infinite numbers; a missing sample is NaN"),
+        ({"y_stars": np.full((9, 3, 2), np.inf)}, "y_stars is inf at step 0, mode 0; it takes finite numbers"),
     ],
 )
 def test_what_is_no_record_is_one_line(change: dict[str, Any], line: str) -> None:

@@ -26,6 +26,9 @@ DELAY = 2
 OF_MODES = ("y_lgs", "u", "y_ngs", "open_loop_y", "turbulence", "vibration")
 """Signals of a record, (n_steps, n_modes)."""
 
+LARGEST = 1e12
+"""Largest number of a signal, whatever its unit: a kilometre in nanometres."""
+
 SENSORS = ("lgs", "ngs")
 """Whose measurements a record has."""
 
@@ -191,13 +194,16 @@ class Record(Signals):
         """Take lists, tables and numbers of any kind. Raises RecordError where they are no record."""
         for name in (*OF_MODES, "y_stars"):
             if (values := getattr(self, name)) is not None:
-                object.__setattr__(self, name, numbers := _numbers(name, values))
+                object.__setattr__(self, name, numbers := as_signal(name, values))
                 if self.y_lgs.ndim != 2:
                     raise RecordError(f"y_lgs has shape {self.y_lgs.shape}; expected (n_steps, n_modes)")
                 if name != "y_stars" and numbers.shape != self.y_lgs.shape:
                     raise RecordError(f"{name} has shape {numbers.shape}; expected {self.y_lgs.shape}, that of y_lgs")
         if self.y_stars is not None and (self.y_stars.ndim != 3 or self.y_stars.shape[::2] != self.y_lgs.shape):
             raise RecordError(f"y_stars has shape {self.y_stars.shape}; expected ({self.n_steps}, n_lgs, {self.n_modes})")
+        for name in (*OF_MODES, "y_stars"):
+            if (values := getattr(self, name)) is not None:
+                check_size(name, values)
         if self.lgs_stars is not None:
             object.__setattr__(self, "lgs_stars", star_counts(self.lgs_stars, self.n_steps))
         try:
@@ -315,17 +321,26 @@ class Record(Signals):
         return {"turbulence": self.turbulence, "vibration": self.vibration}[target]
 
 
-def _numbers(name: str, values: ArrayLike) -> Array:
+def as_signal(name: str, values: ArrayLike) -> Array:
     """Return a signal as float64. Raises RecordError."""
     if why := unit_refusal(values):
         raise RecordError(f"{name} {why}")
     try:
-        out = fill_masked(values).astype(np.float64, copy=False)
+        raw = fill_masked(values)
+        if raw.dtype.kind in "fiuO":
+            return raw.astype(np.float64, copy=False)
     except (TypeError, ValueError):
         raise RecordError(f"{name} holds no numbers, or rows of unlike lengths") from None
-    if np.isinf(out).any():
-        raise RecordError(f"{name} holds infinite numbers; a missing sample is NaN")
-    return out
+    raise RecordError(f"{name} holds {raw.dtype}, not numbers")
+
+
+def check_size(name: str, signal: Array, *, is_whole: bool = False) -> None:
+    """Raise RecordError for a number of a signal that is infinite or too large, and for a missing one where it is whole."""
+    bad = ~(np.abs(signal) <= LARGEST) if is_whole else np.abs(signal) > LARGEST
+    if bad.any():
+        step, *_, mode = at = tuple(np.argwhere(bad)[0])
+        most = f" up to {LARGEST:g}, NaN where one is missing" if np.isfinite(signal[at]) else ""
+        raise RecordError(f"{name} is {signal[at]} at step {step}, mode {mode}; it takes finite numbers{most}")
 
 
 def star_counts(counts: ArrayLike, n_steps: int) -> NDArray[np.int_]:

@@ -15,7 +15,7 @@ from typing import Self
 
 import numpy as np
 
-from wfsobs.record import DELAY, Record, RecordError, Training, star_counts
+from wfsobs.record import DELAY, Record, RecordError, Training, as_signal, check_size, star_counts
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.zernike import order_of
 from wfsobs.telemetry.bridged import without_bridged
@@ -31,7 +31,7 @@ from wfsobs.telemetry.clocks import (
     steps_of,
 )
 from wfsobs.telemetry.columns import LoopMatrix, apply_matrices
-from wfsobs.telemetry.formats.contents import APART, FAST, FRAME, LARGEST, NGS, SIGNALS, STARS, TIME, TRAINING, Contents
+from wfsobs.telemetry.formats.contents import APART, FAST, FRAME, NGS, SIGNALS, STARS, TIME, TRAINING, Contents
 from wfsobs.typing import Array
 from wfsobs.units import ANGLES, UNITS, micrometres_per, parse_unit
 
@@ -164,16 +164,10 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
 
 def _signal(name: str, raw: Array) -> Array:
     """Return a signal as native float64 of its own, NaN where a sample is missing."""
-    if raw.dtype.kind not in "fiu":
-        raise RecordError(f"{name} holds {raw.dtype}, not numbers")
-    if raw.ndim != 2:
-        raise RecordError(f"{name} has shape {raw.shape}; expected (any, any)")
-    out = np.array(raw, dtype=np.float64, order="C")
-    bad = np.abs(out) > LARGEST if name not in TRAINING else ~(np.abs(out) <= LARGEST)
-    if bad.any():
-        row, column = np.argwhere(bad)[0]
-        most = f" up to {LARGEST:g}, NaN where one is missing" if np.isfinite(out[row, column]) else ""
-        raise RecordError(f"{name} is {out[row, column]} at step {row}, mode {column}; it takes finite numbers{most}")
+    out = np.array(as_signal(name, raw), order="C")
+    if out.ndim != 2:
+        raise RecordError(f"{name} has shape {out.shape}; expected (any, any)")
+    check_size(name, out, is_whole=name in TRAINING)
     return out
 
 

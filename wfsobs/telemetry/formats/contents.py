@@ -25,9 +25,6 @@ from wfsobs.units import DAYS, SECONDS, parse_unit, split_unit
 FAST = ("y_lgs", "u", "turbulence", "vibration", "open_loop_y")
 """Arrays with one row per fast step."""
 
-LARGEST = 1e12
-"""Largest number of a signal, whatever its unit: a kilometre in nanometres."""
-
 NGS = "y_ngs"
 TRAINING = ("training_y", "training_u", "training_open_loop_y")
 SIGNALS = (*FAST, NGS, *TRAINING)
