@@ -295,6 +295,6 @@ def test_what_the_frames_of_the_ngs_lack_is_said(tmp_path: Path) -> None:
     assert "269 of 299 NGS frames are missing" in told.replace("\n", " ")
     y = rng.standard_normal((1500, 2)).cumsum(axis=0)
     for ratio in (1, 5):
-        frames = np.roll(frame_mean(y, ratio), -1, axis=0)
+        frames = np.where((np.arange(1500) % ratio == 0)[:, None], np.roll(frame_mean(y, ratio), -1, axis=0), np.nan)
         with pytest.raises(RecordError, match="y_ngs has no noise of its own beside y_lgs"):
             identify(Record(y, u, DT, y_ngs=frames, ratio=ratio))

@@ -363,6 +363,8 @@ NM = Unit("nm")
             {"lgs_stars": np.ma.masked_less(np.arange(9), 1)},
             r"lgs_stars takes 9 whole numbers from 0, not float64 of shape \(9,\)",
         ),
+        ({"y_ngs": np.zeros((9, 2))}, "y_ngs needs ratio, the number of fast steps per NGS frame"),
+        ({"y_ngs": np.zeros((9, 2)), "ratio": 4}, "y_ngs has a frame at step 1; with ratio = 4 frames are at steps 4, 8, .*"),
         ({"y_stars": np.zeros((9, 2))}, r"y_stars has shape \(9, 2\); expected \(9, n_lgs, 2\)"),
         ({"y_stars": np.zeros((9, 3, 1))}, r"y_stars has shape \(9, 3, 1\); expected \(9, n_lgs, 2\)"),
         ({"y_stars": np.full((9, 3, 2), np.inf)}, "y_stars is inf at step 0, mode 0; it takes finite numbers"),

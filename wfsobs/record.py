@@ -216,6 +216,10 @@ class Record(Signals):
             if not (whole := as_whole(getattr(self, name))):
                 raise RecordError(f"{name} takes a whole number of steps from 1, not {shorten(getattr(self, name))}")
             object.__setattr__(self, name, whole)
+        if self.y_ngs is not None:
+            if self.ratio is None:
+                raise RecordError("y_ngs needs ratio, the number of fast steps per NGS frame")
+            check_frames(self.y_ngs, self.ratio)
 
     def __repr__(self) -> str:
         return f"Record({', '.join(f'{what} {value}' for what, value in self._summary())})"
@@ -341,6 +345,17 @@ def check_size(name: str, signal: Array, *, is_whole: bool = False) -> None:
         step, *_, mode = at = tuple(np.argwhere(bad)[0])
         most = f" up to {LARGEST:g}, NaN where one is missing" if np.isfinite(signal[at]) else ""
         raise RecordError(f"{name} is {signal[at]} at step {step}, mode {mode}; it takes finite numbers{most}")
+
+
+def check_frames(y_ngs: Array, ratio: int) -> None:
+    """Raise RecordError where NGS frames are at other steps than 0, n, 2n, ..., the first of which saw nothing."""
+    is_off = np.asarray(~np.isnan(y_ngs).all(axis=1))
+    is_off[::ratio] = False
+    if is_off.any():
+        raise RecordError(
+            f"y_ngs has a frame at step {int(np.argmax(is_off))}; with ratio = {ratio} "
+            f"frames are at steps {ratio}, {2 * ratio}, ... and NaN elsewhere"
+        )
 
 
 def star_counts(counts: ArrayLike, n_steps: int) -> NDArray[np.int_]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wfsobs.record import RecordError
+from wfsobs.record import RecordError, check_frames
 from wfsobs.typing import Array
 from wfsobs.units import SECONDS
 
@@ -264,12 +264,7 @@ def place_frames(frames: Array, n: int, ratio: int) -> Array:
 
 def drop_partial_frames(y_ngs: Array, ratio: int) -> Array:
     """Check that frames are at k = n, 2n, ...; drop a frame at k = 0, which saw nothing, and frames without all modes."""
-    steps = np.arange(y_ngs.shape[0])
-    due = (steps % ratio == 0) & (steps >= ratio)
-    wrong = ~due & ~np.isnan(y_ngs).all(axis=1) & (steps > 0)
-    if wrong.any():
-        raise RecordError(
-            f"y_ngs has a frame at step {int(np.argmax(wrong))}; with ratio = {ratio} "
-            f"frames are at steps {ratio}, {2 * ratio}, ... and NaN elsewhere"
-        )
-    return np.where((due & ~np.isnan(y_ngs).any(axis=1))[:, None], y_ngs, np.nan)
+    check_frames(y_ngs, ratio)
+    is_kept = np.asarray(~np.isnan(y_ngs).any(axis=1))
+    is_kept[0] = False
+    return np.where(is_kept[:, None], y_ngs, np.nan)
