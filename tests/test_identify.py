@@ -31,6 +31,7 @@ from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS
+from wfsobs.settings.values import SettingError
 from wfsobs.signal.autoregressive import Ar2, Ar3
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import true_spectra
@@ -524,7 +525,10 @@ def test_records_that_are_none_of_the_model_are_survived_and_told(z: np.ndarray,
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"y_lgs": np.where(np.arange(4000)[:, None] == 7, np.inf, np.ones((4000, 2))), "u": np.zeros((4000, 2))}, "is inf at step 7"),
+        (
+            {"y_lgs": np.where(np.arange(4000)[:, None] == 7, np.inf, np.ones((4000, 2))), "u": np.zeros((4000, 2))},
+            "is inf at step 7",
+        ),
         ({"y_lgs": np.zeros((900, 2)), "u": np.zeros((900, 2))}, "900 samples, identification needs"),
         ({"y_lgs": np.zeros((4000, 2)), "u": np.zeros((4000, 2))}, "tip: z is constant"),
         ({"y_lgs": np.ones((4000, 2)), "u": np.zeros((4000, 2)), "dt": 0.1}, "lowest peak frequency = 5 Hz: .* 2.5 Hz"),
@@ -533,6 +537,15 @@ def test_records_that_are_none_of_the_model_are_survived_and_told(z: np.ndarray,
 def test_unusable_records_are_refused(change: dict, said: str) -> None:
     with pytest.raises(RecordError, match=said):
         identify(Record(**{"dt": DT, **change}))
+
+
+@pytest.mark.parametrize(
+    "setting", [{"lowest": x} for x in (0.0, -1.0, np.nan)] + [{"level": x} for x in (0.0, -1.0, 0.51, np.nan)]
+)
+def test_a_level_or_a_frequency_that_no_search_has_is_one_line(setting: dict[str, float]) -> None:
+    (name, value), white = *setting.items(), np.random.default_rng(1).standard_normal((4000, 1))
+    with pytest.raises(SettingError, match=rf"^{name} = {value:g}: takes a number above 0( and up to 0\.5)?$"):
+        identify(Record(white, 0.0 * white, DT), **setting)
 
 
 def test_cancel_and_progress(record: Record) -> None:

@@ -37,6 +37,7 @@ from wfsobs.evaluation.result import score_rows
 from wfsobs.files import write_text
 from wfsobs.identification import identify as identify_record
 from wfsobs.identification.identification import (
+    HIGHEST_LEVEL,
     LEVEL,
     format_number,
     identification_dict,
@@ -144,7 +145,7 @@ def observe(
 @record_command
 @click.option(
     "--level",
-    type=FiniteRange(0, 0.5, min_open=True),
+    type=FiniteRange(0, HIGHEST_LEVEL, min_open=True),
     default=LEVEL,
     metavar="P",
     help="Probability of finding any peak where there is none.",

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from math import isnan, sqrt
+from math import inf, isnan, sqrt
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,7 @@ from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import add_comments, to_toml
 from wfsobs.sensors.zernike import MODE_NAMES
+from wfsobs.settings.values import SettingError
 from wfsobs.signal.autoregressive import Ar3
 from wfsobs.signal.gains import RiccatiError
 from wfsobs.spectral.search import LOWEST, PAD, Candidate, SearchResult, search_peaks
@@ -91,6 +92,8 @@ def in_time(e: Array, dt: float) -> list[str]:
 
 LEVEL = 0.05
 """Probability of any false peak in a record."""
+HIGHEST_LEVEL = 0.5
+"""Maximum of that probability."""
 EVERY_SWEEP, SELDOM = 8, 4
 """All parameters are fitted anew after every peak; with many peaks, only after several: each has been fitted alone."""
 MOST_PEAKS = 40
@@ -119,9 +122,9 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
     record : Record
         Measurements and commands.
     level : float
-        Probability of finding any peak where there is none.
+        Probability of finding any peak where there is none, above 0 and up to HIGHEST_LEVEL.
     lowest : float
-        Minimum frequency of a peak [Hz].
+        Minimum frequency of a peak [Hz], above 0.
     watch : Watch, optional
         Receives the progress, and is asked at every block of work whether to stop.
 
@@ -132,6 +135,8 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
 
     Raises
     ------
+    SettingError
+        There is no such level or frequency.
     RecordError
         The record is too short, has too few samples or is constant.
     Cancelled
@@ -141,6 +146,9 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
     --------
     wfsobs.observe : Run observers on a record.
     """
+    for name, value, most in (("level", level, HIGHEST_LEVEL), ("lowest", lowest, inf)):
+        if not 0.0 < value <= most:
+            raise SettingError(f"{name} = {value:g}: takes a number above 0{f' and up to {most:g}' if most < inf else ''}")
     z = seen_z(record)
     z = z[: fast_length(len(z))]
     if len(z) < SHORTEST:

@@ -41,6 +41,7 @@ from wfsobs.app.views.plots import call, new_spectrum, set_ends
 from wfsobs.app.work import RunResults
 from wfsobs.identification import Identification, identify
 from wfsobs.identification.identification import (
+    HIGHEST_LEVEL,
     LEVEL,
     Fit,
     bin_periodogram,
@@ -244,7 +245,7 @@ class IdentifyPage(Page):
 
     def _start(self) -> None:
         of = self.shown_results()
-        work = partial(compute, of, read_number(self.level, 1e-9, 0.5), read_number(self.lowest, 1e-3, 1e4))
+        work = partial(compute, of, read_number(self.level, 1e-9, HIGHEST_LEVEL), read_number(self.lowest, 1e-3, 1e4))
         self.work.start(self.store.limits.job("identify", "identification", work, seconds(of.result.record)))
 
     def tell_filters(self) -> None:
