@@ -1,5 +1,6 @@
 """The live loop: blocks without a seam, a ring, and numbers that are those of the recording."""
 
+import errno
 import itertools
 import json
 import os
@@ -225,6 +226,20 @@ def test_a_port_in_use_is_one_line_and_no_loop_begins():
     lines = done.stderr.splitlines()
     assert (done.returncode, lines[-1]) == (2, f"wfsobs: localhost:{port}: Address already in use")
     assert not [line for line in lines[:-1] if " INFO " not in line or "live" in line]
+
+
+def test_a_log_that_cannot_be_written_is_said_once_and_the_loop_runs_on(monkeypatch, tmp_path):
+    def append(path, *_):
+        raise OSError(errno.ENOSPC, "No space left on device", path)
+
+    monkeypatch.setattr("wfsobs.live.loop.append_line", append)
+    record = wfsobs.simulate(paper().replace({"run.duration": 3.0}))
+    record.y_lgs[500:1500] = np.nan
+    save_record(tmp_path / "gap.npz", record)
+    log, options = str(tmp_path / "night.log"), ["--headless", "--json", "--seconds", "3", "--observer", "kf-lgs"]
+    done = CliRunner().invoke(main, ["live", *options, "--replay", str(tmp_path / "gap.npz"), "--log", log])
+    assert done.stderr.splitlines()[1:] == [f"wfsobs: live: {log}: No space left on device: the log ends"]  # after the gap
+    assert done.exit_code == 2 and json.loads(done.stdout)["frames"] == 3000
 
 
 def test_without_a_page_what_happens_and_alarms_go_to_a_log(tmp_path):

@@ -8,9 +8,11 @@ from collections.abc import Iterable
 from dataclasses import replace
 from os import cpu_count
 from types import FrameType
+from typing import Any
 
 import click
 import numpy as np
+from rich.table import Table
 
 from wfsobs.cli.options import (
     RECORD_OPTIONS,
@@ -200,6 +202,12 @@ def _run_headless(order: LiveOrder, seconds: float, as_json: bool) -> None:
     n_frames = max(1, round(seconds / source.sampling.dt * order.speed))
     if isinstance(source, Replay):
         n_frames = min(n_frames, source.record.n_steps)
+    complaints: list[str] = []
+
+    def complain(line: str) -> None:
+        complaints.append(line)
+        _say(line)
+
     before = signal.signal(signal.SIGTERM, _end)
     try:
         with progress_bar("frames") as watch:
@@ -213,6 +221,7 @@ def _run_headless(order: LiveOrder, seconds: float, as_json: bool) -> None:
                 report=watch.progress,
                 say=_say if isinstance(source, StreamSource) else lambda _: None,
                 log_file=order.log_file,
+                complain=complain,
             )
     finally:  # what has been sent is there, whatever has ended it
         signal.signal(signal.SIGTERM, before)
@@ -224,7 +233,14 @@ def _run_headless(order: LiveOrder, seconds: float, as_json: bool) -> None:
                 print_note(lost)
     if as_json:
         print_json(result)
-        return
+    else:
+        show_table(_table(result, source))
+    if complaints:
+        sys.exit(2)
+
+
+def _table(result: dict[str, Any], source: LiveSource) -> Table:
+    """Return what `follow` tells of every observer."""
     error = ("rms" if source.has_truth else "next") + ", nm"
     title = f"{result['frames']} frames, {result['lost']} lost, {100.0 * result['late_share']:.2f} % more than 1 ms late"
     table = new_table(("Observer",), (error, "step p50, us", "p99.9, us", "longer than a frame"), no_wrap=False, title=title)
@@ -232,7 +248,7 @@ def _run_headless(order: LiveOrder, seconds: float, as_json: bool) -> None:
         rms = row["rms_nm"] if source.has_truth else _rms(row["next_nm"].values())
         cells = ("-" if x is None else f"{x:.{digits}f}" for x, digits in ((rms, 2), (row["p50_us"], 0), (row["p99_9_us"], 0)))
         table.add_row(name, *cells, str(row["late"]))
-    show_table(table)
+    return table
 
 
 def _rms(values: Iterable[float | None]) -> float | None:

@@ -35,6 +35,7 @@ def follow(
     report: Callable[[float], None] = lambda _: None,
     say: Callable[[str], None] = lambda _: None,
     log_file: str = "",
+    complain: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Let observers follow a source in real time, until Ctrl+C at most.
 
@@ -58,6 +59,8 @@ def follow(
         Receives a line about whatever happens.
     log_file : str
         Raise alarms, and append them and what else happens to this file.
+    complain : callable
+        Receives why that file cannot be written, once; the loop goes on without it.
 
     Returns
     -------
@@ -77,7 +80,7 @@ def follow(
     chosen = list(dict.fromkeys(observers or observers_on(source, scenario)))
     loop = LiveLoop(source, scenario, chosen, speed=speed, n_frames=n_frames)
     if log_file:
-        loop.watch(log_file)
+        loop.watch(log_file, complain)
     try:
         while not loop.is_ready:
             if reason := loop.failure():

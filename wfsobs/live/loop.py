@@ -436,11 +436,19 @@ class LiveLoop:
     def _add(self, event: LiveEvent) -> None:
         self.events.append(event)
         if self._log_file:
-            append_line(self._log_file, event.frame * self.sampling.dt, event.line)
+            try:
+                append_line(self._log_file, event.frame * self.sampling.dt, event.line)
+            except OSError as error:
+                line, self._log_file = f"{self._log_file}: {error.strerror or error}: the log ends", ""
+                self.say(line, kind=ALARM)
+                self._complain(line)
 
-    def watch(self, log_file: str = "") -> None:
-        """Raise alarms from now on; append them, and all events, to a file."""
-        self._log_file, self._shadow = log_file, Shadow(self.say, self._processes)
+    def watch(self, log_file: str = "", complain: Callable[[str], None] = lambda _: None) -> None:
+        """Raise alarms from now on; append them, and all events, to a file.
+
+        complain : receives why that cannot be written, once; the loop goes on without it
+        """
+        self._log_file, self._complain, self._shadow = log_file, complain, Shadow(self.say, self._processes)
 
     def view(self, seconds: float) -> LiveView:
         """Return the last so many seconds of frames and estimates."""
