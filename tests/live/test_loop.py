@@ -25,7 +25,7 @@ from wfsobs.live.loop import TICK, LiveLoop, _keep
 from wfsobs.live.processes import made_crew
 from wfsobs.live.ring import LiveFrame, Ring, Rows, merged_rows
 from wfsobs.live.simulated import FADE, GLANCE, SimulatedFrames, SimulatedLoop
-from wfsobs.live.source import Desk, Pace
+from wfsobs.live.source import Desk, Pace, Worker
 from wfsobs.observers.step import StepError
 from wfsobs.scenario.presets import paper
 from wfsobs.settings.group import SettingError
@@ -384,6 +384,23 @@ def test_a_crew_is_woken_once_however_many_frames_have_come():
         desk.wake()
         assert all(one.acquire(timeout=ENOUGH) for one in wakes)
     assert not any(one.acquire(timeout=0) for one in wakes)
+
+
+def interrupt_itself(pipe):
+    """Be reached by Ctrl+C before anything else, as what still imports is."""
+    os.kill(os.getpid(), signal.SIGINT)
+    pipe.send("alive")
+
+
+@pytest.mark.slow
+def test_a_process_does_not_see_ctrl_c_before_it_can_ignore_it():
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    worker = Worker(get_context("spawn"), "a test", interrupt_itself)
+    try:
+        assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == before
+        assert worker.pipe.poll(ENOUGH) and worker.pipe.recv() == "alive"
+    finally:
+        worker.stop()
 
 
 @pytest.mark.slow

@@ -5,10 +5,10 @@ from __future__ import annotations
 import gc
 import os
 import signal
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from multiprocessing import parent_process
+from multiprocessing import parent_process, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext
 from multiprocessing.process import BaseProcess
@@ -140,7 +140,8 @@ class Worker:
         self.pipe, theirs = context.Pipe()
         self._queues = [it for it in arguments if isinstance(it, Queue)]
         self.process = context.Process(target=work, args=(*arguments, theirs), name=name, daemon=True)
-        self.process.start()
+        with _without_interrupts():
+            self.process.start()
 
     def tell(self, command: Command) -> None:
         """Give it a command; where it has ended, nothing."""
@@ -154,6 +155,20 @@ class Worker:
         if self.process.is_alive():
             self.process.kill()
             self.process.join(5)
+
+
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Have what starts here never see Ctrl+C, which would come before it ignores that; where the system has no masks, nothing."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    resource_tracker.ensure_running()  # whose start would let them through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 class Pace:
