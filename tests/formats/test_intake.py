@@ -305,7 +305,7 @@ def test_blank_cells_after_the_last_ngs_frame() -> None:
     """A column that is blank to its end is short, also where rows are lost."""
     steps = np.delete(np.arange(N), [7, 23])
     ngs = np.where(np.isin(steps, [5, 10, 15, 20])[:, None], Y[steps], np.nan)[:20]
-    arrays = {"y_lgs": Y[steps], "u": U[steps], "dt": NONE, "time": steps * 1.1e-3, "y_ngs": ngs}
+    arrays = {"y_lgs": Y[steps], "u": U[steps], "dt": NONE, "time": steps * 1e-3, "y_ngs": ngs}
     for record in (taken(**arrays), taken(**arrays, ratio=5)):
         np.testing.assert_array_equal(np.flatnonzero(np.isfinite(record.y_ngs[:, 0])), [5, 10, 15, 20])
         np.testing.assert_array_equal(record.y_ngs[5:21:5], Y[5:21:5])

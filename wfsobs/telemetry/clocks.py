@@ -92,7 +92,7 @@ def _rounded_step(time: Array) -> tuple[float, str] | None:
     """Return the time step of stamps that are rounded to a third of it or more, and that they are; None of any others.
 
     Stamps in whole quanta are rounded where they follow a line over the whole record. Raises RecordError where they follow it
-    over most stretches alone, or too few of their differences are uneven to say that no frame is missing there.
+    over most stretches alone. Where fewer than TURNS of their differences are uneven, frames are missing there.
     """
     difference, error = np.diff(time), 4.0 * np.spacing(np.abs(time).max())
     for unit in (1.0, DAY) if difference.min() > 0 else ():
@@ -109,8 +109,8 @@ def _rounded_step(time: Array) -> tuple[float, str] | None:
             rate = next((x for x in written if abs(x / rate - 1.0) * count[-1] <= 1.0), rate)
             return 1.0 / rate, f"stamps rounded to {quantum:.3g} s"
         parts = np.split(count, uneven[TURNS::TURNS])[:-1]
-        spreads = [_line(part)[1] for part in parts[:: len(parts) // BLOCKS + 1]] or [spread]
-        if np.median(spreads) <= ROUNDED and uneven.size > AGREE * time.size:
+        spreads = [_line(part)[1] for part in parts[:: len(parts) // BLOCKS + 1]]
+        if spreads and np.median(spreads) <= ROUNDED:
             raise RecordError(
                 f"time is in whole {quantum:.3g} s, so that rounded stamps and missing frames are not told apart; "
                 "state the rate (--rate, rate=)"
