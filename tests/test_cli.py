@@ -1,5 +1,6 @@
 """The command line as a person types it."""
 
+import errno
 import json
 import subprocess
 import sys
@@ -307,3 +308,26 @@ def test_the_file_of_an_identification_is_all_that_telemetry_needs(tmp_path):
     moved = {key[0] for key, value in as_prior.items() if value != without[key]}
     filters = {"kf-lgs", "kf-multi", "kf-ngs", "multirate", "multirate-optimal", "multirate-multi"}
     assert moved == filters | {"gp-lgs", "gp-both"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("title", "arguments"),
+    [
+        ("Identified from", ["identify", "RECORD", "--out"]),
+        ("RMS error", ["observe", "RECORD", "--observer", "zero", "--out"]),
+        ("settings after", ["tune", "--set", "run.duration=3", "--observer", "butterworth-cl", "--evaluations", "2", "--out"]),
+        ("Best observer", ["sweep", *QUICK, "--over", "loop.gain=0.2,0.3", "--seeds", "1", "--observer", "zero", "--csv"]),
+    ],
+)
+def test_what_has_been_computed_is_printed_where_it_cannot_be_saved(arguments, title, tmp_path, monkeypatch):
+    record, out = tmp_path / "r.npz", tmp_path / "out.npz"
+    wfsobs.save(record, wfsobs.simulate(paper().replace({"run.duration": 3.0})))
+
+    def write(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("wfsobs.files._write_and_rename", write)
+    done = CliRunner().invoke(main, [str(record) if word == "RECORD" else word for word in arguments] + [str(out)])
+    assert done.exit_code == 2 and done.stderr.splitlines()[-1] == f"wfsobs: {out}: No space left on device"
+    assert title in done.stdout

@@ -448,11 +448,11 @@ def sweep(
     print_note(f"{len(plan.cells)} scenarios x {seeds} seeds = {plan.n_runs} runs, about {plan.seconds:.2g} s")
     with progress_bar("runs") as watch:
         results = run_sweep(plan, watch)
-    if csv_file:
-        write_text(csv_file, _csv(results.rows()))
     show_table(_winners(results))
     for cell, reason in results.failures.items():
         print_note(f"{_settings(results, cell)}: {reason}")
+    if csv_file:
+        write_text(csv_file, _csv(results.rows()))
 
 
 def _csv(rows: Sequence[dict[str, Any]]) -> str:

@@ -132,14 +132,14 @@ def observe(
         told = None if prior is None else scenario
         result = observe_record(record, scenario, observers=observers or None, prior=told, train=learnt, watch=watch)
     warn(result)
-    if out:
-        save_arrays(out, {f"{e.observer}/{e.target}": e.values for e in result.estimates})
     if not result.scores and not as_json:
         print_note(f"{record_file}: {len(result.estimates)} estimates, no scores: nothing after the warm-up")
-        return
-    show(score_rows(result.scores, None, source=result.prior_source), as_json)
-    if not as_json:
-        show_verdicts(result, is_simulated=False)
+    else:
+        show(score_rows(result.scores, None, source=result.prior_source), as_json)
+        if not as_json:
+            show_verdicts(result, is_simulated=False)
+    if out:
+        save_arrays(out, {f"{e.observer}/{e.target}": e.values for e in result.estimates})
 
 
 @record_command
@@ -174,14 +174,14 @@ def identify(
     record = load_declared(record_file, scenario, declaration)
     with errors_of(record_file, RecordError), progress_bar("sweeps") as watch:
         result = identify_record(record, level=level, lowest=lowest, watch=watch)
-    if out:
-        write_text(out, identification_toml(result, result.scenario(as_stated(record, scenario))))
     if as_json:
         print_json(identification_dict(result))
-        return
-    show_table(identification_table(result))
-    for line in whiteness_lines(result):
-        click.echo(line)
+    else:
+        show_table(identification_table(result))
+        for line in whiteness_lines(result):
+            click.echo(line)
+    if out:
+        write_text(out, identification_toml(result, result.scenario(as_stated(record, scenario))))
 
 
 @record_command

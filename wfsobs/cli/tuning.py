@@ -187,12 +187,12 @@ def tune(
             envelope=goal if on_envelope else None,
             watch=watch,
         )
-    if out:
-        write_text(out, tuning_toml(tuned))
     if as_json:
         print_json(tuning_dict(tuned))
-        return
-    show_table(settings_table(tuned))
-    show_table(errors_table(tuned) if tuned.after.spreads is None else spreads_table(tuned))
-    for line in tuning_remarks(tuned):
-        click.echo(line)
+    else:
+        show_table(settings_table(tuned))
+        show_table(errors_table(tuned) if tuned.after.spreads is None else spreads_table(tuned))
+        for line in tuning_remarks(tuned):
+            click.echo(line)
+    if out:
+        write_text(out, tuning_toml(tuned))
