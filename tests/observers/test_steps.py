@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import pickle
 from dataclasses import replace
 from functools import cache
@@ -17,6 +18,7 @@ from tests.records import ON_PAPER, kalman_model, short, third_of_pairs
 from wfsobs import PRESETS
 from wfsobs.control.controllers import CONTROLLERS, gpr_offline_ahead, gpr_online_ahead
 from wfsobs.control.mirror import Mirror, Plant
+from wfsobs.control.supervisor import SupervisedController
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
 from wfsobs.observers.gpr.offline import training_targets
@@ -136,6 +138,24 @@ def test_predictions_that_are_kept_stay_what_they_were(name: str) -> None:
         np.testing.assert_array_equal(observer.predict(0, target), copies[-1])
         kept[-1][1][:] = copies[-1][1]
     np.testing.assert_array_equal(kept, copies)
+
+
+@pytest.mark.parametrize(
+    "make", [lambda one: one("kf-multi"), lambda one: one("lqg-kf-multi"), lambda one: SupervisedController(one("lqg-kf-multi"))]
+)
+def test_a_copy_has_a_state_of_its_own(make: Any) -> None:
+    """What the one takes, the other does not."""
+
+    def state(design: Any) -> str:
+        return str({name: np.asarray(x).tolist() for name, x in design.state_dict().items()})
+
+    here = make(lambda name: wfsobs.design(name, PRESETS["paper"]()))
+    here.update([0.1, 0.2])
+    there, before = copy.copy(here), state(here)
+    there.update([0.3, 0.4])
+    assert state(here) == before != state(there)
+    here.update([0.3, 0.4])
+    assert state(here) == state(there)
 
 
 def test_every_causal_observer_has_steps() -> None:

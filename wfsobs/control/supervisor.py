@@ -9,7 +9,9 @@ was sent, whoever asked for it: the controller's own state stays right while the
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -186,6 +188,9 @@ class SupervisedController(StateArrays):
         self._exposure = np.zeros(n)  # sum of the measurements since the last NGS frame
         self._slow_error = np.zeros(n)  # of the LGS
         self.mark_start()
+
+    def __copy__(self) -> Self:
+        return deepcopy(self)  # the state of a copy is its own
 
     @property
     def reason(self) -> str:

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from copy import deepcopy
 from math import inf, isfinite, isnan
 from textwrap import shorten
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -221,6 +222,9 @@ class StepBase:
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.id}, frames {self.frame}, modes {self.sampling.n_modes})"
+
+    def __copy__(self) -> Self:
+        return deepcopy(self)  # the state of a copy is its own
 
     def reset(self) -> None:
         """Go back to before the first frame, a mirror at rest."""
