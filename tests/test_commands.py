@@ -4,6 +4,7 @@ import errno
 from collections.abc import Iterator
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from typing import NoReturn
 
 import click
 import pytest
@@ -46,14 +47,19 @@ def test_a_package_brings_a_command(points: list[EntryPoint], monkeypatch: pytes
 def test_an_error_of_the_system_is_one_line_unless_nobody_reads_the_output(
     points: list[EntryPoint], monkeypatch: pytest.MonkeyPatch, error: OSError, outcome: tuple[int, str]
 ) -> None:
+    def fail(*_: object) -> NoReturn:
+        raise error
+
     @click.command()
     def write() -> None:
-        raise error
+        fail()
 
     monkeypatch.setattr(EntryPoint, "load", lambda _self: write)
     points.append(EntryPoint("write", "somewhere.cli:write", group.ENTRY_POINTS))
-    done = CliRunner().invoke(group.main, ["write"])
-    assert (done.exit_code, done.output) == outcome
+    monkeypatch.setattr(group.Commands, "get_help", fail)
+    for argument in ("write", "--help"):
+        done = CliRunner().invoke(group.main, [argument])
+        assert (done.exit_code, done.output) == outcome
 
 
 @pytest.mark.parametrize(

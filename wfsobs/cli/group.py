@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
@@ -92,21 +94,34 @@ class Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command."""
-        try:
+        with _one_line(ctx):
             return super().invoke(ctx)
-        except ValueError as error:
-            from wfsobs.observers.step import StepError
-            from wfsobs.record import RecordError
-            from wfsobs.settings.values import SettingError
 
-            if not isinstance(error, (SettingError, RecordError, StepError)):
-                raise
-            click.echo(f"wfsobs: {error}", err=True)
-        except OSError as error:
-            if isinstance(error, BrokenPipeError) and error.filename is None:
-                raise  # whoever reads the output has enough of it: click ends without a word
-            click.echo(": ".join(str(word) for word in ("wfsobs", error.filename, error.strerror or error) if word), err=True)
-        ctx.exit(2)
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Read the options, or print the help."""
+        with _one_line(ctx):
+            return super().parse_args(ctx, args)
+
+
+@contextmanager
+def _one_line(ctx: click.Context) -> Iterator[None]:
+    """Turn an error that a user can cause into one line, and end."""
+    try:
+        yield
+        return
+    except ValueError as error:
+        from wfsobs.observers.step import StepError
+        from wfsobs.record import RecordError
+        from wfsobs.settings.values import SettingError
+
+        if not isinstance(error, (SettingError, RecordError, StepError)):
+            raise
+        click.echo(f"wfsobs: {error}", err=True)
+    except OSError as error:
+        if isinstance(error, BrokenPipeError) and error.filename is None:
+            raise  # whoever reads the output has enough of it: click ends without a word
+        click.echo(": ".join(str(word) for word in ("wfsobs", error.filename, error.strerror or error) if word), err=True)
+    ctx.exit(2)
 
 
 def _entries() -> dict[str, EntryPoint]:
