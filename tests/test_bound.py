@@ -139,6 +139,8 @@ def test_what_cannot_be_known_is_refused() -> None:
         bound(PRESETS["peak-jump"]())
     with pytest.raises(ValueError, match=r"ahead = 0\.5: takes whole steps"):
         bound(BASE, ahead=0.5)
+    with pytest.raises(ValueError, match=r"ahead = nan: takes 0 steps or more"):
+        bound(BASE, ahead=np.nan)
     with pytest.raises(ValueError, match=r"ahead = -3: takes 0 steps or more"):
         bound(BASE, ahead=-3)
     with pytest.raises(ValueError, match=r"modes: takes indices from 0 to 1, not 9"):

@@ -21,6 +21,7 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Estimate, Record
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.zernike import HIGHEST_ORDER, order_of
+from wfsobs.settings.values import check_kind
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
 
@@ -64,6 +65,7 @@ def run(scenario: Scenario, *, observers: Sequence[str] | None = None, watch: Wa
     >>> wfsobs.run(scenario, observers=["kf-lgs"])
     Result(1 observers, ...)
     """
+    check_kind("run takes a Scenario", scenario, Scenario, 'such as wfsobs.PRESETS["paper"]()')
     return observe(simulate(scenario, watch=watch), scenario, observers=observers, watch=watch, is_simulated=True)
 
 
@@ -120,6 +122,7 @@ def observe(
     Cancelled
         `watch` asks to stop.
     """
+    check_kind("observe takes a Record", record, Record, "as of wfsobs.load(path)")
     scenario = as_stated(record, scenario or Scenario())
     if prior is not None:
         scenario = as_stated(record, told_by(prior, scenario))

@@ -220,7 +220,7 @@ def bound(scenario: Scenario, *, information: str = "lgs", ahead: float = 0, mod
     row, chosen = INFORMATION[information], every if modes is None else modes
     if wrong := [mode for mode in chosen if mode not in every]:
         raise ValueError(f"modes: takes indices from 0 to {every[-1]}, not {wrong[0]}")
-    if ahead < 0:
+    if not 0 <= ahead < inf:
         raise ValueError(f"ahead = {ahead:g}: takes 0 steps or more")
     if row in ALONE:
         found = _least_together(scenario.replace({"run.seed": 0}), row, ahead)

@@ -37,7 +37,7 @@ from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import add_comments, to_toml
 from wfsobs.sensors.zernike import MODE_NAMES
-from wfsobs.settings.values import SettingError
+from wfsobs.settings.values import SettingError, check_kind
 from wfsobs.signal.autoregressive import Ar3
 from wfsobs.signal.gains import RiccatiError
 from wfsobs.spectral.search import LOWEST, PAD, Candidate, SearchResult, search_peaks
@@ -146,6 +146,7 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
     --------
     wfsobs.observe : Run observers on a record.
     """
+    check_kind("identify takes a Record", record, Record, "as of wfsobs.load(path)")
     for name, value, most in (("level", level, HIGHEST_LEVEL), ("lowest", lowest, inf)):
         if not 0.0 < value <= most:
             raise SettingError(f"{name} = {value:g}: takes a number above 0{f' and up to {most:g}' if most < inf else ''}")

@@ -27,6 +27,15 @@ def errors_of(what: str, kind: type[ValueError] = SettingError) -> Iterator[None
         raise kind(f"{what}: {error}") from None
 
 
+def check_kind(what: str, value: object, kinds: type | tuple[type, ...], source: str) -> None:
+    """Raise SettingError where an argument, such as a path, is of another type than it must be.
+
+    what, source : of the message, what is taken and where it comes from
+    """
+    if not isinstance(value, kinds):
+        raise SettingError(f"{what}, {source}, not {shorten(value)}")
+
+
 _WORDS = reprlib.Repr()  # stops at a depth, where `repr` would end in a RecursionError
 _WORDS.maxlist = _WORDS.maxtuple = _WORDS.maxdict = 40
 _WORDS.maxstring = _WORDS.maxother = _WORDS.maxlong = 400
