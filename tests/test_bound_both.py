@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.linalg import cholesky, solve_triangular, toeplitz
 
 from tests.records import kalman_model
-from wfsobs.evaluation.bound import bound_rms, least_errors_of_both, record_bounds
+from wfsobs.evaluation.bound import NO_BOUND, bound, bound_rms, least_errors_of_both, record_bounds
 from wfsobs.evaluation.result import can_be_best
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, COMMON_BOUNDS, SCORED
 from wfsobs.observers.kalman.filters import optimal_cycle
@@ -19,9 +20,10 @@ from wfsobs.priors_from.scenario import measurement_noise
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.gains import periodic_steady_state
+from wfsobs.simulation.disturbance import damping_for_width, line_width
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.sensing import lgs_error_process
-from wfsobs.simulation.true_spectra import TrueSpectra, true_spectra
+from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, true_spectra
 from wfsobs.typing import Array
 
 # The truth is the model of `multirate-optimal`: AR(2) turbulence, one line, two LGS with slow errors of their own.
@@ -89,6 +91,31 @@ def test_the_wrapped_line_is_all_that_differs_from_the_riccati_covariance() -> N
         for name, error in least_errors_of_both(true_spectra(MATCHED, 0), ahead).items():
             # conjugate gradients stop at 1e-4, wrong by its square of variances up to 100 times that of both together
             assert error.phases == pytest.approx(expected[name], rel=1e-5), (name, ahead)
+
+
+@pytest.mark.parametrize(("frequency", "rms"), [(5.96, 1.0), (48.3, 0.3), (48.3, 0.1), (48.3, 0.03), (18.1, 1e-3)])
+def test_of_a_narrow_line_however_strong_nothing_comes_round(frequency: float, rms: float) -> None:
+    peak = {"frequency": frequency, "damping": 1e-4, "rms": [rms]}
+    scenario = MATCHED.replace({"run.duration": 10.0, "vibration.peaks": [peak], "kalman.frequency": frequency})
+    scenario = scenario.replace({"kalman.damping": damping_for_width(line_width(scenario), frequency, 1e-4)})
+    for ahead, expected in enumerate(riccati_errors(scenario)):
+        for name, error in least_errors_of_both(true_spectra(scenario, 0), ahead).items():
+            # up to 3e-3 of the noise's variance comes round, of errors that are some 4e-2 of it
+            assert error.phases == pytest.approx(expected[name], rel=4e-3), (name, ahead)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"turbulence.wind_speed": 0.1, "sensors.lgs_rate": 5000.0},
+        {"run.duration": 30.0, "vibration.peaks": [{"frequency": 5.96, "damping": 1e-4, "rms": [3.0]}]},
+    ],
+)
+def test_where_more_would_come_round_there_is_no_bound(changes: dict[str, Any]) -> None:
+    scenario = MATCHED.replace(changes)
+    assert not has_known_spectra(scenario)
+    with pytest.raises(ValueError, match=re.escape(NO_BOUND)):
+        bound(scenario)
 
 
 SLOW_RATE = MATCHED.replace(

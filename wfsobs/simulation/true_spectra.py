@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
-from math import ceil, log2, pi
+from math import ceil, log, log2, pi
 from typing import NamedTuple
 
 import numpy as np
@@ -39,11 +39,14 @@ from wfsobs.typing import Array
 DECAYED = 2.5
 """Decay of correlations after half the DFT, as an exponent; a line that wraps around by then brings nothing new."""
 
-SMOOTH = 5.0
-"""The same for processes of a known width, whose correlations must not wrap around: exp(-12.5) of them does."""
+SMOOTHEST = 12.5
+"""The same for processes of a known width, whose correlations must not wrap around."""
+
+NEGLIGIBLE = 3e-3
+"""Over the variance of the least noise: that of a process times exp(-2 exponent), which is what wrapping puts into an error."""
 
 MOST = 2**20
-"""Maximum length of the DFT: an AR(2) that decays more slowly wraps around, which changes the bound by little."""
+"""Maximum length of the DFT."""
 
 NOTCH = 0.1
 """Mean square of a mode in waves across the wind, whose maximum is 1, below which its spectrum has a notch at 0 Hz."""
@@ -56,28 +59,46 @@ def n_frequencies(scenario: Scenario, mode: int = 0) -> int:
 
 def wanted_frequencies(scenario: Scenario, mode: int = 0) -> int:
     """Return the same without the maximum."""
-    rate = min(_decay_rates(scenario))
+    slowest = max(one.exponent / one.rate for one in _correlations(scenario))
     if _is_of_aperture(scenario, mode):  # 2^16 and 2^18 differ by 6e-5 at most, on `higher-orders`
-        rate = max(rate, _slowest_wind(scenario) / (16.0 * scenario.telescope.diameter))
-    return int(2 ** ceil(log2(2.0 * DECAYED / (rate * scenario.dt))))
+        slowest = min(slowest, DECAYED * 16.0 * scenario.telescope.diameter / _slowest_wind(scenario))
+    return int(2 ** ceil(log2(2.0 * slowest / scenario.dt)))
 
 
-def _decay_rates(scenario: Scenario) -> list[float]:
-    """Return the decay rates of the correlations of the disturbances [1/s], xi w, with the margin of smooth spectra."""
-    v, least = scenario.vibration, pi * line_width(scenario)
+class _Correlation(NamedTuple):
+    """Of a disturbance: decay rate [1/s], exponent that half the DFT is to reach, and the least with which there is a bound."""
+
+    rate: float
+    exponent: float
+    least: float = 0.0
+
+
+def _correlations(scenario: Scenario) -> list[_Correlation]:
+    """Return the correlations of the disturbances."""
+    v, width, modes = scenario.vibration, pi * line_width(scenario), range(len(scenario.modes))
+    noise = max(min(*(lgs_noise_rms(scenario, mode) for mode in modes), *noise_rms(scenario, "ngs")), FLOOR)
+
+    def least(rms: float) -> float:
+        return min(max(log(max(rms, FLOOR) / noise) - 0.5 * log(NEGLIGIBLE), DECAYED), SMOOTHEST)
+
     smooth = [turbulence_process(scenario, 0, scenario.dt)]
     if scenario.turbulence.source == "processes":
-        smooth = [p for mode in range(len(scenario.modes)) for p in processes(scenario, mode, scenario.dt)]
-    rates = [2.0, *(p.omega * p.damping / SMOOTH for p in smooth)]
+        smooth = [p for mode in modes for p in processes(scenario, mode, scenario.dt)]
+    needs = [least(p.rms) if scenario.turbulence.source in ("ar2", "ar3", "processes") else 0.0 for p in smooth]
+    found = [_Correlation(2.0, DECAYED)]
+    found += [_Correlation(p.omega * p.damping, SMOOTHEST, need) for p, need in zip(smooth, needs, strict=True)]
     if v.source in ("psd", "measured"):
-        rates.append(least)
+        found.append(_Correlation(width, DECAYED))
     elif v.source != "none":
-        rates += [max(2.0 * pi * p.frequency * p.damping / SMOOTH, least) for p in v.peaks]
+        for p in v.peaks:
+            rate = max(2.0 * pi * p.frequency * p.damping, width)
+            need = least(max(peak_rms(p.rms, mode) for mode in modes)) if p.damping else 0.0  # undamped ones are known
+            found.append(_Correlation(rate, min(max(DECAYED * rate / width, need), SMOOTHEST), need))
     if scenario.turbulence.source == "frozen-flow":
-        rates.append(_slowest_wind(scenario) / (8.0 * scenario.turbulence.outer_scale))
+        found.append(_Correlation(_slowest_wind(scenario) / (8.0 * scenario.turbulence.outer_scale), DECAYED))
     elif scenario.turbulence.source == "psd":
-        rates.append(least)
-    return rates
+        found.append(_Correlation(width, DECAYED))
+    return found
 
 
 def _slowest_wind(scenario: Scenario) -> float:
@@ -283,10 +304,13 @@ def lgs_turbulence_spectrum(scenario: Scenario, mode: int) -> Array:
 def has_known_spectra(scenario: Scenario) -> bool:
     """Return whether the spectra are known.
 
-    They are not for frozen flow so slow that its low frequencies would not be resolved, nor where events change them.
+    They are not for frozen flow so slow that its low frequencies would not be resolved, nor for lines so narrow and strong, or
+    turbulence so slow, that what wraps around would be more than the error, nor where events change them.
     """
     is_flow, modes = scenario.turbulence.source == "frozen-flow", range(len(scenario.modes))
-    return not scenario.events and not (is_flow and max(wanted_frequencies(scenario, mode) for mode in modes) > 2 * MOST)
+    if scenario.events or (is_flow and max(wanted_frequencies(scenario, mode) for mode in modes) > 2 * MOST):
+        return False
+    return all(one.rate * scenario.dt * MOST >= 2.0 * one.least for one in _correlations(scenario))
 
 
 def _vibration(scenario: Scenario, mode: int, n: int) -> Array:
