@@ -197,13 +197,11 @@ class Record(Signals):
                 object.__setattr__(self, name, numbers := as_signal(name, values))
                 if self.y_lgs.ndim != 2:
                     raise RecordError(f"y_lgs has shape {self.y_lgs.shape}; expected (n_steps, n_modes)")
+                if name == "y_stars" and (numbers.ndim != 3 or numbers.shape[::2] != self.y_lgs.shape):
+                    raise RecordError(f"y_stars has shape {numbers.shape}; expected ({self.n_steps}, n_lgs, {self.n_modes})")
                 if name != "y_stars" and numbers.shape != self.y_lgs.shape:
                     raise RecordError(f"{name} has shape {numbers.shape}; expected {self.y_lgs.shape}, that of y_lgs")
-        if self.y_stars is not None and (self.y_stars.ndim != 3 or self.y_stars.shape[::2] != self.y_lgs.shape):
-            raise RecordError(f"y_stars has shape {self.y_stars.shape}; expected ({self.n_steps}, n_lgs, {self.n_modes})")
-        for name in (*OF_MODES, "y_stars"):
-            if (values := getattr(self, name)) is not None:
-                check_size(name, values)
+                check_size(name, numbers)
         if self.lgs_stars is not None:
             object.__setattr__(self, "lgs_stars", star_counts(self.lgs_stars, self.n_steps))
         try:

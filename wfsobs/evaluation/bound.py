@@ -65,7 +65,7 @@ from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean, degrees
 from wfsobs.simulation.disturbance import line_width
 from wfsobs.simulation.mode_spectra import AXIS, FIRST, LGS, NGS, StarSpectra, are_coupled, star_spectra
 from wfsobs.simulation.sensing import MEAN, stars_differ
-from wfsobs.simulation.true_spectra import CausalEstimate, TrueSpectra, has_known_spectra, true_spectra
+from wfsobs.simulation.true_spectra import UNRESOLVED, CausalEstimate, TrueSpectra, has_known_spectra, true_spectra
 from wfsobs.typing import Array
 
 INFORMATION: Mapping[str, str] = dict(zip(("lgs", "both", "stars", "modes", "both-modes", "asterism"), BOUNDS, strict=True))
@@ -74,7 +74,7 @@ INFORMATION: Mapping[str, str] = dict(zip(("lgs", "both", "stars", "modes", "bot
 ALONE: dict[str, str] = dict(zip(BOUNDS[3:], BOUNDS[:3], strict=True))
 """Row of the bound of all modes together -> that of every mode by itself."""
 
-NO_BOUND = "no bound: the spectra of this scenario are not known, or events change them"
+NO_BOUND = f"no bound: {UNRESOLVED}"
 
 SHARE = 0.95
 """Share of the records whose rms lies in an interval."""

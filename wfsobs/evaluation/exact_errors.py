@@ -52,7 +52,15 @@ from wfsobs.signal.spectrum import expected_psd, psd
 from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean, square
 from wfsobs.simulation.flow_spectra import TurbulenceSpectra
 from wfsobs.simulation.sensing import MEAN
-from wfsobs.simulation.true_spectra import MOST, TrueSpectra, has_known_spectra, n_frequencies, true_spectra, turbulence_spectra
+from wfsobs.simulation.true_spectra import (
+    MOST,
+    UNRESOLVED,
+    TrueSpectra,
+    has_known_spectra,
+    n_frequencies,
+    true_spectra,
+    turbulence_spectra,
+)
 from wfsobs.typing import Array
 
 SETTLED, EXACT = 1e-6, 1e-12
@@ -430,7 +438,7 @@ class Theory:
             The spectra of the scenario are not known.
         """
         if not has_known_spectra(scenario):
-            raise ValueError("no prediction: the spectra of this scenario are not known, or events change them")
+            raise ValueError(f"no prediction: {UNRESOLVED}")
         known = self.spectra(scenario, mode)
         sensors = self._keep(f"spectra {target}", self._key("spectra"), lambda: target_spectra(known, target))
         n_steps = scenario.n_steps - round(scenario.run.warm_up / scenario.dt)

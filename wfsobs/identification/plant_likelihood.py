@@ -125,7 +125,8 @@ command that is tested, and of a measurement that shows it: 6 deviations of whit
 def not_received(y: Array, u: Array) -> NDArray[np.bool_]:
     """Return which commands the mirror cannot have received, bool (n,): far from those around them, with no trace in y later on.
 
-    Files have numbers such as -9999 in place of what is missing, and errors of the link to the recorder.
+    Such are numbers like -9999 in place of missing ones, and errors of the link to the recorder.
+    y, u : measurements and commands, (n, k) [um], NaN where one is missing
     """
 
     def is_far(x: Array, times: float) -> Any:

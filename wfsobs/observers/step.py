@@ -490,10 +490,11 @@ KNOWN = frozenset({"beside", "commands", "covariance", "frames", "held_value", "
 
 def as_numbers(id: str, x: ArrayLike, name: str) -> Array:
     """Return real numbers as float64. Raises StepError for anything else."""
-    if why := unit_refusal(x):
+    is_plain = type(x) is np.ndarray  # which has neither unit nor mask: nearly all that comes in a loop
+    if not is_plain and (why := unit_refusal(x)):
         raise StepError(f"{id}: {name} {why}")
     try:
-        raw = fill_masked(x)
+        raw = np.asarray(x) if is_plain else fill_masked(x)
         if raw.dtype.kind in "biufO":
             return raw.astype(float)
     except (TypeError, ValueError):

@@ -39,7 +39,7 @@ from wfsobs.typing import Array
 DECAYED = 2.5
 """Decay of correlations after half the DFT, as an exponent; a line that wraps around by then brings nothing new."""
 
-SMOOTHEST = 12.5
+SMOOTH = 12.5
 """The same for processes of a known width, whose correlations must not wrap around."""
 
 NEGLIGIBLE = 3e-3
@@ -47,6 +47,9 @@ NEGLIGIBLE = 3e-3
 
 MOST = 2**20
 """Maximum length of the DFT."""
+
+UNRESOLVED = "the spectra of this scenario are not known or too narrow to resolve, or events change them"
+"""Where `has_known_spectra` is false."""
 
 NOTCH = 0.1
 """Mean square of a mode in waves across the wind, whose maximum is 1, below which its spectrum has a notch at 0 Hz."""
@@ -79,21 +82,21 @@ def _correlations(scenario: Scenario) -> list[_Correlation]:
     noise = max(min(*(lgs_noise_rms(scenario, mode) for mode in modes), *noise_rms(scenario, "ngs")), FLOOR)
 
     def least(rms: float) -> float:
-        return min(max(log(max(rms, FLOOR) / noise) - 0.5 * log(NEGLIGIBLE), DECAYED), SMOOTHEST)
+        return min(max(log(max(rms, FLOOR) / noise) - 0.5 * log(NEGLIGIBLE), DECAYED), SMOOTH)
 
     smooth = [turbulence_process(scenario, 0, scenario.dt)]
     if scenario.turbulence.source == "processes":
         smooth = [p for mode in modes for p in processes(scenario, mode, scenario.dt)]
     needs = [least(p.rms) if scenario.turbulence.source in ("ar2", "ar3", "processes") else 0.0 for p in smooth]
     found = [_Correlation(2.0, DECAYED)]
-    found += [_Correlation(p.omega * p.damping, SMOOTHEST, need) for p, need in zip(smooth, needs, strict=True)]
+    found += [_Correlation(p.omega * p.damping, SMOOTH, need) for p, need in zip(smooth, needs, strict=True)]
     if v.source in ("psd", "measured"):
         found.append(_Correlation(width, DECAYED))
     elif v.source != "none":
         for p in v.peaks:
             rate = max(2.0 * pi * p.frequency * p.damping, width)
             need = least(max(peak_rms(p.rms, mode) for mode in modes)) if p.damping else 0.0  # undamped ones are known
-            found.append(_Correlation(rate, min(max(DECAYED * rate / width, need), SMOOTHEST), need))
+            found.append(_Correlation(rate, min(max(DECAYED * rate / width, need), SMOOTH), need))
     if scenario.turbulence.source == "frozen-flow":
         found.append(_Correlation(_slowest_wind(scenario) / (8.0 * scenario.turbulence.outer_scale), DECAYED))
     elif scenario.turbulence.source == "psd":

@@ -63,7 +63,12 @@ def save(path: str | Path, record: Record) -> None:
     path : str or Path
         The file, whose ending gives the format; one that is there is replaced once the new one is whole.
     record : Record
-        Measurements and commands [um], and the truth where the format has a place for it; a warning names what it has none for.
+        Measurements and commands [um], and the truth where the format has a place for it.
+
+    Warns
+    -----
+    UserWarning
+        The format has no place for parts of the record, which are named.
 
     Raises
     ------
