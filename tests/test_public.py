@@ -209,18 +209,15 @@ def test_what_cannot_be_stated_of_a_file_is_one_line(stated: dict[str, Any], lin
         wfsobs.load("night.npz", **stated)
 
 
-@pytest.mark.parametrize(
-    ("call", "line"),
-    [
-        (lambda: wfsobs.identify("x.npz"), r"identify takes a Record, as of wfsobs\.load\(path\), not 'x\.npz'"),  # type: ignore[arg-type]
-        (lambda: wfsobs.observe("x.npz"), r"observe takes a Record, as of wfsobs\.load\(path\), not 'x\.npz'"),  # type: ignore[arg-type]
-        (lambda: wfsobs.run("paper"), "run takes a Scenario, such as .*, not 'paper'"),  # type: ignore[arg-type]
-        (lambda: wfsobs.run(None), "run takes a Scenario, such as .*, not None"),  # type: ignore[arg-type]
-    ],
-)
-def test_a_path_in_place_of_what_it_holds_is_one_line(call: Any, line: str) -> None:
-    with pytest.raises(wfsobs.SettingError, match=f"^{line}$"):
-        call()
+@pytest.mark.parametrize("value", ["x.npz", None])
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_path_in_place_of_what_it_holds_is_one_line(name: str, value: str | None) -> None:
+    function = getattr(wfsobs, name)
+    arguments = {"path": "x.csv", "observer": "kf-lgs", "estimates": (), "start": 0.0}
+    parameters = [p for p in inspect.signature(function).parameters.values() if p.default is p.empty]
+    for one in (p.name for p in parameters if p.annotation in ("Record", "Scenario")):
+        with pytest.raises(wfsobs.SettingError, match=f"^{name} takes a {one.title()}, .*, not {value!r}$"):
+            function(**{p.name: value if p.name == one else arguments.get(p.name) for p in parameters})
 
 
 def test_the_loop_is_closed_on_what_is_simulated() -> None:

@@ -65,7 +65,7 @@ def run(scenario: Scenario, *, observers: Sequence[str] | None = None, watch: Wa
     >>> wfsobs.run(scenario, observers=["kf-lgs"])
     Result(1 observers, ...)
     """
-    check_kind("run takes a Scenario", scenario, Scenario, 'such as wfsobs.PRESETS["paper"]()')
+    check_kind("run", scenario, Scenario)
     return observe(simulate(scenario, watch=watch), scenario, observers=observers, watch=watch, is_simulated=True)
 
 
@@ -122,7 +122,7 @@ def observe(
     Cancelled
         `watch` asks to stop.
     """
-    check_kind("observe takes a Record", record, Record, "as of wfsobs.load(path)")
+    check_kind("observe", record, Record)
     scenario = as_stated(record, scenario or Scenario())
     if prior is not None:
         scenario = as_stated(record, told_by(prior, scenario))

@@ -16,6 +16,7 @@ from wfsobs.app.serve import make_service, session_page
 from wfsobs.app.service import Post
 from wfsobs.evaluation.result import Result
 from wfsobs.scenario import Scenario
+from wfsobs.settings.values import check_kind
 
 
 class Explorer:
@@ -99,4 +100,5 @@ def explore(scenario: Scenario, *, height: int = 900) -> Explorer:
     --------
     wfsobs.run : Run observers without a page.
     """
+    check_kind("explore", scenario, Scenario)
     return Explorer(scenario, height)

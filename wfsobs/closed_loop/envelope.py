@@ -29,7 +29,7 @@ from wfsobs.priors_from.scenario import told_spectra
 from wfsobs.progress import QUIET, Watch
 from wfsobs.registry import name_list
 from wfsobs.scenario import Scenario
-from wfsobs.settings.values import SettingError, error_line
+from wfsobs.settings.values import SettingError, check_kind, error_line
 from wfsobs.signal.wiener import in_two_threads
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, true_spectra
@@ -296,6 +296,7 @@ def plant_envelope(
     wfsobs.close_loop : Simulate the loop with one plant.
     wfsobs.tune : Tune a controller on an uncertain plant.
     """
+    check_kind("plant_envelope", scenario, Scenario)
     of = uncertainty or Uncertainty()
     errors, corners, plants = uncertain_plants(scenario, of, points)
     spectra = known_spectra(scenario)

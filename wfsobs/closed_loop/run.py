@@ -34,7 +34,7 @@ from wfsobs.progress import QUIET, Cancelled, Watch, detach_watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.scenario import used_settings
-from wfsobs.settings.values import error_line
+from wfsobs.settings.values import check_kind, error_line
 from wfsobs.signal.spectrum import rms
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
@@ -291,6 +291,7 @@ def close_loop(scenario: Scenario, *, controllers: Sequence[str] | None = None, 
     --------
     wfsobs.run : Run observers, which do not act on the loop.
     """
+    check_kind("close_loop", scenario, Scenario)
     plan = design(scenario, controllers)
     return closed_loop(simulate(scenario, watch=watch.silent), plan, watch)
 

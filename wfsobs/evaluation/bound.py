@@ -58,6 +58,7 @@ from wfsobs.prior import Asterism, Flow, FlowOfBoth, Lines
 from wfsobs.priors_from.scenario import has_prior, prior_of
 from wfsobs.record import TOTAL, Record
 from wfsobs.scenario import Scenario
+from wfsobs.settings.values import check_kind
 from wfsobs.signal.joint_states import running_means
 from wfsobs.signal.sensor_array import FastSensors, SlowSensor, SlowTarget, variance_from_frames, variance_from_sensors
 from wfsobs.signal.spectrum import rms
@@ -212,6 +213,7 @@ def bound(scenario: Scenario, *, information: str = "lgs", ahead: float = 0, mod
     >>> 0.0 < both < lgs
     True
     """
+    check_kind("bound", scenario, Scenario)
     if information not in INFORMATION:
         raise ValueError(f"information = {information!r}: takes one of {', '.join(INFORMATION)}")
     if not has_known_spectra(scenario):

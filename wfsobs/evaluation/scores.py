@@ -20,6 +20,7 @@ from scipy.special import ndtr, ndtri, stdtrit
 from wfsobs.observers.base import TARGETS
 from wfsobs.record import NEXT_Z, TOTAL, Estimate, Record, fuse_frames
 from wfsobs.sensors.zernike import MODE_NAMES
+from wfsobs.settings.values import check_kind
 from wfsobs.signal.spectrum import rms
 from wfsobs.typing import Array
 
@@ -351,6 +352,7 @@ def score(
     ValueError
         There are not as many names as modes.
     """
+    check_kind("score", record, Record)
     names = list(MODE_NAMES[: record.n_modes] if mode_names is None else mode_names)
     if len(names) != record.n_modes:
         raise ValueError(f"mode_names takes {record.n_modes} names, one per mode of the record, not {len(names)}")

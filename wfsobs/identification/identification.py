@@ -136,7 +136,7 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
     Raises
     ------
     SettingError
-        There is no such level or frequency.
+        There is no such level or frequency, or `record` is none.
     RecordError
         The record is too short, has too few samples or is constant.
     Cancelled
@@ -146,7 +146,7 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
     --------
     wfsobs.observe : Run observers on a record.
     """
-    check_kind("identify takes a Record", record, Record, "as of wfsobs.load(path)")
+    check_kind("identify", record, Record)
     for name, value, most in (("level", level, HIGHEST_LEVEL), ("lowest", lowest, inf)):
         if not 0.0 < value <= most:
             raise SettingError(f"{name} = {value:g}: takes a number above 0{f' and up to {most:g}' if most < inf else ''}")

@@ -23,6 +23,7 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.registry import kind_of
 from wfsobs.sensors.zernike import MODE_NAMES
+from wfsobs.settings.values import check_kind
 from wfsobs.signal.autoregressive import Ar2
 from wfsobs.typing import Array
 
@@ -153,6 +154,7 @@ def fit_kernels(
     Cancelled
         `watch` asks to stop.
     """
+    check_kind("fit_kernels", record, Record)
     z = seen_z(record)
     if np.isfinite(z).sum(axis=0).min(initial=len(z)) < SHORTEST:
         raise RecordError(f"a mode has fewer than {SHORTEST} samples")

@@ -8,6 +8,7 @@ import reprlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,13 +28,19 @@ def errors_of(what: str, kind: type[ValueError] = SettingError) -> Iterator[None
         raise kind(f"{what}: {error}") from None
 
 
-def check_kind(what: str, value: object, kinds: type | tuple[type, ...], source: str) -> None:
-    """Raise SettingError where an argument, such as a path, is of another type than it must be.
+SOURCES: Mapping[str, str] = MappingProxyType(
+    {
+        "Record": "as of wfsobs.load(path)",
+        "Scenario": 'such as wfsobs.PRESETS["paper"]()',
+    }
+)
+"""Where arguments of public functions come from."""
 
-    what, source : of the message, what is taken and where it comes from
-    """
-    if not isinstance(value, kinds):
-        raise SettingError(f"{what}, {source}, not {shorten(value)}")
+
+def check_kind(function: str, value: object, kind: type) -> None:
+    """Raise SettingError where an argument of a public function is of another type, such as a path."""
+    if not isinstance(value, kind):
+        raise SettingError(f"{function} takes a {kind.__name__}, {SOURCES[kind.__name__]}, not {shorten(value)}")
 
 
 _WORDS = reprlib.Repr()  # stops at a depth, where `repr` would end in a RecursionError

@@ -14,7 +14,7 @@ from wfsobs.record import DELAY, Measurements, Record, Training, delay_signal, f
 from wfsobs.registry import sections
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.scenario import used_settings
-from wfsobs.settings.values import Plain
+from wfsobs.settings.values import Plain, check_kind
 from wfsobs.simulation.disturbance import make_disturbance
 from wfsobs.simulation.sensing import OpenLoop, measure_noise, measure_open_loop
 from wfsobs.typing import Array
@@ -103,6 +103,7 @@ def simulate(
     Cancelled
         `watch` asks to stop.
     """
+    check_kind("simulate", scenario, Scenario)
     scenario.validate()
     rng = np.random.default_rng(scenario.run.seed) if rng is None else rng
     record_rng, training_rng = rng.spawn(2)

@@ -22,6 +22,7 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
+from wfsobs.settings.values import check_kind
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.columns import LoopMatrix, join_clock, matrix_of, split_source, to_contents
 from wfsobs.telemetry.formats import format_of, from_gzip, writer_of
@@ -77,6 +78,7 @@ def save(path: str | Path, record: Record) -> None:
     RecordError
         There is no such format, or it is only read.
     """
+    check_kind("save", record, Record)
     if lost := save_record(path, record):
         warnings.warn(lost, stacklevel=2)
 

@@ -34,7 +34,7 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import add_comments, changed_settings, to_toml
-from wfsobs.settings.values import SettingError
+from wfsobs.settings.values import SettingError, check_kind
 from wfsobs.simulation.true_spectra import TrueSpectra
 from wfsobs.tuning.records import DESIGN, MEASURES, P95, TRUTH, WORST, cut_record, simulate_records, space, stream
 from wfsobs.tuning.trials import Errors, Evaluation, RecordTrials, Stage, Trials, minimise, target_of
@@ -155,6 +155,7 @@ def tune(
     wfsobs.run : Run observers with given settings.
     wfsobs.plant_envelope : What controllers with given settings leave over an uncertain plant.
     """
+    check_kind("tune", scenario, Scenario)
     if evaluations < 1:
         raise SettingError(f"evaluations = {evaluations}: takes a whole number from 1")
     if envelope is not None:

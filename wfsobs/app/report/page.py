@@ -55,6 +55,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import Variation, scenarios
 from wfsobs.scenario.names import setting_label, value_of
 from wfsobs.sensors.zernike import TIP_TILT
+from wfsobs.settings.values import check_kind
 from wfsobs.version import __version__
 
 START = 'document.documentElement.classList.add("js")'
@@ -354,6 +355,7 @@ def export(
     Cancelled
         `watch` asks to stop.
     """
+    check_kind("export", scenario, Scenario)
     chosen, observers = scenarios(scenario, vary), name_list(observers)
     check_writable(path, endings=(".html", ".htm"))
     kept = []
