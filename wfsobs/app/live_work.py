@@ -37,7 +37,8 @@ def compute(order: LiveOrder, service: Service, watch: Watch, tell: Tell) -> Non
             sleep(LOOK)
     finally:
         try:
-            order.end(loop)
+            if lost := order.end(loop):
+                event("live-recording", logging.WARNING, reason=lost)
         finally:
             loop.stop()
 

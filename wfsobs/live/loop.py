@@ -533,8 +533,7 @@ class LiveOrder:
         if self.record_file:
             loop.recorder.start()
 
-    def end(self, loop: LiveLoop) -> None:
-        """Write what has been recorded. Raises OSError."""
+    def end(self, loop: LiveLoop) -> str:
+        """Write what has been recorded; return a line if the file has no place for parts of it. Raises OSError."""
         record = loop.recorder.stop(loop.scenario) if self.record_file else None
-        if record is not None:
-            save_record(self.record_file, record, to_toml(loop.scenario))
+        return save_record(self.record_file, record, to_toml(loop.scenario)) if record is not None else ""
