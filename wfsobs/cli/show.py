@@ -197,7 +197,7 @@ def score_table(rows: Sequence[Row]) -> Table:
             + (f" ({own_interval(own[0])})" if (own := [r for r in same if r["apart"]]) else ""),
             same[0]["needs"],
             f"{error * 1e3:.2f}",
-            interval_text(interval, 1e3),
+            interval_text(error, interval, 1e3),
             *(
                 ("-" if above is None else "?" if isnan(above) else f"{100.0 * above:+.0f} %" if above else "at",)
                 if bounded

@@ -96,7 +96,7 @@ def loop_table(rows: Sequence[Row]) -> Table:
             label(controller),
             same[0]["needs"],
             shown,
-            *((interval_text(seeds_interval(np.array(left)), 1.0),) if several else ()),
+            *((interval_text(float(np.mean(left)), seeds_interval(np.array(left)), 1.0),) if several else ()),
             median_text(same, "residual_rms_mas", 3),
             median_text(same, "strehl", 4),
             linear(same, median_text(same, "predicted_rms_nm", 2)),

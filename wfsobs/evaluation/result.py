@@ -111,9 +111,15 @@ def score_rows(scores: Iterable[Score], seed: int | None, *, source: PriorSource
     ]
 
 
-def interval_text(interval: Sequence[float] | None, scale: float) -> str:
-    """Return the interval of the rms of an optimal observer in 95 % of records, "low - high"; "-" where there is none."""
-    return "-" if interval is None else f"{interval[0] * scale:.2f} - {interval[1] * scale:.2f}"
+def interval_text(x: float, interval: Sequence[float] | None, scale: float) -> str:
+    """Return the interval of a value, "low - high"; "-" where there is none, and "unknown" where it `is_unknown`.
+
+    >>> interval_text(0.044, (0.03, 0.06), 1e3), interval_text(0.044, (1e-4, 12.8), 1e3)
+    ('30.00 - 60.00', 'unknown')
+    """
+    if interval is None or is_unknown(x, interval):
+        return "-" if interval is None else "unknown"
+    return f"{interval[0] * scale:.2f} - {interval[1] * scale:.2f}"
 
 
 def is_unknown(x: float, interval: Sequence[float]) -> bool:
